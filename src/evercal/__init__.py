@@ -1,0 +1,41 @@
+"""evercal tells a robot where its camera is, from one ordinary image.
+
+The names below are loaded when they are first used, so that `import evercal` costs nothing.
+"""
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from evercal.datasets import Frame as Frame
+    from evercal.datasets import Scene as Scene
+    from evercal.datasets import load_scene as load_scene
+    from evercal.errors import InputError as InputError
+    from evercal.geometry import SE3 as SE3
+    from evercal.geometry import Camera as Camera
+
+__version__ = "0.1.0"
+
+# The public names and the module that holds each. A name enters here together with its module.
+_PUBLIC = {
+    "Camera": "evercal.geometry",
+    "Frame": "evercal.datasets",
+    "InputError": "evercal.errors",
+    "SE3": "evercal.geometry",
+    "Scene": "evercal.datasets",
+    "load_scene": "evercal.datasets",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Loads a public name on first use."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'evercal' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_PUBLIC[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """The public names, loaded or not."""
+    return sorted({*_PUBLIC, "__version__"})

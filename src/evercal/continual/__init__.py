@@ -1,0 +1,1 @@
+"""Learning scenes one after another: what to keep, what to replay, how to distil."""

@@ -1,0 +1,103 @@
+"""The atlas: one frame for the network in which scenes do not overlap.
+
+Every scene keeps its own base frame; `atlas_from_base` only shifts it into the scene's cell.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from evercal.geometry.se3 import SE3
+
+MIN_CELL_M = 5.0
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The square of the atlas that belongs to one scene."""
+
+    centre_m: tuple[float, float, float]
+    """Atlas coordinates of the scene's mean camera position."""
+    side_m: float
+    """Side of the square around it, in x and y."""
+    origin_m: tuple[float, float, float]
+    """Mean camera position in the scene's own base frame."""
+
+    @property
+    def atlas_from_base(self) -> SE3:
+        """A pure shift."""
+        shift = np.subtract(self.centre_m, self.origin_m)
+        return SE3(np.array([1.0, 0.0, 0.0, 0.0]), shift)
+
+
+class Atlas:
+    """Cells in order of arrival.
+
+    Args:
+        layout: `open` (default) walks a square spiral and takes the first free place that is large
+            enough, so no scene need be known in advance. `paper` is GLACE's grid: scene i of n goes
+            to 5 m (-row, -column, 0) with ceil(sqrt(n)) columns.
+        expected: n for the layout `paper`.
+    """
+
+    def __init__(self, layout: Literal["open", "paper"] = "open", expected: int = 0):
+        self.layout, self.expected = layout, expected
+        self.cells: list[Cell] = []
+
+    def place(self, positions_m: np.ndarray) -> Cell:
+        """Gives a new scene its cell.
+
+        Args:
+            positions_m: (n, 3) camera positions in the scene's base frame.
+
+        Returns:
+            The cell, already part of the atlas.
+        """
+        origin = positions_m.mean(axis=0)
+        side = max(MIN_CELL_M, 2.0 * float(np.ptp(positions_m, axis=0).max()))
+        if self.layout == "paper":
+            centre, side = paper_grid(max(self.expected, 1))[len(self.cells)], MIN_CELL_M
+        else:
+            centre = next(c for c in spiral() if self._free(c, side))
+        x, y, z = (float(value) for value in centre)
+        ox, oy, oz = (float(value) for value in origin)
+        cell = Cell((x, y, z), side, (ox, oy, oz))
+        self.cells.append(cell)
+        return cell
+
+    def _free(self, centre: np.ndarray, side: float) -> bool:
+        return all(
+            np.abs(centre[:2] - cell.centre_m[:2]).max() >= (side + cell.side_m) / 2
+            for cell in self.cells
+        )
+
+    def scene_at(self, position_m: np.ndarray) -> int | None:
+        """Index of the scene whose cell holds an atlas position (3,); None outside all cells."""
+        for i, cell in enumerate(self.cells):
+            if np.abs(position_m[:2] - cell.centre_m[:2]).max() <= cell.side_m / 2:
+                return i
+        return None
+
+
+def spiral() -> Iterator[np.ndarray]:
+    """Points of a square spiral around the origin, 5 m apart, for ever."""
+    x = y = 0
+    dx, dy, leg = 1, 0, 1
+    while True:
+        for _ in range(2):
+            for _ in range(leg):
+                yield np.array([x, y, 0.0]) * MIN_CELL_M
+                x, y = x + dx, y + dy
+            dx, dy = -dy, dx
+        leg += 1
+
+
+def paper_grid(count: int) -> np.ndarray:
+    """(count, 3) cell centres of GLACE's combined scenes, metres."""
+    columns = math.ceil(math.sqrt(count))
+    i = np.arange(count)
+    row = -(-(i + 1) // columns) - 1
+    return MIN_CELL_M * np.stack([-row, -(i % columns), 0 * i], -1).astype(float)

@@ -1,0 +1,283 @@
+"""`learn`: one more scene, as a generator of progress, checkpoints and the finished stage."""
+
+import copy
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from evercal.continual.atlas import Cell
+from evercal.continual.knowledge import Knowledge, SceneRecord, prototypes
+from evercal.continual.memory import remember
+from evercal.continual.strategies import STRATEGIES, Strategy
+from evercal.datasets.frame import Frame, Scene
+from evercal.models.head import Head, HeadOptions, HeadOutput
+from evercal.training.buffer import FeatureBuffer, FillPlan, Rows, fill
+from evercal.training.fit import FitOptions, Fitter, Progress, Replay
+from evercal.training.precision import autocast
+
+CHECKPOINT_SECONDS = 10.0
+
+
+@dataclass(frozen=True)
+class StageOptions:
+    """How one scene is learned."""
+
+    head: HeadOptions = field(default_factory=HeadOptions)
+    """Shape of a new head; a later stage keeps the head it finds."""
+    fit: FitOptions = field(default_factory=FitOptions)
+    """Training."""
+    fill: FillPlan = field(default_factory=FillPlan)
+    """Views of the new scene's frames."""
+    replay_passes: int = 3
+    """Views of every remembered frame."""
+    memory_share: float = 0.10
+    """N_b as a share of the scene's training frames."""
+    memory_bytes: int | None = None
+    """N_b as a size instead; frames are counted at the size of the first one."""
+    fixed_centres_m: tuple[tuple[float, float, float], ...] = ()
+    """Atlas coordinates of all centres, known in advance (HeadOptions.centres `fixed`)."""
+    seed: int = 0
+    """Of everything that is drawn."""
+
+
+@dataclass
+class Encoding:
+    """The encoder is at work."""
+
+    done: int
+    """Views encoded."""
+    total: int
+    """Views to encode."""
+
+
+@dataclass
+class Checkpoint:
+    """A state from which `learn` can go on; only what is new since the last one."""
+
+    rows: Mapping[str, Tensor]
+    """Feature rows encoded since the last checkpoint; empty when there are none."""
+    fitter: Mapping[str, Tensor]
+    """State of the training; empty while the encoder is at work."""
+
+
+@dataclass
+class Resume:
+    """What checkpoints left behind."""
+
+    rows: Sequence[Mapping[str, Tensor]]
+    """The `rows` of all checkpoints in order."""
+    fitter: Mapping[str, Tensor]
+    """The last non-empty `fitter`."""
+
+
+@dataclass
+class Stage:
+    """A finished stage."""
+
+    knowledge: Knowledge
+    """What is known now; thresholds are not fitted yet."""
+    iterations: int
+    """Optimiser steps."""
+    frames_kept: int
+    """Frames of this scene that stay in memory."""
+
+
+Event = Encoding | Progress | Checkpoint | Stage
+
+
+def learn(
+    known: Knowledge,
+    scene: Scene,
+    options: StageOptions,
+    resume: Resume | None = None,
+    earlier: Sequence[Scene] = (),
+) -> Iterator[Event]:
+    """Learns one more scene.
+
+    Args:
+        known: what is known so far; not changed.
+        scene: its training frames are learned, its test frames are not looked at.
+        options: how.
+        resume: where an interrupted run of the same call stood.
+        earlier: all earlier scenes, only for strategies with `data: all`.
+
+    Yields:
+        `Encoding` and `Progress` as it goes, a `Checkpoint` every 10 seconds, a `Stage` at the end.
+    """
+    strategy = STRATEGIES[known.strategy]
+    after = known.fork()
+    teacher = copy.deepcopy(after.heads[-1]).eval() if after.heads else None
+    positions = np.stack([_pose(frame).translation_m for frame in scene.train])
+    cell = after.atlas.place(positions)
+    head, local = _head_for_stage(after, strategy, options, cell, positions)
+    buffer = FeatureBuffer(local, cell.atlas_from_base)
+    pacer = _Pacer()
+    past_rows, fitter_state = (resume.rows, resume.fitter) if resume else ((), {})
+    for rows in past_rows:
+        buffer.restore(rows)
+    frames = scene.train
+    for done in fill(buffer, frames, options.fill, known.encoder, known.descriptor):
+        yield Encoding(done, len(frames) * options.fill.passes)
+        if pacer.due():
+            yield Checkpoint(buffer.take_new(), {})
+    new = buffer.take_new()
+    if new:
+        yield Checkpoint(new, {})
+    buffers = [buffer]
+    if strategy.data == "all":
+        buffers += yield from _refill(known, earlier, options)
+    replay = None
+    if strategy.penalty is not None and teacher is not None:
+        replay = yield from _replay(known, strategy, teacher, options)
+    fit = options.fit
+    if known.scenes and strategy.data == "stage" and strategy.heads == "one":
+        fit = replace(fit, peak_rate=fit.peak_rate * strategy.warm_rate)
+    fitter = Fitter(head, buffers, replay, fit, options.seed)
+    if fitter_state:
+        fitter.load(dict(fitter_state))
+    for progress in fitter.run():
+        yield progress
+        if pacer.due():
+            yield Checkpoint({}, fitter.state())
+    yield _finish(after, scene, cell, buffer, options)
+
+
+def _pose(frame: Frame):
+    assert frame.base_from_camera is not None, "training frames are posed"
+    return frame.base_from_camera
+
+
+def _head_for_stage(
+    after: Knowledge,
+    strategy: Strategy,
+    options: StageOptions,
+    cell: Cell,
+    positions: np.ndarray,
+) -> tuple[Head, int]:
+    """The head to train, grown by this scene, put in its place; and the scene's index in it."""
+    shape = replace(options.head, condition=strategy.condition)
+    width = after.encoder.width
+    number = len(after.scenes)
+    in_atlas = cell.atlas_from_base.apply(positions)
+    if strategy.data == "all":
+        head = Head(width, after.descriptor.width, _seeded(shape, options.seed))
+        for i, record in enumerate(after.scenes):
+            old = after.heads[0]
+            head.grow(old.centres[old.centre_scene == i], options.seed + i)
+        after.heads = []
+    elif strategy.heads == "per_scene" or not after.heads:
+        head = Head(width, after.descriptor.width, _seeded(shape, options.seed))
+    else:
+        head = after.heads.pop()
+    local = head.scenes
+    head.grow(_new_centres(head, options, in_atlas), options.seed + number)
+    after.heads.append(head)
+    return head, local
+
+
+def _seeded(shape: HeadOptions, seed: int) -> HeadOptions:
+    torch.manual_seed(seed)
+    return shape
+
+
+def _new_centres(head: Head, options: StageOptions, positions: np.ndarray) -> Tensor:
+    """(k, 3) centres that the scene adds, from its camera positions (n, 3) in the atlas."""
+    from scipy.cluster.vq import kmeans2
+
+    kind, count = head.options.centres, head.options.centres_per_scene
+    if kind == "grow":
+        if count == 1:
+            return torch.from_numpy(positions.mean(0, keepdims=True)).float()
+        count = min(count, len(positions))
+        rng = np.random.default_rng(options.seed)
+        centres, _ = kmeans2(positions, count, minit="++", rng=rng)
+        return torch.from_numpy(centres).float()
+    if head.scenes > 0:
+        return torch.zeros(0, 3)
+    if kind == "fixed":
+        return torch.tensor(options.fixed_centres_m).reshape(-1, 3)
+    from itertools import islice
+
+    from evercal.continual.atlas import spiral
+
+    return torch.tensor(np.stack(list(islice(spiral(), count)))).float()
+
+
+def _refill(known: Knowledge, earlier: Sequence[Scene], options: StageOptions) -> Iterator[Event]:
+    """Encodes all earlier scenes again (strategies with `data: all`)."""
+    buffers = []
+    for i, (scene, record) in enumerate(zip(earlier, known.scenes, strict=True)):
+        buffer = FeatureBuffer(i, record.cell.atlas_from_base)
+        plan = options.fill
+        for done in fill(buffer, scene.train, plan, known.encoder, known.descriptor):
+            yield Encoding(done, len(scene.train) * plan.passes)
+        buffers.append(buffer)
+    return buffers
+
+
+def _replay(
+    known: Knowledge, strategy: Strategy, teacher: Head, options: StageOptions
+) -> Iterator[Event]:
+    """Encodes what is remembered and binds the penalty to the frozen teacher."""
+    buffers = []
+    for i, (memory, record) in enumerate(zip(known.memories, known.scenes, strict=True)):
+        if memory is None or not memory.images:
+            continue
+        buffer = FeatureBuffer(i, record.cell.atlas_from_base)
+        plan = replace(options.fill, passes=options.replay_passes)
+        frames = memory.frames()
+        for done in fill(buffer, frames, plan, known.encoder, known.descriptor):
+            yield Encoding(done, len(frames) * plan.passes)
+        buffers.append(buffer)
+    cost = strategy.penalty
+    assert cost is not None
+
+    def penalty(student: HeadOutput, rows: Rows, progress: float) -> Tensor:
+        with torch.no_grad(), autocast():
+            before = teacher(rows.features.float(), rows.scene, rows.descriptor)
+        return cost(student, before, rows, progress)
+
+    return Replay(buffers, penalty) if buffers else None
+
+
+def _finish(
+    after: Knowledge,
+    scene: Scene,
+    cell: Cell,
+    buffer: FeatureBuffer,
+    options: StageOptions,
+) -> Stage:
+    strategy = STRATEGIES[after.strategy]
+    frames = scene.train
+    descriptors = buffer.tensors["descriptors"][: len(frames)]
+    record = SceneRecord(scene.name, frames[0].camera, cell, prototypes(descriptors), len(frames))
+    kept: list[Frame] = []
+    if strategy.select is not None:
+        positions = np.stack([_pose(frame).translation_m for frame in frames])
+        quaternions = np.stack([_pose(frame).rotation_wxyz for frame in frames])
+        capacity = max(1, round(options.memory_share * len(frames)))
+        if options.memory_bytes is not None:
+            one = remember(frames[:1], after.short_side).bytes
+            capacity = min(len(frames), max(1, options.memory_bytes // one))
+        kept = [frames[i] for i in strategy.select(positions, quaternions, capacity)]
+    after.scenes.append(record)
+    after.memories.append(remember(kept, after.short_side) if kept else None)
+    return Stage(after, options.fit.iterations, len(kept))
+
+
+class _Pacer:
+    """Says when a checkpoint is due."""
+
+    def __init__(self) -> None:
+        self._last = time.monotonic()
+
+    def due(self) -> bool:
+        now = time.monotonic()
+        if now - self._last < CHECKPOINT_SECONDS:
+            return False
+        self._last = now
+        return True

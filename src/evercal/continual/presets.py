@@ -1,0 +1,48 @@
+"""Presets: how much work a scene gets."""
+
+from dataclasses import replace
+from typing import Literal
+
+from evercal.continual.learn import StageOptions
+from evercal.models.head import HeadOptions
+from evercal.training.buffer import FillPlan
+from evercal.training.fit import FitOptions
+
+Preset = Literal["fast", "demo", "bench", "paper"]
+
+PRESETS: dict[str, StageOptions] = {
+    # 2 cores, at most 240 s a scene.
+    "fast": StageOptions(
+        head=HeadOptions(width=384),
+        fit=FitOptions(iterations=5000, batch=2048, replay_batch=1024),
+        fill=FillPlan(passes=4),
+    ),
+    # At most 45 s a scene of about 100 frames.
+    "demo": StageOptions(
+        head=HeadOptions(width=256),
+        fit=FitOptions(iterations=1500, batch=2048, replay_batch=1024),
+        fill=FillPlan(passes=3),
+        replay_passes=2,
+    ),
+    # At most 30 s a stage.
+    "bench": StageOptions(
+        head=HeadOptions(width=256),
+        fit=FitOptions(iterations=1000, batch=2048, replay_batch=1024),
+        fill=FillPlan(passes=1),
+        replay_passes=1,
+    ),
+    # The paper's settings, for a GPU; Sim takes 5,000 steps.
+    "paper": StageOptions(
+        head=HeadOptions(width=768, centres_per_scene=100),
+        fit=FitOptions(
+            iterations=15_000, batch=40_960, replay_batch=40_960, peak_rate=5e-3, warm_share=0.3
+        ),
+        fill=FillPlan(passes=8, cells=1024),
+    ),
+}
+
+
+def preset(name: str, seed: int = 0) -> StageOptions:
+    """A preset with everything drawn from `seed`."""
+    options = PRESETS[name]
+    return replace(options, seed=seed, fill=replace(options.fill, seed=seed))

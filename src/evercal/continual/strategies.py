@@ -1,0 +1,104 @@
+"""Strategies: small records of functions, and the literal dict that names them all."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from evercal.continual.selection import SarsOptions, select_sars
+from evercal.continual.spdd import SpddOptions, spdd_loss
+from evercal.models.head import HeadOutput
+from evercal.training.buffer import Rows
+from evercal.training.loss import LossOptions, reprojection_loss
+
+Select = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
+"""Which frames stay: (positions (n, 3) metres, quaternions wxyz (n, 4), capacity) -> indices."""
+
+Penalty = Callable[[HeadOutput, HeadOutput, Rows, float], Tensor]
+"""What replay costs: (student, frozen teacher, replayed rows, progress in [0, 1]) -> scalar."""
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """How scenes that come one after another share a network."""
+
+    source: str
+    """Where the rule comes from."""
+    select: Select | None = None
+    """Which frames of a finished scene are remembered; None keeps none."""
+    penalty: Penalty | None = None
+    """What replayed rows cost."""
+    condition: Literal["code", "descriptor"] = "code"
+    """What tells the scenes apart at the head's input."""
+    data: Literal["stage", "all"] = "stage"
+    """Train on the new scene, or on every frame of every scene from scratch."""
+    heads: Literal["one", "per_scene"] = "one"
+    """One head for all scenes, or one each."""
+    warm_rate: float = 1.0
+    """Peak learning rate of the second and later stages, as a share of the first one's."""
+
+
+def _sars(positions: np.ndarray, quaternions: np.ndarray, capacity: int) -> np.ndarray:
+    return select_sars(positions, quaternions, capacity, SarsOptions())
+
+
+def _sars_filled(positions: np.ndarray, quaternions: np.ndarray, capacity: int) -> np.ndarray:
+    return select_sars(positions, quaternions, capacity, SarsOptions(fill=True))
+
+
+def _spdd(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
+    return spdd_loss(student, teacher, SpddOptions()).total
+
+
+REPLAY_CLAMP_PX = 5.0
+TEACHER_LIMIT_PX = 10.0
+OUTPUT_WEIGHT_PX_PER_M = 50.0
+
+
+def anchored_reprojection(
+    student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float
+) -> Tensor:
+    """Replay of `evercal`: geometric truth, and the teacher's points where they were right.
+
+    Reprojection against the known poses with a tight, fixed clamp corrects itself, so errors do not
+    pile up from stage to stage. The L1 distance to the teacher's point (weight 50 px per metre, about
+    the parallax of a pixel at 3 m) holds the depth, which a single reprojection does not see; it
+    counts only where the teacher reprojects within 10 px (after Buff-CS's teacher-bounded
+    regression, Wang et al., ICCV 2021).
+    """
+    options = LossOptions()
+    cost, _ = reprojection_loss(student.points, rows.target, REPLAY_CLAMP_PX, options)
+    _, error = reprojection_loss(teacher.points, rows.target, REPLAY_CLAMP_PX, options)
+    drift = (student.points - teacher.points.detach()).abs().sum(-1)
+    held = torch.where(error < TEACHER_LIMIT_PX, drift, torch.zeros_like(drift))
+    return cost.mean() + OUTPUT_WEIGHT_PX_PER_M * held.mean()
+
+
+STRATEGIES: dict[str, Strategy] = {
+    "evercal": Strategy(
+        source="this project: scene codes, own centres, anchored replay",
+        select=_sars_filled,
+        penalty=anchored_reprojection,
+    ),
+    "finetune": Strategy(source="control: the head and steps of evercal, no replay"),
+    "sars_spdd": Strategy(
+        source="Li et al., Continual Hand-Eye Calibration, arXiv 2604.15814, Algorithms 1 and 2",
+        select=_sars,
+        penalty=_spdd,
+        condition="descriptor",
+    ),
+    "sars_spdd_filled": Strategy(
+        source="the same with the largest radius that fills the memory",
+        select=_sars_filled,
+        penalty=_spdd,
+        condition="descriptor",
+    ),
+    "isolation": Strategy(
+        source="after ESAC (Brachmann, Rother, ICCV 2019): an expert per scene behind a gate",
+        heads="per_scene",
+    ),
+    "joint": Strategy(source="all frames of all scenes at once, restarted", data="all"),
+}

@@ -1,0 +1,59 @@
+"""What every dataset yields: frames with a camera and poses, in scenes with a train/test split."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.datasets.images import read_image
+from evercal.errors import InputError
+from evercal.geometry import SE3, Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image and what is known about it."""
+
+    name: str
+    """Unique within its scene."""
+    image: Path | NDArray[np.uint8]
+    """A file, or (H, W, 3) uint8 RGB."""
+    camera: Camera
+    """Intrinsics at the size of `image`."""
+    base_from_camera: SE3 | None
+    """Camera pose in the scene's base frame; None if it is not known."""
+    base_from_gripper: SE3 | None = None
+    """Gripper pose in the robot's base frame when the image was taken; None if there is no arm."""
+
+    def read_image(self) -> NDArray[np.uint8]:
+        """Reads the pixels.
+
+        Returns:
+            (H, W, 3) uint8 RGB.
+
+        Raises:
+            InputError: The file is missing or broken, or its size is not the camera's.
+        """
+        image = read_image(self.image) if isinstance(self.image, Path) else self.image
+        if image.shape[:2] != (self.camera.height, self.camera.width):
+            where = self.image if isinstance(self.image, Path) else self.name
+            raise InputError(
+                f"{where}: image is {image.shape[1]}x{image.shape[0]}, its camera"
+                f" {self.camera.width}x{self.camera.height}; give the intrinsics of this image size"
+            )
+        return image
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One place: frames in the order they were recorded, all poses in one base frame."""
+
+    name: str
+    """What the scene is called."""
+    train: tuple[Frame, ...]
+    """Frames to learn from."""
+    test: tuple[Frame, ...]
+    """Frames to score on; never learned from."""
+    untracked: int = 0
+    """How many recorded frames were left out because they have no valid pose."""

@@ -1,0 +1,12 @@
+"""Pictures and pages from plain arrays; knows nothing of the project."""
+
+from evercal.drawing.charts import error_curve as error_curve
+from evercal.drawing.charts import forgetting_curves as forgetting_curves
+from evercal.drawing.charts import trajectory as trajectory
+from evercal.drawing.overlay import contact_sheet as contact_sheet
+from evercal.drawing.overlay import encode_image as encode_image
+from evercal.drawing.overlay import overlay_points as overlay_points
+from evercal.drawing.page import Picture as Picture
+from evercal.drawing.page import Section as Section
+from evercal.drawing.page import Table as Table
+from evercal.drawing.page import html_page as html_page

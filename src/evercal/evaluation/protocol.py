@@ -1,0 +1,145 @@
+"""How a store is examined: the test images of all scenes in one list, no scene given away."""
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.datasets import Frame, Scene
+from evercal.errors import InputError
+from evercal.evaluation.metrics import FrameResult, Status, near_training
+from evercal.geometry import SE3, Camera, pose_distance
+
+
+class Estimate(Protocol):
+    """What is read from a localizer's answer."""
+
+    @property
+    def status(self) -> Status:
+        """Whether there is a pose, and if not, why."""
+        ...
+
+    @property
+    def scene(self) -> str | None:
+        """The scene that the image was found in."""
+        ...
+
+    @property
+    def base_from_camera(self) -> SE3 | None:
+        """The pose in the base frame of `scene`; not None if the status is ok."""
+        ...
+
+    @property
+    def inliers(self) -> int:
+        """How many scene points agree with the pose."""
+        ...
+
+    @property
+    def inlier_ratio(self) -> float:
+        """The same as a share of all scene points."""
+        ...
+
+
+class SceneLocalizer(Protocol):
+    """What is examined: anything that takes an image and a camera and knows some scenes."""
+
+    @property
+    def scenes(self) -> Sequence[str]:
+        """The names of the scenes it was taught."""
+        ...
+
+    def localize(self, image: NDArray[np.uint8], camera: Camera, /) -> Estimate:
+        """Localizes one image (H, W, 3) uint8 RGB."""
+        ...
+
+
+def evaluate(
+    localizer: SceneLocalizer,
+    scenes: Mapping[str, Scene],
+    seed: int = 0,
+    on_frame: Callable[[int, int], None] | None = None,
+) -> list[FrameResult]:
+    """Localizes every test image of all scenes, one at a time and in random order, and scores it.
+
+    The localizer sees an image and its camera only. Names are used afterwards: errors count if
+    the scene that was found is the frame's, and are infinite otherwise. Test frames whose pose is
+    not known cannot be scored and are left out.
+
+    Args:
+        localizer: What is examined.
+        scenes: By the name under which the localizer was taught each; no need to give them all.
+        seed: Of the random order.
+        on_frame: Told the number of images done and of all images, after each.
+
+    Returns:
+        Results scene by scene in the order of `scenes`, frames in recorded order.
+
+    Raises:
+        InputError: No scenes, a scene that the localizer was not taught, one without test frames
+            that have a pose, or an image that cannot be read.
+    """
+    tests = {name: _test_frames(localizer, name, scene) for name, scene in scenes.items()}
+    if not tests:
+        raise InputError(f"no scene to evaluate; give one or more of {_listed(localizer.scenes)}")
+    near = [flag for name, frames in tests.items() for flag in _near(scenes[name], frames)]
+    jobs = [(name, frame) for name, frames in tests.items() for frame in frames]
+    results: dict[int, FrameResult] = {}
+    for done, index in enumerate(np.random.default_rng(seed).permutation(len(jobs)), start=1):
+        name, frame = jobs[index]
+        results[int(index)] = _result(localizer, name, frame, near[index])
+        if on_frame is not None:
+            on_frame(done, len(jobs))
+    return [results[index] for index in range(len(jobs))]
+
+
+def _test_frames(localizer: SceneLocalizer, name: str, scene: Scene) -> list[Frame]:
+    if name not in localizer.scenes:
+        raise InputError(
+            f"scene {name!r} is not in the store, which knows {_listed(localizer.scenes)};"
+            f" give it as NAME=SCENE with the name under which it was learned"
+        )
+    frames = [frame for frame in scene.test if frame.base_from_camera is not None]
+    if not frames:
+        raise InputError(
+            f"scene {name!r} has {len(scene.test)} test frames, none with a known pose;"
+            f" give a scene with posed test frames"
+        )
+    return frames
+
+
+def _result(localizer: SceneLocalizer, name: str, frame: Frame, near: bool) -> FrameResult:
+    start = time.perf_counter()
+    estimate = localizer.localize(frame.read_image(), frame.camera)
+    milliseconds = 1e3 * (time.perf_counter() - start)
+    metres = radians = np.inf
+    truth, found = frame.base_from_camera, estimate.base_from_camera
+    if estimate.status == "ok" and estimate.scene == name:
+        assert truth is not None
+        assert found is not None, "an estimate whose status is ok has a pose"
+        metres, radians = pose_distance(truth, found)
+    return FrameResult(
+        scene=name,
+        frame=frame.name,
+        translation_error_m=float(metres),
+        rotation_error_rad=float(radians),
+        status=estimate.status,
+        found_scene=estimate.scene,
+        near_training_frame=near,
+        milliseconds=milliseconds,
+        inliers=int(estimate.inliers),
+        inlier_ratio=float(estimate.inlier_ratio),
+    )
+
+
+def _near(scene: Scene, frames: Sequence[Frame]) -> list[bool]:
+    return near_training(_poses(scene.train), _poses(frames)).tolist()
+
+
+def _poses(frames: Iterable[Frame]) -> SE3:
+    return SE3.stack([f.base_from_camera for f in frames if f.base_from_camera is not None])
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names) or "no scene yet"

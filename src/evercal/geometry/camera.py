@@ -1,0 +1,208 @@
+"""The camera: pinhole with OpenCV's distortion.
+
+Conventions: OpenCV axes (x right, y down, z forward). Pixel (0, 0) is the CENTRE of the top-left
+pixel, as in OpenCV and ROS, so an image covers -0.5 .. width - 0.5 and its middle is at
+(width - 1) / 2.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+_COEFFICIENT_COUNTS = (0, 4, 5, 8)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of one camera at one image size.
+
+    Raises:
+        ValueError: A size or focal length that is not positive, numbers that are not finite, or a
+            number of distortion coefficients other than 0, 4, 5 or 8.
+    """
+
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+    fx: float
+    """Focal length along x in pixels."""
+    fy: float
+    """Focal length along y in pixels."""
+    cx: float
+    """Principal point in pixels; 0 is the centre of the leftmost pixel."""
+    cy: float
+    """Principal point in pixels; 0 is the centre of the topmost pixel."""
+    distortion: tuple[float, ...] = ()
+    """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty for none."""
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if not (1 <= value < math.inf) or int(value) != value:
+                raise ValueError(f"camera {name} is a whole number of pixels >= 1, got {value}")
+            object.__setattr__(self, name, int(value))
+        for name in ("fx", "fy", "cx", "cy"):
+            value = float(getattr(self, name))
+            if not math.isfinite(value) or (name.startswith("f") and value <= 0):
+                raise ValueError(f"camera {name} is finite (and > 0 for fx, fy), got {value}")
+            object.__setattr__(self, name, value)
+        distortion = tuple(float(value) for value in self.distortion)
+        if len(distortion) not in _COEFFICIENT_COUNTS or not all(map(math.isfinite, distortion)):
+            raise ValueError(
+                f"camera distortion has 0, 4, 5 or 8 finite coefficients"
+                f" (OpenCV's k1 k2 p1 p2 k3 k4 k5 k6), got {distortion}"
+            )
+        object.__setattr__(self, "distortion", distortion)
+
+    @classmethod
+    def from_matrix(
+        cls, matrix: ArrayLike, width: int, height: int, distortion: tuple[float, ...] = ()
+    ) -> Self:
+        """From a 3x3 intrinsic matrix.
+
+        Raises:
+            ValueError: Not 3x3, skew, or a last row other than 0 0 1.
+        """
+        k = np.asarray(matrix, dtype=np.float64)
+        if k.shape != (3, 3):
+            raise ValueError(f"an intrinsic matrix is 3x3, got {k.shape}")
+        if abs(k[0, 1]) > 1e-9 or abs(k[1, 0]) > 1e-9 or not np.allclose(k[2], (0, 0, 1)):
+            raise ValueError(
+                f"an intrinsic matrix is [fx 0 cx; 0 fy cy; 0 0 1], got {k.tolist()}; skew is"
+                f" not supported"
+            )
+        return cls(width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], distortion)
+
+    def matrix(self) -> Array:
+        """(3, 3) intrinsic matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The camera of the same image resized to `width` x `height` pixels."""
+        sx, sy = width / self.width, height / self.height
+        # The half pixels: resizing scales about the image's corner, which lies at -0.5.
+        return Camera(
+            width,
+            height,
+            self.fx * sx,
+            self.fy * sy,
+            (self.cx + 0.5) * sx - 0.5,
+            (self.cy + 0.5) * sy - 0.5,
+            self.distortion,
+        )
+
+    def short_side_resized(self, short_side: int) -> "Camera":
+        """The camera of the image resized so that its shorter side is `short_side` pixels."""
+        scale = short_side / min(self.width, self.height)
+        if self.width <= self.height:
+            return self.resized(short_side, max(1, round(self.height * scale)))
+        return self.resized(max(1, round(self.width * scale)), short_side)
+
+    def project(self, points_camera: ArrayLike) -> Array:
+        """Points in the camera frame to pixels.
+
+        Args:
+            points_camera: (..., 3) metres, camera frame.
+
+        Returns:
+            (..., 2) pixels, x then y, not clipped to the image; nan for points that are not in
+            front of the camera.
+        """
+        points = np.asarray(points_camera, dtype=np.float64)
+        if points.shape[-1:] != (3,):
+            raise ValueError(f"points are (..., 3), got {points.shape}")
+        depth = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
+        plane = self._distort(points[..., :2] / depth)
+        return plane * (self.fx, self.fy) + (self.cx, self.cy)
+
+    def unproject(self, pixels: ArrayLike) -> Array:
+        """Pixels to viewing rays.
+
+        Args:
+            pixels: (..., 2), x then y.
+
+        Returns:
+            (..., 3) rays in the camera frame with z = 1.
+        """
+        pixels = np.asarray(pixels, dtype=np.float64)
+        if pixels.shape[-1:] != (2,):
+            raise ValueError(f"pixels are (..., 2), got {pixels.shape}")
+        if any(self.distortion) and pixels.size:
+            import cv2
+
+            # OpenCV's default of five rounds leaves errors of pixels with strong lenses.
+            criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-10)
+            plane = cv2.undistortPoints(
+                np.ascontiguousarray(pixels.reshape(-1, 1, 2)),
+                self.matrix(),
+                np.array(self.distortion),
+                criteria=criteria,
+            ).reshape(pixels.shape)
+            plane = np.asarray(plane, dtype=np.float64)
+        else:
+            plane = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
+        return np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
+
+    def to_dict(self) -> dict[str, object]:
+        """Plain numbers for JSON."""
+        return {
+            "width": self.width,
+            "height": self.height,
+            "fx": self.fx,
+            "fy": self.fy,
+            "cx": self.cx,
+            "cy": self.cy,
+            "distortion": list(self.distortion),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, object]) -> Self:
+        """From `to_dict`; keys it does not know are passed over, `distortion` may be missing.
+
+        Raises:
+            ValueError: A key is missing or its value is not a number.
+        """
+        values: dict[str, float] = {}
+        for name in ("width", "height", "fx", "fy", "cx", "cy"):
+            values[name] = _number(data.get(name), name)
+        distortion = data.get("distortion", ())
+        if not isinstance(distortion, (list, tuple)):
+            raise ValueError(f"camera 'distortion' is a list of numbers, got {distortion!r}")
+        return cls(
+            values["width"],  # pyright: ignore[reportArgumentType]  # checked when constructed
+            values["height"],  # pyright: ignore[reportArgumentType]
+            values["fx"],
+            values["fy"],
+            values["cx"],
+            values["cy"],
+            tuple(_number(value, "distortion") for value in distortion),
+        )
+
+    def _distort(self, plane: Array) -> Array:
+        """(..., 2) ideal to distorted points of the plane z = 1."""
+        if not any(self.distortion):
+            return plane
+        k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
+        x, y = plane[..., 0], plane[..., 1]
+        r2 = x * x + y * y
+        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        return np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ],
+            axis=-1,
+        )
+
+
+def _number(value: object, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"camera '{name}' is a number, got {value!r}")
+    return float(value)

@@ -1,0 +1,269 @@
+"""Rigid transforms: batched, immutable, float64.
+
+Conventions: a transform is named after its frames, `base_from_camera` takes points in the camera
+frame to points in the base frame, so that `base_from_camera @ camera_from_point` cancels on sight.
+Metres, radians, quaternions in the order w, x, y, z, tangents in the order (translation, rotation).
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SE3:
+    """One rigid transform, or an array of them with any batch shape.
+
+    Quaternions are normalised on entry. Two transforms are compared with `pose_distance`, not `==`.
+
+    Raises:
+        ValueError: Shapes that do not belong together, numbers that are not finite, or a
+            quaternion of length zero.
+    """
+
+    rotation_wxyz: Array
+    """(..., 4) unit quaternion w, x, y, z."""
+    translation_m: Array
+    """(..., 3) metres."""
+
+    def __post_init__(self) -> None:
+        quaternion = np.array(self.rotation_wxyz, dtype=np.float64)
+        translation = np.array(self.translation_m, dtype=np.float64)
+        if quaternion.shape[-1:] != (4,) or translation.shape != (*quaternion.shape[:-1], 3):
+            raise ValueError(
+                f"SE3 takes rotation_wxyz (..., 4) and translation_m (..., 3) with one batch shape,"
+                f" got {quaternion.shape} and {translation.shape}"
+            )
+        length = np.sqrt((quaternion * quaternion).sum(-1, keepdims=True))
+        if not (np.isfinite(length).all() and np.isfinite(translation).all()):
+            raise ValueError("SE3 takes finite numbers, got inf or nan; leave untracked poses out")
+        if not (length > 1e-12).all():
+            raise ValueError("SE3 got a quaternion of length zero, which is no rotation")
+        object.__setattr__(self, "rotation_wxyz", quaternion / length)
+        object.__setattr__(self, "translation_m", translation)
+
+    @classmethod
+    def identity(cls, shape: tuple[int, ...] = ()) -> Self:
+        """The transform that changes nothing, repeated to the batch `shape`."""
+        quaternion = np.broadcast_to(np.array([1.0, 0.0, 0.0, 0.0]), (*shape, 4))
+        return cls(quaternion, np.zeros((*shape, 3)))
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike, tolerance: float = 1e-3) -> Self:
+        """From homogeneous matrices.
+
+        Args:
+            matrix: (..., 4, 4) or (..., 3, 4).
+            tolerance: Largest entry of `R^T R - I` that is still taken for rounding; within it the
+                nearest rotation is used.
+
+        Raises:
+            ValueError: Wrong shape, numbers that are not finite, a last row other than 0 0 0 1, or
+                a left 3x3 block that is not a rotation within `tolerance`.
+        """
+        matrix = np.asarray(matrix, dtype=np.float64)
+        if matrix.ndim < 2 or matrix.shape[-2:] not in ((4, 4), (3, 4)):
+            raise ValueError(f"a pose matrix is (..., 4, 4) or (..., 3, 4), got {matrix.shape}")
+        if not np.isfinite(matrix).all():
+            raise ValueError("a pose matrix takes finite numbers, got inf or nan")
+        if matrix.shape[-2] == 4 and not np.allclose(matrix[..., 3, :], (0, 0, 0, 1), atol=1e-6):
+            raise ValueError("the last row of a pose matrix is 0 0 0 1, got something else")
+        block = matrix[..., :3, :3]
+        drift = np.abs(np.swapaxes(block, -1, -2) @ block - np.eye(3)).max(initial=0.0)
+        if drift > tolerance:
+            raise ValueError(
+                f"the left 3x3 block of a pose matrix is a rotation within {tolerance:g},"
+                f" got one that is off by {drift:.3g}"
+            )
+        if not (np.linalg.det(block) > 0).all():
+            raise ValueError("a pose matrix got a reflection (determinant -1), which is no pose")
+        rotation = Rotation.from_matrix(block)
+        return cls(rotation.as_quat(canonical=True, scalar_first=True), matrix[..., :3, 3])
+
+    @classmethod
+    def exp(cls, tangent: ArrayLike) -> Self:
+        """From tangents (..., 6) = (v, w): translation part in metres, rotation part in radians."""
+        tangent = np.asarray(tangent, dtype=np.float64)
+        if tangent.shape[-1:] != (6,):
+            raise ValueError(f"a tangent is (..., 6) = (v, w), got {tangent.shape}")
+        # scipy wants the rotation first.
+        coordinates = np.concatenate([tangent[..., 3:], tangent[..., :3]], axis=-1)
+        transform = RigidTransform.from_exp_coords(coordinates)
+        quaternion = transform.rotation.as_quat(canonical=True, scalar_first=True)
+        return cls(quaternion, transform.translation)
+
+    @classmethod
+    def stack(cls, poses: Sequence["SE3"]) -> Self:
+        """Stacks transforms of one batch shape along a new first axis; none gives shape (0,)."""
+        if not poses:
+            return cls(np.zeros((0, 4)), np.zeros((0, 3)))
+        return cls(
+            np.stack([pose.rotation_wxyz for pose in poses]),
+            np.stack([pose.translation_m for pose in poses]),
+        )
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The batch shape, () for a single transform."""
+        return self.translation_m.shape[:-1]
+
+    def __len__(self) -> int:
+        """The first batch axis; TypeError for a single transform."""
+        if not self.shape:
+            raise TypeError("a single SE3 has no length")
+        return self.shape[0]
+
+    def __bool__(self) -> bool:
+        """Always true: `pose or default` must not depend on the batch."""
+        return True
+
+    def __getitem__(self, index: object) -> Self:
+        """Indexes the batch axes like a numpy array."""
+        if not self.shape:
+            raise TypeError("a single SE3 cannot be indexed")
+        rows = np.arange(int(np.prod(self.shape))).reshape(self.shape)[index]  # pyright: ignore[reportCallIssue, reportArgumentType]
+        return type(self)(
+            self.rotation_wxyz.reshape(-1, 4)[rows], self.translation_m.reshape(-1, 3)[rows]
+        )
+
+    def __iter__(self) -> Iterator[Self]:
+        """Over the first batch axis."""
+        return (self[i] for i in range(len(self)))
+
+    def rotation_matrix(self) -> Array:
+        """(..., 3, 3)."""
+        return self._rotation().as_matrix()
+
+    def matrix(self) -> Array:
+        """(..., 4, 4) homogeneous matrices."""
+        matrix = np.zeros((*self.shape, 4, 4))
+        matrix[..., :3, :3] = self.rotation_matrix()
+        matrix[..., :3, 3] = self.translation_m
+        matrix[..., 3, 3] = 1.0
+        return matrix
+
+    def inverse(self) -> Self:
+        """`base_from_camera.inverse()` is `camera_from_base`."""
+        conjugate = self.rotation_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
+        transposed = np.swapaxes(self.rotation_matrix(), -1, -2)
+        return type(self)(conjugate, -(transposed @ self.translation_m[..., None])[..., 0])
+
+    def __matmul__(self, other: "SE3") -> Self:
+        """`a_from_b @ b_from_c` is `a_from_c`; batch shapes broadcast."""
+        if not isinstance(other, SE3):
+            return NotImplemented
+        quaternion = _quaternion_product(self.rotation_wxyz, other.rotation_wxyz)
+        return type(self)(quaternion, self.apply(other.translation_m))
+
+    def apply(self, points: ArrayLike) -> Array:
+        """Takes points (..., 3) to the other frame; the axes before the last broadcast."""
+        points = np.asarray(points, dtype=np.float64)
+        if points.shape[-1:] != (3,):
+            raise ValueError(f"points are (..., 3), got {points.shape}")
+        if not self.shape:
+            return points @ self.rotation_matrix().T + self.translation_m
+        return (self.rotation_matrix() @ points[..., None])[..., 0] + self.translation_m
+
+    def log(self) -> Array:
+        """(..., 6) = (v, w) with |w| <= pi, the inverse of `exp`."""
+        transform = RigidTransform.from_components(self.translation_m, self._rotation())
+        coordinates = transform.as_exp_coords()
+        return np.concatenate([coordinates[..., 3:], coordinates[..., :3]], axis=-1)
+
+    def _rotation(self) -> Rotation:
+        return Rotation.from_quat(self.rotation_wxyz, scalar_first=True)
+
+
+def pose_distance(a: SE3, b: SE3) -> tuple[Array, Array]:
+    """Distance between transforms into the same frame.
+
+    Args:
+        a: Batch shape (...).
+        b: Batch shape that broadcasts with that of `a`.
+
+    Returns:
+        Metres (...) between the origins and radians (...) in [0, pi] between the rotations.
+    """
+    metres = np.linalg.norm(a.translation_m - b.translation_m, axis=-1)
+    conjugate = a.rotation_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
+    difference = _quaternion_product(conjugate, b.rotation_wxyz)
+    # atan2 keeps its digits near 0 and near pi, where arccos of the trace loses half of them.
+    sine = np.linalg.norm(difference[..., 1:], axis=-1)
+    return np.asarray(metres), 2.0 * np.arctan2(sine, np.abs(difference[..., 0]))
+
+
+def average_poses(poses: SE3, weights: ArrayLike | None = None) -> SE3:
+    """Robust mean: up to nearly half of the weight may be far off without moving the answer.
+
+    Starts at the pose closest to all others and repeats a weighted mean in which a pose counts
+    less the farther it lies from the current answer, and not at all beyond four median distances
+    (Tukey's biweight), in metres or in radians.
+
+    Args:
+        poses: (n,), n >= 1.
+        weights: (n,) not negative, with a positive sum; all equal when left out.
+
+    Raises:
+        ValueError: No poses, or weights that do not fit.
+    """
+    if len(poses.shape) != 1 or len(poses) == 0:
+        raise ValueError(f"average_poses takes a batch (n,) with n >= 1, got {poses.shape}")
+    given = np.ones(len(poses)) if weights is None else np.asarray(weights, dtype=np.float64)
+    if given.shape != poses.shape or not (given >= 0).all() or not 0 < given.sum() < np.inf:
+        raise ValueError(
+            f"weights are {poses.shape}, finite, not negative, with a positive sum; got {given}"
+        )
+    mean = _medoid(poses, given)
+    for _ in range(50):
+        metres, radians = pose_distance(mean, poses)
+        weight = given * _biweight(metres, given) * _biweight(radians, given)
+        if weight.sum() <= 0:  # those close in metres and those close in radians are disjoint
+            return mean
+        translation = weight @ poses.translation_m / weight.sum()
+        rotation = poses._rotation().mean(weight).as_quat(canonical=True, scalar_first=True)
+        before, mean = mean, SE3(rotation, translation)
+        if max(pose_distance(before, mean)) < 1e-12:
+            break
+    return mean
+
+
+def _quaternion_product(a: Array, b: Array) -> Array:
+    """Hamilton product of (..., 4) wxyz; written out because it is the inner loop of everything."""
+    aw, ax, ay, az = np.moveaxis(a, -1, 0)
+    bw, bx, by, bz = np.moveaxis(b, -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def _medoid(poses: SE3, weights: Array) -> SE3:
+    """The pose whose summed distance to the others is least; of many, only some are candidates."""
+    heavy = np.flatnonzero(weights > 0)
+    candidates = heavy[np.unique(np.linspace(0, len(heavy) - 1, 200).round().astype(int))]
+    metres, radians = pose_distance(poses[candidates[:, None]], poses[None])
+    cost = np.zeros(len(candidates))
+    for distance in (metres, radians):
+        # Each kind in its own unit of spread, so that metres and radians may be added.
+        cost += distance @ weights / max(float(np.median(distance)), 1e-9)
+    return poses[candidates[np.argmin(cost)]]
+
+
+def _biweight(distance: Array, weights: Array) -> Array:
+    """Tukey's biweight of (n,) distances, cut at four weighted medians."""
+    order = np.argsort(distance)
+    # side="right": of two poses the farther one, so that they meet in the middle.
+    middle = np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2, side="right")
+    cut = 4.0 * max(float(distance[order[min(middle, len(order) - 1)]]), 1e-9)
+    return np.clip(1.0 - (distance / cut) ** 2, 0.0, None) ** 2

@@ -1,0 +1,34 @@
+"""What localization answers."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from evercal.geometry.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """The answer for one image; failure is a value, not an exception."""
+
+    status: Literal["ok", "unknown_scene", "failed"]
+    """`unknown_scene`: a pose was found but too few points agree with it. `failed`: none was found."""
+    reason: str
+    """Why the status is not `ok`; empty otherwise."""
+    scene: str | None
+    """Name of the scene that the pose lies in."""
+    base_from_camera: SE3 | None
+    """Camera pose in that scene's base frame, metres, OpenCV axes."""
+    covariance: np.ndarray | None
+    """(6, 6) of (translation in the base frame in metres, rotation about the camera axes in radians)."""
+    inliers: int
+    """Cells that reproject within the threshold."""
+    inlier_ratio: float
+    """The same as a share of all cells."""
+    milliseconds: float
+    """Time from image to answer, decoding not included."""
+    pixels: np.ndarray | None = None
+    """(n, 2) inlying cells in the working image, for overlays."""
+    points_m: np.ndarray | None = None
+    """(n, 3) their scene points in the base frame, metres."""

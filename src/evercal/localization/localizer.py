@@ -1,0 +1,248 @@
+"""`Localizer`: what a robot calls."""
+
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from evercal.continual.knowledge import Knowledge
+from evercal.errors import InputError
+from evercal.geometry.camera import Camera
+from evercal.localization.estimate import PoseEstimate
+from evercal.localization.pnp import PnpOptions, PnpResult, solve_pnp
+from evercal.training.buffer import ENCODE_BATCH, encode
+from evercal.training.precision import autocast
+from evercal.training.views import View, ViewOptions, ideal_cell_pixels, plain_view
+
+ASPECT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class LocalizeOptions:
+    """How an image is located."""
+
+    candidates: int = 3
+    """At most this many scenes are tried for an image."""
+    margin: float = 0.15
+    """Scenes whose best prototype is less similar than the best scene's by more are not tried."""
+    pnp: PnpOptions = field(default_factory=PnpOptions)
+    """RANSAC settings."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Hypothesis:
+    """A pose for one image under the assumption that it shows one scene."""
+
+    scene: int
+    camera: Camera
+    pose: PnpResult | None
+    cells: int
+    pixels: np.ndarray
+    points_m: np.ndarray
+
+    @property
+    def inliers(self) -> int:
+        return int(self.pose.inliers.sum()) if self.pose else 0
+
+
+class Localizer:
+    """Finds the camera in any of the scenes that a store knows.
+
+    Args:
+        known: networks, atlas and scene records.
+        options: how.
+    """
+
+    def __init__(self, known: Knowledge, options: LocalizeOptions | None = None):
+        self.known, self.options = known, options or LocalizeOptions()
+        self._view = ViewOptions(short_side=known.short_side)
+        self._prototypes = [record.prototypes.float() for record in known.scenes]
+        for head in known.heads:
+            head.eval()
+
+    @classmethod
+    def open(cls, store: Path | str, options: LocalizeOptions | None = None) -> Self:
+        """A localizer for a store on disk.
+
+        Raises:
+            InputError: not a store, an empty one, or a damaged file.
+        """
+        from evercal.continual.robot import Robot
+
+        robot = Robot.open(Path(store))
+        if not robot.known.scenes:
+            raise InputError(f"store {store}: no scene learned yet; run 'evercal learn' first")
+        return cls(robot.known, options)
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Names of the scenes, in order of learning."""
+        return tuple(record.name for record in self.known.scenes)
+
+    def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
+        """Camera pose of one image.
+
+        Args:
+            image: (h, w, 3) uint8 RGB or (h, w) grey.
+            camera: its intrinsics; None takes those of the scene that is found, scaled.
+
+        Raises:
+            InputError: no camera given and the proportions fit no known scene's camera, or a camera
+                whose proportions are not the image's.
+        """
+        began = time.perf_counter()
+        features, descriptors = self._encode([self._prepare(image, camera)])
+        return self._locate(features[0], descriptors[0], image.shape, camera, began)
+
+    def localize_batch(
+        self, images: Sequence[np.ndarray], cameras: Sequence[Camera | None]
+    ) -> list[PoseEstimate]:
+        """`localize` for many images; the encoder sees several at once, poses are found in parallel."""
+        answers: dict[int, PoseEstimate] = {}
+        views = [self._prepare(image, c) for image, c in zip(images, cameras, strict=True)]
+        by_shape: dict[tuple[int, ...], list[int]] = {}
+        for i, view in enumerate(views):
+            by_shape.setdefault(view.grey.shape, []).append(i)
+        with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
+            for group in by_shape.values():
+                for start in range(0, len(group), ENCODE_BATCH):
+                    chunk = group[start : start + ENCODE_BATCH]
+                    began = time.perf_counter()
+                    features, descriptors = self._encode([views[i] for i in chunk])
+                    jobs = [
+                        pool.submit(self._locate, f, d, images[i].shape, cameras[i], began)
+                        for i, f, d in zip(chunk, features, descriptors, strict=True)
+                    ]
+                    answers |= {i: job.result() for i, job in zip(chunk, jobs, strict=True)}
+        return [answers[i] for i in range(len(images))]
+
+    def _prepare(self, image: np.ndarray, camera: Camera | None) -> View:
+        height, width = image.shape[:2]
+        if camera is not None and not _same_shape(camera, width, height):
+            raise InputError(
+                f"camera {camera.width}x{camera.height} does not fit the image {width}x{height}: "
+                "give the intrinsics of this image (any size of the same proportions will do)"
+            )
+        plain = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
+        return plain_view(image, plain, self.known.encoder.stride, self._view)
+
+    def _encode(self, views: Sequence[View]) -> tuple[Tensor, Tensor]:
+        features, descriptors = encode(views, self.known.encoder, self.known.descriptor)
+        return features.flatten(2).transpose(1, 2), descriptors
+
+    def _locate(
+        self,
+        features: Tensor,
+        descriptor: Tensor,
+        shape: tuple[int, ...],
+        camera: Camera | None,
+        began: float,
+    ) -> PoseEstimate:
+        best: _Hypothesis | None = None
+        cameras = self._cameras(camera, shape)
+        for scene in self._candidates(descriptor, cameras):
+            lens = cameras[scene]
+            assert lens is not None
+            trial = self._hypothesis(features, descriptor, scene, lens)
+            if best is None or trial.inliers > best.inliers:
+                best = trial
+        assert best is not None
+        return self._answer(best, began)
+
+    def _cameras(self, camera: Camera | None, shape: tuple[int, ...]) -> list[Camera | None]:
+        """Intrinsics at working size under each scene, None where the proportions do not fit."""
+        height, width = shape[:2]
+        found: list[Camera | None] = []
+        for record in self.known.scenes:
+            lens = camera or record.camera
+            fits = _same_shape(lens, width, height)
+            found.append(lens.short_side_resized(self.known.short_side) if fits else None)
+        if not any(found):
+            known = ", ".join(
+                f"{r.name} {r.camera.width}x{r.camera.height}" for r in self.known.scenes
+            )
+            raise InputError(
+                f"image {width}x{height}: its proportions fit no known camera ({known}); "
+                "give its intrinsics with --camera"
+            )
+        return found
+
+    def _candidates(self, descriptor: Tensor, cameras: list[Camera | None]) -> list[int]:
+        """Scenes to try, the likeliest first."""
+        if self._one_answer():
+            return [next(i for i, c in enumerate(cameras) if c is not None)]
+        likeness = [float((p @ descriptor).max()) for p in self._prototypes]
+        usable = [i for i, c in enumerate(cameras) if c is not None]
+        usable.sort(key=lambda i: -likeness[i])
+        floor = likeness[usable[0]] - self.options.margin
+        return [i for i in usable if likeness[i] >= floor][: self.options.candidates]
+
+    def _one_answer(self) -> bool:
+        """Whether the head itself decides which scene answers (condition `descriptor`)."""
+        return self.known.heads[0].options.condition == "descriptor" and len(self.known.heads) == 1
+
+    @torch.inference_mode()
+    def _hypothesis(
+        self, features: Tensor, descriptor: Tensor, scene: int, camera: Camera
+    ) -> _Hypothesis:
+        head, local = self.known.head_for(scene)
+        with autocast():
+            output = head(features, local, descriptor.expand(len(features), -1))
+        points = output.points.double().numpy()
+        pixels = ideal_cell_pixels(camera, self.known.encoder.stride).astype(float)
+        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        pose = solve_pnp(pixels, points, intrinsics, self.options.pnp)
+        if pose is not None and self._one_answer():
+            found = self.known.atlas.scene_at(pose.world_from_camera.translation_m)
+            scene = scene if found is None else found
+        return _Hypothesis(scene, camera, pose, len(pixels), pixels, points)
+
+    def _answer(self, best: _Hypothesis, began: float) -> PoseEstimate:
+        def answer(status, reason, **found) -> PoseEstimate:
+            ms = 1000 * (time.perf_counter() - began)
+            ratio = best.inliers / max(best.cells, 1)
+            return PoseEstimate(
+                status,
+                reason,
+                found.get("scene"),
+                found.get("pose"),
+                found.get("covariance"),
+                best.inliers,
+                ratio,
+                ms,
+                found.get("pixels"),
+                found.get("points"),
+            )
+
+        if best.pose is None:
+            return answer("failed", "no pose agrees with at least 6 cells of the image")
+        found = self.known.atlas.scene_at(best.pose.world_from_camera.translation_m)
+        if found is None or (found != best.scene and not self._one_answer()):
+            return answer("failed", "the pose lies outside the cell of its scene")
+        record = self.known.scenes[found]
+        ratio = best.inliers / best.cells
+        if ratio < record.inlier_threshold:
+            need = f"{100 * record.inlier_threshold:.0f} %"
+            reason = f"{100 * ratio:.0f} % of the cells agree, {record.name} needs {need}"
+            return answer("unknown_scene", reason)
+        base_from_atlas = record.cell.atlas_from_base.inverse()
+        inliers = best.pose.inliers
+        return answer(
+            "ok",
+            "",
+            scene=record.name,
+            pose=base_from_atlas @ best.pose.world_from_camera,
+            covariance=best.pose.covariance * record.covariance_scale,
+            pixels=best.pixels[inliers],
+            points=base_from_atlas.apply(best.points_m[inliers]),
+        )
+
+
+def _same_shape(camera: Camera, width: int, height: int) -> bool:
+    return abs(camera.width * height / (camera.height * width) - 1) < ASPECT_TOLERANCE

@@ -1,0 +1,231 @@
+"""`learn_scene`: what the command line, the API and the benchmarks call to learn a scene."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from evercal.continual.knowledge import Knowledge
+from evercal.continual.learn import (
+    Checkpoint,
+    Encoding,
+    Resume,
+    Stage,
+    StageOptions,
+    learn,
+)
+from evercal.continual.robot import Robot, head_bytes, with_fit
+from evercal.datasets.frame import Frame, Scene
+from evercal.errors import InputError
+from evercal.geometry.se3 import pose_distance
+from evercal.localization.localizer import Localizer
+from evercal.simulation.box_room import BoxRoom, default_camera
+from evercal.storage.manifest import MANIFEST
+from evercal.training.fit import Progress
+
+HELD_OUT_EVERY = 100
+HELD_OUT_BLOCK = 4
+NEGATIVE_ROOM_SEED = 8_990
+CHI2_6_MEDIAN = 5.348
+
+
+@dataclass(frozen=True)
+class LearnOptions:
+    """How a scene is learned into a store."""
+
+    stage: StageOptions = field(default_factory=StageOptions)
+    """Network and training."""
+    strategy: str = "evercal"
+    """Key of STRATEGIES; a store keeps the strategy it was made with."""
+    encoder: Path | None = None
+    """Another encoder than the shipped one, for a new store."""
+    short_side: int = 240
+    """Working size of images in a new store, pixels."""
+
+
+@dataclass(frozen=True)
+class LearnReport:
+    """What came out."""
+
+    scene: str
+    """Its name in the store."""
+    seconds: float
+    """Wall time of this call; a resumed run counts from the resumption."""
+    iterations: int
+    """Optimiser steps of the stage."""
+    memory_bytes: int
+    """What replay keeps of all scenes."""
+    head_bytes: int
+    """All heads, as stored."""
+    frames_kept: int
+    """Frames of this scene in memory."""
+    train_frames: int
+    """Frames learned."""
+    held_out_frames: int
+    """Frames kept aside to fit the threshold of the unknown."""
+    inlier_threshold: float
+    """Smallest inlier ratio that is believed."""
+    resumed: bool
+    """Whether an interrupted run was continued."""
+
+
+OnEvent = Callable[[Encoding | Progress | Checkpoint], None]
+
+
+def learn_scene(
+    store: Path, scene: Scene, options: LearnOptions, on_event: OnEvent | None = None
+) -> LearnReport:
+    """Learns a scene into a store, or goes on where an interrupted call with the same input stopped.
+
+    Args:
+        store: folder of the store; made when missing.
+        scene: its training frames are learned; a few of them are held out to fit the threshold of
+            the unknown place. Its test frames are not looked at.
+        options: how.
+        on_event: called with everything that happens, for progress bars.
+
+    Raises:
+        InputError: too few frames, a name that the store knows already, another strategy than the
+            store's, a store that is none.
+    """
+    began = time.perf_counter()
+    robot = open_or_create(store, options)
+    _check(robot, scene, options)
+    train, held_out = hold_out(scene.train)
+    lesson = replace(scene, train=train)
+    resume = robot.begin(_identity(robot, scene, options))
+    stage = run_stage(robot, lesson, options.stage, resume, on_event)
+    known = stage.knowledge
+    known.scenes[-1] = with_fit(known.scenes[-1], *fit_threshold(known, held_out))
+    memories = [memory.bytes for memory in known.memories if memory is not None]
+    report = LearnReport(
+        scene.name,
+        time.perf_counter() - began,
+        stage.iterations,
+        sum(memories),
+        sum(head_bytes(head) for head in known.heads),
+        stage.frames_kept,
+        len(train),
+        len(held_out),
+        known.scenes[-1].inlier_threshold,
+        resume is not None,
+    )
+    robot.commit(known, asdict(report))
+    return report
+
+
+def open_or_create(store: Path, options: LearnOptions) -> Robot:
+    """The store at a path, or a new one when there is none yet."""
+    if (store / MANIFEST).exists():
+        return Robot.open(store)
+    return Robot.create(store, options.strategy, options.short_side, options.encoder)
+
+
+def _check(robot: Robot, scene: Scene, options: LearnOptions) -> None:
+    names = [record.name for record in robot.known.scenes]
+    if scene.name in names:
+        raise InputError(
+            f"scene {scene.name!r}: the store has a scene of this name; give another with --name"
+        )
+    if robot.known.strategy != options.strategy:
+        raise InputError(
+            f"strategy {options.strategy!r}: the store was made with {robot.known.strategy!r}; "
+            "go on with that one or start a new store"
+        )
+    if len(scene.train) < 16:
+        raise InputError(
+            f"scene {scene.name!r}: {len(scene.train)} training frames are too few; give at least 16"
+        )
+
+
+def _identity(robot: Robot, scene: Scene, options: LearnOptions) -> dict[str, object]:
+    """Whatever changes the outcome of a stage: only the same identity may be resumed."""
+    poses = hashlib.sha256()
+    for frame in scene.train:
+        assert frame.base_from_camera is not None
+        poses.update(frame.name.encode())
+        poses.update(frame.base_from_camera.matrix().tobytes())
+    stages = list(robot.stages)
+    return {
+        "scene": scene.name,
+        "frames": poses.hexdigest(),
+        "camera": scene.train[0].camera.to_dict(),
+        "options": json.loads(json.dumps(asdict(options), default=str)),
+        "stages": stages,
+    }
+
+
+def run_stage(
+    robot: Robot,
+    lesson: Scene,
+    options: StageOptions,
+    resume: Resume | None,
+    on_event: OnEvent | None,
+) -> Stage:
+    """Drives `learn` to its end, writing checkpoints to the store."""
+    for event in learn(robot.known, lesson, options, resume):
+        if isinstance(event, Stage):
+            return event
+        if isinstance(event, Checkpoint):
+            robot.checkpoint(event)
+        if on_event is not None:
+            on_event(event)
+    raise AssertionError("learn() ends with a Stage")
+
+
+def hold_out(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
+    """Splits recorded frames into those to learn and blocks of 4 in every 100 (at least one block)."""
+    every = min(HELD_OUT_EVERY, max(len(frames) // 2, HELD_OUT_BLOCK + 1))
+    middle = every // 2
+    aside = [middle <= i % every < middle + HELD_OUT_BLOCK for i in range(len(frames))]
+    learned = tuple(f for f, out in zip(frames, aside, strict=True) if not out)
+    return learned, tuple(f for f, out in zip(frames, aside, strict=True) if out)
+
+
+def fit_threshold(known: Knowledge, held_out: Sequence[Frame]) -> tuple[float, float]:
+    """Inlier threshold and covariance scale of the newest scene.
+
+    Positives are held-out training frames, negatives are views of box rooms nobody ever learned. The
+    threshold lies a third of the way from the negatives' top to the positives' 5 % quantile, so
+    that an unlucky but known view is rather believed than not. The scale makes the median of the
+    squared Mahalanobis error of well located frames what it is for six Gaussian dimensions.
+
+    Returns:
+        (smallest inlier ratio that is believed, factor on covariances).
+    """
+    localizer = Localizer(known)
+    right, ratios = [], []
+    for frame in held_out:
+        estimate = localizer.localize(frame.read_image(), frame.camera)
+        ratios.append(estimate.inlier_ratio)
+        if estimate.base_from_camera is None or frame.base_from_camera is None:
+            continue
+        metres, radians = pose_distance(estimate.base_from_camera, frame.base_from_camera)
+        if metres < 0.25 and radians < np.deg2rad(15) and estimate.covariance is not None:
+            moved = estimate.base_from_camera.inverse() @ frame.base_from_camera
+            shift = frame.base_from_camera.translation_m - estimate.base_from_camera.translation_m
+            error = np.concatenate([shift, moved.log()[3:]])
+            right.append(float(error @ np.linalg.pinv(estimate.covariance) @ error))
+    strangers = [localizer.localize(image).inlier_ratio for image in _strangers(known)]
+    top = float(np.quantile(strangers, 0.95))
+    known_low = float(np.quantile(ratios, 0.05)) if ratios else 1.0
+    threshold = top + max(0.0, known_low - top) / 3
+    scale = float(np.median(right)) / CHI2_6_MEDIAN if right else 1.0
+    return threshold, max(scale, 1.0)
+
+
+def _strangers(known: Knowledge) -> list[np.ndarray]:
+    """Views of rooms that are in no scene, at the proportions of the newest scene's camera."""
+    lens = known.scenes[-1].camera
+    small = lens.short_side_resized(known.short_side)
+    plain = default_camera(small.width, small.height)
+    images = []
+    for seed in range(NEGATIVE_ROOM_SEED, NEGATIVE_ROOM_SEED + 4):
+        room = BoxRoom(seed, texture_px=192)
+        rng = np.random.default_rng(seed)
+        images += [room.render(plain, room.random_view(rng)) for _ in range(4)]
+    return images

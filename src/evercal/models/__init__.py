@@ -1,0 +1,1 @@
+"""Networks: local encoder, global descriptor and scene-coordinate head, and the shipped weights."""

@@ -1,0 +1,214 @@
+"""The scene-coordinate head: a feature vector in, a point of the scene out.
+
+After GLACE (Wang et al., CVPR 2024): residual MLP, cluster centres chosen by a softmax, and an offset
+in homogeneous form. Scenes may be told apart in two ways (`HeadOptions.condition`):
+
+- `descriptor`: the image's global descriptor is part of the input, as in GLACE. Nothing but the
+  image decides which centres answer.
+- `code`: every layer gets a learned bias of the scene (its code), and only the scene's own centres
+  answer. The caller says for which scene it asks; at test time that is a hypothesis drawn from the
+  image's descriptor, and the hypothesis with most inliers wins.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+SCALE_MAX = 4.0
+SCALE_MIN = 0.01
+
+
+@dataclass(frozen=True)
+class HeadOptions:
+    """Shape of a head."""
+
+    width: int = 256
+    """Channels of every hidden layer."""
+    blocks: int = 1
+    """Residual blocks of three layers after the first one."""
+    condition: Literal["code", "descriptor"] = "code"
+    """What tells scenes apart: a code per scene, or the image's global descriptor in the input."""
+    offsets: Literal["shared", "per_centre"] = "per_centre"
+    """One offset and scale for all centres (GLACE), or one for each centre (the paper)."""
+    centres: Literal["grow", "fixed", "grid"] = "grow"
+    """Where centres come from: each scene appends its own, all scenes at once in advance (the paper;
+    needs the future), or the middles of the atlas cells."""
+    centres_per_scene: int = 4
+    """Cluster centres that a scene adds."""
+
+
+@dataclass
+class HeadOutput:
+    """What a head says about n rows, K centres."""
+
+    logits: Tensor
+    """(n, K) fp32; -inf for centres that cannot answer."""
+    offsets: Tensor
+    """(n, K, 3) per centre or (n, 1, 3) shared, metres, already divided by the scale."""
+    points: Tensor
+    """(n, 3) fp32 scene coordinates in the atlas frame, metres."""
+
+    def part(self, where: slice) -> "HeadOutput":
+        """The rows of a slice."""
+        return HeadOutput(self.logits[where], self.offsets[where], self.points[where])
+
+
+class Head(nn.Module):
+    """Residual MLP with growing outputs.
+
+    Args:
+        features: channels of the local feature.
+        descriptor: channels of the global descriptor (used with condition `descriptor`).
+        options: shape.
+    """
+
+    centres: Tensor
+    centre_scene: Tensor
+
+    def __init__(self, features: int, descriptor: int, options: HeadOptions):
+        super().__init__()
+        self.features, self.descriptor, self.options = features, descriptor, options
+        width = options.width
+        inputs = features + (descriptor if options.condition == "descriptor" else 0)
+        self.first = nn.ModuleList([nn.Linear(inputs, width), *_linears(width, 2)])
+        self.skip = nn.Identity() if inputs == width else nn.Linear(inputs, width)
+        self.blocks = nn.ModuleList(_linears(width, 3) for _ in range(options.blocks))
+        self.last = _linears(width, 2)
+        # One bias per layer and scene; rows are appended by `grow`.
+        self.code = nn.Parameter(torch.zeros(0, self.layers, width))
+        self.logit = nn.Parameter(torch.zeros(0, width))
+        self.logit_bias = nn.Parameter(torch.zeros(0))
+        offsets = 0 if options.offsets == "per_centre" else 1
+        self.offset = nn.Parameter(torch.zeros(offsets, 4, width))
+        self.offset_bias = nn.Parameter(torch.zeros(offsets, 4))
+        if offsets:
+            nn.init.kaiming_uniform_(self.offset.data.view(4, width), a=math.sqrt(5))
+        self.register_buffer("centres", torch.zeros(0, 3))
+        self.register_buffer("centre_scene", torch.zeros(0, dtype=torch.long))
+
+    @property
+    def layers(self) -> int:
+        """Hidden layers, each with a row in a scene's code."""
+        return 3 + 3 * self.options.blocks + 2
+
+    @property
+    def scenes(self) -> int:
+        """How many scenes this head knows."""
+        return self.code.shape[0]
+
+    def grow(self, centres: Tensor, seed: int) -> None:
+        """Makes room for one more scene; what the head says about others does not change.
+
+        Args:
+            centres: (k, 3) atlas coordinates of the new scene's centres, metres; k may be 0.
+            seed: of the new rows.
+        """
+        generator = torch.Generator().manual_seed(seed)
+        width, count = self.options.width, len(centres)
+
+        def draw(*shape: int, scale: float) -> Tensor:
+            return (torch.rand(*shape, generator=generator) * 2 - 1) * scale
+
+        bound = 1 / math.sqrt(width)
+        self.code = _append(self.code, draw(1, self.layers, width, scale=0.2))
+        self.logit = _append(self.logit, draw(count, width, scale=bound))
+        self.logit_bias = _append(self.logit_bias, torch.zeros(count))
+        if self.options.offsets == "per_centre":
+            self.offset = _append(self.offset, draw(count, 4, width, scale=bound))
+            self.offset_bias = _append(self.offset_bias, torch.zeros(count, 4))
+        scene = torch.full((count,), self.scenes - 1)
+        self.centres = torch.cat([self.centres, centres.float()])
+        self.centre_scene = torch.cat([self.centre_scene, scene])
+
+    def scene_parameters(self) -> int:
+        """Bytes in half precision of what the newest scene added (code, logits, offsets, centres)."""
+        added = int((self.centre_scene == self.scenes - 1).sum())
+        rows = self.options.width + 1
+        per_centre = rows + 3 + (4 * rows if self.options.offsets == "per_centre" else 0)
+        return 2 * (self.layers * self.options.width + added * per_centre)
+
+    def forward(
+        self, features: Tensor, scene: Tensor | int, descriptor: Tensor | None
+    ) -> HeadOutput:
+        """Scene coordinates of feature rows.
+
+        Args:
+            features: (n, features).
+            scene: (n,) index of the scene that each row is taken to show, or one for all.
+            descriptor: (n, descriptor), or None with condition `code`.
+
+        Returns:
+            What the head says, in fp32, whatever autocast does inside.
+        """
+        coded = self.options.condition == "code"
+        if coded:
+            x = features
+            codes = self._codes(scene, len(features))
+        else:
+            assert descriptor is not None, "condition 'descriptor' needs the image descriptors"
+            x = torch.cat([descriptor.to(features.dtype), features], dim=-1)
+            codes: list[Tensor | None] = [None] * self.layers
+        hidden = self._trunk(x, codes)
+        with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+            return self._decode(hidden.float(), scene, coded)
+
+    def _codes(self, scene: Tensor | int, rows: int) -> list[Tensor | None]:
+        if isinstance(scene, int):
+            return list(self.code[scene].unsqueeze(1))
+        # A product with one-hot rows instead of indexing: its gradient is a product too.
+        one_hot = F.one_hot(scene, self.scenes).to(self.code.dtype)
+        return list((one_hot @ self.code.flatten(1)).view(rows, self.layers, -1).unbind(1))
+
+    def _trunk(self, x: Tensor, codes: list[Tensor | None]) -> Tensor:
+        remaining = iter(codes)
+
+        def layer(linear: nn.Module, y: Tensor) -> Tensor:
+            code, z = next(remaining), linear(y)
+            return F.relu(z if code is None else z + code.to(z.dtype))
+
+        y = x
+        for linear in self.first:
+            y = layer(linear, y)
+        hidden = self.skip(x) + y
+        for block in self.blocks:
+            y = hidden
+            for linear in block:  # pyright: ignore[reportGeneralTypeIssues]
+                y = layer(linear, y)
+            hidden = hidden + y
+        for linear in self.last:
+            hidden = layer(linear, hidden)
+        return hidden
+
+    def _decode(self, hidden: Tensor, scene: Tensor | int, coded: bool) -> HeadOutput:
+        logits = F.linear(hidden, self.logit, self.logit_bias)
+        if coded:
+            own = self.centre_scene == (scene if isinstance(scene, int) else scene[:, None])
+            logits = logits.masked_fill(~own, -torch.inf)
+        raw = F.linear(hidden, self.offset.flatten(0, 1), self.offset_bias.flatten())
+        raw = raw.unflatten(-1, (-1, 4))
+        offsets = raw[..., :3] / homogeneous_scale(raw[..., 3:])
+        share = logits.softmax(-1)
+        points = (share.unsqueeze(-1) * (self.centres + offsets)).sum(1)
+        return HeadOutput(logits, offsets, points)
+
+
+def homogeneous_scale(raw: Tensor) -> Tensor:
+    """The clamped softplus h of ACE and GLACE: raw 0 gives 1, the range is (1 / 4, 100].
+
+    h = min(softplus_b(raw) + 1 / s_max, 1 / s_min), softplus_b(z) = ln(1 + e^(b z)) / b,
+    b = ln 2 / (1 - 1 / s_max); so an offset is divided by at least 1/4 and at most 100.
+    """
+    beta = math.log(2.0) / (1.0 - 1.0 / SCALE_MAX)
+    return (F.softplus(raw, beta=beta) + 1.0 / SCALE_MAX).clamp(max=1.0 / SCALE_MIN)
+
+
+def _linears(width: int, count: int) -> nn.ModuleList:
+    return nn.ModuleList(nn.Linear(width, width) for _ in range(count))
+
+
+def _append(parameter: Tensor, rows: Tensor) -> nn.Parameter:
+    return nn.Parameter(torch.cat([parameter.detach(), rows.to(parameter)]))

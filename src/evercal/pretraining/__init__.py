@@ -1,0 +1,1 @@
+"""How the shipped encoder and descriptor are made: procedural images only."""

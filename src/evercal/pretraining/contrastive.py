@@ -1,0 +1,254 @@
+"""Contrastive training of the local encoder on procedural pairs, resumable and seeded."""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+from torch.utils.data import DataLoader, IterableDataset
+
+from evercal.models.encoder import LocalEncoder
+from evercal.pretraining.pairs import (
+    FIRST_ROOM_SEED,
+    HEIGHT,
+    WIDTH,
+    Pair,
+    RoomViews,
+    homography_pair,
+    leaf_picture,
+    photometric,
+    room_pair,
+    room_views,
+)
+from evercal.storage.atomic import write_bytes
+
+VALIDATION_ROOM_SEED = FIRST_ROOM_SEED + 50_000
+
+
+@dataclass(frozen=True)
+class PretrainOptions:
+    """What makes the weights; the shipped ones are made with the defaults."""
+
+    steps: int = 9_000
+    """Optimiser steps of the local encoder."""
+    rooms: int = 160
+    """Box rooms, each seen from 20 cameras."""
+    pictures: int = 300
+    """Dead-leaves pictures for homography pairs."""
+    room_pairs: int = 3
+    """Pairs with parallax in a step."""
+    leaf_pairs: int = 2
+    """Homography pairs in a step."""
+    points: int = 192
+    """Corresponding points drawn from a pair."""
+    temperature: float = 0.07
+    """Of the softmax over cosine similarities."""
+    peak_rate: float = 2e-3
+    """Peak of the one-cycle learning rate."""
+    descriptor_steps: int = 2_000
+    """Optimiser steps of the global descriptor."""
+    seed: int = 1
+    """Of everything that is drawn."""
+
+
+@dataclass(frozen=True)
+class PretrainData:
+    """All rendered input, made once from seeds."""
+
+    rooms: list[RoomViews]
+    pictures: list[np.ndarray]
+
+
+def _picture(seed: int) -> np.ndarray:
+    return leaf_picture(np.random.default_rng([seed, 3]))
+
+
+def make_data(options: PretrainOptions, first_room: int = FIRST_ROOM_SEED) -> PretrainData:
+    """Renders rooms and pictures with one process per core."""
+    with get_context("spawn").Pool() as pool:
+        seeds = range(first_room, first_room + options.rooms)
+        rooms = pool.map(room_views, seeds, chunksize=4)
+        pictures = pool.map(_picture, range(first_room, first_room + options.pictures), chunksize=8)
+    return PretrainData(rooms, pictures)
+
+
+class PairStream(IterableDataset):
+    """An endless, seeded stream of training batches that can start at any step."""
+
+    def __init__(self, data: PretrainData, options: PretrainOptions, first_step: int):
+        self.data, self.options, self.first_step = data, options, first_step
+
+    def draw(self, step: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Batch number `step`: images (2, b, 1, h, w), pixels (2, b, points, 2), valid (b, points)."""
+        o = self.options
+        rng = np.random.default_rng([o.seed, step])
+        pairs: list[Pair] = []
+        while len(pairs) < o.room_pairs:
+            views = self.data.rooms[rng.integers(len(self.data.rooms))]
+            anchor = 4 * rng.integers(len(views.images) // 4)
+            first, second = anchor + rng.choice(4, 2, replace=False)
+            pair = room_pair(views, int(first), int(second), rng)
+            if pair.pixels.shape[1] >= 48:
+                pairs.append(pair)
+        while len(pairs) < o.room_pairs + o.leaf_pairs:
+            picture = self.data.pictures[rng.integers(len(self.data.pictures))]
+            pair = homography_pair(picture, rng)
+            if pair.pixels.shape[1] >= 48:
+                pairs.append(pair)
+        count = len(pairs)
+        images = np.stack([[photometric(im, rng) for im in p.images] for p in pairs], 1)
+        pixels = np.zeros((2, count, o.points, 2), np.float32)
+        valid = np.zeros((count, o.points), bool)
+        for i, pair in enumerate(pairs):
+            chosen = rng.permutation(pair.pixels.shape[1])[: o.points]
+            pixels[:, i, : len(chosen)] = pair.pixels[:, chosen]
+            valid[i, : len(chosen)] = True
+        grey = torch.from_numpy(images[:, :, None]).float() / 255
+        return grey, torch.from_numpy(pixels), torch.from_numpy(valid)
+
+    def __iter__(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        import cv2
+
+        cv2.setNumThreads(1)
+        for step in range(self.first_step, self.options.steps):
+            yield self.draw(step)
+
+
+def sample_features(features: Tensor, pixels: Tensor) -> Tensor:
+    """Bilinear features (b, c, h, w) at pixels (b, n, 2) of the image, unit length (b, n, c)."""
+    size = torch.tensor([WIDTH, HEIGHT], dtype=pixels.dtype)
+    grid = 2 * (pixels + 0.5) / size - 1
+    found = F.grid_sample(features, grid[:, None], align_corners=False, padding_mode="border")
+    return F.normalize(found[:, :, 0].transpose(1, 2), dim=-1)
+
+
+def contrastive_loss(
+    a: Tensor, b: Tensor, pixels_b: Tensor, valid: Tensor, temperature: float
+) -> Tensor:
+    """Symmetric InfoNCE (van den Oord et al., 2018) over every point of the batch.
+
+    Args:
+        a: (p, n, c) unit features of the points in the first images.
+        b: (p, n, c) the same points in the second images.
+        pixels_b: (p, n, 2) where they lie there: points of one image nearer than 10 pixels to each
+            other are not held against each other.
+        valid: (p, n) bool.
+        temperature: of the softmax.
+    """
+    keep = valid.flatten()
+    x, y = a.flatten(0, 1)[keep], b.flatten(0, 1)[keep]
+    where = pixels_b.flatten(0, 1)[keep]
+    image = torch.arange(len(valid)).repeat_interleave(valid.shape[1])[keep]
+    near = (torch.cdist(where, where) < 10) & (image[:, None] == image[None])
+    near.fill_diagonal_(False)
+    logits = (x @ y.T / temperature).masked_fill(near, -1e4)
+    target = torch.arange(len(x))
+    return 0.5 * (F.cross_entropy(logits, target) + F.cross_entropy(logits.T, target))
+
+
+@torch.inference_mode()
+def matching_accuracy(
+    encoder: torch.nn.Module, batches: list[tuple[Tensor, Tensor, Tensor]]
+) -> float:
+    """Share (%) of points whose best cell in the other image lies within 8 pixels of the truth."""
+    right = total = 0
+    for images, pixels, valid in batches:
+        with torch.autocast("cpu", torch.bfloat16):
+            maps = encoder(images.flatten(0, 1)).float().unflatten(0, images.shape[:2])
+        points = sample_features(maps[0], pixels[0])
+        cells = maps[1].flatten(2)
+        best = (points @ cells).argmax(-1)
+        columns = maps.shape[-1]
+        found = torch.stack([best % columns, best // columns], -1) * 8 + 3.5
+        close = (found - pixels[1]).norm(dim=-1) < 8
+        right += int((close & valid).sum())
+        total += int(valid.sum())
+    return 100.0 * right / max(total, 1)
+
+
+def train_encoder(
+    data: PretrainData, options: PretrainOptions, folder: Path, say: Callable[[str], None]
+) -> LocalEncoder:
+    """Trains, checkpointing every 250 steps to `folder`; picks up a checkpoint it finds there.
+
+    Returns:
+        The trained encoder with batch norm still separate (`fuse()` gives the inference form).
+    """
+    torch.manual_seed(options.seed)
+    encoder = LocalEncoder(fused=False)
+    encoder.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    optimiser = torch.optim.AdamW(encoder.parameters(), lr=1e-4, weight_decay=0.02)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, options.peak_rate, total_steps=options.steps, pct_start=0.05
+    )
+    checkpoint, step = folder / "encoder.pt", 0
+    if checkpoint.is_file():
+        saved = torch.load(checkpoint, weights_only=True)
+        if saved["options"] == json.dumps(asdict(options)):
+            encoder.load_state_dict(saved["encoder"])
+            optimiser.load_state_dict(saved["optimiser"])
+            schedule.load_state_dict(saved["schedule"])
+            step = saved["step"]
+            say(f"resumed at step {step}")
+    held_out = PretrainData(
+        [room_views(VALIDATION_ROOM_SEED + i) for i in range(8)], data.pictures[:1]
+    )
+    judge = PairStream(held_out, PretrainOptions(room_pairs=8, leaf_pairs=0), 0)
+    validation = [judge.draw(i) for i in range(6)]
+    # Spawned, not forked: OpenCV's threads do not survive a fork, and the worker would hang.
+    loader = DataLoader(
+        PairStream(data, options, step),
+        batch_size=None,
+        num_workers=1,
+        prefetch_factor=8,
+        multiprocessing_context="spawn",
+    )
+    began, losses = time.perf_counter(), []
+    for images, pixels, valid in loader:
+        with torch.autocast("cpu", torch.bfloat16):
+            maps = encoder(images.flatten(0, 1)).float().unflatten(0, images.shape[:2])
+        a, b = sample_features(maps[0], pixels[0]), sample_features(maps[1], pixels[1])
+        loss = contrastive_loss(a, b, pixels[1], valid, options.temperature)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+        losses.append(float(loss.detach()))
+        step += 1
+        if step % 250 == 0 or step == options.steps:
+            encoder.eval()
+            accuracy = matching_accuracy(encoder, validation)
+            encoder.train()
+            seconds = time.perf_counter() - began
+            say(f"step {step} loss {np.mean(losses):.3f} matched {accuracy:.1f} % {seconds:.0f} s")
+            losses.clear()
+            _save(checkpoint, encoder, optimiser, schedule, step, options)
+    return encoder
+
+
+def _save(
+    path: Path,
+    encoder: LocalEncoder,
+    optimiser: torch.optim.Optimizer,
+    schedule: torch.optim.lr_scheduler.LRScheduler,
+    step: int,
+    options: PretrainOptions,
+) -> None:
+    import io
+
+    buffer = io.BytesIO()
+    state = {
+        "encoder": encoder.state_dict(),
+        "optimiser": optimiser.state_dict(),
+        "schedule": schedule.state_dict(),
+        "step": step,
+        "options": json.dumps(asdict(options)),
+    }
+    torch.save(state, buffer)
+    write_bytes(path, buffer.getvalue())

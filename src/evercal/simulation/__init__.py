@@ -1,0 +1,1 @@
+"""Frames from a virtual cell instead of a disk."""

@@ -1,0 +1,1 @@
+"""Fitting a head to rows of features: views, buffer, reprojection loss and the loop."""

@@ -1,0 +1,165 @@
+"""The loop: one head, rows of one or more scenes, optionally rows that are replayed."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from evercal.models.head import Head, HeadOutput
+from evercal.training.buffer import FeatureBuffer, Rows, join
+from evercal.training.loss import LossOptions, clamp_px, reprojection_loss
+from evercal.training.precision import autocast
+
+INLIER_PX = 5.0
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """One stage of training."""
+
+    iterations: int = 4000
+    """Optimiser steps."""
+    batch: int = 2048
+    """Rows of the scenes being learned in a step."""
+    replay_batch: int = 1024
+    """Replayed rows in a step, drawn evenly from all remembered scenes."""
+    peak_rate: float = 3e-3
+    """Peak of the one-cycle learning rate (cosine up and down)."""
+    warm_share: float = 0.05
+    """Share of the steps in which the rate rises."""
+    weight_decay: float = 0.01
+    """Of AdamW."""
+    diffusion: float = 0.1
+    """Standard deviation of the noise on every row's descriptor (GLACE's feature diffusion)."""
+    loss: LossOptions = field(default_factory=LossOptions)
+    """Reprojection loss on the scenes being learned."""
+
+
+@dataclass
+class Progress:
+    """Where training stands."""
+
+    step: int
+    """Steps done."""
+    total: int
+    """Steps of the stage."""
+    loss: float
+    """Mean loss of the rows being learned at the last step."""
+    inlier_share: float
+    """Share of the rows being learned within 5 px at the last step."""
+
+
+Penalty = Callable[[HeadOutput, Rows, float], Tensor]
+"""What replay costs: (head output on replayed rows, those rows, progress in [0, 1]) -> scalar."""
+
+
+@dataclass
+class Replay:
+    """Rows of remembered scenes and what they cost."""
+
+    buffers: Sequence[FeatureBuffer]
+    """One per remembered scene."""
+    penalty: Penalty
+    """Loss on a batch of their rows."""
+
+
+class Fitter:
+    """Trains `head` on `buffers`; can stop after any step and go on from `state()`.
+
+    The rows of step k are a function of (seed, k), so a resumed run sees what an uninterrupted one
+    would have seen.
+    """
+
+    def __init__(
+        self,
+        head: Head,
+        buffers: Sequence[FeatureBuffer],
+        replay: Replay | None,
+        options: FitOptions,
+        seed: int,
+    ):
+        self.head, self.buffers, self.replay = head, buffers, replay
+        self.options, self.seed, self.step = options, seed, 0
+        decay, plain = [], []
+        for name, parameter in head.named_parameters():
+            (plain if name.startswith(("code", "logit")) else decay).append(parameter)
+        groups = [{"params": decay}, {"params": plain, "weight_decay": 0.0}]
+        self._optimiser = torch.optim.AdamW(
+            groups, lr=options.peak_rate, weight_decay=options.weight_decay, fused=True
+        )
+
+    def run(self) -> Iterator[Progress]:
+        """Trains to the end, yielding after every step."""
+        self.head.train()
+        while self.step < self.options.iterations:
+            yield self._train_step()
+        self.head.eval()
+
+    def _train_step(self) -> Progress:
+        options, replay = self.options, self.replay
+        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
+        share = options.batch // len(self.buffers)
+        parts = [buffer.draw(share, generator) for buffer in self.buffers]
+        fresh = sum(len(part.scene) for part in parts)
+        if replay is not None:
+            each = max(1, options.replay_batch // len(replay.buffers))
+            parts += [buffer.draw(each, generator) for buffer in replay.buffers]
+        rows = join(parts)
+        if self.head.options.condition == "descriptor":
+            noise = torch.randn(rows.descriptor.shape, generator=generator)
+            rows.descriptor = F.normalize(rows.descriptor + options.diffusion * noise, dim=-1)
+        for group in self._optimiser.param_groups:
+            group["lr"] = one_cycle(options, self.step)
+        with autocast():
+            output = self.head(rows.features.float(), rows.scene, rows.descriptor)
+        progress = self.step / options.iterations
+        new = rows.part(slice(0, fresh))
+        tau = clamp_px(options.loss, progress)
+        cost, error = reprojection_loss(output.points[:fresh], new.target, tau, options.loss)
+        loss = cost.mean()
+        if replay is not None:
+            old = slice(fresh, None)
+            loss = loss + replay.penalty(output.part(old), rows.part(old), progress)
+        self._optimiser.zero_grad()
+        loss.backward()
+        self._optimiser.step()
+        self.step += 1
+        inliers = float((error < INLIER_PX).float().mean())
+        return Progress(self.step, options.iterations, float(cost.mean().detach()), inliers)
+
+    def state(self) -> dict[str, Tensor]:
+        """What `load` needs to go on from here, as named tensors."""
+        state = {f"head.{k}": v for k, v in self.head.state_dict().items()}
+        for i, slots in self._optimiser.state_dict()["state"].items():
+            state |= {f"optimiser.{i}.{name}": value for name, value in slots.items()}
+        return state | {"step": torch.tensor(self.step)}
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Goes back to where `state()` was taken; the head must have the same shape."""
+        self.step = int(state["step"])
+        head = {k.removeprefix("head."): v for k, v in state.items() if k.startswith("head.")}
+        self.head.load_state_dict(head)
+        slots: dict[int, dict[str, Tensor]] = {}
+        for key, value in state.items():
+            if key.startswith("optimiser."):
+                _, i, name = key.split(".")
+                slots.setdefault(int(i), {})[name] = value
+        groups = self._optimiser.state_dict()["param_groups"]
+        self._optimiser.load_state_dict({"state": slots, "param_groups": groups})
+
+
+def one_cycle(options: FitOptions, step: int) -> float:
+    """Learning rate of a step: cosine from 1/25 of the peak to the peak, then cosine to zero.
+
+    The shape of torch's OneCycleLR, as a function of the step alone so that nothing need be saved.
+    """
+    rise = max(1.0, options.warm_share * options.iterations)
+    if step < rise:
+        low, high, share = options.peak_rate / 25, options.peak_rate, 1 - step / rise
+    else:
+        low, high = 0.0, options.peak_rate
+        share = (step - rise) / max(1.0, options.iterations - rise)
+    return low + (high - low) * 0.5 * (1 + math.cos(math.pi * share))

@@ -1,0 +1,75 @@
+"""The reprojection loss of ACE and GLACE and its schedule."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+MIN_DEPTH_M = 0.1
+MAX_DEPTH_M = 1000.0
+MAX_ERROR_PX = 1000.0
+PROXY_DEPTH_M = 10.0
+
+
+@dataclass(frozen=True)
+class LossOptions:
+    """Robust reprojection loss."""
+
+    clamp_start_px: float = 50.0
+    """Soft clamp at the first step, above `clamp_end_px`."""
+    clamp_end_px: float = 1.0
+    """Soft clamp at the last step."""
+    proxy_depth_m: float = 10.0
+    """Points behind the camera or far off are pulled to this depth on their ray."""
+
+
+@dataclass
+class Target:
+    """Where rows must project to."""
+
+    pixels: Tensor
+    """(n, 2) ideal-pinhole pixels."""
+    intrinsics: Tensor
+    """(n, 4) fx, fy, cx, cy."""
+    camera_from_atlas: Tensor
+    """(n, 3, 4)."""
+
+
+def clamp_px(options: LossOptions, progress: float) -> float:
+    """Soft clamp tau at `progress` in [0, 1], ACE's circle schedule: wide first, tight last."""
+    q = 1.0 - math.sqrt(max(0.0, 1.0 - progress * progress))
+    return options.clamp_start_px * (1.0 - q) + options.clamp_end_px
+
+
+def reprojection_error(points: Tensor, target: Target) -> tuple[Tensor, Tensor]:
+    """Signed pixel residuals (n, 2) and camera coordinates (n, 3), all in fp32."""
+    matrix = target.camera_from_atlas
+    in_camera = torch.einsum("nij,nj->ni", matrix[:, :, :3], points) + matrix[:, :, 3]
+    depth = in_camera[:, 2:].clamp(min=MIN_DEPTH_M)
+    projected = in_camera[:, :2] / depth * target.intrinsics[:, :2] + target.intrinsics[:, 2:]
+    return projected - target.pixels, in_camera
+
+
+def reprojection_loss(
+    points: Tensor, target: Target, tau: float, options: LossOptions
+) -> tuple[Tensor, Tensor]:
+    """Loss of every row.
+
+    Valid rows (depth in [0.1, 1000] m, L1 error at most 1000 px) cost tau tanh(e / tau); the others
+    the L1 distance in metres to the point at the proxy depth on their ray.
+
+    Returns:
+        loss (n,) and the L2 error in pixels (n,), infinite for invalid rows and without gradient.
+    """
+    residual, in_camera = reprojection_error(points, target)
+    error = residual.abs().sum(-1)
+    depth = in_camera[:, 2]
+    valid = (depth > MIN_DEPTH_M) & (depth < MAX_DEPTH_M) & (error < MAX_ERROR_PX)
+    robust = tau * torch.tanh(error / tau)
+    focal, centre = target.intrinsics[:, :2], target.intrinsics[:, 2:]
+    ray = torch.cat([(target.pixels - centre) / focal, torch.ones_like(error)[:, None]], -1)
+    proxy = (ray * options.proxy_depth_m - in_camera).abs().sum(-1)
+    loss = torch.where(valid, robust, proxy)
+    pixels = torch.where(valid, residual.detach().norm(dim=-1), torch.inf)
+    return loss, pixels

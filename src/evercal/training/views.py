@@ -1,0 +1,133 @@
+"""What the encoder gets to see of a frame: the image at working size, plain or as another view.
+
+Another view is the image that the same camera would take after turning about its own centre with
+another focal length: for that motion the image is known exactly whatever the depth, so the pose
+that goes with it is true, not approximate.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from evercal.datasets.frame import Frame
+from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Working size and augmentation."""
+
+    short_side: int = 240
+    """Pixels of the shorter image side that the encoder works on."""
+    zoom: float = 1.4
+    """Augmented views scale the focal length by a factor drawn from [1 / zoom, zoom]."""
+    roll_deg: float = 20.0
+    """Augmented views turn about the optical axis by up to this."""
+    tilt_deg: float = 6.0
+    """Augmented views turn about the other axes by up to this."""
+    gamma: float = 0.3
+    """Standard deviation of the logarithm of the brightness exponent."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One image for the encoder and how its cells see the world."""
+
+    grey: np.ndarray
+    """(h, w) uint8."""
+    cell_pixels: np.ndarray
+    """(cells, 2) float32 pixels of the cell centres in an ideal pinhole with `intrinsics`;
+    row-major over the (h // stride, w // stride) grid."""
+    valid: np.ndarray
+    """(cells,) bool: the cell shows something of the image."""
+    intrinsics: np.ndarray
+    """(4,) fx, fy, cx, cy of the ideal pinhole, pixels."""
+    base_from_camera: SE3
+    """Pose of this view; identity where the frame has none."""
+
+
+def cell_centres(height: int, width: int, stride: int) -> np.ndarray:
+    """(cells, 2) pixels (u, v) of the cell centres, row-major."""
+    v, u = np.mgrid[0 : height // stride, 0 : width // stride]
+    return np.stack([u, v], -1).reshape(-1, 2) * float(stride) + (stride - 1) / 2
+
+
+def plain_view(image: np.ndarray, camera: Camera, stride: int, options: ViewOptions) -> View:
+    """An image as it is, at working size; only the cell pixels are freed from distortion.
+
+    Args:
+        image: (h, w, 3) uint8 RGB or (h, w) grey, any size with the camera's proportions.
+        camera: intrinsics; scaled to the working size.
+        stride: of the encoder.
+        options: working size.
+    """
+    grey, camera = working_image(image, camera, options.short_side)
+    pixels = ideal_cell_pixels(camera, stride)
+    return View(grey, pixels, np.ones(len(pixels), bool), _four(camera), SE3.identity())
+
+
+def ideal_cell_pixels(camera: Camera, stride: int) -> np.ndarray:
+    """(cells, 2) float32: where the cell centres lie once the lens distortion is taken away."""
+    pixels = cell_centres(camera.height, camera.width, stride)
+    if camera.distortion:
+        rays = camera.unproject(pixels)
+        pixels = rays[:, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    return pixels.astype(np.float32)
+
+
+def frame_view(frame: Frame, stride: int, options: ViewOptions) -> View:
+    """The plain view of a frame, with its pose."""
+    view = plain_view(frame.read_image(), frame.camera, stride, options)
+    pose = frame.base_from_camera or SE3.identity()
+    return View(view.grey, view.cell_pixels, view.valid, view.intrinsics, pose)
+
+
+def augmented_view(
+    frame: Frame, stride: int, options: ViewOptions, rng: np.random.Generator
+) -> View:
+    """A random other view of a posed frame from the same camera centre, free of distortion."""
+    import cv2
+
+    grey, camera = working_image(frame.read_image(), frame.camera, options.short_side)
+    zoom = options.zoom ** rng.uniform(-1, 1)
+    roll, tilt = np.deg2rad(options.roll_deg), np.deg2rad(options.tilt_deg)
+    turn = SE3.exp(np.array([0, 0, 0, *(rng.uniform(-1, 1, 3) * [tilt, tilt, roll])]))
+    camera_from_view = turn.rotation_matrix()
+    height, width = grey.shape
+    virtual = Camera(width, height, zoom * camera.fx, zoom * camera.fy, camera.cx, camera.cy)
+    homography = camera.matrix() @ camera_from_view @ np.linalg.inv(virtual.matrix())
+    if camera.distortion:
+        v, u = np.mgrid[0:height, 0:width]
+        rays = virtual.unproject(np.stack([u, v], -1).astype(float)) @ camera_from_view.T
+        where = camera.project(rays).astype(np.float32)
+        warped = cv2.remap(grey, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)  # type: ignore[call-overload]
+    else:
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        size, border = (width, height), cv2.BORDER_REFLECT
+        warped = cv2.warpPerspective(grey, homography, size, flags=flags, borderMode=border)
+    table = (np.arange(256) / 255.0) ** np.exp(rng.normal(0, options.gamma)) * 255
+    warped = cv2.LUT(warped, table.astype(np.uint8))
+    pixels = cell_centres(height, width, stride)
+    source = camera.project(virtual.unproject(pixels) @ camera_from_view.T)
+    valid = np.all((source >= 0) & (source <= [width - 1, height - 1]), axis=-1)
+    assert frame.base_from_camera is not None, "only posed frames can be learned"
+    pose = frame.base_from_camera @ turn
+    return View(warped, pixels.astype(np.float32), valid, _four(virtual), pose)
+
+
+def working_image(image: np.ndarray, camera: Camera, short_side: int) -> tuple[np.ndarray, Camera]:
+    """Grey (h, w) uint8 image with the given shorter side, and its camera."""
+    import cv2
+
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    small = camera.short_side_resized(short_side)
+    if grey.shape != (small.height, small.width):
+        shrink = small.height < grey.shape[0]
+        kind = cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
+        grey = cv2.resize(grey, (small.width, small.height), interpolation=kind)
+    return grey, small
+
+
+def _four(camera: Camera) -> np.ndarray:
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)

@@ -1,0 +1,186 @@
+"""Scores against numbers worked out by hand, and against slow twins."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from evercal.evaluation import (
+    FrameResult,
+    continual_scores,
+    correct,
+    near_training,
+    scores,
+)
+from evercal.evaluation.metrics import FINE
+from evercal.geometry import SE3, pose_distance
+
+DEGREE = math.pi / 180
+
+
+def result(
+    scene: str = "a", centimetres: float = 1.0, degrees: float = 1.0, **other
+) -> FrameResult:
+    fields = {
+        "scene": scene,
+        "frame": "f",
+        "translation_error_m": centimetres / 100,
+        "rotation_error_rad": math.radians(degrees),
+        "status": "ok",
+        "found_scene": scene,
+        "near_training_frame": False,
+        "milliseconds": 10.0,
+        "inliers": 5,
+        "inlier_ratio": 0.5,
+    }
+    return FrameResult(**{**fields, **other})
+
+
+def lost(scene: str, status: str, found: str | None) -> FrameResult:
+    return result(scene, math.inf, math.inf, status=status, found_scene=found)
+
+
+def test_an_error_equal_to_a_threshold_is_wrong() -> None:
+    rows = [
+        result(centimetres=4.999, degrees=4.999),
+        result(centimetres=5, degrees=1),
+        result(centimetres=1, degrees=5),
+        result(centimetres=0.999, degrees=0.999),
+        result(centimetres=1, degrees=0.5),
+    ]
+    assert correct(rows)["a"].tolist() == [True, False, False, True, True]
+    assert correct(rows, FINE)["a"].tolist() == [False, False, False, True, False]
+
+
+def test_scores_of_two_scenes_by_hand() -> None:
+    rows = [
+        result("a", 1.0, 4.0, milliseconds=20.0),
+        lost("b", "unknown_scene", None),
+        result("a", 3.0, 2.0, near_training_frame=True),
+        result("a", 2.0, 6.0),
+        lost("b", "failed", "b"),
+        lost("a", "ok", "b"),
+        result("b", 0.5, 0.5),
+        result("b", 7.0, 3.0),
+    ]
+    found = scores(rows)
+    assert list(found.scenes) == ["a", "b"]
+    a, b = found.scenes["a"], found.scenes["b"]
+    assert (a.frames, a.accuracy_5cm_5deg, a.accuracy_1cm_1deg) == (4, 50.0, 0.0)
+    # The upper of the two middle values, each error sorted for itself: 1 2 [3] inf, 2 4 [6] inf.
+    assert a.median_translation_cm == pytest.approx(3.0)
+    assert a.median_rotation_deg == pytest.approx(6.0)
+    assert (a.wrong_scene, a.unknown, a.near_training_frame) == (25.0, 0.0, 25.0)
+    assert (b.accuracy_5cm_5deg, b.accuracy_1cm_1deg) == (25.0, 25.0)
+    assert b.median_translation_cm == math.inf
+    # A failure in another scene's name gave no pose, so it is no wrong scene.
+    assert (b.wrong_scene, b.unknown, b.near_training_frame) == (0.0, 25.0, 0.0)
+    assert found.mean_accuracy_5cm_5deg == 37.5
+    assert found.ms_per_image == pytest.approx(11.25)
+
+
+def test_the_mean_over_scenes_does_not_weigh_them_by_frames() -> None:
+    rows = [result("small")] + [result("large", 50.0)] * 9
+    assert scores(rows).mean_accuracy_5cm_5deg == 50.0
+
+
+def test_json_has_the_agreed_fields_and_null_for_infinite() -> None:
+    text = json.dumps(scores([result("a"), lost("b", "failed", None)]).to_dict(), allow_nan=False)
+    data = json.loads(text)
+    assert set(data) == {"scenes", "mean_accuracy_5cm_5deg", "ms_per_image"}
+    assert list(data["scenes"]["b"]) == [
+        "frames",
+        "accuracy_5cm_5deg",
+        "accuracy_1cm_1deg",
+        "median_translation_cm",
+        "median_rotation_deg",
+        "wrong_scene",
+        "unknown",
+        "near_training_frame",
+    ]
+    assert data["scenes"]["b"]["median_translation_cm"] is None
+    assert data["scenes"]["a"]["median_translation_cm"] == pytest.approx(1.0)
+
+
+def test_no_results_are_refused() -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        scores([])
+
+
+def test_near_training_agrees_with_a_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("evercal.evaluation.metrics._PAIRS_AT_ONCE", 700)  # many blocks
+    generator = np.random.default_rng(0)
+    tangents = generator.uniform(-1, 1, (300, 6)) * [0.2, 0.1, 0.1, 0.1, 0.1, 0.1]
+    train, test = SE3.exp(tangents[:200]), SE3.exp(tangents[200:])
+    near = near_training(train, test)
+    for pose, flag in zip(test, near, strict=True):
+        metres, radians = pose_distance(pose, train)
+        assert flag == ((metres < 0.05) & (radians < 5 * DEGREE)).any()
+    assert 10 < near.sum() < 90  # the twin saw both answers
+
+
+def test_near_in_metres_and_near_in_degrees_must_be_one_frame() -> None:
+    here = SE3.identity()
+    turned = SE3.exp([0, 0, 0, 0, 0, 6 * DEGREE])
+    moved = SE3.exp([0.06, 0, 0, 0, 0, 0])
+    both = SE3.exp([0.04, 0, 0, 0, 0, 4 * DEGREE])
+    test = SE3.stack([here])
+    assert not near_training(SE3.stack([turned, moved]), test)[0]
+    assert near_training(SE3.stack([turned, moved, both]), test)[0]
+    assert near_training(SE3.stack([]), test).tolist() == [False]
+    assert near_training(SE3.stack([both]), SE3.stack([])).shape == (0,)
+    with pytest.raises(ValueError, match="poses"):
+        near_training(here, test)
+
+
+def test_continual_scores_by_hand() -> None:
+    nan = math.nan
+    accuracies = [
+        [90.0, nan, nan, nan],
+        [95.0, 80.0, nan, nan],
+        [70.0, 85.0, 60.0, nan],
+        [75.0, 70.0, 66.0, 40.0],
+    ]
+    found = continual_scores(accuracies)
+    assert found.final_accuracy == pytest.approx((75 + 70 + 66 + 40) / 4)
+    # Best with the last stage: 95, 85, 66; without: 95, 85, 60; just learned: 90, 80, 60.
+    assert found.total_forgetting == pytest.approx((20 + 15 + 0) / 3)
+    assert found.forgetting == pytest.approx((20 + 15 - 6) / 3)
+    assert found.backward_transfer == pytest.approx((-15 - 10 + 6) / 3)
+    assert found.last_scene_accuracy == 40.0
+
+
+def test_what_stands_above_the_diagonal_does_not_count() -> None:
+    generator = np.random.default_rng(1)
+    matrix = generator.uniform(0, 100, (5, 5))
+    hidden = np.where(np.tri(5, dtype=bool), matrix, np.nan)
+    assert continual_scores(matrix) == continual_scores(hidden)
+
+
+def test_the_two_kinds_of_forgetting_differ_only_where_the_end_is_best() -> None:
+    generator = np.random.default_rng(2)
+    for _ in range(50):
+        matrix = generator.uniform(0, 100, (4, 4))
+        found = continual_scores(matrix)
+        assert found.total_forgetting >= max(found.forgetting, 0.0)
+        assert found.forgetting >= -found.backward_transfer - 1e-9
+        matrix[-1] = 0.0
+        found = continual_scores(matrix)
+        assert found.total_forgetting == found.forgetting
+
+
+def test_one_scene_leaves_nothing_to_forget() -> None:
+    found = continual_scores([[70.0]])
+    assert (found.final_accuracy, found.last_scene_accuracy) == (70.0, 70.0)
+    assert math.isnan(found.total_forgetting)
+    assert found.to_dict()["backward_transfer"] is None
+    assert found.to_dict()["final_accuracy"] == 70.0
+
+
+@pytest.mark.parametrize(
+    "matrix", [[], [1.0, 2.0], [[1.0, 2.0]], [[1.0, 0.0], [math.nan, 2.0]], np.zeros((2, 2, 2))]
+)
+def test_a_broken_matrix_is_refused(matrix: object) -> None:
+    with pytest.raises(ValueError, match="accuracies"):
+        continual_scores(matrix)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,127 @@
+"""The camera against OpenCV, against closed forms, and against itself at other sizes."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evercal.geometry import Camera
+
+KINECT = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+RATIONAL = (0.1, -0.05, 0.001, -0.002, 0.01, 0.05, 0.01, 0.002)
+LENSES = [(), (-0.2, 0.05, 0.001, -0.0005), KINECT, RATIONAL]
+
+
+def camera_with(distortion: tuple[float, ...]) -> Camera:
+    return Camera(640, 480, 517.3, 516.5, 318.6, 255.3, distortion)
+
+
+@pytest.mark.parametrize("distortion", LENSES)
+def test_project_agrees_with_opencv(distortion: tuple[float, ...]) -> None:
+    camera = camera_with(distortion)
+    points = np.random.default_rng(0).uniform([-1, -0.8, 2], [1, 0.8, 4], size=(200, 3))
+    twin, _ = cv2.projectPoints(
+        points, np.zeros(3), np.zeros(3), camera.matrix(), np.array(distortion)
+    )
+    np.testing.assert_allclose(camera.project(points), twin[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("distortion", LENSES)
+def test_unproject_inverts_project_over_the_whole_image(distortion: tuple[float, ...]) -> None:
+    camera = camera_with(distortion)
+    x, y = np.meshgrid(np.linspace(0, 639, 17), np.linspace(0, 479, 13))
+    pixels = np.stack([x, y], axis=-1)
+    rays = camera.unproject(pixels)
+    assert rays.shape == (13, 17, 3)
+    assert np.all(rays[..., 2] == 1.0)
+    np.testing.assert_allclose(camera.project(rays * 3.7), pixels, atol=1e-6)
+
+
+@given(
+    size=st.tuples(st.integers(8, 4000), st.integers(8, 4000)),
+    new=st.tuples(st.integers(8, 4000), st.integers(8, 4000)),
+    lens=st.sampled_from(LENSES),
+)
+@settings(deadline=None, max_examples=80)
+def test_a_resized_camera_sees_each_point_at_the_same_part_of_the_image(
+    size: tuple[int, int], new: tuple[int, int], lens: tuple[float, ...]
+) -> None:
+    camera = Camera(*size, 0.9 * size[0], 1.1 * size[0], 0.4 * size[0], 0.6 * size[1], lens)
+    points = np.array([[0.1, -0.2, 1.0], [0.3, 0.1, 2.0], [-0.5, 0.4, 1.5]])
+    # Measured from the image's corner, half a pixel outside the first centre.
+    before = (camera.project(points) + 0.5) / size
+    after = (camera.resized(*new).project(points) + 0.5) / new
+    np.testing.assert_allclose(after, before, atol=1e-10)
+    back = camera.resized(*new).resized(*size)
+    np.testing.assert_allclose(back.matrix(), camera.matrix(), rtol=1e-9, atol=1e-7)
+
+
+def test_resizing_matches_what_opencv_does_to_pixels() -> None:
+    """A bright spot's centre of mass moves as the principal point does."""
+    image = np.zeros((48, 64), np.float32)
+    image[10:14, 40:44] = 1.0
+    camera = Camera(64, 48, 50.0, 50.0, 41.5, 11.5)
+    small = cv2.resize(image, (32, 24), interpolation=cv2.INTER_AREA)
+    y, x = np.indices(small.shape)
+    centre = (x * small).sum() / small.sum(), (y * small).sum() / small.sum()
+    resized = camera.resized(32, 24)
+    assert centre == pytest.approx((resized.cx, resized.cy), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        ((640, 480), (320, 240)),
+        ((480, 640), (240, 320)),
+        ((1920, 1080), (427, 240)),
+        ((1080, 1920), (240, 427)),
+        ((500, 500), (240, 240)),
+        ((10000, 3), (800000, 240)),
+    ],
+)
+def test_short_side(size: tuple[int, int], expected: tuple[int, int]) -> None:
+    camera = Camera(*size, 500.0, 500.0, size[0] / 2, size[1] / 2).short_side_resized(240)
+    assert (camera.width, camera.height) == expected
+
+
+def test_points_behind_the_camera_have_no_pixel() -> None:
+    pixels = camera_with(()).project([[0.0, 0.0, -1.0], [0.1, 0.1, 0.0], [0.0, 0.0, 1.0]])
+    assert np.isnan(pixels[:2]).all()
+    assert pixels[2] == pytest.approx((318.6, 255.3))
+
+
+def test_matrix_and_dict_round_trips() -> None:
+    camera = camera_with(KINECT)
+    assert Camera.from_matrix(camera.matrix(), 640, 480, KINECT) == camera
+    assert Camera.from_dict(camera.to_dict()) == camera
+    assert Camera.from_dict({**camera.to_dict(), "serial": "A1"}) == camera
+    assert hash(Camera.from_dict(camera.to_dict())) == hash(camera)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fx": 0.0}, "fx"),
+        ({"cy": float("nan")}, "cy"),
+        ({"width": 0}, "width"),
+        ({"height": 10.5}, "height"),
+        ({"width": float("inf")}, "width"),
+        ({"distortion": [0.1, 0.2]}, "0, 4, 5 or 8"),
+        ({"distortion": "none"}, "list"),
+        ({"fy": "500"}, "'fy' is a number"),
+        ({"cx": None}, "'cx' is a number"),
+    ],
+)
+def test_bad_intrinsics_are_refused_by_name(change: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Camera.from_dict({**camera_with(()).to_dict(), **change})
+
+
+def test_a_matrix_that_is_not_pinhole_is_refused() -> None:
+    skewed = camera_with(()).matrix()
+    skewed[0, 1] = 0.5
+    with pytest.raises(ValueError, match="skew"):
+        Camera.from_matrix(skewed, 640, 480)
+    with pytest.raises(ValueError, match="3x3"):
+        Camera.from_matrix(np.eye(4), 640, 480)
