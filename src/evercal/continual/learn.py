@@ -11,7 +11,7 @@ from torch import Tensor
 
 from evercal.continual.atlas import Cell
 from evercal.continual.knowledge import Knowledge, SceneRecord, prototypes
-from evercal.continual.memory import remember
+from evercal.continual.memory import Memory, remember
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.datasets.frame import Frame, Scene
 from evercal.models.head import Head, HeadOptions, HeadOutput
@@ -251,22 +251,31 @@ def _finish(
     buffer: FeatureBuffer,
     options: StageOptions,
 ) -> Stage:
-    strategy = STRATEGIES[after.strategy]
     frames = scene.train
     descriptors = buffer.tensors["descriptors"][: len(frames)]
-    record = SceneRecord(scene.name, frames[0].camera, cell, prototypes(descriptors), len(frames))
-    kept: list[Frame] = []
-    if strategy.select is not None:
-        positions = np.stack([_pose(frame).translation_m for frame in frames])
-        quaternions = np.stack([_pose(frame).rotation_wxyz for frame in frames])
-        capacity = max(1, round(options.memory_share * len(frames)))
-        if options.memory_bytes is not None:
-            one = remember(frames[:1], after.short_side).bytes
-            capacity = min(len(frames), max(1, options.memory_bytes // one))
-        kept = [frames[i] for i in strategy.select(positions, quaternions, capacity)]
+    record = SceneRecord(
+        scene.name, frames[0].camera, cell, prototypes(descriptors), len(frames)
+    )
+    memory = keep(frames, STRATEGIES[after.strategy], options, after.short_side)
     after.scenes.append(record)
-    after.memories.append(remember(kept, after.short_side) if kept else None)
-    return Stage(after, options.fit.iterations, len(kept))
+    after.memories.append(memory)
+    return Stage(after, options.fit.iterations, len(memory.images) if memory else 0)
+
+
+def keep(
+    frames: Sequence[Frame], strategy: Strategy, options: StageOptions, short_side: int
+) -> Memory | None:
+    """What a strategy remembers of a scene's training frames, at most N_b of them."""
+    if strategy.select is None:
+        return None
+    positions = np.stack([_pose(frame).translation_m for frame in frames])
+    quaternions = np.stack([_pose(frame).rotation_wxyz for frame in frames])
+    capacity = max(1, round(options.memory_share * len(frames)))
+    if options.memory_bytes is not None:
+        one = remember(frames[:1], short_side).bytes
+        capacity = min(len(frames), max(1, options.memory_bytes // one))
+    chosen = strategy.select(positions, quaternions, capacity)
+    return remember([frames[i] for i in chosen], short_side)
 
 
 class _Pacer:

@@ -186,8 +186,10 @@ def hold_out(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], tuple[Frame, .
     return learned, tuple(f for f, out in zip(frames, aside, strict=True) if out)
 
 
-def fit_threshold(known: Knowledge, held_out: Sequence[Frame]) -> tuple[float, float]:
-    """Inlier threshold and covariance scale of the newest scene.
+def fit_threshold(
+    known: Knowledge, held_out: Sequence[Frame], scene: int = -1
+) -> tuple[float, float]:
+    """Inlier threshold and covariance scale of a scene, by default the newest.
 
     Positives are held-out training frames, negatives are views of box rooms nobody ever learned. The
     threshold lies a third of the way from the negatives' top to the positives' 5 % quantile, so
@@ -210,7 +212,7 @@ def fit_threshold(known: Knowledge, held_out: Sequence[Frame]) -> tuple[float, f
             shift = frame.base_from_camera.translation_m - estimate.base_from_camera.translation_m
             error = np.concatenate([shift, moved.log()[3:]])
             right.append(float(error @ np.linalg.pinv(estimate.covariance) @ error))
-    strangers = [localizer.localize(image).inlier_ratio for image in _strangers(known)]
+    strangers = [localizer.localize(image).inlier_ratio for image in _strangers(known, scene)]
     top = float(np.quantile(strangers, 0.95))
     known_low = float(np.quantile(ratios, 0.05)) if ratios else 1.0
     threshold = top + max(0.0, known_low - top) / 3
@@ -218,9 +220,9 @@ def fit_threshold(known: Knowledge, held_out: Sequence[Frame]) -> tuple[float, f
     return threshold, max(scale, 1.0)
 
 
-def _strangers(known: Knowledge) -> list[np.ndarray]:
-    """Views of rooms that are in no scene, at the proportions of the newest scene's camera."""
-    lens = known.scenes[-1].camera
+def _strangers(known: Knowledge, scene: int) -> list[np.ndarray]:
+    """Views of rooms that are in no scene, at the proportions of the scene's camera."""
+    lens = known.scenes[scene].camera
     small = lens.short_side_resized(known.short_side)
     plain = default_camera(small.width, small.height)
     images = []

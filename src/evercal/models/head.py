@@ -1,7 +1,7 @@
 """The scene-coordinate head: a feature vector in, a point of the scene out.
 
-After GLACE (Wang et al., CVPR 2024): residual MLP, cluster centres chosen by a softmax, and an offset
-in homogeneous form. Scenes may be told apart in two ways (`HeadOptions.condition`):
+After GLACE (Wang et al., CVPR 2024): residual MLP, cluster centres chosen by a softmax, and an
+offset in homogeneous form. Scenes may be told apart in two ways (`HeadOptions.condition`):
 
 - `descriptor`: the image's global descriptor is part of the input, as in GLACE. Nothing but the
   image decides which centres answer.
@@ -35,8 +35,8 @@ class HeadOptions:
     offsets: Literal["shared", "per_centre"] = "per_centre"
     """One offset and scale for all centres (GLACE), or one for each centre (the paper)."""
     centres: Literal["grow", "fixed", "grid"] = "grow"
-    """Where centres come from: each scene appends its own, all scenes at once in advance (the paper;
-    needs the future), or the middles of the atlas cells."""
+    """Where centres come from: each scene appends its own, all scenes at once in advance (the
+    paper; needs the future), or the middles of the atlas cells."""
     centres_per_scene: int = 4
     """Cluster centres that a scene adds."""
 
@@ -125,7 +125,7 @@ class Head(nn.Module):
         self.centre_scene = torch.cat([self.centre_scene, scene])
 
     def scene_parameters(self) -> int:
-        """Bytes in half precision of what the newest scene added (code, logits, offsets, centres)."""
+        """Bytes in half precision that the newest scene added: code, logits, offsets, centres."""
         added = int((self.centre_scene == self.scenes - 1).sum())
         rows = self.options.width + 1
         per_centre = rows + 3 + (4 * rows if self.options.offsets == "per_centre" else 0)

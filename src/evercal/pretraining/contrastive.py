@@ -85,7 +85,7 @@ class PairStream(IterableDataset):
         self.data, self.options, self.first_step = data, options, first_step
 
     def draw(self, step: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Batch number `step`: images (2, b, 1, h, w), pixels (2, b, points, 2), valid (b, points)."""
+        """Batch `step`: images (2, b, 1, h, w), pixels (2, b, points, 2), valid (b, points)."""
         o = self.options
         rng = np.random.default_rng([o.seed, step])
         pairs: list[Pair] = []

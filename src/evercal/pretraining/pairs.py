@@ -1,4 +1,4 @@
-"""Image pairs with known correspondence: dead leaves under homographies, box rooms under parallax."""
+"""Image pairs with known correspondence: dead leaves under homographies, rooms under parallax."""
 
 from dataclasses import dataclass
 
@@ -84,7 +84,7 @@ class RoomViews:
 
 
 def room_views(seed: int, anchors: int = 5, per_anchor: int = 4) -> RoomViews:
-    """Draws a room from `anchors * per_anchor` cameras with parallax, scale and roll between them."""
+    """Draws a room from `anchors * per_anchor` cameras that differ by parallax, scale and roll."""
     import cv2
 
     rng = np.random.default_rng([seed, 77])
@@ -147,7 +147,7 @@ def photometric(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         half = (length - 1) / 2
         for step in np.linspace(-half, half, 2 * length):
             row, column = half + step * np.sin(angle), half + step * np.cos(angle)
-            kernel[int(round(row)), int(round(column))] = 1
+            kernel[round(row), round(column)] = 1
         x = cv2.filter2D(x, -1, kernel / kernel.sum())
     x = np.clip(x, 0, 1) ** np.exp(rng.normal(0, 0.25))
     x = (x - 0.5) * np.exp(rng.normal(0, 0.2)) + 0.5 + rng.normal(0, 0.08)

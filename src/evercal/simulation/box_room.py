@@ -1,7 +1,8 @@
 """Box rooms: textured rectangles with exact poses, drawn in milliseconds, no extra dependency.
 
-A room is a box with furniture boxes in it and pictures on its walls. Every surface is a rectangle, so
-an image is a set of perspective warps put together by depth, and a ray meets the room in closed form.
+A room is a box with furniture boxes in it and pictures on its walls. Every surface is a rectangle,
+so an image is a set of perspective warps put together by depth, and a ray meets the room in closed
+form.
 The robot base frame: origin on the floor in the middle of the room, z up, metres.
 """
 
@@ -54,7 +55,7 @@ class BoxRoom:
         self.size_m = np.array([rng.uniform(3.0, 5.5), rng.uniform(3.0, 5.5), rng.uniform(2.3, 3)])
         self._texture_px = texture_px
         self.surfaces: list[Surface] = []
-        x, y, z = self.size_m
+        x, y, _ = self.size_m
         self._add_box(np.array([-x / 2, -y / 2, 0]), self.size_m, rng, inward=True)
         for _ in range(int(rng.integers(5, 14)) if furniture is None else furniture):
             size = np.array([rng.uniform(0.2, 1.2), rng.uniform(0.2, 1.2), rng.uniform(0.2, 1.4)])

@@ -1,9 +1,9 @@
 """Procedural pictures: the only image source that the shipped weights are made from.
 
-A picture is a "dead leaves" collage (Lee, Mumford, Huang: Occlusion models for natural images, IJCV
-2001): shapes of power-law size painted over each other, each filled with 1/f noise, stripes, checks,
-a plain tone or text. It has what features need to learn from: edges, corners, blobs and flat parts at
-every scale.
+A picture is a "dead leaves" collage (Lee, Mumford, Huang: Occlusion models for natural images,
+IJCV 2001): shapes of power-law size painted over each other, each filled with 1/f noise, stripes,
+checks, a plain tone or text. It has what features need to learn from: edges, corners, blobs and
+flat parts at every scale.
 """
 
 from collections.abc import Callable

@@ -1,0 +1,56 @@
+"""`python -m benchmarks real|speed ...`: prints the tables of docs/results.md."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+DATA_VARIABLE = "EVERCAL_REAL_DATA"
+
+
+def real(
+    data: Path | None = None,
+    out: Path = Path("runs/real"),
+    seeds: tuple[int, ...] = (0, 1, 2),
+    tables: tuple[Literal["fast", "two", "four"], ...] = ("fast", "two", "four"),
+) -> None:
+    """Learns real scenes and prints accuracy tables; finished runs are kept and not repeated.
+
+    Args:
+        data: folder with `redkitchen` and `fr1_rpy` (7-Scenes layout); else EVERCAL_REAL_DATA.
+        out: where stores and per-frame results are kept.
+        seeds: of the runs of tables `two` and `four`; `fast` uses the first.
+        tables: which tables to make.
+    """
+    where = data or (Path(found) if (found := os.environ.get(DATA_VARIABLE)) else None)
+    if where is None:
+        print(f"skipped: no real data; give --data DIR or set {DATA_VARIABLE}")
+        return
+    from benchmarks.real import run
+
+    run(where, out, seeds, tables)
+
+
+def speed(store: Path, image: Path, repeat: int = 50) -> None:
+    """Times localization of one image, one at a time and in a batch, and SARS.
+
+    Args:
+        store: a learned store.
+        image: an image of one of its scenes.
+        repeat: images timed.
+    """
+    from benchmarks.speed import run
+
+    run(store, image, repeat)
+
+
+def main() -> int:
+    """Runs one benchmark."""
+    tyro.extras.subcommand_cli_from_dict({"real": real, "speed": speed})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
