@@ -111,9 +111,7 @@ class Runner:
             if known.scenes[i].inlier_threshold == 0.0 or i == number:
                 alone = replace(known.scenes[i])
                 known.scenes[i] = with_fit(alone, *fit_threshold(known, self.held_out[i], i))
-        results = evaluate(
-            Localizer(known), {s.name: s for s in self.scenes[: number + 1]}
-        )
+        results = evaluate(Localizer(known), {s.name: s for s in self.scenes[: number + 1]})
         outcome.wrong_scene = 100 * float(np.mean([r.wrong_scene for r in results]))
         return {name: flags.tolist() for name, flags in correct(results).items()}
 
@@ -162,7 +160,8 @@ class Runner:
             _first_stages[key] = self._next(blank, number, stage_options(seed)).knowledge
         known = _first_stages[key].fork()
         known.strategy = strategy
-        known.memories = [keep(scene.train, rule, stage_options(seed), SHORT_SIDE)]
+        refined = known.scenes[0].refined_camera
+        known.memories = [keep(scene.train, rule, stage_options(seed), SHORT_SIDE, refined)]
         return known
 
     def _alone_beside(self, known: Knowledge, number: int, seed: int) -> Knowledge:
@@ -236,8 +235,15 @@ def comparison(runner: Runner, strategies: Sequence[str], seeds: Sequence[int]) 
     for i, name in enumerate(names):
         alone = np.array([o.correct[i][name] for o in outcomes["isolation"]], float)
         d = paired_difference([ours[i]], [alone])
-        pairs.append([f"{name}: evercal at the end - alone", *(100 * v for v in (d.mean, d.low, d.high))])
+        pairs.append(
+            [f"{name}: evercal at the end - alone", *(100 * v for v in (d.mean, d.low, d.high))]
+        )
         d = paired_difference([ours[i]], [learned("evercal", i)])
-        pairs.append([f"{name}: evercal at the end - when learned", *(100 * v for v in (d.mean, d.low, d.high))])
+        pairs.append(
+            [
+                f"{name}: evercal at the end - when learned",
+                *(100 * v for v in (d.mean, d.low, d.high)),
+            ]
+        )
     header = ["difference in points", "mean", "95 % low", "95 % high"]
     return text + tabulate(pairs, header, "github", floatfmt=".1f") + "\n"

@@ -27,7 +27,9 @@ def run(store: Path, image: Path, repeat: int) -> None:
     localizer.localize_batch(images[:8], [None] * 8)
     began = time.perf_counter()
     localizer.localize_batch([read_image(image) for _ in range(repeat)], [None] * repeat)
-    print(f"batch, decoding included: {repeat / (time.perf_counter() - began):.1f} images per second")
+    print(
+        f"batch, decoding included: {repeat / (time.perf_counter() - began):.1f} images per second"
+    )
     rng = np.random.default_rng(0)
     positions = np.cumsum(rng.normal(0, 0.01, (10_000, 3)), 0)
     quaternions = rng.normal(size=(10_000, 4))

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from evercal.errors import InputError
 from evercal.geometry.se3 import SE3
 
 MIN_CELL_M = 5.0
@@ -55,11 +56,19 @@ class Atlas:
 
         Returns:
             The cell, already part of the atlas.
+
+        Raises:
+            InputError: layout `paper` and more scenes than expected.
         """
         origin = positions_m.mean(axis=0)
         side = max(MIN_CELL_M, 2.0 * float(np.ptp(positions_m, axis=0).max()))
         if self.layout == "paper":
-            centre, side = paper_grid(max(self.expected, 1))[len(self.cells)], MIN_CELL_M
+            if len(self.cells) >= self.expected:
+                raise InputError(
+                    f"atlas: its paper layout was made for {self.expected} scenes and is full; "
+                    "expect more, or use the open layout"
+                )
+            centre, side = paper_grid(self.expected)[len(self.cells)], MIN_CELL_M
         else:
             centre = next(c for c in spiral() if self._free(c, side))
         x, y, z = (float(value) for value in centre)

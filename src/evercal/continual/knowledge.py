@@ -30,10 +30,41 @@ class SceneRecord:
     """(p, width) descriptors of training frames spread over the recording, half precision."""
     train_frames: int
     """Frames it was learned from."""
+    refined_camera: Camera | None = None
+    """`camera` as training corrected it, with distortion; None where the given one is trusted."""
     inlier_threshold: float = 0.0
     """Smallest inlier ratio of a pose that is believed; fitted on held-out training frames."""
     covariance_scale: float = 1.0
     """What covariances are multiplied with to match the errors on held-out training frames."""
+
+    def lens(self, camera: Camera | None) -> Camera:
+        """Intrinsics to use for a query: what is known better than the nominal ones, else as given."""
+        own = self.camera
+        if camera is None or (
+            not camera.distortion
+            and np.allclose(_proportions(camera), _proportions(own), atol=1e-3)
+        ):
+            return self.refined_camera or own
+        return camera
+
+
+def _proportions(camera: Camera) -> tuple[float, float, float, float]:
+    w, h = camera.width, camera.height
+    return camera.fx / w, camera.fy / h, (camera.cx + 0.5) / w, (camera.cy + 0.5) / h
+
+
+def refine(camera: Camera, lens: Tensor) -> Camera:
+    """A nominal pinhole with the correction (5,) that training found (see `reprojection_error`)."""
+    focal, dx, dy, k1, k2 = (float(value) for value in lens)
+    return Camera(
+        camera.width,
+        camera.height,
+        camera.fx * (1 + focal),
+        camera.fy * (1 + focal),
+        camera.cx + dx * camera.fx,
+        camera.cy + dy * camera.fy,
+        (k1, k2, 0.0, 0.0),
+    )
 
 
 @dataclass

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from evercal.continual.atlas import Cell
-from evercal.continual.knowledge import Knowledge, SceneRecord, prototypes
+from evercal.continual.knowledge import Knowledge, SceneRecord, prototypes, refine
 from evercal.continual.memory import Memory, remember
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.datasets.frame import Frame, Scene
+from evercal.geometry.camera import Camera
 from evercal.models.head import Head, HeadOptions, HeadOutput
 from evercal.training.buffer import FeatureBuffer, FillPlan, Rows, fill
 from evercal.training.fit import FitOptions, Fitter, Progress, Replay
@@ -114,7 +115,8 @@ def learn(
     positions = np.stack([_pose(frame).translation_m for frame in scene.train])
     cell = after.atlas.place(positions)
     head, local = _head_for_stage(after, strategy, options, cell, positions)
-    buffer = FeatureBuffer(local, cell.atlas_from_base)
+    correctable = _correctable(scene.train)
+    buffer = FeatureBuffer(local, cell.atlas_from_base, correctable)
     pacer = _Pacer()
     past_rows, fitter_state = (resume.rows, resume.fitter) if resume else ((), {})
     for rows in past_rows:
@@ -143,7 +145,20 @@ def learn(
         yield progress
         if pacer.due():
             yield Checkpoint({}, fitter.state())
-    yield _finish(after, scene, cell, buffer, options)
+    refined: list[Camera | None] = [None] * len(buffers)
+    if fit.lens_rate > 0 and fit.iterations > 0:
+        nominal = [scene.train[0].camera, *[other.train[0].camera for other in earlier]]
+        for i, buffer_ in enumerate(buffers):
+            if buffer_.correctable:
+                refined[i] = refine(nominal[i], fitter.lens[i].detach())
+    for i, camera in enumerate(refined[1:]):
+        after.scenes[i] = replace(after.scenes[i], refined_camera=camera)
+    yield _finish(after, scene, cell, buffer, options, refined[0])
+
+
+def _correctable(frames: Sequence[Frame]) -> bool:
+    """Whether one camera without known distortion took all frames."""
+    return not frames[0].camera.distortion and all(f.camera == frames[0].camera for f in frames)
 
 
 def _pose(frame: Frame):
@@ -165,7 +180,7 @@ def _head_for_stage(
     in_atlas = cell.atlas_from_base.apply(positions)
     if strategy.data == "all":
         head = Head(width, after.descriptor.width, _seeded(shape, options.seed))
-        for i, record in enumerate(after.scenes):
+        for i in range(len(after.scenes)):
             old = after.heads[0]
             head.grow(old.centres[old.centre_scene == i], options.seed + i)
         after.heads = []
@@ -211,7 +226,8 @@ def _refill(known: Knowledge, earlier: Sequence[Scene], options: StageOptions) -
     """Encodes all earlier scenes again (strategies with `data: all`)."""
     buffers = []
     for i, (scene, record) in enumerate(zip(earlier, known.scenes, strict=True)):
-        buffer = FeatureBuffer(i, record.cell.atlas_from_base)
+        correctable = _correctable(scene.train)
+        buffer = FeatureBuffer(i, record.cell.atlas_from_base, correctable)
         plan = options.fill
         for done in fill(buffer, scene.train, plan, known.encoder, known.descriptor):
             yield Encoding(done, len(scene.train) * plan.passes)
@@ -250,22 +266,34 @@ def _finish(
     cell: Cell,
     buffer: FeatureBuffer,
     options: StageOptions,
+    refined: Camera | None,
 ) -> Stage:
     frames = scene.train
-    descriptors = buffer.tensors["descriptors"][: len(frames)]
-    record = SceneRecord(
-        scene.name, frames[0].camera, cell, prototypes(descriptors), len(frames)
-    )
-    memory = keep(frames, STRATEGIES[after.strategy], options, after.short_side)
+    descriptors = prototypes(buffer.tensors["descriptors"][: len(frames)])
+    camera = frames[0].camera
+    record = SceneRecord(scene.name, camera, cell, descriptors, len(frames), refined)
+    memory = keep(frames, STRATEGIES[after.strategy], options, after.short_side, refined)
     after.scenes.append(record)
     after.memories.append(memory)
     return Stage(after, options.fit.iterations, len(memory.images) if memory else 0)
 
 
 def keep(
-    frames: Sequence[Frame], strategy: Strategy, options: StageOptions, short_side: int
+    frames: Sequence[Frame],
+    strategy: Strategy,
+    options: StageOptions,
+    short_side: int,
+    refined: Camera | None,
 ) -> Memory | None:
-    """What a strategy remembers of a scene's training frames, at most N_b of them."""
+    """What a strategy remembers of a scene's training frames, at most N_b of them.
+
+    Args:
+        frames: in recorded order.
+        strategy: whose rule selects.
+        options: size of the memory.
+        short_side: working size of images, pixels.
+        refined: the camera as training corrected it; replay takes it as given.
+    """
     if strategy.select is None:
         return None
     positions = np.stack([_pose(frame).translation_m for frame in frames])
@@ -275,7 +303,10 @@ def keep(
         one = remember(frames[:1], short_side).bytes
         capacity = min(len(frames), max(1, options.memory_bytes // one))
     chosen = strategy.select(positions, quaternions, capacity)
-    return remember([frames[i] for i in chosen], short_side)
+    kept = [frames[i] for i in chosen]
+    if refined is not None:
+        kept = [replace(frame, camera=refined) for frame in kept]
+    return remember(kept, short_side)
 
 
 class _Pacer:

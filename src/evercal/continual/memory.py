@@ -1,8 +1,8 @@
 """What stays of a scene: a few frames, as the encoder saw them, counted in bytes.
 
-The frames are kept as grey JPEG images at working size, not as feature rows: an image of 320x240 takes
-about 25 kB, its 1,200 rows of 128 half floats 307 kB. From the image, the frozen encoder makes
-the same rows again in milliseconds, and augmented views besides.
+The frames are kept as grey JPEG images at working size, not as feature rows: an image of 320x240
+takes about 25 kB, its 1,200 rows of 128 half floats 307 kB. From the image, the frozen encoder
+makes the same rows again in milliseconds, and augmented views besides.
 """
 
 from collections.abc import Sequence
@@ -33,8 +33,8 @@ class Memory:
 
     @property
     def bytes(self) -> int:
-        """Size of images, poses and intrinsics."""
-        return sum(map(len, self.images)) + len(self.images) * (7 * 8 + 6 * 8)
+        """Size of `to_tensors`: images, their lengths, poses and intrinsics."""
+        return sum(map(len, self.images)) + len(self.images) * 8 * (1 + 14 + 1 + 7)
 
     def frames(self) -> list[Frame]:
         """The remembered frames, decoded."""
@@ -51,7 +51,11 @@ class Memory:
         return frames
 
     def to_tensors(self) -> dict[str, Tensor]:
-        """As named tensors: `images` (bytes, joined), `lengths`, `cameras` (n, 14), `poses` (n, 7)."""
+        """As named tensors.
+
+        `images` (bytes, joined), `lengths` (n,), `cameras` (n, 14), `distortion` (n,) number of
+        coefficients, `poses` (n, 7) quaternion wxyz and metres.
+        """
         joined = np.frombuffer(b"".join(self.images), np.uint8).copy()
         cameras = np.zeros((len(self.images), 14))
         for i, c in enumerate(self.cameras):

@@ -1,19 +1,23 @@
 """`Robot`: the only code that knows what a store contains.
 
-STORE/
-manifest.json                 written last, by atomic replace; sha256 of every file
-encoder-SHA.safetensors       the networks that the stages were made with
-descriptor-SHA.safetensors
-stages/0001-NAME/scene.json   camera, cell, thresholds
-head.safetensors        weights (fp16, centres fp32); of a shared head only the
-newest stage's remains
-memory.safetensors      remembered frames
-prototypes.safetensors
-report.json
-learning/                     checkpoints of an interrupted stage, not part of the manifest
+    STORE/
+      manifest.json                 written last, by atomic replace; sha256 of every file
+      encoder-SHA.safetensors       the networks that the stages were made with
+      descriptor-SHA.safetensors
+      stages/0001-NAME/
+        scene.json                  camera, cell, thresholds
+        head.safetensors            weights (fp16, centres fp32); of a shared head only the
+                                    newest stage's remains
+        memory.safetensors          remembered frames
+        prototypes.safetensors
+        report.json
+      learning/                     checkpoints of an interrupted stage
+
+What the manifest does not list is no part of the store.
 """
 
 import json
+import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -34,11 +38,26 @@ from evercal.models.descriptor import load_descriptor
 from evercal.models.encoder import load_encoder
 from evercal.models.head import Head, HeadOptions
 from evercal.models.weights_file import network_bytes
-from evercal.storage.atomic import write_bytes, write_json
-from evercal.storage.manifest import read_manifest, sha256_file, verify, write_manifest
+from evercal.storage.atomic import replace_folder, write_bytes, write_json
+from evercal.storage.manifest import (
+    MANIFEST,
+    read_manifest,
+    sha256_file,
+    verify,
+    write_manifest,
+)
 
 SCHEMA = 1
 LEARNING = "learning"
+STAGES = "stages"
+HEAD = "head.safetensors"
+STAGE_FILES = (
+    HEAD,
+    "memory.safetensors",
+    "prototypes.safetensors",
+    "report.json",
+    "scene.json",
+)
 
 
 class Robot:
@@ -65,7 +84,7 @@ class Robot:
         Raises:
             InputError: `root` holds something that is not a store, unknown strategy, bad encoder.
         """
-        if root.exists() and (not root.is_dir() or any(p.name != LEARNING for p in root.iterdir())):
+        if root.exists() and not _free(root):
             raise InputError(f"store {root}: exists and is not an evercal store; give another path")
         if strategy not in STRATEGIES:
             known = ", ".join(STRATEGIES)
@@ -73,8 +92,8 @@ class Robot:
         networks = load_encoder(encoder), load_descriptor()
         if networks[0].width != networks[1].settings["inputs"]:
             raise InputError(
-                f"encoder {encoder}: gives {networks[0].width} channels, the shipped descriptor needs "
-                f"{networks[1].settings['inputs']}; make both with 'evercal pretrain'"
+                f"encoder {encoder}: gives {networks[0].width} channels, the shipped descriptor "
+                f"needs {networks[1].settings['inputs']}; make both with 'evercal pretrain'"
             )
         return cls(root, Knowledge(*networks, strategy, short_side), [], None)
 
@@ -91,7 +110,14 @@ class Robot:
             raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
         if payload.get("schema") != SCHEMA:
             raise InputError(f"store {root}: schema {payload.get('schema')!r} is not {SCHEMA}")
-        encoder, descriptor = (str(name) for name in payload["networks"])  # type: ignore[attr-defined]
+        if payload["strategy"] not in STRATEGIES:
+            known_ones = ", ".join(STRATEGIES)
+            raise InputError(
+                f"store {root}: made with strategy {payload['strategy']!r}, this evercal has "
+                f"{known_ones}; update evercal"
+            )
+        networks = payload["networks"]
+        encoder, descriptor = (str(name) for name in networks)  # type: ignore[attr-defined]
         known = Knowledge(
             load_encoder(root / encoder),
             load_descriptor(root / descriptor),
@@ -100,7 +126,7 @@ class Robot:
         )
         stages = [str(name) for name in payload["stages"]]  # type: ignore[attr-defined]
         for name in stages:
-            folder = root / "stages" / name
+            folder = root / STAGES / name
             known.scenes.append(_read_record(folder))
             memory = folder / "memory.safetensors"
             known.memories.append(Memory.from_tensors(_load(memory)) if memory.exists() else None)
@@ -117,8 +143,10 @@ class Robot:
             report: what `report.json` says.
         """
         record, memory = known.scenes[-1], known.memories[-1]
-        name = f"{len(self.stages) + 1:04d}-{record.name}"
-        folder = self.root / "stages" / name
+        # A scene may be called anything, a folder may not.
+        legal = re.sub(r"[^\w.-]", "_", record.name)[:60]
+        name = f"{len(self.stages) + 1:04d}-{legal}"
+        folder = self.root / STAGES / f".{name}"
         shutil.rmtree(folder, ignore_errors=True)  # left by a commit that was killed
         folder.mkdir(parents=True)
         if self.networks is None:
@@ -129,13 +157,15 @@ class Robot:
         if memory is not None:
             _save(folder / "memory.safetensors", memory.to_tensors())
         write_json(folder / "report.json", report)
+        replace_folder(folder, self.root / STAGES / name)
         stages = [*self.stages, name]
-        drop = STRATEGIES[known.strategy].heads == "one"
+        shared = STRATEGIES[known.strategy].heads == "one"
         files = [*self.networks]
         for stage in stages:
-            for file in sorted((self.root / "stages" / stage).iterdir()):
-                if not (drop and stage != name and file.name == "head.safetensors"):
-                    files.append(str(file.relative_to(self.root)))
+            for file in STAGE_FILES:
+                superseded = shared and stage != name and file == HEAD
+                if not superseded and (self.root / STAGES / stage / file).exists():
+                    files.append(f"{STAGES}/{stage}/{file}")
         payload = {
             "schema": SCHEMA,
             "strategy": known.strategy,
@@ -144,11 +174,19 @@ class Robot:
             "stages": stages,
         }
         write_manifest(self.root, payload, files)
-        # From here on the new stage counts; what nothing refers to any more may go.
-        if drop and self.stages:
-            (self.root / "stages" / self.stages[-1] / "head.safetensors").unlink(missing_ok=True)
-        shutil.rmtree(self.root / LEARNING, ignore_errors=True)
+        # From here on the new stage counts.
         self.known, self.stages = known, stages
+        self._tidy(shared)
+
+    def _tidy(self, shared: bool) -> None:
+        """Removes what nothing refers to any more, also what killed commits left."""
+        if shared:
+            for stage in self.stages[:-1]:
+                (self.root / STAGES / stage / HEAD).unlink(missing_ok=True)
+        for folder in (self.root / STAGES).iterdir():
+            if folder.name not in self.stages and re.match(r"\.?\d{4}-", folder.name):
+                shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(self.root / LEARNING, ignore_errors=True)
 
     def _write_networks(self, known: Knowledge) -> tuple[str, str]:
         names = []
@@ -176,6 +214,8 @@ class Robot:
         except (OSError, ValueError):
             found = None
         if found != asked:
+            # First the name, so that half a removal is never taken for a stage to resume.
+            (folder / "stage.json").unlink(missing_ok=True)
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
             write_json(folder / "stage.json", asked)
@@ -196,38 +236,50 @@ class Robot:
             _save(folder / "fitter.safetensors", checkpoint.fitter)
 
     def bytes(self) -> dict[str, int]:
-        """Size on disk: `memory` (what replay keeps) and `rest` (all else that is in the manifest)."""
-        memory = sum(f.stat().st_size for f in self.root.glob("stages/*/memory.safetensors"))
-        every = [f for f in self.root.rglob("*") if f.is_file() and LEARNING not in f.parts]
-        return {"memory": memory, "rest": sum(f.stat().st_size for f in every) - memory}
+        """Size on disk: `memory` (what replay keeps) and `rest` (all else in the manifest)."""
+        files = [self.root / MANIFEST, *(self.root / name for name in self.networks or ())]
+        for stage in self.stages:
+            files += [self.root / STAGES / stage / file for file in STAGE_FILES]
+        sizes = {file: file.stat().st_size for file in files if file.exists()}
+        memory = sum(size for file, size in sizes.items() if file.name == "memory.safetensors")
+        return {"memory": memory, "rest": sum(sizes.values()) - memory}
+
+
+def _free(root: Path) -> bool:
+    """Whether a store may be made here: nothing there, or a first stage that was interrupted."""
+    if not root.is_dir():
+        return False
+    names = [path.name for path in root.iterdir()]
+    ours = re.compile(rf"{LEARNING}|{STAGES}|(encoder|descriptor)(-\w+)?\.safetensors|\..*\.tmp")
+    return not names or (LEARNING in names and all(map(ours.fullmatch, names)))
 
 
 def head_bytes(head: Head) -> int:
     """Size of a head as it is stored: weights in half precision, centres in single."""
-    return sum(
-        value.numel() * (2 if value.dtype == torch.float32 and key != "centres" else 4)
-        for key, value in head.state_dict().items()
-    )
+    return sum(value.nbytes for value in _stored(head).values())
 
 
-def _write_head(folder: Path, head: Head) -> None:
+def _stored(head: Head) -> dict[str, Tensor]:
     # Centres stay fp32: half floats are 4 to 16 mm apart at the size of an atlas.
-    state = {
+    return {
         key: value if key == "centres" or not value.is_floating_point() else value.half()
         for key, value in head.state_dict().items()
     }
+
+
+def _write_head(folder: Path, head: Head) -> None:
     settings = {
         "options": asdict(head.options),
         "features": head.features,
         "descriptor": head.descriptor,
     }
-    _save(folder / "head.safetensors", state, {"head": json.dumps(settings)})
+    _save(folder / HEAD, _stored(head), {"head": json.dumps(settings)})
 
 
 def _read_head(folder: Path, known: Knowledge) -> Head:
     from safetensors import safe_open
 
-    path = folder / "head.safetensors"
+    path = folder / HEAD
     state = _load(path)
     with safe_open(path, "pt") as file:
         settings = json.loads((file.metadata() or {})["head"])
@@ -249,6 +301,7 @@ def _write_record(folder: Path, record: SceneRecord) -> None:
         "camera": record.camera.to_dict(),
         "cell": asdict(record.cell),
         "train_frames": record.train_frames,
+        "refined_camera": record.refined_camera.to_dict() if record.refined_camera else None,
         "inlier_threshold": record.inlier_threshold,
         "covariance_scale": record.covariance_scale,
     }
@@ -257,13 +310,14 @@ def _write_record(folder: Path, record: SceneRecord) -> None:
 
 def _read_record(folder: Path) -> SceneRecord:
     content = json.loads((folder / "scene.json").read_text())
-    cell = content["cell"]
+    cell, refined = content["cell"], content["refined_camera"]
     return SceneRecord(
         content["name"],
         Camera.from_dict(content["camera"]),
         Cell(tuple(cell["centre_m"]), cell["side_m"], tuple(cell["origin_m"])),
         _load(folder / "prototypes.safetensors")["prototypes"],
         content["train_frames"],
+        Camera.from_dict(refined) if refined else None,
         content["inlier_threshold"],
         content["covariance_scale"],
     )

@@ -13,7 +13,7 @@ class PoseEstimate:
     """The answer for one image; failure is a value, not an exception."""
 
     status: Literal["ok", "unknown_scene", "failed"]
-    """`unknown_scene`: a pose was found but too few points agree with it. `failed`: none was found."""
+    """`unknown_scene`: a pose was found but too few points agree. `failed`: none was found."""
     reason: str
     """Why the status is not `ok`; empty otherwise."""
     scene: str | None
@@ -21,7 +21,7 @@ class PoseEstimate:
     base_from_camera: SE3 | None
     """Camera pose in that scene's base frame, metres, OpenCV axes."""
     covariance: np.ndarray | None
-    """(6, 6) of (translation in the base frame in metres, rotation about the camera axes in radians)."""
+    """(6, 6) of (translation in the base frame, metres; rotation about camera axes, radians)."""
     inliers: int
     """Cells that reproject within the threshold."""
     inlier_ratio: float

@@ -103,7 +103,7 @@ class Localizer:
     def localize_batch(
         self, images: Sequence[np.ndarray], cameras: Sequence[Camera | None]
     ) -> list[PoseEstimate]:
-        """`localize` for many images; the encoder sees several at once, poses are found in parallel."""
+        """`localize` for many images: encoded several at once, poses found in parallel."""
         answers: dict[int, PoseEstimate] = {}
         views = [self._prepare(image, c) for image, c in zip(images, cameras, strict=True)]
         by_shape: dict[tuple[int, ...], list[int]] = {}
@@ -160,7 +160,7 @@ class Localizer:
         height, width = shape[:2]
         found: list[Camera | None] = []
         for record in self.known.scenes:
-            lens = camera or record.camera
+            lens = record.lens(camera)
             fits = _same_shape(lens, width, height)
             found.append(lens.short_side_resized(self.known.short_side) if fits else None)
         if not any(found):

@@ -79,7 +79,7 @@ OnEvent = Callable[[Encoding | Progress | Checkpoint], None]
 def learn_scene(
     store: Path, scene: Scene, options: LearnOptions, on_event: OnEvent | None = None
 ) -> LearnReport:
-    """Learns a scene into a store, or goes on where an interrupted call with the same input stopped.
+    """Learns a scene into a store, or goes on where an interrupted call of the same kind stopped.
 
     Args:
         store: folder of the store; made when missing.
@@ -138,7 +138,8 @@ def _check(robot: Robot, scene: Scene, options: LearnOptions) -> None:
         )
     if len(scene.train) < 16:
         raise InputError(
-            f"scene {scene.name!r}: {len(scene.train)} training frames are too few; give at least 16"
+            f"scene {scene.name!r}: {len(scene.train)} training frames are too few; "
+            "give at least 16"
         )
 
 
@@ -178,7 +179,7 @@ def run_stage(
 
 
 def hold_out(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
-    """Splits recorded frames into those to learn and blocks of 4 in every 100 (at least one block)."""
+    """Splits recorded frames: those to learn, and blocks of 4 in every 100 (at least one)."""
     every = min(HELD_OUT_EVERY, max(len(frames) // 2, HELD_OUT_BLOCK + 1))
     middle = every // 2
     aside = [middle <= i % every < middle + HELD_OUT_BLOCK for i in range(len(frames))]
@@ -191,10 +192,10 @@ def fit_threshold(
 ) -> tuple[float, float]:
     """Inlier threshold and covariance scale of a scene, by default the newest.
 
-    Positives are held-out training frames, negatives are views of box rooms nobody ever learned. The
-    threshold lies a third of the way from the negatives' top to the positives' 5 % quantile, so
-    that an unlucky but known view is rather believed than not. The scale makes the median of the
-    squared Mahalanobis error of well located frames what it is for six Gaussian dimensions.
+    Positives are held-out training frames, negatives are views of box rooms nobody ever learned.
+    The threshold lies a third of the way from the negatives' top to the positives' 5 % quantile,
+    so that an unlucky but known view is rather believed than not. The scale makes the median of
+    the squared Mahalanobis error of well located frames what it is for six Gaussian dimensions.
 
     Returns:
         (smallest inlier ratio that is believed, factor on covariances).

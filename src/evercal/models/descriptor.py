@@ -9,6 +9,7 @@ from torch.nn import functional as F
 
 from evercal.errors import InputError
 from evercal.models.encoder import WEIGHTS
+from evercal.models.weights_file import load_strictly
 
 DESCRIPTOR_FILE = WEIGHTS / "descriptor.safetensors"
 
@@ -59,9 +60,9 @@ def load_descriptor(path: Path | None = None) -> GlobalDescriptor:
         with safe_open(path, "pt") as file:
             settings = json.loads((file.metadata() or {})["descriptor"])
             state = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
-    except (SafetensorError, KeyError) as error:
+        settings.pop("layout", None)
+        descriptor = GlobalDescriptor(**settings)
+    except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"descriptor {path}: not an evercal descriptor ({error!r})") from error
-    settings.pop("layout", None)
-    descriptor = GlobalDescriptor(**settings)
-    descriptor.load_state_dict(state, strict=True)
+    load_strictly(descriptor, state, f"descriptor {path}: not an evercal descriptor")
     return descriptor.eval()

@@ -4,7 +4,6 @@ Ours is trained on procedural images alone (`evercal.pretraining`). ACE's publis
 too, for users who have that file and may use it, and any module with `stride` and `width` will do.
 """
 
-from collections import OrderedDict
 from pathlib import Path
 from typing import Protocol, cast, runtime_checkable
 
@@ -14,6 +13,7 @@ from torch.nn import functional as F
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from evercal.errors import InputError
+from evercal.models.weights_file import load_strictly
 
 WEIGHTS = Path(__file__).parent / "weights"
 ENCODER_FILE = WEIGHTS / "encoder.safetensors"
@@ -114,7 +114,7 @@ class LocalEncoder(nn.Module):
 
     def fuse(self) -> "LocalEncoder":
         """The same function with batch norm folded in, for inference and shipping."""
-        settings = self.settings
+        settings, training = self.settings, self.training
         twin = LocalEncoder(
             stem=(settings["stem"][0], settings["stem"][1]),
             inner=settings["inner"],
@@ -129,6 +129,7 @@ class LocalEncoder(nn.Module):
                 conv = fuse_conv_bn_eval(conv.eval(), cast(nn.BatchNorm2d, a[1]).eval())
             b[0].load_state_dict(conv.state_dict())
         twin.project.load_state_dict(self.project.state_dict())
+        self.train(training)
         return twin.eval()
 
 
@@ -198,7 +199,8 @@ def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
-        raise InputError(f"encoder {path}: not a readable torch weight file ({error})") from error
+        reason = (str(error).splitlines() or [repr(error)])[0]  # torch's own go on for ten lines
+        raise InputError(f"encoder {path}: not a readable torch weight file ({reason})") from error
     return ace_encoder_from_state(state, str(path))
 
 
@@ -213,12 +215,9 @@ def ace_encoder_from_state(state: object, name: str) -> AceEncoder:
             f"encoder {name}: not ACE's layout (no tensor 'res2_skip.weight'); "
             "give ACE's published encoder file or one written by 'evercal pretrain'"
         )
-    encoder = AceEncoder(int(state["res2_skip.weight"].shape[0]))
-    try:
-        encoder.load_state_dict(OrderedDict(state), strict=True)
-    except RuntimeError as error:
-        first = str(error).splitlines()[1].strip()
-        raise InputError(f"encoder {name}: does not match ACE's layout: {first}") from error
+    shape = getattr(state["res2_skip.weight"], "shape", ())
+    encoder = AceEncoder(int(shape[0]) if len(shape) == 4 else 512)
+    load_strictly(encoder, state, f"encoder {name}: does not match ACE's layout")
     return encoder.eval()
 
 
@@ -231,13 +230,13 @@ def _load_own(path: Path) -> LocalEncoder | AceEncoder:
         with safe_open(path, "pt") as file:
             settings = json.loads((file.metadata() or {})["encoder"])
             state = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
-    except (SafetensorError, KeyError) as error:
+        if settings.get("layout") == AceEncoder.__name__:
+            return ace_encoder_from_state(state, str(path))
+        stem = (settings["stem"][0], settings["stem"][1])
+        encoder = LocalEncoder(stem, settings["inner"], settings["blocks"], settings["width"])
+    except (SafetensorError, KeyError, ValueError) as error:
         raise InputError(f"encoder {path}: not an evercal encoder file ({error!r})") from error
-    if settings.get("layout") == AceEncoder.__name__:
-        return ace_encoder_from_state(state, str(path))
-    stem = (settings["stem"][0], settings["stem"][1])
-    encoder = LocalEncoder(stem, settings["inner"], settings["blocks"], settings["width"])
-    encoder.load_state_dict(state, strict=True)
+    load_strictly(encoder, state, f"encoder {path}: not an evercal encoder file")
     return cast(LocalEncoder, _channels_last(encoder.eval()))
 
 

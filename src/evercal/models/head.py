@@ -18,6 +18,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from evercal.errors import InputError
+
 SCALE_MAX = 4.0
 SCALE_MIN = 0.01
 
@@ -43,7 +45,7 @@ class HeadOptions:
 
 @dataclass
 class HeadOutput:
-    """What a head says about n rows, K centres."""
+    """What a head says about n rows, K centres (one scene's own where one was asked for)."""
 
     logits: Tensor
     """(n, K) fp32; -inf for centres that cannot answer."""
@@ -64,6 +66,9 @@ class Head(nn.Module):
         features: channels of the local feature.
         descriptor: channels of the global descriptor (used with condition `descriptor`).
         options: shape.
+
+    Raises:
+        InputError: condition `code` with centres that no scene owns.
     """
 
     centres: Tensor
@@ -71,6 +76,11 @@ class Head(nn.Module):
 
     def __init__(self, features: int, descriptor: int, options: HeadOptions):
         super().__init__()
+        if options.condition == "code" and options.centres != "grow":
+            raise InputError(
+                f"centres {options.centres!r} belong to no scene, so condition 'code' has none to"
+                " answer with; take condition 'descriptor' or centres 'grow'"
+            )
         self.features, self.descriptor, self.options = features, descriptor, options
         width = options.width
         inputs = features + (descriptor if options.condition == "descriptor" else 0)
@@ -184,15 +194,19 @@ class Head(nn.Module):
         return hidden
 
     def _decode(self, hidden: Tensor, scene: Tensor | int, coded: bool) -> HeadOutput:
-        logits = F.linear(hidden, self.logit, self.logit_bias)
-        if coded:
-            own = self.centre_scene == (scene if isinstance(scene, int) else scene[:, None])
-            logits = logits.masked_fill(~own, -torch.inf)
-        raw = F.linear(hidden, self.offset.flatten(0, 1), self.offset_bias.flatten())
-        raw = raw.unflatten(-1, (-1, 4))
+        rows: slice | Tensor = slice(None)
+        if coded and isinstance(scene, int):
+            # Same shapes however many scenes follow, so not a bit of the answer changes with them.
+            rows = torch.nonzero(self.centre_scene == scene)[:, 0]
+        logits = F.linear(hidden, self.logit[rows], self.logit_bias[rows])
+        if coded and not isinstance(scene, int):
+            logits = logits.masked_fill(self.centre_scene != scene[:, None], -torch.inf)
+        which = rows if self.options.offsets == "per_centre" else slice(None)
+        offset, bias = self.offset[which].flatten(0, 1), self.offset_bias[which].flatten()
+        raw = F.linear(hidden, offset, bias).unflatten(-1, (-1, 4))
         offsets = raw[..., :3] / homogeneous_scale(raw[..., 3:])
         share = logits.softmax(-1)
-        points = (share.unsqueeze(-1) * (self.centres + offsets)).sum(1)
+        points = (share.unsqueeze(-1) * (self.centres[rows] + offsets)).sum(1)
         return HeadOutput(logits, offsets, points)
 
 

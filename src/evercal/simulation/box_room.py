@@ -44,7 +44,7 @@ class BoxRoom:
     """A room made from a seed.
 
     Args:
-        seed: same seed, same room. Seeds from 9000 on are reserved for benchmarks.
+        seed: same seed, same room. Seeds 9000 to 9999 are reserved for benchmarks.
         furniture: number of boxes standing in the room; drawn when None.
         texture_px: side of one texture in pixels.
     """
@@ -64,9 +64,8 @@ class BoxRoom:
             place = rng.uniform(-0.5, 0.5, 2) * (self.size_m[:2] - size[:2])
             axis, sign = side // 2, 1 - 2 * (side % 2)
             place[axis] = sign * (self.size_m[axis] - size[axis]) / 2 * rng.uniform(0.85, 0.999)
-            hung = max(
-                0.0, rng.uniform(-1.0, self.size_m[2] - size[2])
-            )  # on the floor or on the wall
+            # On the floor or on the wall.
+            hung = max(0.0, rng.uniform(-1.0, self.size_m[2] - size[2]))
             self._add_box(np.array([*(place - size[:2] / 2), hung]), size, rng, inward=False)
         for _ in range(int(rng.integers(4, 13))):
             self._add_picture(rng)
@@ -196,7 +195,8 @@ class BoxRoom:
                 for k in (1, 2, 3)
             ]
             total = np.sum(parts, axis=0)
-            return low + (high - low) * (total - total.min()) / np.ptp(total)
+            total = total - total.min(initial=np.inf)
+            return low + (high - low) * total / max(total.max(initial=0.0), 1e-9)
 
         x = wave(-0.35 * half[0], 0.35 * half[0], 1)
         y = wave(-0.35 * half[1], 0.35 * half[1], 1)

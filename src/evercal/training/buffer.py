@@ -52,10 +52,12 @@ class FeatureBuffer:
     Args:
         scene: index of the scene in the atlas.
         atlas_from_base: where the scene's base frame lies in the atlas.
+        correctable: one camera took all frames, and its distortion is not known.
     """
 
-    def __init__(self, scene: int, atlas_from_base: SE3):
+    def __init__(self, scene: int, atlas_from_base: SE3, correctable: bool = False):
         self.scene, self.atlas_from_base = scene, atlas_from_base
+        self.correctable = correctable
         self.views = 0
         self._parts: list[dict[str, Tensor]] = []
         self._taken = 0

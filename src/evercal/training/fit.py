@@ -14,6 +14,8 @@ from evercal.training.loss import LossOptions, clamp_px, reprojection_loss
 from evercal.training.precision import autocast
 
 INLIER_PX = 5.0
+# While points are still far off, their errors say nothing about the lens.
+LENS_FROM_PX = 40.0
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,9 @@ class FitOptions:
     """Of AdamW."""
     diffusion: float = 0.1
     """Standard deviation of the noise on every row's descriptor (GLACE's feature diffusion)."""
+    lens_rate: float = 0.1
+    """Learning rate of the camera correction (focal length, principal point, k1, k2) as a share of the
+    head's; 0 trusts the given intrinsics. Only cameras given without distortion are corrected."""
     loss: LossOptions = field(default_factory=LossOptions)
     """Reprojection loss on the scenes being learned."""
 
@@ -86,7 +91,13 @@ class Fitter:
         decay, plain = [], []
         for name, parameter in head.named_parameters():
             (plain if name.startswith(("code", "logit")) else decay).append(parameter)
-        groups = [{"params": decay}, {"params": plain, "weight_decay": 0.0}]
+        self.lens = torch.nn.Parameter(torch.zeros(len(buffers), 5))
+        self._correctable = torch.tensor([[buffer.correctable] for buffer in buffers]).float()
+        groups = [
+            {"params": decay, "share": 1.0},
+            {"params": plain, "share": 1.0, "weight_decay": 0.0},
+            {"params": [self.lens], "share": options.lens_rate, "weight_decay": 0.0},
+        ]
         self._optimiser = torch.optim.AdamW(
             groups, lr=options.peak_rate, weight_decay=options.weight_decay, fused=True
         )
@@ -112,13 +123,17 @@ class Fitter:
             noise = torch.randn(rows.descriptor.shape, generator=generator)
             rows.descriptor = F.normalize(rows.descriptor + options.diffusion * noise, dim=-1)
         for group in self._optimiser.param_groups:
-            group["lr"] = one_cycle(options, self.step)
+            group["lr"] = one_cycle(options, self.step) * group["share"]
         with autocast():
             output = self.head(rows.features.float(), rows.scene, rows.descriptor)
         progress = self.step / options.iterations
         new = rows.part(slice(0, fresh))
         tau = clamp_px(options.loss, progress)
-        cost, error = reprojection_loss(output.points[:fresh], new.target, tau, options.loss)
+        lens = None
+        if options.lens_rate > 0 and tau < LENS_FROM_PX:
+            lens = (self.lens * self._correctable).repeat_interleave(share, 0)
+        points = output.points[:fresh]
+        cost, error = reprojection_loss(points, new.target, tau, options.loss, lens)
         loss = cost.mean()
         if replay is not None:
             old = slice(fresh, None)
@@ -133,6 +148,7 @@ class Fitter:
     def state(self) -> dict[str, Tensor]:
         """What `load` needs to go on from here, as named tensors."""
         state = {f"head.{k}": v for k, v in self.head.state_dict().items()}
+        state["lens"] = self.lens.detach()
         for i, slots in self._optimiser.state_dict()["state"].items():
             state |= {f"optimiser.{i}.{name}": value for name, value in slots.items()}
         return state | {"step": torch.tensor(self.step)}
@@ -142,6 +158,7 @@ class Fitter:
         self.step = int(state["step"])
         head = {k.removeprefix("head."): v for k, v in state.items() if k.startswith("head.")}
         self.head.load_state_dict(head)
+        self.lens.data.copy_(state["lens"])
         slots: dict[int, dict[str, Tensor]] = {}
         for key, value in state.items():
             if key.startswith("optimiser."):

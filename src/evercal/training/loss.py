@@ -9,7 +9,8 @@ from torch import Tensor
 MIN_DEPTH_M = 0.1
 MAX_DEPTH_M = 1000.0
 MAX_ERROR_PX = 1000.0
-PROXY_DEPTH_M = 10.0
+# A wide lens' corner: beyond it a polynomial in the radius means nothing.
+MAX_RADIUS2 = 1.0
 
 
 @dataclass(frozen=True)
@@ -42,17 +43,35 @@ def clamp_px(options: LossOptions, progress: float) -> float:
     return options.clamp_start_px * (1.0 - q) + options.clamp_end_px
 
 
-def reprojection_error(points: Tensor, target: Target) -> tuple[Tensor, Tensor]:
-    """Signed pixel residuals (n, 2) and camera coordinates (n, 3), all in fp32."""
+def reprojection_error(
+    points: Tensor, target: Target, lens: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Signed pixel residuals (n, 2) and camera coordinates (n, 3), all in fp32.
+
+    Args:
+        points: (n, 3) in the atlas.
+        target: where they must project to.
+        lens: (n, 5) correction of the nominal pinhole: relative focal length, shift of the principal
+            point in units of the focal length (x, y), OpenCV's k1 and k2.
+    """
     matrix = target.camera_from_atlas
     in_camera = torch.einsum("nij,nj->ni", matrix[:, :, :3], points) + matrix[:, :, 3]
     depth = in_camera[:, 2:].clamp(min=MIN_DEPTH_M)
-    projected = in_camera[:, :2] / depth * target.intrinsics[:, :2] + target.intrinsics[:, 2:]
+    plane = in_camera[:, :2] / depth
+    if lens is not None:
+        radius2 = (plane * plane).sum(-1, keepdim=True).clamp(max=MAX_RADIUS2)
+        bend = 1.0 + lens[:, 3:4] * radius2 + lens[:, 4:5] * radius2 * radius2
+        plane = plane * bend * (1.0 + lens[:, :1]) + lens[:, 1:3]
+    projected = plane * target.intrinsics[:, :2] + target.intrinsics[:, 2:]
     return projected - target.pixels, in_camera
 
 
 def reprojection_loss(
-    points: Tensor, target: Target, tau: float, options: LossOptions
+    points: Tensor,
+    target: Target,
+    tau: float,
+    options: LossOptions,
+    lens: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Loss of every row.
 
@@ -62,7 +81,7 @@ def reprojection_loss(
     Returns:
         loss (n,) and the L2 error in pixels (n,), infinite for invalid rows and without gradient.
     """
-    residual, in_camera = reprojection_error(points, target)
+    residual, in_camera = reprojection_error(points, target, lens)
     error = residual.abs().sum(-1)
     depth = in_camera[:, 2]
     valid = (depth > MIN_DEPTH_M) & (depth < MAX_DEPTH_M) & (error < MAX_ERROR_PX)

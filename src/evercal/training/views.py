@@ -37,14 +37,14 @@ class View:
     grey: np.ndarray
     """(h, w) uint8."""
     cell_pixels: np.ndarray
-    """(cells, 2) float32 pixels of the cell centres in an ideal pinhole with `intrinsics`;
-    row-major over the (h // stride, w // stride) grid."""
+    """(cells, 2) float32 pixels of the frame that the cells are centred on, in an ideal pinhole
+    with `intrinsics`; row-major over the (h // stride, w // stride) grid."""
     valid: np.ndarray
     """(cells,) bool: the cell shows something of the image."""
     intrinsics: np.ndarray
     """(4,) fx, fy, cx, cy of the ideal pinhole, pixels."""
     base_from_camera: SE3
-    """Pose of this view; identity where the frame has none."""
+    """Pose of the frame; identity where it has none."""
 
 
 def cell_centres(height: int, width: int, stride: int) -> np.ndarray:
@@ -86,7 +86,11 @@ def frame_view(frame: Frame, stride: int, options: ViewOptions) -> View:
 def augmented_view(
     frame: Frame, stride: int, options: ViewOptions, rng: np.random.Generator
 ) -> View:
-    """A random other view of a posed frame from the same camera centre, free of distortion."""
+    """A random other view of a posed frame from the same camera centre.
+
+    Its cells are given by the pixels of the original image that they show, so pose and intrinsics are
+    the frame's own.
+    """
     import cv2
 
     grey, camera = working_image(frame.read_image(), frame.camera, options.short_side)
@@ -97,6 +101,7 @@ def augmented_view(
     height, width = grey.shape
     virtual = Camera(width, height, zoom * camera.fx, zoom * camera.fy, camera.cx, camera.cy)
     homography = camera.matrix() @ camera_from_view @ np.linalg.inv(virtual.matrix())
+    turned = virtual.unproject(cell_centres(height, width, stride)) @ camera_from_view.T
     if camera.distortion:
         v, u = np.mgrid[0:height, 0:width]
         rays = virtual.unproject(np.stack([u, v], -1).astype(float)) @ camera_from_view.T
@@ -108,12 +113,12 @@ def augmented_view(
         warped = cv2.warpPerspective(grey, homography, size, flags=flags, borderMode=border)
     table = (np.arange(256) / 255.0) ** np.exp(rng.normal(0, options.gamma)) * 255
     warped = cv2.LUT(warped, table.astype(np.uint8))
-    pixels = cell_centres(height, width, stride)
-    source = camera.project(virtual.unproject(pixels) @ camera_from_view.T)
+    source = camera.project(turned)
     valid = np.all((source >= 0) & (source <= [width - 1, height - 1]), axis=-1)
+    rays = turned[:, :2] / turned[:, 2:]
+    pixels = rays * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     assert frame.base_from_camera is not None, "only posed frames can be learned"
-    pose = frame.base_from_camera @ turn
-    return View(warped, pixels.astype(np.float32), valid, _four(virtual), pose)
+    return View(warped, pixels.astype(np.float32), valid, _four(camera), frame.base_from_camera)
 
 
 def working_image(image: np.ndarray, camera: Camera, short_side: int) -> tuple[np.ndarray, Camera]:

@@ -1,0 +1,129 @@
+"""The command line: one verb, one file; `main` finds the verb, runs it and turns errors into lines.
+
+No verb imports torch before it runs, so that help and complaints about arguments come at once. Only
+`pretrain`, whose options are those of the training, does so for its own help.
+"""
+
+import contextlib
+import io
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from evercal.errors import InputError
+
+_DESCRIPTION = """Tells a robot where its camera is, from one image, and keeps learning new places.
+
+Exit codes: 0 done, 1 the answer is no, 2 misuse or bad input. 'evercal --version' prints the
+version."""
+
+
+class Command(Protocol):
+    """A verb with its arguments."""
+
+    def run(self) -> int:
+        """Does it and gives the exit code."""
+        ...
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command.
+
+    Args:
+        argv: the words after `evercal`; those of the process when None.
+
+    Returns:
+        The exit code: 0 done, 1 the answer is no, 2 misuse or bad input, 130 interrupted.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words == ["--version"]:
+        from evercal import __version__
+
+        print(f"evercal {__version__}")
+        return 0
+    as_json = "--json" in words
+    try:
+        command = _parse(words, as_json)
+        code = command if isinstance(command, int) else command.run()
+        sys.stdout.flush()  # here, where a closed pipe is understood
+        return code
+    except InputError as error:
+        return _complain(str(error), as_json)
+    except BrokenPipeError:
+        # The reader of our output has seen enough; a second attempt to write must not fail at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:  # a full disk, a folder that may not be written
+        where = f"{error.filename}: " if error.filename else ""
+        return _complain(f"{where}{error.strerror or error}", as_json)
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130
+
+
+def _complain(message: str, as_json: bool) -> int:
+    from evercal.cli.console import print_json
+
+    message = " ".join(message.split())
+    print(f"error: {message}", file=sys.stderr)
+    if as_json:
+        print_json({"error": message})
+    return 2
+
+
+def _verbs(first: str) -> dict[str, Any]:
+    """All verbs by name."""
+    from evercal.cli.demo import Demo
+    from evercal.cli.evaluate import Evaluate
+    from evercal.cli.info import Info, Verify
+    from evercal.cli.inspect import Inspect
+    from evercal.cli.learn import Learn
+    from evercal.cli.localize import Localize
+    from evercal.cli.pretrain import Pretrain, pretrain_with_options
+
+    return {
+        "demo": Demo,
+        "learn": Learn,
+        "localize": Localize,
+        "evaluate": Evaluate,
+        "info": Info,
+        "verify": Verify,
+        "inspect": Inspect,
+        "pretrain": pretrain_with_options() if first == "pretrain" else Pretrain,
+    }
+
+
+def _parse(words: list[str], as_json: bool) -> Command | int:
+    """The command that the words make, or the exit code where they make none."""
+    import tyro
+
+    caught = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(caught):
+            return tyro.extras.subcommand_cli_from_dict(
+                _verbs(words[0] if words else ""),
+                prog="evercal",
+                description=_DESCRIPTION,
+                args=words,
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as stop:
+        sys.stderr.write(caught.getvalue())
+        code = 0 if stop.code in (0, None) else 2
+        if code and as_json:
+            from evercal.cli.console import print_json
+
+            print_json({"error": _box_text(caught.getvalue())})
+        return code
+
+
+def _box_text(box: str) -> str:
+    """The first paragraph of tyro's framed message as one line."""
+    lines = [line.strip("│ ") for line in box.splitlines()]
+    text = []
+    for line in lines[1:]:
+        if line.startswith(("─", "╰")):
+            break
+        text.append(line)
+    return " ".join(text) or "unusable arguments"

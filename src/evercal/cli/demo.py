@@ -1,0 +1,190 @@
+"""`evercal demo`."""
+
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import arg
+
+from evercal.cli.console import print_json, print_next
+from evercal.errors import InputError
+
+if TYPE_CHECKING:
+    from evercal.continual.learn import StageOptions
+    from evercal.datasets import Scene
+    from evercal.localization.localizer import Localizer
+
+METHODS = {"evercal": "evercal", "finetune": "fine-tuning"}
+"""Strategies and what pictures call them."""
+STORE = "store"
+QUERY = "query.png"
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Learn two small virtual rooms one by one, with evercal and with plain fine-tuning."""
+
+    out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-demo")
+    """Folder for report.html, overview.png, a store and an image to try it with."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Takes some minutes on two cores."""
+        say = _quiet if self.json else print
+        outcome = run_demo(self.out, DemoOptions(), say)
+        if self.json:
+            print_json(outcome.to_dict())
+            return 0
+        print(outcome.table())
+        print(f"wrote {self.out / 'report.html'} and {self.out / 'overview.png'}")
+        print_next("evercal", "localize", self.out / STORE, self.out / QUERY)
+        return 0
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """How much the demo does."""
+
+    seeds: tuple[int, ...] = (41, 42)
+    """Of the rooms, two or more."""
+    train_frames: int = 120
+    """Per room."""
+    test_frames: int = 40
+    """Per room."""
+    stage: "StageOptions | None" = None
+    """How a room is learned; the preset `demo` when None."""
+
+
+@dataclass
+class DemoOutcome:
+    """What came out."""
+
+    rooms: list[str]
+    """In order of learning."""
+    accuracy: dict[str, list[list[float]]] = field(default_factory=dict)
+    """Per strategy: row i after stage i, column j room j; per cent within 5 cm and 5 deg."""
+    seconds: dict[str, list[float]] = field(default_factory=dict)
+    """Per strategy: of learning each room."""
+    memory_bytes: int = 0
+    """What `evercal` remembers of all rooms."""
+
+    def to_dict(self) -> dict[str, object]:
+        """Plain values for JSON; row i of an accuracy has the i rooms learned so far."""
+        return {
+            "rooms": self.rooms,
+            "accuracy_5cm_5deg": self.accuracy,
+            "seconds": self.seconds,
+            "memory_bytes": self.memory_bytes,
+        }
+
+    def rows(self) -> list[list[str]]:
+        """Method, stage, and the accuracy on each room."""
+        rows = []
+        for method, matrix in self.accuracy.items():
+            for i, accuracies in enumerate(matrix):
+                cells = [f"{value:.1f}" for value in accuracies]
+                blanks = [""] * (len(self.rooms) - len(cells))
+                rows.append([METHODS[method], f"+ {self.rooms[i]}", *cells, *blanks])
+        return rows
+
+    def table(self) -> str:
+        """The same for the terminal."""
+        from tabulate import tabulate
+
+        header = ["method", "after", *(f"{room} %" for room in self.rooms)]
+        align = ("left", "left", *("right" for _ in self.rooms))
+        text = tabulate(self.rows(), headers=header, colalign=align, disable_numparse=True)
+        return f"test frames within 5 cm and 5 deg\n{text}"
+
+
+def _quiet(line: str) -> None:
+    """In place of `print` where stdout is for JSON."""
+
+
+def run_demo(out: Path, options: DemoOptions, say: Callable[[str], None] = _quiet) -> DemoOutcome:
+    """Learns the rooms with both methods, evaluates after each, and writes pictures and report.
+
+    Args:
+        out: folder for the results; made when missing, results of an earlier demo are replaced.
+        options: how much.
+        say: told in a line what comes next.
+
+    Raises:
+        InputError: `out` holds something else under a name that the demo needs.
+    """
+    from evercal.cli.demo_page import write_pictures
+    from evercal.datasets import write_image
+    from evercal.localization.localizer import Localizer
+    from evercal.simulation.box_room import box_room_scene
+    from evercal.storage import MANIFEST, replace_folder
+
+    store = out / STORE
+    if store.exists() and not (store / MANIFEST).is_file():
+        raise InputError(f"{store}: exists and is not an evercal store; give another --out")
+    out.mkdir(parents=True, exist_ok=True)
+    say(f"making {len(options.seeds)} virtual rooms")
+    frames = options.train_frames, options.test_frames
+    scenes = [box_room_scene(seed, *frames) for seed in options.seeds]
+    outcome = DemoOutcome([scene.name for scene in scenes])
+    work = Path(tempfile.mkdtemp(prefix=".demo-", dir=out))
+    try:
+        # Stage 1 is the same training twice: a store says which strategy it was made with.
+        for method in METHODS:
+            _run_method(work / method, method, scenes, options, outcome, say)
+        replace_folder(work / "evercal", store)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    localizer = Localizer.open(store)
+    write_pictures(out, localizer, scenes, outcome)
+    middle = scenes[0].test[len(scenes[0].test) // 2]
+    write_image(out / QUERY, middle.read_image())
+    return outcome
+
+
+def _run_method(
+    store: Path,
+    method: str,
+    scenes: "list[Scene]",
+    options: DemoOptions,
+    outcome: DemoOutcome,
+    say: Callable[[str], None],
+) -> None:
+    from evercal.cli.learn import LearnBars
+    from evercal.continual.presets import preset
+    from evercal.localization.localizer import Localizer
+    from evercal.localization.teach import LearnOptions, learn_scene
+
+    how = LearnOptions(options.stage or preset("demo"), method)
+    outcome.accuracy[method], outcome.seconds[method] = [], []
+    for i, scene in enumerate(scenes):
+        say(f"{METHODS[method]}: learning {scene.name}")
+        began = time.perf_counter()
+        with LearnBars() as bars:
+            report = learn_scene(store, scene, how, bars)
+        outcome.seconds[method].append(time.perf_counter() - began)
+        if method == "evercal":
+            outcome.memory_bytes = report.memory_bytes
+        row = _accuracies(Localizer.open(store), scenes[: i + 1])
+        outcome.accuracy[method].append(row)
+
+
+def _accuracies(localizer: "Localizer", scenes: "list[Scene]") -> list[float]:
+    """Per cent of test frames within 5 cm and 5 deg, for each scene."""
+    from evercal.cli.console import progress_bar
+    from evercal.evaluation import evaluate, scores
+
+    count = sum(len(scene.test) for scene in scenes)
+    with progress_bar("evaluating", count, "image") as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.update(done - bar.n)
+
+        named = {scene.name: scene for scene in scenes}
+        results = evaluate(localizer, named, on_frame=show)
+    rows = scores(results).scenes
+    return [rows[scene.name].accuracy_5cm_5deg for scene in scenes]

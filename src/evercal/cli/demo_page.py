@@ -1,0 +1,123 @@
+"""The pictures and the report of `evercal demo`."""
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from evercal.cli.demo import METHODS
+from evercal.cli.pictures import draw_estimate
+
+if TYPE_CHECKING:
+    from evercal.cli.demo import DemoOutcome
+    from evercal.datasets import Scene
+    from evercal.localization.localizer import Localizer
+
+_COLOURS = ("#0072B2", "#D55E00")
+_OVERLAYS_PER_ROOM = 3
+
+
+def write_pictures(
+    out: Path, localizer: "Localizer", scenes: "list[Scene]", outcome: "DemoOutcome"
+) -> None:
+    """Writes `overview.png` and `report.html`.
+
+    Args:
+        out: folder, there already.
+        localizer: evercal's after the last room.
+        scenes: the rooms.
+        outcome: what was measured.
+    """
+    from evercal.drawing import Picture, Section, Table, encode_image, forgetting_curves, html_page
+    from evercal.storage import write_bytes
+
+    overlays = _overlays(localizer, scenes)
+    shown = [overlays[i * _OVERLAYS_PER_ROOM] for i in range(2)]
+    overview = _overview(shown, outcome)
+    write_bytes(out / "overview.png", overview)
+    rooms = outcome.rooms
+    curves = {METHODS[key]: _square(rows, len(rooms)) for key, rows in outcome.accuracy.items()}
+    header = ["method", "after", *(f"{room} %" for room in rooms)]
+    seconds = [second for times in outcome.seconds.values() for second in times]
+    intro = (
+        f"{len(rooms)} virtual rooms were learned one after the other, from {len(scenes[0].train)}"
+        f" posed images each, by one small network. Fine-tuning is the same network and the same"
+        f" number of steps without anything to remember by. A room took {np.mean(seconds):.0f} s on"
+        f" average; evercal keeps {outcome.memory_bytes / 1e6:.1f} MB of the rooms in memory. At"
+        f" test time nothing says which room an image is from."
+    )
+    sheets = [
+        Picture(
+            encode_image(_sheet(overlays), "jpg"), "Test images with the scene points that agree"
+        )
+    ]
+    sections = [
+        Section("", [intro, Picture(overview, "Left: two test images; right: the first room")]),
+        Section(
+            "Accuracy after each room",
+            [
+                Table(header, outcome.rows(), "Test frames within 5 cm and 5 deg, per cent"),
+                Picture(forgetting_curves(curves, rooms), "What became of each room"),
+            ],
+        ),
+        Section("Predicted points", sheets),
+    ]
+    write_bytes(out / "report.html", html_page("evercal demo", sections).encode())
+
+
+def _square(rows: list[list[float]], count: int) -> np.ndarray:
+    matrix = np.full((count, count), np.nan)
+    for i, row in enumerate(rows):
+        matrix[i, : len(row)] = row
+    return matrix
+
+
+def _overlays(localizer: "Localizer", scenes: "list[Scene]") -> list[tuple[str, np.ndarray]]:
+    """Captions and images, room by room: test frames spread over the recording."""
+    found = []
+    for scene in scenes:
+        places = np.linspace(0, len(scene.test), _OVERLAYS_PER_ROOM, endpoint=False)
+        for place in places + len(scene.test) / (2 * _OVERLAYS_PER_ROOM):
+            frame = scene.test[int(place)]
+            image = frame.read_image()
+            estimate = localizer.localize(image, frame.camera)
+            said = estimate.scene or estimate.status.replace("_", " ")
+            drawn = draw_estimate(image, estimate, frame.camera)
+            found.append((f"{said}, {100 * estimate.inlier_ratio:.0f} % inliers", drawn))
+    return found
+
+
+def _sheet(overlays: list[tuple[str, np.ndarray]]) -> np.ndarray:
+    from evercal.drawing import contact_sheet
+
+    captions = [caption for caption, _ in overlays]
+    return contact_sheet([image for _, image in overlays], _OVERLAYS_PER_ROOM, captions)
+
+
+def _overview(shown: list[tuple[str, np.ndarray]], outcome: "DemoOutcome") -> bytes:
+    """Two images with points, and what became of the first room with both methods, as a PNG."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.1), dpi=130, layout="constrained", facecolor="white")
+    panels = figure.subplots(1, 3, width_ratios=(1.35, 1.35, 1))
+    for panel, (caption, image) in zip(panels, shown, strict=False):
+        panel.imshow(image)
+        panel.set_title(f"located in {caption}" if "box" in caption else caption, fontsize=9)
+        panel.set_axis_off()
+    bars = panels[2]
+    first, last = outcome.rooms[0], outcome.rooms[-1]
+    for i, (method, rows) in enumerate(outcome.accuracy.items()):
+        heights = [rows[0][0], rows[-1][0]]
+        places = np.arange(2) + 0.4 * (i - 0.5)
+        drawn = bars.bar(places, heights, 0.38, color=_COLOURS[i], label=METHODS[method])
+        bars.bar_label(drawn, fmt="%.0f", fontsize=9)
+    bars.set_xticks([0, 1], [f"after learning\n{first}", f"after learning\n{last}"], fontsize=9)
+    bars.set_ylim(0, 112)
+    bars.set_yticks([0, 50, 100])
+    bars.set_title(f"{first}: test images within 5 cm, 5 deg (%)", fontsize=9)
+    bars.spines[["top", "right"]].set_visible(False)
+    bars.legend(frameon=False, fontsize=9, loc="lower left")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()

@@ -1,0 +1,107 @@
+"""`evercal info` and `evercal verify`."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from evercal.cli.console import print_json, print_next, size
+
+
+@dataclass(frozen=True)
+class Info:
+    """Say what a store knows and how large it is."""
+
+    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    """Folder of the store."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Opens the store and describes it."""
+        from evercal.continual.robot import Robot, head_bytes
+
+        robot = Robot.open(self.store)
+        known, used = robot.known, robot.bytes()
+        scenes = [
+            {
+                "name": record.name,
+                "train_frames": record.train_frames,
+                "memory_bytes": memory.bytes if memory is not None else 0,
+                "inlier_threshold": record.inlier_threshold,
+                "camera": record.camera.to_dict(),
+                "cell": asdict(record.cell),
+            }
+            for record, memory in zip(known.scenes, known.memories, strict=True)
+        ]
+        heads = sum(head_bytes(head) for head in known.heads)
+        content = {
+            "store": str(self.store),
+            "strategy": known.strategy,
+            "short_side": known.short_side,
+            "head_bytes": heads,
+            "memory_bytes": used["memory"],
+            "total_bytes": used["memory"] + used["rest"],
+            "scenes": scenes,
+        }
+        if self.json:
+            print_json(content)
+            return 0
+        print(
+            f"{self.store}: {len(scenes)} scene{'s' if len(scenes) != 1 else ''}, strategy"
+            f" {known.strategy}, images at {known.short_side} px"
+        )
+        print(
+            f"{size(used['memory'] + used['rest'])} in all: head {size(heads)},"
+            f" memory {size(used['memory'])}, the rest encoder and prototypes"
+        )
+        self._table(scenes)
+        print_next("evercal", "verify", self.store)
+        return 0
+
+    def _table(self, scenes: list[dict]) -> None:
+        from tabulate import tabulate
+
+        rows = [
+            [
+                scene["name"],
+                scene["train_frames"],
+                size(scene["memory_bytes"]),
+                f"{100 * scene['inlier_threshold']:.0f} %",
+                f"{scene['camera']['width']}x{scene['camera']['height']}",
+            ]
+            for scene in scenes
+        ]
+        header = ["scene", "frames learned", "memory", "believed from inliers", "camera"]
+        align = ("left", "right", "right", "right", "right")
+        print(tabulate(rows, headers=header, colalign=align, disable_numparse=True))
+
+
+@dataclass(frozen=True)
+class Verify:
+    """Check every file of a store against its checksum."""
+
+    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    """Folder of the store."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Names every problem; exit code 1 if there is one."""
+        from evercal.storage import verify
+
+        problems = verify(self.store)
+        if self.json:
+            print_json({"store": str(self.store), "ok": not problems, "problems": problems})
+            return 1 if problems else 0
+        for problem in problems:
+            print(problem)
+        if problems:
+            files = "1 file is" if len(problems) == 1 else f"{len(problems)} files are"
+            print(f"{files} damaged; restore from a copy of the store")
+            print_next("evercal", "verify", self.store)
+            return 1
+        print(f"{self.store}: all files are as they were written")
+        print_next("evercal", "localize", self.store, "IMAGE")
+        return 0

@@ -1,0 +1,53 @@
+"""`evercal inspect`."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from evercal.cli.console import print_json, print_next
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """Describe a recorded scene and point out what looks wrong, before time is spent on it."""
+
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
+    """Folder of the recorded scene."""
+    format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """Format of the folder, generic or 7scenes; recognised when left out."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Reads the scene and the first image of every camera."""
+        from evercal.cli.inspection import inspect_scene
+        from evercal.datasets import load_scene
+
+        scene = load_scene(self.scene, self.format)
+        found = inspect_scene(scene)
+        if self.json:
+            print_json(asdict(found))
+            return 0
+        extent = " x ".join(f"{side:.2f}" for side in found.extent_m)
+        print(f"{found.name}: {found.train} training and {found.test} test frames")
+        print(f"  without a pose  {found.untracked}")
+        for lens in found.cameras:
+            print(f"  camera          {lens}")
+        print(f"  camera moved in {extent} m (training frames)")
+        if found.step_median_m is not None and found.step_largest_m is not None:
+            print(
+                f"  frame to frame  {100 * found.step_median_m:.1f} cm"
+                f" and {found.step_median_deg:.1f} deg (median),"
+                f" {found.step_largest_m:.2f} m at most"
+            )
+        if found.near_training is not None:
+            print(
+                f"  near training   {found.near_training:.1f} % of the test frames lie within 5 cm"
+                f" and 5 deg of a training frame"
+            )
+        for warning in found.warnings:
+            print(f"warning: {warning}")
+        print_next("evercal", "learn", "STORE", self.scene)
+        return 0

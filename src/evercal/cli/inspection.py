@@ -1,0 +1,194 @@
+"""What a recorded scene looks like, and what looks wrong about it."""
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from evercal.datasets import Frame, Scene
+from evercal.evaluation import near_training
+from evercal.geometry import SE3, Camera, pose_distance
+
+FEWEST_FRAMES = 16
+SAME_M, SAME_DEG = 0.001, 0.1
+LARGEST_EXTENT_M = 100.0
+LARGEST_STEP_M = 0.5
+SMALLEST_EXTENT_M = 0.05
+LARGEST_ROLL_DEG = 20.0
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What a recorded scene looks like."""
+
+    name: str
+    """Its own name."""
+    train: int
+    """Training frames with a pose."""
+    test: int
+    """Test frames with a pose."""
+    untracked: int
+    """Frames without a usable pose."""
+    cameras: tuple[str, ...]
+    """One line for each set of intrinsics."""
+    extent_m: tuple[float, float, float]
+    """Sides of the box around the training camera positions, metres."""
+    step_median_m: float | None
+    """Median distance between consecutive training frames, metres; None for fewer than two."""
+    step_median_deg: float | None
+    """The same as an angle."""
+    step_largest_m: float | None
+    """Largest distance between consecutive training frames, metres."""
+    near_training: float | None
+    """Per cent of test frames with a training frame within 5 cm and 5 deg; None without any."""
+    warnings: tuple[str, ...]
+    """What looks wrong."""
+
+
+def inspect_scene(scene: Scene) -> Inspection:
+    """Looks at a scene's poses and cameras and at one image of every camera.
+
+    Raises:
+        InputError: An image that cannot be read or has not its camera's size.
+    """
+    train = [f for f in scene.train if f.base_from_camera is not None]
+    test = [f for f in scene.test if f.base_from_camera is not None]
+    cameras = Counter(frame.camera for frame in (*scene.train, *scene.test))
+    for camera in cameras:
+        next(f for f in (*scene.train, *scene.test) if f.camera == camera).read_image()
+    poses, tested = _poses(train), _poses(test)
+    metres = radians = None
+    if len(train) > 1:
+        metres, radians = pose_distance(poses[:-1], poses[1:])
+    extent = np.ptp(poses.translation_m, axis=0) if len(train) else np.zeros(3)
+    near = 100 * float(near_training(poses, tested).mean()) if train and test else None
+    lost = scene.untracked + len(scene.train) + len(scene.test) - len(train) - len(test)
+    warnings = [*_warn_frames(len(train), len(test), lost), *_warn_cameras(cameras)]
+    if len(train) > 1 and metres is not None:
+        warnings += _warn_motion(poses, extent, float(np.median(metres)))
+    if train and test:
+        warnings += _warn_copies(train, test)
+    x, y, z = extent.tolist()
+    return Inspection(
+        scene.name,
+        len(train),
+        len(test),
+        lost,
+        tuple(_describe(camera, count) for camera, count in cameras.items()),
+        (x, y, z),
+        float(np.median(metres)) if metres is not None else None,
+        float(np.rad2deg(np.median(radians))) if radians is not None else None,
+        float(metres.max()) if metres is not None else None,
+        near,
+        tuple(warnings),
+    )
+
+
+def _poses(frames: list[Frame]) -> SE3:
+    return SE3.stack([f.base_from_camera for f in frames if f.base_from_camera is not None])
+
+
+def _describe(camera: Camera, count: int) -> str:
+    lens = f"distortion {' '.join(f'{k:g}' for k in camera.distortion)}"
+    return (
+        f"{camera.width}x{camera.height}, fx {camera.fx:.1f} fy {camera.fy:.1f} cx {camera.cx:.1f}"
+        f" cy {camera.cy:.1f}, {lens if any(camera.distortion) else 'no distortion'};"
+        f" {count} frames"
+    )
+
+
+def _warn_frames(train: int, test: int, lost: int) -> list[str]:
+    found = []
+    if train < FEWEST_FRAMES:
+        found.append(f"{train} training frames with a pose; learning takes {FEWEST_FRAMES} or more")
+    if not test:
+        found.append("no test frame with a pose; 'evercal evaluate' has nothing to measure on")
+    if lost > (train + test + lost) / 2:
+        found.append(f"{lost} of {train + test + lost} frames have no pose; check the tracking")
+    return found
+
+
+def _warn_cameras(cameras: Counter[Camera]) -> list[str]:
+    found = []
+    for camera in cameras:
+        name = f"camera {camera.width}x{camera.height}"
+        off = (
+            abs((camera.cx + 0.5) / camera.width - 0.5),
+            abs((camera.cy + 0.5) / camera.height - 0.5),
+        )
+        view = np.rad2deg(2 * np.arctan(camera.width / (2 * camera.fx)))
+        if max(off) > 0.2:
+            found.append(
+                f"{name}: principal point ({camera.cx:.0f}, {camera.cy:.0f}) is far from the"
+                f" middle; are the intrinsics those of this image size?"
+            )
+        if not 20 < view < 150:
+            found.append(
+                f"{name}: sees {view:.0f} deg across; are the intrinsics those of this image size?"
+            )
+        if not 0.8 < camera.fx / camera.fy < 1.25:
+            found.append(
+                f"{name}: fx {camera.fx:.0f} and fy {camera.fy:.0f} differ; square pixels?"
+            )
+    return found
+
+
+def _warn_motion(poses: SE3, extent: np.ndarray, step: float) -> list[str]:
+    found = []
+    _, turned = pose_distance(poses[0], poses)
+    if extent.max() < SAME_M:
+        found.append("all training frames stand at one point; a map takes views from several")
+    elif extent.max() < SMALLEST_EXTENT_M:
+        found.append(
+            f"the training camera moves by {100 * extent.max():.1f} cm only; points may get no"
+            f" depth. Are the translations in metres?"
+        )
+    if np.rad2deg(turned.max()) < SAME_DEG:
+        found.append("all training frames look the same way; are the rotations missing?")
+    if extent.max() > LARGEST_EXTENT_M:
+        found.append(f"the camera moves over {extent.max():.0f} m; are the poses in millimetres?")
+    elif step > LARGEST_STEP_M:
+        found.append(
+            f"consecutive frames are {step:.2f} m apart; are they in recorded order and in metres?"
+        )
+    roll = roll_deg(poses)
+    if roll > LARGEST_ROLL_DEG:
+        found.append(
+            f"the cameras are rolled by {roll:.0f} deg (rms) about their viewing axes, which robots"
+            f" and hands hardly do; are quaternions in the order w x y z, poses base_from_camera?"
+        )
+    return found
+
+
+def roll_deg(poses: SE3) -> float:
+    """How far the images' horizontals stray from one common plane, degrees (root mean square).
+
+    Cameras that are carried about stay near upright: their x axes are all perpendicular to one
+    direction, gravity, wherever they look. That direction is fitted here. Little turning cannot
+    raise suspicion, since a plane is then always near.
+    """
+    right = poses.rotation_matrix()[:, :, 0]
+    smallest = np.linalg.eigvalsh(right.T @ right / len(right))[0]
+    return float(np.rad2deg(np.arcsin(np.sqrt(np.clip(smallest, 0, 1)))))
+
+
+def _warn_copies(train: list[Frame], test: list[Frame]) -> list[str]:
+    """Test frames that are training frames: the same file, or the very same pose."""
+    from scipy.spatial import KDTree
+
+    files = {f.image for f in train if isinstance(f.image, Path)}
+    poses, tested = _poses(train), _poses(test)
+    close = KDTree(poses.translation_m).query_ball_point(tested.translation_m, SAME_M)
+    copies = 0
+    for i, frame in enumerate(test):
+        same = isinstance(frame.image, Path) and frame.image in files
+        if not same and close[i]:
+            same = bool(np.rad2deg(pose_distance(tested[i], poses[close[i]])[1]).min() < SAME_DEG)
+        copies += same
+    if copies < max(1, len(test) / 10):
+        return []
+    return [
+        f"{copies} of {len(test)} test frames have the pose or the file of a training frame;"
+        f" accuracy on them says nothing"
+    ]

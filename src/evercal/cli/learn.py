@@ -1,0 +1,243 @@
+"""`evercal learn`."""
+
+import dataclasses
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, TextIO
+
+from tyro.conf import Positional, arg
+
+from evercal.cli.console import print_json, print_next, progress_bar, size
+from evercal.errors import InputError
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from tqdm import tqdm
+
+    from evercal.continual.learn import Checkpoint, Encoding
+    from evercal.datasets import Scene
+    from evercal.localization.teach import LearnOptions
+    from evercal.training.fit import Progress
+
+_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
+_UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
+
+
+@dataclass(frozen=True)
+class Learn:
+    """Learn a scene into a store without spoiling the scenes it knows; goes on after a stop."""
+
+    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    """Folder of the store; made when it is missing."""
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
+    """Folder of the recorded scene."""
+    name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """What the scene is called in the store; its own name when left out."""
+    strategy: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """evercal (if new), finetune, sars_spdd, sars_spdd_filled or isolation; a store keeps it."""
+    preset: Literal["fast", "demo", "bench", "paper"] = "fast"
+    """How much work: fast takes minutes on two cores, demo and bench less, paper wants a GPU."""
+    memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
+    """What is remembered of the scene: a share of its frames (10%) or bytes (5MB)."""
+    centres: Annotated[int | None, arg(metavar="M", help_behavior_hint="")] = None
+    """Cluster centres that a scene adds to the network; the preset's number when left out."""
+    encoder: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Encoder weights from 'evercal pretrain', for a new store; else the shipped ones."""
+    format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """Format of the scene folder, generic or 7scenes; recognised when left out."""
+    seed: int = 0
+    """Of everything that is drawn."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Learns, shows how it goes, and says what came out."""
+        share, count = parse_memory(self.memory)
+        if self.centres is not None and self.centres < 1:
+            raise InputError(f"--centres {self.centres}: give a number >= 1")
+        if self.seed < 0:
+            raise InputError(f"--seed {self.seed}: give a number >= 0")
+        from evercal.datasets import load_scene
+        from evercal.localization.teach import hold_out, learn_scene
+
+        scene = posed(load_scene(self.scene, self.format, self.name))
+        check_name(scene.name)
+        options = self._options(share, count)
+        held_out = len(hold_out(scene.train)[1])
+        start = (
+            f"{scene.name}: {len(scene.train)} training frames, {scene.untracked} untracked left"
+            f" out, {held_out} held out to learn what is unknown"
+        )
+        try:
+            with LearnBars(start, sys.stderr if self.json else sys.stdout) as bars:
+                report = learn_scene(self.store, scene, options, bars)
+        except KeyboardInterrupt:
+            print("stopped; the same command continues where it stopped", file=sys.stderr)
+            return 130
+        if self.json:
+            print_json(dataclasses.asdict(report))
+            return 0
+        print(
+            f"{scene.name}: learned in {report.seconds:.0f} s and {report.iterations} steps;"
+            f" memory {size(report.memory_bytes)} ({report.frames_kept} frames of this scene),"
+            f" head {size(report.head_bytes)}"
+        )
+        print(f"a pose is believed from {100 * report.inlier_threshold:.0f} % inliers on")
+        if scene.test:
+            print_next("evercal", "evaluate", self.store, self._scene_word(scene.name))
+        else:
+            print_next("evercal", "localize", self.store, "IMAGE")
+        return 0
+
+    def _scene_word(self, name: str) -> str:
+        return str(self.scene) if self.name is None else f"{name}={self.scene}"
+
+    def _options(self, share: float | None, count: int | None) -> "LearnOptions":
+        from evercal.continual.presets import preset
+        from evercal.localization.teach import LearnOptions
+
+        if self.encoder is not None and not self.encoder.is_file():
+            raise InputError(f"--encoder {self.encoder}: no such file")
+        stage = preset(self.preset, self.seed)
+        stage = dataclasses.replace(stage, memory_bytes=count)
+        if share is not None:
+            stage = dataclasses.replace(stage, memory_share=share)
+        if self.centres is not None:
+            head = dataclasses.replace(stage.head, centres_per_scene=self.centres)
+            stage = dataclasses.replace(stage, head=head)
+        return LearnOptions(stage, self._strategy(), self.encoder)
+
+    def _strategy(self) -> str:
+        """The strategy asked for, else the store's; refuses what a store cannot change later."""
+        from evercal.continual.robot import Robot
+        from evercal.continual.strategies import STRATEGIES
+        from evercal.storage import MANIFEST
+
+        if self.strategy is not None:
+            usable = [name for name, entry in STRATEGIES.items() if entry.data == "stage"]
+            if self.strategy in STRATEGIES and self.strategy not in usable:
+                raise InputError(
+                    f"--strategy {self.strategy}: needs the recordings of all scenes at once, so it"
+                    f" is for the benchmark only; use one of {', '.join(usable)}"
+                )
+            if self.strategy not in usable:
+                raise InputError(f"--strategy {self.strategy}: unknown; use {', '.join(usable)}")
+        if not (self.store / MANIFEST).exists():
+            return self.strategy or "evercal"
+        known = Robot.open(self.store).known
+        if self.encoder is not None:
+            raise InputError(
+                f"--encoder {self.encoder}: {self.store} keeps the encoder it was made with; leave"
+                f" the option out or start a new store"
+            )
+        made_with = known.heads[-1].options.centres_per_scene if known.heads else self.centres
+        shared = STRATEGIES[known.strategy].heads == "one"
+        if shared and self.centres is not None and self.centres != made_with:
+            raise InputError(
+                f"--centres {self.centres}: {self.store} was made with {made_with} for each scene;"
+                f" leave the option out or start a new store"
+            )
+        return self.strategy or known.strategy
+
+
+def parse_memory(text: str) -> tuple[float | None, int | None]:
+    """(share of the frames, None) of `10%`, or (None, bytes) of `5MB`, `512KiB`, `100000`.
+
+    Raises:
+        InputError: Neither, or nothing at all to remember in.
+    """
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(%|[kmg]?i?b?)\s*", text, re.IGNORECASE)
+    unit = match[2].upper() if match else ""
+    if match and unit == "%" and 0 < float(match[1]) <= 100:
+        return float(match[1]) / 100, None
+    if match and unit in _UNITS and float(match[1]) * _UNITS[unit] >= 1:
+        return None, int(float(match[1]) * _UNITS[unit])
+    raise InputError(
+        f"--memory {text}: give a share of the frames above 0% and up to 100%, or bytes such as"
+        f" 500kB, 5MB or 5MiB"
+    )
+
+
+def check_name(name: str) -> None:
+    """Refuses scene names that are no single word of a path or clash with NAME=SCENE.
+
+    Raises:
+        InputError: Such a name.
+    """
+    if not name.strip() or name.startswith(".") or re.search(r"[/\\=\x00-\x1f]", name):
+        raise InputError(
+            f"scene name {name!r}: give one with --name that is not empty, does not begin with a"
+            f" dot and holds no slash, '=' or line break"
+        )
+
+
+def posed(scene: "Scene") -> "Scene":
+    """The scene without training frames that have no pose, which count as untracked."""
+    train = tuple(frame for frame in scene.train if frame.base_from_camera is not None)
+    lost = len(scene.train) - len(train)
+    return dataclasses.replace(scene, train=train, untracked=scene.untracked + lost)
+
+
+class LearnBars:
+    """Shows the events of learning as progress bars on stderr; a context that closes them.
+
+    Args:
+        start: a line to print before the first bar, once learning has really begun.
+        stream: where to; stdout when None.
+    """
+
+    def __init__(self, start: str = "", stream: TextIO | None = None):
+        self._start, self._stream = start, stream
+        self._bar: tqdm | None = None
+        self._training = False
+
+    def __enter__(self) -> "LearnBars":
+        """Nothing is shown yet: bad input is to be told without anything before it."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: "TracebackType | None",
+    ) -> None:
+        """Ends the last bar's line."""
+        self._close()
+
+    def __call__(self, event: "Encoding | Progress | Checkpoint") -> None:
+        """Takes one event."""
+        from evercal.continual.learn import Encoding
+        from evercal.training.fit import Progress
+
+        if self._start:
+            print(self._start, file=self._stream, flush=True)
+            self._start = ""
+        if isinstance(event, Progress):
+            bar = self._at(event.step, event.total, training=True)
+            text = f"loss {event.loss:.1f}, {100 * event.inlier_share:.0f} % inliers"
+            bar.set_postfix_str(text, refresh=event.step == event.total)
+            if event.step == event.total:  # what follows takes a while and is not training
+                self._close()
+        elif isinstance(event, Encoding):
+            self._at(event.done, event.total, training=False)
+
+    def _at(self, done: int, total: int, training: bool) -> "tqdm":
+        """The bar moved to `done`; a new one where another task begins."""
+        bar = self._bar
+        if bar is None or training != self._training or total != bar.total or done <= bar.n:
+            self._close()
+            what, unit = ("training", "step") if training else ("encoding", "image")
+            # A resumed task begins where it stood; what was done before must not count as speed.
+            first = done if done > (1 if training else 8) else 0
+            self._training, self._bar = training, progress_bar(what, total, unit, first)
+            bar = self._bar
+        bar.update(done - bar.n)
+        return bar
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None

@@ -1,0 +1,49 @@
+"""`evercal pretrain`."""
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import arg
+
+from evercal.cli.console import print_json, print_next
+
+
+@dataclass(frozen=True)
+class Pretrain:
+    """Make the weights of encoder and descriptor anew from procedural images; takes hours."""
+
+    out: Annotated[Path, arg(metavar="FOLDER")]
+    """Folder for encoder.safetensors, descriptor.safetensors and pretrain.log."""
+    work: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """Folder for checkpoints, from which the same command continues; OUT/work when left out."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+def pretrain_with_options() -> type:
+    """The verb with the options of the training, whose module imports torch."""
+    from evercal.pretraining.contrastive import PretrainOptions
+
+    @dataclass(frozen=True)
+    class PretrainWithOptions(Pretrain):
+        options: Annotated[PretrainOptions, arg(name="")] = field(default_factory=PretrainOptions)
+        """What is trained."""
+
+        def run(self) -> int:
+            """Trains; the log goes to stderr."""
+            from evercal.pretraining.make import pretrain
+
+            began = time.perf_counter()
+            pretrain(self.out, self.work or self.out / "work", self.options)
+            encoder = self.out / "encoder.safetensors"
+            if self.json:
+                seconds = time.perf_counter() - began
+                print_json({"encoder": str(encoder), "seconds": seconds})
+            else:
+                print_next("evercal", "learn", "STORE", "SCENE", "--encoder", encoder)
+            return 0
+
+    PretrainWithOptions.__doc__ = Pretrain.__doc__
+    return PretrainWithOptions

@@ -1,0 +1,97 @@
+"""`evercal evaluate`: the JSON that other programs read, names of scenes, the report."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evercal.cli.evaluate import load_named
+from evercal.cli.evaluate_page import Watch
+from evercal.datasets import load_scene
+from evercal.errors import InputError
+from evercal.evaluation import evaluate
+from evercal.localization.localizer import Localizer
+
+
+def test_json_is_the_contract(run: Any, store: Path, rooms: Any) -> None:
+    ran = run("evaluate", store, f"box-room-41={rooms[0]}", "--json")
+    scores = json.loads(ran.out)
+    assert ran.code == 0
+    assert ran.err == []
+    assert scores.keys() == {"scenes", "mean_accuracy_5cm_5deg", "ms_per_image"}
+    assert scores["scenes"].keys() == {"box-room-41"}
+    assert scores["scenes"]["box-room-41"].keys() == {
+        "frames",
+        "accuracy_5cm_5deg",
+        "accuracy_1cm_1deg",
+        "median_translation_cm",
+        "median_rotation_deg",
+        "wrong_scene",
+        "unknown",
+        "near_training_frame",
+    }
+    assert scores["scenes"]["box-room-41"]["frames"] == 6
+
+
+def test_table_and_report(run: Any, store: Path, rooms: Any, tmp_path: Path) -> None:
+    ran = run("evaluate", store, rooms[0], "--report", tmp_path / "r.html")
+    assert ran.code == 0
+    assert "box-room-41" in ran.out
+    assert ran.out.splitlines()[-1].startswith("next: evercal ")
+    page = (tmp_path / "r.html").read_text()
+    assert page.count('<img src="data:image/') == 3  # errors, one trajectory, worst frames
+    assert not re.search(r"(?:src|href)=\"(?!data:)", page)
+
+
+def test_the_watch_keeps_the_pose_of_every_frame(store: Path, rooms: Any) -> None:
+    localizer, scene = Localizer.open(store), load_scene(rooms[0])
+    watch = Watch(localizer, {"box-room-41": scene})
+    results = evaluate(watch, watch.watched)
+    assert [r.frame for r in results] == [f.name for f in scene.test]
+    found = 0
+    for frame, watched in zip(scene.test, watch.watched["box-room-41"].test, strict=True):
+        expected = localizer.localize(frame.read_image(), frame.camera).base_from_camera
+        seen = watch.found(watched)
+        assert (seen is None) == (expected is None)
+        if seen is not None and expected is not None:
+            np.testing.assert_array_equal(seen.matrix(), expected.matrix())
+            found += 1
+    assert found  # else nothing was tested
+
+
+def test_names_are_the_scenes_own_or_given(rooms: Any, tmp_path: Path) -> None:
+    odd = tmp_path / "a=b"
+    shutil.copytree(rooms[0], odd)
+    assert list(load_named((str(rooms[0]), f"other={rooms[0]}"))) == ["box-room-41", "other"]
+    assert list(load_named((str(odd),))) == ["box-room-41"]
+    assert list(load_named((f"x={odd}",))) == ["x"]
+    with pytest.raises(InputError, match="given twice"):
+        load_named((str(rooms[0]), str(odd)))
+
+
+@pytest.mark.parametrize("kind", ["none", "missing", "unknown", "no poses", "report", "store"])
+def test_bad_input_is_one_line(
+    run: Any, store: Path, rooms: Any, snapshot: Any, tmp_path: Path, kind: str
+) -> None:
+    shutil.copytree(rooms[0], tmp_path / "scene")
+    data = json.loads((tmp_path / "scene/scene.json").read_text())
+    for frame in data["frames"]:
+        frame["base_from_camera"] = None
+    (tmp_path / "scene/scene.json").write_text(json.dumps(data))
+    words: list[object] = {
+        "none": [store],
+        "missing": [store, tmp_path / "nowhere"],
+        "unknown": [store, rooms[1]],
+        "no poses": [store, tmp_path / "scene"],
+        "report": [store, rooms[0], "--report", tmp_path / "no/such/r.html"],
+        "store": [rooms[0], rooms[0]],
+    }[kind]
+    before = snapshot(store)
+    ran = run("evaluate", *words)
+    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
+    assert snapshot(store) == before
+    assert json.loads(run("evaluate", *words, "--json").out).keys() == {"error"}

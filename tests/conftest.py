@@ -1,0 +1,124 @@
+"""Small rooms and small networks, made once.
+
+Two sizes. `rooms` are 64x48 pixels with random networks, for all that does not depend on what was
+learned. `arcs` are short camera arcs at 160x120 with the shipped networks: a few hundred steps of
+training locate their images to some centimetres. torch is imported inside the fixtures only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from evercal.continual.knowledge import Knowledge
+    from evercal.continual.learn import StageOptions
+    from evercal.datasets.frame import Scene
+
+
+def _room(seed: int, name: str, size: tuple[int, int], span: int, every: int = 1) -> Scene:
+    """The first `span` of 240 views along a path; every `every`-th is learned, the rest tested."""
+    from evercal.datasets.frame import Frame, Scene
+    from evercal.simulation.box_room import BoxRoom, default_camera
+
+    room, camera = BoxRoom(seed, texture_px=96), default_camera(*size)
+    poses = room.path(240, 1)[:span]
+    frames = [
+        Frame(f"{name}-{i:03d}", room.render(camera, pose), camera, pose)
+        for i, pose in enumerate(poses)
+    ]
+    train = tuple(frames[::every])
+    return Scene(name, train, tuple(f for i, f in enumerate(frames) if i % every))
+
+
+@pytest.fixture(scope="session")
+def one_thread() -> None:
+    """Small products are slower with more threads, much slower on a busy machine."""
+    import torch
+
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def rooms(one_thread: None) -> tuple[Scene, Scene, Scene]:
+    """Three scenes of 30 frames, 64x48 pixels."""
+    alpha, beta, gamma = (
+        _room(seed, name, (64, 48), 30)
+        for seed, name in ((31, "alpha"), (32, "beta"), (33, "gamma"))
+    )
+    return alpha, beta, gamma
+
+
+@pytest.fixture(scope="session")
+def quick() -> StageOptions:
+    """A stage of eight steps for `rooms`."""
+    from evercal.continual.learn import StageOptions
+    from evercal.models.head import HeadOptions
+    from evercal.training.buffer import FillPlan
+    from evercal.training.fit import FitOptions
+    from evercal.training.views import ViewOptions
+
+    return StageOptions(
+        head=HeadOptions(width=16, centres_per_scene=3),
+        fit=FitOptions(iterations=8, batch=64, replay_batch=32),
+        fill=FillPlan(passes=2, cells=24, view=ViewOptions(short_side=48)),
+        replay_passes=2,
+    )
+
+
+@pytest.fixture(scope="session")
+def blank(one_thread: None) -> Callable[[str], Knowledge]:
+    """Makes a robot that knows nothing, with tiny random networks, given its strategy."""
+    import torch
+
+    from evercal.continual.knowledge import Knowledge
+    from evercal.models.descriptor import GlobalDescriptor
+    from evercal.models.encoder import LocalEncoder
+
+    torch.manual_seed(0)
+    encoder = LocalEncoder(stem=(4, 4), inner=8, blocks=1, width=8).eval()
+    descriptor = GlobalDescriptor(8, maps=2, hidden=4, width=8).eval()
+    for parameter in (*encoder.parameters(), *descriptor.parameters()):
+        parameter.data = parameter.data.half().float()  # as they are stored
+    return lambda strategy: Knowledge(encoder, descriptor, strategy, 48)
+
+
+@pytest.fixture(scope="session")
+def arcs(one_thread: None) -> tuple[Scene, Scene]:
+    """Two scenes of 24 training and 24 test frames in between, 160x120 pixels."""
+    one, two = (_room(seed, name, (160, 120), 48, 2) for seed, name in ((31, "one"), (32, "two")))
+    return one, two
+
+
+@pytest.fixture(scope="session")
+def arc_stage() -> StageOptions:
+    """Enough training for `arcs`."""
+    from evercal.continual.learn import StageOptions
+    from evercal.models.head import HeadOptions
+    from evercal.training.buffer import FillPlan
+    from evercal.training.fit import FitOptions
+    from evercal.training.views import ViewOptions
+
+    return StageOptions(
+        head=HeadOptions(width=64),
+        fit=FitOptions(iterations=600, batch=512, replay_batch=256, peak_rate=5e-3),
+        fill=FillPlan(passes=2, view=ViewOptions(short_side=120)),
+    )
+
+
+@pytest.fixture(scope="session")
+def arc_known(arcs: tuple[Scene, Scene], arc_stage: StageOptions) -> tuple[Knowledge, Knowledge]:
+    """What is known after the first arc, and after both."""
+    from evercal.continual.knowledge import Knowledge
+    from evercal.continual.learn import Stage, learn
+    from evercal.models.descriptor import load_descriptor
+    from evercal.models.encoder import load_encoder
+
+    known = [Knowledge(load_encoder(), load_descriptor(), "evercal", 120)]
+    for arc in arcs:
+        *_, stage = learn(known[-1], arc, arc_stage)
+        assert isinstance(stage, Stage)
+        known.append(stage.knowledge)
+    return known[1], known[2]

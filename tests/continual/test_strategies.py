@@ -1,0 +1,156 @@
+"""The rules of the strategies, on rows small enough to do by hand."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from evercal.continual.spdd import SpddOptions, spdd_loss
+from evercal.continual.strategies import (
+    OUTPUT_WEIGHT_PX_PER_M,
+    REPLAY_CLAMP_PX,
+    STRATEGIES,
+    TEACHER_LIMIT_PX,
+    Strategy,
+    anchored_reprojection,
+)
+from evercal.models.head import HeadOutput
+from evercal.training.buffer import Rows
+from evercal.training.loss import Target
+
+DEPTH_M, FOCAL_PX = 2.0, 100.0
+SELECTING = [name for name, strategy in STRATEGIES.items() if strategy.select is not None]
+REPLAYING = [name for name, strategy in STRATEGIES.items() if strategy.penalty is not None]
+
+
+def rows(count: int) -> Rows:
+    """Rows seen by a camera at the origin, each of which must project to the image centre."""
+    target = Target(
+        torch.full((count, 2), 50.0),
+        torch.tensor([FOCAL_PX, FOCAL_PX, 50.0, 50.0]).repeat(count, 1),
+        torch.eye(4)[:3].repeat(count, 1, 1),
+    )
+    zero = torch.zeros(count, dtype=torch.long)
+    return Rows(torch.zeros(count, 1), zero, torch.zeros(count, 1), target, zero)
+
+
+def says(points: list[list[float]]) -> HeadOutput:
+    """A head's output with these points (camera frame, metres)."""
+    where = torch.tensor(points, requires_grad=True)
+    return HeadOutput(torch.zeros(len(points), 2), torch.zeros(len(points), 1, 3), where)
+
+
+def off_by(pixels: float) -> list[float]:
+    """A point that projects `pixels` to the right of where it must."""
+    return [pixels / FOCAL_PX * DEPTH_M, 0.0, DEPTH_M]
+
+
+def test_anchored_reprojection_by_hand() -> None:
+    # Row 0: the teacher is right, the student 3 px (6 cm) off: it pays for both.
+    # Row 1: the teacher is far off, the student right: it pays nothing, however far they are apart.
+    teacher = says([off_by(0.0), off_by(4 * TEACHER_LIMIT_PX)])
+    student = says([off_by(3.0), off_by(0.0)])
+    cost = anchored_reprojection(student, teacher, rows(2), 0.5)
+    tau = REPLAY_CLAMP_PX
+    expected = tau * math.tanh(3.0 / tau) / 2 + OUTPUT_WEIGHT_PX_PER_M * 0.06 / 2
+    assert float(cost.detach()) == pytest.approx(expected, rel=1e-5)
+
+
+def test_depth_that_no_pixel_sees_is_held_by_a_teacher_who_is_right() -> None:
+    student, right = says([[0.0, 0.0, DEPTH_M + 0.1]]), says([off_by(0.0)])
+    wrong = says([off_by(2 * TEACHER_LIMIT_PX)])
+    held = anchored_reprojection(student, right, rows(1), 0.0)
+    free = anchored_reprojection(student, wrong, rows(1), 0.0)
+    assert float(held.detach()) == pytest.approx(OUTPUT_WEIGHT_PX_PER_M * 0.1, rel=1e-5)
+    assert float(free.detach()) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_teacher_behind_the_camera_holds_nothing() -> None:
+    behind = says([[0.0, 0.0, -DEPTH_M]])  # projects to the very pixel, if one divides blindly
+    cost = anchored_reprojection(says([off_by(0.0)]), behind, rows(1), 0.0)
+    assert float(cost.detach()) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", REPLAYING)
+def test_the_teacher_is_frozen_and_agreement_with_the_truth_is_free(name: str) -> None:
+    penalty = STRATEGIES[name].penalty
+    assert penalty is not None
+    teacher, student = says([off_by(0.0)] * 3), says([off_by(1.0)] * 3)
+    cost = penalty(student, teacher, rows(3), 0.3)
+    cost.backward()
+    assert student.points.grad is not None
+    assert bool((student.points.grad[:, 0] > 0).all())  # back towards the truth
+    assert teacher.points.grad is None
+    same = penalty(says([off_by(0.0)] * 3), teacher, rows(3), 0.3)
+    assert float(same.detach()) == pytest.approx(0.0, abs=1e-6)
+    assert float(cost.detach()) > 1e-3
+
+
+def test_the_papers_penalty_is_spdd_with_its_defaults() -> None:
+    generator = torch.Generator().manual_seed(0)
+
+    def output(centres: int) -> HeadOutput:
+        def draw(*shape: int) -> Tensor:
+            return torch.randn(*shape, generator=generator)
+
+        return HeadOutput(draw(5, centres), draw(5, centres, 3), draw(5, 3))
+
+    teacher, student = output(6), output(8)
+    for name in ("sars_spdd", "sars_spdd_filled"):
+        penalty = STRATEGIES[name].penalty
+        assert penalty is not None
+        expected = spdd_loss(student, teacher, SpddOptions()).total
+        torch.testing.assert_close(penalty(student, teacher, rows(5), 0.7), expected)
+
+
+@pytest.mark.parametrize("count", [10, 37, 100, 256])
+@pytest.mark.parametrize("name", SELECTING)
+def test_no_selection_exceeds_its_capacity(name: str, count: int) -> None:
+    rng = np.random.default_rng(count)
+    positions = np.cumsum(rng.normal(0, 0.05, (count, 3)), axis=0)
+    turns = np.array([1.0, 0, 0, 0]) + np.cumsum(rng.normal(0, 0.1, (count, 4)), axis=0)
+    quaternions = turns / np.linalg.norm(turns, axis=1, keepdims=True)
+    select = STRATEGIES[name].select
+    assert select is not None
+    capacity = count // 10
+    kept = select(positions, quaternions, capacity)
+    assert 1 <= len(kept) <= capacity
+    assert np.issubdtype(kept.dtype, np.integer)
+    assert (np.diff(kept) > 0).all()
+    assert kept[0] >= 0
+    assert kept[-1] < count
+
+
+def test_only_the_papers_own_radius_leaves_memory_unused() -> None:
+    # A camera that moves little relative to its turning stays within r = 0.5 of few frames.
+    positions = np.linspace(0, 1, 200)[:, None] * [1.0, 0, 0]
+    quaternions = np.tile([1.0, 0, 0, 0], (200, 1))
+    kept = {}
+    for name in SELECTING:
+        select = STRATEGIES[name].select
+        assert select is not None
+        kept[name] = len(select(positions, quaternions, 20))
+    assert kept.pop("sars_spdd") < 20
+    assert set(kept.values()) == {20}
+
+
+@pytest.mark.parametrize(("name", "strategy"), STRATEGIES.items())
+def test_every_strategy_says_where_it_is_from_and_hangs_together(
+    name: str, strategy: Strategy
+) -> None:
+    assert name.isidentifier()
+    assert len(strategy.source.split()) >= 4
+    # What is remembered is replayed and nothing is replayed that was not remembered.
+    assert (strategy.select is None) == (strategy.penalty is None)
+    if strategy.data == "all" or strategy.heads == "per_scene":
+        assert strategy.select is None
+
+
+def test_fine_tuning_differs_from_ours_in_replay_alone() -> None:
+    ours, control = STRATEGIES["evercal"], STRATEGIES["finetune"]
+    assert control.select is None
+    assert control.penalty is None
+    for field in ("condition", "data", "heads", "warm_rate"):
+        assert getattr(ours, field) == getattr(control, field)

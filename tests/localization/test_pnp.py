@@ -1,0 +1,164 @@
+"""Poses from matches against the truth, and their covariance against a thousand repetitions."""
+
+import time
+
+import numpy as np
+import pytest
+
+from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3, pose_distance
+from evercal.localization.pnp import PnpOptions, pose_covariance, solve_pnp
+
+CAMERA = Camera(320, 240, 262.5, 250.0, 159.5, 119.5)
+INTRINSICS = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])
+
+
+def case(
+    seed: int, count: int, depth: tuple[float, float] = (1.0, 4.0)
+) -> tuple[SE3, np.ndarray, np.ndarray]:
+    """A random pose, pixels (n, 2) and the points (n, 3) in the world that they show."""
+    rng = np.random.default_rng(seed)
+    world_from_camera = SE3.exp(np.array([*rng.normal(0, 3, 3), *rng.normal(0, 1.5, 3)]))
+    pixels = rng.uniform([0, 0], [319, 239], (count, 2))
+    in_camera = CAMERA.unproject(pixels) * rng.uniform(*depth, (count, 1))
+    return world_from_camera, pixels, world_from_camera.apply(in_camera)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_exact_points_give_the_exact_pose(seed: int) -> None:
+    truth, pixels, points = case(seed, 200)
+    found = solve_pnp(pixels, points, INTRINSICS, PnpOptions())
+    assert found is not None
+    metres, radians = pose_distance(found.world_from_camera, truth)
+    assert metres < 1e-6
+    assert radians < 1e-6
+    assert found.inliers.all()
+    assert found.covariance.shape == (6, 6)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_half_of_the_points_may_be_wrong(seed: int) -> None:
+    truth, pixels, points = case(seed, 400)
+    rng = np.random.default_rng(seed)
+    wrong = rng.permutation(400) < 200
+    points[wrong] += rng.normal(0, 2, (200, 3))
+    noisy = pixels + rng.normal(0, 0.5, pixels.shape)
+    found = solve_pnp(noisy, points, INTRINSICS, PnpOptions())
+    assert found is not None
+    metres, radians = pose_distance(found.world_from_camera, truth)
+    assert metres < 0.02
+    assert radians < np.deg2rad(0.5)
+    # The inliers are those that reproject within the threshold, no more and no fewer.
+    camera_from_world = found.world_from_camera.inverse()
+    with np.errstate(invalid="ignore"):
+        error = np.linalg.norm(CAMERA.project(camera_from_world.apply(points)) - noisy, axis=1)
+    assert (found.inliers == (np.nan_to_num(error, nan=np.inf) < 5.0)).mean() > 0.99
+    assert found.inliers[~wrong].all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 5])
+def test_too_few_points_give_none(count: int) -> None:
+    _, pixels, points = case(0, count)
+    assert solve_pnp(pixels, points, INTRINSICS, PnpOptions()) is None
+
+
+def test_too_few_inliers_give_none() -> None:
+    _, pixels, points = case(1, 300)
+    # Points on one ray each but at random ends of it: five rays are right, the rest nonsense.
+    rng = np.random.default_rng(0)
+    points[5:] = rng.normal(0, 0.01, (295, 3))  # a speck: all behind one pixel at most
+    pixels[5:] = rng.uniform([-4000, -4000], [4000, 4000], (295, 2))
+    assert solve_pnp(pixels, points, INTRINSICS, PnpOptions()) is None
+    _, pixels, points = case(1, 6)
+    assert solve_pnp(pixels, points, INTRINSICS, PnpOptions()) is not None
+
+
+def test_nonsense_is_given_up_in_time() -> None:
+    rng = np.random.default_rng(0)
+    times, shares = [], []
+    for _ in range(5):
+        pixels, points = rng.uniform([0, 0], [319, 239], (1200, 2)), rng.normal(0, 2, (1200, 3))
+        began = time.thread_time()
+        found = solve_pnp(pixels, points, INTRINSICS, PnpOptions())
+        times.append(time.thread_time() - began)
+        shares.append(0.0 if found is None else found.inliers.mean())
+    assert min(times) < 0.1
+    assert max(shares) < 0.05
+
+
+def test_the_same_matches_give_the_same_bytes() -> None:
+    _, pixels, points = case(4, 300)
+    points[::2] += np.random.default_rng(0).normal(0, 1, (150, 3))
+    a, b = (solve_pnp(pixels, points, INTRINSICS, PnpOptions()) for _ in range(2))
+    assert a is not None
+    assert b is not None
+    for one, two in (
+        (a.world_from_camera.rotation_wxyz, b.world_from_camera.rotation_wxyz),
+        (a.world_from_camera.translation_m, b.world_from_camera.translation_m),
+        (a.covariance, b.covariance),
+        (a.inliers, b.inliers),
+    ):
+        assert one.tobytes() == two.tobytes()
+
+
+def moved(pose: SE3, shift: np.ndarray, turn: np.ndarray) -> SE3:
+    """The documented perturbation: t + shift in the world, R Exp(turn) in the camera."""
+    turned = pose @ SE3.exp(np.array([0, 0, 0, *turn]))
+    return SE3(turned.rotation_wxyz, pose.translation_m + shift)
+
+
+def test_covariance_is_that_of_least_squares_with_a_numeric_jacobian() -> None:
+    truth, pixels, points = case(7, 50)
+    noisy = pixels + np.random.default_rng(0).normal(0, 1, pixels.shape)
+
+    def residual(tangent: np.ndarray) -> np.ndarray:
+        pose = moved(truth, tangent[:3], tangent[3:])
+        return (CAMERA.project(pose.inverse().apply(points)) - noisy).ravel()
+
+    step = 1e-6
+    jacobian = np.stack(
+        [(residual(step * e) - residual(-step * e)) / (2 * step) for e in np.eye(6)], -1
+    )
+    expected = (residual(np.zeros(6)) ** 2).mean() * np.linalg.inv(jacobian.T @ jacobian)
+    found = pose_covariance(noisy, points, INTRINSICS, truth)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(found / scale, expected / scale, atol=1e-4)
+
+
+def test_covariance_matches_the_spread_of_many_solutions() -> None:
+    # Looking along world x at a tall, nearly flat strip: every axis has its own spread, so mixing
+    # up axes or frames would change some standard deviation by more than 20 %.
+    rng = np.random.default_rng(2)
+    truth = SE3.from_matrix(np.array([[0.0, 0, 1, 1], [-1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]]))
+    pixels = rng.uniform([140, 20], [180, 220], (80, 2))
+    points = truth.apply(CAMERA.unproject(pixels) * rng.uniform(3.8, 4.2, (80, 1)))
+    errors, claimed = [], []
+    for _ in range(400):
+        noisy = pixels + rng.normal(0, 0.3, pixels.shape)
+        found = solve_pnp(noisy, points, INTRINSICS, PnpOptions())
+        assert found is not None
+        pose = found.world_from_camera
+        turn = (truth.inverse() @ pose).log()[3:]
+        errors.append([*(pose.translation_m - truth.translation_m), *turn])
+        claimed.append(found.covariance)
+    spread, said = np.std(errors, axis=0), np.sqrt(np.mean(claimed, axis=0).diagonal())
+    ratios = said / spread
+    assert (np.abs(ratios - 1) < 0.2).all(), ratios
+    for part in (spread[:3], spread[3:]):  # the test can fail: axes differ
+        ordered = np.sort(part)
+        assert (ordered[1:] / ordered[:-1] > 1.3).all()
+    # The squared Mahalanobis error of six Gaussian dimensions has mean 6.
+    distances = [e @ np.linalg.inv(c) @ e for e, c in zip(np.array(errors), claimed, strict=True)]
+    assert np.mean(distances) == pytest.approx(6.0, rel=0.25)
+
+
+def test_covariance_grows_with_noise_and_shrinks_with_points() -> None:
+    truth, pixels, points = case(9, 2000)
+    noise = np.random.default_rng(0).normal(0, 1, pixels.shape)
+
+    def deviation(count: int, sigma: float) -> np.ndarray:
+        seen = pixels[:count] + sigma * noise[:count]
+        return np.sqrt(pose_covariance(seen, points[:count], INTRINSICS, truth).diagonal())
+
+    np.testing.assert_allclose(deviation(2000, 2.0) / deviation(2000, 1.0), 2.0, rtol=1e-3)
+    np.testing.assert_allclose(deviation(500, 1.0) / deviation(2000, 1.0), 2.0, rtol=0.15)
