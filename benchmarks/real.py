@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +58,7 @@ def fast_table(real: Mapping[str, Scene], out: Path, seed: int) -> None:
             report = learn_scene(store, scene, LearnOptions(stage=preset("fast", seed)))
             seconds = time.perf_counter() - began
             results = evaluate(Localizer.open(store), {name: scene})
-            table = scores(results).to_dict()["scenes"][name]
+            table = asdict(scores(results).scenes[name])
             ms = float(np.mean([r.milliseconds for r in results]))
             record.write_text(
                 json.dumps(table | {"seconds": seconds, "ms": ms, "bytes": report.head_bytes})

@@ -37,7 +37,7 @@ def run(capfd: pytest.CaptureFixture[str]) -> Run:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def tiny() -> Iterator[None]:
+def tiny(one_thread: None) -> Iterator[None]:
     """Learning takes a second; thresholds, which take longer to fit, believe every pose."""
     from evercal.continual.presets import PRESETS
     from evercal.localization import teach

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evercal.cli.inspection import Inspection, inspect_scene, roll_deg
+from evercal.cli.inspection import Inspection, inspect_scene, turning_shares
 from evercal.datasets import Frame, Scene, load_scene
 from evercal.geometry import SE3, Camera
 from evercal.simulation.box_room import BoxRoom, look_at
@@ -76,22 +76,27 @@ def test_planted_faults_are_found() -> None:
     assert "square pixels" in warned(scene(TRAIN, TEST, Camera(32, 24, 26, 40, 15.5, 11.5)))
 
 
-def test_quaternions_in_the_wrong_order_are_found() -> None:
-    wrong = SE3(np.roll(TRAIN.rotation_wxyz, 1, axis=1), TRAIN.translation_m)
-    assert "w x y z" in warned(scene(wrong, TEST))
+def test_other_conventions_are_found() -> None:
+    for shift in (1, -1):
+        wrong = SE3(np.roll(TRAIN.rotation_wxyz, shift, axis=1), TRAIN.translation_m)
+        assert "w x y z" in warned(scene(wrong, TEST))
+    assert "not their inverse" in warned(scene(TRAIN.inverse(), TEST))
+    body = np.eye(4)
+    body[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]  # camera_from_body, x forward and z up
+    assert "forward" in warned(scene(TRAIN @ SE3.from_matrix(body), TEST))
 
 
-def test_roll_is_that_of_the_cameras() -> None:
-    eye = np.zeros(3)
-    for roll in (0.0, 0.3):
-        turns = np.linspace(0, 2 * np.pi, 360, endpoint=False)
-        level = [look_at(eye, np.array([np.cos(a), np.sin(a), 0.0]), roll) for a in turns]
-        # All lean to the same side: their x axes lie on a cone about gravity.
-        assert roll_deg(SE3.stack(level)) == pytest.approx(np.rad2deg(roll), abs=1e-3)
-    rng = np.random.default_rng(0)
-    everywhere = SE3(rng.normal(size=(4000, 4)), np.zeros((4000, 3)))
-    assert roll_deg(everywhere) == pytest.approx(np.rad2deg(np.arcsin(3**-0.5)), abs=1.5)
-    assert roll_deg(SE3.exp(np.zeros((20, 6)))) == pytest.approx(0, abs=1e-3)
+def test_turning_is_told_apart_by_axis() -> None:
+    eye, angles = np.zeros(3), np.linspace(0, 6, 100)
+    pan = [look_at(eye, np.array([np.cos(a), np.sin(a), 0.0])) for a in angles]
+    np.testing.assert_allclose(turning_shares(SE3.stack(pan)), (0, 1, 0), atol=1e-9)
+    # Looking down by 45 deg, half of a pan is a roll: no reason for a warning.
+    down = [look_at(eye, np.array([np.cos(a), np.sin(a), -1.0])) for a in angles]
+    np.testing.assert_allclose(turning_shares(SE3.stack(down)), (0, 0.5, 0.5), atol=1e-9)
+    roll = [look_at(eye, np.array([1.0, 0, 0]), a) for a in angles]
+    np.testing.assert_allclose(turning_shares(SE3.stack(roll)), (0, 0, 1), atol=1e-9)
+    leaps = SE3.stack([pose for i in range(10) for pose in (pan[i], roll[50 + i])])
+    assert turning_shares(leaps) == (1 / 3, 1 / 3, 1 / 3)
 
 
 def test_the_same_files_in_both_splits_are_found(rooms: Any) -> None:

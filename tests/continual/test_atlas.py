@@ -69,11 +69,12 @@ def test_a_scene_gets_the_first_free_place_of_the_spiral() -> None:
     atlas, scenes = filled(3, 6)
     for i, scene in enumerate(scenes):
         side = max(5.0, 2 * max(scene[:, k].max() - scene[:, k].min() for k in range(3)))
-        for place in spiral():
-            x, y, z = (float(value) for value in place)
-            wanted = Cell((x, y, z), side, (0.0, 0.0, 0.0))
-            if all(overlap(wanted, cell) < 1e-9 for cell in atlas.cells[:i]):
-                break
+        places = (Cell((float(x), float(y), 0.0), side, (0.0, 0.0, 0.0)) for x, y, _ in spiral())
+        wanted = next(
+            place
+            for place in places
+            if all(overlap(place, cell) < 1e-9 for cell in atlas.cells[:i])
+        )
         assert atlas.cells[i].centre_m == wanted.centre_m
         assert atlas.cells[i].side_m == pytest.approx(side)
 

@@ -38,9 +38,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     if words == ["--version"]:
-        from evercal import __version__
-
-        print(f"evercal {__version__}")
+        # Folders do not import the public face above them; it is loaded before they are.
+        print(f"evercal {sys.modules['evercal'].__version__}")
         return 0
     as_json = "--json" in words
     try:

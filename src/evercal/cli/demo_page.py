@@ -1,6 +1,7 @@
 """The pictures and the report of `evercal demo`."""
 
 import io
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,8 +34,7 @@ def write_pictures(
     from evercal.storage import write_bytes
 
     overlays = _overlays(localizer, scenes)
-    shown = [overlays[i * _OVERLAYS_PER_ROOM] for i in range(2)]
-    overview = _overview(shown, outcome)
+    overview = _overview([_best(overlays, i) for i in range(2)], outcome)
     write_bytes(out / "overview.png", overview)
     rooms = outcome.rooms
     curves = {METHODS[key]: _square(rows, len(rooms)) for key, rows in outcome.accuracy.items()}
@@ -73,8 +73,20 @@ def _square(rows: list[list[float]], count: int) -> np.ndarray:
     return matrix
 
 
-def _overlays(localizer: "Localizer", scenes: "list[Scene]") -> list[tuple[str, np.ndarray]]:
-    """Captions and images, room by room: test frames spread over the recording."""
+@dataclass(frozen=True, eq=False)
+class _Overlay:
+    """A test image and what was said about it."""
+
+    caption: str
+    """In words."""
+    image: np.ndarray
+    """(H, W, 3) uint8 RGB, scene points drawn in."""
+    inliers: int
+    """0 without a pose."""
+
+
+def _overlays(localizer: "Localizer", scenes: "list[Scene]") -> list[_Overlay]:
+    """Room by room, test frames spread over the recording."""
     found = []
     for scene in scenes:
         places = np.linspace(0, len(scene.test), _OVERLAYS_PER_ROOM, endpoint=False)
@@ -82,28 +94,36 @@ def _overlays(localizer: "Localizer", scenes: "list[Scene]") -> list[tuple[str, 
             frame = scene.test[int(place)]
             image = frame.read_image()
             estimate = localizer.localize(image, frame.camera)
-            said = estimate.scene or estimate.status.replace("_", " ")
+            share = f"{100 * estimate.inlier_ratio:.0f} % inliers"
+            said = f"in {estimate.scene}" if estimate.scene else estimate.status.replace("_", " ")
             drawn = draw_estimate(image, estimate, frame.camera)
-            found.append((f"{said}, {100 * estimate.inlier_ratio:.0f} % inliers", drawn))
+            count = estimate.inliers if estimate.status == "ok" else 0
+            found.append(_Overlay(f"{said}, {share}", drawn, count))
     return found
 
 
-def _sheet(overlays: list[tuple[str, np.ndarray]]) -> np.ndarray:
+def _best(overlays: list[_Overlay], room: int) -> _Overlay:
+    """The overlay of a room that shows most."""
+    first = room * _OVERLAYS_PER_ROOM
+    return max(overlays[first : first + _OVERLAYS_PER_ROOM], key=lambda overlay: overlay.inliers)
+
+
+def _sheet(overlays: list[_Overlay]) -> np.ndarray:
     from evercal.drawing import contact_sheet
 
-    captions = [caption for caption, _ in overlays]
-    return contact_sheet([image for _, image in overlays], _OVERLAYS_PER_ROOM, captions)
+    captions = [overlay.caption for overlay in overlays]
+    return contact_sheet([overlay.image for overlay in overlays], _OVERLAYS_PER_ROOM, captions)
 
 
-def _overview(shown: list[tuple[str, np.ndarray]], outcome: "DemoOutcome") -> bytes:
+def _overview(shown: list[_Overlay], outcome: "DemoOutcome") -> bytes:
     """Two images with points, and what became of the first room with both methods, as a PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 3.1), dpi=130, layout="constrained", facecolor="white")
     panels = figure.subplots(1, 3, width_ratios=(1.35, 1.35, 1))
-    for panel, (caption, image) in zip(panels, shown, strict=False):
-        panel.imshow(image)
-        panel.set_title(f"located in {caption}" if "box" in caption else caption, fontsize=9)
+    for panel, overlay in zip(panels, shown, strict=False):
+        panel.imshow(overlay.image)
+        panel.set_title(overlay.caption, fontsize=9)
         panel.set_axis_off()
     bars = panels[2]
     first, last = outcome.rooms[0], outcome.rooms[-1]
@@ -113,11 +133,11 @@ def _overview(shown: list[tuple[str, np.ndarray]], outcome: "DemoOutcome") -> by
         drawn = bars.bar(places, heights, 0.38, color=_COLOURS[i], label=METHODS[method])
         bars.bar_label(drawn, fmt="%.0f", fontsize=9)
     bars.set_xticks([0, 1], [f"after learning\n{first}", f"after learning\n{last}"], fontsize=9)
-    bars.set_ylim(0, 112)
+    bars.set_ylim(0, 135)  # room for the legend
     bars.set_yticks([0, 50, 100])
-    bars.set_title(f"{first}: test images within 5 cm, 5 deg (%)", fontsize=9)
+    bars.set_title(f"{first}: % within 5 cm, 5 deg", fontsize=9, loc="left")
     bars.spines[["top", "right"]].set_visible(False)
-    bars.legend(frameon=False, fontsize=9, loc="lower left")
+    bars.legend(frameon=False, fontsize=9, loc="upper right", bbox_to_anchor=(1, 0.97))
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()

@@ -15,7 +15,9 @@ SAME_M, SAME_DEG = 0.001, 0.1
 LARGEST_EXTENT_M = 100.0
 LARGEST_STEP_M = 0.5
 SMALLEST_EXTENT_M = 0.05
-LARGEST_ROLL_DEG = 20.0
+SMALLEST_TURN_DEG = 60.0
+LARGEST_TURN_DEG = 30.0
+LARGEST_PITCH_SHARE, LARGEST_ROLL_SHARE = 0.6, 0.8
 
 
 @dataclass(frozen=True)
@@ -152,25 +154,35 @@ def _warn_motion(poses: SE3, extent: np.ndarray, step: float) -> list[str]:
         found.append(
             f"consecutive frames are {step:.2f} m apart; are they in recorded order and in metres?"
         )
-    roll = roll_deg(poses)
-    if roll > LARGEST_ROLL_DEG:
-        found.append(
-            f"the cameras are rolled by {roll:.0f} deg (rms) about their viewing axes, which robots"
-            f" and hands hardly do; are quaternions in the order w x y z, poses base_from_camera?"
-        )
+    about_x, _, about_z = turning_shares(poses)
+    if np.rad2deg(turned.max()) > SMALLEST_TURN_DEG:
+        if about_x > LARGEST_PITCH_SHARE:
+            found.append(
+                f"{100 * about_x:.0f} % of the turning is a nod about the image's x axis; are"
+                f" quaternions in the order w x y z, and camera axes right, down, forward?"
+            )
+        if about_z > LARGEST_ROLL_SHARE:
+            found.append(
+                f"{100 * about_z:.0f} % of the turning is a roll about the viewing axis; are poses"
+                f" base_from_camera, not their inverse, and camera axes right, down, forward?"
+            )
     return found
 
 
-def roll_deg(poses: SE3) -> float:
-    """How far the images' horizontals stray from one common plane, degrees (root mean square).
+def turning_shares(poses: SE3) -> tuple[float, float, float]:
+    """About which camera axes (x, y, z) the camera turns from frame to frame; the three sum to 1.
 
-    Cameras that are carried about stay near upright: their x axes are all perpendicular to one
-    direction, gravity, wherever they look. That direction is fitted here. Little turning cannot
-    raise suspicion, since a plane is then always near.
+    A camera that is carried about turns mostly about its y axis, as it pans. Inverted poses seem to
+    roll, and quaternions in another order or a body's axes (x forward) seem to nod. Leaps between
+    recordings are passed over. Thirds where nothing turns.
     """
-    right = poses.rotation_matrix()[:, :, 0]
-    smallest = np.linalg.eigvalsh(right.T @ right / len(right))[0]
-    return float(np.rad2deg(np.arcsin(np.sqrt(np.clip(smallest, 0, 1)))))
+    turns = (poses[:-1].inverse() @ poses[1:]).log()[:, 3:]
+    turns = turns[np.linalg.norm(turns, axis=1) < np.deg2rad(LARGEST_TURN_DEG)]
+    squares = np.square(turns).sum(axis=0)
+    if squares.sum() < 1e-12:
+        return 1 / 3, 1 / 3, 1 / 3
+    x, y, z = (squares / squares.sum()).tolist()
+    return x, y, z
 
 
 def _warn_copies(train: list[Frame], test: list[Frame]) -> list[str]:

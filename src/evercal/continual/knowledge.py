@@ -9,7 +9,7 @@ from torch import Tensor
 from evercal.continual.atlas import Atlas, Cell
 from evercal.continual.memory import Memory
 from evercal.geometry.camera import Camera
-from evercal.models.descriptor import GlobalDescriptor
+from evercal.models.descriptor import Descriptor
 from evercal.models.encoder import Encoder
 from evercal.models.head import Head
 
@@ -38,7 +38,7 @@ class SceneRecord:
     """What covariances are multiplied with to match the errors on held-out training frames."""
 
     def lens(self, camera: Camera | None) -> Camera:
-        """Intrinsics to use for a query: what is known better than the nominal ones, else as given."""
+        """Intrinsics for a query: refined if the nominal ones or none are given, else as given."""
         own = self.camera
         if camera is None or (
             not camera.distortion
@@ -73,7 +73,7 @@ class Knowledge:
 
     encoder: Encoder
     """Frozen local encoder."""
-    descriptor: GlobalDescriptor
+    descriptor: Descriptor
     """Frozen global descriptor."""
     strategy: str
     """Key of STRATEGIES."""

@@ -13,8 +13,8 @@ Preset = Literal["fast", "demo", "bench", "paper"]
 PRESETS: dict[str, StageOptions] = {
     # 2 cores, at most 240 s a scene.
     "fast": StageOptions(
-        head=HeadOptions(width=384),
-        fit=FitOptions(iterations=5000, batch=2048, replay_batch=1024),
+        head=HeadOptions(width=512),
+        fit=FitOptions(iterations=3500, batch=2048, replay_batch=1024),
         fill=FillPlan(passes=4),
     ),
     # At most 45 s a scene of about 100 frames.

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Self
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from evercal.continual.atlas import Cell
 from evercal.continual.knowledge import Knowledge, SceneRecord
@@ -34,8 +34,8 @@ from evercal.continual.memory import Memory
 from evercal.continual.strategies import STRATEGIES
 from evercal.errors import InputError
 from evercal.geometry.camera import Camera
-from evercal.models.descriptor import load_descriptor
-from evercal.models.encoder import load_encoder
+from evercal.models.descriptor import PooledDescriptor, descriptor_for, load_descriptor
+from evercal.models.encoder import Encoder, checked_encoder, load_encoder
 from evercal.models.head import Head, HeadOptions
 from evercal.models.weights_file import network_bytes
 from evercal.storage.atomic import replace_folder, write_bytes, write_json
@@ -77,9 +77,21 @@ class Robot:
 
     @classmethod
     def create(
-        cls, root: Path, strategy: str, short_side: int = 240, encoder: Path | None = None
+        cls,
+        root: Path,
+        strategy: str,
+        short_side: int = 240,
+        encoder: Path | nn.Module | None = None,
     ) -> Self:
         """A robot that knows nothing yet; nothing is written before the first `commit`.
+
+        Args:
+            root: folder of the store to be.
+            strategy: key of STRATEGIES.
+            short_side: working size of images, pixels.
+            encoder: another encoder than the shipped one: a file (its sibling
+                `descriptor.safetensors` is taken too, if it fits), or any module that is an
+                `Encoder`; `open` then needs the module again.
 
         Raises:
             InputError: `root` holds something that is not a store, unknown strategy, bad encoder.
@@ -89,17 +101,23 @@ class Robot:
         if strategy not in STRATEGIES:
             known = ", ".join(STRATEGIES)
             raise InputError(f"strategy {strategy!r}: unknown; choose one of {known}")
-        networks = load_encoder(encoder), load_descriptor()
-        if networks[0].width != networks[1].settings["inputs"]:
-            raise InputError(
-                f"encoder {encoder}: gives {networks[0].width} channels, the shipped descriptor "
-                f"needs {networks[1].settings['inputs']}; make both with 'evercal pretrain'"
-            )
+        if encoder is None:
+            networks = load_encoder(), load_descriptor()
+        elif isinstance(encoder, Path):
+            found = load_encoder(encoder)
+            networks = found, descriptor_for(encoder, found.width)
+        else:
+            networks = checked_encoder(encoder), PooledDescriptor(checked_encoder(encoder).width)
         return cls(root, Knowledge(*networks, strategy, short_side), [], None)
 
     @classmethod
-    def open(cls, root: Path) -> Self:
+    def open(cls, root: Path, encoder: nn.Module | None = None) -> Self:
         """Opens a store at its last complete stage.
+
+        Args:
+            root: folder of the store.
+            encoder: only for a store made with a module of one's own: that module; its weights are
+                replaced by those in the store.
 
         Raises:
             InputError: not a store, a file missing or not matching its checksum.
@@ -117,9 +135,9 @@ class Robot:
                 f"{known_ones}; update evercal"
             )
         networks = payload["networks"]
-        encoder, descriptor = (str(name) for name in networks)  # type: ignore[attr-defined]
+        local, descriptor = (str(name) for name in networks)  # type: ignore[attr-defined]
         known = Knowledge(
-            load_encoder(root / encoder),
+            load_encoder(root / local) if encoder is None else _own(encoder, root / local),
             load_descriptor(root / descriptor),
             str(payload["strategy"]),
             int(payload["short_side"]),  # type: ignore[call-overload]
@@ -133,7 +151,7 @@ class Robot:
             shared = STRATEGIES[known.strategy].heads == "one"
             if not shared or name == stages[-1]:
                 known.heads.append(_read_head(folder, known))
-        return cls(root, known, stages, (encoder, descriptor))
+        return cls(root, known, stages, (local, descriptor))
 
     def commit(self, known: Knowledge, report: Mapping[str, object]) -> None:
         """Adds the newest scene of `known` to the store: whole, or not at all.
@@ -186,6 +204,9 @@ class Robot:
         for folder in (self.root / STAGES).iterdir():
             if folder.name not in self.stages and re.match(r"\.?\d{4}-", folder.name):
                 shutil.rmtree(folder, ignore_errors=True)
+        for unfinished in self.root.glob(".*.tmp"):
+            if unfinished.name.startswith((f".{MANIFEST}", ".encoder", ".descriptor")):
+                unfinished.unlink(missing_ok=True)
         shutil.rmtree(self.root / LEARNING, ignore_errors=True)
 
     def _write_networks(self, known: Knowledge) -> tuple[str, str]:
@@ -226,6 +247,12 @@ class Robot:
             return None
         return Resume(rows, _load(fitter) if fitter.exists() else {})
 
+    def abandon(self) -> None:
+        """Drops the stage under way, and the folder too if nothing else was ever stored in it."""
+        shutil.rmtree(self.root / LEARNING, ignore_errors=True)
+        if self.root.is_dir() and not any(self.root.iterdir()):
+            self.root.rmdir()
+
     def checkpoint(self, checkpoint: Checkpoint) -> None:
         """Writes a checkpoint of the stage under way."""
         folder = self.root / LEARNING
@@ -252,6 +279,16 @@ def _free(root: Path) -> bool:
     names = [path.name for path in root.iterdir()]
     ours = re.compile(rf"{LEARNING}|{STAGES}|(encoder|descriptor)(-\w+)?\.safetensors|\..*\.tmp")
     return not names or (LEARNING in names and all(map(ours.fullmatch, names)))
+
+
+def _own(module: nn.Module, path: Path) -> Encoder:
+    """A user's module with the weights that the store keeps of it."""
+    try:
+        module.load_state_dict({k: v.float() for k, v in _load(path).items()}, strict=True)
+    except RuntimeError as error:
+        first = str(error).splitlines()[-1].strip()
+        raise InputError(f"{path}: not the weights of the encoder given ({first})") from None
+    return checked_encoder(module)
 
 
 def head_bytes(head: Head) -> int:

@@ -64,9 +64,9 @@ def anchored_reprojection(
     """Replay of `evercal`: geometric truth, and the teacher's points where they were right.
 
     Reprojection against the known poses with a tight, fixed clamp corrects itself, so errors do not
-    pile up from stage to stage. The L1 distance to the teacher's point (weight 50 px per metre, about
-    the parallax of a pixel at 3 m) holds the depth, which a single reprojection does not see; it
-    counts only where the teacher reprojects within 10 px (after Buff-CS's teacher-bounded
+    pile up from stage to stage. The L1 distance to the teacher's point (weight 50 px per metre,
+    about the parallax of a pixel at 3 m) holds the depth, which a single reprojection does not
+    see; it counts only where the teacher reprojects within 10 px (after Buff-CS's teacher-bounded
     regression, Wang et al., ICCV 2021).
     """
     options = LossOptions()

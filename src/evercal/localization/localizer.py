@@ -67,15 +67,25 @@ class Localizer:
             head.eval()
 
     @classmethod
-    def open(cls, store: Path | str, options: LocalizeOptions | None = None) -> Self:
+    def open(
+        cls,
+        store: Path | str,
+        options: LocalizeOptions | None = None,
+        encoder: torch.nn.Module | None = None,
+    ) -> Self:
         """A localizer for a store on disk.
+
+        Args:
+            store: its folder.
+            options: how to locate.
+            encoder: only for a store made with a module of one's own: that module.
 
         Raises:
             InputError: not a store, an empty one, or a damaged file.
         """
         from evercal.continual.robot import Robot
 
-        robot = Robot.open(Path(store))
+        robot = Robot.open(Path(store), encoder)
         if not robot.known.scenes:
             raise InputError(f"store {store}: no scene learned yet; run 'evercal learn' first")
         return cls(robot.known, options)

@@ -5,9 +5,11 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from evercal.continual.knowledge import Knowledge
 from evercal.continual.learn import (
@@ -41,8 +43,8 @@ class LearnOptions:
     """Network and training."""
     strategy: str = "evercal"
     """Key of STRATEGIES; a store keeps the strategy it was made with."""
-    encoder: Path | None = None
-    """Another encoder than the shipped one, for a new store."""
+    encoder: Path | torch.nn.Module | None = None
+    """Another encoder than the shipped one: a file for a new store, or a module of one's own."""
     short_side: int = 240
     """Working size of images in a new store, pixels."""
 
@@ -93,12 +95,18 @@ def learn_scene(
             store's, a store that is none.
     """
     began = time.perf_counter()
+    posed = tuple(frame for frame in scene.train if frame.base_from_camera is not None)
+    scene = replace(scene, train=posed)
     robot = open_or_create(store, options)
     _check(robot, scene, options)
     train, held_out = hold_out(scene.train)
     lesson = replace(scene, train=train)
     resume = robot.begin(_identity(robot, scene, options))
-    stage = run_stage(robot, lesson, options.stage, resume, on_event)
+    try:
+        stage = run_stage(robot, lesson, options.stage, resume, on_event)
+    except InputError:
+        robot.abandon()  # bad input: no interrupted stage worth going on with
+        raise
     known = stage.knowledge
     known.scenes[-1] = with_fit(known.scenes[-1], *fit_threshold(known, held_out))
     memories = [memory.bytes for memory in known.memories if memory is not None]
@@ -121,7 +129,8 @@ def learn_scene(
 def open_or_create(store: Path, options: LearnOptions) -> Robot:
     """The store at a path, or a new one when there is none yet."""
     if (store / MANIFEST).exists():
-        return Robot.open(store)
+        own = options.encoder if isinstance(options.encoder, torch.nn.Module) else None
+        return Robot.open(store, own)
     return Robot.create(store, options.strategy, options.short_side, options.encoder)
 
 
@@ -130,6 +139,10 @@ def _check(robot: Robot, scene: Scene, options: LearnOptions) -> None:
     if scene.name in names:
         raise InputError(
             f"scene {scene.name!r}: the store has a scene of this name; give another with --name"
+        )
+    if not scene.name or set(scene.name) & set("/\\") or scene.name.startswith("."):
+        raise InputError(
+            f"scene name {scene.name!r}: names become folders; give one without slashes (--name)"
         )
     if robot.known.strategy != options.strategy:
         raise InputError(
@@ -147,7 +160,7 @@ def _identity(robot: Robot, scene: Scene, options: LearnOptions) -> dict[str, ob
     """Whatever changes the outcome of a stage: only the same identity may be resumed."""
     poses = hashlib.sha256()
     for frame in scene.train:
-        assert frame.base_from_camera is not None
+        assert frame.base_from_camera is not None, "frames without a pose are left out before"
         poses.update(frame.name.encode())
         poses.update(frame.base_from_camera.matrix().tobytes())
     stages = list(robot.stages)
@@ -155,7 +168,8 @@ def _identity(robot: Robot, scene: Scene, options: LearnOptions) -> dict[str, ob
         "scene": scene.name,
         "frames": poses.hexdigest(),
         "camera": scene.train[0].camera.to_dict(),
-        "options": json.loads(json.dumps(asdict(options), default=str)),
+        "stage": json.loads(json.dumps(asdict(options.stage))),
+        "strategy": options.strategy,
         "stages": stages,
     }
 
@@ -223,10 +237,13 @@ def fit_threshold(
 
 def _strangers(known: Knowledge, scene: int) -> list[np.ndarray]:
     """Views of rooms that are in no scene, at the proportions of the scene's camera."""
-    lens = known.scenes[scene].camera
-    small = lens.short_side_resized(known.short_side)
-    plain = default_camera(small.width, small.height)
-    images = []
+    small = known.scenes[scene].camera.short_side_resized(known.short_side)
+    return _stranger_views(small.width, small.height)
+
+
+@lru_cache(maxsize=4)
+def _stranger_views(width: int, height: int) -> list[np.ndarray]:
+    plain, images = default_camera(width, height), []
     for seed in range(NEGATIVE_ROOM_SEED, NEGATIVE_ROOM_SEED + 4):
         room = BoxRoom(seed, texture_px=192)
         rng = np.random.default_rng(seed)

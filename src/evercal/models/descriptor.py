@@ -45,7 +45,37 @@ class GlobalDescriptor(nn.Module):
         return F.normalize(self.project(pooled), dim=-1)
 
 
-def load_descriptor(path: Path | None = None) -> GlobalDescriptor:
+class PooledDescriptor(nn.Module):
+    """A descriptor without trained weights, for encoders that bring none of their own.
+
+    Mean and deviation of the features over the image, through a fixed random projection.
+
+    Args:
+        inputs: channels of the local features.
+        width: length of the descriptor.
+    """
+
+    projection: Tensor
+
+    def __init__(self, inputs: int, width: int = 128):
+        super().__init__()
+        self.width = width
+        self.settings = {"inputs": inputs, "width": width}
+        generator = torch.Generator().manual_seed(0)
+        projection = torch.randn(2 * inputs, width, generator=generator) / inputs**0.5
+        self.register_buffer("projection", projection)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(b, inputs, h, w) local features of any grid size -> (b, width) unit vectors."""
+        cells = features.flatten(2)
+        pooled = torch.cat([cells.mean(-1), cells.std(-1)], -1)
+        return F.normalize(F.normalize(pooled, dim=-1) @ self.projection, dim=-1)
+
+
+Descriptor = GlobalDescriptor | PooledDescriptor
+
+
+def load_descriptor(path: Path | None = None) -> Descriptor:
     """Reads a descriptor, ready for inference; the shipped one when `path` is None.
 
     Raises:
@@ -60,9 +90,19 @@ def load_descriptor(path: Path | None = None) -> GlobalDescriptor:
         with safe_open(path, "pt") as file:
             settings = json.loads((file.metadata() or {})["descriptor"])
             state = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
-        settings.pop("layout", None)
-        descriptor = GlobalDescriptor(**settings)
+        pooled = settings.pop("layout", None) == PooledDescriptor.__name__
+        descriptor = PooledDescriptor(**settings) if pooled else GlobalDescriptor(**settings)
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"descriptor {path}: not an evercal descriptor ({error!r})") from error
     load_strictly(descriptor, state, f"descriptor {path}: not an evercal descriptor")
     return descriptor.eval()
+
+
+def descriptor_for(encoder_file: Path, inputs: int) -> Descriptor:
+    """The descriptor to go with a user's encoder: its sibling file, or one without training."""
+    sibling = encoder_file.with_name(DESCRIPTOR_FILE.name)
+    if sibling.is_file() and sibling != encoder_file:
+        found = load_descriptor(sibling)
+        if found.settings["inputs"] == inputs:
+            return found
+    return PooledDescriptor(inputs)

@@ -181,6 +181,28 @@ class AceEncoder(nn.Module):
         return (self.res2_skip(x) + F.relu(self.res2_conv3(y))).float()
 
 
+def checked_encoder(module: nn.Module) -> Encoder:
+    """A user's module as an encoder, frozen.
+
+    Raises:
+        InputError: it lacks `stride` or `width`, or gives something else than (b, width, h, w).
+    """
+    if not isinstance(module, Encoder):
+        raise InputError(
+            f"encoder {type(module).__name__}: needs integer attributes 'stride' and 'width'"
+        )
+    module.eval().requires_grad_(False)
+    side = 8 * module.stride
+    with torch.inference_mode():
+        shape = tuple(module(torch.zeros(1, 1, side, side)).shape)
+    if shape != (1, module.width, 8, 8):
+        raise InputError(
+            f"encoder {type(module).__name__}: made {shape} of a (1, 1, {side}, {side}) image, "
+            f"its stride {module.stride} and width {module.width} promise (1, {module.width}, 8, 8)"
+        )
+    return module
+
+
 def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:
     """Reads an encoder, ready for inference.
 
@@ -232,6 +254,9 @@ def _load_own(path: Path) -> LocalEncoder | AceEncoder:
             state = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
         if settings.get("layout") == AceEncoder.__name__:
             return ace_encoder_from_state(state, str(path))
+        if settings.get("layout", LocalEncoder.__name__) != LocalEncoder.__name__:
+            made = settings["layout"]
+            raise InputError(f"encoder {path}: made by the module {made!r}; give it to open this")
         stem = (settings["stem"][0], settings["stem"][1])
         encoder = LocalEncoder(stem, settings["inner"], settings["blocks"], settings["width"])
     except (SafetensorError, KeyError, ValueError) as error:

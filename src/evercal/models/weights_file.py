@@ -13,7 +13,7 @@ def network_bytes(module: torch.nn.Module, kind: str) -> bytes:
     from safetensors.torch import save
 
     state = {k: v.detach().half().contiguous() for k, v in module.state_dict().items()}
-    settings = getattr(module, "settings")  # noqa: B009
+    settings = getattr(module, "settings", {})
     layout = {"layout": type(module).__name__}
     return save(state, {kind: json.dumps(settings | layout)})
 

@@ -29,6 +29,7 @@ from evercal.pretraining.pairs import (
 from evercal.storage.atomic import write_bytes
 
 VALIDATION_ROOM_SEED = FIRST_ROOM_SEED + 50_000
+CHECKPOINT_STEPS = 250
 
 
 @dataclass(frozen=True)
@@ -221,7 +222,7 @@ def train_encoder(
         schedule.step()
         losses.append(float(loss.detach()))
         step += 1
-        if step % 250 == 0 or step == options.steps:
+        if step % CHECKPOINT_STEPS == 0 or step == options.steps:
             encoder.eval()
             accuracy = matching_accuracy(encoder, validation)
             encoder.train()

@@ -142,11 +142,12 @@ def photometric(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         x = cv2.GaussianBlur(x, (0, 0), sigma)
     if rng.random() < 0.25:  # motion blur
         length = int(rng.integers(3, 8))
-        kernel = np.zeros((length, length), np.float32)
+        middle = length // 2  # of an odd kernel: an even one would move the picture
+        kernel = np.zeros((2 * middle + 1, 2 * middle + 1), np.float32)
         angle = rng.uniform(0, np.pi)
         half = (length - 1) / 2
         for step in np.linspace(-half, half, 2 * length):
-            row, column = half + step * np.sin(angle), half + step * np.cos(angle)
+            row, column = middle + step * np.sin(angle), middle + step * np.cos(angle)
             kernel[round(row), round(column)] = 1
         x = cv2.filter2D(x, -1, kernel / kernel.sum())
     x = np.clip(x, 0, 1) ** np.exp(rng.normal(0, 0.25))

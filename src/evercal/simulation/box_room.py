@@ -82,7 +82,10 @@ class BoxRoom:
         picture = np.clip(picture * shade, 0, 255).astype(np.uint8)
         pyramid = [picture]
         while pyramid[-1].shape[0] > 16:
-            pyramid.append(cv2.pyrDown(pyramid[-1]).astype(np.uint8))
+            # Not pyrDown: its pixel k is centred on 2k, not on 2k + 0.5, which moves the picture.
+            half = pyramid[-1].shape[0] // 2
+            smaller = cv2.resize(pyramid[-1], (half, half), interpolation=cv2.INTER_AREA)
+            pyramid.append(smaller.astype(np.uint8))
         return tuple(pyramid)
 
     def _add_box(

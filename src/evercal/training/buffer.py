@@ -1,7 +1,7 @@
 """The feature buffer: the frozen encoder runs once, its rows are trained on many times."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from evercal.datasets.frame import Frame
 from evercal.geometry.se3 import SE3
-from evercal.models.descriptor import GlobalDescriptor
+from evercal.models.descriptor import Descriptor
 from evercal.models.encoder import Encoder
 from evercal.training.loss import Target
 from evercal.training.precision import autocast
@@ -154,7 +154,7 @@ def join(parts: Sequence[Rows]) -> Rows:
 
 @torch.inference_mode()
 def encode(
-    views: Sequence[View], encoder: Encoder, descriptor: GlobalDescriptor
+    views: Sequence[View], encoder: Encoder, descriptor: Descriptor
 ) -> tuple[Tensor, Tensor]:
     """Features (b, channels, h, w) and descriptors (b, width) of views of one size."""
     grey = torch.from_numpy(np.stack([view.grey for view in views]))[:, None].float() / 255.0
@@ -168,7 +168,7 @@ def fill(
     frames: Sequence[Frame],
     plan: "FillPlan",
     encoder: Encoder,
-    descriptor: GlobalDescriptor,
+    descriptor: Descriptor,
 ) -> Iterator[int]:
     """Encodes every frame `plan.passes` times into `buffer`; yields the views done so far.
 
@@ -208,7 +208,7 @@ class FillPlan:
     """Rows kept from an augmented view; a plain view keeps all."""
     seed: int = 0
     """Of views and cells."""
-    view: ViewOptions = ViewOptions()
+    view: ViewOptions = field(default_factory=ViewOptions)
     """Working size and augmentation."""
 
 
@@ -216,7 +216,7 @@ def _flush(
     buffer: FeatureBuffer,
     pending: list[tuple[View, Tensor]],
     encoder: Encoder,
-    descriptor: GlobalDescriptor,
+    descriptor: Descriptor,
 ) -> int:
     views = [view for view, _ in pending]
     features, descriptors = encode(views, encoder, descriptor)

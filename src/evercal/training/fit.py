@@ -15,7 +15,7 @@ from evercal.training.precision import autocast
 
 INLIER_PX = 5.0
 # While points are still far off, their errors say nothing about the lens.
-LENS_FROM_PX = 40.0
+LENS_FROM_PX = 20.0
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class FitOptions:
     """Rows of the scenes being learned in a step."""
     replay_batch: int = 1024
     """Replayed rows in a step, drawn evenly from all remembered scenes."""
-    peak_rate: float = 3e-3
+    peak_rate: float = 4e-3
     """Peak of the one-cycle learning rate (cosine up and down)."""
     warm_share: float = 0.05
     """Share of the steps in which the rate rises."""
@@ -36,9 +36,9 @@ class FitOptions:
     """Of AdamW."""
     diffusion: float = 0.1
     """Standard deviation of the noise on every row's descriptor (GLACE's feature diffusion)."""
-    lens_rate: float = 0.1
-    """Learning rate of the camera correction (focal length, principal point, k1, k2) as a share of the
-    head's; 0 trusts the given intrinsics. Only cameras given without distortion are corrected."""
+    lens_rate: float = 0.3
+    """Learning rate of the camera correction (focal length, principal point, k1, k2) as a share of
+    the head's; 0 trusts the given intrinsics. Cameras with known distortion stay as they are."""
     loss: LossOptions = field(default_factory=LossOptions)
     """Reprojection loss on the scenes being learned."""
 

@@ -17,7 +17,7 @@ MAX_RADIUS2 = 1.0
 class LossOptions:
     """Robust reprojection loss."""
 
-    clamp_start_px: float = 50.0
+    clamp_start_px: float = 25.0
     """Soft clamp at the first step, above `clamp_end_px`."""
     clamp_end_px: float = 1.0
     """Soft clamp at the last step."""
@@ -51,8 +51,8 @@ def reprojection_error(
     Args:
         points: (n, 3) in the atlas.
         target: where they must project to.
-        lens: (n, 5) correction of the nominal pinhole: relative focal length, shift of the principal
-            point in units of the focal length (x, y), OpenCV's k1 and k2.
+        lens: (n, 5) correction of the nominal pinhole: relative focal length, shift of the
+            principal point in units of the focal length (x, y), OpenCV's k1 and k2.
     """
     matrix = target.camera_from_atlas
     in_camera = torch.einsum("nij,nj->ni", matrix[:, :, :3], points) + matrix[:, :, 3]

@@ -88,8 +88,8 @@ def augmented_view(
 ) -> View:
     """A random other view of a posed frame from the same camera centre.
 
-    Its cells are given by the pixels of the original image that they show, so pose and intrinsics are
-    the frame's own.
+    Its cells are given by the pixels of the original image that they show, so pose and intrinsics
+    are the frame's own.
     """
     import cv2
 

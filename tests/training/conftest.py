@@ -1,0 +1,67 @@
+"""A box room, frames of it through any lens, and networks that need no training."""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from evercal.datasets.frame import Frame
+from evercal.geometry import SE3, Camera
+from evercal.models.descriptor import GlobalDescriptor
+from evercal.simulation.box_room import BoxRoom
+
+Shoot = Callable[[Camera, SE3], Frame]
+
+
+def through_lens(room: BoxRoom, camera: Camera, pose: SE3) -> np.ndarray:
+    """(h, w, 3) what a camera with distortion sees: a fine ideal image, bent pixel by pixel."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(float)
+    rays = camera.unproject(np.stack([u, v], -1))
+    low, high = rays.reshape(-1, 3).min(0) - 0.02, rays.reshape(-1, 3).max(0) + 0.02
+    focal = 2.0 * camera.fx
+    width, height = (int(np.ceil(side * focal)) for side in (high - low)[:2])
+    ideal = Camera(width, height, focal, focal, -low[0] * focal, -low[1] * focal)
+    image = room.render(ideal, pose)
+    image = cv2.GaussianBlur(image, (0, 0), 0.6)
+    where = ideal.project(rays).astype(np.float32)
+    return cv2.remap(image, where, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
+
+
+@pytest.fixture(scope="session")
+def box(one_thread: None) -> BoxRoom:
+    return BoxRoom(41, furniture=5, texture_px=160)
+
+
+@pytest.fixture(scope="session")
+def shoot(box: BoxRoom) -> Shoot:
+    """Takes a frame with a camera at a pose."""
+
+    def take(camera: Camera, pose: SE3) -> Frame:
+        image = through_lens(box, camera, pose) if camera.distortion else box.render(camera, pose)
+        return Frame("frame", image, camera, pose)
+
+    return take
+
+
+class BlockMean:
+    """An encoder of one channel: the mean grey value of each cell."""
+
+    stride, width = 8, 1
+
+    def __call__(self, grey: Tensor) -> Tensor:
+        return F.avg_pool2d(grey, 8)
+
+
+@pytest.fixture(scope="session")
+def block_mean() -> BlockMean:
+    return BlockMean()
+
+
+@pytest.fixture(scope="session")
+def describe() -> GlobalDescriptor:
+    torch.manual_seed(1)
+    return GlobalDescriptor(1, maps=2, hidden=4, width=6).eval()
