@@ -25,7 +25,7 @@ from evercal.localization.teach import fit_threshold, hold_out
 from evercal.models.descriptor import load_descriptor
 from evercal.models.encoder import load_encoder
 
-STRATEGIES = ("evercal", "isolation", "joint", "finetune", "sars_spdd", "sars_spdd_filled")
+STRATEGIES = ("evercal", "isolation", "joint", "finetune", "sars_spdd")
 SHORT_SIDE = 240
 
 

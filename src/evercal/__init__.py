@@ -13,6 +13,11 @@ if TYPE_CHECKING:
     from evercal.errors import InputError as InputError
     from evercal.geometry import SE3 as SE3
     from evercal.geometry import Camera as Camera
+    from evercal.localization.estimate import PoseEstimate as PoseEstimate
+    from evercal.localization.localizer import Localizer as Localizer
+    from evercal.localization.teach import LearnOptions as LearnOptions
+    from evercal.localization.teach import LearnReport as LearnReport
+    from evercal.localization.teach import learn_scene as learn_scene
 
 __version__ = "0.1.0"
 
@@ -21,8 +26,13 @@ _PUBLIC = {
     "Camera": "evercal.geometry",
     "Frame": "evercal.datasets",
     "InputError": "evercal.errors",
+    "LearnOptions": "evercal.localization.teach",
+    "LearnReport": "evercal.localization.teach",
+    "Localizer": "evercal.localization.localizer",
+    "PoseEstimate": "evercal.localization.estimate",
     "SE3": "evercal.geometry",
     "Scene": "evercal.datasets",
+    "learn_scene": "evercal.localization.teach",
     "load_scene": "evercal.datasets",
 }
 

@@ -30,8 +30,10 @@ from evercal.datasets.frame import Frame, Scene
 from evercal.errors import InputError
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.localizer import Localizer
-from evercal.models.head import Head
+from evercal.models.head import Head, HeadOutput
+from evercal.training.buffer import Rows
 from evercal.training.fit import Progress
+from evercal.training.precision import autocast
 
 Blank = Callable[[str], Knowledge]
 Rooms = tuple[Scene, Scene, Scene]
@@ -291,6 +293,39 @@ def test_interrupted_twice(
     resume = Resume([*once.rows, *twice.rows], twice.fitter)
     again = outcome(continued(known, rooms, quick, resume))
     assert_same(weights(again.heads[0]), weights(whole.heads[0]))
+
+
+def test_replayed_rows_are_the_old_scenes_and_their_teacher_stays_as_it_was(
+    first: dict[str, Knowledge],
+    rooms: Rooms,
+    quick: StageOptions,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = first["evercal"]
+    memory = known.memories[0]
+    assert memory is not None
+    seen: list[tuple[HeadOutput, Rows, float]] = []
+
+    def spy(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
+        seen.append((teacher, rows, progress))
+        return student.points.square().mean()
+
+    monkeypatch.setitem(STRATEGIES, "evercal", replace(STRATEGIES["evercal"], penalty=spy))
+    list(learn(known, rooms[1], quick))
+    assert [progress for *_, progress in seen] == [i / 8 for i in range(8)]
+    centres = known.scenes[0].cell.atlas_from_base.apply(memory.base_from_camera.translation_m)
+    for teacher, rows, _ in seen:
+        assert len(rows.scene) == 32
+        assert not rows.scene.any()
+        with torch.no_grad(), autocast():
+            expected = known.heads[0](rows.features.float(), rows.scene, rows.descriptor)
+        torch.testing.assert_close(teacher.points, expected.points)
+        assert not teacher.points.requires_grad
+        # Every row was seen from a remembered camera: augmentation turns, but does not move it.
+        turn, shift = rows.target.camera_from_atlas.double().split([3, 1], -1)
+        where = -(turn.transpose(1, 2) @ shift)[..., 0].numpy()
+        nearest = np.linalg.norm(where[:, None] - centres, axis=-1).min(1)
+        assert nearest.max() < 1e-5
 
 
 @pytest.mark.xfail(reason="shares memory with the training", strict=True)

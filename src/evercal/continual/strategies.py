@@ -56,6 +56,7 @@ def _spdd(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float)
 REPLAY_CLAMP_PX = 5.0
 TEACHER_LIMIT_PX = 10.0
 OUTPUT_WEIGHT_PX_PER_M = 50.0
+REPLAY_WEIGHT = 0.3
 
 
 def anchored_reprojection(
@@ -74,7 +75,7 @@ def anchored_reprojection(
     _, error = reprojection_loss(teacher.points, rows.target, REPLAY_CLAMP_PX, options)
     drift = (student.points - teacher.points.detach()).abs().sum(-1)
     held = torch.where(error < TEACHER_LIMIT_PX, drift, torch.zeros_like(drift))
-    return cost.mean() + OUTPUT_WEIGHT_PX_PER_M * held.mean()
+    return REPLAY_WEIGHT * (cost.mean() + OUTPUT_WEIGHT_PX_PER_M * held.mean())
 
 
 STRATEGIES: dict[str, Strategy] = {

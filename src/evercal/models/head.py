@@ -11,6 +11,7 @@ offset in homogeneous form. Scenes may be told apart in two ways (`HeadOptions.c
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -156,29 +157,28 @@ class Head(nn.Module):
         """
         coded = self.options.condition == "code"
         if coded:
-            x = features
-            codes = self._codes(scene, len(features))
+            hidden = self._trunk(features, self._codes(scene))
         else:
             assert descriptor is not None, "condition 'descriptor' needs the image descriptors"
             x = torch.cat([descriptor.to(features.dtype), features], dim=-1)
-            codes: list[Tensor | None] = [None] * self.layers
-        hidden = self._trunk(x, codes)
+            hidden = self._trunk(x, None)
         with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
             return self._decode(hidden.float(), scene, coded)
 
-    def _codes(self, scene: Tensor | int, rows: int) -> list[Tensor | None]:
+    def _codes(self, scene: Tensor | int) -> Callable[[int], Tensor]:
+        """The bias of a layer: (width,) for one scene, (n, width) for a scene per row."""
         if isinstance(scene, int):
-            return list(self.code[scene].unsqueeze(1))
+            return lambda layer: self.code[scene, layer]
         # A product with one-hot rows instead of indexing: its gradient is a product too.
         one_hot = F.one_hot(scene, self.scenes).to(self.code.dtype)
-        return list((one_hot @ self.code.flatten(1)).view(rows, self.layers, -1).unbind(1))
+        return lambda layer: one_hot @ self.code[:, layer]
 
-    def _trunk(self, x: Tensor, codes: list[Tensor | None]) -> Tensor:
-        remaining = iter(codes)
+    def _trunk(self, x: Tensor, code: Callable[[int], Tensor] | None) -> Tensor:
+        number = iter(range(self.layers))
 
         def layer(linear: nn.Module, y: Tensor) -> Tensor:
-            code, z = next(remaining), linear(y)
-            return F.relu(z if code is None else z + code.to(z.dtype))
+            z, i = linear(y), next(number)
+            return F.relu(z if code is None else z + code(i).to(z.dtype))
 
         y = x
         for linear in self.first:

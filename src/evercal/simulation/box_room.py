@@ -179,36 +179,43 @@ class BoxRoom:
         return look_at(position, position + target, rng.uniform(-0.25, 0.25))
 
     def path(self, frames: int, seed: int) -> SE3:
-        """A smooth hand-held sweep.
+        """A smooth hand-held sweep once round the room.
 
         Args:
             frames: number of poses.
-            seed: another seed, another sweep through the same room.
+            seed: another seed walks the same way through the room as another person would: off by
+                some 10 to 20 cm and 10 degrees, smoothly.
 
         Returns:
             `base_from_camera` with shape (frames,).
         """
-        rng = np.random.default_rng([self.seed, seed])
+        way, walker = (
+            np.random.default_rng([self.seed, 0]),
+            np.random.default_rng([self.seed, seed]),
+        )
         t = np.linspace(0, 2 * np.pi, frames, endpoint=False)
         half = self.size_m / 2
 
-        def wave(low: float, high: float, cycles: int) -> np.ndarray:
-            parts = [
-                rng.uniform(0.4, 1) / k * np.sin(k * cycles * t + rng.uniform(0, 2 * np.pi))
-                for k in (1, 2, 3)
-            ]
-            total = np.sum(parts, axis=0)
-            total = total - total.min(initial=np.inf)
-            return low + (high - low) * total / max(total.max(initial=0.0), 1e-9)
+        def wave(low: float, high: float, cycles: int, off: float) -> np.ndarray:
+            own = np.sin(3 * t + walker.uniform(0, 2 * np.pi)) + walker.uniform(-1, 1)
+            return low + (high - low) * _wave(t, cycles, way) + 0.6 * off * own
 
-        x = wave(-0.35 * half[0], 0.35 * half[0], 1)
-        y = wave(-0.35 * half[1], 0.35 * half[1], 1)
-        z = wave(0.9, min(1.9, 0.75 * self.size_m[2]), 1)
-        heading = t + wave(-0.6, 0.6, 2)
-        pitch, roll = wave(-0.45, 0.15, 2), wave(-0.12, 0.12, 2)
+        x = wave(-0.35 * half[0], 0.35 * half[0], 1, 0.15)
+        y = wave(-0.35 * half[1], 0.35 * half[1], 1, 0.15)
+        z = wave(0.9, min(1.9, 0.75 * self.size_m[2]), 1, 0.1)
+        heading = t + wave(-0.6, 0.6, 2, 0.12)
+        pitch, roll = wave(-0.45, 0.15, 2, 0.05), wave(-0.12, 0.12, 2, 0.05)
         eye = np.stack([x, y, z], -1)
         target = eye + np.stack([np.cos(heading), np.sin(heading), pitch], -1)
         return SE3.stack([look_at(eye[i], target[i], roll[i]) for i in range(frames)])
+
+
+def _wave(t: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
+    """A random smooth periodic function of t (n,) in [0, 2 pi], scaled to [0, 1]."""
+    total = np.zeros_like(t)
+    for k in (1, 2, 3):
+        total += rng.uniform(0.4, 1) / k * np.sin(k * cycles * t + rng.uniform(0, 2 * np.pi))
+    return (total - total.min()) / np.ptp(total)
 
 
 def look_at(position_m: np.ndarray, target_m: np.ndarray, roll_rad: float = 0.0) -> SE3:

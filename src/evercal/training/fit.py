@@ -124,8 +124,10 @@ class Fitter:
             rows.descriptor = F.normalize(rows.descriptor + options.diffusion * noise, dim=-1)
         for group in self._optimiser.param_groups:
             group["lr"] = one_cycle(options, self.step) * group["share"]
+        # One scene for all rows is a plain bias, a scene per row another product in every layer.
+        scene = rows.scene if len(parts) > 1 else self.buffers[0].scene
         with autocast():
-            output = self.head(rows.features.float(), rows.scene, rows.descriptor)
+            output = self.head(rows.features.float(), scene, rows.descriptor)
         progress = self.step / options.iterations
         new = rows.part(slice(0, fresh))
         tau = clamp_px(options.loss, progress)

@@ -6,6 +6,7 @@ that goes with it is true, not approximate.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -67,13 +68,19 @@ def plain_view(image: np.ndarray, camera: Camera, stride: int, options: ViewOpti
     return View(grey, pixels, np.ones(len(pixels), bool), _four(camera), SE3.identity())
 
 
+@lru_cache(maxsize=64)
 def ideal_cell_pixels(camera: Camera, stride: int) -> np.ndarray:
-    """(cells, 2) float32: where the cell centres lie once the lens distortion is taken away."""
+    """(cells, 2) float32: where the cell centres lie once the lens distortion is taken away.
+
+    The same array for the same camera: not to be written to.
+    """
     pixels = cell_centres(camera.height, camera.width, stride)
     if camera.distortion:
         rays = camera.unproject(pixels)
         pixels = rays[:, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    return pixels.astype(np.float32)
+    pixels = pixels.astype(np.float32)
+    pixels.flags.writeable = False
+    return pixels
 
 
 def frame_view(frame: Frame, stride: int, options: ViewOptions) -> View:
