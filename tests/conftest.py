@@ -19,16 +19,23 @@ if TYPE_CHECKING:
 
 
 def _room(seed: int, name: str, size: tuple[int, int], span: int, every: int = 1) -> Scene:
-    """The first `span` of 240 views along a path; every `every`-th is learned, the rest tested."""
+    """A walk of half a metre, turning by 50 degrees; every `every`-th view of `span` is learned.
+
+    The other views are there to test.
+    """
+    import numpy as np
+
     from evercal.datasets.frame import Frame, Scene
-    from evercal.simulation.box_room import BoxRoom, default_camera
+    from evercal.simulation.box_room import BoxRoom, default_camera, look_at
 
     room, camera = BoxRoom(seed, texture_px=96), default_camera(*size)
-    poses = room.path(240, 1)[:span]
-    frames = [
-        Frame(f"{name}-{i:03d}", room.render(camera, pose), camera, pose)
-        for i, pose in enumerate(poses)
-    ]
+    frames = []
+    for i, s in enumerate(np.linspace(0, 1, span)):
+        sway, heading = np.sin(2 * np.pi * s), seed + 0.9 * s
+        eye = np.array([0.5 * s - 0.25, 0.15 * sway, 1.3 + 0.1 * sway])
+        ahead = np.array([np.cos(heading), np.sin(heading), 0.1 * sway - 0.1])
+        pose = look_at(eye, eye + ahead, 0.1 * sway)
+        frames.append(Frame(f"{name}-{i:03d}", room.render(camera, pose), camera, pose))
     train = tuple(frames[::every])
     return Scene(name, train, tuple(f for i, f in enumerate(frames) if i % every))
 

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from evercal.cli import demo
-from evercal.cli.demo import DemoOptions, DemoOutcome
+from evercal.cli.demo import DemoOptions
+from evercal.cli.demo_outcome import DemoOutcome
 from evercal.datasets import read_image
 
 

@@ -11,6 +11,7 @@ from evercal.continual.spdd import SpddOptions, spdd_loss
 from evercal.continual.strategies import (
     OUTPUT_WEIGHT_PX_PER_M,
     REPLAY_CLAMP_PX,
+    REPLAY_WEIGHT,
     STRATEGIES,
     TEACHER_LIMIT_PX,
     Strategy,
@@ -55,7 +56,7 @@ def test_anchored_reprojection_by_hand() -> None:
     cost = anchored_reprojection(student, teacher, rows(2), 0.5)
     tau = REPLAY_CLAMP_PX
     expected = tau * math.tanh(3.0 / tau) / 2 + OUTPUT_WEIGHT_PX_PER_M * 0.06 / 2
-    assert float(cost.detach()) == pytest.approx(expected, rel=1e-5)
+    assert float(cost.detach()) == pytest.approx(REPLAY_WEIGHT * expected, rel=1e-5)
 
 
 def test_depth_that_no_pixel_sees_is_held_by_a_teacher_who_is_right() -> None:
@@ -63,7 +64,8 @@ def test_depth_that_no_pixel_sees_is_held_by_a_teacher_who_is_right() -> None:
     wrong = says([off_by(2 * TEACHER_LIMIT_PX)])
     held = anchored_reprojection(student, right, rows(1), 0.0)
     free = anchored_reprojection(student, wrong, rows(1), 0.0)
-    assert float(held.detach()) == pytest.approx(OUTPUT_WEIGHT_PX_PER_M * 0.1, rel=1e-5)
+    expected = REPLAY_WEIGHT * OUTPUT_WEIGHT_PX_PER_M * 0.1
+    assert float(held.detach()) == pytest.approx(expected, rel=1e-5)
     assert float(free.detach()) == pytest.approx(0.0, abs=1e-6)
 
 

@@ -131,6 +131,7 @@ def test_encode_is_the_encoder_on_grey_values_from_0_to_1(
     for view, found in zip(views, features, strict=True):
         blocks = view.grey.reshape(15, 8, 20, 8).mean((1, 3)) / 255
         np.testing.assert_allclose(found[0].numpy(), blocks, atol=4e-3)  # 4e-3: bfloat16
+        assert float(found.mean()) == pytest.approx(blocks.mean(), rel=1e-3)
     assert descriptors.shape == (2, describe.width)
 
 

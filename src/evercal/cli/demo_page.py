@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evercal.cli.demo import METHODS
+from evercal.cli.demo_outcome import METHODS, DemoOutcome
 from evercal.cli.pictures import draw_estimate
 
 if TYPE_CHECKING:
-    from evercal.cli.demo import DemoOutcome
     from evercal.datasets import Scene
     from evercal.localization.localizer import Localizer
 
@@ -20,7 +19,7 @@ _OVERLAYS_PER_ROOM = 3
 
 
 def write_pictures(
-    out: Path, localizer: "Localizer", scenes: "list[Scene]", outcome: "DemoOutcome"
+    out: Path, localizer: "Localizer", scenes: "list[Scene]", outcome: DemoOutcome
 ) -> None:
     """Writes `overview.png` and `report.html`.
 
@@ -115,7 +114,7 @@ def _sheet(overlays: list[_Overlay]) -> np.ndarray:
     return contact_sheet([overlay.image for overlay in overlays], _OVERLAYS_PER_ROOM, captions)
 
 
-def _overview(shown: list[_Overlay], outcome: "DemoOutcome") -> bytes:
+def _overview(shown: list[_Overlay], outcome: DemoOutcome) -> bytes:
     """Two images with points, and what became of the first room with both methods, as a PNG."""
     from matplotlib.figure import Figure
 

@@ -200,8 +200,8 @@ class BoxRoom:
             own = np.sin(3 * t + walker.uniform(0, 2 * np.pi)) + walker.uniform(-1, 1)
             return low + (high - low) * _wave(t, cycles, way) + 0.6 * off * own
 
-        x = wave(-0.35 * half[0], 0.35 * half[0], 1, 0.15)
-        y = wave(-0.35 * half[1], 0.35 * half[1], 1, 0.15)
+        x = wave(-0.24 * half[0], 0.24 * half[0], 1, 0.15)
+        y = wave(-0.24 * half[1], 0.24 * half[1], 1, 0.15)
         z = wave(0.9, min(1.9, 0.75 * self.size_m[2]), 1, 0.1)
         heading = t + wave(-0.6, 0.6, 2, 0.12)
         pitch, roll = wave(-0.45, 0.15, 2, 0.05), wave(-0.12, 0.12, 2, 0.05)
@@ -211,11 +211,14 @@ class BoxRoom:
 
 
 def _wave(t: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
-    """A random smooth periodic function of t (n,) in [0, 2 pi], scaled to [0, 1]."""
-    total = np.zeros_like(t)
-    for k in (1, 2, 3):
-        total += rng.uniform(0.4, 1) / k * np.sin(k * cycles * t + rng.uniform(0, 2 * np.pi))
-    return (total - total.min()) / np.ptp(total)
+    """A random smooth periodic function of t (n,) whose values over [0, 2 pi] fill [0, 1]."""
+    parts = [(k, rng.uniform(0.4, 1) / k, rng.uniform(0, 2 * np.pi)) for k in (1, 2, 3)]
+
+    def total(where: np.ndarray) -> np.ndarray:
+        return sum((a * np.sin(k * cycles * where + p) for k, a, p in parts), np.zeros_like(where))
+
+    whole = total(np.linspace(0, 2 * np.pi, 720))
+    return (total(t) - whole.min()) / np.ptp(whole)
 
 
 def look_at(position_m: np.ndarray, target_m: np.ndarray, roll_rad: float = 0.0) -> SE3:
