@@ -7,7 +7,9 @@ training locate their images to some centimetres. torch is imported inside the f
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -129,3 +131,17 @@ def arc_known(arcs: tuple[Scene, Scene], arc_stage: StageOptions) -> tuple[Knowl
         assert isinstance(stage, Stage)
         known.append(stage.knowledge)
     return known[1], known[2]
+
+
+@pytest.fixture(scope="session")
+def tree() -> Callable[[Path], dict[str, str]]:
+    """Lists a folder: checksum of every file in it, by relative path."""
+
+    def checksums(root: Path) -> dict[str, str]:
+        return {
+            str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in sorted(root.rglob("*"))
+            if path.is_file()
+        }
+
+    return checksums

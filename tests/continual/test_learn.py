@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -11,10 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load, save
 from torch import Tensor
 
-from evercal.continual import learn as learn_module
 from evercal.continual.knowledge import Knowledge
 from evercal.continual.learn import (
     Checkpoint,
@@ -53,12 +51,6 @@ def assert_same(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
     assert a.keys() == b.keys()
     for name, value in a.items():
         torch.testing.assert_close(value, b[name], rtol=0, atol=1e-7, equal_nan=False)
-
-
-@pytest.fixture(scope="module")
-def first(blank: Blank, rooms: Rooms, quick: StageOptions) -> dict[str, Knowledge]:
-    """What each strategy knows after `alpha`."""
-    return {name: outcome(learn(blank(name), rooms[0], quick)) for name in STRATEGIES}
 
 
 def continued(
@@ -217,84 +209,6 @@ def test_the_new_scene_stands_in_its_cell(
         assert after.atlas.scene_at(centres[0]) == i
 
 
-def saved(checkpoint: Checkpoint) -> Checkpoint:
-    """The checkpoint as a file would give it back."""
-    rows, state = (
-        load(save({k: v.contiguous() for k, v in part.items()})) if part else {}
-        for part in (checkpoint.rows, checkpoint.fitter)
-    )
-    return Checkpoint(rows, state)
-
-
-def interrupted(
-    events: Iterator[Event], stop: Callable[[Sequence[Checkpoint]], bool]
-) -> Resume | None:
-    """Runs until `stop` says so after a checkpoint; None if it ran to the end."""
-    checkpoints: list[Checkpoint] = []
-    for event in events:
-        if isinstance(event, Checkpoint):
-            checkpoints.append(saved(event))
-            if stop(checkpoints):
-                fitters = [c.fitter for c in checkpoints if c.fitter]
-                return Resume([c.rows for c in checkpoints if c.rows], (fitters or [{}])[-1])
-    return None
-
-
-STOPS: dict[str, Callable[[Sequence[Checkpoint]], bool]] = {
-    "first rows": lambda c: len(c) == 1,
-    "halfway through encoding": lambda c: len(c) == 4,
-    "first step": lambda c: bool(c[-1].fitter),
-    "fifth step": lambda c: sum(bool(x.fitter) for x in c) == 5,
-}
-
-
-@pytest.mark.parametrize("where", STOPS)
-@pytest.mark.parametrize("name", ["evercal", "sars_spdd", "joint"])
-def test_an_interruption_does_not_show(
-    name: str,
-    where: str,
-    first: dict[str, Knowledge],
-    rooms: Rooms,
-    quick: StageOptions,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    known = first[name]
-    whole = outcome(continued(known, rooms, quick))
-    monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
-    resume = interrupted(continued(known, rooms, quick), STOPS[where])
-    assert resume is not None
-    again = list(continued(known, rooms, quick, resume))
-    assert_same(weights(outcome(again).heads[-1]), weights(whole.heads[-1]))
-    a, b = outcome(again), whole
-    assert torch.equal(a.scenes[-1].prototypes, b.scenes[-1].prototypes)
-    # It went on rather than beginning again.
-    steps = [event.step for event in again if isinstance(event, Progress)]
-    views = [event.done for event in again if isinstance(event, Encoding) and event.total == 60]
-    if "step" in where:
-        assert steps[0] == (2 if where == "first step" else 6)
-    else:
-        assert views[0] > 8
-        assert steps[0] == 1
-
-
-def test_interrupted_twice(
-    first: dict[str, Knowledge],
-    rooms: Rooms,
-    quick: StageOptions,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    known = first["evercal"]
-    whole = outcome(continued(known, rooms, quick))
-    monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
-    once = interrupted(continued(known, rooms, quick), STOPS["halfway through encoding"])
-    assert once is not None
-    twice = interrupted(continued(known, rooms, quick, once), STOPS["fifth step"])
-    assert twice is not None
-    resume = Resume([*once.rows, *twice.rows], twice.fitter)
-    again = outcome(continued(known, rooms, quick, resume))
-    assert_same(weights(again.heads[0]), weights(whole.heads[0]))
-
-
 def test_replayed_rows_are_the_old_scenes_and_their_teacher_stays_as_it_was(
     first: dict[str, Knowledge],
     rooms: Rooms,
@@ -326,24 +240,6 @@ def test_replayed_rows_are_the_old_scenes_and_their_teacher_stays_as_it_was(
         where = -(turn.transpose(1, 2) @ shift)[..., 0].numpy()
         nearest = np.linalg.norm(where[:, None] - centres, axis=-1).min(1)
         assert nearest.max() < 1e-5
-
-
-@pytest.mark.xfail(reason="shares memory with the training", strict=True)
-def test_a_checkpoint_keeps_its_value(
-    first: dict[str, Knowledge],
-    rooms: Rooms,
-    quick: StageOptions,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    # A consumer may write it while training goes on.
-    monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
-    kept: list[tuple[Checkpoint, Checkpoint]] = []
-    for event in continued(first["evercal"], rooms, quick):
-        if isinstance(event, Checkpoint):
-            kept.append((event, copy.deepcopy(event)))
-    for event, then in kept:
-        assert_same(dict(event.rows), dict(then.rows))
-        assert_same(dict(event.fitter), dict(then.fitter))
 
 
 def test_everything_comes_from_the_seed(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import signal
 import subprocess
@@ -31,6 +30,7 @@ from evercal.simulation.box_room import BoxRoom, default_camera
 from evercal.training.fit import Progress
 
 Rooms = tuple[Scene, Scene, Scene]
+Tree = Callable[[Path], dict[str, str]]
 
 
 STRANGERS = teach._strangers
@@ -65,19 +65,11 @@ def taught(options: LearnOptions, rooms: Rooms, tmp_path_factory: pytest.TempPat
     return Taught(root, reports, events)
 
 
-def tree(root: Path) -> dict[str, str]:
-    """Checksums of all files under a folder."""
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
-
-
-def learned(root: Path) -> dict[str, str]:
-    """The same without what tells of the time that was needed."""
+@pytest.fixture
+def learned(tree: Tree) -> Tree:
+    """Lists a store without what tells of the time that was needed."""
     timed = ("manifest.json", "report.json")
-    return {name: sha for name, sha in tree(root).items() if not name.endswith(timed)}
+    return lambda root: {k: sha for k, sha in tree(root).items() if not k.endswith(timed)}
 
 
 TOO_MANY = pytest.mark.xfail(reason="two blocks at least are held out", strict=True)
@@ -243,7 +235,7 @@ def test_a_report_says_what_is_in_the_store(taught: Taught) -> None:
 
 
 def test_what_cannot_be_learned_is_refused_and_nothing_happens(
-    taught: Taught, rooms: Rooms, options: LearnOptions, tmp_path: Path
+    taught: Taught, rooms: Rooms, options: LearnOptions, tmp_path: Path, tree: Tree
 ) -> None:
     before = tree(taught.root)
     with pytest.raises(InputError, match=r"'alpha'.*--name"):
@@ -266,7 +258,7 @@ def test_what_cannot_be_learned_is_refused_and_nothing_happens(
 
 @pytest.mark.xfail(reason="a ValueError from zip, after all the encoding", strict=True)
 def test_a_joint_store_says_that_it_cannot_go_on_alone(
-    rooms: Rooms, options: LearnOptions, tmp_path: Path
+    rooms: Rooms, options: LearnOptions, tmp_path: Path, tree: Tree
 ) -> None:
     joint = replace(options, strategy="joint")
     learn_scene(tmp_path / "store", rooms[0], joint)
@@ -302,6 +294,7 @@ def test_an_interrupted_scene_goes_on_where_it_stopped(
     options: LearnOptions,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    learned: Tree,
 ) -> None:
     monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
     store = tmp_path / "store"
@@ -321,6 +314,7 @@ def test_another_lesson_does_not_resume(
     options: LearnOptions,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    learned: Tree,
 ) -> None:
     monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
     store = tmp_path / "store"
@@ -371,7 +365,9 @@ learn_scene(Path(sys.argv[1]), scene, LearnOptions(stage=stage, short_side=48), 
 """
 
 
-def test_kill_nine(taught: Taught, rooms: Rooms, options: LearnOptions, tmp_path: Path) -> None:
+def test_kill_nine(
+    taught: Taught, rooms: Rooms, options: LearnOptions, tmp_path: Path, tree: Tree
+) -> None:
     generic.write(tmp_path / "beta", rooms[1])
     beta, store = generic.load(tmp_path / "beta"), tmp_path / "store"
     learn_scene(store, rooms[0], options)

@@ -1,0 +1,148 @@
+"""An interruption of `learn` does not show in what is learned."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import pytest
+import torch
+from safetensors.torch import load, save
+from torch import Tensor
+
+from evercal.continual import learn as learn_module
+from evercal.continual.knowledge import Knowledge
+from evercal.continual.learn import (
+    Checkpoint,
+    Encoding,
+    Event,
+    Resume,
+    Stage,
+    StageOptions,
+    learn,
+)
+from evercal.datasets.frame import Scene
+from evercal.models.head import Head
+from evercal.training.fit import Progress
+
+Blank = Callable[[str], Knowledge]
+Rooms = tuple[Scene, Scene, Scene]
+
+
+def outcome(events: Iterable[Event]) -> Knowledge:
+    *_, stage = events
+    assert isinstance(stage, Stage)
+    return stage.knowledge
+
+
+def weights(head: Head) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in head.state_dict().items()}
+
+
+def assert_same(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
+    assert a.keys() == b.keys()
+    for name, value in a.items():
+        torch.testing.assert_close(value, b[name], rtol=0, atol=1e-7, equal_nan=False)
+
+
+def continued(
+    known: Knowledge, rooms: Rooms, options: StageOptions, resume: Resume | None = None
+) -> Iterator[Event]:
+    """The events of the second stage, `beta`, for any strategy."""
+    return learn(known, rooms[1], options, resume, earlier=rooms[:1])
+
+
+def saved(checkpoint: Checkpoint) -> Checkpoint:
+    """The checkpoint as a file would give it back."""
+    rows, state = (
+        load(save({k: v.contiguous() for k, v in part.items()})) if part else {}
+        for part in (checkpoint.rows, checkpoint.fitter)
+    )
+    return Checkpoint(rows, state)
+
+
+def interrupted(
+    events: Iterator[Event], stop: Callable[[Sequence[Checkpoint]], bool]
+) -> Resume | None:
+    """Runs until `stop` says so after a checkpoint; None if it ran to the end."""
+    checkpoints: list[Checkpoint] = []
+    for event in events:
+        if isinstance(event, Checkpoint):
+            checkpoints.append(saved(event))
+            if stop(checkpoints):
+                fitters = [c.fitter for c in checkpoints if c.fitter]
+                return Resume([c.rows for c in checkpoints if c.rows], (fitters or [{}])[-1])
+    return None
+
+
+STOPS: dict[str, Callable[[Sequence[Checkpoint]], bool]] = {
+    "first rows": lambda c: len(c) == 1,
+    "halfway through encoding": lambda c: len(c) == 4,
+    "first step": lambda c: bool(c[-1].fitter),
+    "fifth step": lambda c: sum(bool(x.fitter) for x in c) == 5,
+}
+
+
+@pytest.mark.parametrize("where", STOPS)
+@pytest.mark.parametrize("name", ["evercal", "sars_spdd", "joint"])
+def test_an_interruption_does_not_show(
+    name: str,
+    where: str,
+    first: dict[str, Knowledge],
+    rooms: Rooms,
+    quick: StageOptions,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = first[name]
+    whole = outcome(continued(known, rooms, quick))
+    monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
+    resume = interrupted(continued(known, rooms, quick), STOPS[where])
+    assert resume is not None
+    again = list(continued(known, rooms, quick, resume))
+    assert_same(weights(outcome(again).heads[-1]), weights(whole.heads[-1]))
+    a, b = outcome(again), whole
+    assert torch.equal(a.scenes[-1].prototypes, b.scenes[-1].prototypes)
+    # It went on rather than beginning again.
+    steps = [event.step for event in again if isinstance(event, Progress)]
+    views = [event.done for event in again if isinstance(event, Encoding) and event.total == 60]
+    if "step" in where:
+        assert steps[0] == (2 if where == "first step" else 6)
+    else:
+        assert views[0] > 8
+        assert steps[0] == 1
+
+
+def test_interrupted_twice(
+    first: dict[str, Knowledge],
+    rooms: Rooms,
+    quick: StageOptions,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = first["evercal"]
+    whole = outcome(continued(known, rooms, quick))
+    monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
+    once = interrupted(continued(known, rooms, quick), STOPS["halfway through encoding"])
+    assert once is not None
+    twice = interrupted(continued(known, rooms, quick, once), STOPS["fifth step"])
+    assert twice is not None
+    resume = Resume([*once.rows, *twice.rows], twice.fitter)
+    again = outcome(continued(known, rooms, quick, resume))
+    assert_same(weights(again.heads[0]), weights(whole.heads[0]))
+
+
+@pytest.mark.xfail(reason="shares memory with the training", strict=True)
+def test_a_checkpoint_keeps_its_value(
+    first: dict[str, Knowledge],
+    rooms: Rooms,
+    quick: StageOptions,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # A consumer may write it while training goes on.
+    monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
+    kept: list[tuple[Checkpoint, Checkpoint]] = []
+    for event in continued(first["evercal"], rooms, quick):
+        if isinstance(event, Checkpoint):
+            kept.append((event, copy.deepcopy(event)))
+    for event, then in kept:
+        assert_same(dict(event.rows), dict(then.rows))
+        assert_same(dict(event.fitter), dict(then.fitter))
