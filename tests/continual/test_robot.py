@@ -201,7 +201,7 @@ def test_a_store_of_another_version_is_refused(
 
 
 def test_two_stores_share_nothing(
-    taught: Stages, rooms: Rooms, tmp_path: Path, make: Make, tree: Tree, answers: Answers
+    taught: Stages, tmp_path: Path, make: Make, tree: Tree, answers: Answers
 ) -> None:
     stages = taught["evercal"]
     a, b = make(tmp_path / "a", stages[:1]), make(tmp_path / "b", stages[:1])
@@ -221,7 +221,7 @@ def test_two_stores_share_nothing(
 
 
 def test_what_the_manifest_does_not_list_does_not_count(
-    taught: Stages, rooms: Rooms, tmp_path: Path, make: Make, answers: Answers
+    taught: Stages, tmp_path: Path, make: Make, answers: Answers
 ) -> None:
     make(tmp_path, taught["evercal"][:1])
     expected = answers(Robot.open(tmp_path).known)

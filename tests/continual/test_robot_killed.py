@@ -69,7 +69,6 @@ def unlinked(snapshot: Path, to: Path) -> Path:
 
 def test_killed_anywhere_in_a_second_stage(
     taught: Stages,
-    rooms: Rooms,
     tmp_path: Path,
     every_step: Callable[[Path, Callable[[], object]], Snapshots],
     make: Make,
@@ -122,7 +121,6 @@ def test_killed_anywhere_in_a_second_stage(
 
 def test_killed_anywhere_in_the_first_stage(
     taught: Stages,
-    rooms: Rooms,
     tmp_path: Path,
     every_step: Callable[[Path, Callable[[], object]], Snapshots],
     make: Make,
@@ -172,7 +170,6 @@ def test_killed_while_giving_up_an_older_stage(
 
 def test_a_full_disk_leaves_the_store_as_it_was(
     taught: Stages,
-    rooms: Rooms,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     make: Make,

@@ -84,6 +84,12 @@ def test_the_clamp_follows_the_circle_from_51_to_1() -> None:
     assert [clamp_px(other, t) for t in (0.0, 0.6, 1.0)] == pytest.approx([13.0, 11.0, 3.0])
 
 
+def test_the_exponential_schedule_halves_in_equal_steps() -> None:
+    options = LossOptions(schedule="exponential", clamp_start_px=64.0, clamp_end_px=1.0)
+    steps = [clamp_px(options, k / 6) for k in range(7)]
+    assert steps == pytest.approx([64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0])
+
+
 def test_loss_of_valid_rows_in_closed_form() -> None:
     cx, cy = CAMERA.cx, CAMERA.cy
     pixels = [[cx, cy], [cx + 3, cy], [cx - 3, cy + 4], [cx + 100, cy - 200]]

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -17,8 +18,11 @@ MAX_RADIUS2 = 1.0
 class LossOptions:
     """Robust reprojection loss."""
 
+    schedule: Literal["circle", "exponential"] = "circle"
+    """How the soft clamp narrows: ACE's circle stays wide until late, the exponential halves in equal
+    steps and forgives a bad start."""
     clamp_start_px: float = 25.0
-    """Soft clamp at the first step, above `clamp_end_px`."""
+    """Soft clamp at the first step (circle: above `clamp_end_px`)."""
     clamp_end_px: float = 1.0
     """Soft clamp at the last step."""
     proxy_depth_m: float = 10.0
@@ -38,7 +42,9 @@ class Target:
 
 
 def clamp_px(options: LossOptions, progress: float) -> float:
-    """Soft clamp tau at `progress` in [0, 1], ACE's circle schedule: wide first, tight last."""
+    """Soft clamp tau at `progress` in [0, 1]: wide first, tight last."""
+    if options.schedule == "exponential":
+        return options.clamp_start_px * (options.clamp_end_px / options.clamp_start_px) ** progress
     q = 1.0 - math.sqrt(max(0.0, 1.0 - progress * progress))
     return options.clamp_start_px * (1.0 - q) + options.clamp_end_px
 
