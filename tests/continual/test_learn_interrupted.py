@@ -130,7 +130,6 @@ def test_interrupted_twice(
     assert_same(weights(again.heads[0]), weights(whole.heads[0]))
 
 
-@pytest.mark.xfail(reason="shares memory with the training", strict=True)
 def test_a_checkpoint_keeps_its_value(
     first: dict[str, Knowledge],
     rooms: Rooms,

@@ -133,7 +133,6 @@ def test_a_head_that_decides_itself_is_asked_once_and_the_atlas_tells_the_scene(
     assert "cell" in found.reason
 
 
-@pytest.mark.xfail(reason="takes the camera of the first scene that fits", strict=True)
 def test_a_head_that_decides_itself_takes_the_camera_of_the_scene_it_finds(world: Any) -> None:
     wide = Camera(640, 480, 400.0, 410.0, 300.0, 250.0)
     where = world((CAMERA, wide), condition="descriptor")

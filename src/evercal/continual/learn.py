@@ -14,6 +14,7 @@ from evercal.continual.knowledge import Knowledge, SceneRecord, prototypes, refi
 from evercal.continual.memory import Memory, remember
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.datasets.frame import Frame, Scene
+from evercal.errors import InputError
 from evercal.geometry.camera import Camera
 from evercal.models.head import Head, HeadOptions, HeadOutput
 from evercal.training.buffer import FeatureBuffer, FillPlan, Rows, fill
@@ -106,10 +107,22 @@ def learn(
         resume: where an interrupted run of the same call stood.
         earlier: all earlier scenes, only for strategies with `data: all`.
 
+    Raises:
+        InputError: a strategy with `data: all` and not all earlier scenes.
+
     Yields:
         `Encoding` and `Progress` as it goes, a `Checkpoint` every 10 seconds, a `Stage` at the end.
     """
     strategy = STRATEGIES[known.strategy]
+    if strategy.data == "all" and len(earlier) != len(known.scenes):
+        raise InputError(
+            f"strategy {known.strategy!r}: learns all scenes at once and needs the "
+            f"{len(known.scenes)} earlier ones again, got {len(earlier)}; give them, or take "
+            "another strategy"
+        )
+    # Views are made at the size at which the localizer will see images.
+    view = replace(options.fill.view, short_side=known.short_side)
+    options = replace(options, fill=replace(options.fill, view=view))
     after = known.fork()
     teacher = copy.deepcopy(after.heads[-1]).eval() if after.heads else None
     positions = np.stack([_pose(frame).translation_m for frame in scene.train])
@@ -207,7 +220,7 @@ def _new_centres(head: Head, options: StageOptions, positions: np.ndarray) -> Te
     if kind == "grow":
         if count == 1:
             return torch.from_numpy(positions.mean(0, keepdims=True)).float()
-        count = min(count, len(positions))
+        count = min(count, len(np.unique(positions, axis=0)))
         rng = np.random.default_rng(options.seed)
         centres, _ = kmeans2(positions, count, minit="++", rng=rng)
         return torch.from_numpy(centres).float()
@@ -298,7 +311,7 @@ def keep(
         return None
     positions = np.stack([_pose(frame).translation_m for frame in frames])
     quaternions = np.stack([_pose(frame).rotation_wxyz for frame in frames])
-    capacity = max(1, round(options.memory_share * len(frames)))
+    capacity = max(1, int(options.memory_share * len(frames) + 1e-9))
     if options.memory_bytes is not None:
         one = remember(frames[:1], short_side).bytes
         capacity = min(len(frames), max(1, options.memory_bytes // one))

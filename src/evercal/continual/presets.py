@@ -11,7 +11,7 @@ from evercal.training.loss import LossOptions
 
 Preset = Literal["fast", "demo", "bench", "paper"]
 
-# Short stages cannot afford the circle's start: far-off points have no gradient under a narrow clamp.
+# Short stages cannot afford the circle's start: far-off points get no gradient from a narrow clamp.
 _SHORT = LossOptions(schedule="exponential", clamp_start_px=100.0)
 
 PRESETS: dict[str, StageOptions] = {

@@ -160,6 +160,9 @@ class Localizer:
             lens = cameras[scene]
             assert lens is not None
             trial = self._hypothesis(features, descriptor, scene, lens)
+            own = cameras[trial.scene]
+            if own is not None and own != lens:  # the head found another scene: with its camera
+                trial = self._hypothesis(features, descriptor, trial.scene, own)
             if best is None or trial.inliers > best.inliers:
                 best = trial
         assert best is not None
@@ -168,11 +171,12 @@ class Localizer:
     def _cameras(self, camera: Camera | None, shape: tuple[int, ...]) -> list[Camera | None]:
         """Intrinsics at working size under each scene, None where the proportions do not fit."""
         height, width = shape[:2]
+        small = Camera(width, height, 1, 1, 0, 0).short_side_resized(self.known.short_side)
         found: list[Camera | None] = []
         for record in self.known.scenes:
             lens = record.lens(camera)
             fits = _same_shape(lens, width, height)
-            found.append(lens.short_side_resized(self.known.short_side) if fits else None)
+            found.append(lens.resized(small.width, small.height) if fits else None)
         if not any(found):
             known = ", ".join(
                 f"{r.name} {r.camera.width}x{r.camera.height}" for r in self.known.scenes

@@ -21,6 +21,7 @@ from evercal.continual.learn import (
     learn,
 )
 from evercal.continual.robot import Robot, head_bytes, with_fit
+from evercal.continual.strategies import STRATEGIES
 from evercal.datasets.frame import Frame, Scene
 from evercal.errors import InputError
 from evercal.geometry.se3 import pose_distance
@@ -149,6 +150,11 @@ def _check(robot: Robot, scene: Scene, options: LearnOptions) -> None:
             f"strategy {options.strategy!r}: the store was made with {robot.known.strategy!r}; "
             "go on with that one or start a new store"
         )
+    if STRATEGIES[robot.known.strategy].data == "all" and names:
+        raise InputError(
+            f"strategy {robot.known.strategy!r}: learns all scenes at once, so a scene cannot be "
+            "added to a store; start a new store with another strategy"
+        )
     if len(scene.train) < 16:
         raise InputError(
             f"scene {scene.name!r}: {len(scene.train)} training frames are too few; "
@@ -194,7 +200,7 @@ def run_stage(
 
 def hold_out(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
     """Splits recorded frames: those to learn, and blocks of 4 in every 100 (at least one)."""
-    every = min(HELD_OUT_EVERY, max(len(frames) // 2, HELD_OUT_BLOCK + 1))
+    every = min(HELD_OUT_EVERY, len(frames))
     middle = every // 2
     aside = [middle <= i % every < middle + HELD_OUT_BLOCK for i in range(len(frames))]
     learned = tuple(f for f, out in zip(frames, aside, strict=True) if not out)

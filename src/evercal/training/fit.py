@@ -153,7 +153,8 @@ class Fitter:
         state["lens"] = self.lens.detach()
         for i, slots in self._optimiser.state_dict()["state"].items():
             state |= {f"optimiser.{i}.{name}": value for name, value in slots.items()}
-        return state | {"step": torch.tensor(self.step)}
+        # Copies: training goes on while someone may be writing them.
+        return {k: v.clone() for k, v in state.items()} | {"step": torch.tensor(self.step)}
 
     def load(self, state: dict[str, Tensor]) -> None:
         """Goes back to where `state()` was taken; the head must have the same shape."""

@@ -19,8 +19,8 @@ class LossOptions:
     """Robust reprojection loss."""
 
     schedule: Literal["circle", "exponential"] = "circle"
-    """How the soft clamp narrows: ACE's circle stays wide until late, the exponential halves in equal
-    steps and forgives a bad start."""
+    """How the soft clamp narrows: ACE's circle stays wide until late, the exponential halves in
+    equal steps and forgives a bad start."""
     clamp_start_px: float = 25.0
     """Soft clamp at the first step (circle: above `clamp_end_px`)."""
     clamp_end_px: float = 1.0
