@@ -36,7 +36,7 @@ def run(capfd: pytest.CaptureFixture[str]) -> Run:
     return call
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def tiny(one_thread: None) -> Iterator[None]:
     """Learning takes a second; thresholds, which take longer to fit, believe every pose."""
     from evercal.continual.presets import PRESETS
@@ -68,8 +68,8 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return root / "41", root / "42"
 
 
-@pytest.fixture(scope="session")
-def store(tmp_path_factory: pytest.TempPathFactory, rooms: tuple[Path, Path]) -> Path:
+@pytest.fixture(scope="module")
+def store(tiny: None, tmp_path_factory: pytest.TempPathFactory, rooms: tuple[Path, Path]) -> Path:
     """A store that knows `box-room-41`; not to be changed."""
     folder = tmp_path_factory.mktemp("stores") / "known"
     assert main(["learn", str(folder), str(rooms[0])]) == 0

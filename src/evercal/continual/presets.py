@@ -24,7 +24,7 @@ PRESETS: dict[str, StageOptions] = {
     # At most 45 s a scene of about 100 frames.
     "demo": StageOptions(
         head=HeadOptions(width=256),
-        fit=FitOptions(iterations=1500, batch=2048, replay_batch=1024, loss=_SHORT),
+        fit=FitOptions(iterations=1800, batch=2048, replay_batch=1024, loss=_SHORT),
         fill=FillPlan(passes=3),
         replay_passes=2,
     ),
