@@ -176,10 +176,10 @@ def test_a_thousand_frames_load_in_well_under_a_second(kitchen: Path) -> None:
     assert min(seconds) < 1.0
 
 
-REAL = os.environ.get("EVERCAL_REAL_SCENES", "")
+REAL = os.environ.get("EVERCAL_REAL_DATA", "")
 
 
-@pytest.mark.skipif(not REAL, reason="EVERCAL_REAL_SCENES names no folder with real 7-Scenes data")
+@pytest.mark.skipif(not REAL, reason="EVERCAL_REAL_DATA names no folder with real 7-Scenes data")
 @pytest.mark.parametrize(("name", "focal"), [("redkitchen", 525.0), ("fr1_rpy", 517.3)])
 def test_real_recordings_load(name: str, focal: float) -> None:
     root = Path(REAL) / name

@@ -18,7 +18,7 @@ from evercal.training.loss import (
 )
 
 OPTIONS = LossOptions()
-ACE = LossOptions(clamp_start_px=50.0, clamp_end_px=1.0)
+ACE = LossOptions(schedule="circle", clamp_start_px=50.0, clamp_end_px=1.0)
 CAMERA = Camera(320, 240, 262.0, 255.0, 158.0, 121.0)
 TAU = 7.0
 
@@ -80,7 +80,7 @@ def test_the_clamp_follows_the_circle_from_51_to_1() -> None:
     # A circle: (tau - 1)^2 / 50^2 + t^2 = 1.
     for t in np.linspace(0, 1, 21):
         assert ((clamp_px(ACE, t) - 1) / 50) ** 2 + t * t == pytest.approx(1.0)
-    other = LossOptions(clamp_start_px=10.0, clamp_end_px=3.0)
+    other = LossOptions(schedule="circle", clamp_start_px=10.0, clamp_end_px=3.0)
     assert [clamp_px(other, t) for t in (0.0, 0.6, 1.0)] == pytest.approx([13.0, 11.0, 3.0])
 
 
@@ -88,6 +88,12 @@ def test_the_exponential_schedule_halves_in_equal_steps() -> None:
     options = LossOptions(schedule="exponential", clamp_start_px=64.0, clamp_end_px=1.0)
     steps = [clamp_px(options, k / 6) for k in range(7)]
     assert steps == pytest.approx([64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0])
+
+
+def test_the_exponential_clamp_halves_in_equal_steps() -> None:
+    options = LossOptions(schedule="exponential", clamp_start_px=32.0, clamp_end_px=1.0)
+    found = [clamp_px(options, i / 5) for i in range(6)]
+    assert found == pytest.approx([32.0, 16.0, 8.0, 4.0, 2.0, 1.0])
 
 
 def test_loss_of_valid_rows_in_closed_form() -> None:
