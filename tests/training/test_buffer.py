@@ -231,7 +231,6 @@ def test_taking_gives_every_row_once(
         assert torch.equal(torch.cat([part[name] for part in parts if part]), value)
 
 
-@pytest.mark.xfail(reason="looking at `tensors` between two calls gives rows twice", strict=False)
 def test_taking_gives_every_row_once_even_if_someone_looked(
     frames: list[Frame], block_mean: Encoder, describe: GlobalDescriptor
 ) -> None:

@@ -108,9 +108,12 @@ class FeatureBuffer:
     def tensors(self) -> dict[str, Tensor]:
         """Everything in the buffer, by name."""
         if self._merged is None:
+            halves = self._parts[: self._taken], self._parts[self._taken :]
+            self._parts, self._taken = (
+                [_merge(half) for half in halves if half],
+                min(self._taken, 1),
+            )
             self._merged = _merge(self._parts)
-            taken = self._taken == len(self._parts)
-            self._parts, self._taken = [self._merged], int(taken)
         return self._merged
 
     def __len__(self) -> int:
