@@ -188,17 +188,16 @@ def _head_for_stage(
 ) -> tuple[Head, int]:
     """The head to train, grown by this scene, put in its place; and the scene's index in it."""
     shape = replace(options.head, condition=strategy.condition)
-    width = after.encoder.width
     number = len(after.scenes)
     in_atlas = cell.atlas_from_base.apply(positions)
     if strategy.data == "all":
-        head = Head(width, after.descriptor.width, _seeded(shape, options.seed))
+        head = _fresh_head(after, shape, options.seed)
         for i in range(len(after.scenes)):
             old = after.heads[0]
             head.grow(old.centres[old.centre_scene == i], options.seed + i)
         after.heads = []
     elif strategy.heads == "per_scene" or not after.heads:
-        head = Head(width, after.descriptor.width, _seeded(shape, options.seed))
+        head = _fresh_head(after, shape, options.seed)
     else:
         head = after.heads.pop()
     local = head.scenes
@@ -207,9 +206,9 @@ def _head_for_stage(
     return head, local
 
 
-def _seeded(shape: HeadOptions, seed: int) -> HeadOptions:
+def _fresh_head(after: Knowledge, shape: HeadOptions, seed: int) -> Head:
     torch.manual_seed(seed)
-    return shape
+    return Head(after.encoder.width, after.descriptor.width, shape)
 
 
 def _new_centres(head: Head, options: StageOptions, positions: np.ndarray) -> Tensor:
