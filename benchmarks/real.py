@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from tabulate import tabulate
 
-from benchmarks.sequence import STRATEGIES, Runner, comparison
+from benchmarks.sequence import Runner, comparison
 from evercal.continual.presets import preset
 from evercal.datasets import load_scene
 from evercal.datasets.frame import Scene
@@ -21,7 +21,8 @@ from evercal.simulation.box_room import box_room_scene
 
 REAL = ("redkitchen", "fr1_rpy")
 BOX_SEEDS = (51, 52)
-FOUR_STRATEGIES = ("evercal", "finetune", "isolation", "joint")
+TWO_STRATEGIES = ("evercal", "isolation", "joint", "finetune", "sars_spdd")
+FOUR_STRATEGIES = ("evercal", "isolation", "joint", "finetune")
 
 
 def run(data: Path, out: Path, seeds: Sequence[int], tables: Sequence[str]) -> None:
@@ -33,19 +34,12 @@ def run(data: Path, out: Path, seeds: Sequence[int], tables: Sequence[str]) -> N
     if "two" in tables:
         orders = [[real[name] for name in order] for order in (REAL, REAL[::-1])]
         runners = [Runner(order, out) for order in orders]
-        for seed in seeds:
-            for strategy in STRATEGIES:
-                for runner in runners:
-                    runner.result(strategy, seed)
         for runner in runners:
-            print(comparison(runner, STRATEGIES, seeds))
+            print(comparison(runner, TWO_STRATEGIES, seeds, ("sars_spdd",)))
     if "four" in tables:
         rooms = [box_room_scene(seed, 200, 60) for seed in BOX_SEEDS]
         runner = Runner([real[REAL[0]], rooms[0], real[REAL[1]], rooms[1]], out)
-        for seed in seeds:
-            for strategy in FOUR_STRATEGIES:
-                runner.result(strategy, seed)
-        print(comparison(runner, FOUR_STRATEGIES, seeds))
+        print(comparison(runner, FOUR_STRATEGIES, seeds, ("finetune",)))
 
 
 def fast_table(real: Mapping[str, Scene], out: Path, seed: int) -> None:

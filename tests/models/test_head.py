@@ -27,6 +27,7 @@ def grown(options: HeadOptions, scenes: int, features: int = FEATURES) -> Head:
     with torch.no_grad():  # a new scene's biases are zero; a trained head's are not
         head.logit_bias.copy_(random(*head.logit_bias.shape, seed=8))
         head.offset_bias.copy_(random(*head.offset_bias.shape, seed=9))
+    head.whiten(random(50, features, seed=7) * torch.linspace(0.1, 3, features) + 1)
     return head.eval()
 
 
@@ -36,8 +37,48 @@ SHAPES = [
     HeadOptions(width=12, condition="descriptor", offsets="per_centre", blocks=0),
     HeadOptions(width=12, condition="descriptor", offsets="shared"),
     HeadOptions(width=FEATURES, condition="code"),  # the first skip is the identity
+    HeadOptions(width=12, whiten=False, activation="relu"),
 ]
 CODED = [shape for shape in SHAPES if shape.condition == "code"]
+
+
+def test_whitening_centres_scales_and_half_decorrelates() -> None:
+    mixing = random(FEATURES, FEATURES, seed=3)
+    rows = random(4000, FEATURES, seed=4) @ mixing + 5
+    head = Head(FEATURES, DESCRIPTOR, HeadOptions(width=12))
+    head.whiten(rows)
+    white = ((rows - head.feature_mean) @ head.feature_map).double()
+    torch.testing.assert_close(white.mean(0), torch.zeros(FEATURES).double(), atol=1e-5, rtol=0)
+    assert abs(float(white.std()) - 1) < 1e-3
+
+    def condition(x: Tensor) -> float:
+        return float(torch.linalg.cond(torch.cov(x.double().T)))
+
+    # Standard deviations s become s^(1/2): condition numbers of covariances their root.
+    assert condition(white) == pytest.approx(math.sqrt(condition(rows)), rel=0.02)
+    assert condition(rows) > 50
+
+
+def test_whitening_leaves_alone_what_does_not_vary() -> None:
+    rows = random(500, FEATURES, seed=4)
+    rows[:, 0] = 2.0
+    head = Head(FEATURES, DESCRIPTOR, HeadOptions(width=12))
+    head.whiten(rows)
+    query = rows[:1].clone()
+    query[:, 0] += 1e-3
+    white = (torch.cat([rows[:1], query]) - head.feature_mean) @ head.feature_map
+    assert float((white[0] - white[1]).abs().max()) < 0.05
+
+
+def test_shrinking_touches_shared_matrices_alone() -> None:
+    head = grown(HeadOptions(width=12), 2)
+    before = {key: value.clone() for key, value in head.state_dict().items()}
+    head.shrink(0.5)
+    changed = {key for key, value in head.state_dict().items() if not value.equal(before[key])}
+    assert changed == {key for key in before if key.endswith(".weight")}
+    assert len(changed) == head.layers + 1  # and the skip
+    for key in changed:
+        assert torch.equal(head.state_dict()[key], 0.5 * before[key])
 
 
 def test_scale_in_closed_form() -> None:
@@ -69,8 +110,12 @@ def by_hand(head: Head, feature: np.ndarray, scene: int, descriptor: np.ndarray)
         if coded:
             y = y + w["code"][scene, layer]
         layer += 1
-        return np.maximum(y, 0)
+        if head.options.activation == "relu":
+            return np.maximum(y, 0)
+        return np.array([v * (1 + math.erf(v / math.sqrt(2))) / 2 for v in y])
 
+    if head.options.whiten:
+        feature = (feature - w["feature_mean"]) @ w["feature_map"]
     x = feature if coded else np.concatenate([descriptor, feature])
     y = x
     for i in range(3):

@@ -22,6 +22,7 @@ from evercal.training.fit import FitOptions, Fitter, Progress, Replay
 from evercal.training.precision import autocast
 
 CHECKPOINT_SECONDS = 10.0
+WHITENING_ROWS = 20_000
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class StageOptions:
     """Training."""
     fill: FillPlan = field(default_factory=FillPlan)
     """Views of the new scene's frames."""
-    replay_passes: int = 3
+    replay_passes: int = 4
     """Views of every remembered frame."""
     memory_share: float = 0.10
     """N_b as a share of the scene's training frames."""
@@ -145,12 +146,12 @@ def learn(
     buffers = [buffer]
     if strategy.data == "all":
         buffers += yield from _refill(known, earlier, options)
+    if head.options.whiten and (strategy.data == "all" or head.scenes == 1):
+        head.whiten(_sample(buffers, options.seed))
     replay = None
     if strategy.penalty is not None and teacher is not None:
         replay = yield from _replay(known, strategy, teacher, options)
     fit = options.fit
-    if known.scenes and strategy.data == "stage" and strategy.heads == "one":
-        fit = replace(fit, peak_rate=fit.peak_rate * strategy.warm_rate)
     fitter = Fitter(head, buffers, replay, fit, options.seed)
     if fitter_state:
         fitter.load(dict(fitter_state))
@@ -200,6 +201,7 @@ def _head_for_stage(
         head = _fresh_head(after, shape, options.seed)
     else:
         head = after.heads.pop()
+        head.shrink(strategy.shrink)
     local = head.scenes
     head.grow(_new_centres(head, options, in_atlas), options.seed + number)
     after.heads.append(head)
@@ -209,6 +211,13 @@ def _head_for_stage(
 def _fresh_head(after: Knowledge, shape: HeadOptions, seed: int) -> Head:
     torch.manual_seed(seed)
     return Head(after.encoder.width, after.descriptor.width, shape)
+
+
+def _sample(buffers: Sequence[FeatureBuffer], seed: int) -> Tensor:
+    """Feature rows of all buffers, enough for their covariance."""
+    generator = torch.Generator().manual_seed(seed)
+    drawn = [buffer.draw(WHITENING_ROWS // len(buffers), generator) for buffer in buffers]
+    return torch.cat([rows.features for rows in drawn])
 
 
 def _new_centres(head: Head, options: StageOptions, positions: np.ndarray) -> Tensor:

@@ -11,40 +11,38 @@ from evercal.training.loss import LossOptions
 
 Preset = Literal["fast", "demo", "bench", "paper"]
 
-# Short stages cannot afford the circle's start: far-off points get no gradient from a narrow clamp.
-_SHORT = LossOptions(schedule="exponential", clamp_start_px=100.0)
-
 PRESETS: dict[str, StageOptions] = {
     # 2 cores, at most 240 s a scene.
     "fast": StageOptions(
-        head=HeadOptions(width=512),
-        fit=FitOptions(iterations=3500, batch=2048, replay_batch=1024),
+        head=HeadOptions(width=384),
+        fit=FitOptions(iterations=2400, batch=2048, replay_batch=1024),
         fill=FillPlan(passes=4),
     ),
     # At most 45 s a scene of about 100 frames.
     "demo": StageOptions(
         head=HeadOptions(width=256),
-        fit=FitOptions(iterations=1800, batch=2048, replay_batch=1024, loss=_SHORT),
+        fit=FitOptions(iterations=1800, batch=2048, replay_batch=1024),
         fill=FillPlan(passes=3),
-        replay_passes=2,
+        replay_passes=4,
     ),
     # At most 30 s a stage.
     "bench": StageOptions(
         head=HeadOptions(width=256),
-        fit=FitOptions(iterations=1000, batch=2048, replay_batch=1024, loss=_SHORT),
+        fit=FitOptions(iterations=1000, batch=2048, replay_batch=1024),
         fill=FillPlan(passes=1),
-        replay_passes=1,
+        replay_passes=2,
     ),
     # The paper's settings, for a GPU; Sim takes 5,000 steps.
     "paper": StageOptions(
-        head=HeadOptions(width=768, centres_per_scene=100),
+        head=HeadOptions(width=768, centres_per_scene=100, whiten=False, activation="relu"),
         fit=FitOptions(
             iterations=15_000,
             batch=40_960,
             replay_batch=40_960,
             peak_rate=5e-3,
+            muon_rate=0.0,
             warm_share=0.3,
-            loss=LossOptions(clamp_start_px=50.0),
+            loss=LossOptions(schedule="circle", clamp_start_px=50.0),
         ),
         fill=FillPlan(passes=8, cells=1024),
     ),

@@ -37,8 +37,11 @@ class Strategy:
     """Train on the new scene, or on every frame of every scene from scratch."""
     heads: Literal["one", "per_scene"] = "one"
     """One head for all scenes, or one each."""
-    warm_rate: float = 1.0
-    """Peak learning rate of the second and later stages, as a share of the first one's."""
+    shrink: float = 1.0
+    """What the head's shared matrices are multiplied with before the second and later stages: a
+    network that was trained to the end learns the next scene worse than a fresh one; a shrunk one
+    does not (after Ash and Adams, On Warm-Starting Neural Network Training, NeurIPS 2020). The
+    teacher stays whole, and replay brings back what shrinking took."""
 
 
 def _sars(positions: np.ndarray, quaternions: np.ndarray, capacity: int) -> np.ndarray:
@@ -56,7 +59,8 @@ def _spdd(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float)
 REPLAY_CLAMP_PX = 5.0
 TEACHER_LIMIT_PX = 10.0
 OUTPUT_WEIGHT_PX_PER_M = 50.0
-REPLAY_WEIGHT = 0.3
+REPLAY_WEIGHT = 0.5
+SHRINK = 0.5
 
 
 def anchored_reprojection(
@@ -83,8 +87,11 @@ STRATEGIES: dict[str, Strategy] = {
         source="this project: scene codes, own centres, anchored replay",
         select=_sars_filled,
         penalty=anchored_reprojection,
+        shrink=SHRINK,
     ),
-    "finetune": Strategy(source="control: the head and steps of evercal, no replay"),
+    "finetune": Strategy(
+        source="control: the head, start and steps of evercal, no replay", shrink=SHRINK
+    ),
     "sars_spdd": Strategy(
         source="Li et al., Continual Hand-Eye Calibration, arXiv 2604.15814, Algorithms 1 and 2",
         select=_sars,

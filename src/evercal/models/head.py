@@ -23,6 +23,8 @@ from evercal.errors import InputError
 
 SCALE_MAX = 4.0
 SCALE_MIN = 0.01
+# Share of the way from plain features (0) to wholly decorrelated ones (1).
+WHITENING = 0.5
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,11 @@ class HeadOptions:
     paper; needs the future), or the middles of the atlas cells."""
     centres_per_scene: int = 4
     """Cluster centres that a scene adds."""
+    whiten: bool = True
+    """Features are centred, scaled and half decorrelated before the first layer. Without it their
+    few strong directions drown the many weak ones, which tell neighbouring points apart."""
+    activation: Literal["gelu", "relu"] = "gelu"
+    """Between layers; ACE and GLACE have `relu`."""
 
 
 @dataclass
@@ -74,6 +81,8 @@ class Head(nn.Module):
 
     centres: Tensor
     centre_scene: Tensor
+    feature_mean: Tensor
+    feature_map: Tensor
 
     def __init__(self, features: int, descriptor: int, options: HeadOptions):
         super().__init__()
@@ -98,6 +107,8 @@ class Head(nn.Module):
         self.offset_bias = nn.Parameter(torch.zeros(offsets, 4))
         if offsets:
             nn.init.kaiming_uniform_(self.offset.data.view(4, width), a=math.sqrt(5))
+        self.register_buffer("feature_mean", torch.zeros(features))
+        self.register_buffer("feature_map", torch.eye(features))
         self.register_buffer("centres", torch.zeros(0, 3))
         self.register_buffer("centre_scene", torch.zeros(0, dtype=torch.long))
 
@@ -110,6 +121,33 @@ class Head(nn.Module):
     def scenes(self) -> int:
         """How many scenes this head knows."""
         return self.code.shape[0]
+
+    def whiten(self, features: Tensor) -> None:
+        """Fits the input whitening; it stays as it is from then on, also for later scenes.
+
+        With C = V diag(s^2) V' the covariance, an input becomes a (x - mean) V diag(s^-1/2) V',
+        a such that the variance over all rows and channels is 1.
+
+        Args:
+            features: (n, features) rows of the first scene, n well above the number of channels.
+        """
+        features = features.double()
+        mean = features.mean(0)
+        centred = features - mean
+        variance, axes = torch.linalg.eigh(centred.T @ centred / len(centred))
+        spread = variance.clamp(min=0).sqrt()
+        # Directions in which nothing varies must not be blown up.
+        gain = (spread + 1e-3 * spread.max() + 1e-12) ** -WHITENING
+        mapping = (axes * gain) @ axes.T
+        mapping /= (centred @ mapping).std().clamp(min=1e-12)
+        self.feature_mean.copy_(mean)
+        self.feature_map.copy_(mapping)
+
+    def shrink(self, factor: float) -> None:
+        """Multiplies the matrices that all scenes share; biases, codes and outputs stay."""
+        with torch.no_grad():
+            for matrix in (m.weight for m in self.modules() if isinstance(m, nn.Linear)):
+                matrix.mul_(factor)
 
     def grow(self, centres: Tensor, seed: int) -> None:
         """Makes room for one more scene; what the head says about others does not change.
@@ -156,6 +194,8 @@ class Head(nn.Module):
             What the head says, in fp32, whatever autocast does inside.
         """
         coded = self.options.condition == "code"
+        if self.options.whiten:
+            features = (features - self.feature_mean) @ self.feature_map
         if coded:
             hidden = self._trunk(features, self._codes(scene))
         else:
@@ -175,10 +215,11 @@ class Head(nn.Module):
 
     def _trunk(self, x: Tensor, code: Callable[[int], Tensor] | None) -> Tensor:
         number = iter(range(self.layers))
+        activation = F.gelu if self.options.activation == "gelu" else F.relu
 
         def layer(linear: nn.Module, y: Tensor) -> Tensor:
             z, i = linear(y), next(number)
-            return F.relu(z if code is None else z + code(i).to(z.dtype))
+            return activation(z if code is None else z + code(i).to(z.dtype))
 
         y = x
         for linear in self.first:

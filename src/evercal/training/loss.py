@@ -18,10 +18,10 @@ MAX_RADIUS2 = 1.0
 class LossOptions:
     """Robust reprojection loss."""
 
-    schedule: Literal["circle", "exponential"] = "circle"
+    schedule: Literal["circle", "exponential"] = "exponential"
     """How the soft clamp narrows: ACE's circle stays wide until late, the exponential halves in
     equal steps and forgives a bad start."""
-    clamp_start_px: float = 25.0
+    clamp_start_px: float = 100.0
     """Soft clamp at the first step (circle: above `clamp_end_px`)."""
     clamp_end_px: float = 1.0
     """Soft clamp at the last step."""
