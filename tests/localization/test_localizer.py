@@ -107,6 +107,21 @@ def test_wrong_proportions_are_refused(world: Any) -> None:
         localizer.localize(np.zeros((160, 120, 3), np.uint8))
 
 
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((120, 160, 4), np.uint8),
+        np.zeros((120, 160, 3), np.float32),
+        np.zeros((1, 120, 160, 3), np.uint8),
+        np.zeros(7, np.uint8),
+    ],
+)
+def test_what_is_no_image_is_refused(world: Any, image: np.ndarray) -> None:
+    localizer = Localizer(world((CAMERA,)).known)
+    with pytest.raises(InputError, match=r"image of shape \(.*give \(height, width, 3\) uint8"):
+        localizer.localize(image)
+
+
 def test_grey_images_are_images_too(world: Any) -> None:
     where = world()
     image = where.view(1)

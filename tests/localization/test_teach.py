@@ -300,6 +300,24 @@ def test_an_interrupted_scene_goes_on_where_it_stopped(
     assert learned(store) == learned(taught.root)
 
 
+def test_a_second_learner_is_kept_out(
+    taught: Taught, rooms: Rooms, options: LearnOptions, tmp_path: Path, learned: Tree
+) -> None:
+    store, meanwhile = tmp_path / "store", []
+
+    def intrude(event: object) -> None:
+        if not meanwhile:
+            with pytest.raises(InputError, match="another process is learning into it") as refusal:
+                learn_scene(store, rooms[1], options)
+            meanwhile.append(str(refusal.value))
+
+    learn_scene(store, rooms[0], options, intrude)
+    assert len(meanwhile) == 1
+    learn_scene(store, rooms[1], options)  # later it may
+    assert learned(store) == learned(taught.root)
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+
+
 def test_another_lesson_does_not_resume(
     taught: Taught,
     rooms: Rooms,

@@ -21,14 +21,14 @@ PRESETS: dict[str, StageOptions] = {
     # At most 45 s a scene of about 100 frames.
     "demo": StageOptions(
         head=HeadOptions(width=256),
-        fit=FitOptions(iterations=1800, batch=2048, replay_batch=1024),
+        fit=FitOptions(iterations=1000, batch=2048, replay_batch=1024),
         fill=FillPlan(passes=3),
         replay_passes=4,
     ),
     # At most 30 s a stage.
     "bench": StageOptions(
         head=HeadOptions(width=256),
-        fit=FitOptions(iterations=1000, batch=2048, replay_batch=1024),
+        fit=FitOptions(iterations=600, batch=2048, replay_batch=1024),
         fill=FillPlan(passes=1),
         replay_passes=2,
     ),

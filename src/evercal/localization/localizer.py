@@ -103,8 +103,8 @@ class Localizer:
             camera: its intrinsics; None takes those of the scene that is found, scaled.
 
         Raises:
-            InputError: no camera given and the proportions fit no known scene's camera, or a camera
-                whose proportions are not the image's.
+            InputError: an array that is no such image, no camera given and the proportions fit no
+                known scene's camera, or a camera whose proportions are not the image's.
         """
         began = time.perf_counter()
         features, descriptors = self._encode([self._prepare(image, camera)])
@@ -133,6 +133,11 @@ class Localizer:
         return [answers[i] for i in range(len(images))]
 
     def _prepare(self, image: np.ndarray, camera: Camera | None) -> View:
+        if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
+            raise InputError(
+                f"image of shape {image.shape}, {image.dtype}: give (height, width, 3) uint8 RGB "
+                "or (height, width) uint8 grey"
+            )
         height, width = image.shape[:2]
         if camera is not None and not _same_shape(camera, width, height):
             raise InputError(

@@ -3,13 +3,15 @@
 import hashlib
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import torch
+from filelock import FileLock, Timeout
 
 from evercal.continual.knowledge import Knowledge
 from evercal.continual.learn import (
@@ -26,6 +28,7 @@ from evercal.datasets.frame import Frame, Scene
 from evercal.errors import InputError
 from evercal.geometry.se3 import pose_distance
 from evercal.localization.localizer import Localizer
+from evercal.models.weights_file import network_bytes
 from evercal.simulation.box_room import BoxRoom, default_camera
 from evercal.storage.manifest import MANIFEST
 from evercal.training.fit import Progress
@@ -93,8 +96,36 @@ def learn_scene(
 
     Raises:
         InputError: too few frames, a name that the store knows already, another strategy than the
-            store's, a store that is none.
+            store's, a store that is none or that another process is learning into.
     """
+    with _alone(store):
+        return _learn_scene(store, scene, options, on_event)
+
+
+@contextmanager
+def _alone(store: Path) -> Iterator[None]:
+    """Holds the lock that keeps a second learner out of a store; it lies beside the store."""
+    path = store.with_name(f".{store.name}.lock")
+    lock = FileLock(path)
+    try:
+        store.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise InputError(
+            f"store {store}: another process is learning into it; wait until it has finished"
+        ) from None
+    except OSError as error:
+        raise InputError(f"store {store}: cannot be written ({error.strerror})") from error
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        lock.release()
+
+
+def _learn_scene(
+    store: Path, scene: Scene, options: LearnOptions, on_event: OnEvent | None
+) -> LearnReport:
     began = time.perf_counter()
     posed = tuple(frame for frame in scene.train if frame.base_from_camera is not None)
     scene = replace(scene, train=posed)
@@ -169,9 +200,15 @@ def _identity(robot: Robot, scene: Scene, options: LearnOptions) -> dict[str, ob
         assert frame.base_from_camera is not None, "frames without a pose are left out before"
         poses.update(frame.name.encode())
         poses.update(frame.base_from_camera.matrix().tobytes())
+    networks = hashlib.sha256()
+    for kind in ("encoder", "descriptor"):
+        module = getattr(robot.known, kind)
+        assert isinstance(module, torch.nn.Module)
+        networks.update(network_bytes(module, kind))
     stages = list(robot.stages)
     return {
         "scene": scene.name,
+        "networks": networks.hexdigest(),
         "frames": poses.hexdigest(),
         "camera": scene.train[0].camera.to_dict(),
         "stage": json.loads(json.dumps(asdict(options.stage))),
