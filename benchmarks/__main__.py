@@ -48,7 +48,13 @@ def speed(store: Path, image: Path, repeat: int = 50) -> None:
 
 def main() -> int:
     """Runs one benchmark."""
-    tyro.extras.subcommand_cli_from_dict({"real": real, "speed": speed})
+    from evercal.errors import InputError
+
+    try:
+        tyro.extras.subcommand_cli_from_dict({"real": real, "speed": speed})
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     return 0
 
 

@@ -17,6 +17,7 @@ from evercal.continual.presets import preset
 from evercal.continual.robot import head_bytes, with_fit
 from evercal.continual.strategies import STRATEGIES as RULES
 from evercal.datasets.frame import Scene
+from evercal.errors import InputError
 from evercal.evaluation.metrics import correct
 from evercal.evaluation.protocol import evaluate
 from evercal.evaluation.statistics import paired_difference
@@ -55,16 +56,35 @@ class Outcome:
 _first_stages: dict[tuple[str, str, int, int], Knowledge] = {}
 
 
+def _same_settings(out: Path) -> None:
+    """Notes with which settings a folder's results are made, or refuses to mix them with others."""
+    path, ours = out / "settings.json", json.loads(json.dumps(asdict(stage_options(0))))
+    if not path.exists():
+        out.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(ours))
+    theirs = json.loads(path.read_text())
+    for part in sorted({*ours, *theirs}):
+        a, b = theirs.get(part), ours.get(part)
+        if a != b:
+            raise InputError(
+                f"results {out}: made with {part} {a}, now it is {b}; give another --out"
+            )
+
+
 class Runner:
     """Runs strategies over one sequence of scenes; results are read from disk when they are there.
 
     Args:
         scenes: in order of learning.
         out: folder of results.
+
+    Raises:
+        InputError: the folder holds results of other settings.
     """
 
     def __init__(self, scenes: Sequence[Scene], out: Path):
         self.scenes, self.out = list(scenes), out
+        _same_settings(out)
         self.lessons, self.held_out = [], []
         for scene in scenes:
             train, aside = hold_out(scene.train)
