@@ -198,21 +198,6 @@ def test_the_input_is_whitened_by_the_first_scene_and_stays_so(
         assert not torch.equal(other.feature_map, before.feature_map)
 
 
-@pytest.mark.parametrize(("name", "factor"), [("evercal", 0.5), ("sars_spdd", 1.0)])
-def test_a_later_stage_starts_from_shrunk_matrices(
-    name: str, factor: float, first: dict[str, Knowledge], rooms: Rooms, quick: StageOptions
-) -> None:
-    at_rest = replace(quick, fit=replace(quick.fit, iterations=1, peak_rate=1e-12, muon_rate=0.0))
-    known = first[name]
-    started = outcome(continued(known, rooms, at_rest)).heads[0]
-    for layer in ("first.1.weight", "last.0.weight"):
-        before, after = weights(known.heads[0])[layer], weights(started)[layer]
-        torch.testing.assert_close(after, factor * before, rtol=0, atol=1e-6)
-    # What belongs to the first scene alone stays.
-    code = known.heads[0].code
-    torch.testing.assert_close(started.code[: len(code)], code, rtol=0, atol=1e-6)
-
-
 def test_the_new_scene_stands_in_its_cell(
     first: dict[str, Knowledge], rooms: Rooms, quick: StageOptions
 ) -> None:

@@ -70,17 +70,6 @@ def test_whitening_leaves_alone_what_does_not_vary() -> None:
     assert float((white[0] - white[1]).abs().max()) < 0.05
 
 
-def test_shrinking_touches_shared_matrices_alone() -> None:
-    head = grown(HeadOptions(width=12), 2)
-    before = {key: value.clone() for key, value in head.state_dict().items()}
-    head.shrink(0.5)
-    changed = {key for key, value in head.state_dict().items() if not value.equal(before[key])}
-    assert changed == {key for key in before if key.endswith(".weight")}
-    assert len(changed) == head.layers + 1  # and the skip
-    for key in changed:
-        assert torch.equal(head.state_dict()[key], 0.5 * before[key])
-
-
 def test_scale_in_closed_form() -> None:
     raw = torch.tensor([-torch.inf, -60.0, 0.0, 200.0, torch.inf])
     expected = torch.tensor([0.25, 0.25, 1.0, 100.0, 100.0])

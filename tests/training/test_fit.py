@@ -5,18 +5,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from evercal.geometry import SE3, Camera
 from evercal.models.head import Head, HeadOptions, HeadOutput
-from evercal.simulation.box_room import BoxRoom
 from evercal.training.buffer import FeatureBuffer, Rows
 from evercal.training.fit import FitOptions, Fitter, Progress, Replay, one_cycle
 from evercal.training.loss import LossOptions, reprojection_error
-from evercal.training.views import View, cell_centres
+from evercal.training.views import cell_centres
 
 CAMERA = Camera(160, 120, 131.0, 128.0, 79.5, 59.5)
 CHANNELS, DESCRIPTOR = 48, 6
@@ -30,35 +28,6 @@ OPTIONS = FitOptions(
 )
 
 Learnable = Callable[..., tuple[FeatureBuffer, Tensor]]
-
-
-@pytest.fixture(scope="session")
-def learnable(box: BoxRoom) -> Learnable:
-    """A buffer of a box room whose features are waves of the true point; and those points."""
-    waves = np.random.default_rng(0).normal(0, 0.6, (CHANNELS // 2, 3))
-
-    def make(
-        scene: int = 0, views: int = 6, lens: Camera | None = None, correctable: bool = False
-    ) -> tuple[FeatureBuffer, Tensor]:
-        rng = np.random.default_rng(scene)
-        buffer = FeatureBuffer(scene, ATLAS_FROM_BASE, correctable)
-        everything = []
-        for _ in range(views):
-            pose, pixels = box.random_view(rng), cell_centres(120, 160, 8)
-            rays = (lens or CAMERA).unproject(pixels) @ pose.rotation_matrix().T
-            points, _ = box.intersect(pose.translation_m, rays)
-            phase = points @ waves.T
-            features = np.concatenate([np.sin(phase), np.cos(phase)], 1)
-            grid = torch.from_numpy(features.T.reshape(1, CHANNELS, 15, 20)).float()
-            intrinsics = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy], np.float32)
-            grey, valid = np.zeros((120, 160), np.uint8), np.ones(300, bool)
-            view = View(grey, pixels.astype(np.float32), valid, intrinsics, pose)
-            descriptor = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(1, 6))))
-            buffer.add([view], grid, descriptor, torch.ones(1, 300, dtype=torch.bool))
-            everything.append(torch.from_numpy(ATLAS_FROM_BASE.apply(points)).float())
-        return buffer, torch.cat(everything)
-
-    return make
 
 
 def head_for(buffers: list[FeatureBuffer], options: HeadOptions | None = None) -> Head:

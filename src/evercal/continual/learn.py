@@ -201,7 +201,6 @@ def _head_for_stage(
         head = _fresh_head(after, shape, options.seed)
     else:
         head = after.heads.pop()
-        head.shrink(strategy.shrink)
     local = head.scenes
     head.grow(_new_centres(head, options, in_atlas), options.seed + number)
     after.heads.append(head)
@@ -278,7 +277,7 @@ def _replay(
             before = teacher(rows.features.float(), rows.scene, rows.descriptor)
         return cost(student, before, rows, progress)
 
-    return Replay(buffers, penalty) if buffers else None
+    return Replay(buffers, penalty, strategy.protection) if buffers else None
 
 
 def _finish(

@@ -37,11 +37,9 @@ class Strategy:
     """Train on the new scene, or on every frame of every scene from scratch."""
     heads: Literal["one", "per_scene"] = "one"
     """One head for all scenes, or one each."""
-    shrink: float = 1.0
-    """What the head's shared matrices are multiplied with before the second and later stages: a
-    network that was trained to the end learns the next scene worse than a fresh one; a shrunk one
-    does not (after Ash and Adams, On Warm-Starting Neural Network Training, NeurIPS 2020). The
-    teacher stays whole, and replay brings back what shrinking took."""
+    protection: float = 0.0
+    """How strongly updates of shared matrices spare the directions that remembered scenes use
+    (`training.protection`)."""
 
 
 def _sars(positions: np.ndarray, quaternions: np.ndarray, capacity: int) -> np.ndarray:
@@ -60,7 +58,7 @@ REPLAY_CLAMP_PX = 5.0
 TEACHER_LIMIT_PX = 10.0
 OUTPUT_WEIGHT_PX_PER_M = 50.0
 REPLAY_WEIGHT = 0.5
-SHRINK = 0.5
+PROTECTION = 2.0
 
 
 def anchored_reprojection(
@@ -84,14 +82,12 @@ def anchored_reprojection(
 
 STRATEGIES: dict[str, Strategy] = {
     "evercal": Strategy(
-        source="this project: scene codes, own centres, anchored replay",
+        source="this project: scene codes, own centres, anchored replay, protection",
         select=_sars_filled,
         penalty=anchored_reprojection,
-        shrink=SHRINK,
+        protection=PROTECTION,
     ),
-    "finetune": Strategy(
-        source="control: the head, start and steps of evercal, no replay", shrink=SHRINK
-    ),
+    "finetune": Strategy(source="control: the head and steps of evercal, no replay"),
     "sars_spdd": Strategy(
         source="Li et al., Continual Hand-Eye Calibration, arXiv 2604.15814, Algorithms 1 and 2",
         select=_sars,

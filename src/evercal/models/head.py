@@ -143,12 +143,6 @@ class Head(nn.Module):
         self.feature_mean.copy_(mean)
         self.feature_map.copy_(mapping)
 
-    def shrink(self, factor: float) -> None:
-        """Multiplies the matrices that all scenes share; biases, codes and outputs stay."""
-        with torch.no_grad():
-            for matrix in (m.weight for m in self.modules() if isinstance(m, nn.Linear)):
-                matrix.mul_(factor)
-
     def grow(self, centres: Tensor, seed: int) -> None:
         """Makes room for one more scene; what the head says about others does not change.
 

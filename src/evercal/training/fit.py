@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 
 import torch
@@ -12,6 +13,7 @@ from evercal.models.head import Head, HeadOutput
 from evercal.training.buffer import FeatureBuffer, Rows, join
 from evercal.training.loss import LossOptions, clamp_px, reprojection_loss
 from evercal.training.precision import autocast
+from evercal.training.protection import Protection
 
 INLIER_PX = 5.0
 # Newton-Schulz iterations of Muon. Three train as well as the usual five here, and cost less.
@@ -74,6 +76,8 @@ class Replay:
     """One per remembered scene."""
     penalty: Penalty
     """Loss on a batch of their rows."""
+    protection: float = 0.0
+    """How strongly updates spare the directions that their rows use (see `Protection`)."""
 
 
 class Fitter:
@@ -118,6 +122,10 @@ class Fitter:
                 torch.optim.Muon(matrices, weight_decay=decay_rate, ns_steps=MUON_STEPS)
             )
 
+        self._spare: Callable[[], AbstractContextManager[None]] = nullcontext
+        if replay is not None and replay.protection > 0:
+            self._spare = Protection(head, replay.buffers, replay.protection, seed).damped
+
     def run(self) -> Iterator[Progress]:
         """Trains to the end, yielding after every step."""
         self.head.train()
@@ -160,8 +168,9 @@ class Fitter:
         for optimiser in self._optimisers:
             optimiser.zero_grad()
         loss.backward()
-        for optimiser in self._optimisers:
-            optimiser.step()
+        with self._spare():
+            for optimiser in self._optimisers:
+                optimiser.step()
         self.step += 1
         inliers = float((error < INLIER_PX).float().mean())
         return Progress(self.step, options.iterations, float(cost.mean().detach()), inliers)

@@ -1,0 +1,62 @@
+"""Weight updates that leave alone what remembered scenes use."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor, nn
+
+from evercal.models.head import Head
+from evercal.training.buffer import FeatureBuffer, join
+
+ROWS = 16_384
+
+
+class Protection:
+    """Damps updates of the shared matrices along the inputs that remembered scenes give them.
+
+    Replay holds a scene where its few frames look; a matrix drifts in every other direction that
+    the scene's images use, too. With C the second moment of a layer's inputs over replayed rows and
+    c the mean of its diagonal, an update D of the matrix W becomes D (I + strength C / c)^-1: what
+    W says about inputs of remembered scenes hardly moves, and directions that they leave free stay
+    free for the new scene. A soft form of orthogonal weight modification (Zeng et al., Nature
+    Machine Intelligence 2019) and gradient projection memory (Saha et al., ICLR 2021); nothing is
+    stored for it, as C comes from the remembered frames.
+
+    Args:
+        head: as it is before the stage.
+        buffers: rows of remembered scenes.
+        strength: 0 protects nothing.
+        seed: of the rows that are looked at.
+    """
+
+    def __init__(self, head: Head, buffers: Sequence[FeatureBuffer], strength: float, seed: int):
+        moments: dict[nn.Linear, Tensor] = {}
+
+        def look(layer: nn.Module, inputs: tuple[Tensor, ...], _: Tensor) -> None:
+            assert isinstance(layer, nn.Linear)
+            x = inputs[0].double()
+            moments[layer] = x.T @ x
+
+        layers = [module for module in head.modules() if isinstance(module, nn.Linear)]
+        hooks = [layer.register_forward_hook(look) for layer in layers]
+        generator = torch.Generator().manual_seed(seed)
+        rows = join([buffer.draw(ROWS // len(buffers), generator) for buffer in buffers])
+        with torch.no_grad():
+            head(rows.features.float(), rows.scene, rows.descriptor)
+        for hook in hooks:
+            hook.remove()
+        self._damping: list[tuple[Tensor, Tensor]] = []
+        for layer, moment in moments.items():
+            scaled = moment / (moment.trace() / len(moment)).clamp(min=1e-12)
+            damping = torch.linalg.inv(torch.eye(len(moment)).double() + strength * scaled)
+            self._damping.append((layer.weight, damping.float()))
+
+    @contextmanager
+    def damped(self) -> Iterator[None]:
+        """Whatever the body changes in the shared matrices is damped."""
+        before = [weight.detach().clone() for weight, _ in self._damping]
+        yield
+        with torch.no_grad():
+            for (weight, damping), old in zip(self._damping, before, strict=True):
+                weight.copy_(old + (weight - old) @ damping)
