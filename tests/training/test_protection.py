@@ -39,8 +39,8 @@ def test_updates_are_damped_as_the_formula_says(learnable: Learnable) -> None:
     change = torch.randn(32, 48, generator=torch.Generator().manual_seed(2))
     before, bias = first.weight.detach().clone(), first.bias.detach().clone()
     with protection.damped(), torch.no_grad():
-        first.weight += change
-        first.bias += 1
+        first.weight.add_(change)
+        first.bias.add_(1)
     found = first.weight.detach() - before
     torch.testing.assert_close(found.double(), change.double() @ expected, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(first.bias.detach(), bias + 1)
