@@ -106,9 +106,7 @@ def hand_joints(frames: int, seed: int) -> np.ndarray:
     return start + spread * rng.uniform(-1, 1, (frames, 7))
 
 
-def _arm_path(
-    frames: int, seed: list[int], hold: int, cycles: float | None = None
-) -> np.ndarray:
+def _arm_path(frames: int, seed: list[int], hold: int, cycles: float | None = None) -> np.ndarray:
     """(frames, 7) joint angles round the ready position; the arm rests `hold` frames at a time."""
     rng = np.random.default_rng(seed)
     step = np.arange(frames) // hold * hold
@@ -152,7 +150,11 @@ def _sweep(frames: int, rng: np.random.Generator) -> SE3:
     )
     roll = wave(-0.12, 0.12, 0.8)
     way = np.stack(
-        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)],
+        [
+            np.cos(azimuth) * np.cos(elevation),
+            np.sin(azimuth) * np.cos(elevation),
+            np.sin(elevation),
+        ],
         -1,
     )
     position = WORK_AREA_M + distance[:, None] * way

@@ -108,13 +108,18 @@ class Workshop:
         parts = [
             (box(w, d, 0.22, 0.02).shifted(0, -d / 2, 0.1), wood),
             (box(w + 0.1, 0.07, 1.0, 0.03, steps=3).shifted(0, -0.04, 0), wood),
-            (box(w - 0.06, d - 0.12, 0.22, 0.07, steps=4).shifted(0, -d / 2 - 0.02, 0.3), self.linen),
+            (
+                box(w - 0.06, d - 0.12, 0.22, 0.07, steps=4).shifted(0, -d / 2 - 0.02, 0.3),
+                self.linen,
+            ),
             (box(w + 0.04, 1.3, 0.14, 0.06, steps=4).shifted(0, -1.42, 0.42), self.cloths[0]),
         ]
         for x in (-0.36, 0.36):
             pillow = cushion(0.62, 0.42, 0.17).turned(about_x(0.35), (x, -0.36, 0.52))
             parts.append((pillow, self.cloths[1]))
-        parts.append((cushion(0.4, 0.4, 0.16).turned(about_x(0.9), (0.05, -0.55, 0.62)), self.cloths[2]))
+        parts.append(
+            (cushion(0.4, 0.4, 0.16).turned(about_x(0.9), (0.05, -0.55, 0.62)), self.cloths[2])
+        )
         return Item("bed", parts)
 
     def wardrobe(self) -> Item:
@@ -227,8 +232,13 @@ class Workshop:
             end = x1 - float(self.rng.uniform(0.0, 0.45)) * (x1 - x0)
             books, x = [], x0
             while x < end:
-                thick, tall = float(self.rng.uniform(0.018, 0.05)), float(self.rng.uniform(0.18, 0.3))
-                books.append(self.book(thick, 0.19, tall).shifted(x + thick / 2, -0.15, i * gap + 0.022))
+                thick, tall = (
+                    float(self.rng.uniform(0.018, 0.05)),
+                    float(self.rng.uniform(0.18, 0.3)),
+                )
+                books.append(
+                    self.book(thick, 0.19, tall).shifted(x + thick / 2, -0.15, i * gap + 0.022)
+                )
                 x += thick + 0.001
             if books:
                 parts.append((Mesh.merged(books), spines))
@@ -237,7 +247,7 @@ class Workshop:
         return Item("bookcase", parts, tops)
 
     def book(self, thick: float, deep: float, tall: float) -> Mesh:
-        """A book upright, spine towards -y, one random cell of the `spines` texture on its spine."""
+        """A book upright, its spine towards -y with one random cell of the `spines` texture."""
         mesh, cell = box(thick, deep, tall, 0.003, steps=1), self.rng.integers(m.BOOKS)
         spine = mesh.normals[:, 1] < -0.5
         # Covers take the colour of their own spine from its untitled edge.
@@ -251,32 +261,59 @@ class Workshop:
         parts = [
             (box(w, d - 0.08, 0.1, 0.003).shifted(0, -d / 2 + 0.04, 0), self.dark),
             (box(w, d - 0.04, h - 0.14, 0.004).shifted(0, -d / 2 + 0.02, 0.1), self.paint),
-            (box(w, d + 0.02, 0.04, 0.012, steps=3).shifted(0, -d / 2 - 0.01, h - 0.04), self.stone),
+            (
+                box(w, d + 0.02, 0.04, 0.012, steps=3).shifted(0, -d / 2 - 0.01, h - 0.04),
+                self.stone,
+            ),
         ]
         units = round(w / 0.6)
         for i in range(units):
             x = -w / 2 + (i + 0.5) * w / units
             if i == units - 1:  # the oven
                 parts.append((box(0.56, 0.03, 0.6, 0.01).shifted(x, -d + 0.02, 0.14), self.dark))
-                bar = np.array([[x - 0.22, -d - 0.03, 0.66], [x, -d - 0.04, 0.66], [x + 0.22, -d - 0.03, 0.66]])
+                bar = np.array(
+                    [[x - 0.22, -d - 0.03, 0.66], [x, -d - 0.04, 0.66], [x + 0.22, -d - 0.03, 0.66]]
+                )
                 parts.append((tube(bar, 0.01), self.steel))
-                knobs = [cylinder(0.018, 0.025).turned(about_x(np.pi / 2), (x + k, -d + 0.01, 0.8)) for k in (-0.2, -0.1, 0.1, 0.2)]
+                knobs = [
+                    cylinder(0.018, 0.025).turned(about_x(np.pi / 2), (x + k, -d + 0.01, 0.8))
+                    for k in (-0.2, -0.1, 0.1, 0.2)
+                ]
                 parts.append((Mesh.merged(knobs), self.steel))
             else:
                 door = box(w / units - 0.012, 0.022, h - 0.17, 0.007).shifted(x, -d + 0.03, 0.11)
-                bar = np.array([[x - 0.1, -d - 0.01, 0.75], [x, -d - 0.02, 0.75], [x + 0.1, -d - 0.01, 0.75]])
+                bar = np.array(
+                    [[x - 0.1, -d - 0.01, 0.75], [x, -d - 0.02, 0.75], [x + 0.1, -d - 0.01, 0.75]]
+                )
                 parts += [(door, self.paint), (tube(bar, 0.007), self.steel)]
         sink, hob = -w / 2 + 0.7, w / 2 - 0.32
         parts.append((box(0.56, 0.42, 0.012, 0.005).shifted(sink, -d / 2, h), self.steel))
         parts.append((box(0.46, 0.32, 0.01, 0.004).shifted(sink, -d / 2, h + 0.005), self.dark))
         t = np.linspace(0, np.pi, 12)
-        arc = np.stack([np.full(12, sink), -0.17 - 0.08 * (1 - np.cos(t)), h + 0.24 + 0.09 * np.sin(t)], -1)
+        arc = np.stack(
+            [np.full(12, sink), -0.17 - 0.08 * (1 - np.cos(t)), h + 0.24 + 0.09 * np.sin(t)], -1
+        )
         pipe = np.concatenate([[[sink, -0.17, h]], [[sink, -0.17, h + 0.12]], arc])
         parts.append((tube(pipe, 0.013), self.steel))
         parts.append((box(0.56, 0.48, 0.008, 0.003).shifted(hob, -d / 2, h), self.dark))
-        rings = [cylinder(r, 0.006, 0.002, 32).shifted(hob + x, -d / 2 + y, h + 0.005) for r, x, y in ((0.09, -0.13, 0.1), (0.075, 0.13, 0.1), (0.075, -0.13, -0.11), (0.1, 0.13, -0.11))]
+        rings = [
+            cylinder(r, 0.006, 0.002, 32).shifted(hob + x, -d / 2 + y, h + 0.005)
+            for r, x, y in (
+                (0.09, -0.13, 0.1),
+                (0.075, 0.13, 0.1),
+                (0.075, -0.13, -0.11),
+                (0.1, 0.13, -0.11),
+            )
+        ]
         parts.append((Mesh.merged(rings), self.steel))
-        return Item("counter", parts, [(sink + 0.32, hob - 0.32, -d + 0.08, -0.06, h), (hob - 0.2, hob + 0.2, -0.3, -0.15, h + 0.012)])
+        return Item(
+            "counter",
+            parts,
+            [
+                (sink + 0.32, hob - 0.32, -d + 0.08, -0.06, h),
+                (hob - 0.2, hob + 0.2, -0.3, -0.15, h + 0.012),
+            ],
+        )
 
     def cupboard(self, w: float = 1.2) -> Item:
         """A wall cupboard with two doors and knobs; hangs."""
@@ -292,7 +329,9 @@ class Workshop:
         parts = [(box(0.62, 0.6, 1.8, 0.02).shifted(0, -0.3, 0), paint)]
         for z, h in ((0.05, 1.1), (1.17, 0.6)):
             parts.append((box(0.61, 0.06, h, 0.028, steps=4).shifted(0, -0.62, z), paint))
-            bar = np.array([[-0.25, -0.67, z + 0.1], [-0.25, -0.69, z + h / 2], [-0.25, -0.67, z + h - 0.1]])
+            bar = np.array(
+                [[-0.25, -0.67, z + 0.1], [-0.25, -0.69, z + h / 2], [-0.25, -0.67, z + h - 0.1]]
+            )
             parts.append((tube(bar, 0.012), self.steel))
         for _ in range(4):
             x, z = self.rng.uniform(-0.15, 0.2), self.rng.uniform(0.7, 1.55)
@@ -306,16 +345,24 @@ class Workshop:
         parts = [(box(w, 0.24, 0.028, 0.01, steps=3).shifted(0, -0.12, 0), self.wood())]
         for x in (-w / 3, w / 3):
             t = np.linspace(0, np.pi / 2, 8)
-            arc = np.stack([np.full(8, x), -0.01 - 0.17 * (1 - np.cos(t)), -0.17 + 0.17 * np.sin(t)], -1)
+            arc = np.stack(
+                [np.full(8, x), -0.01 - 0.17 * (1 - np.cos(t)), -0.17 + 0.17 * np.sin(t)], -1
+            )
             parts.append((tube(arc, 0.008), self.dark))
         return Item("wall shelf", parts, [(-w / 2 + 0.04, w / 2 - 0.04, -0.21, -0.03, 0.028)])
 
     def floor_lamp(self) -> Item:
         """Foot, pole, a glowing shade."""
-        foot = lathe([(0, 0), (0.15, 0), (0.15, 0.015), (0.02, 0.035), (0.012, 0.1), (0.012, 1.4), (0, 1.4)], 24, 2)
+        foot = lathe(
+            [(0, 0), (0.15, 0), (0.15, 0.015), (0.02, 0.035), (0.012, 0.1), (0.012, 1.4), (0, 1.4)],
+            24,
+            2,
+        )
         glow = m.plain("glow", (1.0, 0.82, 0.58), emission=2.2)
         parts = [(foot.shifted(0, -0.2, 0), self.dark)]
-        parts.append((lathe([(0.19, 1.3), (0.17, 1.45), (0.13, 1.62)], 28, 2).shifted(0, -0.2, 0), glow))
+        parts.append(
+            (lathe([(0.19, 1.3), (0.17, 1.45), (0.13, 1.62)], 28, 2).shifted(0, -0.2, 0), glow)
+        )
         return Item("floor lamp", parts)
 
     def picture(self) -> Item:
@@ -332,7 +379,9 @@ class Workshop:
     def clock(self) -> Item:
         """A round wall clock; hangs."""
         r = float(self.rng.uniform(0.13, 0.18))
-        rim = lathe([(r, 0), (r + 0.02, 0), (r + 0.02, 0.025), (r + 0.005, 0.035), (r - 0.005, 0.02)], 36, 2)
+        rim = lathe(
+            [(r, 0), (r + 0.02, 0), (r + 0.02, 0.025), (r + 0.005, 0.035), (r - 0.005, 0.02)], 36, 2
+        )
         up = about_x(np.pi / 2)
         face = sheet((-r, 0, 0), (2 * r, 0, 0), (0, 2 * r, 0))
         angle = np.linspace(0, 2 * np.pi, 37)[:-1]
@@ -341,13 +390,18 @@ class Workshop:
         uv = np.concatenate([0.5 + points[:, :2] / (2 * r), [[0.5, 0.5]]])
         points = np.concatenate([points, [[0, 0, 0]]])
         face = Mesh(points, fan, np.tile([0.0, 0, 1], (37, 1)), uv)
-        parts = [(rim.turned(up, (0, 0, r)), self.dark), (face.turned(up, (0, -0.012, r)), m.clock_face("clock"))]
+        parts = [
+            (rim.turned(up, (0, 0, r)), self.dark),
+            (face.turned(up, (0, -0.012, r)), m.clock_face("clock")),
+        ]
         return Item("clock", parts)
 
     def curtains(self, w: float = 0.5) -> Item:
         """One length of cloth on a rod; hangs from 2.2 m."""
         cloth = self.cloths[1]
-        parts = [(drape(w, 2.05, 0.035, 6, int(self.rng.integers(99))).shifted(0, -0.08, 0.12), cloth)]
+        parts = [
+            (drape(w, 2.05, 0.035, 6, int(self.rng.integers(99))).shifted(0, -0.08, 0.12), cloth)
+        ]
         rod = np.array([[-w / 2 - 0.1, -0.08, 2.19], [0, -0.08, 2.19], [w / 2 + 0.1, -0.08, 2.19]])
         parts.append((tube(rod, 0.012), self.dark))
         return Item("curtain", parts)
@@ -360,6 +414,8 @@ class Workshop:
         for x in (-0.48, 0.48):
             parts.append((box(0.09, 0.05, 2.08, 0.012).shifted(x, -0.025, 0), self.white))
         parts.append((box(1.05, 0.05, 0.09, 0.012).shifted(0, -0.025, 2.0), self.white))
-        lever = np.array([[0.36, -0.03, 1.0], [0.36, -0.08, 1.0], [0.33, -0.09, 1.0], [0.24, -0.09, 1.0]])
+        lever = np.array(
+            [[0.36, -0.03, 1.0], [0.36, -0.08, 1.0], [0.33, -0.09, 1.0], [0.24, -0.09, 1.0]]
+        )
         parts.append((tube(lever, 0.011), self.steel))
         return Item("door", parts)

@@ -24,8 +24,8 @@ import drjit as dr, sys
 dr.set_thread_count(1)
 import mitsuba as mi
 mi.set_variant(sys.argv[1])
-scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "light": {"type": "constant"},
-    "ball": {"type": "sphere", "bsdf": {"type": "roughplastic"}}, "sensor": {"type": "perspective",
+scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"},
+    "light": {"type": "constant"}, "ball": {"type": "sphere", "bsdf": {"type": "roughplastic"}}, "sensor": {"type": "perspective",
     "to_world": mi.ScalarTransform4f().translate([0, 0, -4]),
     "film": {"type": "hdrfilm", "width": 8, "height": 8}}})
 assert float(mi.TensorXf(mi.render(scene, spp=1)).array[0]) > 0
@@ -60,7 +60,7 @@ class Picture:
 
 @lru_cache(maxsize=1)
 def mitsuba() -> Any:
-    """The mitsuba module with the fastest variant that works here; said in one line on stderr.
+    """The mitsuba module with the fastest variant that works here, see `choose_variant`.
 
     EVERCAL_MITSUBA_VARIANT names a variant instead; EVERCAL_RENDER_THREADS limits the threads.
 
@@ -79,7 +79,6 @@ def mitsuba() -> Any:
         dr.set_thread_count(int(os.environ["EVERCAL_RENDER_THREADS"]))
     mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
-    print(f"rendering with Mitsuba {mi.__version__}, {variant} ({why})", file=sys.stderr)
     return mi
 
 
@@ -140,7 +139,7 @@ class Renderer:
         depth: longest path in segments.
     """
 
-    def __init__(self, meshes: list[tuple[Mesh, Material]], exposure: float = 1.0, depth: int = 4):
+    def __init__(self, meshes: list[tuple[Mesh, Material]], exposure: float = 1.5, depth: int = 4):
         mi = mitsuba()
         self._mi = mi
         self._exposure = exposure

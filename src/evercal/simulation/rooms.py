@@ -115,7 +115,9 @@ class _Builder:
                 for _ in range(6):
                     x, y = self.rng.uniform(x0, x1), self.rng.uniform(y0, y1)
                     yaw = self.rng.uniform(0, 2 * np.pi)
-                    if self.add(thing.placed(float(x), float(y), z + 0.001, float(yaw)), 0.004, item):
+                    if self.add(
+                        thing.placed(float(x), float(y), z + 0.001, float(yaw)), 0.004, item
+                    ):
                         break
 
 
@@ -172,7 +174,9 @@ def _robot_table(build: _Builder, base: np.ndarray) -> float:
             x = base[0] + build.rng.uniform(-0.35, 0.98)
             y = base[1] + build.rng.uniform(-0.42, 0.42)
             near = np.hypot(x - base[0] - 0.45, y - base[1]) < 0.16
-            turned = thing.placed(float(x), float(y), height + 0.001, float(build.rng.uniform(0, 6)))
+            turned = thing.placed(
+                float(x), float(y), height + 0.001, float(build.rng.uniform(0, 6))
+            )
             if not near and build.add(turned, 0.01, table):
                 break
     return height
@@ -220,7 +224,14 @@ def _fill_up(build: _Builder) -> None:
     """What every room has: a door, chairs, chests, shelves, pictures, plants on the floor."""
     shop, t, rng = build.shop, build.trinkets, build.rng
     build.try_wall(shop.door, (3, 2))
-    for make in (shop.drawers, shop.chair, shop.floor_lamp, shop.round_table, shop.chair, shop.drawers):
+    for make in (
+        shop.drawers,
+        shop.chair,
+        shop.floor_lamp,
+        shop.round_table,
+        shop.chair,
+        shop.drawers,
+    ):
         build.try_wall(make, (0, 2, 3))
     build.try_wall(shop.clock, (0, 1, 2), float(rng.uniform(1.75, 1.95)))
     for _ in range(3):
@@ -240,7 +251,9 @@ def _on_floor(item: Item) -> Item:
     """Twice as large for things that also stand on tables."""
     if item.kind != "plant":
         return item
-    parts = [(Mesh(2.6 * p.vertices_m, p.faces, p.normals, 2.6 * p.uv), mat) for p, mat in item.parts]
+    parts = [
+        (Mesh(2.6 * p.vertices_m, p.faces, p.normals, 2.6 * p.uv), mat) for p, mat in item.parts
+    ]
     return Item(item.kind, parts)
 
 
@@ -265,7 +278,12 @@ def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
         (_panel((0, 0, 0), (x, 0, 0), (0, 0, z)), paint),
         (_panel((x, 0, 0), (0, y, 0), (0, 0, z)), paint),
     ]
-    for px, py, w, d in ((x / 2, 0.008, x, 0.016), (x / 2, y - 0.008, x, 0.016), (0.008, y / 2, 0.016, y), (x - 0.008, y / 2, 0.016, y)):
+    for px, py, w, d in (
+        (x / 2, 0.008, x, 0.016),
+        (x / 2, y - 0.008, x, 0.016),
+        (0.008, y / 2, 0.016, y),
+        (x - 0.008, y / 2, 0.016, y),
+    ):
         slabs.append((box(w, d, 0.08, 0.006).shifted(px, py, 0), shop.white))
     slabs += _window(build, 0, float(rng.uniform(0.45, 0.75)))
     slabs += _window(build, 2, float(rng.uniform(0.2, 0.5)))
@@ -273,7 +291,9 @@ def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
     # A broad ceiling lamp keeps shadows soft and noise low.
     lamp = m.plain("lamp", (1.0, 0.95, 0.87), emission=5.0)
     slabs.append((cylinder(0.38, 0.05, 0.01, 48).shifted(0.55 * x, y / 2, z - 0.07), lamp))
-    rim = lathe([(0.38, 0), (0.4, 0), (0.4, 0.06), (0.38, 0.06)], 48, 1).shifted(0.55 * x, y / 2, z - 0.06)
+    rim = lathe([(0.38, 0), (0.4, 0), (0.4, 0.06), (0.38, 0.06)], 48, 1).shifted(
+        0.55 * x, y / 2, z - 0.06
+    )
     slabs.append((rim, shop.steel))
     rug = m.carpet("carpet", tuple(rng.uniform(0.2, 0.6, 3).tolist()), rng)
     w, d = 0.62 * x, 0.55 * y
@@ -286,7 +306,9 @@ def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
 def _panel(corner: tuple, u: tuple, v: tuple) -> Mesh:
     """A wall whose texture coordinates are metres."""
     flat = sheet(corner, u, v)
-    return Mesh(flat.vertices_m, flat.faces, flat.normals, flat.uv * (np.linalg.norm(u), np.linalg.norm(v)))
+    return Mesh(
+        flat.vertices_m, flat.faces, flat.normals, flat.uv * (np.linalg.norm(u), np.linalg.norm(v))
+    )
 
 
 def _window(build: _Builder, wall: int, at: float) -> list[tuple[Mesh, m.Material]]:
@@ -304,7 +326,9 @@ def _window(build: _Builder, wall: int, at: float) -> list[tuple[Mesh, m.Materia
         parts.append((box(0.06, 0.07, h + 0.06, 0.012).shifted(px, -0.03, low - 0.03), shop.white))
     for pz in (low - 0.03, low + 0.62 * h, low + h):
         parts.append((box(w, 0.06, 0.05, 0.012).shifted(0, -0.03, pz), shop.white))
-    parts.append((box(w + 0.2, 0.2, 0.035, 0.014, steps=3).shifted(0, -0.1, low - 0.06), shop.white))
+    parts.append(
+        (box(w + 0.2, 0.2, 0.035, 0.014, steps=3).shifted(0, -0.1, low - 0.06), shop.white)
+    )
     frame = Item("window", parts).placed(*place, yaw)
     build.blocked.append((None, frame.bounds_m()))
     for side in (-1, 1):
