@@ -24,10 +24,11 @@ import drjit as dr, sys
 dr.set_thread_count(1)
 import mitsuba as mi
 mi.set_variant(sys.argv[1])
+film = {"type": "hdrfilm", "width": 8, "height": 8}
+away = mi.ScalarTransform4f().translate([0, 0, -4])
 scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"},
-    "light": {"type": "constant"}, "ball": {"type": "sphere", "bsdf": {"type": "roughplastic"}}, "sensor": {"type": "perspective",
-    "to_world": mi.ScalarTransform4f().translate([0, 0, -4]),
-    "film": {"type": "hdrfilm", "width": 8, "height": 8}}})
+    "light": {"type": "constant"}, "ball": {"type": "sphere", "bsdf": {"type": "roughplastic"}},
+    "sensor": {"type": "perspective", "to_world": away, "film": film}})
 assert float(mi.TensorXf(mi.render(scene, spp=1)).array[0]) > 0
 """
 
@@ -74,7 +75,7 @@ def mitsuba() -> Any:
         raise InputError(
             "the simulator needs Mitsuba, which is not installed; run: pip install 'evercal[sim]'"
         ) from None
-    variant, why = choose_variant()
+    variant, _ = choose_variant()
     if "EVERCAL_RENDER_THREADS" in os.environ:
         dr.set_thread_count(int(os.environ["EVERCAL_RENDER_THREADS"]))
     mi.set_variant(variant)
