@@ -10,7 +10,7 @@ off goes on where it stopped. Rooms have fixed seeds; `seed` draws the paths.
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -106,7 +106,9 @@ class Progress:
     """Which Mitsuba variant draws, and why that one."""
 
 
-def simulate(name: str, out: Path, options: SimulateOptions | None = None) -> Iterator[Progress]:
+def simulate(
+    name: str, out: Path, options: SimulateOptions | None = None
+) -> Generator[Progress, None, None]:
     """Renders a suite; a generator that says after each frame how far it is.
 
     Args:
@@ -279,7 +281,7 @@ class _Writer:
         if self._renderer is None:
             arm = self._panda.meshes(shot.joints_rad)
             self._renderer = Renderer(self._place.meshes() + arm, depth=options.depth)
-        elif not np.array_equal(self._joints, shot.joints_rad):
+        elif self._joints is None or (self._joints != shot.joints_rad).any():
             self._renderer.move({m.name: m for m, _ in self._panda.meshes(shot.joints_rad)})
         self._joints = shot.joints_rad
         path = _shutter(shot, following, options.blur_steps)

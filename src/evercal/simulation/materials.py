@@ -178,10 +178,10 @@ def fabric(name: str, rgb: tuple[float, float, float], rng: np.random.Generator)
 def carpet(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
     """A woven rug: border, medallions and rows of figures, mirrored like the real ones."""
     half = dead_leaves(SIZE // 2, SIZE // 2, rng, 70).astype(np.float32) / 255
-    half = 0.55 * half + 0.45 * np.array(rgb)
+    half = 0.35 * half + 0.2 * half.mean(-1, keepdims=True) + 0.45 * np.array(rgb)
     picture = np.concatenate([half, half[:, ::-1]], 1)
     picture = np.concatenate([picture, picture[::-1]], 0)
-    for margin, colour in ((0, rng.uniform(0.1, 0.8, 3)), (26, rng.uniform(0.5, 0.9, 3))):
+    for margin, colour in ((0, 0.6 * np.array(rgb)), (26, 0.4 + 0.6 * np.array(rgb))):
         frame = np.ones((SIZE, SIZE), bool)
         frame[margin + 22 : SIZE - margin - 22, margin + 22 : SIZE - margin - 22] = False
         frame[:margin] = frame[:, :margin] = False

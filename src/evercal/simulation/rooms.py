@@ -12,6 +12,7 @@ import numpy as np
 from evercal.simulation import materials as m
 from evercal.simulation.clutter import Trinkets
 from evercal.simulation.furniture import Item, Workshop
+from evercal.simulation.hangings import Hangings
 from evercal.simulation.shapes import Mesh, box, cylinder, lathe, sheet
 
 RESERVED = 9000
@@ -57,7 +58,7 @@ class Room:
         boxes = self.boxes_m()
         low, high = boxes[:, 0] - margin_m, boxes[:, 1] + margin_m
         hit = (points_m[:, None] > low) & (points_m[:, None] < high)
-        return inside.all(-1) & ~hit.all(-1).any(-1)
+        return np.asarray(inside.all(-1) & ~hit.all(-1).any(-1))
 
 
 class _Builder:
@@ -68,6 +69,7 @@ class _Builder:
         self.size = np.array([self.rng.uniform(5.0, 5.7), self.rng.uniform(4.7, 5.3), 2.55])
         self.shop = Workshop(self.rng)
         self.trinkets = Trinkets(self.shop)
+        self.hangings = Hangings(self.shop)
         self.items: list[Item] = []
         self.blocked: list[tuple[Item | None, np.ndarray]] = []
 
@@ -195,7 +197,7 @@ def _kitchen(build: _Builder) -> None:
     shop = build.shop
     build.along_wall(shop.counter(), 1, 0.6)
     for at in (0.25, 0.62):
-        build.along_wall(shop.cupboard(), 1, at, 1.45)
+        build.along_wall(build.hangings.cupboard(), 1, at, 1.45)
     build.along_wall(shop.fridge(), 1, 0.02)
     build.try_wall(lambda: shop.table(1.1, 0.7), (0, 2))
     build.try_wall(lambda: shop.counter(1.8), (0, 2))
@@ -223,7 +225,7 @@ KINDS: dict[str, Callable[[_Builder], None]] = {
 def _fill_up(build: _Builder) -> None:
     """What every room has: a door, chairs, chests, shelves, pictures, plants on the floor."""
     shop, t, rng = build.shop, build.trinkets, build.rng
-    build.try_wall(shop.door, (3, 2))
+    build.try_wall(build.hangings.door, (3, 2))
     for make in (
         shop.drawers,
         shop.chair,
@@ -233,11 +235,11 @@ def _fill_up(build: _Builder) -> None:
         shop.drawers,
     ):
         build.try_wall(make, (0, 2, 3))
-    build.try_wall(shop.clock, (0, 1, 2), float(rng.uniform(1.75, 1.95)))
+    build.try_wall(build.hangings.clock, (0, 1, 2), float(rng.uniform(1.75, 1.95)))
     for _ in range(3):
-        build.try_wall(shop.wall_shelf, (0, 1, 2), float(rng.uniform(1.3, 1.6)))
+        build.try_wall(build.hangings.wall_shelf, (0, 1, 2), float(rng.uniform(1.3, 1.6)))
     for _ in range(9):
-        build.try_wall(shop.picture, (0, 1, 1, 2, 3), float(rng.uniform(1.25, 1.6)))
+        build.try_wall(build.hangings.picture, (0, 1, 1, 2, 3), float(rng.uniform(1.25, 1.6)))
     for make in (t.plant, t.basket, t.toy_ball, t.basket, t.plant):
         thing = _on_floor(make())
         for _ in range(20):
@@ -334,5 +336,7 @@ def _window(build: _Builder, wall: int, at: float) -> list[tuple[Mesh, m.Materia
     for side in (-1, 1):
         offset = np.array([np.cos(yaw), np.sin(yaw), 0.0]) * side * (w / 2 + 0.22)
         spot = np.array(place) + offset
-        build.add(shop.curtains(0.42).placed(float(spot[0]), float(spot[1]), 0.0, yaw), -0.25)
+        build.add(
+            build.hangings.curtains(0.42).placed(float(spot[0]), float(spot[1]), 0.0, yaw), -0.25
+        )
     return frame.parts
