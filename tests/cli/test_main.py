@@ -14,7 +14,17 @@ import evercal
 from evercal import cli
 from evercal.errors import InputError
 
-VERBS = ("demo", "learn", "localize", "evaluate", "info", "verify", "inspect", "pretrain")
+VERBS = (
+    "demo",
+    "learn",
+    "localize",
+    "evaluate",
+    "info",
+    "verify",
+    "inspect",
+    "simulate",
+    "pretrain",
+)
 
 
 def alone(*words: str) -> tuple[subprocess.CompletedProcess[str], set[str], float]:

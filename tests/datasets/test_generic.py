@@ -1,5 +1,6 @@
 """The generic folder format: round trips, and damage named."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -54,6 +55,20 @@ def test_a_scene_comes_back_as_it_was_written(tmp_path: Path) -> None:
     generic.write(tmp_path / "b", read)
     assert_same(scene, load_scene(tmp_path / "b"))
     assert (tmp_path / "a/scene.json").read_bytes() == (tmp_path / "b/scene.json").read_bytes()
+
+
+def test_depth_and_joint_angles_travel_along(tmp_path: Path) -> None:
+    first = make_scene().train[0]
+    depth = tmp_path / "depth.png"
+    depth.write_bytes(b"any bytes: depth is copied, not decoded")
+    frame = dataclasses.replace(first, depth=depth, joints_rad=(0.1, -0.2, 0.3))
+    generic.write(tmp_path / "a", Scene("arm", (frame, make_scene().train[1]), ()))
+    read = load_scene(tmp_path / "a").train
+    copied = tmp_path / "a/depth/000000.png"
+    assert read[0].depth == copied
+    assert copied.read_bytes() == depth.read_bytes()
+    assert read[0].joints_rad == (0.1, -0.2, 0.3)
+    assert (read[1].depth, read[1].joints_rad) == (None, None)
 
 
 def test_an_interrupted_recording_is_no_scene(tmp_path: Path) -> None:

@@ -80,6 +80,7 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.learn import Learn
     from evercal.cli.localize import Localize
     from evercal.cli.pretrain import Pretrain, pretrain_with_options
+    from evercal.cli.simulate import Simulate
 
     return {
         "demo": Demo,
@@ -89,6 +90,7 @@ def _verbs(first: str) -> dict[str, Any]:
         "info": Info,
         "verify": Verify,
         "inspect": Inspect,
+        "simulate": Simulate,
         "pretrain": pretrain_with_options() if first == "pretrain" else Pretrain,
     }
 

@@ -25,6 +25,10 @@ class Frame:
     """Camera pose in the scene's base frame; None if it is not known."""
     base_from_gripper: SE3 | None = None
     """Gripper pose in the robot's base frame when the image was taken; None if there is no arm."""
+    depth: Path | None = None
+    """16-bit PNG of the image's size: millimetres along the optical axis, 0 where unknown."""
+    joints_rad: tuple[float, ...] | None = None
+    """The arm's joint angles when the image was taken."""
 
     def read_image(self) -> NDArray[np.uint8]:
         """Reads the pixels.

@@ -4,12 +4,15 @@
      "cameras": {"0": {"width", "height", "fx", "fy", "cx", "cy", "distortion": []}},
      "frames": [{"name": "000000", "image": "images/000000.png", "camera": "0", "split": "train",
                  "base_from_camera": {"translation_m": [3], "quaternion_wxyz": [4]},
-                 "base_from_gripper": null}, ...],
-     "untracked": 0}
+                 "base_from_gripper": null, "depth": "depth/000000.png",
+                 "joints_rad": [7]}, ...],
+     "untracked": 0, "render": {}}
 
 Metres, quaternions in the order w, x, y, z, OpenCV camera axes, pixel (0, 0) at the centre of the
 top-left pixel, distortion k1 k2 p1 p2 k3 k4 k5 k6 as in OpenCV. Image paths are relative to the
 folder, with forward slashes. Both poses may be null or missing, as may `name` and `untracked`.
+Depth is a 16-bit PNG in millimetres along the optical axis, 0 where unknown; it and the arm's joint
+angles are there only if known. `render` tells how a simulated scene was made.
 Frames stand in the order they were recorded. Keys not listed here are passed over.
 """
 
@@ -19,7 +22,7 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from types import TracebackType
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from evercal.datasets.frame import Frame, Scene
 from evercal.datasets.images import write_image
@@ -99,6 +102,7 @@ class SceneWriter:
 
     def __init__(self, root: str | os.PathLike[str], name: str) -> None:
         self.untracked = 0
+        self.render: dict[str, object] | None = None
         self._root = Path(root)
         self._name = name
         self._cameras: dict[Camera, str] = {}
@@ -135,37 +139,49 @@ class SceneWriter:
         suffix = frame.image.suffix.lower() if isinstance(frame.image, Path) else ".png"
         relative = f"images/{stem}{suffix}"
         if isinstance(frame.image, Path):
-            try:
-                shutil.copyfile(frame.image, self._root / relative)
-            except OSError as error:
-                raise InputError(f"{frame.image}: cannot be copied ({error.strerror})") from None
+            self._copy(frame.image, relative)
         else:
             write_image(self._root / relative, frame.read_image())
         self._names.add(frame.name)
-        self._frames.append(
-            {
-                "name": frame.name,
-                "image": relative,
-                "camera": self._cameras.setdefault(frame.camera, str(len(self._cameras))),
-                "split": split,
-                "base_from_camera": pose_to_dict(frame.base_from_camera),
-                "base_from_gripper": pose_to_dict(frame.base_from_gripper),
-            }
-        )
+        entry: dict[str, object] = {
+            "name": frame.name,
+            "image": relative,
+            "camera": self._cameras.setdefault(frame.camera, str(len(self._cameras))),
+            "split": split,
+            "base_from_camera": pose_to_dict(frame.base_from_camera),
+            "base_from_gripper": pose_to_dict(frame.base_from_gripper),
+        }
+        if frame.depth is not None:
+            entry["depth"] = f"depth/{stem}.png"
+            (self._root / "depth").mkdir(exist_ok=True)
+            self._copy(frame.depth, f"depth/{stem}.png")
+        if frame.joints_rad is not None:
+            entry["joints_rad"] = list(frame.joints_rad)
+        self._frames.append(entry)
+
+    def _copy(self, source: Path, relative: str) -> None:
+        """Copies a file to its place; one that already lies there stays as it is."""
+        target = self._root / relative
+        if target.exists() and target.samefile(source):
+            return
+        try:
+            shutil.copyfile(source, target)
+        except OSError as error:
+            raise InputError(f"{source}: cannot be copied ({error.strerror})") from None
 
     def close(self) -> None:
         """Writes scene.json."""
-        write_json(
-            self._root / FILE,
-            {
-                "format": _FORMAT,
-                "version": _VERSION,
-                "name": self._name,
-                "cameras": {number: camera.to_dict() for camera, number in self._cameras.items()},
-                "frames": self._frames,
-                "untracked": self.untracked,
-            },
-        )
+        data: dict[str, object] = {
+            "format": _FORMAT,
+            "version": _VERSION,
+            "name": self._name,
+            "cameras": {number: camera.to_dict() for camera, number in self._cameras.items()},
+            "frames": self._frames,
+            "untracked": self.untracked,
+        }
+        if self.render is not None:
+            data["render"] = self.render
+        write_json(self._root / FILE, data)
 
 
 def pose_to_dict(pose: SE3 | None) -> dict[str, object] | None:
@@ -232,16 +248,19 @@ def _frame(
 ) -> tuple[Literal["train", "test"], Frame]:
     if not isinstance(entry, dict):
         raise ValueError(f"frame {i} is an object, got {entry!r}")
-    image, camera, split = entry.get("image"), entry.get("camera"), entry.get("split")
-    if not isinstance(image, str) or not image or PurePosixPath(image).is_absolute():
-        raise ValueError(f"frame {i}: 'image' is a path relative to the folder, got {image!r}")
-    if ".." in PurePosixPath(image).parts:
-        raise ValueError(f"frame {i}: 'image' stays inside the folder, got {image!r}")
+    camera, split = entry.get("camera"), entry.get("split")
+    image = _inside(entry.get("image"), f"frame {i}: 'image'")
+    depth = entry.get("depth")
+    poses: dict[str, Any] = {}
+    if depth is not None:
+        poses["depth"] = root / _inside(depth, f"frame {i}: 'depth'")
+    if (joints := entry.get("joints_rad")) is not None:
+        count = len(joints) if isinstance(joints, list) else 7
+        poses["joints_rad"] = tuple(_numbers(joints, count, f"frame {i}: joints_rad"))
     if not isinstance(camera, str) or camera not in cameras:
         raise ValueError(f"frame {i}: 'camera' is one of {sorted(cameras)}, got {camera!r}")
     if split not in ("train", "test"):
         raise ValueError(f"frame {i}: 'split' is 'train' or 'test', got {split!r}")
-    poses = {}
     for key in ("base_from_camera", "base_from_gripper"):
         try:
             poses[key] = pose_from_dict(entry.get(key))
@@ -249,6 +268,14 @@ def _frame(
             raise ValueError(f"frame {i}: '{key}': {error}") from None
     name = entry.get("name", image)
     return split, Frame(str(name), root / image, cameras[camera], **poses)
+
+
+def _inside(path: object, what: str) -> str:
+    if not isinstance(path, str) or not path or PurePosixPath(path).is_absolute():
+        raise ValueError(f"{what} is a path relative to the folder, got {path!r}")
+    if ".." in PurePosixPath(path).parts:
+        raise ValueError(f"{what} stays inside the folder, got {path!r}")
+    return path
 
 
 def _numbers(value: object, count: int, name: str) -> list[float]:

@@ -1,0 +1,179 @@
+"""Where cameras go: smooth sweeps to learn from and to be judged on, and calibration recordings.
+
+A sweep moves over a dome round the work area. Train and test take the same kind of way with other
+phases; test poses that come too near a training pose are left out, and the sweep is drawn finer
+until enough remain.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from evercal.geometry import SE3, pose_distance
+from evercal.simulation.box_room import look_at
+from evercal.simulation.robot import HOME_RAD
+from evercal.simulation.rooms import Room
+
+WORK_AREA_M = np.array([0.45, 0.0, 0.15])
+"""What cameras look towards, base frame."""
+NEAR_M, NEAR_RAD = 0.05, np.deg2rad(5.0)
+TOO_NEAR_M, TOO_NEAR_RAD = 0.012, np.deg2rad(1.2)
+NEAR_SHARE = 0.08
+"""At most this share of test frames lies within NEAR of a training frame; the promise is 0.10."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One frame before it is rendered."""
+
+    name: str
+    """Unique within the recording."""
+    split: Literal["train", "test"]
+    """What the frame is for."""
+    base_from_camera: SE3
+    """Camera pose, shape ()."""
+    joints_rad: np.ndarray
+    """(7,) joint angles of the arm."""
+
+
+def sweep_shots(room: Room, frames: int, seed: int) -> list[Shot]:
+    """A moving camera: seven in ten frames to learn from, three to be judged on.
+
+    Args:
+        room: what the camera must not fly into.
+        frames: train and test together.
+        seed: of both paths.
+
+    Raises:
+        ValueError: The room leaves no free way.
+    """
+    train_count = max(1, round(0.7 * frames))
+    train = _free_path(room, train_count, [seed, 1])
+    test = _far_from(room, frames - train_count, train, seed)
+    arm_train = _arm_path(train_count, [seed, 2], hold=12)
+    arm_test = _arm_path(frames - train_count, [seed, 3], hold=12)
+    shots = [Shot(f"train-{i:06d}", "train", train[i], arm_train[i]) for i in range(train_count)]
+    for i in range(frames - train_count):
+        shots.append(Shot(f"test-{i:06d}", "test", test[i], arm_test[i]))
+    return shots
+
+
+def fixed_shots(room: Room, frames: int, seed: int) -> tuple[list[Shot], list[Shot], SE3]:
+    """A fixed camera with the arm moving; the same after a bump.
+
+    Returns:
+        Shots before, shots after, and camera_before_from_camera_after, the bump: 5 mm along a
+        random direction for even seeds, 0.5 deg about a random axis for odd ones.
+    """
+    rng = np.random.default_rng([seed, 4])
+    pose = _free_path(room, 200, [seed, 5])[int(rng.integers(200))]
+    way = rng.standard_normal(3)
+    way /= np.linalg.norm(way)
+    tangent = np.zeros(6)
+    if seed % 2 == 0:
+        tangent[:3] = 0.005 * way
+    else:
+        tangent[3:] = np.deg2rad(0.5) * way
+    bump = SE3.exp(tangent)
+    arms = _arm_path(2 * frames, [seed, 6], hold=1, cycles=3.0)
+    before = [Shot(f"fixed-{i:06d}", "test", pose, arms[i]) for i in range(frames)]
+    moved = pose @ bump
+    after = [Shot(f"bumped-{i:06d}", "test", moved, arms[frames + i]) for i in range(frames)]
+    return before, after, bump
+
+
+def hand_shots(panda_flange: list[SE3], joints: np.ndarray, gripper_from_camera: SE3) -> list[Shot]:
+    """A camera on the flange."""
+    return [
+        Shot(f"hand-{i:06d}", "test", pose @ gripper_from_camera, joints[i])
+        for i, pose in enumerate(panda_flange)
+    ]
+
+
+def hand_camera(seed: int) -> SE3:
+    """gripper_from_camera: 8 cm beside the flange, looking along the fingers, a little askew."""
+    rng = np.random.default_rng([seed, 7])
+    tangent = np.concatenate([rng.uniform(-0.01, 0.01, 3), rng.uniform(-0.12, 0.12, 3)])
+    return SE3(np.array([1.0, 0, 0, 0]), np.array([0.085, 0.0, 0.02])) @ SE3.exp(tangent)
+
+
+def hand_joints(frames: int, seed: int) -> np.ndarray:
+    """(frames, 7) joint angles with the flange high, its camera looking out into the room."""
+    rng = np.random.default_rng([seed, 8])
+    start = np.array([0.0, -0.9, 0.0, -2.0, 0.0, 2.6, 0.785])
+    spread = np.array([1.1, 0.22, 0.35, 0.3, 0.4, 0.35, 0.9])
+    return start + spread * rng.uniform(-1, 1, (frames, 7))
+
+
+def _arm_path(frames: int, seed: list[int], hold: int, cycles: float | None = None) -> np.ndarray:
+    """(frames, 7) joint angles round the ready position; the arm rests `hold` frames at a time."""
+    rng = np.random.default_rng(seed)
+    step = np.arange(frames) // hold * hold
+    t = step * (2 * np.pi * (cycles or 1.0 + frames / 400) / max(frames, 1))
+    spread = np.array([0.45, 0.25, 0.3, 0.3, 0.5, 0.35, 0.6])
+    phase = rng.uniform(0, 2 * np.pi, (2, 7))
+    wave = 0.65 * np.sin(t[:, None] + phase[0]) + 0.35 * np.sin(2.3 * t[:, None] + phase[1])
+    return np.array(HOME_RAD) + spread * wave
+
+
+def _free_path(room: Room, frames: int, seed: list[int]) -> SE3:
+    """A sweep that keeps out of everything, shape (frames,)."""
+    for attempt in range(300):
+        path = _sweep(frames, np.random.default_rng([*seed, room.seed, attempt]))
+        if _is_clear(room, path.translation_m).all():
+            return path
+    raise ValueError(f"{room.kind} {room.seed}: no free camera path in 300 attempts")
+
+
+def _is_clear(room: Room, points: np.ndarray) -> np.ndarray:
+    """Outside all things, and out of the arm's reach above its table."""
+    near_arm = np.linalg.norm(points - (0.2, 0.0, 0.45), axis=-1) < 0.62
+    return room.is_free(points) & ~near_arm
+
+
+def _sweep(frames: int, rng: np.random.Generator) -> SE3:
+    """Smooth in direction, distance, height and gaze; one turn per some hundred frames."""
+    turns = 1.0 + frames / 500
+    t = np.linspace(0, 2 * np.pi * turns, max(frames, 2), endpoint=False)[:frames]
+
+    def wave(low: float, high: float, speed: float) -> np.ndarray:
+        phase = rng.uniform(0, 2 * np.pi, 2)
+        mix = 0.7 * np.sin(speed * t + phase[0]) + 0.3 * np.sin(2.6 * speed * t + phase[1])
+        return (low + high) / 2 + (high - low) / 2 * mix
+
+    azimuth = wave(-1.9, 1.9, 1.0)
+    distance = wave(0.85, 1.9, 1.63)
+    elevation = wave(0.28, 0.95, 0.71)
+    target = WORK_AREA_M + np.stack(
+        [wave(-0.45, 0.15, 0.9), wave(-0.35, 0.35, 1.2), wave(-0.1, 0.3, 1.4)], -1
+    )
+    roll = wave(-0.12, 0.12, 0.8)
+    way = np.stack(
+        [
+            np.cos(azimuth) * np.cos(elevation),
+            np.sin(azimuth) * np.cos(elevation),
+            np.sin(elevation),
+        ],
+        -1,
+    )
+    position = WORK_AREA_M + distance[:, None] * way
+    return SE3.stack([look_at(*given) for given in zip(position, target, roll, strict=True)])
+
+
+def _far_from(room: Room, frames: int, train: SE3, seed: int) -> SE3:
+    """A sweep of which few frames lie near a training frame, none very near, shape (frames,)."""
+    if frames == 0:
+        return SE3.stack([])
+    for finer in (1.0, 1.15, 1.3, 1.6, 2.0, 3.0):
+        for attempt in range(4):
+            path = _free_path(room, int(np.ceil(frames * finer)), [seed, 9, attempt])
+            metres, radians = pose_distance(path[:, None], train[None])
+            too_near = ((metres < TOO_NEAR_M) & (radians < TOO_NEAR_RAD)).any(1)
+            near = ((metres < NEAR_M) & (radians < NEAR_RAD)).any(1)
+            far = np.flatnonzero(~near)
+            allowed = np.flatnonzero(near & ~too_near)[: int(NEAR_SHARE * frames)]
+            kept = np.sort(np.concatenate([far, allowed]))
+            if len(kept) >= frames and near[kept[:frames]].mean() <= NEAR_SHARE:
+                return path[kept[:frames]]
+    raise ValueError(f"{room.kind} {room.seed}: no test path apart from the training path")

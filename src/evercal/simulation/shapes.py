@@ -1,0 +1,275 @@
+"""Triangle meshes from numpy: bevelled boxes, turned profiles, bent tubes, cushions, sheets.
+
+Everything is in metres. Texture coordinates are metres along the surface too, so that a material's
+`tile_m` alone decides how large its pattern is; `sheet` runs from 0 to 1 for pictures.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles with smooth normals."""
+
+    vertices_m: np.ndarray
+    """(n, 3) metres."""
+    faces: np.ndarray
+    """(m, 3) vertex numbers, counter-clockwise seen from outside."""
+    normals: np.ndarray
+    """(n, 3) unit normals that point outside."""
+    uv: np.ndarray
+    """(n, 2) texture coordinates, metres along the surface."""
+    name: str = ""
+    """Set for meshes that move on their own."""
+
+    @classmethod
+    def merged(cls, meshes: Sequence["Mesh"]) -> "Mesh":
+        """All of them as one; it bears the first one's name."""
+        starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
+        return cls(
+            np.concatenate([mesh.vertices_m for mesh in meshes]),
+            np.concatenate([m.faces + start for m, start in zip(meshes, starts, strict=False)]),
+            np.concatenate([mesh.normals for mesh in meshes]),
+            np.concatenate([mesh.uv for mesh in meshes]),
+            meshes[0].name,
+        )
+
+    def placed(self, position_m: Sequence[float], yaw_rad: float = 0.0) -> "Mesh":
+        """Turned about z, then shifted."""
+        c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return self.turned(turn, position_m)
+
+    def turned(self, rotation: np.ndarray, position_m: Sequence[float] = (0, 0, 0)) -> "Mesh":
+        """Turned by a (3, 3) rotation, then shifted."""
+        return replace(
+            self,
+            vertices_m=self.vertices_m @ rotation.T + np.asarray(position_m, float),
+            normals=self.normals @ rotation.T,
+        )
+
+    def shifted(self, x: float, y: float, z: float) -> "Mesh":
+        """Moved along."""
+        return replace(self, vertices_m=self.vertices_m + np.array([x, y, z]))
+
+
+def about_x(angle_rad: float) -> np.ndarray:
+    """(3, 3) rotation about x."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])
+
+
+def about_y(angle_rad: float) -> np.ndarray:
+    """(3, 3) rotation about y."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, 0, s], [0, 1.0, 0], [-s, 0, c]])
+
+
+def _grid(points: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> Mesh:
+    """A surface from (rows, columns, 3) points; normals decide which way the triangles turn."""
+    rows, columns = points.shape[:2]
+    number = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).reshape(-1, 3)
+    vertices, flat = points.reshape(-1, 3), normals.reshape(-1, 3)
+    corners = vertices[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=-1)
+    if (cross * flat[faces[:, 0]]).sum() < 0:
+        faces = faces[:, ::-1]
+    return Mesh(vertices, faces[area > 1e-14], flat, uv.reshape(-1, 2))
+
+
+def box(
+    x: float, y: float, z: float, bevel_m: float = 0.006, bottom: bool = True, steps: int = 2
+) -> Mesh:
+    """A bevelled box with its footprint's middle at the origin, standing on z = 0.
+
+    Args:
+        x: length in metres.
+        y: depth in metres.
+        z: height in metres.
+        bevel_m: radius of the edges.
+        bottom: whether there is an underside.
+        steps: segments per bevel.
+    """
+    half = np.array([x, y, z]) / 2
+    radius = min(bevel_m, 0.499 * min(x, y, z))
+    meshes = []
+    for axis in range(3):
+        a, b = (axis + 1) % 3, (axis + 2) % 3
+        for sign in (1.0, -1.0):
+            if axis == 2 and sign < 0 and not bottom:
+                continue
+            ring = np.tan(np.linspace(0, np.pi / 4, steps + 1)) * radius
+            lines = []
+            for side in (a, b):
+                inner = half[side] - radius
+                # One step from one side's bevel to the other's: long flat faces stay two triangles.
+                lines.append(np.concatenate([-inner - ring[::-1], inner + ring]))
+            p = np.zeros((len(lines[0]), len(lines[1]), 3))
+            p[..., axis] = sign * half[axis]
+            p[..., a], p[..., b] = lines[0][:, None], lines[1][None, :]
+            core = np.clip(p, -(half - radius), half - radius)
+            normal = p - core
+            normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+            points = core + radius * normal
+            # Upright faces carry their texture upright, with v along z.
+            u_axis, v_axis = (0, 1) if axis == 2 else (1 - axis, 2)
+            uv = np.stack([points[..., u_axis], points[..., v_axis]], -1)
+            meshes.append(_grid(points, normal, uv))
+    return Mesh.merged(meshes).shifted(0, 0, z / 2)
+
+
+def lathe(profile: Sequence[tuple[float, float]], segments: int = 28, smooth: int = 3) -> Mesh:
+    """A turned body.
+
+    Args:
+        profile: (radius, height) pairs in metres from the bottom of the outside over the rim to
+            the bottom of the inside; the outside is on the right of the way.
+        segments: around.
+        smooth: pieces each profile step is cut into by a spline; 1 keeps straight steps.
+    """
+    points = np.asarray(profile, float)
+    if smooth > 1:
+        points = _spline(points, smooth)
+        points[:, 0] = np.maximum(points[:, 0], 0.0)
+    angle = np.linspace(0, 2 * np.pi, segments + 1)
+    tangent = np.gradient(points, axis=0)
+    normal = np.stack([tangent[:, 1], -tangent[:, 0]], -1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
+    around = np.stack([np.cos(angle), np.sin(angle)], -1)
+    p = np.zeros((len(points), len(angle), 3))
+    n = np.zeros_like(p)
+    p[..., :2] = points[:, None, :1] * around
+    p[..., 2] = points[:, 1:]
+    n[..., :2] = normal[:, None, :1] * around
+    n[..., 2] = normal[:, 1:]
+    width = angle * points[:, 0].max()
+    uv = np.stack(np.broadcast_arrays(width[None, :], along[:, None]), -1)
+    return _grid(p, n, uv)
+
+
+def _spline(points: np.ndarray, pieces: int) -> np.ndarray:
+    """Catmull-Rom through (k, 2) points."""
+    padded = np.concatenate([points[:1], points, points[-1:]])
+    t = np.arange(pieces)[:, None] / pieces
+    parts = []
+    for i in range(len(points) - 1):
+        a, b, c, d = padded[i : i + 4]
+        parts.append(
+            0.5
+            * (
+                2 * b
+                + (c - a) * t
+                + (2 * a - 5 * b + 4 * c - d) * t**2
+                + (3 * b - a - 3 * c + d) * t**3
+            )
+        )
+    return np.concatenate([*parts, points[-1:]])
+
+
+def cylinder(radius: float, height: float, bevel_m: float = 0.004, segments: int = 28) -> Mesh:
+    """A turned bar with bevelled ends, standing on z = 0."""
+    r, b = radius, min(bevel_m, 0.45 * height, 0.45 * radius)
+    k = b * (1 - np.sqrt(0.5))
+    # Doubled points keep the flat ends flat where normals are smoothed.
+    profile = [
+        (0, 0), (r - b - 1e-4, 0), (r - b, 0), (r - k, k), (r, b), (r, b + 1e-4),
+        (r, height - b - 1e-4), (r, height - b), (r - k, height - k), (r - b, height),
+        (r - b - 1e-4, height), (0, height),
+    ]  # fmt: skip
+    return lathe(profile, segments, smooth=1)
+
+
+def ball(radius: float, squash: float = 1.0, segments: int = 24) -> Mesh:
+    """A sphere (or an ellipsoid of height `squash`) lying on z = 0."""
+    angle = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 1)
+    z = squash * radius * (1 + np.sin(angle))
+    return lathe(list(zip(radius * np.cos(angle), z, strict=True)), segments, smooth=1)
+
+
+def tube(path: np.ndarray, radius: float, segments: int = 10) -> Mesh:
+    """A round bar along a (k, 3) path in metres."""
+    path = np.asarray(path, float)
+    tangent = np.gradient(path, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
+    reference = np.array([0.0, 0.0, 1.0])
+    if np.abs(tangent @ reference).max() > 0.95:
+        reference = np.array([1.0, 0.3, 0.0]) / np.hypot(1, 0.3)
+    side = np.cross(tangent, reference)
+    side /= np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), 1e-9)
+    up = np.cross(side, tangent)
+    angle = np.linspace(0, 2 * np.pi, segments + 1)
+    normal = side[:, None] * np.cos(angle)[:, None] + up[:, None] * np.sin(angle)[:, None]
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=-1))])
+    uv = np.stack(np.broadcast_arrays(angle[None, :] * radius, along[:, None]), -1)
+    return _grid(path[:, None] + radius * normal, normal, uv)
+
+
+def cushion(x: float, y: float, z: float, cells: int = 12) -> Mesh:
+    """A pillow lying on z = 0, thick in the middle and thin at the seam."""
+    s = np.sin(np.linspace(-np.pi / 2, np.pi / 2, cells + 1))
+    u, v = np.meshgrid(s, s, indexing="ij")
+    bulge = np.sqrt(np.clip((1 - u**4) * (1 - v**4), 0, 1))
+    # Seams pull inwards between the corners.
+    pull = 1 - 0.06 * (1 - bulge) * np.cos(u * v * np.pi / 2)
+    halves = []
+    for sign in (1.0, -1.0):
+        p = np.stack([u * pull * x / 2, v * pull * y / 2, z / 2 * (1 + sign * bulge)], -1)
+        uv = np.stack([u * x / 2, v * y / 2], -1)
+        halves.append(_grid(p, sign * _normals(p), uv))
+    return Mesh.merged(halves)
+
+
+def _normals(points: np.ndarray) -> np.ndarray:
+    """Upward unit normals of a (rows, columns, 3) height field."""
+    du, dv = np.gradient(points, axis=0), np.gradient(points, axis=1)
+    normal = np.cross(du, dv)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal = np.where(length > 1e-12, normal / np.maximum(length, 1e-12), (0.0, 0.0, 1.0))
+    return normal * np.where(normal[..., 2:].sum() < 0, -1.0, 1.0)
+
+
+def sheet(corner_m: Sequence[float], u_m: Sequence[float], v_m: Sequence[float]) -> Mesh:
+    """A flat rectangle with texture coordinates from 0 to 1, seen from the side of u x v."""
+    corner, u, v = (np.asarray(value, float) for value in (corner_m, u_m, v_m))
+    normal = np.cross(u, v)
+    normal /= np.linalg.norm(normal)
+    corners = np.stack([corner, corner + u, corner + u + v, corner + v])
+    uv = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.tile(normal, (4, 1)), uv)
+
+
+def drape(width: float, height: float, fold_m: float, folds: int, seed: int = 0) -> Mesh:
+    """A curtain in the plane y = 0 whose folds run in y, hanging from z = height to 0."""
+    rng = np.random.default_rng(seed)
+    x = np.linspace(-width / 2, width / 2, folds * 8 + 1)
+    z = np.linspace(0, height, 9)
+    phase = 2 * np.pi * folds * (x / width) + 0.6 * np.sin(3 * x + rng.uniform(0, 6))
+    grid_x, grid_z = np.meshgrid(x, z, indexing="ij")
+    swing = fold_m * np.sin(phase)[:, None] * (1 - 0.35 * (grid_z / height))
+    p = np.stack([grid_x, -swing, grid_z], -1)
+    du, dv = np.gradient(p, axis=0), np.gradient(p, axis=1)
+    normal = np.cross(du, dv)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return _grid(p, normal, np.stack([grid_x * 1.4, grid_z], -1))
+
+
+def leaf(length: float, width: float, droop: float, cells: int = 6) -> Mesh:
+    """A leaf that starts at the origin, grows along +x and bends down by `droop` radians."""
+    t = np.linspace(0, 1, cells + 1)
+    angle = 0.9 - droop * t
+    step = np.stack([np.cos(angle), np.zeros_like(t), np.sin(angle)], -1) * length / cells
+    spine = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)[:-1]])
+    half = width / 2 * np.sin(np.pi * np.clip(t * 0.94 + 0.06, 0, 1)) ** 0.8
+    across = np.array([-1.0, 0.0, 1.0])
+    p = np.repeat(spine[:, None], 3, axis=1)
+    p[..., 1] += half[:, None] * across
+    p[..., 2] += 0.25 * half[:, None] * np.abs(across)
+    uv = np.stack(np.broadcast_arrays(across[None, :] * width / 2, t[:, None] * length), -1)
+    return _grid(p, _normals(p), uv)

@@ -1,0 +1,85 @@
+"""A suite on disk: complete, the same again, continued after a stop; bad input named."""
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from evercal.datasets import load_scene
+from evercal.errors import InputError
+from evercal.simulation import cell, renderer
+from evercal.simulation.cell import SimulateOptions, Suite, simulate
+
+TINY = SimulateOptions(frames=4, size=(32, 24), samples=1)
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mitsuba", reason="the extra 'sim' is not installed")
+    suite = Suite((("kitchen", "kitchen", 102),), 4, (32, 24), 1)
+    monkeypatch.setitem(cell.SUITES, "sim", suite)
+    monkeypatch.setattr(cell, "CALIBRATION_FRAMES", 2)
+
+
+@pytest.mark.usefixtures("small")
+def test_a_run_cut_off_goes_on_and_ends_the_same(tmp_path: Path) -> None:
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    steps = list(simulate("sim", whole, TINY))
+    assert [step.done for step in steps] == list(range(1, 11))
+    run = simulate("sim", cut, TINY)
+    for _ in range(3):
+        next(run)
+    run.close()
+    with pytest.raises(InputError, match="no known scene format"):
+        load_scene(cut / "kitchen")
+    # Half-written: an image without its depth is rendered again.
+    (cut / "kitchen/depth/000001.png").unlink()
+    (cut / "kitchen/images/000002.jpg").unlink()
+    list(simulate("sim", cut, TINY))
+    for part in ("", "calibration/fixed", "calibration/bumped", "calibration/hand"):
+        a, b = load_scene(whole / "kitchen" / part), load_scene(cut / "kitchen" / part)
+        assert len(a.train) + len(a.test) == (2 if part else 4)
+        for x, y in zip(a.train + a.test, b.train + b.test, strict=True):
+            np.testing.assert_array_equal(x.read_image(), y.read_image())
+            assert x.depth is not None
+            assert y.depth is not None
+            assert x.depth.read_bytes() == y.depth.read_bytes()
+            depth = cv2.imread(str(x.depth), cv2.IMREAD_UNCHANGED)
+            assert depth is not None
+            assert (depth.dtype, depth.shape) == (np.uint16, (24, 32))
+            assert x.joints_rad is not None
+            assert x.base_from_gripper is not None
+    hand = load_scene(whole / "kitchen/calibration/hand").test
+    truth = cell.hand_camera(0).matrix()
+    for frame in hand:
+        assert frame.base_from_gripper is not None
+        assert frame.base_from_camera is not None
+        found = frame.base_from_gripper.inverse() @ frame.base_from_camera
+        np.testing.assert_allclose(found.matrix(), truth, atol=1e-9)
+    with pytest.raises(InputError, match="begun with other settings"):
+        next(simulate("sim", cut, SimulateOptions(frames=4, size=(32, 24), samples=2)))
+
+
+def test_bad_input_is_named(tmp_path: Path) -> None:
+    for name, options, message in (
+        ("lab", TINY, "use one of sim, sim-7, sim-12, sim-mini"),
+        ("sim", SimulateOptions(seed=9000), "reserved"),
+        ("sim", SimulateOptions(frames=10**9), r"GB are free"),
+        ("sim", SimulateOptions(frames=1), "at least 2"),
+        ("sim", SimulateOptions(size=(4, 4)), "at least 16x16"),
+    ):
+        with pytest.raises(InputError, match=message):
+            next(simulate(name, tmp_path / "out", options))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_extra_says_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    renderer.mitsuba.cache_clear()
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    with pytest.raises(InputError, match=r"pip install 'evercal\[sim\]'"):
+        next(simulate("sim", tmp_path / "out", TINY))
+    renderer.mitsuba.cache_clear()
