@@ -39,7 +39,7 @@ def run(store: Path, image: Path, repeat: int) -> None:
     print(f"SARS, 10,000 poses, N_b 1,000, r 0: {time.perf_counter() - began:.2f} s")
     for name, command in (
         ("import evercal", [sys.executable, "-c", "import evercal"]),
-        ("evercal --help", [sys.executable, "-m", "evercal.cli", "--help"]),
+        ("evercal --help", [sys.executable, "-m", "evercal", "--help"]),
     ):
         times = []
         for _ in range(5):

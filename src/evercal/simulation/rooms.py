@@ -26,6 +26,10 @@ WALLS: tuple[tuple[float, float, float], ...] = (
     (0.83, 0.77, 0.76),
 )  # fmt: skip
 
+WALL_YAW_RAD = (0.0, np.pi / 2, np.pi, -np.pi / 2)
+"""How a thing with its back to wall 0 (y high), 1 (x low), 2 (y low) or 3 (x high) is turned, so
+that its front faces the room."""
+
 
 @dataclass(eq=False)
 class Room:
@@ -96,9 +100,7 @@ class _Builder:
         along = half + at * (length - 2 * half)
         gap = 0.015 if z == 0.0 else 0.003
         place = ((along, y - gap), (gap, along), (along, gap), (x - gap, along))[wall]
-        # Fronts face the room: -y, +x, +y, -x.
-        yaw = (0.0, np.pi / 2, np.pi, -np.pi / 2)[wall]
-        return self.add(item.placed(*place, z, yaw))
+        return self.add(item.placed(*place, z, WALL_YAW_RAD[wall]))
 
     def try_wall(self, make: Callable[[], Item], walls: tuple[int, ...], z: float = 0.0) -> bool:
         """Some free place along one of the walls."""
@@ -322,7 +324,7 @@ def _window(build: _Builder, wall: int, at: float) -> list[tuple[Mesh, m.Materia
     length = x if wall % 2 == 0 else y
     along = w / 2 + 0.6 + at * (length - w - 1.2)
     place = ((along, y, 0.0), (0.0, along, 0.0), (along, 0.0, 0.0), (x, along, 0.0))[wall]
-    yaw = (0.0, np.pi / 2, np.pi, -np.pi / 2)[wall]
+    yaw = WALL_YAW_RAD[wall]
     parts = [(sheet((-w / 2, -0.012, low), (w, 0, 0), (0, 0, h)), sky)]
     for px in (-w / 2, 0.0, w / 2):
         parts.append((box(0.06, 0.07, h + 0.06, 0.012).shifted(px, -0.03, low - 0.03), shop.white))
