@@ -17,7 +17,6 @@ from evercal.continual.presets import preset
 from evercal.continual.robot import head_bytes, with_fit
 from evercal.continual.strategies import STRATEGIES as RULES
 from evercal.datasets.frame import Scene
-from evercal.errors import InputError
 from evercal.evaluation.metrics import correct
 from evercal.evaluation.protocol import evaluate
 from evercal.evaluation.statistics import paired_difference
@@ -25,6 +24,7 @@ from evercal.localization.localizer import Localizer
 from evercal.localization.teach import fit_threshold, hold_out
 from evercal.models.descriptor import load_descriptor
 from evercal.models.encoder import load_encoder
+from evercal.storage import hold_settings
 
 SHORT_SIDE = 240
 
@@ -56,21 +56,6 @@ class Outcome:
 _first_stages: dict[tuple[str, str, int, int], Knowledge] = {}
 
 
-def _same_settings(out: Path) -> None:
-    """Notes with which settings a folder's results are made, or refuses to mix them with others."""
-    path, ours = out / "settings.json", json.loads(json.dumps(asdict(stage_options(0))))
-    if not path.exists():
-        out.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(ours))
-    theirs = json.loads(path.read_text())
-    for part in sorted({*ours, *theirs}):
-        a, b = theirs.get(part), ours.get(part)
-        if a != b:
-            raise InputError(
-                f"results {out}: made with {part} {a}, now it is {b}; give another --out"
-            )
-
-
 class Runner:
     """Runs strategies over one sequence of scenes; results are read from disk when they are there.
 
@@ -84,7 +69,7 @@ class Runner:
 
     def __init__(self, scenes: Sequence[Scene], out: Path):
         self.scenes, self.out = list(scenes), out
-        _same_settings(out)
+        hold_settings(out / "settings.json", asdict(stage_options(0)))
         self.lessons, self.held_out = [], []
         for scene in scenes:
             train, aside = hold_out(scene.train)

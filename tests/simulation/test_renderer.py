@@ -25,9 +25,10 @@ def balls() -> Renderer:
 
 
 def test_balls_land_where_the_camera_projects_them(balls: Renderer) -> None:
-    picture = balls.render(CAMERA, POSE, RenderOptions(samples=64))
+    image = balls.render(CAMERA, POSE, RenderOptions(samples=64))
+    depth = balls.depth(CAMERA, POSE)
     seen = POSE.inverse().apply(CENTRES)
-    value = picture.image[..., 0] / 255.0
+    value = image[..., 0] / 255.0
     weight = np.where(value > 0.04045, ((value + 0.055) / 1.055) ** 2.4, value / 12.92)
     v, u = np.mgrid[0:72, 0:96]
     for centre, pixel in zip(seen, CAMERA.project(seen), strict=True):
@@ -36,7 +37,7 @@ def test_balls_land_where_the_camera_projects_them(balls: Renderer) -> None:
         assert np.abs(found - pixel).max() < 0.2
         near = np.hypot(u - pixel[0], v - pixel[1]) < 0.71
         # A ball's front is its radius nearer than its centre.
-        front = picture.depth_m[near][picture.depth_m[near] > 0].min()
+        front = depth[near][depth[near] > 0].min()
         assert front == pytest.approx(centre[2] * (1 - RADIUS / np.linalg.norm(centre)), abs=2e-3)
 
 
@@ -54,8 +55,8 @@ def test_depth_is_along_the_axis_and_exact() -> None:
 def test_same_seed_same_pixels(balls: Renderer) -> None:
     options = RenderOptions(samples=4, noise=0.02)
     a, b, c = (balls.render(CAMERA, POSE, options, seed) for seed in (3, 3, 4))
-    np.testing.assert_array_equal(a.image, b.image)
-    assert (a.image != c.image).any()
+    np.testing.assert_array_equal(a, b)
+    assert (a != c).any()
 
 
 def test_moved_meshes_are_seen_where_they_are() -> None:

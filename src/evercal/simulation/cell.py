@@ -8,7 +8,6 @@ A frame appears under its name only when it is whole, and scene.json comes last:
 off goes on where it stopped. Rooms have fixed seeds; `seed` draws the paths.
 """
 
-import json
 import shutil
 from collections.abc import Generator, Iterator
 from dataclasses import asdict, dataclass
@@ -31,7 +30,7 @@ from evercal.simulation.cell_paths import (
 from evercal.simulation.renderer import Renderer, RenderOptions, choose_variant, mitsuba
 from evercal.simulation.robot import Panda
 from evercal.simulation.rooms import RESERVED, Room, room
-from evercal.storage import write_bytes, write_json
+from evercal.storage import hold_settings, write_bytes, write_json
 
 CALIBRATION_FRAMES = 25
 
@@ -126,25 +125,31 @@ def simulate(
     width, height = options.size or suite.size
     per_room = frames + 3 * CALIBRATION_FRAMES
     total, done = per_room * len(suite.rooms), 0
-    settings = {
+    taken = RenderOptions(
+        samples=options.samples or suite.samples,
+        exposure_ev=options.exposure_ev,
+        noise=options.noise,
+        blur_steps=options.blur_steps,
+    )
+    settings: dict[str, object] = {
         "suite": name,
-        **asdict(options),
         "frames": frames,
         "size": [width, height],
-        "samples": options.samples or suite.samples,
+        "seed": options.seed,
         "jpeg_quality": suite.jpeg_quality,
+        **asdict(taken),
     }
     _refuse_full_disk(out, total * width * height * (4 if suite.depth else 2))
     mi = mitsuba()
     settings["renderer"] = f"mitsuba {mi.__version__} {mi.variant()}"
-    _same_settings(out, settings)
+    hold_settings(out / "render.json", settings)
     said = f"Mitsuba {mi.__version__}, {': '.join(choose_variant())}"
     camera = default_camera(width, height)
     panda = Panda()
     for scene, kind, room_seed in suite.rooms:
         place = room(kind, room_seed)
         recordings = _recordings(place, panda, frames, options.seed, out / scene)
-        writer = _Writer(place, panda, camera, suite, settings)
+        writer = _Writer(place, panda, camera, suite, taken, settings)
         for root, shots in recordings:
             for _ in writer.record(root, scene, shots):
                 done += 1
@@ -175,25 +180,6 @@ def _refuse_full_disk(out: Path, needed: int) -> None:
         raise InputError(
             f"{out}: the frames take up to {needed / 1e9:.1f} GB and {free / 1e9:.1f} GB are free;"
             f" ask for fewer --frames, a smaller --size, or another --out"
-        )
-
-
-def _same_settings(out: Path, settings: dict[str, object]) -> None:
-    out.mkdir(parents=True, exist_ok=True)
-    file = out / "render.json"
-    if not file.exists():
-        write_json(file, settings)
-        return
-    try:
-        before = json.loads(file.read_text())
-    except ValueError:
-        raise InputError(f"{file}: not valid JSON; remove the folder and start anew") from None
-    now = json.loads(json.dumps(settings))
-    differ = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
-    if differ:
-        raise InputError(
-            f"{out}: was begun with other settings ({', '.join(differ)}: {before.get(differ[0])!r},"
-            f" now {now.get(differ[0])!r}); give another --out or the same settings"
         )
 
 
@@ -234,10 +220,16 @@ class _Writer:
     """Renders the missing frames of recordings in one room."""
 
     def __init__(
-        self, place: Room, panda: Panda, camera: Camera, suite: Suite, settings: dict[str, object]
+        self,
+        place: Room,
+        panda: Panda,
+        camera: Camera,
+        suite: Suite,
+        options: RenderOptions,
+        settings: dict[str, object],
     ):
         self._place, self._panda, self._camera = place, panda, camera
-        self._suite, self._settings = suite, settings
+        self._suite, self._options, self._settings = suite, options, settings
         self._renderer: Renderer | None = None
         self._joints: np.ndarray | None = None
 
@@ -272,12 +264,7 @@ class _Writer:
     def _render(self, shot: Shot, following: Shot, i: int, image: Path, depth: Path) -> None:
         import cv2
 
-        options = RenderOptions(
-            samples=int(str(self._settings["samples"])),
-            exposure_ev=float(str(self._settings["exposure_ev"])),
-            noise=float(str(self._settings["noise"])),
-            blur_steps=int(str(self._settings["blur_steps"])),
-        )
+        options = self._options
         if self._renderer is None:
             arm = self._panda.meshes(shot.joints_rad)
             self._renderer = Renderer(self._place.meshes() + arm, depth=options.depth)
@@ -287,13 +274,14 @@ class _Writer:
         path = _shutter(shot, following, options.blur_steps)
         # Seeds of neighbouring frames must not make one pattern of noise.
         seed = int(np.random.default_rng([self._place.seed, i, len(shot.name)]).integers(2**31))
-        picture = self._renderer.render(self._camera, path, options, seed)
+        colour = self._renderer.render(self._camera, path, options, seed)
         if self._suite.depth:
-            millimetres = np.round(np.minimum(picture.depth_m, 65.0) * 1000).astype(np.uint16)
+            metres = self._renderer.depth(self._camera, shot.base_from_camera)
+            millimetres = np.round(np.minimum(metres, 65.0) * 1000).astype(np.uint16)
             depth.parent.mkdir(parents=True, exist_ok=True)
             write_bytes(depth, cv2.imencode(".png", millimetres)[1].tobytes())
         quality = [cv2.IMWRITE_JPEG_QUALITY, self._suite.jpeg_quality]
-        bgr = np.ascontiguousarray(picture.image[..., ::-1])
+        bgr = np.ascontiguousarray(colour[..., ::-1])
         image.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(image, cv2.imencode(".jpg", bgr, quality)[1].tobytes())
 

@@ -49,16 +49,6 @@ class RenderOptions:
     """Poses that the samples are spread over while the shutter is open; 1 is no motion blur."""
 
 
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """One rendered view."""
-
-    image: np.ndarray
-    """(H, W, 3) uint8 RGB, sRGB-encoded."""
-    depth_m: np.ndarray
-    """(H, W) float32 metres along the optical axis; 0 where nothing was hit."""
-
-
 @lru_cache(maxsize=1)
 def mitsuba() -> Any:
     """The mitsuba module with the fastest variant that works here, see `choose_variant`.
@@ -174,15 +164,18 @@ class Renderer:
         base_from_camera: SE3,
         options: RenderOptions | None = None,
         seed: int = 0,
-    ) -> Picture:
+    ) -> np.ndarray:
         """Takes one picture.
 
         Args:
             camera: pinhole with square pixels and no distortion.
             base_from_camera: pose (), or (n,) poses that the camera passes while the shutter is
-                open; depth then belongs to the middle one.
+                open.
             options: samples and the like.
             seed: of the noise; same seed, same pixels on the same variant.
+
+        Returns:
+            (H, W, 3) uint8 RGB, sRGB-encoded.
 
         Raises:
             ValueError: A camera with distortion or with fx and fy that differ.
@@ -201,8 +194,7 @@ class Renderer:
             )
             total += np.asarray(seen)[..., :3]
         radiance = total / len(poses) * self._exposure * 2.0**options.exposure_ev
-        image = _encode(radiance, options.noise, np.random.default_rng([seed, 1]))
-        return Picture(image, self.depth(camera, poses[len(poses) // 2]))
+        return _encode(radiance, options.noise, np.random.default_rng([seed, 1]))
 
     def depth(self, camera: Camera, base_from_camera: SE3) -> np.ndarray:
         """(H, W) float32 metres along the optical axis; 0 where nothing is hit."""

@@ -9,3 +9,4 @@ from evercal.storage.manifest import read_manifest as read_manifest
 from evercal.storage.manifest import sha256_file as sha256_file
 from evercal.storage.manifest import verify as verify
 from evercal.storage.manifest import write_manifest as write_manifest
+from evercal.storage.settings import hold_settings as hold_settings

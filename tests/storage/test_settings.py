@@ -1,0 +1,32 @@
+"""Folders of results and the settings they were begun with."""
+
+from pathlib import Path
+
+import pytest
+
+from evercal.errors import InputError
+from evercal.storage import hold_settings
+
+
+def test_first_settings_are_kept_and_others_refused(tmp_path: Path) -> None:
+    file = tmp_path / "new" / "settings.json"
+    hold_settings(file, {"steps": 3, "sizes": (1, 2)})
+    before = file.read_bytes()
+    hold_settings(file, {"steps": 3, "sizes": (1, 2)})  # tuples come back as lists
+    for other, message in (
+        ({"steps": 4, "sizes": (1, 2)}, r"new: .*steps 3, now it is 4; give another --out"),
+        ({"steps": 3}, r"sizes \[1, 2\], now it is None"),
+        ({"steps": 3, "sizes": (1, 2), "seed": 0}, "seed None, now it is 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            hold_settings(file, other)
+    assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", "null", "3"])
+def test_settings_that_cannot_be_read_are_named(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "settings.json"
+    file.write_text(text)
+    with pytest.raises(InputError, match=r"settings\.json: no settings in JSON"):
+        hold_settings(file, {})
+    assert file.read_text() == text
