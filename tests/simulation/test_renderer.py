@@ -1,11 +1,13 @@
 """Pictures against geometry: where small balls land, how deep a plane is. Needs the extra `sim`."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from evercal.geometry import SE3, Camera
 from evercal.simulation.box_room import look_at
-from evercal.simulation.materials import plain
+from evercal.simulation.materials import Material, plain
 from evercal.simulation.renderer import Renderer, RenderOptions
 from evercal.simulation.shapes import ball, box
 
@@ -69,3 +71,33 @@ def test_moved_meshes_are_seen_where_they_are() -> None:
     before = renderer.depth(camera, pose)[24, 24]
     renderer.move({"cube": named.shifted(0, 0, 0.5)})
     assert renderer.depth(camera, pose)[24, 24] - before == pytest.approx(0.5, abs=1e-4)
+
+
+@pytest.mark.parametrize("side", range(4))
+def test_pictures_are_neither_mirrored_nor_upside_down(side: int) -> None:
+    texture = np.full((64, 64, 3), 20, np.uint8)
+    texture[:32, :, 0] = 250  # red above
+    texture[:, 32:, 2] = 250  # blue on the right
+    poster = Material("poster", texture, tile_m=0.4)
+    cube = box(0.4, 0.4, 0.4, 1e-3)
+    cube = replace(cube, uv=cube.uv + 0.2)
+    lamp = plain("lamp", (1, 1, 1), emission=20.0)
+    lamps = [(ball(0.3).shifted(x, y, 1.5), lamp) for x, y in ((3, 0), (0, 3), (-3, 0), (0, -3))]
+    angle = np.pi / 2 * side
+    pose = look_at(np.array([2 * np.cos(angle), 2 * np.sin(angle), 0.2]), np.array([0, 0, 0.2]))
+    image = Renderer([(cube, poster), *lamps]).render(CAMERA, pose).astype(float)
+    red, blue = image[30:47, 36:53, 0], image[30:47, 36:53, 2]  # the face is 20 pixels wide
+    assert red[:7].min() > red[-7:].max() + 50
+    assert blue[:, -7:].min() > blue[:, :7].max() + 50
+
+
+def test_denoising_brings_few_samples_near_many() -> None:
+    grey, lamp = plain("grey", (0.5, 0.5, 0.5)), plain("lamp", (1, 1, 1), emission=20.0)
+    plane = box(6.0, 6.0, 0.1, 1e-3).shifted(0, 0, -0.1)
+    scene = Renderer([(plane, grey), (ball(0.2).shifted(1.0, 0.0, 2.0), lamp)])
+    pose = look_at(np.array([-0.5, 0.0, 1.5]), np.zeros(3))
+    few, clean, many = (
+        scene.render(CAMERA, pose, RenderOptions(samples, denoise=denoise)).astype(float)
+        for samples, denoise in ((4, False), (4, True), (256, False))
+    )
+    assert np.abs(clean - many).mean() < 0.4 * np.abs(few - many).mean()

@@ -16,6 +16,7 @@ from evercal.simulation.shapes import (
     box,
     cushion,
     cylinder,
+    lampshade,
     lathe,
     sheet,
     tube,
@@ -339,7 +340,6 @@ class Workshop:
         )
         glow = m.plain("glow", (1.0, 0.82, 0.58), emission=2.2)
         parts = [(foot.shifted(0, -0.2, 0), self.dark)]
-        parts.append(
-            (lathe([(0.19, 1.3), (0.17, 1.45), (0.13, 1.62)], 28, 2).shifted(0, -0.2, 0), glow)
-        )
+        shade = lathe(lampshade((0.19, 1.3), (0.17, 1.45), (0.13, 1.62)), 28, 2)
+        parts.append((shade.shifted(0, -0.2, 0), glow))
         return Item("floor lamp", parts)

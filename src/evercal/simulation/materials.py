@@ -41,28 +41,26 @@ class Material:
     """Radiance of a lamp, times the texture; 0 for everything else."""
 
     def bsdf(self, mi: Any) -> dict[str, Any]:
-        """Mitsuba's description of the surface."""
+        """Mitsuba's description of the surface, as seen from outside; the inside is black."""
         if self.texture.shape[:2] == (1, 1):
             colour: dict[str, Any] = {"type": "rgb", "value": linear(self.texture[0, 0]).tolist()}
         else:
             colour = self._bitmap(mi)
         if self.kind == "metal":
-            inner: dict[str, Any] = {
+            return {
                 "type": "roughconductor",
                 "material": "none",
                 "alpha": self.roughness,
                 "specular_reflectance": colour,
             }
-        elif self.kind == "coated":
-            inner = {
+        if self.kind == "coated":
+            return {
                 "type": "roughplastic",
                 "alpha": self.roughness,
                 "int_ior": 1.45,
                 "diffuse_reflectance": colour,
             }
-        else:
-            inner = {"type": "diffuse", "reflectance": colour}
-        return {"type": "twosided", "bsdf": inner}
+        return {"type": "diffuse", "reflectance": colour}
 
     def emitter(self, mi: Any) -> dict[str, Any] | None:
         """Mitsuba's description of the light it gives, if any."""
@@ -75,10 +73,10 @@ class Material:
         return {"type": "area", "radiance": radiance, "sampling_weight": weight}
 
     def _bitmap(self, mi: Any) -> dict[str, Any]:
-        # Mitsuba's v runs upwards, rows run downwards.
+        # Rows run downwards, v of our meshes runs upwards.
         return {
             "type": "bitmap",
-            "bitmap": mi.Bitmap(np.ascontiguousarray(self.texture)),
+            "bitmap": mi.Bitmap(np.ascontiguousarray(self.texture[::-1])),
             "filter_type": "bilinear",
             "wrap_mode": "repeat",
         }

@@ -277,10 +277,10 @@ def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
     slabs = [
         (_panel((0, 0, 0), (x, 0, 0), (0, y, 0)), floor),
         (_panel((0, y, z), (x, 0, 0), (0, -y, 0)), ceiling),
-        (_panel((x, y, 0), (-x, 0, 0), (0, 0, z)), paint),
-        (_panel((0, y, 0), (0, -y, 0), (0, 0, z)), accent),
-        (_panel((0, 0, 0), (x, 0, 0), (0, 0, z)), paint),
-        (_panel((x, 0, 0), (0, y, 0), (0, 0, z)), paint),
+        (_panel((0, y, 0), (x, 0, 0), (0, 0, z)), paint),
+        (_panel((0, 0, 0), (0, y, 0), (0, 0, z)), accent),
+        (_panel((x, 0, 0), (-x, 0, 0), (0, 0, z)), paint),
+        (_panel((x, y, 0), (0, -y, 0), (0, 0, z)), paint),
     ]
     for px, py, w, d in (
         (x / 2, 0.008, x, 0.016),
@@ -308,7 +308,7 @@ def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
 
 
 def _panel(corner: tuple, u: tuple, v: tuple) -> Mesh:
-    """A wall whose texture coordinates are metres."""
+    """A wall seen from inside whose texture coordinates are metres."""
     flat = sheet(corner, u, v)
     return Mesh(
         flat.vertices_m, flat.faces, flat.normals, flat.uv * (np.linalg.norm(u), np.linalg.norm(v))

@@ -119,7 +119,9 @@ def box(
             points = core + radius * normal
             # Upright faces carry their texture upright, with v along z.
             u_axis, v_axis = (0, 1) if axis == 2 else (1 - axis, 2)
-            uv = np.stack([points[..., u_axis], points[..., v_axis]], -1)
+            # u runs to the right for who looks from outside, or writing would be mirrored.
+            right = -sign if axis == 1 else sign
+            uv = np.stack([right * points[..., u_axis], points[..., v_axis]], -1)
             meshes.append(_grid(points, normal, uv))
     return Mesh.merged(meshes).shifted(0, 0, z / 2)
 
@@ -152,6 +154,11 @@ def lathe(profile: Sequence[tuple[float, float]], segments: int = 28, smooth: in
     width = angle * points[:, 0].max()
     uv = np.stack(np.broadcast_arrays(width[None, :], along[:, None]), -1)
     return _grid(p, n, uv)
+
+
+def lampshade(*outside: tuple[float, float]) -> list[tuple[float, float]]:
+    """The profile of a thin wall, open below and above, from its outside's."""
+    return [*outside, *((radius - 0.002, height) for radius, height in reversed(outside))]
 
 
 def _spline(points: np.ndarray, pieces: int) -> np.ndarray:
@@ -245,6 +252,12 @@ def sheet(corner_m: Sequence[float], u_m: Sequence[float], v_m: Sequence[float])
     return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.tile(normal, (4, 1)), uv)
 
 
+def _both_sides(points: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> Mesh:
+    """A thin surface as two, a millimetre apart: surfaces are drawn from outside only."""
+    step = 5e-4 * normals
+    return Mesh.merged([_grid(points + step, normals, uv), _grid(points - step, -normals, uv)])
+
+
 def drape(width: float, height: float, fold_m: float, folds: int, seed: int = 0) -> Mesh:
     """A curtain in the plane y = 0 whose folds run in y, hanging from z = height to 0."""
     rng = np.random.default_rng(seed)
@@ -257,7 +270,7 @@ def drape(width: float, height: float, fold_m: float, folds: int, seed: int = 0)
     du, dv = np.gradient(p, axis=0), np.gradient(p, axis=1)
     normal = np.cross(du, dv)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    return _grid(p, normal, np.stack([grid_x * 1.4, grid_z], -1))
+    return _both_sides(p, normal, np.stack([grid_x * 1.4, grid_z], -1))
 
 
 def leaf(length: float, width: float, droop: float, cells: int = 6) -> Mesh:
@@ -272,4 +285,4 @@ def leaf(length: float, width: float, droop: float, cells: int = 6) -> Mesh:
     p[..., 1] += half[:, None] * across
     p[..., 2] += 0.25 * half[:, None] * np.abs(across)
     uv = np.stack(np.broadcast_arrays(across[None, :] * width / 2, t[:, None] * length), -1)
-    return _grid(p, _normals(p), uv)
+    return _both_sides(p, _normals(p), uv)
