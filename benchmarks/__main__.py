@@ -1,4 +1,4 @@
-"""`python -m benchmarks real|speed ...`: prints the tables of docs/results.md."""
+"""`python -m benchmarks real|speed|rooms ...`: prints the tables of docs/results.md."""
 
 import os
 import sys
@@ -46,12 +46,31 @@ def speed(store: Path, image: Path, repeat: int = 50) -> None:
     run(store, image, repeat)
 
 
+def rooms(
+    out: Path = Path("runs/rooms.jpg"),
+    suites: tuple[Literal["sim", "sim-7", "sim-12"], ...] = ("sim",),
+    samples: int = 16,
+    views: int = 2,
+) -> None:
+    """Renders views of every room as one contact sheet and times them; needs evercal[sim].
+
+    Args:
+        out: the sheet, a JPEG.
+        suites: whose rooms.
+        samples: paths per pixel.
+        views: of each room on the sheet.
+    """
+    from benchmarks.rooms import run
+
+    run(out, suites, samples, views)
+
+
 def main() -> int:
     """Runs one benchmark."""
     from evercal.errors import InputError
 
     try:
-        tyro.extras.subcommand_cli_from_dict({"real": real, "speed": speed})
+        tyro.extras.subcommand_cli_from_dict({"real": real, "speed": speed, "rooms": rooms})
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

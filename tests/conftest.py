@@ -112,7 +112,7 @@ def arc_stage() -> StageOptions:
 
     return StageOptions(
         head=HeadOptions(width=64),
-        fit=FitOptions(iterations=400, batch=384, replay_batch=256, peak_rate=7e-3),
+        fit=FitOptions(iterations=600, batch=384, replay_batch=256, peak_rate=7e-3),
         fill=FillPlan(passes=2, view=ViewOptions(short_side=120)),
     )
 

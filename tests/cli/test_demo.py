@@ -3,21 +3,29 @@
 import functools
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from evercal.cli import demo
 from evercal.cli.demo import DemoOptions
-from evercal.cli.demo_outcome import DemoOutcome
-from evercal.datasets import read_image
+from evercal.cli.demo_outcome import DemoOutcome, FixedCamera
+from evercal.datasets import Scene, read_image
+from evercal.geometry import SE3
+from evercal.simulation.box_room import box_room_scene
+from evercal.simulation.mini import CellRoom
 
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    options = functools.partial(DemoOptions, train_frames=16, test_frames=4)
-    monkeypatch.setattr(demo, "DemoOptions", options)
+    scenes = [box_room_scene(seed, 16, 4) for seed in (41, 42)]
+    still = replace(scenes[1].test[0], name="again")
+    fixed = Scene("still", (), (scenes[1].test[0], still))
+    rooms = CellRoom(scenes[0]), CellRoom(scenes[1], fixed)
+    monkeypatch.setattr(demo, "DemoOptions", functools.partial(DemoOptions, rooms=rooms))
 
 
 @pytest.mark.usefixtures("small")
@@ -30,6 +38,8 @@ def test_demo_leaves_a_report_a_picture_and_a_store(run: Any, tmp_path: Path) ->
         assert (len(first), len(second)) == (1, 2)
         assert all(0 <= value <= 100 for value in first + second)
     assert outcome["memory_bytes"] > 0
+    (camera,) = outcome["fixed_cameras"]
+    assert (camera["room"], camera["images"]) == ("box-room-42", 2)
     names = sorted(path.name for path in out.iterdir())
     assert names == ["overview.png", "query.png", "report.html", "store"]
     height, width, _ = read_image(out / "overview.png").shape
@@ -38,6 +48,7 @@ def test_demo_leaves_a_report_a_picture_and_a_store(run: Any, tmp_path: Path) ->
     assert page.count('<img src="data:image/') == 3
     assert not re.search(r"(?:src|href)=\"(?!data:)", page)
     assert "fine-tuning" in page
+    assert "Calibration of a fixed camera" in page
     assert run("localize", out / "store", out / "query.png").code in (0, 1)
     scenes = json.loads(run("info", out / "store", "--json").out)["scenes"]
     assert [scene["name"] for scene in scenes] == outcome["rooms"]
@@ -60,3 +71,42 @@ def test_rows_leave_rooms_not_yet_learned_blank() -> None:
         ["fine-tuning", "+ b", "0.0", "92.5"],
     ]
     assert "92.5" in outcome.table()
+
+
+class Answers:
+    """A localizer that has its answers from a list."""
+
+    def __init__(self, answers: list[tuple[str, SE3 | None]]):
+        self.answers = iter(answers)
+
+    def localize(self, image: object, camera: object) -> SimpleNamespace:
+        scene, pose = next(self.answers)
+        return SimpleNamespace(scene=scene, base_from_camera=pose, inliers=9)
+
+
+def test_a_fixed_camera_is_the_robust_mean_of_its_own_room() -> None:
+    scene = box_room_scene(7, 1, 1)
+    frame = scene.test[0]
+    truth = frame.base_from_camera
+    assert truth is not None
+    room = CellRoom(scene, Scene("still", (), (frame,) * 5))
+
+    def off(metres: float) -> SE3:
+        return truth @ SE3.exp([metres, 0, 0, 0, 0, 0])
+
+    here = scene.name
+    far = [
+        (here, off(0.004)),
+        (here, off(0.004)),
+        ("elsewhere", off(3)),
+        (here, off(9)),
+        (here, None),
+    ]
+    found = demo._find_fixed(Answers(far), room)  # pyright: ignore[reportArgumentType]
+    assert (found.room, found.images, found.located) == (here, 5, 3)
+    assert found.error_mm == pytest.approx(4.0, abs=1e-6)
+    assert found.error_deg == pytest.approx(0.0, abs=1e-6)
+    none = demo._find_fixed(Answers([(here, None)] * 5), room)  # pyright: ignore[reportArgumentType]
+    assert none == FixedCamera(here, 5, 0, None, None)
+    shown = DemoOutcome([here], fixed=[found, none])
+    assert shown.fixed_rows() == [[here, "3 of 5", "4.0", "0.00"], [here, "0 of 5", "", ""]]

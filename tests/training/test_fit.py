@@ -12,7 +12,7 @@ from torch import Tensor
 from evercal.geometry import SE3, Camera
 from evercal.models.head import Head, HeadOptions, HeadOutput
 from evercal.training.buffer import FeatureBuffer, Rows
-from evercal.training.fit import FitOptions, Fitter, Progress, Replay, one_cycle
+from evercal.training.fit import FitOptions, Fitter, Progress, Replay, one_cycle, replayed_rows
 from evercal.training.loss import LossOptions, reprojection_error
 from evercal.training.views import cell_centres
 
@@ -185,6 +185,13 @@ def test_replay_gets_remembered_rows_evenly_and_its_cost_is_trained(learnable: L
     for scene, _ in seen:
         assert torch.bincount(scene, minlength=3).tolist() == [30, 30, 0]
     assert [progress for _, progress in seen] == pytest.approx([i / 60 for i in range(60)])
+
+
+@pytest.mark.parametrize(
+    ("scenes", "rows"), [(1, 60), (2, 60), (3, 90), (7, 210), (8, 240), (12, 240), (500, 500)]
+)
+def test_replayed_rows_grow_with_the_scenes_up_to_a_limit(scenes: int, rows: int) -> None:
+    assert replayed_rows(OPTIONS, scenes) == rows
 
 
 def test_several_scenes_share_a_batch_evenly(learnable: Learnable) -> None:

@@ -24,18 +24,20 @@ def head_of(buffers: list[FeatureBuffer]) -> Head:
     return head
 
 
-def test_updates_are_damped_as_the_formula_says(learnable: Learnable) -> None:
-    buffer, _ = learnable()
-    head, strength = head_of([buffer]), 3.0
+@pytest.mark.parametrize("scenes", [1, 2])
+def test_updates_are_damped_as_the_formula_says(learnable: Learnable, scenes: int) -> None:
+    buffers = [learnable(scene)[0] for scene in range(scenes)]
+    head, strength = head_of(buffers), 3.0
     seen: list[Tensor] = []
     first = head.first[0]
     assert isinstance(first, torch.nn.Linear)
     hook = first.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0]))
-    protection = Protection(head, [buffer], strength, seed=4)
+    protection = Protection(head, buffers, strength, seed=4)
     hook.remove()
-    x = seen[0].double()
-    moment = x.T @ x / len(x)
-    expected = torch.linalg.inv(torch.eye(48) + strength * moment / moment.diagonal().mean())
+    moments = [x.double().T @ x.double() / len(x) for x in seen]
+    assert len(moments) == scenes
+    moment = torch.stack([m / m.diagonal().mean() for m in moments]).sum(0)
+    expected = torch.linalg.inv(torch.eye(48) + strength * moment)
     change = torch.randn(32, 48, generator=torch.Generator().manual_seed(2))
     before, bias = first.weight.detach().clone(), first.bias.detach().clone()
     with protection.damped(), torch.no_grad():

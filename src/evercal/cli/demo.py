@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 from evercal.cli.console import print_json, print_next
-from evercal.cli.demo_outcome import METHODS, DemoOutcome
+from evercal.cli.demo_outcome import METHODS, DemoOutcome, FixedCamera
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
     from evercal.continual.learn import StageOptions
     from evercal.datasets import Scene
     from evercal.localization.localizer import Localizer
+    from evercal.simulation.mini import CellRoom
 
 STORE = "store"
 QUERY = "query.png"
@@ -25,7 +26,7 @@ QUERY = "query.png"
 
 @dataclass(frozen=True)
 class Demo:
-    """Learn two small virtual rooms one by one, with evercal and with plain fine-tuning."""
+    """Learn three rendered rooms one by one, with evercal and with plain fine-tuning."""
 
     out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-demo")
     """Folder for report.html, overview.png, a store and an image to try it with."""
@@ -40,6 +41,8 @@ class Demo:
             print_json(outcome.to_dict())
             return 0
         print(outcome.table())
+        if outcome.fixed:
+            print(outcome.fixed_table())
         print(f"wrote {self.out / 'report.html'} and {self.out / 'overview.png'}")
         print_next("evercal", "localize", self.out / STORE, self.out / QUERY)
         return 0
@@ -49,12 +52,8 @@ class Demo:
 class DemoOptions:
     """How much the demo does."""
 
-    seeds: tuple[int, ...] = (41, 42)
-    """Of the rooms, two or more."""
-    train_frames: int = 120
-    """Per room."""
-    test_frames: int = 40
-    """Per room."""
+    rooms: "tuple[CellRoom, ...] | None" = None
+    """Two or more; those that come with the package when None."""
     stage: "StageOptions | None" = None
     """How a room is learned; the preset `demo` when None."""
 
@@ -77,16 +76,15 @@ def run_demo(out: Path, options: DemoOptions, say: Callable[[str], None] = _quie
     from evercal.cli.demo_page import write_pictures
     from evercal.datasets import write_image
     from evercal.localization.localizer import Localizer
-    from evercal.simulation.box_room import box_room_scene
+    from evercal.simulation.mini import mini_rooms
     from evercal.storage import MANIFEST, replace_folder
 
     store = out / STORE
     if store.exists() and not (store / MANIFEST).is_file():
         raise InputError(f"{store}: exists and is not an evercal store; give another --out")
     out.mkdir(parents=True, exist_ok=True)
-    say(f"making {len(options.seeds)} virtual rooms")
-    frames = options.train_frames, options.test_frames
-    scenes = [box_room_scene(seed, *frames) for seed in options.seeds]
+    rooms = options.rooms or mini_rooms()
+    scenes = [room.scene for room in rooms]
     outcome = DemoOutcome([scene.name for scene in scenes])
     work = Path(tempfile.mkdtemp(prefix=".demo-", dir=out))
     try:
@@ -97,10 +95,33 @@ def run_demo(out: Path, options: DemoOptions, say: Callable[[str], None] = _quie
     finally:
         shutil.rmtree(work, ignore_errors=True)
     localizer = Localizer.open(store)
+    outcome.fixed = [_find_fixed(localizer, room) for room in rooms if room.fixed is not None]
     write_pictures(out, localizer, scenes, outcome)
     middle = scenes[0].test[len(scenes[0].test) // 2]
     write_image(out / QUERY, middle.read_image())
     return outcome
+
+
+def _find_fixed(localizer: "Localizer", room: "CellRoom") -> FixedCamera:
+    """One pose from all images of a camera that stands still, compared with the truth."""
+    import numpy as np
+
+    from evercal.geometry import SE3, average_poses, pose_distance
+
+    assert room.fixed is not None
+    frames, poses, inliers = room.fixed.test, [], []
+    for frame in frames:
+        estimate = localizer.localize(frame.read_image(), frame.camera)
+        if estimate.scene == room.scene.name and estimate.base_from_camera is not None:
+            poses.append(estimate.base_from_camera)
+            inliers.append(estimate.inliers)
+    truth = frames[0].base_from_camera
+    if not poses or truth is None:
+        return FixedCamera(room.scene.name, len(frames), len(poses), None, None)
+    found = average_poses(SE3.stack(poses), np.array(inliers, float))
+    metres, radians = pose_distance(found, truth)
+    error = float(1000 * metres), float(np.rad2deg(radians))
+    return FixedCamera(room.scene.name, len(frames), len(poses), *error)
 
 
 def _run_method(

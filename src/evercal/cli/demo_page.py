@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evercal.cli.demo_outcome import METHODS, DemoOutcome
+from evercal.cli.demo_outcome import FIXED_HEADER, METHODS, DemoOutcome
 from evercal.cli.pictures import draw_estimate
 
 if TYPE_CHECKING:
@@ -62,6 +62,13 @@ def write_pictures(
         ),
         Section("Predicted points", sheets),
     ]
+    if outcome.fixed:
+        said = (
+            "A camera stands still while the arm moves. Its pose in the robot's base frame is the"
+            " robust mean over its images; no marker, no motion of the camera."
+        )
+        table = Table(FIXED_HEADER, outcome.fixed_rows(), "evercal after the last room")
+        sections.append(Section("Calibration of a fixed camera", [said, table]))
     write_bytes(out / "report.html", html_page("evercal demo", sections).encode())
 
 

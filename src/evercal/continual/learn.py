@@ -275,8 +275,9 @@ def _replay(
     def penalty(student: HeadOutput, rows: Rows, progress: float) -> Tensor:
         with torch.no_grad(), autocast():
             before = teacher(rows.features.float(), rows.scene, rows.descriptor)
-        return cost(student, before, rows, progress)
+        return weight * cost(student, before, rows, progress)
 
+    weight = len(buffers) if strategy.each_scene else 1
     return Replay(buffers, penalty, strategy.protection) if buffers else None
 
 

@@ -31,6 +31,9 @@ class Strategy:
     """Which frames of a finished scene are remembered; None keeps none."""
     penalty: Penalty | None = None
     """What replayed rows cost."""
+    each_scene: bool = False
+    """Whether every remembered scene costs that much, or (the paper) all of them together: then a
+    scene counts less with every one that follows."""
     condition: Literal["code", "descriptor"] = "code"
     """What tells the scenes apart at the head's input."""
     data: Literal["stage", "all"] = "stage"
@@ -58,7 +61,7 @@ REPLAY_CLAMP_PX = 5.0
 TEACHER_LIMIT_PX = 10.0
 OUTPUT_WEIGHT_PX_PER_M = 50.0
 REPLAY_WEIGHT = 0.5
-PROTECTION = 2.0
+PROTECTION = 0.5
 
 
 def anchored_reprojection(
@@ -85,6 +88,7 @@ STRATEGIES: dict[str, Strategy] = {
         source="this project: scene codes, own centres, anchored replay, protection",
         select=_sars_filled,
         penalty=anchored_reprojection,
+        each_scene=True,
         protection=PROTECTION,
     ),
     "finetune": Strategy(source="control: the head and steps of evercal, no replay"),

@@ -25,6 +25,7 @@ from evercal.simulation.cell_paths import (
     hand_camera,
     hand_joints,
     hand_shots,
+    sees_work_area,
     sweep_shots,
 )
 from evercal.simulation.renderer import Renderer, RenderOptions, choose_variant, mitsuba
@@ -64,10 +65,10 @@ def _numbered(count: int, first_seed: int) -> tuple[tuple[str, str, int], ...]:
 _THREE = (("bedroom", "bedroom", 101), ("kitchen", "kitchen", 102), ("living", "living", 103))
 
 SUITES: dict[str, Suite] = {
-    "sim": Suite(_THREE, 3300, (640, 480), 64),
-    "sim-7": Suite(_numbered(7, 201), 1000, (320, 240), 32),
-    "sim-12": Suite(_numbered(12, 301), 1000, (320, 240), 32),
-    "sim-mini": Suite(_THREE, 130, (320, 240), 128, depth=False, jpeg_quality=85),
+    "sim": Suite(_THREE, 3300, (640, 480), 16),
+    "sim-7": Suite(_numbered(7, 201), 1000, (320, 240), 16),
+    "sim-12": Suite(_numbered(12, 301), 1000, (320, 240), 16),
+    "sim-mini": Suite(_THREE, 130, (320, 240), 32, depth=False, jpeg_quality=85),
 }
 
 
@@ -192,12 +193,15 @@ def _recordings(
     joints, flanges = [], []
     for angles in hand_joints(40 * CALIBRATION_FRAMES, seed):
         flange = panda.base_from_flange(angles)
-        eye = (flange @ gripper_from_camera).translation_m
-        if eye[2] > 0.2 and place.is_free(eye[None], 0.05).all():
+        camera = flange @ gripper_from_camera
+        eye = camera.translation_m
+        if eye[2] > 0.2 and sees_work_area(camera) and place.is_free(eye[None], 0.05).all():
             joints.append(angles)
             flanges.append(flange)
         if len(joints) == CALIBRATION_FRAMES:
             break
+    else:
+        raise ValueError(f"{place.kind} {place.seed}: too few free arm poses for a hand camera")
     hand = hand_shots(flanges, np.array(joints), gripper_from_camera)
     folder = root / "calibration"
     folder.mkdir(parents=True, exist_ok=True)

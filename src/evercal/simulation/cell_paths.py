@@ -99,11 +99,21 @@ def hand_camera(seed: int) -> SE3:
 
 
 def hand_joints(frames: int, seed: int) -> np.ndarray:
-    """(frames, 7) joint angles with the flange high, its camera looking out into the room."""
+    """(frames, 7) joint angles with the flange high and tilted, its camera looking over the table.
+
+    Not every one shows the work area: see `sees_work_area`.
+    """
     rng = np.random.default_rng([seed, 8])
-    start = np.array([0.0, -0.9, 0.0, -2.0, 0.0, 2.6, 0.785])
-    spread = np.array([1.1, 0.22, 0.35, 0.3, 0.4, 0.35, 0.9])
+    start = np.array([0.0, -0.9, 0.0, -2.1, 0.0, 2.0, 0.785])
+    spread = np.array([0.9, 0.35, 0.4, 0.35, 0.5, 0.35, 0.9])
     return start + spread * rng.uniform(-1, 1, (frames, 7))
+
+
+def sees_work_area(base_from_camera: SE3) -> bool:
+    """Whether the middle of the work area lies within 25 deg of the optical axis, 0.5 m off."""
+    middle = base_from_camera.inverse().apply(WORK_AREA_M)
+    distance = float(np.linalg.norm(middle))
+    return distance > 0.5 and middle[2] > np.cos(np.deg2rad(25.0)) * distance
 
 
 def _arm_path(frames: int, seed: list[int], hold: int, cycles: float | None = None) -> np.ndarray:

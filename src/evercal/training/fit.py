@@ -31,7 +31,8 @@ class FitOptions:
     batch: int = 2048
     """Rows of the scenes being learned in a step."""
     replay_batch: int = 1024
-    """Replayed rows in a step, drawn evenly from all remembered scenes."""
+    """Replayed rows in a step from one or two remembered scenes together; each further scene brings
+    half as many, up to four times this."""
     peak_rate: float = 4e-3
     """Peak of the one-cycle learning rate (cosine up and down) of AdamW."""
     muon_rate: float = 0.02
@@ -140,7 +141,7 @@ class Fitter:
         parts = [buffer.draw(share, generator) for buffer in self.buffers]
         fresh = sum(len(part.scene) for part in parts)
         if replay is not None:
-            each = max(1, options.replay_batch // len(replay.buffers))
+            each = replayed_rows(options, len(replay.buffers)) // len(replay.buffers)
             parts += [buffer.draw(each, generator) for buffer in replay.buffers]
         rows = join(parts)
         if self.head.options.condition == "descriptor":
@@ -200,6 +201,12 @@ class Fitter:
                     slots.setdefault(int(i), {})[name] = value
             groups = optimiser.state_dict()["param_groups"]
             optimiser.load_state_dict({"state": slots, "param_groups": groups})
+
+
+def replayed_rows(options: FitOptions, scenes: int) -> int:
+    """Rows that a step replays, `scenes` (>= 1) remembered ones together; at least one of each."""
+    shares = min(max(2, scenes), 8)
+    return max(scenes, shares * options.replay_batch // 2)
 
 
 def one_cycle(options: FitOptions, step: int) -> float:

@@ -7,49 +7,54 @@ import torch
 from torch import Tensor, nn
 
 from evercal.models.head import Head
-from evercal.training.buffer import FeatureBuffer, join
+from evercal.training.buffer import FeatureBuffer
 
-ROWS = 16_384
+ROWS = 8192
+"""Of every remembered scene."""
 
 
 class Protection:
     """Damps updates of the shared matrices along the inputs that remembered scenes give them.
 
     Replay holds a scene where its few frames look; a matrix drifts in every other direction that
-    the scene's images use, too. With C the second moment of a layer's inputs over replayed rows and
-    c the mean of its diagonal, an update D of the matrix W becomes D (I + strength C / c)^-1: what
-    W says about inputs of remembered scenes hardly moves, and directions that they leave free stay
-    free for the new scene. A soft form of orthogonal weight modification (Zeng et al., Nature
-    Machine Intelligence 2019) and gradient projection memory (Saha et al., ICLR 2021); nothing is
-    stored for it, as C comes from the remembered frames.
+    the scene's images use, too. With C_s the second moment of a layer's inputs over replayed rows
+    of scene s and c_s the mean of its diagonal, an update D of the matrix W becomes
+    D (I + strength sum_s C_s / c_s)^-1: what W says about inputs of remembered scenes hardly moves,
+    and directions that they leave free stay free for the new scene. The sum lets every scene count
+    alike however many there are, as precisions add up in sequential Laplace approximations. A soft
+    form of orthogonal weight modification (Zeng et al., Nature Machine Intelligence 2019) and
+    gradient projection memory (Saha et al., ICLR 2021); nothing is stored for it, as C_s comes from
+    the remembered frames.
 
     Args:
         head: as it is before the stage.
-        buffers: rows of remembered scenes.
-        strength: 0 protects nothing.
+        buffers: rows of remembered scenes, one buffer each.
+        strength: of a scene; 0 protects nothing.
         seed: of the rows that are looked at.
     """
 
     def __init__(self, head: Head, buffers: Sequence[FeatureBuffer], strength: float, seed: int):
-        moments: dict[nn.Linear, Tensor] = {}
+        used: dict[nn.Linear, Tensor] = {}
 
         def look(layer: nn.Module, inputs: tuple[Tensor, ...], _: Tensor) -> None:
             assert isinstance(layer, nn.Linear)
             x = inputs[0].double()
-            moments[layer] = x.T @ x
+            moment = x.T @ x
+            scaled = moment / (moment.trace() / len(moment)).clamp(min=1e-12)
+            used[layer] = used[layer] + scaled if layer in used else scaled
 
         layers = [module for module in head.modules() if isinstance(module, nn.Linear)]
         hooks = [layer.register_forward_hook(look) for layer in layers]
         generator = torch.Generator().manual_seed(seed)
-        rows = join([buffer.draw(ROWS // len(buffers), generator) for buffer in buffers])
         with torch.no_grad():
-            head(rows.features.float(), rows.scene, rows.descriptor)
+            for buffer in buffers:
+                rows = buffer.draw(ROWS, generator)
+                head(rows.features.float(), rows.scene, rows.descriptor)
         for hook in hooks:
             hook.remove()
         self._damping: list[tuple[Tensor, Tensor]] = []
-        for layer, moment in moments.items():
-            scaled = moment / (moment.trace() / len(moment)).clamp(min=1e-12)
-            damping = torch.linalg.inv(torch.eye(len(moment)).double() + strength * scaled)
+        for layer, scaled in used.items():
+            damping = torch.linalg.inv(torch.eye(len(scaled)).double() + strength * scaled)
             self._damping.append((layer.weight, damping.float()))
 
     @contextmanager

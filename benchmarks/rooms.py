@@ -1,0 +1,47 @@
+"""What the simulator's rooms look like, and how fast they are rendered."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from tabulate import tabulate
+
+from evercal.drawing import contact_sheet, encode_image
+from evercal.simulation.box_room import default_camera
+from evercal.simulation.cell import SUITES
+from evercal.simulation.cell_paths import sweep_shots
+from evercal.simulation.renderer import Renderer, RenderOptions, choose_variant
+from evercal.simulation.robot import Panda
+from evercal.simulation.rooms import room
+from evercal.storage import write_bytes
+
+TIMED = 6
+
+
+def run(out: Path, suites: Sequence[str], samples: int, views: int) -> None:
+    """Renders some views of every room of the suites, writes them as one sheet, prints times."""
+    camera, panda, options = default_camera(320, 240), Panda(), RenderOptions(samples=samples)
+    images, captions, rows = [], [], []
+    for suite in suites:
+        for name, kind, seed in SUITES[suite].rooms:
+            place = room(kind, seed)
+            shots = sweep_shots(place, 40, 0)[:: 28 // max(views, TIMED)]
+            renderer = Renderer(place.meshes() + panda.meshes(shots[0].joints_rad))
+            seconds = []
+            for i, shot in enumerate(shots[: max(views, TIMED)]):
+                start = time.perf_counter()
+                image = renderer.render(camera, shot.base_from_camera, options, i)
+                seconds.append(time.perf_counter() - start)
+                if i < views:
+                    images.append(image)
+                    captions.append(f"{suite}: {name}")
+            # The first frame compiles the kernels.
+            rate = 1 / float(np.median(seconds[1:]))
+            rows.append([suite, name, len(place.items), rate])
+            print(f"{suite} {name}: {rate:.2f} frames/s", flush=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(out, encode_image(contact_sheet(images, 2 * views, captions), "jpg"))
+    print(f"\n320x240, {samples} samples, {': '.join(choose_variant())}\n")
+    header = ["suite", "room", "things", "frames/s"]
+    print(tabulate(rows, header, "github", floatfmt=".2f"))
