@@ -38,6 +38,10 @@ class FitOptions:
     muon_rate: float = 0.02
     """The same peak for the hidden matrices, which Muon trains (Jordan et al., 2024); 0 leaves them
     to AdamW."""
+    muon_decay: float = 0.2
+    """Decoupled decay of those matrices. Every update of Muon has the same size, so a matrix that
+    grows learns ever less; 0.2 holds it at its initial size, and later scenes learn like the
+    first. The other parameters have `weight_decay`."""
     warm_share: float = 0.05
     """Share of the steps in which the rate rises."""
     weight_decay: float = 0.01
@@ -120,7 +124,7 @@ class Fitter:
         if hidden:
             matrices = [{"params": hidden, "share": options.muon_rate / rate}]
             self._optimisers.append(
-                torch.optim.Muon(matrices, weight_decay=decay_rate, ns_steps=MUON_STEPS)
+                torch.optim.Muon(matrices, weight_decay=options.muon_decay, ns_steps=MUON_STEPS)
             )
 
         self._spare: Callable[[], AbstractContextManager[None]] = nullcontext
