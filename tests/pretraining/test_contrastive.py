@@ -156,11 +156,11 @@ def test_pairs_in_a_batch_are_of_one_anchor(data: PretrainData, views: RoomViews
 
     def spy(views: RoomViews, first: int, second: int, rng: np.random.Generator):
         drawn.append((first, second))
-        return room_pair(views, first, second, rng)
+        return view_pair(views, first, second, rng)
 
-    room_pair = contrastive.room_pair
+    view_pair = contrastive.view_pair
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contrastive, "room_pair", spy)
+        patch.setattr(contrastive, "view_pair", spy)
         for step in range(4):
             PairStream(data, replace(OPTIONS, leaf_pairs=0), 0).draw(step)
     assert all(a // 4 == b // 4 and a != b for a, b in drawn)

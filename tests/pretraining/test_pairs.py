@@ -16,8 +16,8 @@ from evercal.pretraining.pairs import (
     leaf_picture,
     photometric,
     random_homography,
-    room_pair,
     room_views,
+    view_pair,
 )
 from evercal.simulation.box_room import BoxRoom
 from evercal.training.views import cell_centres
@@ -50,7 +50,7 @@ def test_inside_keeps_a_margin() -> None:
 
 @pytest.mark.parametrize(("first", "second"), [(0, 1), (1, 0), (2, 3), (4, 6), (7, 5)])
 def test_rays_of_both_cameras_meet_at_one_point(views: RoomViews, first: int, second: int) -> None:
-    pair = room_pair(views, first, second, np.random.default_rng(0))
+    pair = view_pair(views, first, second, np.random.default_rng(0))
     a, b = pair.pixels.astype(float)
     assert len(a) == len(b) > 20
     assert inside(a).all()
@@ -80,7 +80,7 @@ def test_no_visible_point_is_left_out(views: RoomViews, first: int, second: int)
         again = hit(views, second, pixel[None])[0]
         if np.linalg.norm(again - point) < 0.01 * np.linalg.norm(local):
             expected.append([candidate, pixel])
-    found = room_pair(views, first, second, np.random.default_rng(3)).pixels
+    found = view_pair(views, first, second, np.random.default_rng(3)).pixels
     assert abs(len(expected) - found.shape[1]) <= 2  # a ray may graze an edge
     nearest = np.abs(np.array(expected)[:, None] - found.transpose(1, 0, 2)[None]).max((2, 3))
     assert (nearest.min(1) < 1e-3).mean() > 0.98
@@ -89,7 +89,7 @@ def test_no_visible_point_is_left_out(views: RoomViews, first: int, second: int)
 def test_corresponding_pixels_look_alike(views: RoomViews) -> None:
     rng, values = np.random.default_rng(1), []
     for first, second in ((0, 1), (1, 2), (4, 5), (6, 7)):
-        pair = room_pair(views, first, second, rng)
+        pair = view_pair(views, first, second, rng)
         values.append(np.stack([grey_at(*both) for both in zip(*vars(pair).values(), strict=True)]))
     a, b = np.concatenate(values, 1)
     assert np.corrcoef(a, b)[0, 1] > 0.95
@@ -97,7 +97,7 @@ def test_corresponding_pixels_look_alike(views: RoomViews) -> None:
 
 
 def test_a_view_paired_with_itself_keeps_every_pixel_in_place(views: RoomViews) -> None:
-    pair = room_pair(views, 3, 3, np.random.default_rng(0))
+    pair = view_pair(views, 3, 3, np.random.default_rng(0))
     np.testing.assert_allclose(pair.pixels[0], pair.pixels[1], atol=1e-3)
     candidates = cell_pixels() + np.random.default_rng(0).uniform(-3.5, 3.5, (768, 2))
     assert pair.pixels.shape[1] == inside(candidates).sum()

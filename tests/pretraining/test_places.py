@@ -101,7 +101,7 @@ def test_pretrain_writes_what_the_loaders_read(
     """With stand-ins for the two long parts: data and the encoder's training."""
     data = PretrainData([one_room], [leaf_picture(np.random.default_rng(0), 64)])
     unfused = LocalEncoder((4, 4), 8, 1, 8, fused=False)
-    monkeypatch.setattr(make, "make_data", lambda options: data)
+    monkeypatch.setattr(make, "make_data", lambda options, folder: data)
     monkeypatch.setattr(make, "train_encoder", lambda *_: unfused)
     monkeypatch.setattr(places, "photometric", lambda image, rng: image)
     options = PretrainOptions(descriptor_steps=2, rooms=1, pictures=1)

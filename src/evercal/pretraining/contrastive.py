@@ -2,8 +2,8 @@
 
 import json
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -14,21 +14,25 @@ from torch.nn import functional as F
 from torch.utils.data import DataLoader, IterableDataset
 
 from evercal.models.encoder import LocalEncoder
+from evercal.pretraining.cells import FIRST_CELL_SEED, CellViews, kept_cell_views
 from evercal.pretraining.pairs import (
     FIRST_ROOM_SEED,
     HEIGHT,
+    PER_ANCHOR,
     WIDTH,
     Pair,
     RoomViews,
+    Views,
     homography_pair,
     leaf_picture,
     photometric,
-    room_pair,
     room_views,
+    view_pair,
 )
 from evercal.storage.atomic import write_bytes
 
 VALIDATION_ROOM_SEED = FIRST_ROOM_SEED + 50_000
+VALIDATION_CELL_SEED = FIRST_CELL_SEED + 7_000
 CHECKPOINT_STEPS = 250
 
 
@@ -40,10 +44,14 @@ class PretrainOptions:
     """Optimiser steps of the local encoder."""
     rooms: int = 160
     """Box rooms, each seen from 20 cameras."""
+    cells: int = 0
+    """Furnished rooms (extra `sim`), each seen from 20 cameras."""
     pictures: int = 300
     """Dead-leaves pictures for homography pairs."""
     room_pairs: int = 3
-    """Pairs with parallax in a step."""
+    """Pairs of box rooms in a step."""
+    cell_pairs: int = 0
+    """Pairs of furnished rooms in a step."""
     leaf_pairs: int = 2
     """Homography pairs in a step."""
     points: int = 192
@@ -64,19 +72,26 @@ class PretrainData:
 
     rooms: list[RoomViews]
     pictures: list[np.ndarray]
+    cells: list[CellViews] = field(default_factory=list)
 
 
 def _picture(seed: int) -> np.ndarray:
     return leaf_picture(np.random.default_rng([seed, 3]))
 
 
-def make_data(options: PretrainOptions, first_room: int = FIRST_ROOM_SEED) -> PretrainData:
-    """Renders rooms and pictures with one process per core."""
+def make_data(
+    options: PretrainOptions, folder: Path, first_room: int = FIRST_ROOM_SEED
+) -> PretrainData:
+    """Draws box rooms and pictures with one process per core, and renders furnished rooms.
+
+    The latter take about ten seconds each and are kept in `folder`.
+    """
     with get_context("spawn").Pool() as pool:
         seeds = range(first_room, first_room + options.rooms)
         rooms = pool.map(room_views, seeds, chunksize=4)
         pictures = pool.map(_picture, range(first_room, first_room + options.pictures), chunksize=8)
-    return PretrainData(rooms, pictures)
+    cells = range(FIRST_CELL_SEED, FIRST_CELL_SEED + options.cells)
+    return PretrainData(rooms, pictures, [kept_cell_views(seed, folder) for seed in cells])
 
 
 class PairStream(IterableDataset):
@@ -90,18 +105,16 @@ class PairStream(IterableDataset):
         o = self.options
         rng = np.random.default_rng([o.seed, step])
         pairs: list[Pair] = []
-        while len(pairs) < o.room_pairs:
-            views = self.data.rooms[rng.integers(len(self.data.rooms))]
-            anchor = 4 * rng.integers(len(views.images) // 4)
-            first, second = anchor + rng.choice(4, 2, replace=False)
-            pair = room_pair(views, int(first), int(second), rng)
-            if pair.pixels.shape[1] >= 48:
-                pairs.append(pair)
-        while len(pairs) < o.room_pairs + o.leaf_pairs:
-            picture = self.data.pictures[rng.integers(len(self.data.pictures))]
-            pair = homography_pair(picture, rng)
-            if pair.pixels.shape[1] >= 48:
-                pairs.append(pair)
+        for count, draw in (
+            (o.room_pairs, lambda: self._parallax(self.data.rooms, rng)),
+            (o.cell_pairs, lambda: self._parallax(self.data.cells, rng)),
+            (o.leaf_pairs, lambda: self._homography(rng)),
+        ):
+            goal = len(pairs) + count
+            while len(pairs) < goal:
+                pair = draw()
+                if pair.pixels.shape[1] >= 48:
+                    pairs.append(pair)
         count = len(pairs)
         images = np.stack([[photometric(im, rng) for im in p.images] for p in pairs], 1)
         pixels = np.zeros((2, count, o.points, 2), np.float32)
@@ -112,6 +125,17 @@ class PairStream(IterableDataset):
             valid[i, : len(chosen)] = True
         grey = torch.from_numpy(images[:, :, None]).float() / 255
         return grey, torch.from_numpy(pixels), torch.from_numpy(valid)
+
+    def _parallax(self, rooms: Sequence[Views], rng: np.random.Generator) -> Pair:
+        """Two views of one part of one room."""
+        views = rooms[int(rng.integers(len(rooms)))]
+        anchor = PER_ANCHOR * rng.integers(len(views.images) // PER_ANCHOR)
+        first, second = anchor + rng.choice(PER_ANCHOR, 2, replace=False)
+        return view_pair(views, int(first), int(second), rng)
+
+    def _homography(self, rng: np.random.Generator) -> Pair:
+        picture = self.data.pictures[rng.integers(len(self.data.pictures))]
+        return homography_pair(picture, rng)
 
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         import cv2
@@ -197,11 +221,7 @@ def train_encoder(
             schedule.load_state_dict(saved["schedule"])
             step = saved["step"]
             say(f"resumed at step {step}")
-    held_out = PretrainData(
-        [room_views(VALIDATION_ROOM_SEED + i) for i in range(8)], data.pictures[:1]
-    )
-    judge = PairStream(held_out, PretrainOptions(room_pairs=8, leaf_pairs=0), 0)
-    validation = [judge.draw(i) for i in range(6)]
+    validation = _validation(data, folder)
     # Spawned, not forked: OpenCV's threads do not survive a fork, and the worker would hang.
     loader = DataLoader(
         PairStream(data, options, step),
@@ -224,13 +244,29 @@ def train_encoder(
         step += 1
         if step % CHECKPOINT_STEPS == 0 or step == options.steps:
             encoder.eval()
-            accuracy = matching_accuracy(encoder, validation)
+            matched = ", ".join(
+                f"{matching_accuracy(encoder, batches):.1f} % in {kind}"
+                for kind, batches in validation.items()
+            )
             encoder.train()
             seconds = time.perf_counter() - began
-            say(f"step {step} loss {np.mean(losses):.3f} matched {accuracy:.1f} % {seconds:.0f} s")
+            say(f"step {step} loss {np.mean(losses):.3f} matched {matched} {seconds:.0f} s")
             losses.clear()
             _save(checkpoint, encoder, optimiser, schedule, step, options)
     return encoder
+
+
+def _validation(data: PretrainData, folder: Path) -> dict[str, list[tuple[Tensor, Tensor, Tensor]]]:
+    """Batches of rooms that training never sees, by kind of room."""
+    rooms = [room_views(VALIDATION_ROOM_SEED + i) for i in range(8)]
+    judge = PairStream(PretrainData(rooms, []), PretrainOptions(room_pairs=8, leaf_pairs=0), 0)
+    batches = {"box rooms": [judge.draw(i) for i in range(6)]}
+    if data.cells:
+        cells = [kept_cell_views(VALIDATION_CELL_SEED + i, folder) for i in range(8)]
+        options = PretrainOptions(room_pairs=0, cell_pairs=8, leaf_pairs=0)
+        judge = PairStream(PretrainData([], [], cells), options, 0)
+        batches["furnished rooms"] = [judge.draw(i) for i in range(6)]
+    return batches
 
 
 def _save(

@@ -35,8 +35,11 @@ def pretrain(out: Path, work: Path, options: PretrainOptions) -> None:
     say(f"options {json.dumps(asdict(options))}")
     say(f"torch {torch.__version__} numpy {np.__version__} threads {torch.get_num_threads()}")
     began = time.perf_counter()
-    data = make_data(options)
-    say(f"rendered {options.rooms} rooms, {options.pictures} pictures {_since(began)}")
+    data = make_data(options, work)
+    say(
+        f"rendered {options.rooms} box rooms, {options.cells} furnished rooms, "
+        f"{options.pictures} pictures {_since(began)}"
+    )
     trained = train_encoder(data, options, work, say)
     encoder = trained.fuse().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     write_bytes(out / "encoder.safetensors", network_bytes(encoder, "encoder"))

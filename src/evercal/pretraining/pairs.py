@@ -1,6 +1,7 @@
 """Image pairs with known correspondence: dead leaves under homographies, rooms under parallax."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from evercal.simulation.box_room import BoxRoom, look_at
 from evercal.simulation.textures import dead_leaves
 
 HEIGHT, WIDTH = 192, 256
+PER_ANCHOR = 4
 FIRST_ROOM_SEED = 100_000
 """Rooms for pretraining start here: far from the seeds that tests, demos and benchmarks use."""
 
@@ -69,9 +71,8 @@ def homography_pair(picture: np.ndarray, rng: np.random.Generator) -> Pair:
     return Pair(np.stack(images), np.stack([first[keep], second[keep]]).astype(np.float32))
 
 
-@dataclass(frozen=True)
-class RoomViews:
-    """Views of one box room: every `per_anchor` in a row look at roughly the same part."""
+class Views(Protocol):
+    """Views of one room: every `PER_ANCHOR` in a row look at roughly the same part."""
 
     images: np.ndarray
     """(n, HEIGHT, WIDTH) uint8 grey."""
@@ -79,11 +80,40 @@ class RoomViews:
     """(n,) poses."""
     cameras: tuple[Camera, ...]
     """n pinholes; the focal length differs between anchors."""
+
+    def hit(self, view: int, pixels: np.ndarray) -> np.ndarray:
+        """(n, 3) surface points that (n, 2) pixels of a view show; not finite where none is."""
+        ...
+
+    def sees(self, view: int, points_m: np.ndarray) -> np.ndarray:
+        """(n,) bool: no surface hides the (n, 3) points, which project into the view."""
+        ...
+
+
+@dataclass(eq=False)
+class RoomViews:
+    """`Views` of a box room."""
+
+    images: np.ndarray
+    base_from_camera: SE3
+    cameras: tuple[Camera, ...]
     geometry: BoxRoom
     """The room; its textures are dropped to save memory, its rectangles stay."""
 
+    def hit(self, view: int, pixels: np.ndarray) -> np.ndarray:
+        """See `Views`."""
+        pose = self.base_from_camera[view]
+        rays = self.cameras[view].unproject(pixels) @ pose.rotation_matrix().T
+        return self.geometry.intersect(pose.translation_m, rays)[0]
 
-def room_views(seed: int, anchors: int = 5, per_anchor: int = 4) -> RoomViews:
+    def sees(self, view: int, points_m: np.ndarray) -> np.ndarray:
+        """See `Views`."""
+        eye = self.base_from_camera[view].translation_m
+        _, depth = self.geometry.intersect(eye, points_m - eye)
+        return np.abs(depth - 1.0) < 0.01  # 1: the first thing hit is the point itself
+
+
+def room_views(seed: int, anchors: int = 5, per_anchor: int = PER_ANCHOR) -> RoomViews:
     """Draws a room from `anchors * per_anchor` cameras that differ by parallax, scale and roll."""
     import cv2
 
@@ -113,21 +143,16 @@ def room_views(seed: int, anchors: int = 5, per_anchor: int = 4) -> RoomViews:
     return RoomViews(np.stack(images), SE3.stack(poses), tuple(cameras), room)
 
 
-def room_pair(views: RoomViews, first: int, second: int, rng: np.random.Generator) -> Pair:
+def view_pair(views: Views, first: int, second: int, rng: np.random.Generator) -> Pair:
     """Corresponding pixels of two views of a room, with what is hidden in either left out."""
     pixels = cell_pixels() + rng.uniform(-3.5, 3.5, (HEIGHT * WIDTH // 64, 2))
-    pose_a, pose_b = views.base_from_camera[first], views.base_from_camera[second]
-    camera_a, camera_b = views.cameras[first], views.cameras[second]
-    rays = camera_a.unproject(pixels) @ pose_a.rotation_matrix().T
-    points, _ = views.geometry.intersect(pose_a.translation_m, rays)
-    in_b = pose_b.inverse().apply(points)
+    points = views.hit(first, pixels)
+    in_b = views.base_from_camera[second].inverse().apply(points)
     front = np.isfinite(in_b[:, 2]) & (in_b[:, 2] > 0.05)
     in_b[~front] = [0, 0, 1]
-    seen = camera_b.project(in_b)
+    seen = views.cameras[second].project(in_b)
     keep = np.flatnonzero(front & inside(pixels) & inside(seen))
-    direction = points[keep] - pose_b.translation_m
-    _, depth = views.geometry.intersect(pose_b.translation_m, direction)
-    keep = keep[np.abs(depth - 1.0) < 0.01]  # 1: the first thing hit is the point itself
+    keep = keep[views.sees(second, points[keep])]
     images = views.images[[first, second]]
     return Pair(images, np.stack([pixels[keep], seen[keep]]).astype(np.float32))
 

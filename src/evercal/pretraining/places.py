@@ -1,6 +1,6 @@
 """Training of the global descriptor: views of one place together, other rooms apart."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -10,22 +10,21 @@ from torch.nn import functional as F
 from evercal.models.descriptor import GlobalDescriptor
 from evercal.models.encoder import Encoder
 from evercal.pretraining.contrastive import VALIDATION_ROOM_SEED, PretrainData, PretrainOptions
-from evercal.pretraining.pairs import RoomViews, photometric, room_views
+from evercal.pretraining.pairs import PER_ANCHOR, Views, photometric, room_views
 
-VIEWS_PER_ANCHOR = 4
 PLACES_PER_BATCH = 64
 TEMPERATURE = 0.07
 
 
 @torch.inference_mode()
-def _encode(encoder: Encoder, rooms: list[RoomViews], rng: np.random.Generator) -> Tensor:
+def _encode(encoder: Encoder, rooms: Sequence[Views], rng: np.random.Generator) -> Tensor:
     """(rooms, anchors, views, width, h, w) features in bfloat16, each image under its own light."""
     maps = []
     for room in rooms:
         images = np.stack([photometric(image, rng) for image in room.images])
         with torch.autocast("cpu", torch.bfloat16):
             maps.append(encoder(torch.from_numpy(images[:, None]).float() / 255).bfloat16())
-    return torch.stack(maps).unflatten(1, (-1, VIEWS_PER_ANCHOR))
+    return torch.stack(maps).unflatten(1, (-1, PER_ANCHOR))
 
 
 def _crop(maps: Tensor, rng: np.random.Generator) -> Tensor:
@@ -59,7 +58,7 @@ def place_accuracy(descriptor: GlobalDescriptor, maps: Tensor) -> float:
     gallery = flat[:, :, 1:].flatten(0, 2)
     per_room = maps.shape[1]
     query_room = torch.arange(len(queries)) // per_room
-    gallery_room = torch.arange(len(gallery)) // (per_room * (VIEWS_PER_ANCHOR - 1))
+    gallery_room = torch.arange(len(gallery)) // (per_room * (PER_ANCHOR - 1))
     nearest = (queries @ gallery.T).argmax(-1)
     return 100.0 * float((gallery_room[nearest] == query_room).float().mean())
 
@@ -70,7 +69,7 @@ def train_descriptor(
     """Trains the descriptor on features of the finished, frozen encoder."""
     rng = np.random.default_rng([options.seed, 9])
     torch.manual_seed(options.seed)
-    maps = _encode(encoder, data.rooms, rng)
+    maps = _encode(encoder, [*data.rooms, *data.cells], rng)
     held_out = [room_views(VALIDATION_ROOM_SEED + i) for i in range(24)]
     validation = _encode(encoder, held_out, rng)
     descriptor = GlobalDescriptor(encoder.width)
@@ -83,7 +82,7 @@ def train_descriptor(
     for step in range(1, options.descriptor_steps + 1):
         place = rng.permutation(rooms * anchors)[:PLACES_PER_BATCH]
         room, anchor = place // anchors, place % anchors
-        views = np.argsort(rng.random((len(place), VIEWS_PER_ANCHOR)), axis=1)[:, :2]
+        views = np.argsort(rng.random((len(place), PER_ANCHOR)), axis=1)[:, :2]
         a = descriptor(_crop(maps[room, anchor, views[:, 0]].float(), rng))
         b = descriptor(_crop(maps[room, anchor, views[:, 1]].float(), rng))
         loss = place_loss(a, b, torch.from_numpy(room))

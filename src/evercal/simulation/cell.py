@@ -68,7 +68,7 @@ SUITES: dict[str, Suite] = {
     "sim": Suite(_THREE, 3300, (640, 480), 16),
     "sim-7": Suite(_numbered(7, 201), 1000, (320, 240), 16),
     "sim-12": Suite(_numbered(12, 301), 1000, (320, 240), 16),
-    "sim-mini": Suite(_THREE, 130, (320, 240), 32, depth=False, jpeg_quality=85),
+    "sim-mini": Suite(_THREE, 130, (320, 240), 16, depth=False, jpeg_quality=85),
 }
 
 

@@ -1,0 +1,84 @@
+"""Furnished rooms for pretraining: pairs show one point, files are kept, reserved seeds are left
+alone. Rendering needs the extra `sim`."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evercal.geometry import SE3, Camera
+from evercal.pretraining import cells
+from evercal.pretraining.cells import CellViews, cell_views, kept_cell_views
+from evercal.pretraining.contrastive import VALIDATION_CELL_SEED
+from evercal.pretraining.pairs import HEIGHT, PER_ANCHOR, WIDTH, view_pair
+from evercal.simulation.rooms import RESERVED
+
+CAMERA = Camera(WIDTH, HEIGHT, 200.0, 200.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+
+
+def step() -> CellViews:
+    """A wall 2 m off whose left half stands out by a metre, seen from two places."""
+    depth = np.full((2, HEIGHT, WIDTH), 2.0, np.float16)
+    depth[0, :, : WIDTH // 2] = 1.0
+    shift = 0.1
+    edge = WIDTH // 2 - round(shift * 200)  # the near half ends 20 pixels further left
+    depth[1, :, :edge] = 1.0
+    depth[:, :20] = 0.0  # nothing was hit
+    move = SE3(np.array([1.0, 0, 0, 0]), np.array([shift, 0, 0]))
+    images = np.zeros((2, HEIGHT, WIDTH), np.uint8)
+    return CellViews(images, SE3.stack([SE3.identity(), move]), (CAMERA, CAMERA), depth)
+
+
+def test_depth_maps_say_where_points_lie_and_which_are_hidden() -> None:
+    views = step()
+    pixels = np.array([[40.0, 100.0], [200.0, 100.0], [40.0, 5.0]])
+    points = views.hit(0, pixels)
+    np.testing.assert_allclose(points[:2, 2], [1.0, 2.0])
+    np.testing.assert_allclose(CAMERA.project(points[:2]), pixels[:2])
+    assert np.isnan(points[2]).all()
+    first, second = view_pair(views, 0, 1, np.random.default_rng(0)).pixels
+    near = first[:, 0] < WIDTH // 2 - 0.5
+    parallax = (first - second)[:, 0]
+    np.testing.assert_allclose(parallax[near], 20.0, atol=1e-3)
+    np.testing.assert_allclose(parallax[~near], 10.0, atol=1e-3)
+    assert min(near.sum(), (~near).sum()) > 100
+    assert first[:, 1].min() > 19
+    # From the left, the near half hides a strip of the far one.
+    back = view_pair(views, 1, 0, np.random.default_rng(0)).pixels[0]
+    strip = WIDTH // 2 - 20
+    assert not ((back[:, 0] > strip) & (back[:, 0] < strip + 9)).any()
+
+
+def test_pretraining_stays_below_the_reserved_seeds() -> None:
+    assert cells.FIRST_CELL_SEED > 400  # those of the suites are below
+    assert VALIDATION_CELL_SEED + 100 < RESERVED
+
+
+def test_rendered_pairs_look_alike_and_are_kept(tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba", reason="the extra 'sim' is not installed")
+    views = cell_views(1001, anchors=1)
+    assert views.images.shape == views.depth_m.shape == (PER_ANCHOR, HEIGHT, WIDTH)
+    rng, seen = np.random.default_rng(0), []
+    for first, second in ((0, 1), (2, 3), (1, 2)):
+        pair = view_pair(views, first, second, rng)
+        assert pair.pixels.shape[1] > 20
+        (u, v), (x, y) = np.rint(pair.pixels).astype(int).transpose(0, 2, 1)
+        seen.append(np.stack([pair.images[0, v, u], pair.images[1, y, x]]).astype(float))
+        # The same surface point, found from either side.
+        gap = views.hit(first, pair.pixels[0]) - views.hit(second, pair.pixels[1])
+        assert np.median(np.linalg.norm(gap, axis=-1)) < 0.01
+    left, right = np.concatenate(seen, 1)
+    assert np.corrcoef(left, right)[0, 1] > 0.8
+    patch = pytest.MonkeyPatch()
+    with patch.context() as patched:
+        patched.setattr(cells, "cell_views", lambda seed: views)
+        kept = kept_cell_views(1001, tmp_path / "new")
+        patched.setattr(cells, "cell_views", None)
+        again = kept_cell_views(1001, tmp_path / "new")
+    for found in (kept, again):
+        np.testing.assert_array_equal(found.images, views.images)
+        np.testing.assert_array_equal(found.depth_m, views.depth_m)
+        np.testing.assert_allclose(
+            found.base_from_camera.matrix(), views.base_from_camera.matrix(), atol=1e-12
+        )
+        assert found.cameras == views.cameras
