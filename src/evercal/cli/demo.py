@@ -96,7 +96,7 @@ def run_demo(out: Path, options: DemoOptions, say: Callable[[str], None] = _quie
         shutil.rmtree(work, ignore_errors=True)
     localizer = Localizer.open(store)
     outcome.fixed = [_find_fixed(localizer, room) for room in rooms if room.fixed is not None]
-    write_pictures(out, localizer, scenes, outcome)
+    write_pictures(out, localizer, rooms, outcome)
     middle = scenes[0].test[len(scenes[0].test) // 2]
     write_image(out / QUERY, middle.read_image())
     return outcome

@@ -11,27 +11,39 @@ from evercal.cli.demo_outcome import FIXED_HEADER, METHODS, DemoOutcome
 from evercal.cli.pictures import draw_estimate
 
 if TYPE_CHECKING:
-    from evercal.datasets import Scene
+    from collections.abc import Sequence
+
+    from evercal.datasets import Frame, Scene
     from evercal.localization.localizer import Localizer
+    from evercal.simulation.mini import CellRoom
 
 _COLOURS = ("#0072B2", "#D55E00")
 _OVERLAYS_PER_ROOM = 3
 
 
 def write_pictures(
-    out: Path, localizer: "Localizer", scenes: "list[Scene]", outcome: DemoOutcome
+    out: Path, localizer: "Localizer", places: "Sequence[CellRoom]", outcome: DemoOutcome
 ) -> None:
     """Writes `overview.png` and `report.html`.
 
     Args:
         out: folder, there already.
         localizer: evercal's after the last room.
-        scenes: the rooms.
+        places: the rooms.
         outcome: what was measured.
     """
-    from evercal.drawing import Picture, Section, Table, encode_image, forgetting_curves, html_page
+    from evercal.drawing import (
+        Picture,
+        Section,
+        Table,
+        contact_sheet,
+        encode_image,
+        forgetting_curves,
+        html_page,
+    )
     from evercal.storage import write_bytes
 
+    scenes = [place.scene for place in places]
     overlays = _overlays(localizer, scenes)
     overview = _overview([_best(overlays, i) for i in range(2)], outcome)
     write_bytes(out / "overview.png", overview)
@@ -62,6 +74,11 @@ def write_pictures(
         ),
         Section("Predicted points", sheets),
     ]
+    drawn = [image for place in places for image in _grey_overlays(localizer, place)]
+    if drawn:
+        sheet = encode_image(contact_sheet(drawn, _OVERLAYS_PER_ROOM), "jpg")
+        said = "The room's bare shapes, rendered at the estimated pose, laid over the test image."
+        sections.append(Section("Rendered at the estimated pose", [said, Picture(sheet)]))
     if outcome.fixed:
         said = (
             "A camera stands still while the arm moves. Its pose in the robot's base frame is the"
@@ -95,9 +112,7 @@ def _overlays(localizer: "Localizer", scenes: "list[Scene]") -> list[_Overlay]:
     """Room by room, test frames spread over the recording."""
     found = []
     for scene in scenes:
-        places = np.linspace(0, len(scene.test), _OVERLAYS_PER_ROOM, endpoint=False)
-        for place in places + len(scene.test) / (2 * _OVERLAYS_PER_ROOM):
-            frame = scene.test[int(place)]
+        for frame in _spread(scene):
             image = frame.read_image()
             estimate = localizer.localize(image, frame.camera)
             share = f"{100 * estimate.inlier_ratio:.0f} % inliers"
@@ -106,6 +121,34 @@ def _overlays(localizer: "Localizer", scenes: "list[Scene]") -> list[_Overlay]:
             count = estimate.inliers if estimate.status == "ok" else 0
             found.append(_Overlay(f"{said}, {share}", drawn, count))
     return found
+
+
+def _grey_overlays(localizer: "Localizer", place: "CellRoom") -> list[np.ndarray]:
+    """Test images of a room with its bare shapes over them; none where they cannot be rendered."""
+    from evercal.simulation.mini import grey_views
+
+    if place.model is None:
+        return []
+    frames, poses = [], []
+    for frame in _spread(place.scene):
+        estimate = localizer.localize(frame.read_image(), frame.camera)
+        if estimate.scene == place.scene.name and estimate.base_from_camera is not None:
+            frames.append(frame)
+            poses.append(estimate.base_from_camera)
+    if not frames:
+        return []
+    views = grey_views(place.model, frames, poses)
+    return [
+        ((frame.read_image().astype(int) + view) // 2).astype(np.uint8)
+        for frame, view in zip(frames, views, strict=False)
+    ]
+
+
+def _spread(scene: "Scene") -> "list[Frame]":
+    """Test frames spread over the recording."""
+    places = np.linspace(0, len(scene.test), _OVERLAYS_PER_ROOM, endpoint=False)
+    half = len(scene.test) / (2 * _OVERLAYS_PER_ROOM)
+    return [scene.test[int(place + half)] for place in places]
 
 
 def _best(overlays: list[_Overlay], room: int) -> _Overlay:
