@@ -26,10 +26,12 @@ def run(out: Path, suites: Sequence[str], samples: int, views: int) -> None:
     for suite in suites:
         for name, kind, seed in SUITES[suite].rooms:
             place = room(kind, seed)
-            shots = sweep_shots(place, 40, 0)[:: 28 // max(views, TIMED)]
+            train = sweep_shots(place, 40, 0)[:28]
+            count = max(views, TIMED)
+            shots = [train[int(i)] for i in np.linspace(0, 27, count)]
             renderer = Renderer(place.meshes() + panda.meshes(shots[0].joints_rad))
             seconds = []
-            for i, shot in enumerate(shots[: max(views, TIMED)]):
+            for i, shot in enumerate(shots):
                 start = time.perf_counter()
                 image = renderer.render(camera, shot.base_from_camera, options, i)
                 seconds.append(time.perf_counter() - start)

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from tabulate import tabulate
 
+from evercal.continual import strategies
 from evercal.continual.knowledge import Knowledge
 from evercal.continual.learn import Stage, StageOptions, keep, learn
 from evercal.continual.presets import preset
@@ -56,6 +57,14 @@ class Outcome:
 _first_stages: dict[tuple[str, str, int, int], Knowledge] = {}
 
 
+def _settings() -> dict[str, object]:
+    """What decides the results, but for the code."""
+    rules = {name: [rule.penalty_per_scene, rule.protection] for name, rule in RULES.items()}
+    replay = [strategies.REPLAY_CLAMP_PX, strategies.TEACHER_LIMIT_PX]
+    replay += [strategies.OUTPUT_WEIGHT_PX_PER_M, strategies.REPLAY_WEIGHT]
+    return {**asdict(stage_options(0)), "rules": rules, "replay": replay}
+
+
 class Runner:
     """Runs strategies over one sequence of scenes; results are read from disk when they are there.
 
@@ -69,7 +78,7 @@ class Runner:
 
     def __init__(self, scenes: Sequence[Scene], out: Path):
         self.scenes, self.out = list(scenes), out
-        hold_settings(out / "settings.json", asdict(stage_options(0)))
+        hold_settings(out / "settings.json", _settings())
         self.lessons, self.held_out = [], []
         for scene in scenes:
             train, aside = hold_out(scene.train)

@@ -21,7 +21,6 @@ from evercal.continual.learn import (
     Resume,
     Stage,
     StageOptions,
-    _replay,
     learn,
 )
 from evercal.continual.strategies import STRATEGIES
@@ -30,7 +29,7 @@ from evercal.errors import InputError
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.localizer import Localizer
 from evercal.models.head import Head, HeadOutput
-from evercal.training.buffer import Rows, join
+from evercal.training.buffer import Rows
 from evercal.training.fit import Progress
 from evercal.training.precision import autocast
 
@@ -250,33 +249,6 @@ def test_replayed_rows_are_the_old_scenes_and_their_teacher_stays_as_it_was(
         where = -(turn.transpose(1, 2) @ shift)[..., 0].numpy()
         nearest = np.linalg.norm(where[:, None] - centres, axis=-1).min(1)
         assert nearest.max() < 1e-5
-
-
-def test_remembered_scenes_cost_each_or_together(
-    first: dict[str, Knowledge],
-    rooms: Rooms,
-    quick: StageOptions,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def one(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
-        return 0 * student.points.sum() + 1
-
-    known = outcome(continued(first["evercal"], rooms, quick))
-    cost = []
-    for each in (True, False):
-        strategy = replace(STRATEGIES["evercal"], penalty=one, each_scene=each)
-        monkeypatch.setitem(STRATEGIES, "evercal", strategy)
-        found = _replay(known, STRATEGIES["evercal"], known.heads[0], quick)
-        while True:
-            try:
-                next(found)
-            except StopIteration as end:
-                replay = end.value
-                break
-        rows = join([buffer.draw(8, torch.Generator().manual_seed(0)) for buffer in replay.buffers])
-        output = known.heads[0](rows.features.float(), rows.scene, rows.descriptor)
-        cost.append((len(replay.buffers), float(replay.penalty(output, rows, 0.5).detach())))
-    assert cost == [(2, 2.0), (2, 1.0)]
 
 
 def test_everything_comes_from_the_seed(

@@ -23,7 +23,7 @@ def test_first_settings_are_kept_and_others_refused(tmp_path: Path) -> None:
     assert file.read_bytes() == before
 
 
-@pytest.mark.parametrize("text", ["{", "[1]", "null", "3"])
+@pytest.mark.parametrize("text", ["{", "[1]", "[]", "[[1, 2]]", "null", "3"])
 def test_settings_that_cannot_be_read_are_named(tmp_path: Path, text: str) -> None:
     file = tmp_path / "settings.json"
     file.write_text(text)

@@ -190,8 +190,38 @@ def test_replay_gets_remembered_rows_evenly_and_its_cost_is_trained(learnable: L
 @pytest.mark.parametrize(
     ("scenes", "rows"), [(1, 60), (2, 60), (3, 90), (7, 210), (8, 240), (12, 240), (500, 500)]
 )
-def test_replayed_rows_grow_with_the_scenes_up_to_a_limit(scenes: int, rows: int) -> None:
-    assert replayed_rows(OPTIONS, scenes) == rows
+def test_replayed_rows_grow_with_the_scenes_that_count(
+    scenes: int, rows: int, learnable: Learnable
+) -> None:
+    buffers = [learnable()[0]] * scenes
+
+    def penalty(output: HeadOutput, rows: Rows, progress: float) -> Tensor:
+        return output.points.sum()
+
+    assert replayed_rows(OPTIONS, Replay(buffers, penalty, per_scene=True)) == rows
+    assert replayed_rows(OPTIONS, Replay(buffers, penalty)) == max(60, scenes)
+
+
+@pytest.mark.parametrize("per_scene", [False, True])
+def test_remembered_scenes_cost_each_or_together(per_scene: bool, learnable: Learnable) -> None:
+    """The penalty alone moves the head here; plain gradient steps show how much it counts."""
+    buffers = [learnable(scene)[0] for scene in range(3)]
+    moved = []
+    for scale in (1.0, 2.0):
+        head = head_for(buffers)
+
+        def penalty(
+            output: HeadOutput, rows: Rows, progress: float, scale=scale, bias=head.logit_bias
+        ) -> Tensor:
+            return scale * bias.sum() + 0 * output.points.sum()
+
+        replay = Replay(buffers[:2], penalty, per_scene)
+        fitter = Fitter(head, buffers[2:], replay, replace(OPTIONS, iterations=1), 0)
+        next(fitter.run())
+        gradient = head.logit_bias.grad
+        assert gradient is not None
+        moved.append(float(gradient[head.centre_scene == 0].mean()))
+    assert moved == pytest.approx([2.0, 4.0] if per_scene else [1.0, 2.0])
 
 
 def test_several_scenes_share_a_batch_evenly(learnable: Learnable) -> None:

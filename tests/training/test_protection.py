@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.models.head import Head, HeadOptions
+from evercal.models.head import Head, HeadOptions, HeadOutput
 from evercal.training.buffer import FeatureBuffer, Rows
 from evercal.training.fit import FitOptions, Fitter, Replay
 from evercal.training.protection import Protection
@@ -52,6 +52,28 @@ def test_updates_are_damped_as_the_formula_says(learnable: Learnable, scenes: in
     assert kept[-1] < 0.3 < 0.9 < kept[0]
 
 
+def test_what_one_remembered_scene_owns_does_not_move(learnable: Learnable) -> None:
+    buffers = [learnable(scene)[0] for scene in range(3)]
+    head = head_of(buffers)
+
+    def cost(output: HeadOutput, rows: Rows, progress: float) -> Tensor:
+        return output.points.abs().mean()
+
+    before = {name: value.clone() for name, value in head.state_dict().items()}
+    replay = Replay(buffers[:2], cost, protection=1e-6)
+    list(Fitter(head, buffers[2:], replay, OPTIONS, 0).run())
+    after = head.state_dict()
+    own = {"code": torch.tensor([True, True, False])}
+    for name in ("logit", "logit_bias", "offset", "offset_bias"):
+        own[name] = head.centre_scene < 2
+    for name, held in own.items():
+        changed = (after[name] != before[name]).flatten(1 if after[name].ndim > 1 else 0)
+        changed = changed.any(1) if changed.ndim > 1 else changed
+        assert not changed[held].any()
+        assert changed[~held].any()
+    assert (after["last.1.weight"] != before["last.1.weight"]).any()
+
+
 def test_an_old_scene_drifts_less(learnable: Learnable) -> None:
     old, new = learnable(0)[0], learnable(1)[0]
 
@@ -64,7 +86,7 @@ def test_an_old_scene_drifts_less(learnable: Learnable) -> None:
         rows = old.draw(500, torch.Generator().manual_seed(0))
         with torch.no_grad():
             before = head(rows.features.float(), 0, None).points
-        list(Fitter(head, [new], Replay([old], free, strength), OPTIONS, 0).run())
+        list(Fitter(head, [new], Replay([old], free, protection=strength), OPTIONS, 0).run())
         with torch.no_grad():
             after = head(rows.features.float(), 0, None).points
         drift[strength] = float((after - before).norm(dim=-1).median())
@@ -79,7 +101,7 @@ def test_a_resumed_run_protects_the_same_directions(learnable: Learnable, stop: 
         return torch.zeros(())
 
     def fitter() -> Fitter:
-        return Fitter(head_of([old, new]), [new], Replay([old], free, 5.0), OPTIONS, 0)
+        return Fitter(head_of([old, new]), [new], Replay([old], free, protection=5.0), OPTIONS, 0)
 
     whole, part, rest = fitter(), fitter(), fitter()
     list(whole.run())

@@ -27,7 +27,7 @@ class Simulate:
     seed: int = 0
     """Of the paths and the noise; the rooms of a suite stay the same."""
     samples: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Paths per pixel: more is slower and less grainy; the suite's own when left out."""
+    """Paths per pixel: more is slower and truer in fine detail; the suite's own when left out."""
     exposure_ev: float = 0.0
     """Brighter or darker, in stops."""
     noise: float = 0.0

@@ -275,10 +275,11 @@ def _replay(
     def penalty(student: HeadOutput, rows: Rows, progress: float) -> Tensor:
         with torch.no_grad(), autocast():
             before = teacher(rows.features.float(), rows.scene, rows.descriptor)
-        return weight * cost(student, before, rows, progress)
+        return cost(student, before, rows, progress)
 
-    weight = len(buffers) if strategy.each_scene else 1
-    return Replay(buffers, penalty, strategy.protection) if buffers else None
+    if not buffers:
+        return None
+    return Replay(buffers, penalty, strategy.penalty_per_scene, strategy.protection)
 
 
 def _finish(

@@ -31,7 +31,7 @@ class Strategy:
     """Which frames of a finished scene are remembered; None keeps none."""
     penalty: Penalty | None = None
     """What replayed rows cost."""
-    each_scene: bool = False
+    penalty_per_scene: bool = False
     """Whether every remembered scene costs that much, or (the paper) all of them together: then a
     scene counts less with every one that follows."""
     condition: Literal["code", "descriptor"] = "code"
@@ -41,7 +41,7 @@ class Strategy:
     heads: Literal["one", "per_scene"] = "one"
     """One head for all scenes, or one each."""
     protection: float = 0.0
-    """How strongly updates of shared matrices spare the directions that remembered scenes use
+    """How strongly updates of shared matrices spare the directions that each remembered scene uses
     (`training.protection`)."""
 
 
@@ -61,7 +61,7 @@ REPLAY_CLAMP_PX = 5.0
 TEACHER_LIMIT_PX = 10.0
 OUTPUT_WEIGHT_PX_PER_M = 50.0
 REPLAY_WEIGHT = 0.5
-PROTECTION = 2.0
+PROTECTION = 0.5
 
 
 def anchored_reprojection(
@@ -88,7 +88,7 @@ STRATEGIES: dict[str, Strategy] = {
         source="this project: scene codes, own centres, anchored replay, protection",
         select=_sars_filled,
         penalty=anchored_reprojection,
-        each_scene=True,
+        penalty_per_scene=True,
         protection=PROTECTION,
     ),
     "finetune": Strategy(source="control: the head and steps of evercal, no replay"),

@@ -13,8 +13,9 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import DataLoader, IterableDataset
 
+from evercal.errors import InputError
 from evercal.models.encoder import LocalEncoder
-from evercal.pretraining.cells import FIRST_CELL_SEED, CellViews, kept_cell_views
+from evercal.pretraining.furnished import FIRST_FURNISHED_SEED, FurnishedViews, kept_furnished_views
 from evercal.pretraining.pairs import (
     FIRST_ROOM_SEED,
     HEIGHT,
@@ -29,10 +30,11 @@ from evercal.pretraining.pairs import (
     room_views,
     view_pair,
 )
+from evercal.simulation.renderer import mitsuba
 from evercal.storage.atomic import write_bytes
 
 VALIDATION_ROOM_SEED = FIRST_ROOM_SEED + 50_000
-VALIDATION_CELL_SEED = FIRST_CELL_SEED + 7_000
+VALIDATION_FURNISHED_SEED = FIRST_FURNISHED_SEED + 7_000
 CHECKPOINT_STEPS = 250
 
 
@@ -44,13 +46,13 @@ class PretrainOptions:
     """Optimiser steps of the local encoder."""
     rooms: int = 160
     """Box rooms, each seen from 20 cameras."""
-    cells: int = 0
+    furnished: int = 0
     """Furnished rooms (extra `sim`), each seen from 20 cameras."""
     pictures: int = 300
     """Dead-leaves pictures for homography pairs."""
     room_pairs: int = 3
     """Pairs of box rooms in a step."""
-    cell_pairs: int = 0
+    furnished_pairs: int = 0
     """Pairs of furnished rooms in a step."""
     leaf_pairs: int = 2
     """Homography pairs in a step."""
@@ -72,7 +74,7 @@ class PretrainData:
 
     rooms: list[RoomViews]
     pictures: list[np.ndarray]
-    cells: list[CellViews] = field(default_factory=list)
+    furnished: list[FurnishedViews] = field(default_factory=list)
 
 
 def _picture(seed: int) -> np.ndarray:
@@ -85,13 +87,24 @@ def make_data(
     """Draws box rooms and pictures with one process per core, and renders furnished rooms.
 
     The latter take about ten seconds each and are kept in `folder`.
+
+    Raises:
+        InputError: Pairs of furnished rooms without any, more of them than there are seeds, or the
+            extra `sim` is missing.
     """
+    if options.furnished_pairs and not options.furnished:
+        raise InputError("pairs of furnished rooms need --furnished rooms, at least 1")
+    most = VALIDATION_FURNISHED_SEED - FIRST_FURNISHED_SEED
+    if options.furnished > most:
+        raise InputError(f"furnished {options.furnished}: at most {most}, later seeds are held out")
+    if options.furnished:
+        mitsuba()  # rather now than after minutes
     with get_context("spawn").Pool() as pool:
         seeds = range(first_room, first_room + options.rooms)
         rooms = pool.map(room_views, seeds, chunksize=4)
         pictures = pool.map(_picture, range(first_room, first_room + options.pictures), chunksize=8)
-    cells = range(FIRST_CELL_SEED, FIRST_CELL_SEED + options.cells)
-    return PretrainData(rooms, pictures, [kept_cell_views(seed, folder) for seed in cells])
+    cells = range(FIRST_FURNISHED_SEED, FIRST_FURNISHED_SEED + options.furnished)
+    return PretrainData(rooms, pictures, [kept_furnished_views(seed, folder) for seed in cells])
 
 
 class PairStream(IterableDataset):
@@ -107,7 +120,7 @@ class PairStream(IterableDataset):
         pairs: list[Pair] = []
         for count, draw in (
             (o.room_pairs, lambda: self._parallax(self.data.rooms, rng)),
-            (o.cell_pairs, lambda: self._parallax(self.data.cells, rng)),
+            (o.furnished_pairs, lambda: self._parallax(self.data.furnished, rng)),
             (o.leaf_pairs, lambda: self._homography(rng)),
         ):
             goal = len(pairs) + count
@@ -261,9 +274,9 @@ def _validation(data: PretrainData, folder: Path) -> dict[str, list[tuple[Tensor
     rooms = [room_views(VALIDATION_ROOM_SEED + i) for i in range(8)]
     judge = PairStream(PretrainData(rooms, []), PretrainOptions(room_pairs=8, leaf_pairs=0), 0)
     batches = {"box rooms": [judge.draw(i) for i in range(6)]}
-    if data.cells:
-        cells = [kept_cell_views(VALIDATION_CELL_SEED + i, folder) for i in range(8)]
-        options = PretrainOptions(room_pairs=0, cell_pairs=8, leaf_pairs=0)
+    if data.furnished:
+        cells = [kept_furnished_views(VALIDATION_FURNISHED_SEED + i, folder) for i in range(8)]
+        options = PretrainOptions(room_pairs=0, furnished_pairs=8, leaf_pairs=0)
         judge = PairStream(PretrainData([], [], cells), options, 0)
         batches["furnished rooms"] = [judge.draw(i) for i in range(6)]
     return batches

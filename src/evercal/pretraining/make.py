@@ -37,7 +37,7 @@ def pretrain(out: Path, work: Path, options: PretrainOptions) -> None:
     began = time.perf_counter()
     data = make_data(options, work)
     say(
-        f"rendered {options.rooms} box rooms, {options.cells} furnished rooms, "
+        f"rendered {options.rooms} box rooms, {options.furnished} furnished rooms, "
         f"{options.pictures} pictures {_since(began)}"
     )
     trained = train_encoder(data, options, work, say)

@@ -69,7 +69,7 @@ def train_descriptor(
     """Trains the descriptor on features of the finished, frozen encoder."""
     rng = np.random.default_rng([options.seed, 9])
     torch.manual_seed(options.seed)
-    maps = _encode(encoder, [*data.rooms, *data.cells], rng)
+    maps = _encode(encoder, [*data.rooms, *data.furnished], rng)
     held_out = [room_views(VALIDATION_ROOM_SEED + i) for i in range(24)]
     validation = _encode(encoder, held_out, rng)
     descriptor = GlobalDescriptor(encoder.width)

@@ -150,7 +150,7 @@ def simulate(
     for scene, kind, room_seed in suite.rooms:
         place = room(kind, room_seed)
         recordings = _recordings(place, panda, frames, options.seed, out / scene)
-        writer = _Writer(place, panda, camera, suite, taken, settings)
+        writer = _Writer(place, panda, camera, suite, options.seed, taken, settings)
         for root, shots in recordings:
             for _ in writer.record(root, scene, shots):
                 done += 1
@@ -201,7 +201,10 @@ def _recordings(
         if len(joints) == CALIBRATION_FRAMES:
             break
     else:
-        raise ValueError(f"{place.kind} {place.seed}: too few free arm poses for a hand camera")
+        raise InputError(
+            f"seed {seed}: too few free arm poses for a hand camera in {place.kind} {place.seed};"
+            f" take another seed"
+        )
     hand = hand_shots(flanges, np.array(joints), gripper_from_camera)
     folder = root / "calibration"
     folder.mkdir(parents=True, exist_ok=True)
@@ -229,11 +232,12 @@ class _Writer:
         panda: Panda,
         camera: Camera,
         suite: Suite,
+        seed: int,
         options: RenderOptions,
         settings: dict[str, object],
     ):
         self._place, self._panda, self._camera = place, panda, camera
-        self._suite, self._options, self._settings = suite, options, settings
+        self._suite, self._seed, self._options, self._settings = suite, seed, options, settings
         self._renderer: Renderer | None = None
         self._joints: np.ndarray | None = None
 
@@ -271,13 +275,14 @@ class _Writer:
         options = self._options
         if self._renderer is None:
             arm = self._panda.meshes(shot.joints_rad)
-            self._renderer = Renderer(self._place.meshes() + arm, depth=options.depth)
+            self._renderer = Renderer(self._place.meshes() + arm)
         elif self._joints is None or (self._joints != shot.joints_rad).any():
             self._renderer.move({m.name: m for m, _ in self._panda.meshes(shot.joints_rad)})
         self._joints = shot.joints_rad
         path = _shutter(shot, following, options.blur_steps)
-        # Seeds of neighbouring frames must not make one pattern of noise.
-        seed = int(np.random.default_rng([self._place.seed, i, len(shot.name)]).integers(2**31))
+        # No two frames have one pattern of noise.
+        origin = [self._place.seed, self._seed, i, *shot.name.encode()]
+        seed = int(np.random.default_rng(origin).integers(2**31))
         colour = self._renderer.render(self._camera, path, options, seed)
         if self._suite.depth:
             metres = self._renderer.depth(self._camera, shot.base_from_camera)

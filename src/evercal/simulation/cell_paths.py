@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.simulation.box_room import look_at
 from evercal.simulation.robot import HOME_RAD
@@ -46,7 +47,7 @@ def sweep_shots(room: Room, frames: int, seed: int) -> list[Shot]:
         seed: of both paths.
 
     Raises:
-        ValueError: The room leaves no free way.
+        InputError: The room leaves no free way.
     """
     train_count = max(1, round(0.7 * frames))
     train = _free_path(room, train_count, [seed, 1])
@@ -110,7 +111,7 @@ def hand_joints(frames: int, seed: int) -> np.ndarray:
 
 
 def sees_work_area(base_from_camera: SE3) -> bool:
-    """Whether the middle of the work area lies within 25 deg of the optical axis, 0.5 m off."""
+    """Whether the middle of the work area is near the optical axis (25 deg) and 0.5 m away."""
     middle = base_from_camera.inverse().apply(WORK_AREA_M)
     distance = float(np.linalg.norm(middle))
     return distance > 0.5 and middle[2] > np.cos(np.deg2rad(25.0)) * distance
@@ -131,12 +132,12 @@ def _free_path(room: Room, frames: int, seed: list[int]) -> SE3:
     """A sweep that keeps out of everything, shape (frames,)."""
     for attempt in range(300):
         path = _sweep(frames, np.random.default_rng([*seed, room.seed, attempt]))
-        if _is_clear(room, path.translation_m).all():
+        if is_clear(room, path.translation_m).all():
             return path
-    raise ValueError(f"{room.kind} {room.seed}: no free camera path in 300 attempts")
+    raise InputError(f"{room.kind} {room.seed}: no free camera path; take another seed")
 
 
-def _is_clear(room: Room, points: np.ndarray) -> np.ndarray:
+def is_clear(room: Room, points: np.ndarray) -> np.ndarray:
     """Outside all things, and out of the arm's reach above its table."""
     near_arm = np.linalg.norm(points - (0.2, 0.0, 0.45), axis=-1) < 0.62
     return room.is_free(points) & ~near_arm
@@ -186,4 +187,4 @@ def _far_from(room: Room, frames: int, train: SE3, seed: int) -> SE3:
             kept = np.sort(np.concatenate([far, allowed]))
             if len(kept) >= frames and near[kept[:frames]].mean() <= NEAR_SHARE:
                 return path[kept[:frames]]
-    raise ValueError(f"{room.kind} {room.seed}: no test path apart from the training path")
+    raise InputError(f"{room.kind} {room.seed}: no test path apart from training; another seed may")

@@ -238,7 +238,7 @@ class Trinkets:
             28,
             3,
         )
-        shade = lathe(lampshade((0.12, 0.23), (0.105, 0.32), (0.075, 0.41)), 28, 2)
+        shade = lathe(lampshade((0.12, 0.23), (0.105, 0.32), (0.075, 0.41)), 28, 1)
         glow = m.plain("glow", (1.0, 0.82, 0.58), emission=2.2)
         return Item("lamp", [(foot, self.glaze()), (shade, glow)])
 

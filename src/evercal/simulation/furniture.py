@@ -340,6 +340,6 @@ class Workshop:
         )
         glow = m.plain("glow", (1.0, 0.82, 0.58), emission=2.2)
         parts = [(foot.shifted(0, -0.2, 0), self.dark)]
-        shade = lathe(lampshade((0.19, 1.3), (0.17, 1.45), (0.13, 1.62)), 28, 2)
+        shade = lathe(lampshade((0.19, 1.3), (0.17, 1.45), (0.13, 1.62)), 28, 1)
         parts.append((shade.shifted(0, -0.2, 0), glow))
         return Item("floor lamp", parts)

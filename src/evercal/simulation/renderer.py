@@ -41,8 +41,6 @@ class RenderOptions:
     """Paths per pixel."""
     denoise: bool = True
     """Whether Open Image Denoise removes the grain."""
-    depth: int = 4
-    """Longest path in segments; 4 is light, two bounces, eye."""
     exposure_ev: float = 0.0
     """Brighter (> 0) or darker than the room's own exposure, in stops."""
     noise: float = 0.0
@@ -63,6 +61,7 @@ def mitsuba() -> Any:
     try:
         import drjit as dr  # pyright: ignore[reportMissingImports]
         import mitsuba as mi  # pyright: ignore[reportMissingImports]
+        import mitsuba_oidn  # noqa: F401  # pyright: ignore
     except ImportError:
         raise InputError(
             "the simulator needs Mitsuba, which is not installed; run: pip install 'evercal[sim]'"
@@ -129,10 +128,12 @@ class Renderer:
         meshes: in the base frame; one Mitsuba mesh is made per material, as many small ones are
             slow. A mesh with a `name` stays on its own and can be moved.
         exposure: factor on radiance before it is encoded.
-        depth: longest path in segments.
+        max_depth: longest path in segments; 4 is light, up to two surfaces on the way, eye.
     """
 
-    def __init__(self, meshes: list[tuple[Mesh, Material]], exposure: float = 2.0, depth: int = 4):
+    def __init__(
+        self, meshes: list[tuple[Mesh, Material]], exposure: float = 2.0, max_depth: int = 4
+    ):
         mi = mitsuba()
         self._mi = mi
         self._exposure = exposure
@@ -140,7 +141,7 @@ class Renderer:
         scene: dict[str, Any] = {
             "type": "scene",
             # Roulette from the first bounce on costs some noise and saves half of the time.
-            "integrator": {"type": "path", "max_depth": depth, "rr_depth": 1},
+            "integrator": {"type": "path", "max_depth": max_depth, "rr_depth": 1},
         }
         groups: dict[tuple[str, str], tuple[Material, list[Mesh]]] = {}
         for mesh, material in meshes:

@@ -22,8 +22,10 @@ def hold_settings(path: Path, settings: Mapping[str, object]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, settings)
     try:
-        before = dict(json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError):
+        before = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(before, dict):
+            raise ValueError
+    except ValueError:
         raise InputError(f"{path}: no settings in JSON; remove the folder and start anew") from None
     now = json.loads(json.dumps(settings))
     for key in sorted({*before, *now}):

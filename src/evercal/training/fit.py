@@ -31,17 +31,12 @@ class FitOptions:
     batch: int = 2048
     """Rows of the scenes being learned in a step."""
     replay_batch: int = 1024
-    """Replayed rows in a step from one or two remembered scenes together; each further scene brings
-    half as many, up to four times this."""
+    """Replayed rows in a step, drawn evenly from all remembered scenes."""
     peak_rate: float = 4e-3
     """Peak of the one-cycle learning rate (cosine up and down) of AdamW."""
     muon_rate: float = 0.02
     """The same peak for the hidden matrices, which Muon trains (Jordan et al., 2024); 0 leaves them
     to AdamW."""
-    muon_decay: float = 0.2
-    """Decoupled decay of those matrices. Every update of Muon has the same size, so a matrix that
-    grows learns ever less; 0.2 holds it at its initial size, and later scenes learn like the
-    first. The other parameters have `weight_decay`."""
     warm_share: float = 0.05
     """Share of the steps in which the rate rises."""
     weight_decay: float = 0.01
@@ -81,6 +76,9 @@ class Replay:
     """One per remembered scene."""
     penalty: Penalty
     """Loss on a batch of their rows."""
+    per_scene: bool = False
+    """Whether the penalty is one scene's, and counts once for each. Every further scene then brings
+    rows of its own; else all share `FitOptions.replay_batch`."""
     protection: float = 0.0
     """How strongly updates spare the directions that their rows use (see `Protection`)."""
 
@@ -124,7 +122,7 @@ class Fitter:
         if hidden:
             matrices = [{"params": hidden, "share": options.muon_rate / rate}]
             self._optimisers.append(
-                torch.optim.Muon(matrices, weight_decay=options.muon_decay, ns_steps=MUON_STEPS)
+                torch.optim.Muon(matrices, weight_decay=decay_rate, ns_steps=MUON_STEPS)
             )
 
         self._spare: Callable[[], AbstractContextManager[None]] = nullcontext
@@ -145,7 +143,7 @@ class Fitter:
         parts = [buffer.draw(share, generator) for buffer in self.buffers]
         fresh = sum(len(part.scene) for part in parts)
         if replay is not None:
-            each = replayed_rows(options, len(replay.buffers)) // len(replay.buffers)
+            each = replayed_rows(options, replay) // len(replay.buffers)
             parts += [buffer.draw(each, generator) for buffer in replay.buffers]
         rows = join(parts)
         if self.head.options.condition == "descriptor":
@@ -169,7 +167,8 @@ class Fitter:
         loss = cost.mean()
         if replay is not None:
             old = slice(fresh, None)
-            loss = loss + replay.penalty(output.part(old), rows.part(old), progress)
+            cost_of_old = replay.penalty(output.part(old), rows.part(old), progress)
+            loss = loss + (len(replay.buffers) if replay.per_scene else 1) * cost_of_old
         for optimiser in self._optimisers:
             optimiser.zero_grad()
         loss.backward()
@@ -207,9 +206,14 @@ class Fitter:
             optimiser.load_state_dict({"state": slots, "param_groups": groups})
 
 
-def replayed_rows(options: FitOptions, scenes: int) -> int:
-    """Rows that a step replays, `scenes` (>= 1) remembered ones together; at least one of each."""
-    shares = min(max(2, scenes), 8)
+def replayed_rows(options: FitOptions, replay: Replay) -> int:
+    """Rows that a step replays from all remembered scenes together, at least one of each.
+
+    Where every scene counts, one or two share `replay_batch` and each further one brings half as
+    many, up to four times the batch.
+    """
+    scenes = len(replay.buffers)
+    shares = min(max(2, scenes), 8) if replay.per_scene else 2
     return max(scenes, shares * options.replay_batch // 2)
 
 

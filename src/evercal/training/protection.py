@@ -14,9 +14,10 @@ ROWS = 8192
 
 
 class Protection:
-    """Damps updates of the shared matrices along the inputs that remembered scenes give them.
+    """Holds what a remembered scene owns, and damps updates of what it shares where it looks.
 
-    Replay holds a scene where its few frames look; a matrix drifts in every other direction that
+    What belongs to one remembered scene alone (its code, logits and offsets) does not move: trained
+    on a few frames, it would fit those and lose the others. The matrices are shared. Replay holds a scene where its few frames look; a matrix drifts in every other direction that
     the scene's images use, too. With C_s the second moment of a layer's inputs over replayed rows
     of scene s and c_s the mean of its diagonal, an update D of the matrix W becomes
     D (I + strength sum_s C_s / c_s)^-1: what W says about inputs of remembered scenes hardly moves,
@@ -43,6 +44,12 @@ class Protection:
             scaled = moment / (moment.trace() / len(moment)).clamp(min=1e-12)
             used[layer] = used[layer] + scaled if layer in used else scaled
 
+        scenes = torch.tensor([buffer.scene for buffer in buffers])
+        own = torch.isin(head.centre_scene, scenes)
+        self._held: list[tuple[Tensor, Tensor]] = [(head.code, scenes)]
+        if head.options.offsets == "per_centre":
+            rows = (head.logit, head.logit_bias, head.offset, head.offset_bias)
+            self._held += [(parameter, torch.nonzero(own)[:, 0]) for parameter in rows]
         layers = [module for module in head.modules() if isinstance(module, nn.Linear)]
         hooks = [layer.register_forward_hook(look) for layer in layers]
         generator = torch.Generator().manual_seed(seed)
@@ -59,9 +66,12 @@ class Protection:
 
     @contextmanager
     def damped(self) -> Iterator[None]:
-        """Whatever the body changes in the shared matrices is damped."""
+        """Whatever the body changes in the shared matrices is damped, and undone where held."""
         before = [weight.detach().clone() for weight, _ in self._damping]
+        held = [parameter.detach()[rows].clone() for parameter, rows in self._held]
         yield
         with torch.no_grad():
+            for (parameter, rows), old in zip(self._held, held, strict=True):
+                parameter[rows] = old
             for (weight, damping), old in zip(self._damping, before, strict=True):
                 weight.copy_(old + (weight - old) @ damping)

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3, Camera
-from evercal.pretraining import cells
-from evercal.pretraining.cells import CellViews, cell_views, kept_cell_views
-from evercal.pretraining.contrastive import VALIDATION_CELL_SEED
+from evercal.pretraining import furnished
+from evercal.pretraining.contrastive import VALIDATION_FURNISHED_SEED
+from evercal.pretraining.furnished import FurnishedViews, furnished_views, kept_furnished_views
 from evercal.pretraining.pairs import HEIGHT, PER_ANCHOR, WIDTH, view_pair
 from evercal.simulation.rooms import RESERVED
 
 CAMERA = Camera(WIDTH, HEIGHT, 200.0, 200.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 
 
-def step() -> CellViews:
+def step() -> FurnishedViews:
     """A wall 2 m off whose left half stands out by a metre, seen from two places."""
     depth = np.full((2, HEIGHT, WIDTH), 2.0, np.float16)
     depth[0, :, : WIDTH // 2] = 1.0
@@ -26,7 +26,7 @@ def step() -> CellViews:
     depth[:, :20] = 0.0  # nothing was hit
     move = SE3(np.array([1.0, 0, 0, 0]), np.array([shift, 0, 0]))
     images = np.zeros((2, HEIGHT, WIDTH), np.uint8)
-    return CellViews(images, SE3.stack([SE3.identity(), move]), (CAMERA, CAMERA), depth)
+    return FurnishedViews(images, SE3.stack([SE3.identity(), move]), (CAMERA, CAMERA), depth)
 
 
 def test_depth_maps_say_where_points_lie_and_which_are_hidden() -> None:
@@ -50,13 +50,13 @@ def test_depth_maps_say_where_points_lie_and_which_are_hidden() -> None:
 
 
 def test_pretraining_stays_below_the_reserved_seeds() -> None:
-    assert cells.FIRST_CELL_SEED > 400  # those of the suites are below
-    assert VALIDATION_CELL_SEED + 100 < RESERVED
+    assert furnished.FIRST_FURNISHED_SEED > 400  # those of the suites are below
+    assert VALIDATION_FURNISHED_SEED + 100 < RESERVED
 
 
 def test_rendered_pairs_look_alike_and_are_kept(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason="the extra 'sim' is not installed")
-    views = cell_views(1001, anchors=1)
+    views = furnished_views(1001, anchors=1)
     assert views.images.shape == views.depth_m.shape == (PER_ANCHOR, HEIGHT, WIDTH)
     rng, seen = np.random.default_rng(0), []
     for first, second in ((0, 1), (2, 3), (1, 2)):
@@ -71,10 +71,10 @@ def test_rendered_pairs_look_alike_and_are_kept(tmp_path: Path) -> None:
     assert np.corrcoef(left, right)[0, 1] > 0.8
     patch = pytest.MonkeyPatch()
     with patch.context() as patched:
-        patched.setattr(cells, "cell_views", lambda seed: views)
-        kept = kept_cell_views(1001, tmp_path / "new")
-        patched.setattr(cells, "cell_views", None)
-        again = kept_cell_views(1001, tmp_path / "new")
+        patched.setattr(furnished, "furnished_views", lambda seed: views)
+        kept = kept_furnished_views(1001, tmp_path / "new")
+        patched.setattr(furnished, "furnished_views", None)
+        again = kept_furnished_views(1001, tmp_path / "new")
     for found in (kept, again):
         np.testing.assert_array_equal(found.images, views.images)
         np.testing.assert_array_equal(found.depth_m, views.depth_m)

@@ -11,20 +11,21 @@ from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.pretraining.pairs import HEIGHT, PER_ANCHOR, WIDTH
 from evercal.simulation.box_room import look_at
+from evercal.simulation.cell_paths import is_clear
 from evercal.simulation.renderer import Renderer, RenderOptions
 from evercal.simulation.robot import HOME_RAD, Panda
 from evercal.simulation.rooms import KINDS, Room, room
-from evercal.storage.atomic import write_bytes
+from evercal.storage import hold_settings, write_bytes
 
-FIRST_CELL_SEED = 1000
+FIRST_FURNISHED_SEED = 1000
 """Furnished rooms for pretraining start here: benchmarks and demos use seeds below."""
 SAMPLES = 8
 HIDDEN = 0.02
-"""A point is hidden where the depth map is nearer by this share of its depth."""
+"""A point is hidden where the depth map differs by more than this share of its depth."""
 
 
 @dataclass(eq=False)
-class CellViews:
+class FurnishedViews:
     """`Views` of a furnished room; surfaces are known through depth maps."""
 
     images: np.ndarray
@@ -51,20 +52,20 @@ class CellViews:
         return np.abs(depth - within[:, 2]) < HIDDEN * within[:, 2]
 
 
-def cell_views(seed: int, anchors: int = 5) -> CellViews:
+def furnished_views(seed: int, anchors: int = 5) -> FurnishedViews:
     """Renders a furnished room from `anchors * PER_ANCHOR` cameras.
 
     Cameras stand anywhere in free air and look at furniture from 0.7 to 3 m; those of one anchor
     differ by parallax, scale and roll.
 
     Args:
-        seed: of room, arm and cameras; FIRST_CELL_SEED or later.
+        seed: of room, arm and cameras; FIRST_FURNISHED_SEED or later.
         anchors: how many parts of the room are looked at.
     """
     import cv2
 
     rng = np.random.default_rng([seed, 78])
-    place, panda = room(sorted(KINDS)[seed % 3], seed), Panda()
+    place, panda = room(sorted(KINDS)[seed % len(KINDS)], seed), Panda()
     joints = np.array(HOME_RAD) + rng.normal(0, 0.3, 7)
     renderer = Renderer(place.meshes() + panda.meshes(joints), rng.uniform(1.2, 2.8))
     poses, cameras, images, depths = [], [], [], []
@@ -77,7 +78,7 @@ def cell_views(seed: int, anchors: int = 5) -> CellViews:
             cameras.append(camera)
             images.append(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
             depths.append(renderer.depth(camera, pose).astype(np.float16))
-    return CellViews(np.stack(images), SE3.stack(poses), tuple(cameras), np.stack(depths))
+    return FurnishedViews(np.stack(images), SE3.stack(poses), tuple(cameras), np.stack(depths))
 
 
 def _anchor(place: Room, rng: np.random.Generator) -> Iterator[SE3]:
@@ -89,18 +90,21 @@ def _anchor(place: Room, rng: np.random.Generator) -> Iterator[SE3]:
         eye = target + rng.uniform(0.7, 3.0) * way / np.linalg.norm(way)
         spread = 0.25 * float(np.linalg.norm(eye - target))
         eyes = eye + spread * rng.standard_normal((PER_ANCHOR, 3)) * (1, 1, 0.6)
-        if eye[2] > place.low_m[2] + 0.3 and place.is_free(eyes).all():
+        if eye[2] > place.low_m[2] + 0.3 and is_clear(place, eyes).all():
             break
     for eye in eyes:
         aim = target + 0.15 * rng.standard_normal(3)
         yield look_at(eye, aim, rng.normal(0, 0.15))
 
 
-def kept_cell_views(seed: int, folder: Path) -> CellViews:
+def kept_furnished_views(seed: int, folder: Path) -> FurnishedViews:
     """The same from `folder`, rendered and put there when it is missing."""
-    path = folder / f"cell-{seed}.npz"
+    # Raise the version when the rooms or the renderer change.
+    made = {"version": 1, "samples": SAMPLES, "size": [WIDTH, HEIGHT], "per_anchor": PER_ANCHOR}
+    hold_settings(folder / "rooms.json", made)
+    path = folder / f"room-{seed}.npz"
     if not path.is_file():
-        views, buffer = cell_views(seed), io.BytesIO()
+        views, buffer = furnished_views(seed), io.BytesIO()
         focal = [camera.fx for camera in views.cameras]
         pose = views.base_from_camera
         np.savez_compressed(
@@ -111,7 +115,6 @@ def kept_cell_views(seed: int, folder: Path) -> CellViews:
             rotation_wxyz=pose.rotation_wxyz,
             translation_m=pose.translation_m,
         )
-        folder.mkdir(parents=True, exist_ok=True)
         write_bytes(path, buffer.getvalue())
     with np.load(path) as found:
         cameras = tuple(
@@ -119,4 +122,4 @@ def kept_cell_views(seed: int, folder: Path) -> CellViews:
             for f in found["focal"].tolist()
         )
         poses = SE3(found["rotation_wxyz"], found["translation_m"])
-        return CellViews(found["images"], poses, cameras, found["depth_m"])
+        return FurnishedViews(found["images"], poses, cameras, found["depth_m"])
