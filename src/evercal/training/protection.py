@@ -17,9 +17,10 @@ class Protection:
     """Holds what a remembered scene owns, and damps updates of what it shares where it looks.
 
     What belongs to one remembered scene alone (its code, logits and offsets) does not move: trained
-    on a few frames, it would fit those and lose the others. The matrices are shared. Replay holds a scene where its few frames look; a matrix drifts in every other direction that
-    the scene's images use, too. With C_s the second moment of a layer's inputs over replayed rows
-    of scene s and c_s the mean of its diagonal, an update D of the matrix W becomes
+    on a few frames, it would fit those and lose the others. The matrices are shared. Replay holds a
+    scene where its few frames look; a matrix drifts in every other direction that the scene's
+    images use, too. With C_s the second moment of a layer's inputs over replayed rows of scene s
+    and c_s the mean of its diagonal, an update D of the matrix W becomes
     D (I + strength sum_s C_s / c_s)^-1: what W says about inputs of remembered scenes hardly moves,
     and directions that they leave free stay free for the new scene. The sum lets every scene count
     alike however many there are, as precisions add up in sequential Laplace approximations. A soft
