@@ -24,3 +24,13 @@ def test_results_of_other_settings_are_refused(
     with pytest.raises(InputError, match=r"other settings: fit .*'iterations': 800.*: 7.*--out"):
         sequence.Runner([], tmp_path / "results")
     sequence.Runner([], tmp_path / "others")
+
+
+def test_results_of_other_rules_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence.Runner([], tmp_path / "results")
+    stronger = replace(sequence.RULES["evercal"], protection=9.0)
+    monkeypatch.setitem(sequence.RULES, "evercal", stronger)
+    with pytest.raises(InputError, match=r"other settings: rules .*9\.0"):
+        sequence.Runner([], tmp_path / "results")

@@ -8,13 +8,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from evercal.cli import demo
+from evercal.cli import demo, demo_page
 from evercal.cli.demo import DemoOptions
 from evercal.cli.demo_outcome import DemoOutcome, FixedCamera
-from evercal.datasets import Scene, read_image
+from evercal.datasets import Frame, Scene, read_image
 from evercal.geometry import SE3
+from evercal.simulation import mini
 from evercal.simulation.box_room import box_room_scene
 from evercal.simulation.mini import CellRoom
 
@@ -52,6 +54,26 @@ def test_demo_leaves_a_report_a_picture_and_a_store(run: Any, tmp_path: Path) ->
     assert run("localize", out / "store", out / "query.png").code in (0, 1)
     scenes = json.loads(run("info", out / "store", "--json").out)["scenes"]
     assert [scene["name"] for scene in scenes] == outcome["rooms"]
+
+
+def test_bare_shapes_lie_over_located_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = box_room_scene(7, 1, 6)
+    asked: list[tuple[object, list[Frame], list[SE3]]] = []
+
+    def clay(model: object, frames: list[Frame], poses: list[SE3]) -> list[np.ndarray]:
+        asked.append((model, frames, poses))
+        return [np.full_like(frame.read_image(), 250) for frame in frames]
+
+    monkeypatch.setattr(mini, "clay_views", clay)
+    pose = SE3.identity()
+    answers = [(scene.name, pose), ("elsewhere", pose), (scene.name, None)]
+    room = CellRoom(scene, model=("living", 3))
+    (drawn,) = demo_page._clay_overlays(Answers(answers), room)  # pyright: ignore[reportArgumentType]
+    ((model, frames, poses),) = asked
+    assert (model, frames, poses) == (("living", 3), [scene.test[1]], [pose])
+    expected = (frames[0].read_image().astype(int) + 250) // 2
+    np.testing.assert_array_equal(drawn, expected)
+    assert demo_page._clay_overlays(Answers([]), CellRoom(scene)) == []  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.usefixtures("small")

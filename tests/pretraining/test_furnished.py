@@ -5,12 +5,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.pretraining import furnished
-from evercal.pretraining.contrastive import VALIDATION_FURNISHED_SEED
+from evercal.pretraining import contrastive, furnished
+from evercal.pretraining.contrastive import (
+    VALIDATION_FURNISHED_SEED,
+    PairStream,
+    PretrainData,
+    PretrainOptions,
+    make_data,
+)
 from evercal.pretraining.furnished import FurnishedViews, furnished_views, kept_furnished_views
 from evercal.pretraining.pairs import HEIGHT, PER_ANCHOR, WIDTH, view_pair
+from evercal.simulation.cell import SUITES
 from evercal.simulation.rooms import RESERVED
 
 CAMERA = Camera(WIDTH, HEIGHT, 200.0, 200.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
@@ -49,9 +58,41 @@ def test_depth_maps_say_where_points_lie_and_which_are_hidden() -> None:
     assert not ((back[:, 0] > strip) & (back[:, 0] < strip + 9)).any()
 
 
-def test_pretraining_stays_below_the_reserved_seeds() -> None:
-    assert furnished.FIRST_FURNISHED_SEED > 400  # those of the suites are below
+def test_pretraining_keeps_to_its_own_seeds(tmp_path: Path) -> None:
+    shown = max(seed for suite in SUITES.values() for *_, seed in suite.rooms)
+    assert shown < furnished.FIRST_FURNISHED_SEED < VALIDATION_FURNISHED_SEED
     assert VALIDATION_FURNISHED_SEED + 100 < RESERVED
+    for options, message in (
+        (PretrainOptions(furnished=7_001), "at most 7000"),
+        (PretrainOptions(furnished_pairs=1), "at least 1"),
+    ):
+        with pytest.raises(InputError, match=message):
+            make_data(options, tmp_path)
+
+
+def test_a_batch_takes_its_share_of_furnished_rooms() -> None:
+    two = step()
+    images = np.stack([np.full((HEIGHT, WIDTH), grey, np.uint8) for grey in (80, 81, 82, 83)])
+    four = FurnishedViews(
+        images,
+        SE3.stack([*two.base_from_camera, *two.base_from_camera]),
+        two.cameras * 2,
+        np.concatenate([two.depth_m, two.depth_m]),
+    )
+    picture = np.full((300, 300), 200, np.uint8)
+    options = PretrainOptions(room_pairs=0, furnished_pairs=2, leaf_pairs=1, points=64)
+    patch = pytest.MonkeyPatch()
+    with patch.context() as patched:
+        patched.setattr(contrastive, "photometric", lambda image, rng: image)
+        data = PretrainData([], [picture], [four])
+        grey, pixels, valid = PairStream(data, options, 0).draw(0)
+    assert grey.shape == (2, 3, 1, HEIGHT, WIDTH)
+    shades = (grey[:, :, 0, 96, 128] * 255).round().int()
+    assert ((shades[:, :2] >= 80) & (shades[:, :2] <= 83)).all()
+    assert (shades[:, 2] == 200).all()
+    # Points of the furnished room keep their parallax: 0, 10 or 20 pixels for these cameras.
+    across = (pixels[0, :2] - pixels[1, :2])[valid[:2]][:, 0].abs()
+    assert (across[:, None] - torch.tensor([0.0, 10.0, 20.0])).abs().min(1).values.max() < 1e-2
 
 
 def test_rendered_pairs_look_alike_and_are_kept(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3, pose_distance
-from evercal.simulation.mini import FOLDER, CellRoom, grey_views, mini_rooms
+from evercal.simulation.mini import FOLDER, CellRoom, clay_views, mini_rooms
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def test_test_frames_are_not_training_frames(rooms: tuple[CellRoom, ...]) -> Non
         assert not same.any()
 
 
-def test_grey_views_lie_over_the_images(rooms: tuple[CellRoom, ...]) -> None:
+def test_clay_views_lie_over_the_images(rooms: tuple[CellRoom, ...]) -> None:
     pytest.importorskip("mitsuba", reason="the extra 'sim' is not installed")
     room = rooms[1]
     assert room.model is not None
@@ -48,7 +48,7 @@ def test_grey_views_lie_over_the_images(rooms: tuple[CellRoom, ...]) -> None:
     pose = frame.base_from_camera
     assert pose is not None
     off = pose @ SE3.exp([0.1, 0.05, 0, 0, 0, 0.05])
-    right, wrong = grey_views(room.model, [frame, frame], [pose, off])
+    right, wrong = clay_views(room.model, [frame, frame], [pose, off])
     assert right.shape == frame.read_image().shape
 
     def edges(image: np.ndarray) -> np.ndarray:

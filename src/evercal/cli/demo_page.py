@@ -74,7 +74,7 @@ def write_pictures(
         ),
         Section("Predicted points", sheets),
     ]
-    drawn = [image for place in places for image in _grey_overlays(localizer, place)]
+    drawn = [image for place in places for image in _clay_overlays(localizer, place)]
     if drawn:
         sheet = encode_image(contact_sheet(drawn, _OVERLAYS_PER_ROOM), "jpg")
         said = "The room's bare shapes, rendered at the estimated pose, laid over the test image."
@@ -123,9 +123,9 @@ def _overlays(localizer: "Localizer", scenes: "list[Scene]") -> list[_Overlay]:
     return found
 
 
-def _grey_overlays(localizer: "Localizer", place: "CellRoom") -> list[np.ndarray]:
+def _clay_overlays(localizer: "Localizer", place: "CellRoom") -> list[np.ndarray]:
     """Test images of a room with its bare shapes over them; none where they cannot be rendered."""
-    from evercal.simulation.mini import grey_views
+    from evercal.simulation.mini import clay_views
 
     if place.model is None:
         return []
@@ -137,7 +137,7 @@ def _grey_overlays(localizer: "Localizer", place: "CellRoom") -> list[np.ndarray
             poses.append(estimate.base_from_camera)
     if not frames:
         return []
-    views = grey_views(place.model, frames, poses)
+    views = clay_views(place.model, frames, poses)
     return [
         ((frame.read_image().astype(int) + view) // 2).astype(np.uint8)
         for frame, view in zip(frames, views, strict=False)

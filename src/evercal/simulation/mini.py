@@ -44,7 +44,7 @@ def mini_rooms() -> tuple[CellRoom, ...]:
     )
 
 
-def grey_views(model: tuple[str, int], frames: list[Frame], poses: list[SE3]) -> list[np.ndarray]:
+def clay_views(model: tuple[str, int], frames: list[Frame], poses: list[SE3]) -> list[np.ndarray]:
     """What the room's bare shapes look like to the cameras of `frames` at `poses`.
 
     Args:
