@@ -1,4 +1,4 @@
-"""`python -m benchmarks real|speed|rooms ...`: prints the tables of docs/results.md."""
+"""`python -m benchmarks real|speed|rooms ...`: makes what docs/results.md reports."""
 
 import os
 import sys
