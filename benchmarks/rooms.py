@@ -16,7 +16,7 @@ from evercal.simulation.robot import Panda
 from evercal.simulation.rooms import room
 from evercal.storage import write_bytes
 
-TIMED = 6
+TIMED, COLUMNS = 6, 4
 
 
 def run(out: Path, suites: Sequence[str], samples: int, views: int) -> None:
@@ -43,7 +43,7 @@ def run(out: Path, suites: Sequence[str], samples: int, views: int) -> None:
             rows.append([suite, name, len(place.items), rate])
             print(f"{suite} {name}: {rate:.2f} frames/s", flush=True)
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(out, encode_image(contact_sheet(images, 2 * views, captions), "jpg"))
+    write_bytes(out, encode_image(contact_sheet(images, COLUMNS, captions), "jpg"))
     print(f"\n320x240, {samples} samples, {': '.join(choose_variant())}\n")
     header = ["suite", "room", "things", "frames/s"]
     print(tabulate(rows, header, "github", floatfmt=".2f"))
