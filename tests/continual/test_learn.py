@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -17,8 +16,6 @@ from evercal.continual.knowledge import Knowledge
 from evercal.continual.learn import (
     Checkpoint,
     Encoding,
-    Event,
-    Resume,
     Stage,
     StageOptions,
     learn,
@@ -28,36 +25,12 @@ from evercal.datasets.frame import Frame, Scene
 from evercal.errors import InputError
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.localizer import Localizer
-from evercal.models.head import Head, HeadOutput
+from evercal.models.head import HeadOutput
 from evercal.training.buffer import Rows
 from evercal.training.fit import Progress
 from evercal.training.precision import autocast
 
-Blank = Callable[[str], Knowledge]
-Rooms = tuple[Scene, Scene, Scene]
-
-
-def outcome(events: Iterable[Event]) -> Knowledge:
-    *_, stage = events
-    assert isinstance(stage, Stage)
-    return stage.knowledge
-
-
-def weights(head: Head) -> dict[str, Tensor]:
-    return {name: value.clone() for name, value in head.state_dict().items()}
-
-
-def assert_same(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
-    assert a.keys() == b.keys()
-    for name, value in a.items():
-        torch.testing.assert_close(value, b[name], rtol=0, atol=1e-7, equal_nan=False)
-
-
-def continued(
-    known: Knowledge, rooms: Rooms, options: StageOptions, resume: Resume | None = None
-) -> Iterator[Event]:
-    """The events of the second stage, `beta`, for any strategy."""
-    return learn(known, rooms[1], options, resume, earlier=rooms[:1])
+from .stages import Blank, Rooms, assert_same, continued, outcome, weights
 
 
 def test_events_come_in_order(

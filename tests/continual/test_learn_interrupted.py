@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import pytest
 import torch
 from safetensors.torch import load, save
-from torch import Tensor
 
 from evercal.continual import learn as learn_module
 from evercal.continual.knowledge import Knowledge
@@ -17,39 +16,11 @@ from evercal.continual.learn import (
     Encoding,
     Event,
     Resume,
-    Stage,
     StageOptions,
-    learn,
 )
-from evercal.datasets.frame import Scene
-from evercal.models.head import Head
 from evercal.training.fit import Progress
 
-Blank = Callable[[str], Knowledge]
-Rooms = tuple[Scene, Scene, Scene]
-
-
-def outcome(events: Iterable[Event]) -> Knowledge:
-    *_, stage = events
-    assert isinstance(stage, Stage)
-    return stage.knowledge
-
-
-def weights(head: Head) -> dict[str, Tensor]:
-    return {name: value.clone() for name, value in head.state_dict().items()}
-
-
-def assert_same(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
-    assert a.keys() == b.keys()
-    for name, value in a.items():
-        torch.testing.assert_close(value, b[name], rtol=0, atol=1e-7, equal_nan=False)
-
-
-def continued(
-    known: Knowledge, rooms: Rooms, options: StageOptions, resume: Resume | None = None
-) -> Iterator[Event]:
-    """The events of the second stage, `beta`, for any strategy."""
-    return learn(known, rooms[1], options, resume, earlier=rooms[:1])
+from .stages import Rooms, assert_same, continued, outcome, weights
 
 
 def saved(checkpoint: Checkpoint) -> Checkpoint:
