@@ -68,12 +68,13 @@ def test_bare_shapes_lie_over_located_images(monkeypatch: pytest.MonkeyPatch) ->
     pose = SE3.identity()
     answers = [(scene.name, pose), ("elsewhere", pose), (scene.name, None)]
     room = CellRoom(scene, model=("living", 3))
-    (drawn,) = demo_page._clay_overlays(Answers(answers), room)  # pyright: ignore[reportArgumentType]
+    overlays = demo_page._overlays(Answers(answers), scene)  # pyright: ignore[reportArgumentType]
+    (drawn,) = demo_page._clay_overlays(room, overlays)
     ((model, frames, poses),) = asked
     assert (model, frames, poses) == (("living", 3), [scene.test[1]], [pose])
     expected = (frames[0].read_image().astype(int) + 250) // 2
     np.testing.assert_array_equal(drawn, expected)
-    assert demo_page._clay_overlays(Answers([]), CellRoom(scene)) == []  # pyright: ignore[reportArgumentType]
+    assert demo_page._clay_overlays(CellRoom(scene), overlays) == []
 
 
 @pytest.mark.usefixtures("small")
@@ -103,7 +104,7 @@ class Answers:
 
     def localize(self, image: object, camera: object) -> SimpleNamespace:
         scene, pose = next(self.answers)
-        return SimpleNamespace(scene=scene, base_from_camera=pose, inliers=9)
+        return SimpleNamespace(scene=scene, base_from_camera=pose, inliers=9, points_m=None)
 
 
 def test_a_fixed_camera_is_the_robust_mean_of_its_own_room() -> None:

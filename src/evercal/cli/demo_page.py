@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from evercal.datasets import Frame, Scene
+    from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import Localizer
     from evercal.simulation.mini import CellRoom
 
@@ -44,8 +45,8 @@ def write_pictures(
     from evercal.storage import write_bytes
 
     scenes = [place.scene for place in places]
-    overlays = _overlays(localizer, scenes)
-    overview = _overview([_best(overlays, i) for i in range(2)], outcome)
+    overlays = [_overlays(localizer, scene) for scene in scenes]
+    overview = _overview([max(found, key=lambda o: o.inliers) for found in overlays[:2]], outcome)
     write_bytes(out / "overview.png", overview)
     rooms = outcome.rooms
     curves = {METHODS[key]: _square(rows, len(rooms)) for key, rows in outcome.accuracy.items()}
@@ -74,7 +75,8 @@ def write_pictures(
         ),
         Section("Predicted points", sheets),
     ]
-    drawn = [image for place in places for image in _clay_overlays(localizer, place)]
+    pairs = zip(places, overlays, strict=True)
+    drawn = [image for place, found in pairs for image in _clay_overlays(place, found)]
     if drawn:
         sheet = encode_image(contact_sheet(drawn, _OVERLAYS_PER_ROOM), "jpg")
         said = "The room's bare shapes, rendered at the estimated pose, laid over the test image."
@@ -100,42 +102,47 @@ def _square(rows: list[list[float]], count: int) -> np.ndarray:
 class _Overlay:
     """A test image and what was said about it."""
 
-    caption: str
-    """In words."""
+    frame: "Frame"
+    """The test image."""
+    estimate: "PoseEstimate"
+    """The answer for it."""
     image: np.ndarray
     """(H, W, 3) uint8 RGB, scene points drawn in."""
-    inliers: int
-    """0 without a pose."""
+
+    @property
+    def caption(self) -> str:
+        """The answer in words."""
+        found = self.estimate
+        said = f"in {found.scene}" if found.scene else found.status.replace("_", " ")
+        return f"{said}, {100 * found.inlier_ratio:.0f} % inliers"
+
+    @property
+    def inliers(self) -> int:
+        """0 without a pose."""
+        return self.estimate.inliers if self.estimate.status == "ok" else 0
 
 
-def _overlays(localizer: "Localizer", scenes: "list[Scene]") -> list[_Overlay]:
-    """Room by room, test frames spread over the recording."""
+def _overlays(localizer: "Localizer", scene: "Scene") -> list[_Overlay]:
+    """Of test frames spread over the recording."""
     found = []
-    for scene in scenes:
-        for frame in _spread(scene):
-            image = frame.read_image()
-            estimate = localizer.localize(image, frame.camera)
-            share = f"{100 * estimate.inlier_ratio:.0f} % inliers"
-            said = f"in {estimate.scene}" if estimate.scene else estimate.status.replace("_", " ")
-            drawn = draw_estimate(image, estimate, frame.camera)
-            count = estimate.inliers if estimate.status == "ok" else 0
-            found.append(_Overlay(f"{said}, {share}", drawn, count))
+    for frame in _spread(scene):
+        image = frame.read_image()
+        estimate = localizer.localize(image, frame.camera)
+        found.append(_Overlay(frame, estimate, draw_estimate(image, estimate, frame.camera)))
     return found
 
 
-def _clay_overlays(localizer: "Localizer", place: "CellRoom") -> list[np.ndarray]:
+def _clay_overlays(place: "CellRoom", overlays: list[_Overlay]) -> list[np.ndarray]:
     """Test images of a room with its bare shapes over them; none where they cannot be rendered."""
     from evercal.simulation.mini import clay_views
 
-    if place.model is None:
-        return []
     frames, poses = [], []
-    for frame in _spread(place.scene):
-        estimate = localizer.localize(frame.read_image(), frame.camera)
-        if estimate.scene == place.scene.name and estimate.base_from_camera is not None:
-            frames.append(frame)
-            poses.append(estimate.base_from_camera)
-    if not frames:
+    for overlay in overlays:
+        pose = overlay.estimate.base_from_camera
+        if overlay.estimate.scene == place.scene.name and pose is not None:
+            frames.append(overlay.frame)
+            poses.append(pose)
+    if place.model is None or not frames:
         return []
     views = clay_views(place.model, frames, poses)
     return [
@@ -151,17 +158,13 @@ def _spread(scene: "Scene") -> "list[Frame]":
     return [scene.test[int(place + half)] for place in places]
 
 
-def _best(overlays: list[_Overlay], room: int) -> _Overlay:
-    """The overlay of a room that shows most."""
-    first = room * _OVERLAYS_PER_ROOM
-    return max(overlays[first : first + _OVERLAYS_PER_ROOM], key=lambda overlay: overlay.inliers)
-
-
-def _sheet(overlays: list[_Overlay]) -> np.ndarray:
+def _sheet(overlays: list[list[_Overlay]]) -> np.ndarray:
+    """All of them, a row for each room."""
     from evercal.drawing import contact_sheet
 
-    captions = [overlay.caption for overlay in overlays]
-    return contact_sheet([overlay.image for overlay in overlays], _OVERLAYS_PER_ROOM, captions)
+    flat = [overlay for found in overlays for overlay in found]
+    captions = [overlay.caption for overlay in flat]
+    return contact_sheet([overlay.image for overlay in flat], _OVERLAYS_PER_ROOM, captions)
 
 
 def _overview(shown: list[_Overlay], outcome: DemoOutcome) -> bytes:

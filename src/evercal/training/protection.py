@@ -47,10 +47,11 @@ class Protection:
 
         scenes = torch.tensor([buffer.scene for buffer in buffers])
         own = torch.isin(head.centre_scene, scenes)
-        self._held: list[tuple[Tensor, Tensor]] = [(head.code, scenes)]
+        held = [(head.code, scenes)]
         if head.options.offsets == "per_centre":
-            rows = (head.logit, head.logit_bias, head.offset, head.offset_bias)
-            self._held += [(parameter, torch.nonzero(own)[:, 0]) for parameter in rows]
+            owned = (head.logit, head.logit_bias, head.offset, head.offset_bias)
+            held += [(parameter, torch.nonzero(own)[:, 0]) for parameter in owned]
+        self._held = [(parameter, where, parameter.detach()[where]) for parameter, where in held]
         layers = [module for module in head.modules() if isinstance(module, nn.Linear)]
         hooks = [layer.register_forward_hook(look) for layer in layers]
         generator = torch.Generator().manual_seed(seed)
@@ -69,10 +70,9 @@ class Protection:
     def damped(self) -> Iterator[None]:
         """Whatever the body changes in the shared matrices is damped, and undone where held."""
         before = [weight.detach().clone() for weight, _ in self._damping]
-        held = [parameter.detach()[rows].clone() for parameter, rows in self._held]
         yield
         with torch.no_grad():
-            for (parameter, rows), old in zip(self._held, held, strict=True):
-                parameter[rows] = old
+            for parameter, where, value in self._held:
+                parameter[where] = value
             for (weight, damping), old in zip(self._damping, before, strict=True):
                 weight.copy_(old + (weight - old) @ damping)
