@@ -103,8 +103,8 @@ def make_data(
         seeds = range(first_room, first_room + options.rooms)
         rooms = pool.map(room_views, seeds, chunksize=4)
         pictures = pool.map(_picture, range(first_room, first_room + options.pictures), chunksize=8)
-    cells = range(FIRST_FURNISHED_SEED, FIRST_FURNISHED_SEED + options.furnished)
-    return PretrainData(rooms, pictures, [kept_furnished_views(seed, folder) for seed in cells])
+    seeds = range(FIRST_FURNISHED_SEED, FIRST_FURNISHED_SEED + options.furnished)
+    return PretrainData(rooms, pictures, [kept_furnished_views(seed, folder) for seed in seeds])
 
 
 class PairStream(IterableDataset):

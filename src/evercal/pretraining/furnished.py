@@ -9,7 +9,7 @@ import numpy as np
 
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
-from evercal.pretraining.pairs import HEIGHT, PER_ANCHOR, WIDTH
+from evercal.pretraining.pairs import HEIGHT, PER_ANCHOR, WIDTH, pinhole
 from evercal.simulation.box_room import look_at
 from evercal.simulation.cell_paths import is_clear
 from evercal.simulation.renderer import Renderer, RenderOptions
@@ -70,8 +70,7 @@ def furnished_views(seed: int, anchors: int = 5) -> FurnishedViews:
     renderer = Renderer(place.meshes() + panda.meshes(joints), rng.uniform(1.2, 2.8))
     poses, cameras, images, depths = [], [], [], []
     for _ in range(anchors):
-        focal = rng.uniform(0.65, 1.15) * WIDTH
-        camera = Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+        camera = pinhole(rng.uniform(0.65, 1.15) * WIDTH)
         for pose in _anchor(place, rng):
             image = renderer.render(camera, pose, RenderOptions(SAMPLES), int(rng.integers(2**31)))
             poses.append(pose)
@@ -117,9 +116,6 @@ def kept_furnished_views(seed: int, folder: Path) -> FurnishedViews:
         )
         write_bytes(path, buffer.getvalue())
     with np.load(path) as found:
-        cameras = tuple(
-            Camera(WIDTH, HEIGHT, f, f, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
-            for f in found["focal"].tolist()
-        )
+        cameras = tuple(pinhole(focal) for focal in found["focal"].tolist())
         poses = SE3(found["rotation_wxyz"], found["translation_m"])
         return FurnishedViews(found["images"], poses, cameras, found["depth_m"])

@@ -26,6 +26,11 @@ class Pair:
     """(2, n, 2) float32: row k is one surface point in both images, (u, v) in pixels."""
 
 
+def pinhole(focal: float) -> Camera:
+    """The camera of an image here, its principal point in the middle; `focal` in pixels."""
+    return Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+
+
 def cell_pixels() -> np.ndarray:
     """((HEIGHT / 8) (WIDTH / 8), 2) centres of the stride-8 cells, (u, v) in pixels."""
     v, u = np.mgrid[0 : HEIGHT // 8, 0 : WIDTH // 8]
@@ -121,8 +126,7 @@ def room_views(seed: int, anchors: int = 5, per_anchor: int = PER_ANCHOR) -> Roo
     room = BoxRoom(seed, texture_px=256)
     poses, cameras, images = [], [], []
     for _ in range(anchors):
-        focal = rng.uniform(0.65, 1.15) * WIDTH
-        camera = Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+        camera = pinhole(rng.uniform(0.65, 1.15) * WIDTH)
         anchor = room.random_view(rng)
         axis = anchor.rotation_matrix()[:, 2]
         _, depth = room.intersect(anchor.translation_m, axis[None])
