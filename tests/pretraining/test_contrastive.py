@@ -24,7 +24,7 @@ from evercal.pretraining.contrastive import (
 )
 from evercal.pretraining.pairs import HEIGHT, WIDTH, RoomViews, cell_pixels, leaf_picture
 
-OPTIONS = PretrainOptions(steps=6, room_pairs=2, leaf_pairs=1, points=64)
+OPTIONS = PretrainOptions(steps=6, room_pairs=2, furnished_pairs=0, leaf_pairs=1, points=64)
 FAR = torch.tensor([[0.0, 0.0], [100.0, 0.0]])
 
 
@@ -35,6 +35,11 @@ def data(views: RoomViews) -> PretrainData:
 
 def unit(*shape: int, seed: int = 0) -> Tensor:
     return F.normalize(torch.randn(*shape, generator=torch.Generator().manual_seed(seed)), dim=-1)
+
+
+def twice(pixels: Tensor) -> Tensor:
+    """The same pixels in both images."""
+    return torch.stack([pixels, pixels])
 
 
 def test_features_at_cell_centres_are_the_cells_own() -> None:
@@ -57,40 +62,58 @@ def test_features_between_cells_are_bilinear_and_unit_vectors() -> None:
 def test_loss_of_two_orthogonal_points(temperature: float) -> None:
     eye, valid = torch.eye(2)[None], torch.ones(1, 2, dtype=torch.bool)
     expected = math.log(1 + math.exp(-1 / temperature))
-    found = contrastive_loss(eye, eye, FAR[None], valid, temperature)
+    found = contrastive_loss(torch.stack([eye, eye]), twice(FAR[None]), valid, temperature)
     assert float(found) == pytest.approx(expected, rel=1e-4, abs=1e-6)
-    swapped = contrastive_loss(eye, eye.flip(1), FAR[None], valid, temperature)
+    swapped = contrastive_loss(
+        torch.stack([eye, eye.flip(1)]), twice(FAR[None]), valid, temperature
+    )
     assert float(swapped) == pytest.approx(expected + 1 / temperature, rel=1e-4)
 
 
 def test_close_points_of_one_image_are_not_held_against_each_other() -> None:
     valid = torch.ones(1, 2, dtype=torch.bool)
-    near = torch.tensor([[[0.0, 0.0], [6.0, 7.9]]])  # 9.92 px
-    same = torch.ones(1, 2, 2) / math.sqrt(2)
-    assert float(contrastive_loss(same, same, near, valid, 0.1)) == pytest.approx(0, abs=1e-6)
-    apart = torch.tensor([[[0.0, 0.0], [6.0, 8.1]]])  # 10.08 px
-    assert float(contrastive_loss(same, same, apart, valid, 0.1)) == pytest.approx(math.log(2))
+    near = twice(torch.tensor([[[0.0, 0.0], [6.0, 7.9]]]))  # 9.92 px
+    same = torch.ones(2, 1, 2, 2) / math.sqrt(2)
+    assert float(contrastive_loss(same, near, valid, 0.1)) == pytest.approx(0, abs=1e-6)
+    apart = twice(torch.tensor([[[0.0, 0.0], [6.0, 8.1]]]))  # 10.08 px
+    assert float(contrastive_loss(same, apart, valid, 0.1)) == pytest.approx(math.log(2))
+    # Close in the second images only: rivals count where they are looked for.
+    mixed = torch.stack([apart[0], near[0]])
+    assert float(contrastive_loss(same, mixed, valid, 0.1)) == pytest.approx(math.log(2) / 2)
     # The same pixels in two images are two places.
-    two = torch.tensor([[[0.0, 0.0]], [[6.0, 7.9]]])
-    loss = contrastive_loss(same.transpose(0, 1), same.transpose(0, 1), two, valid.T, 0.1)
+    two = twice(torch.tensor([[[0.0, 0.0]], [[6.0, 7.9]]]))
+    loss = contrastive_loss(same.transpose(1, 2), two, valid.T, 0.1)
     assert float(loss) == pytest.approx(math.log(2))
 
 
-def test_loss_agrees_with_a_slow_twin() -> None:
-    a, b = unit(3, 5, 4, seed=1), unit(3, 5, 4, seed=2)
-    pixels = torch.rand(3, 5, 2, generator=torch.Generator().manual_seed(3)) * 25
-    valid = torch.rand(3, 5, generator=torch.Generator().manual_seed(4)) < 0.7
+@pytest.mark.parametrize("dense", [False, True])
+def test_loss_agrees_with_a_slow_twin(dense: bool) -> None:
+    generator = torch.Generator().manual_seed(3)
+    features = unit(2, 3, 5, 4, seed=1)
+    pixels = torch.rand(2, 3, 5, 2, generator=generator) * 25
+    valid = torch.rand(3, 5, generator=generator) < 0.7
+    grid = cell_pixels()
+    cells = unit(2, 3, len(grid), 4, seed=2)
     points = [(i, k) for i in range(3) for k in range(5) if valid[i, k]]
     total = 0.0
-    for one, other in ((a, b), (b, a)):
+    for one, other in ((0, 1), (1, 0)):
         for i, k in points:
-            rivals = 0.0
-            for j, m in points:
-                close = i == j and math.dist(pixels[i, k].tolist(), pixels[j, m].tolist()) < 10
-                if not close or (i, k) == (j, m):
-                    rivals += math.exp(float(one[i, k] @ other[j, m]) / 0.2)
-            total -= math.log(math.exp(float(one[i, k] @ other[i, k]) / 0.2) / rivals)
-    found = contrastive_loss(a, b, pixels, valid, 0.2)
+            here, truth = features[one, i, k], pixels[other, i, k].tolist()
+            rivals = [
+                (j, features[other, j, m], pixels[other, j, m].tolist())
+                for j, m in points
+                if (j, m) != (i, k)
+            ]
+            if dense:
+                rivals += [(i, cells[other, i, m], grid[m]) for m in range(len(grid))]
+            right = math.exp(float(here @ features[other, i, k]) / 0.2)
+            wrong = sum(
+                math.exp(float(here @ rival) / 0.2)
+                for j, rival, where in rivals
+                if j != i or math.dist(truth, where) >= 10
+            )
+            total -= math.log(right / (right + wrong))
+    found = contrastive_loss(features, pixels, valid, 0.2, cells if dense else None)
     assert float(found) == pytest.approx(total / len(points) / 2, rel=1e-4)
 
 
@@ -228,4 +251,4 @@ def test_training_lowers_the_loss(data: PretrainData, tmp_path: Path) -> None:
     train_encoder(data, options, tmp_path, said.append)
     losses = [float(line.split()[3]) for line in said]
     assert np.mean(losses[-3:]) < 0.93 * np.mean(losses[:2])
-    assert losses[0] < math.log(3 * 64) + 1
+    assert losses[0] < math.log(3 * 64 + len(cell_pixels())) + 1

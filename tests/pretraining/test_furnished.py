@@ -11,14 +11,20 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.pretraining import contrastive, furnished
 from evercal.pretraining.contrastive import (
-    VALIDATION_FURNISHED_SEED,
     PairStream,
     PretrainData,
     PretrainOptions,
     make_data,
 )
 from evercal.pretraining.furnished import FurnishedViews, furnished_views, kept_furnished_views
-from evercal.pretraining.pairs import HEIGHT, PER_ANCHOR, WIDTH, view_pair
+from evercal.pretraining.pairs import (
+    FIRST_ROOM_SEED,
+    HEIGHT,
+    PER_ANCHOR,
+    VALIDATION_ROOM_SEED,
+    WIDTH,
+    view_pair,
+)
 from evercal.simulation.cell import SUITES
 from evercal.simulation.rooms import RESERVED
 
@@ -60,11 +66,12 @@ def test_depth_maps_say_where_points_lie_and_which_are_hidden() -> None:
 
 def test_pretraining_keeps_to_its_own_seeds(tmp_path: Path) -> None:
     shown = max(seed for suite in SUITES.values() for *_, seed in suite.rooms)
-    assert shown < furnished.FIRST_FURNISHED_SEED < VALIDATION_FURNISHED_SEED
-    assert VALIDATION_FURNISHED_SEED + 100 < RESERVED
+    assert shown < FIRST_ROOM_SEED < VALIDATION_ROOM_SEED
+    assert VALIDATION_ROOM_SEED + 100 < RESERVED
     for options, message in (
         (PretrainOptions(furnished=7_001), "at most 7000"),
-        (PretrainOptions(furnished_pairs=1), "at least 1"),
+        (PretrainOptions(rooms=7_001), "at most 7000"),
+        (PretrainOptions(furnished=0), "at least 1"),
     ):
         with pytest.raises(InputError, match=message):
             make_data(options, tmp_path)

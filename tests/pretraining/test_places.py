@@ -121,7 +121,9 @@ def test_pretrain_writes_what_the_loaders_read(
 
 @pytest.mark.slow
 def test_the_whole_of_pretrain_in_small_and_once_more(tmp_path: Path) -> None:
-    options = PretrainOptions(steps=3, rooms=2, pictures=2, descriptor_steps=2)
+    options = PretrainOptions(
+        steps=3, rooms=2, furnished=0, furnished_pairs=0, pictures=2, descriptor_steps=2
+    )
     out, work = tmp_path / "out", tmp_path / "work"
     pretrain(out, work, options)
     files = {path.name: path.read_bytes() for path in out.iterdir()}

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -15,15 +16,17 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from evercal.errors import InputError
 from evercal.models.encoder import LocalEncoder
-from evercal.pretraining.furnished import FIRST_FURNISHED_SEED, FurnishedViews, kept_furnished_views
+from evercal.pretraining.furnished import FurnishedViews, kept_furnished_views
 from evercal.pretraining.pairs import (
     FIRST_ROOM_SEED,
     HEIGHT,
     PER_ANCHOR,
+    VALIDATION_ROOM_SEED,
     WIDTH,
     Pair,
     RoomViews,
     Views,
+    cell_pixels,
     homography_pair,
     leaf_picture,
     photometric,
@@ -33,31 +36,32 @@ from evercal.pretraining.pairs import (
 from evercal.simulation.renderer import mitsuba
 from evercal.storage.atomic import write_bytes
 
-VALIDATION_ROOM_SEED = FIRST_ROOM_SEED + 50_000
-VALIDATION_FURNISHED_SEED = FIRST_FURNISHED_SEED + 7_000
 CHECKPOINT_STEPS = 250
+NEAR_PX = 10.0
 
 
 @dataclass(frozen=True)
 class PretrainOptions:
-    """What makes the weights; the shipped ones are made with the defaults."""
+    """What makes the weights; `pretrain.log` beside the shipped ones tells theirs."""
 
     steps: int = 9_000
     """Optimiser steps of the local encoder."""
     rooms: int = 160
     """Box rooms, each seen from 20 cameras."""
-    furnished: int = 0
+    furnished: int = 120
     """Furnished rooms (extra `sim`), each seen from 20 cameras."""
     pictures: int = 300
     """Dead-leaves pictures for homography pairs."""
-    room_pairs: int = 3
+    room_pairs: int = 1
     """Pairs of box rooms in a step."""
-    furnished_pairs: int = 0
+    furnished_pairs: int = 3
     """Pairs of furnished rooms in a step."""
     leaf_pairs: int = 2
     """Homography pairs in a step."""
     points: int = 192
     """Corresponding points drawn from a pair."""
+    rivals: Literal["points", "cells"] = "cells"
+    """What a point is told apart from: the other points, or every cell of its other image, too."""
     temperature: float = 0.07
     """Of the softmax over cosine similarities."""
     peak_rate: float = 2e-3
@@ -81,29 +85,31 @@ def _picture(seed: int) -> np.ndarray:
     return leaf_picture(np.random.default_rng([seed, 3]))
 
 
-def make_data(
-    options: PretrainOptions, folder: Path, first_room: int = FIRST_ROOM_SEED
-) -> PretrainData:
+def make_data(options: PretrainOptions, folder: Path) -> PretrainData:
     """Draws box rooms and pictures with one process per core, and renders furnished rooms.
 
     The latter take about ten seconds each and are kept in `folder`.
 
     Raises:
-        InputError: Pairs of furnished rooms without any, more of them than there are seeds, or the
-            extra `sim` is missing.
+        InputError: Pairs of furnished rooms without any, more rooms of a kind than there are seeds,
+            or the extra `sim` is missing.
     """
     if options.furnished_pairs and not options.furnished:
         raise InputError("pairs of furnished rooms need --furnished rooms, at least 1")
-    most = VALIDATION_FURNISHED_SEED - FIRST_FURNISHED_SEED
-    if options.furnished > most:
-        raise InputError(f"furnished {options.furnished}: at most {most}, later seeds are held out")
+    most = VALIDATION_ROOM_SEED - FIRST_ROOM_SEED
+    if max(options.furnished, options.rooms) > most:
+        raise InputError(
+            f"rooms {options.rooms}, furnished {options.furnished}: at most {most} of a kind, "
+            "later seeds are held out"
+        )
     if options.furnished:
         mitsuba()  # rather now than after minutes
     with get_context("spawn").Pool() as pool:
-        seeds = range(first_room, first_room + options.rooms)
+        seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + options.rooms)
         rooms = pool.map(room_views, seeds, chunksize=4)
-        pictures = pool.map(_picture, range(first_room, first_room + options.pictures), chunksize=8)
-    seeds = range(FIRST_FURNISHED_SEED, FIRST_FURNISHED_SEED + options.furnished)
+        seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + options.pictures)
+        pictures = pool.map(_picture, seeds, chunksize=8)
+    seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + options.furnished)
     return PretrainData(rooms, pictures, [kept_furnished_views(seed, folder) for seed in seeds])
 
 
@@ -167,27 +173,39 @@ def sample_features(features: Tensor, pixels: Tensor) -> Tensor:
 
 
 def contrastive_loss(
-    a: Tensor, b: Tensor, pixels_b: Tensor, valid: Tensor, temperature: float
+    points: Tensor, pixels: Tensor, valid: Tensor, temperature: float, cells: Tensor | None = None
 ) -> Tensor:
     """Symmetric InfoNCE (van den Oord et al., 2018) over every point of the batch.
 
+    A point's rivals are all points of the batch in the other images and, where `cells` are given,
+    all cells of its own other image: what looks alike within one image (books, tiles, handles)
+    must be told apart, too. Rivals nearer than 10 pixels to the truth are not held against it.
+
     Args:
-        a: (p, n, c) unit features of the points in the first images.
-        b: (p, n, c) the same points in the second images.
-        pixels_b: (p, n, 2) where they lie there: points of one image nearer than 10 pixels to each
-            other are not held against each other.
+        points: (2, p, n, c) unit features of the points in the first and in the second images.
+        pixels: (2, p, n, 2) where they lie there.
         valid: (p, n) bool.
         temperature: of the softmax.
+        cells: (2, p, m, c) unit features of the images' cells, in the order of `cell_pixels`.
     """
     keep = valid.flatten()
-    x, y = a.flatten(0, 1)[keep], b.flatten(0, 1)[keep]
-    where = pixels_b.flatten(0, 1)[keep]
     image = torch.arange(len(valid)).repeat_interleave(valid.shape[1])[keep]
-    near = (torch.cdist(where, where) < 10) & (image[:, None] == image[None])
-    near.fill_diagonal_(False)
-    logits = (x @ y.T / temperature).masked_fill(near, -1e4)
-    target = torch.arange(len(x))
-    return 0.5 * (F.cross_entropy(logits, target) + F.cross_entropy(logits.T, target))
+    target = torch.arange(len(image))
+    total = points.new_zeros(())
+    for one, other in ((0, 1), (1, 0)):
+        x, y = points[one].flatten(0, 1)[keep], points[other].flatten(0, 1)[keep]
+        where = pixels[other].flatten(0, 1)[keep]
+        near = (torch.cdist(where, where) < NEAR_PX) & (image[:, None] == image[None])
+        near.fill_diagonal_(False)
+        logits = x @ y.T
+        if cells is not None:
+            grid = torch.from_numpy(cell_pixels()).to(where)
+            within = (points[one] @ cells[other].transpose(1, 2)).flatten(0, 1)[keep]
+            logits = torch.cat([logits, within], 1)
+            near = torch.cat([near, torch.cdist(where, grid) < NEAR_PX], 1)
+        logits = (logits / temperature).masked_fill(near, -1e4)
+        total = total + 0.5 * F.cross_entropy(logits, target)
+    return total
 
 
 @torch.inference_mode()
@@ -247,8 +265,9 @@ def train_encoder(
     for images, pixels, valid in loader:
         with torch.autocast("cpu", torch.bfloat16):
             maps = encoder(images.flatten(0, 1)).float().unflatten(0, images.shape[:2])
-        a, b = sample_features(maps[0], pixels[0]), sample_features(maps[1], pixels[1])
-        loss = contrastive_loss(a, b, pixels[1], valid, options.temperature)
+        points = torch.stack([sample_features(*of) for of in zip(maps, pixels, strict=True)])
+        cells = maps.flatten(3).transpose(2, 3) if options.rivals == "cells" else None
+        loss = contrastive_loss(points, pixels, valid, options.temperature, cells)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -272,10 +291,11 @@ def train_encoder(
 def _validation(data: PretrainData, folder: Path) -> dict[str, list[tuple[Tensor, Tensor, Tensor]]]:
     """Batches of rooms that training never sees, by kind of room."""
     rooms = [room_views(VALIDATION_ROOM_SEED + i) for i in range(8)]
-    judge = PairStream(PretrainData(rooms, []), PretrainOptions(room_pairs=8, leaf_pairs=0), 0)
+    options = PretrainOptions(room_pairs=8, furnished_pairs=0, leaf_pairs=0)
+    judge = PairStream(PretrainData(rooms, []), options, 0)
     batches = {"box rooms": [judge.draw(i) for i in range(6)]}
     if data.furnished:
-        cells = [kept_furnished_views(VALIDATION_FURNISHED_SEED + i, folder) for i in range(8)]
+        cells = [kept_furnished_views(VALIDATION_ROOM_SEED + i, folder) for i in range(8)]
         options = PretrainOptions(room_pairs=0, furnished_pairs=8, leaf_pairs=0)
         judge = PairStream(PretrainData([], [], cells), options, 0)
         batches["furnished rooms"] = [judge.draw(i) for i in range(6)]

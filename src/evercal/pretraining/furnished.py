@@ -17,8 +17,6 @@ from evercal.simulation.robot import HOME_RAD, Panda
 from evercal.simulation.rooms import KINDS, Room, room
 from evercal.storage import hold_settings, write_bytes
 
-FIRST_FURNISHED_SEED = 1000
-"""Furnished rooms for pretraining start here: benchmarks and demos use seeds below."""
 SAMPLES = 8
 HIDDEN = 0.02
 """A point is hidden where the depth map differs by more than this share of its depth."""
@@ -59,7 +57,7 @@ def furnished_views(seed: int, anchors: int = 5) -> FurnishedViews:
     differ by parallax, scale and roll.
 
     Args:
-        seed: of room, arm and cameras; FIRST_FURNISHED_SEED or later.
+        seed: of room, arm and cameras; FIRST_ROOM_SEED or later.
         anchors: how many parts of the room are looked at.
     """
     import cv2

@@ -12,8 +12,10 @@ from evercal.simulation.textures import dead_leaves
 
 HEIGHT, WIDTH = 192, 256
 PER_ANCHOR = 4
-FIRST_ROOM_SEED = 100_000
-"""Rooms for pretraining start here: far from the seeds that tests, demos and benchmarks use."""
+FIRST_ROOM_SEED = 1_000
+"""Rooms for pretraining, of boxes or furnished, start here: tests, demos and benchmarks use seeds
+below."""
+VALIDATION_ROOM_SEED = FIRST_ROOM_SEED + 7_000
 
 
 @dataclass(frozen=True)

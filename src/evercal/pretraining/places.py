@@ -9,8 +9,14 @@ from torch.nn import functional as F
 
 from evercal.models.descriptor import GlobalDescriptor
 from evercal.models.encoder import Encoder
-from evercal.pretraining.contrastive import VALIDATION_ROOM_SEED, PretrainData, PretrainOptions
-from evercal.pretraining.pairs import PER_ANCHOR, Views, photometric, room_views
+from evercal.pretraining.contrastive import PretrainData, PretrainOptions
+from evercal.pretraining.pairs import (
+    PER_ANCHOR,
+    VALIDATION_ROOM_SEED,
+    Views,
+    photometric,
+    room_views,
+)
 
 PLACES_PER_BATCH = 64
 TEMPERATURE = 0.07
