@@ -202,10 +202,15 @@ def test_replayed_rows_grow_with_the_scenes_that_count(
     assert replayed_rows(OPTIONS, Replay(buffers, penalty)) == max(60, scenes)
 
 
-@pytest.mark.parametrize("per_scene", [False, True])
-def test_remembered_scenes_cost_each_or_together(per_scene: bool, learnable: Learnable) -> None:
+@pytest.mark.parametrize(
+    ("remembered", "per_scene", "expected"),
+    [(1, False, 1), (2, False, 1), (1, True, 1), (2, True, 4), (3, True, 6)],
+)
+def test_remembered_scenes_cost_each_or_together(
+    remembered: int, per_scene: bool, expected: float, learnable: Learnable
+) -> None:
     """The penalty alone moves the head here; plain gradient steps show how much it counts."""
-    buffers = [learnable(scene)[0] for scene in range(3)]
+    buffers = [learnable(scene)[0] for scene in range(remembered + 1)]
     moved = []
     for scale in (1.0, 2.0):
         head = head_for(buffers)
@@ -215,13 +220,13 @@ def test_remembered_scenes_cost_each_or_together(per_scene: bool, learnable: Lea
         ) -> Tensor:
             return scale * bias.sum() + 0 * output.points.sum()
 
-        replay = Replay(buffers[:2], penalty, per_scene)
-        fitter = Fitter(head, buffers[2:], replay, replace(OPTIONS, iterations=1), 0)
+        replay = Replay(buffers[:-1], penalty, per_scene)
+        fitter = Fitter(head, buffers[-1:], replay, replace(OPTIONS, iterations=1), 0)
         next(fitter.run())
         gradient = head.logit_bias.grad
         assert gradient is not None
         moved.append(float(gradient[head.centre_scene == 0].mean()))
-    assert moved == pytest.approx([2.0, 4.0] if per_scene else [1.0, 2.0])
+    assert moved == pytest.approx([expected, 2 * expected])
 
 
 def test_several_scenes_share_a_batch_evenly(learnable: Learnable) -> None:

@@ -60,8 +60,8 @@ def _spdd(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float)
 REPLAY_CLAMP_PX = 5.0
 TEACHER_LIMIT_PX = 10.0
 OUTPUT_WEIGHT_PX_PER_M = 50.0
-REPLAY_WEIGHT = 0.5
-PROTECTION = 0.5
+REPLAY_WEIGHT = 0.25
+PROTECTION = 0.25
 
 
 def anchored_reprojection(

@@ -77,10 +77,19 @@ class Replay:
     penalty: Penalty
     """Loss on a batch of their rows."""
     per_scene: bool = False
-    """Whether the penalty is one scene's, and counts once for each. Every further scene then brings
-    rows of its own; else all share `FitOptions.replay_batch`."""
+    """Whether the penalty is one scene's, and counts for each (`emphasis`). Every further scene
+    then brings rows of its own; else all share `FitOptions.replay_batch`."""
     protection: float = 0.0
     """How strongly updates spare the directions that their rows use (see `Protection`)."""
+
+    @property
+    def emphasis(self) -> int:
+        """How much each remembered scene counts.
+
+        Two scenes have room beside each other; with more, what is lost adds up from stage to stage
+        and each must be held twice as firmly. Three times is too much for the new one (measured).
+        """
+        return min(len(self.buffers), 2) if self.per_scene else 1
 
 
 class Fitter:
@@ -127,7 +136,8 @@ class Fitter:
 
         self._spare: Callable[[], AbstractContextManager[None]] = nullcontext
         if replay is not None and replay.protection > 0:
-            self._spare = Protection(head, replay.buffers, replay.protection, seed).damped
+            strength = replay.emphasis * replay.protection
+            self._spare = Protection(head, replay.buffers, strength, seed).damped
 
     def run(self) -> Iterator[Progress]:
         """Trains to the end, yielding after every step."""
@@ -168,7 +178,8 @@ class Fitter:
         if replay is not None:
             old = slice(fresh, None)
             cost_of_old = replay.penalty(output.part(old), rows.part(old), progress)
-            loss = loss + (len(replay.buffers) if replay.per_scene else 1) * cost_of_old
+            scenes = len(replay.buffers) if replay.per_scene else 1
+            loss = loss + scenes * replay.emphasis * cost_of_old
         for optimiser in self._optimisers:
             optimiser.zero_grad()
         loss.backward()
