@@ -31,7 +31,7 @@ SHORT_SIDE = 240
 
 
 def stage_options(seed: int) -> StageOptions:
-    """A short stage for scenes in a row: `fast` with 1,000 of its 2,400 steps, half of its views."""
+    """A short stage for scenes in a row: `fast` with 1,000 steps and half of its views."""
     options = preset("fast", seed)
     fill = replace(options.fill, passes=2)
     return replace(options, fit=replace(options.fit, iterations=1000), fill=fill)
