@@ -12,6 +12,7 @@ import torch
 from tabulate import tabulate
 
 from evercal.continual import strategies
+from evercal.continual.candidates import Candidates
 from evercal.continual.knowledge import Knowledge
 from evercal.continual.learn import Stage, StageOptions, keep, learn
 from evercal.continual.presets import preset
@@ -26,6 +27,7 @@ from evercal.localization.teach import fit_threshold, hold_out
 from evercal.models.descriptor import load_descriptor
 from evercal.models.encoder import load_encoder
 from evercal.storage import hold_settings
+from evercal.training.buffer import FeatureBuffer, fill
 
 SHORT_SIDE = 240
 
@@ -178,7 +180,17 @@ class Runner:
         known = _first_stages[key].fork()
         known.strategy = strategy
         refined = known.scenes[0].refined_camera
-        known.memories = [keep(scene.train, rule, stage_options(seed), SHORT_SIDE, refined)]
+        options = stage_options(seed)
+
+        def rows() -> FeatureBuffer:
+            buffer = FeatureBuffer(0, known.scenes[0].cell.atlas_from_base)
+            plain = replace(options.fill, passes=1)
+            for _ in fill(buffer, scene.train, plain, known.encoder, known.descriptor):
+                pass
+            return buffer
+
+        frames = Candidates(scene.train, known.heads[0], rows, seed)
+        known.memories = [keep(scene.train, frames, rule, options, SHORT_SIDE, refined)]
         return known
 
     def _alone_beside(self, known: Knowledge, number: int, seed: int) -> Knowledge:

@@ -21,7 +21,7 @@ def test_results_of_other_settings_are_refused(
         return replace(options, fit=replace(options.fit, iterations=7))
 
     monkeypatch.setattr(sequence, "stage_options", shorter)
-    with pytest.raises(InputError, match=r"other settings: fit .*'iterations': 800.*: 7.*--out"):
+    with pytest.raises(InputError, match=r"other settings: fit .*'iterations': 1000.*: 7.*--out"):
         sequence.Runner([], tmp_path / "results")
     sequence.Runner([], tmp_path / "others")
 

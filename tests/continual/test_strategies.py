@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from evercal.continual.candidates import Candidates
 from evercal.continual.spdd import SpddOptions, spdd_loss
 from evercal.continual.strategies import (
     OUTPUT_WEIGHT_PX_PER_M,
@@ -16,14 +17,44 @@ from evercal.continual.strategies import (
     TEACHER_LIMIT_PX,
     Strategy,
     anchored_reprojection,
+    bounded_by_teacher,
+    old_output,
+    reprojection,
 )
-from evercal.models.head import HeadOutput
-from evercal.training.buffer import Rows
+from evercal.datasets.frame import Frame
+from evercal.geometry import SE3, Camera
+from evercal.models.head import Head, HeadOptions, HeadOutput
+from evercal.training.buffer import FeatureBuffer, Rows
 from evercal.training.loss import Target
 
 DEPTH_M, FOCAL_PX = 2.0, 100.0
+IDLE = SE3.identity()
 SELECTING = [name for name, strategy in STRATEGIES.items() if strategy.select is not None]
 REPLAYING = [name for name, strategy in STRATEGIES.items() if strategy.penalty is not None]
+
+
+class Known(Candidates):
+    """Frames of a camera that moves by random steps; what a head would say is made up."""
+
+    def __init__(self, positions: np.ndarray, quaternions: np.ndarray):
+        camera, image = Camera(8, 8, 8, 8, 3.5, 3.5), np.zeros((8, 8, 3), np.uint8)
+        frames = [
+            Frame(f"{i}", image, camera, SE3(quaternions[i], positions[i]))
+            for i in range(len(positions))
+        ]
+        super().__init__(
+            frames, Head(4, 4, HeadOptions(width=4)), lambda: FeatureBuffer(0, IDLE), 0
+        )
+        self._made_up = np.random.default_rng(7).normal(size=(len(positions), 40))
+
+    def features(self) -> np.ndarray:
+        return self._made_up
+
+    def gradients(self) -> np.ndarray:
+        return self._made_up
+
+    def visible_parts(self) -> list[np.ndarray]:
+        return [np.flatnonzero(row > 1) for row in self._made_up]
 
 
 def rows(count: int) -> Rows:
@@ -67,6 +98,29 @@ def test_depth_that_no_pixel_sees_is_held_by_a_teacher_who_is_right() -> None:
     expected = REPLAY_WEIGHT * OUTPUT_WEIGHT_PX_PER_M * 0.1
     assert float(held.detach()) == pytest.approx(expected, rel=1e-5)
     assert float(free.detach()) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("progress", "tau"), [(0.0, 100.0), (1.0, 1.0)])
+def test_plain_replay_costs_what_new_rows_cost(progress: float, tau: float) -> None:
+    cost = reprojection(says([off_by(3.0), off_by(0.0)]), says([off_by(9.0)]), rows(2), progress)
+    assert float(cost.detach()) == pytest.approx(tau * math.tanh(3.0 / tau) / 2, rel=1e-5)
+
+
+def test_old_output_by_hand() -> None:
+    # The student is 3 px (6 cm) right of the truth, the teacher 2 px (4 cm) left of it.
+    cost = old_output(says([off_by(3.0)]), says([off_by(-2.0)]), rows(1), 1.0)
+    expected = math.tanh(3.0) + OUTPUT_WEIGHT_PX_PER_M * 0.10
+    assert float(cost.detach()) == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_teacher_bounds_only_who_is_worse_than_it() -> None:
+    # Row 0: student 3 px, teacher 1 px off: pulled by 4 cm. Row 1: the teacher is worse: free.
+    student = says([off_by(3.0), off_by(1.0)])
+    teacher = says([off_by(1.0), off_by(2.0)])
+    cost = bounded_by_teacher(student, teacher, rows(2), 1.0)
+    truth = (math.tanh(3.0) + math.tanh(1.0)) / 2
+    expected = 0.5 * truth + 0.5 * OUTPUT_WEIGHT_PX_PER_M * 0.04 / 2
+    assert float(cost.detach()) == pytest.approx(expected, rel=1e-5)
 
 
 def test_a_teacher_behind_the_camera_holds_nothing() -> None:
@@ -117,7 +171,7 @@ def test_no_selection_exceeds_its_capacity(name: str, count: int) -> None:
     select = STRATEGIES[name].select
     assert select is not None
     capacity = count // 10
-    kept = select(positions, quaternions, capacity)
+    kept = select(Known(positions, quaternions), capacity)
     assert 1 <= len(kept) <= capacity
     assert np.issubdtype(kept.dtype, np.integer)
     assert (np.diff(kept) > 0).all()
@@ -133,7 +187,7 @@ def test_only_the_papers_own_radius_leaves_memory_unused() -> None:
     for name in SELECTING:
         select = STRATEGIES[name].select
         assert select is not None
-        kept[name] = len(select(positions, quaternions, 20))
+        kept[name] = len(select(Known(positions, quaternions), 20))
     assert kept.pop("sars_spdd") < 20
     assert set(kept.values()) == {20}
 

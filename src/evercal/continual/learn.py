@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from evercal.continual.atlas import Cell
+from evercal.continual.candidates import Candidates
 from evercal.continual.knowledge import Knowledge, SceneRecord, prototypes, refine
 from evercal.continual.memory import Memory, remember
 from evercal.continual.strategies import STRATEGIES, Strategy
@@ -294,7 +295,9 @@ def _finish(
     descriptors = prototypes(buffer.tensors["descriptors"][: len(frames)])
     camera = frames[0].camera
     record = SceneRecord(scene.name, camera, cell, descriptors, len(frames), refined)
-    memory = keep(frames, STRATEGIES[after.strategy], options, after.short_side, refined)
+    candidates = Candidates(frames, after.heads[-1], lambda: buffer, options.seed)
+    strategy = STRATEGIES[after.strategy]
+    memory = keep(frames, candidates, strategy, options, after.short_side, refined)
     after.scenes.append(record)
     after.memories.append(memory)
     return Stage(after, options.fit.iterations, len(memory.images) if memory else 0)
@@ -302,6 +305,7 @@ def _finish(
 
 def keep(
     frames: Sequence[Frame],
+    candidates: Candidates,
     strategy: Strategy,
     options: StageOptions,
     short_side: int,
@@ -311,6 +315,7 @@ def keep(
 
     Args:
         frames: in recorded order.
+        candidates: the same frames as selectors see them.
         strategy: whose rule selects.
         options: size of the memory.
         short_side: working size of images, pixels.
@@ -318,14 +323,11 @@ def keep(
     """
     if strategy.select is None:
         return None
-    positions = np.stack([_pose(frame).translation_m for frame in frames])
-    quaternions = np.stack([_pose(frame).rotation_wxyz for frame in frames])
     capacity = max(1, int(options.memory_share * len(frames) + 1e-9))
     if options.memory_bytes is not None:
         one = remember(frames[:1], short_side).bytes
         capacity = min(len(frames), max(1, options.memory_bytes // one))
-    chosen = strategy.select(positions, quaternions, capacity)
-    kept = [frames[i] for i in chosen]
+    kept = [frames[i] for i in strategy.select(candidates, capacity)]
     if refined is not None:
         kept = [replace(frame, camera=refined) for frame in kept]
     return remember(kept, short_side)

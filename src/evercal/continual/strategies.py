@@ -8,14 +8,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from evercal.continual.candidates import Candidates
+from evercal.continual.exemplars import (
+    select_coverage,
+    select_gradients,
+    select_herding,
+    select_leverage,
+    select_reservoir,
+)
 from evercal.continual.selection import SarsOptions, select_sars
 from evercal.continual.spdd import SpddOptions, spdd_loss
 from evercal.models.head import HeadOutput
 from evercal.training.buffer import Rows
-from evercal.training.loss import LossOptions, reprojection_loss
+from evercal.training.loss import LossOptions, clamp_px, reprojection_loss
 
-Select = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
-"""Which frames stay: (positions (n, 3) metres, quaternions wxyz (n, 4), capacity) -> indices."""
+Select = Callable[[Candidates, int], np.ndarray]
+"""Which frames stay: (frames of a finished scene, capacity) -> indices in recorded order."""
 
 Penalty = Callable[[HeadOutput, HeadOutput, Rows, float], Tensor]
 """What replay costs: (student, frozen teacher, replayed rows, progress in [0, 1]) -> scalar."""
@@ -45,23 +53,79 @@ class Strategy:
     (`training.protection`)."""
 
 
-def _sars(positions: np.ndarray, quaternions: np.ndarray, capacity: int) -> np.ndarray:
-    return select_sars(positions, quaternions, capacity, SarsOptions())
+REPLAY_CLAMP_PX = 5.0
+TEACHER_LIMIT_PX = 10.0
+OUTPUT_WEIGHT_PX_PER_M = 50.0
+REPLAY_WEIGHT = 0.25
+PROTECTION = 0.25
 
 
-def _sars_filled(positions: np.ndarray, quaternions: np.ndarray, capacity: int) -> np.ndarray:
-    return select_sars(positions, quaternions, capacity, SarsOptions(fill=True))
+def _sars(frames: Candidates, capacity: int) -> np.ndarray:
+    return select_sars(frames.positions_m, frames.quaternions_wxyz, capacity, SarsOptions())
+
+
+def _sars_filled(frames: Candidates, capacity: int) -> np.ndarray:
+    fill = SarsOptions(fill=True)
+    return select_sars(frames.positions_m, frames.quaternions_wxyz, capacity, fill)
+
+
+def _reservoir(frames: Candidates, capacity: int) -> np.ndarray:
+    return select_reservoir(len(frames), capacity, frames.rng())
+
+
+def _herding(frames: Candidates, capacity: int) -> np.ndarray:
+    return select_herding(frames.features(), capacity)
+
+
+def _leverage(frames: Candidates, capacity: int) -> np.ndarray:
+    return select_leverage(frames.features(), capacity, frames.rng())
+
+
+def _coverage(frames: Candidates, capacity: int) -> np.ndarray:
+    return select_coverage(frames.visible_parts(), capacity, frames.rng())
+
+
+def _gradients(frames: Candidates, capacity: int) -> np.ndarray:
+    return select_gradients(frames.gradients(), capacity, frames.rng())
 
 
 def _spdd(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
     return spdd_loss(student, teacher, SpddOptions()).total
 
 
-REPLAY_CLAMP_PX = 5.0
-TEACHER_LIMIT_PX = 10.0
-OUTPUT_WEIGHT_PX_PER_M = 50.0
-REPLAY_WEIGHT = 0.25
-PROTECTION = 0.25
+def reprojection(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
+    """Plain experience replay: remembered rows cost what new ones cost, the schedule included."""
+    options = LossOptions()
+    return reprojection_loss(student.points, rows.target, clamp_px(options, progress), options)[
+        0
+    ].mean()
+
+
+def old_output(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
+    """Replay of iCaRL for points: what new rows cost, and the distance to the old model's points.
+
+    Distillation of class scores becomes L1 in metres, on remembered rows only: what the old model
+    says about rows of a new scene means nothing.
+    """
+    drift = (student.points - teacher.points.detach()).abs().sum(-1).mean()
+    return reprojection(student, teacher, rows, progress) + OUTPUT_WEIGHT_PX_PER_M * drift
+
+
+def bounded_by_teacher(
+    student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float
+) -> Tensor:
+    """Replay of Buff-CS: half the truth, half the teacher where it is nearer to the truth.
+
+    The teacher is the model before the stage, where the original stores its outputs when a frame
+    enters the buffer.
+    """
+    options = LossOptions()
+    _, error = reprojection_loss(student.points, rows.target, REPLAY_CLAMP_PX, options)
+    _, bound = reprojection_loss(teacher.points, rows.target, REPLAY_CLAMP_PX, options)
+    drift = (student.points - teacher.points.detach()).abs().sum(-1)
+    pulled = torch.where(error > bound, drift, torch.zeros_like(drift)).mean()
+    truth = reprojection(student, teacher, rows, progress)
+    return 0.5 * truth + 0.5 * OUTPUT_WEIGHT_PX_PER_M * pulled
 
 
 def anchored_reprojection(
@@ -92,6 +156,31 @@ STRATEGIES: dict[str, Strategy] = {
         protection=PROTECTION,
     ),
     "finetune": Strategy(source="control: the head and steps of evercal, no replay"),
+    "er": Strategy(
+        source="experience replay from a reservoir (Vitter, 1985): random frames, true poses",
+        select=_reservoir,
+        penalty=reprojection,
+    ),
+    "icarl": Strategy(
+        source="Rebuffi et al., iCaRL, CVPR 2017, ported to points",
+        select=_herding,
+        penalty=old_output,
+    ),
+    "buff_cs": Strategy(
+        source="Wang et al., Continual Learning for Image-Based Camera Localization, ICCV 2021",
+        select=_coverage,
+        penalty=bounded_by_teacher,
+    ),
+    "gdr": Strategy(
+        source="Qi et al., FedCBDR's global-perspective data replay, NeurIPS 2025",
+        select=_leverage,
+        penalty=reprojection,
+    ),
+    "gss": Strategy(
+        source="Aljundi et al., Gradient based sample selection, NeurIPS 2019",
+        select=_gradients,
+        penalty=reprojection,
+    ),
     "sars_spdd": Strategy(
         source="Li et al., Continual Hand-Eye Calibration, arXiv 2604.15814, Algorithms 1 and 2",
         select=_sars,

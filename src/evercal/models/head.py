@@ -187,17 +187,19 @@ class Head(nn.Module):
         Returns:
             What the head says, in fp32, whatever autocast does inside.
         """
-        coded = self.options.condition == "code"
+        hidden = self.hidden(features, scene, descriptor)
+        with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+            return self.decode(hidden.float(), scene)
+
+    def hidden(self, features: Tensor, scene: Tensor | int, descriptor: Tensor | None) -> Tensor:
+        """Activations (n, width) of the last hidden layer; arguments as of `forward`."""
         if self.options.whiten:
             features = (features - self.feature_mean) @ self.feature_map
-        if coded:
-            hidden = self._trunk(features, self._codes(scene))
-        else:
-            assert descriptor is not None, "condition 'descriptor' needs the image descriptors"
-            x = torch.cat([descriptor.to(features.dtype), features], dim=-1)
-            hidden = self._trunk(x, None)
-        with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
-            return self._decode(hidden.float(), scene, coded)
+        if self.options.condition == "code":
+            return self._trunk(features, self._codes(scene))
+        assert descriptor is not None, "condition 'descriptor' needs the image descriptors"
+        x = torch.cat([descriptor.to(features.dtype), features], dim=-1)
+        return self._trunk(x, None)
 
     def _codes(self, scene: Tensor | int) -> Callable[[int], Tensor]:
         """The bias of a layer: (width,) for one scene, (n, width) for a scene per row."""
@@ -228,7 +230,9 @@ class Head(nn.Module):
             hidden = layer(linear, hidden)
         return hidden
 
-    def _decode(self, hidden: Tensor, scene: Tensor | int, coded: bool) -> HeadOutput:
+    def decode(self, hidden: Tensor, scene: Tensor | int) -> HeadOutput:
+        """What the head says with these activations (n, width) of its last hidden layer, fp32."""
+        coded = self.options.condition == "code"
         rows: slice | Tensor = slice(None)
         if coded and isinstance(scene, int):
             # Same shapes however many scenes follow, so not a bit of the answer changes with them.
