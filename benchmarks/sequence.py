@@ -30,6 +30,8 @@ from evercal.storage import hold_settings
 from evercal.training.buffer import FeatureBuffer, fill
 
 SHORT_SIDE = 240
+PAPER_BACKBONE = ("sars_spdd",)
+"""Strategies that run as the paper has them: descriptor in the input, all centres in advance."""
 
 
 def stage_options(seed: int) -> StageOptions:
@@ -142,8 +144,8 @@ class Runner:
             steps = options.fit.iterations * len(self.scenes) if last else 0
             fill = options.fill if last else replace(options.fill, passes=1)
             options = replace(options, fit=replace(options.fit, iterations=steps), fill=fill)
-        if rule.condition == "descriptor":
-            head = replace(options.head, centres="fixed")
+        if known.strategy in PAPER_BACKBONE:
+            head = replace(options.head, condition="descriptor", centres="fixed")
             options = replace(options, head=head, fixed_centres_m=self._centres(known, options))
         earlier = self.lessons[:number]
         for event in learn(known, self.lessons[number], options, None, earlier):
@@ -172,8 +174,8 @@ class Runner:
         """A scene learned by a fresh network, shared by all strategies that start the same way."""
         scene, rule = self.lessons[number], RULES[strategy]
         # With centres known in advance the whole sequence matters.
-        context = "+".join(self.names) if rule.condition == "descriptor" else ""
-        key = (rule.condition + context, scene.name, seed, len(scene.train))
+        context = "+".join(self.names) if strategy in PAPER_BACKBONE else ""
+        key = (context, scene.name, seed, len(scene.train))
         if key not in _first_stages:
             blank = Knowledge(load_encoder(), load_descriptor(), strategy, SHORT_SIDE)
             _first_stages[key] = self._next(blank, number, stage_options(seed)).knowledge

@@ -208,5 +208,5 @@ def test_fine_tuning_differs_from_ours_in_replay_alone() -> None:
     ours, control = STRATEGIES["evercal"], STRATEGIES["finetune"]
     assert control.select is None
     assert control.penalty is None
-    for field in ("condition", "data", "heads"):
+    for field in ("data", "heads"):
         assert getattr(ours, field) == getattr(control, field)

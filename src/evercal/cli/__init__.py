@@ -73,6 +73,7 @@ def _complain(message: str, as_json: bool) -> int:
 
 def _verbs(first: str) -> dict[str, Any]:
     """All verbs by name."""
+    from evercal.cli.bench import Bench, BenchReport
     from evercal.cli.demo import Demo
     from evercal.cli.evaluate import Evaluate
     from evercal.cli.info import Info, Verify
@@ -91,6 +92,8 @@ def _verbs(first: str) -> dict[str, Any]:
         "verify": Verify,
         "inspect": Inspect,
         "simulate": Simulate,
+        "bench": Bench,
+        "bench-report": BenchReport,
         "pretrain": pretrain_with_options() if first == "pretrain" else Pretrain,
     }
 

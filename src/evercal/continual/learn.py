@@ -189,17 +189,16 @@ def _head_for_stage(
     positions: np.ndarray,
 ) -> tuple[Head, int]:
     """The head to train, grown by this scene, put in its place; and the scene's index in it."""
-    shape = replace(options.head, condition=strategy.condition)
     number = len(after.scenes)
     in_atlas = cell.atlas_from_base.apply(positions)
     if strategy.data == "all":
-        head = _fresh_head(after, shape, options.seed)
+        head = _fresh_head(after, options.head, options.seed)
         for i in range(len(after.scenes)):
             old = after.heads[0]
             head.grow(old.centres[old.centre_scene == i], options.seed + i)
         after.heads = []
     elif strategy.heads == "per_scene" or not after.heads:
-        head = _fresh_head(after, shape, options.seed)
+        head = _fresh_head(after, options.head, options.seed)
     else:
         head = after.heads.pop()
     local = head.scenes

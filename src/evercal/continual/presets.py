@@ -34,7 +34,13 @@ PRESETS: dict[str, StageOptions] = {
     ),
     # The paper's settings, for a GPU; Sim takes 5,000 steps.
     "paper": StageOptions(
-        head=HeadOptions(width=768, centres_per_scene=100, whiten=False, activation="relu"),
+        head=HeadOptions(
+            width=768,
+            centres_per_scene=100,
+            condition="descriptor",
+            whiten=False,
+            activation="relu",
+        ),
         fit=FitOptions(
             iterations=15_000,
             batch=40_960,

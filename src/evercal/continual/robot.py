@@ -22,7 +22,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -261,6 +261,10 @@ class Robot:
             _save(folder / f"rows-{number:05d}.safetensors", checkpoint.rows)
         if checkpoint.fitter:
             _save(folder / "fitter.safetensors", checkpoint.fitter)
+
+    def report(self) -> dict[str, Any]:
+        """What was noted with the newest stage."""
+        return json.loads((self.root / STAGES / self.stages[-1] / "report.json").read_text())
 
     def bytes(self) -> dict[str, int]:
         """Size on disk: `memory` (what replay keeps) and `rest` (all else in the manifest)."""

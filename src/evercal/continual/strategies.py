@@ -42,8 +42,6 @@ class Strategy:
     penalty_per_scene: bool = False
     """Whether every remembered scene costs that much, or (the paper) all of them together: then a
     scene counts less with every one that follows."""
-    condition: Literal["code", "descriptor"] = "code"
-    """What tells the scenes apart at the head's input."""
     data: Literal["stage", "all"] = "stage"
     """Train on the new scene, or on every frame of every scene from scratch."""
     heads: Literal["one", "per_scene"] = "one"
@@ -185,13 +183,11 @@ STRATEGIES: dict[str, Strategy] = {
         source="Li et al., Continual Hand-Eye Calibration, arXiv 2604.15814, Algorithms 1 and 2",
         select=_sars,
         penalty=_spdd,
-        condition="descriptor",
     ),
     "sars_spdd_filled": Strategy(
         source="the same with the largest radius that fills the memory",
         select=_sars_filled,
         penalty=_spdd,
-        condition="descriptor",
     ),
     "isolation": Strategy(
         source="after ESAC (Brachmann, Rother, ICCV 2019): an expert per scene behind a gate",

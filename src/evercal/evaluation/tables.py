@@ -40,7 +40,7 @@ def score_table(scores: Scores, style: Style = "terminal") -> str:
             for _, field, digits in _SCENE_COLUMNS
         ]
         rows.append(["mean", "", *means])
-    return _table(header, rows, style)
+    return table(header, rows, style)
 
 
 def continual_table(methods: Mapping[str, ContinualScores], style: Style = "terminal") -> str:
@@ -50,7 +50,7 @@ def continual_table(methods: Mapping[str, ContinualScores], style: Style = "term
         [name, *(_number(getattr(row, field), 1) for _, field in _CONTINUAL_COLUMNS)]
         for name, row in methods.items()
     ]
-    return _table(header, rows, style)
+    return table(header, rows, style)
 
 
 def matrix_table(accuracies: ArrayLike, scenes: Sequence[str], style: Style = "terminal") -> str:
@@ -74,7 +74,7 @@ def matrix_table(accuracies: ArrayLike, scenes: Sequence[str], style: Style = "t
         [f"+ {scenes[i]}", *(_number(value, 1) if j <= i else "" for j, value in enumerate(row))]
         for i, row in enumerate(matrix)
     ]
-    return _table(["after", *scenes], rows, style)
+    return table(["after", *scenes], rows, style)
 
 
 def _scene_cells(row: SceneScores) -> list[str]:
@@ -85,7 +85,8 @@ def _number(value: float, digits: int) -> str:
     return "-" if math.isnan(value) else f"{value:.{digits}f}"
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]], style: Style) -> str:
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], style: Style) -> str:
+    """Cells as they are, the first column to the left and the others to the right."""
     from tabulate import tabulate
 
     if style == "markdown":

@@ -28,6 +28,7 @@ from evercal.datasets.frame import Frame, Scene
 from evercal.errors import InputError
 from evercal.geometry.se3 import pose_distance
 from evercal.localization.localizer import Localizer
+from evercal.models.feature_cache import cache_features
 from evercal.models.weights_file import network_bytes
 from evercal.simulation.box_room import BoxRoom, default_camera
 from evercal.storage.manifest import MANIFEST
@@ -51,6 +52,8 @@ class LearnOptions:
     """Another encoder than the shipped one: a file for a new store, or a module of one's own."""
     short_side: int = 240
     """Working size of images in a new store, pixels."""
+    cache: Path | None = None
+    """Folder for features of views, for many runs over the same frames (`cache_features`)."""
 
 
 @dataclass(frozen=True)
@@ -131,6 +134,8 @@ def _learn_scene(
     scene = replace(scene, train=posed)
     robot = open_or_create(store, options)
     _check(robot, scene, options)
+    if options.cache is not None and isinstance(robot.known.encoder, torch.nn.Module):
+        cache_features(robot.known.encoder, options.cache)
     train, held_out = hold_out(scene.train)
     lesson = replace(scene, train=train)
     resume = robot.begin(_identity(robot, scene, options))

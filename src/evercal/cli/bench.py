@@ -1,0 +1,149 @@
+"""`evercal bench` and `evercal bench-report`."""
+
+import dataclasses
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from evercal.cli.console import print_json, print_next
+from evercal.errors import InputError
+
+if TYPE_CHECKING:
+    from evercal.continual.learn import StageOptions
+    from evercal.datasets import Scene
+    from evercal.evaluation.comparison import Run
+
+TABLES = "tables.md"
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Compare strategies on a sequence of scenes; what is done is kept, what is missing is run."""
+
+    suite: Annotated[Positional[str], arg(metavar="SUITE")]
+    """sim-mini (in the package), sim, sim-7, sim-12, real2, i7s, or custom."""
+    recordings: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="")
+    ] = ()
+    """Scene folders of the suite custom, in order of learning."""
+    strategies: Annotated[str, arg(metavar="A,B")] = "evercal,joint,finetune,er,sars_spdd"
+    """Names with commas between; the first is compared with the others."""
+    seeds: Annotated[str, arg(metavar="0,1")] = "0,1,2"
+    """One run each."""
+    order: Literal["given", "reversed", "shuffled"] = "given"
+    """In which the scenes come."""
+    scenes: Annotated[str, arg(metavar="A,B", help_behavior_hint="")] = ""
+    """Only these scenes of the suite; all when left out."""
+    data: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Folder of the suite's recordings, a folder per scene."""
+    preset: Literal["fast", "demo", "bench", "paper"] = "bench"
+    """How much work a stage is."""
+    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Optimiser steps of a stage; the preset's when left out."""
+    memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
+    """What is remembered of a scene: a share of its frames (10%) or bytes (5MB)."""
+    out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-bench")
+    """Folder of results; the same command continues there."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Runs what is missing and prints the tables."""
+        seeds = _numbers(self.seeds)
+        from evercal.evaluation.bench import BenchOptions, run_bench
+
+        options = BenchOptions(
+            self._stage, _words(self.strategies), seeds, self.order, settings={"suite": self.suite}
+        )
+        said = sys.stderr if self.json else sys.stdout
+        for step in run_bench(self._scenes(), options, self.out):
+            found = ", ".join(f"{o.scene} {100 * o.correct().mean():.1f}" for o in step.outcomes)
+            seconds = f" ({step.outcomes[0].seconds:.0f} s)" if step.outcomes else ""
+            line = f"[{step.done}/{step.total}] {step.strategy} seed {step.seed}: "
+            print(line + (found or "noted") + seconds, file=said, flush=True)
+        return _show(self.out, _words(self.strategies)[0], self.json)
+
+    def _scenes(self) -> "list[Scene]":
+        from evercal.datasets import load_scene
+        from evercal.evaluation.suites import load_suite
+
+        if (self.suite == "custom") != bool(self.recordings):
+            raise InputError(
+                f"suite {self.suite}: scene folders are for the suite custom, and it needs them"
+            )
+        if self.suite == "custom":
+            return [load_scene(path) for path in self.recordings]
+        return load_suite(self.suite, self.data, _words(self.scenes))
+
+    def _stage(self, seed: int) -> "StageOptions":
+        from evercal.cli.learn import parse_memory
+        from evercal.continual.presets import preset
+
+        share, count = parse_memory(self.memory)
+        stage = preset(self.preset, seed)
+        steps = stage.fit.iterations if self.steps is None else self.steps
+        if steps < 1:
+            raise InputError(f"--steps {steps}: give a number >= 1")
+        return dataclasses.replace(
+            stage,
+            fit=dataclasses.replace(stage.fit, iterations=steps),
+            memory_share=stage.memory_share if share is None else share,
+            memory_bytes=count,
+        )
+
+
+@dataclass(frozen=True)
+class BenchReport:
+    """Make the tables of a benchmark anew from its results."""
+
+    folder: Annotated[Positional[Path], arg(metavar="DIR")]
+    """Folder of results."""
+    reference: Annotated[str, arg(metavar="NAME")] = "evercal"
+    """The strategy that the others are compared with."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Prints and writes the tables."""
+        return _show(self.folder, self.reference, self.json)
+
+
+def _show(folder: Path, reference: str, as_json: bool) -> int:
+    from evercal.evaluation.comparison import runs_of, summary
+    from evercal.evaluation.outcomes import RESULTS, read
+    from evercal.storage import write_bytes
+
+    if not (folder / RESULTS).is_file():
+        raise InputError(f"{folder}: no results here; make some with 'evercal bench'")
+    runs = runs_of(read(folder))
+    write_bytes(folder / TABLES, (_tables(runs, reference, "markdown") + "\n").encode())
+    if as_json:
+        print_json({"strategies": summary(runs)})
+        return 0
+    print(_tables(runs, reference, "terminal"))
+    print(f"wrote {folder / TABLES}")
+    print_next("evercal", "bench-report", folder)
+    return 0
+
+
+def _tables(runs: "list[Run]", reference: str, style: Literal["terminal", "markdown"]) -> str:
+    from evercal.evaluation.comparison import difference_table, method_table, scene_table
+
+    parts = [method_table(runs, style), scene_table(runs, style)]
+    if len({run.strategy for run in runs}) > 1:
+        parts.append(difference_table(runs, reference, style))
+    return "\n\n".join(parts)
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    words = _words(text)
+    if not words or not all(word.isdecimal() for word in words):
+        raise InputError(f"--seeds {text}: give numbers >= 0 with commas between, such as 0,1,2")
+    return tuple(int(word) for word in words)

@@ -1,0 +1,259 @@
+"""The benchmark: strategies over a sequence of scenes, what is missing is run, what is done kept.
+
+    OUT/settings.json             what decides the results; a folder of other settings is refused
+    OUT/results.jsonl             see `evaluation.outcomes`
+    OUT/features/                 encoded views, shared by all runs; may be deleted
+    OUT/runs/STRATEGY-SEED/       a store under way, gone when its sequence is done
+    OUT/runs/first-SCENE-SEED/    the first scene, which all strategies learn alike
+
+A run that is killed goes on from the checkpoint inside its stage, as `evercal learn` does.
+"""
+
+import shutil
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from evercal.continual import strategies as rules
+from evercal.continual.candidates import Candidates
+from evercal.continual.knowledge import Knowledge
+from evercal.continual.learn import Stage, StageOptions, keep, learn
+from evercal.continual.robot import Robot, head_bytes, with_fit
+from evercal.continual.strategies import STRATEGIES
+from evercal.datasets import Scene
+from evercal.errors import InputError
+from evercal.evaluation import outcomes
+from evercal.evaluation.outcomes import Outcome, outcome_of
+from evercal.evaluation.protocol import evaluate
+from evercal.localization.localizer import Localizer
+from evercal.localization.teach import (
+    LearnOptions,
+    OnEvent,
+    fit_threshold,
+    hold_out,
+    learn_scene,
+    open_or_create,
+)
+from evercal.models.feature_cache import cache_features
+from evercal.storage import MANIFEST, hold_settings
+from evercal.training.buffer import FeatureBuffer, fill
+
+Order = Literal["given", "reversed", "shuffled"]
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """What is compared."""
+
+    stage: Callable[[int], StageOptions]
+    """How a scene is learned, given the seed."""
+    strategies: tuple[str, ...]
+    """Keys of STRATEGIES."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Runs of each."""
+    order: Order = "given"
+    """In which the scenes come; `shuffled` differs from seed to seed."""
+    short_side: int = 240
+    """Working size of images, pixels."""
+    settings: dict[str, object] = field(default_factory=dict)
+    """What else decides the results, for settings.json."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A stage that is done."""
+
+    strategy: str
+    """Which strategy."""
+    seed: int
+    """Which run."""
+    outcomes: tuple[Outcome, ...]
+    """One per scene learned so far; none for the stages before the last of joint training."""
+    done: int
+    """Stages done so far, those of earlier calls included."""
+    total: int
+    """Stages of the whole benchmark."""
+
+
+def run_bench(
+    scenes: Sequence[Scene], options: BenchOptions, out: Path, on_event: OnEvent | None = None
+) -> Generator[Step, None, None]:
+    """Runs what is missing.
+
+    Args:
+        scenes: two or more, in the order `given`.
+        options: what is compared.
+        out: folder of results; made when missing.
+        on_event: called with everything that happens while a scene is learned.
+
+    Raises:
+        InputError: fewer than two scenes, an unknown strategy, or a folder of other settings.
+
+    Yields:
+        A `Step` after every stage that was run.
+    """
+    if len(scenes) < 2:
+        raise InputError(f"{len(scenes)} scene: forgetting takes two or more; give more scenes")
+    unknown = [name for name in options.strategies if name not in STRATEGIES]
+    if unknown:
+        raise InputError(f"strategy {unknown[0]!r}: unknown; choose from {', '.join(STRATEGIES)}")
+    hold_settings(out / "settings.json", _settings(scenes, options))
+    found = {(o.strategy, o.seed, o.stage) for o in outcomes.read(out)}
+    runs = [(seed, strategy) for seed in options.seeds for strategy in options.strategies]
+    total, last = len(runs) * len(scenes), len(scenes) - 1
+    for i, (seed, strategy) in enumerate(runs):
+        if (strategy, seed, last) in found:
+            continue
+        ordered = in_order(scenes, options.order, seed)
+        for stage, these in _Run(ordered, options, out, strategy, seed).stages(on_event):
+            if (strategy, seed, stage) not in found:
+                outcomes.append(out, these)
+            yield Step(strategy, seed, these, i * len(scenes) + stage + 1, total)
+
+
+def in_order(scenes: Sequence[Scene], order: Order, seed: int) -> list[Scene]:
+    """The scenes as a run meets them."""
+    if order == "reversed":
+        return list(scenes)[::-1]
+    if order == "shuffled":
+        return [scenes[i] for i in np.random.default_rng([seed, 11]).permutation(len(scenes))]
+    return list(scenes)
+
+
+def _settings(scenes: Sequence[Scene], options: BenchOptions) -> dict[str, object]:
+    stage = options.stage(0)
+    replay = [rules.REPLAY_CLAMP_PX, rules.TEACHER_LIMIT_PX]
+    replay += [rules.OUTPUT_WEIGHT_PX_PER_M, rules.REPLAY_WEIGHT, rules.PROTECTION]
+    return {
+        **asdict(replace(stage, seed=0, fill=replace(stage.fill, seed=0))),
+        "replay": replay,
+        "order": options.order,
+        "short_side": options.short_side,
+        "scenes": [[scene.name, len(scene.train), len(scene.test)] for scene in scenes],
+        **options.settings,
+    }
+
+
+class _Run:
+    """One strategy, one seed."""
+
+    def __init__(
+        self, scenes: list[Scene], options: BenchOptions, out: Path, strategy: str, seed: int
+    ):
+        self.scenes, self.options, self.out = scenes, options, out
+        self.strategy, self.seed, self.rule = strategy, seed, STRATEGIES[strategy]
+        self.store = out / "runs" / f"{strategy}-{seed}"
+
+    def stages(self, on_event: OnEvent | None) -> Iterator[tuple[int, tuple[Outcome, ...]]]:
+        """(number, outcomes) of the stages that were not done before."""
+        if self.rule.data == "all":
+            yield from self._joint(on_event)
+            return
+        self._begin(on_event)
+        for number in range(len(Robot.open(self.store).stages) - 1, len(self.scenes)):
+            if number >= len(Robot.open(self.store).stages):
+                learn_scene(self.store, self.scenes[number], self._how(self.strategy), on_event)
+            robot = Robot.open(self.store)
+            report = robot.report()
+            seconds, kept = float(report["seconds"]), int(report["frames_kept"])
+            yield number, self._judge(robot.known, number, seconds, kept)
+        shutil.rmtree(self.store)
+
+    def _how(self, strategy: str) -> LearnOptions:
+        return LearnOptions(
+            self.options.stage(self.seed),
+            strategy,
+            short_side=self.options.short_side,
+            cache=self.out / "features",
+        )
+
+    def _begin(self, on_event: OnEvent | None) -> None:
+        """The first scene, learned once for all strategies that learn it alike.
+
+        What differs between them, the frames that stay, is chosen by each from the same head.
+        """
+        if (self.store / MANIFEST).exists():
+            return
+        scene = self.scenes[0]
+        shared = self.out / "runs" / f"first-{scene.name}-{self.seed}"
+        if not (shared / MANIFEST).exists():
+            learn_scene(shared, scene, self._how("finetune"), on_event)
+        first = Robot.open(shared)
+        began = time.perf_counter()
+        known = first.known.fork()
+        known.strategy = self.strategy
+        train, _ = hold_out(scene.train)
+        options = self.options.stage(self.seed)
+
+        def rows() -> FeatureBuffer:
+            self._cached(known)
+            buffer = FeatureBuffer(0, known.scenes[0].cell.atlas_from_base)
+            plan = replace(options.fill, passes=1)
+            plan = replace(plan, view=replace(plan.view, short_side=known.short_side))
+            for _ in fill(buffer, train, plan, known.encoder, known.descriptor):
+                pass
+            return buffer
+
+        frames = Candidates(train, known.heads[0], rows, self.seed)
+        refined = known.scenes[0].refined_camera
+        memory = keep(train, frames, self.rule, options, known.short_side, refined)
+        known.memories = [memory]
+        report = first.report()
+        report["seconds"] = float(report["seconds"]) + time.perf_counter() - began
+        report["frames_kept"] = len(memory.images) if memory else 0
+        open_or_create(self.store, self._how(self.strategy)).commit(known, report)
+
+    def _cached(self, known: Knowledge) -> None:
+        cache_features(known.encoder, self.out / "features")  # pyright: ignore[reportArgumentType]
+
+    def _joint(self, on_event: OnEvent | None) -> Iterator[tuple[int, tuple[Outcome, ...]]]:
+        """All scenes at once, with the steps of all stages; the stages before only note a scene."""
+        how = self._how(self.strategy)
+        known = Robot.create(self.store, self.strategy, self.options.short_side).known
+        self._cached(known)
+        split = [hold_out(scene.train) for scene in self.scenes]
+        lessons = [replace(s, train=t) for s, (t, _) in zip(self.scenes, split, strict=True)]
+        began = time.perf_counter()
+        for number, lesson in enumerate(lessons):
+            last = number == len(lessons) - 1
+            steps = how.stage.fit.iterations * len(lessons) if last else 0
+            stage = replace(how.stage, fit=replace(how.stage.fit, iterations=steps))
+            if not last:
+                stage = replace(stage, fill=replace(stage.fill, passes=1))
+            for event in learn(known, lesson, stage, None, lessons[:number]):
+                if isinstance(event, Stage):
+                    known = event.knowledge
+                elif on_event is not None:
+                    on_event(event)
+            if not last:
+                yield number, ()
+        for i, (_, aside) in enumerate(split):
+            known.scenes[i] = with_fit(known.scenes[i], *fit_threshold(known, aside, i))
+        seconds = time.perf_counter() - began
+        yield len(lessons) - 1, self._judge(known, len(lessons) - 1, seconds, 0)
+
+    def _judge(
+        self, known: Knowledge, number: int, seconds: float, kept: int
+    ) -> tuple[Outcome, ...]:
+        self._cached(known)
+        learned = {scene.name: scene for scene in self.scenes[: number + 1]}
+        results = evaluate(Localizer(known), learned)
+        memory = sum(m.bytes for m in known.memories if m is not None)
+        size = sum(head_bytes(head) for head in known.heads)
+        return tuple(
+            outcome_of(
+                [r for r in results if r.scene == name],
+                strategy=self.strategy,
+                seed=self.seed,
+                stage=number,
+                seconds=seconds,
+                memory_bytes=memory,
+                head_bytes=size,
+                frames_kept=kept,
+            )
+            for name in learned
+        )

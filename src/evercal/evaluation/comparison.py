@@ -1,0 +1,204 @@
+"""What the outcomes of a benchmark say: one row per method, and whether differences are real."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from evercal.errors import InputError
+from evercal.evaluation.metrics import COARSE, FINE, ContinualScores, continual_scores
+from evercal.evaluation.outcomes import Outcome
+from evercal.evaluation.statistics import Interval, paired_difference
+from evercal.evaluation.tables import Style, table
+
+BLOCK = 10
+
+
+@dataclass(frozen=True)
+class Run:
+    """One strategy with one seed, its whole sequence done."""
+
+    strategy: str
+    """Which strategy."""
+    seed: int
+    """Which seed."""
+    scenes: tuple[str, ...]
+    """In order of learning."""
+    outcomes: dict[tuple[int, str], Outcome]
+    """By stage and scene; of joint training only those of the last stage."""
+
+    @property
+    def last(self) -> list[Outcome]:
+        """What is known of every scene at the end, in order of learning."""
+        return [self.outcomes[len(self.scenes) - 1, scene] for scene in self.scenes]
+
+    def matrix(self, thresholds: tuple[float, float] = COARSE) -> np.ndarray:
+        """(N, N) accuracies in per cent: row i after stage i, column j the scene of stage j.
+
+        NaN where a scene was not yet learned, and before the last stage of joint training.
+        """
+        count = len(self.scenes)
+        found = np.full((count, count), math.nan)
+        for (stage, scene), outcome in self.outcomes.items():
+            column = self.scenes.index(scene)
+            found[stage, column] = 100 * outcome.correct(thresholds).mean()
+        return found
+
+    def scores(self, thresholds: tuple[float, float] = COARSE) -> ContinualScores:
+        """Final accuracy and forgetting; the latter NaN for joint training."""
+        matrix = self.matrix(thresholds)
+        if not np.isfinite(matrix[np.tril_indices(len(matrix))]).all():
+            final, newest = float(matrix[-1].mean()), float(matrix[-1, -1])
+            return ContinualScores(final, math.nan, math.nan, math.nan, newest)
+        return continual_scores(matrix)
+
+
+def runs_of(outcomes: Sequence[Outcome]) -> list[Run]:
+    """The runs whose last stage is done, in the order of their first lines.
+
+    Raises:
+        InputError: no run is done.
+    """
+    grouped: dict[tuple[str, int], dict[tuple[int, str], Outcome]] = {}
+    for outcome in outcomes:
+        run = grouped.setdefault((outcome.strategy, outcome.seed), {})
+        run[outcome.stage, outcome.scene] = outcome
+    count = max((outcome.stage for outcome in outcomes), default=-1) + 1
+    found = []
+    for (strategy, seed), of in grouped.items():
+        order = tuple(scene for stage, scene in of if stage == count - 1)
+        if len(order) == count:
+            found.append(Run(strategy, seed, order, of))
+    if not found:
+        raise InputError("no run is done yet; go on with 'evercal bench'")
+    return found
+
+
+def method_table(runs: Sequence[Run], style: Style = "terminal") -> str:
+    """One row per strategy: means over seeds, and the spread of the first column."""
+    header = ["strategy", "runs", *(name for name, _ in _COLUMNS)]
+    rows = []
+    for name, of in by_strategy(runs).items():
+        first = [_COLUMNS[0][1](run) for run in of]
+        spread = f" ± {np.std(first, ddof=1):.1f}" if len(of) > 1 else ""
+        cells = [_mean([value(run) for run in of]) for _, value in _COLUMNS]
+        rows.append([name, str(len(of)), cells[0] + spread, *cells[1:]])
+    return table(header, rows, style)
+
+
+def scene_table(runs: Sequence[Run], style: Style = "terminal") -> str:
+    """One row per strategy, a column per scene: accuracy when learned and at the end."""
+    names = sorted(runs[0].scenes)
+    rows = []
+    for strategy, of in by_strategy(runs).items():
+        cells = []
+        for name in names:
+            matrices = [(run.matrix(), run.scenes.index(name)) for run in of]
+            learned = _mean([matrix[i, i] for matrix, i in matrices])
+            cells.append(f"{learned} -> {_mean([matrix[-1, i] for matrix, i in matrices])}")
+        rows.append([strategy, *cells])
+    return table(["strategy", *names], rows, style)
+
+
+def difference_table(runs: Sequence[Run], reference: str, style: Style = "terminal") -> str:
+    """How much better `reference` ends than each other strategy, on the seeds that both ran.
+
+    Bounds are those of a paired bootstrap over runs and blocks of 10 frames.
+    """
+    grouped = by_strategy(runs)
+    rows = []
+    for other, of in grouped.items():
+        if other == reference or reference not in grouped:
+            continue
+        d = difference(grouped[reference], of)
+        if d is not None:
+            cells = [f"{100 * value:+.1f}" for value in (d.mean, d.low, d.high)]
+            rows.append([f"{reference} - {other}", *cells])
+    return table(["difference in points", "mean", "95 % low", "95 % high"], rows, style)
+
+
+def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
+    """Final accuracy of one strategy less that of another; None without a common seed."""
+    pairs = [(a, b) for a in ours for b in theirs if a.seed == b.seed]
+    if not pairs:
+        return None
+    names = sorted(pairs[0][0].scenes)
+
+    def flags(which: int, name: str) -> np.ndarray:
+        ends = [next(o for o in pair[which].last if o.scene == name) for pair in pairs]
+        return np.array([end.correct() for end in ends], float)
+
+    first, second = ([flags(which, name) for name in names] for which in (0, 1))
+    block = min(BLOCK, *(rows.shape[1] // 2 for rows in first))
+    return paired_difference(first, second, block)
+
+
+def by_strategy(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Runs grouped, strategies in the order in which they first appear."""
+    grouped: dict[str, list[Run]] = {}
+    for run in runs:
+        grouped.setdefault(run.strategy, []).append(run)
+    return grouped
+
+
+def summary(runs: Sequence[Run]) -> dict[str, object]:
+    """Everything above for JSON; None where there is no number."""
+    found = {}
+    for name, of in by_strategy(runs).items():
+        found[name] = [
+            {
+                "seed": run.seed,
+                "scenes": list(run.scenes),
+                "accuracy_5cm_5deg": _plain(run.matrix()),
+                "accuracy_1cm_1deg": _plain(run.matrix(FINE)),
+                **{k: _plain(v) for k, v in asdict(run.scores()).items()},
+                "memory_bytes": run.last[0].memory_bytes,
+                "head_bytes": run.last[0].head_bytes,
+                "seconds": _seconds(run),
+            }
+            for run in of
+        ]
+    return found
+
+
+def _fine_median_cm(run: Run) -> float:
+    """Median error among frames that were given the right scene: what is lost within a scene."""
+    errors = np.concatenate([o.translation_m for o in run.last])
+    right = errors[np.isfinite(errors)]
+    return 100 * float(np.median(right)) if len(right) else math.nan
+
+
+def _wrong_scene(run: Run) -> float:
+    return 100 * float(np.mean([np.mean(o.wrong_scene) for o in run.last]))
+
+
+def _seconds(run: Run) -> float:
+    stages = {stage: outcome.seconds for (stage, _), outcome in run.outcomes.items()}
+    return float(sum(stages.values()))
+
+
+_COLUMNS: tuple[tuple[str, Callable[[Run], float]], ...] = (
+    ("final %", lambda run: run.scores().final_accuracy),
+    ("1 cm 1 deg %", lambda run: run.scores(FINE).final_accuracy),
+    ("last scene %", lambda run: run.scores().last_scene_accuracy),
+    ("TFR", lambda run: run.scores().total_forgetting),
+    ("forgetting", lambda run: run.scores().forgetting),
+    ("BWT", lambda run: run.scores().backward_transfer),
+    ("wrong scene %", _wrong_scene),
+    ("median cm, right scene", _fine_median_cm),
+    ("memory MB", lambda run: run.last[0].memory_bytes / 1e6),
+    ("heads MB", lambda run: run.last[0].head_bytes / 1e6),
+    ("s", _seconds),
+)
+
+
+def _mean(values: Sequence[float]) -> str:
+    value = float(np.mean(values))
+    return "-" if math.isnan(value) else f"{value:.1f}"
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.ndarray):
+        return [[None if math.isnan(v) else round(v, 3) for v in row] for row in value.tolist()]
+    return None if isinstance(value, float) and math.isnan(value) else value

@@ -1,0 +1,61 @@
+"""Features of images that were encoded before, for runs that see the same views again and again."""
+
+import hashlib
+import os
+import uuid
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+
+def cache_features(encoder: nn.Module, folder: Path) -> None:
+    """Makes a frozen encoder look up what it has encoded before, and note what it has not.
+
+    From then on features have half precision, found or not, so that results do not depend on what
+    was encoded first. Files that cannot be read are made again; the folder may be deleted.
+
+    Args:
+        encoder: changed in place; its weights and type stay what they are.
+        folder: where features are kept, one file per image; made when missing.
+    """
+    weights = hashlib.blake2b(digest_size=8)
+    for value in encoder.state_dict().values():
+        weights.update(value.detach().float().numpy().tobytes())
+    folder = folder / weights.hexdigest()
+    folder.mkdir(parents=True, exist_ok=True)
+    compute = encoder.forward
+
+    def forward(grey: Tensor) -> Tensor:
+        names = [_name(image) for image in grey]
+        found = [_read(folder / name) for name in names]
+        missing = [i for i, value in enumerate(found) if value is None]
+        if missing:
+            made = compute(grey[missing]).half()
+            for i, value in zip(missing, made, strict=True):
+                found[i] = value
+                _write(folder / names[i], value)
+        return torch.stack([value.float() for value in found if value is not None])
+
+    encoder.forward = forward
+
+
+def _name(image: Tensor) -> str:
+    shape = "x".join(map(str, image.shape))
+    return f"{shape}-{hashlib.blake2b(image.numpy().tobytes(), digest_size=16).hexdigest()}.npy"
+
+
+def _read(path: Path) -> Tensor | None:
+    try:
+        return torch.from_numpy(np.load(path))
+    except (OSError, ValueError, EOFError):
+        return None
+
+
+def _write(path: Path, features: Tensor) -> None:
+    # Whole or not at all, but not synced: what a power cut takes is made again.
+    temporary = path.with_name(f".{uuid.uuid4().hex[:8]}.tmp")
+    with open(temporary, "wb") as file:
+        np.save(file, features.contiguous().numpy())
+    os.replace(temporary, path)

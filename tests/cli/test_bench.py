@@ -1,0 +1,73 @@
+"""`evercal bench` and `bench-report`: tables, one JSON object, and complaints before any work."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from evercal.cli import bench as verb
+from evercal.datasets import generic
+
+if TYPE_CHECKING:
+    from evercal.continual.learn import StageOptions
+    from evercal.datasets import Scene
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch, quick: StageOptions) -> None:
+    """Stages that take no time."""
+    monkeypatch.setattr(verb.Bench, "_stage", lambda self, seed: replace(quick, seed=seed))
+
+
+def test_bench_and_its_report(
+    run: Any, small: None, arcs: tuple[Scene, Scene], tmp_path: Path
+) -> None:
+    folders = []
+    for scene in arcs:
+        folders.append(tmp_path / scene.name)
+        generic.write(folders[-1], replace(scene, train=scene.train[:20], test=scene.test[:20]))
+    words = ["custom", *folders, "--strategies", "evercal,finetune", "--seeds", "0"]
+    first = run("bench", *words, "--out", tmp_path / "out")
+    assert first.code == 0, first.err
+    assert "[4/4] finetune seed 0: one " in first.out
+    assert "evercal - finetune" in first.out
+    again = run("bench", *words, "--out", tmp_path / "out", "--json")
+    assert again.code == 0
+    (found,) = json.loads(again.out)["strategies"]["evercal"]
+    assert found["scenes"] == ["one", "two"]
+    assert found["accuracy_5cm_5deg"][0][1] is None
+    report = run("bench-report", tmp_path / "out")
+    assert report.code == 0
+    assert "| evercal " in (tmp_path / "out" / "tables.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["attic"], "suite 'attic': unknown; choose one of sim-mini"),
+        (["custom"], "suite custom: scene folders are for the suite custom"),
+        (["sim-mini", "somewhere"], "suite sim-mini: scene folders are for the suite custom"),
+        (["sim-mini", "--strategies", "evercal,magic"], "strategy 'magic': unknown; choose from"),
+        (["sim-mini", "--seeds", "0,one"], "--seeds 0,one: give numbers"),
+        (["sim-mini", "--seeds", ","], "--seeds ,: give numbers"),
+        (["sim-mini", "--steps", "0"], "--steps 0: give a number >= 1"),
+        (["sim-mini", "--memory", "all"], "--memory all: give a share"),
+        (["sim-mini", "--scenes", "bedroom"], "two or more"),
+        (["real2"], "--data"),
+    ],
+)
+def test_bad_input(run: Any, words: list[str], message: str, tmp_path: Path) -> None:
+    found = run("bench", *words, "--out", tmp_path / "out")
+    assert found.code == 2
+    assert message in " ".join(" ".join(found.err).split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_without_results(run: Any, tmp_path: Path) -> None:
+    found = run("bench-report", tmp_path)
+    assert found.code == 2
+    assert "no results here" in found.err[0]

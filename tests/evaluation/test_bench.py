@@ -1,0 +1,185 @@
+"""The benchmark runs what is missing, once, and a stop in between does not show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from evercal.errors import InputError
+from evercal.evaluation import bench
+from evercal.evaluation.bench import BenchOptions, in_order, run_bench
+from evercal.evaluation.comparison import runs_of
+from evercal.evaluation.outcomes import RESULTS, Outcome, read
+from evercal.evaluation.suites import SUITES, load_suite
+
+if TYPE_CHECKING:
+    from evercal.continual.learn import StageOptions
+    from evercal.datasets import Scene
+
+Arcs = tuple["Scene", "Scene"]
+
+
+@pytest.fixture(scope="module")
+def options(arc_stage: StageOptions) -> BenchOptions:
+    def stage(seed: int) -> StageOptions:
+        fit = replace(arc_stage.fit, iterations=12, batch=128, replay_batch=64)
+        fill = replace(arc_stage.fill, passes=1, seed=seed)
+        return replace(arc_stage, fit=fit, fill=fill, replay_passes=1, seed=seed)
+
+    return BenchOptions(stage, ("evercal", "finetune", "joint"), seeds=(0,), short_side=120)
+
+
+def told(outcomes: list[Outcome]) -> list[Outcome]:
+    """What must be the same in every run."""
+    return [replace(outcome, seconds=0.0) for outcome in outcomes]
+
+
+@pytest.fixture(scope="module")
+def done(
+    arcs: Arcs, options: BenchOptions, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, list[bench.Step]]:
+    """A whole benchmark and its steps."""
+    out = tmp_path_factory.mktemp("bench")
+    return out, list(run_bench(arcs, options, out))
+
+
+def test_every_strategy_is_judged_after_every_stage(done: tuple[Path, list[bench.Step]]) -> None:
+    out, steps = done
+    assert [(s.strategy, s.done, s.total) for s in steps] == [
+        ("evercal", 1, 6),
+        ("evercal", 2, 6),
+        ("finetune", 3, 6),
+        ("finetune", 4, 6),
+        ("joint", 5, 6),
+        ("joint", 6, 6),
+    ]
+    found = [(o.strategy, o.stage, o.scene) for o in read(out)]
+    rows = [(0, "one"), (1, "one"), (1, "two")]
+    expected = [(s, stage, scene) for s in ("evercal", "finetune") for stage, scene in rows]
+    assert found == [*expected, ("joint", 1, "one"), ("joint", 1, "two")]
+    assert {len(o.frames) for o in read(out)} == {24}
+
+
+def test_strategies_start_from_the_same_first_stage(done: tuple[Path, list[bench.Step]]) -> None:
+    out, _ = done
+    ours, control = (
+        next(o for o in read(out) if o.strategy == name and o.stage == 0)
+        for name in ("evercal", "finetune")
+    )
+    assert ours.translation_m == control.translation_m
+    assert ours.memory_bytes > control.memory_bytes == 0
+    assert ours.frames_kept == 2
+    # Stores of finished runs are gone, the first scene and the features stay for other strategies.
+    assert [path.name for path in (out / "runs").iterdir()] == ["first-one-0"]
+
+
+def test_what_is_done_is_not_run_again(
+    arcs: Arcs,
+    options: BenchOptions,
+    done: tuple[Path, list[bench.Step]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    out, _ = done
+    before = (out / RESULTS).read_bytes()
+    monkeypatch.setattr(bench, "learn_scene", None)
+    monkeypatch.setattr(bench, "learn", None)
+    assert list(run_bench(arcs, options, out)) == []
+    assert (out / RESULTS).read_bytes() == before
+
+
+@pytest.mark.parametrize("stop", [1, 2])
+def test_a_stop_between_stages_does_not_show(
+    arcs: Arcs,
+    options: BenchOptions,
+    done: tuple[Path, list[bench.Step]],
+    tmp_path: Path,
+    stop: int,
+) -> None:
+    alone = replace(options, strategies=("evercal",))
+    steps = run_bench(arcs, alone, tmp_path)
+    for _ in range(stop):
+        next(steps)
+    steps.close()
+    list(run_bench(arcs, alone, tmp_path))
+    expected = [o for o in read(done[0]) if o.strategy == "evercal"]
+    assert told(read(tmp_path)) == told(expected)
+
+
+def test_a_stop_inside_a_stage_resumes_it(
+    arcs: Arcs, options: BenchOptions, done: tuple[Path, list[bench.Step]], tmp_path: Path
+) -> None:
+    alone = replace(options, strategies=("evercal",))
+
+    def stop(event: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(run_bench(arcs, alone, tmp_path, stop))
+    assert read(tmp_path) == []
+    list(run_bench(arcs, alone, tmp_path))
+    expected = [o for o in read(done[0]) if o.strategy == "evercal"]
+    assert told(read(tmp_path)) == told(expected)
+
+
+def test_results_make_runs(done: tuple[Path, list[bench.Step]]) -> None:
+    runs = runs_of(read(done[0]))
+    assert [run.strategy for run in runs] == ["evercal", "finetune", "joint"]
+    assert {run.scenes for run in runs} == {("one", "two")}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"order": "reversed"}, "order 'given', now it is 'reversed'"),
+        ({"strategies": ("evercal", "magic")}, "strategy 'magic': unknown; choose from evercal"),
+        ({"settings": {"suite": "other"}}, "suite None, now it is 'other'"),
+    ],
+)
+def test_other_settings_and_unknown_strategies_are_refused(
+    arcs: Arcs,
+    options: BenchOptions,
+    done: tuple[Path, list[bench.Step]],
+    change: dict[str, object],
+    message: str,
+) -> None:
+    with pytest.raises(InputError, match=message):
+        next(run_bench(arcs, replace(options, **change), done[0]))  # pyright: ignore[reportArgumentType]
+
+
+def test_one_scene_cannot_be_forgotten(arcs: Arcs, options: BenchOptions, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="two or more"):
+        next(run_bench(arcs[:1], options, tmp_path / "new"))
+    assert not (tmp_path / "new").exists()
+
+
+def test_orders(arcs: Arcs) -> None:
+    several = [*arcs, *arcs, *arcs]
+    assert in_order(several, "given", 3) == several
+    assert in_order(several, "reversed", 3) == several[::-1]
+    drawn = [in_order(range(6), "shuffled", seed) for seed in range(20)]  # pyright: ignore[reportArgumentType]
+    assert all(sorted(order) == list(range(6)) for order in drawn)  # pyright: ignore[reportArgumentType]
+    assert len({tuple(order) for order in drawn}) > 15
+    assert drawn[3] == in_order(range(6), "shuffled", 3)  # pyright: ignore[reportArgumentType]
+
+
+def test_suites(tmp_path: Path) -> None:
+    assert [scene.name for scene in load_suite("sim-mini")] == ["bedroom", "kitchen", "living"]
+    assert [scene.name for scene in load_suite("sim-mini", None, ["living", "bedroom"])] == [
+        "bedroom",
+        "living",
+    ]
+    assert [len(SUITES[name].scenes) for name in ("sim-7", "sim-12", "i7s")] == [7, 12, 7]
+    refused: list[tuple[Callable[[], object], str]] = [
+        (lambda: load_suite("nonsense"), "suite 'nonsense': unknown; choose one of sim-mini"),
+        (lambda: load_suite("sim-mini", None, ["attic"]), "scene 'attic': not in suite sim-mini"),
+        (lambda: load_suite("real2"), "--data"),
+        (lambda: load_suite("i7s", tmp_path), "chess is missing; get it from https://www.micro"),
+        (lambda: load_suite("sim", tmp_path), "bedroom is missing; get it from evercal simulate"),
+    ]
+    for call, message in refused:
+        with pytest.raises(InputError, match=message):
+            call()

@@ -1,0 +1,132 @@
+"""Tables from outcomes, by hand: matrices, forgetting, pairs of seeds, joint training."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from evercal.errors import InputError
+from evercal.evaluation.comparison import (
+    Run,
+    difference,
+    difference_table,
+    method_table,
+    runs_of,
+    scene_table,
+    summary,
+)
+from evercal.evaluation.outcomes import Outcome
+
+FRAMES = 20
+
+
+def outcome(strategy: str, seed: int, stage: int, scene: str, right: int) -> Outcome:
+    """`right` of 20 frames are 2 cm off, one is in another scene, the others are 30 cm off."""
+    errors = [0.02] * right + [math.inf] + [0.3] * (FRAMES - right - 1)
+    return Outcome(
+        strategy,
+        seed,
+        stage,
+        scene,
+        tuple(f"{i}" for i in range(FRAMES)),
+        tuple(errors),
+        tuple(0.01 if math.isfinite(e) else e for e in errors),
+        tuple(not math.isfinite(e) for e in errors),
+        (False,) * FRAMES,
+        seconds=10.0 + stage,
+        memory_bytes=2_000_000,
+        head_bytes=3_000_000,
+        frames_kept=2,
+    )
+
+
+def lines(strategy: str, seed: int, rows: Sequence[Sequence[int]]) -> list[Outcome]:
+    """A run over the scenes b, a: row i holds the right frames after stage i."""
+    return [
+        outcome(strategy, seed, stage, "ba"[i], right)
+        for stage, row in enumerate(rows)
+        for i, right in enumerate(row)
+    ]
+
+
+OURS = lines("ours", 0, [[16], [14, 12]]) + lines("ours", 1, [[18], [18, 10]])
+THEIRS = lines("theirs", 0, [[16], [4, 14]])
+
+
+def test_a_matrix_by_hand() -> None:
+    run = runs_of(OURS)[0]
+    assert run.scenes == ("b", "a")
+    np.testing.assert_allclose(run.matrix()[np.tril_indices(2)], [80, 70, 60])
+    assert math.isnan(run.matrix()[0, 1])
+    found = run.scores()
+    assert found.final_accuracy == pytest.approx(65)
+    assert found.total_forgetting == found.forgetting == pytest.approx(10)
+    assert found.backward_transfer == pytest.approx(-10)
+    assert found.last_scene_accuracy == pytest.approx(60)
+
+
+def test_a_run_under_way_does_not_count() -> None:
+    begun = lines("late", 0, [[16]])
+    assert [(r.strategy, r.seed) for r in runs_of(OURS + begun)] == [("ours", 0), ("ours", 1)]
+    with pytest.raises(InputError, match="no run is done"):
+        runs_of([])
+
+
+def test_joint_training_has_a_last_row_and_nothing_to_forget() -> None:
+    joint = [outcome("joint", 0, 1, scene, 18) for scene in "ba"]
+    run = runs_of(OURS + joint)[-1]
+    assert run.scores().final_accuracy == pytest.approx(90)
+    assert math.isnan(run.scores().total_forgetting)
+    row = next(line for line in method_table([run]).splitlines() if line.startswith("joint"))
+    assert row.split()[1:7] == ["1", "90.0", "0.0", "90.0", "-", "-"]
+
+
+def test_the_method_table_shows_means_and_spread() -> None:
+    text = method_table(runs_of(OURS + THEIRS), "markdown")
+    ours, theirs = (
+        next(line for line in text.splitlines() if f"| {name} " in line)
+        for name in ("ours", "theirs")
+    )
+    cells = [cell.strip() for cell in ours.split("|")[1:-1]]
+    # Finals 65 and 70; last scene 60 and 50; forgetting 10 and 0; one of 20 frames is misplaced.
+    assert cells[:6] == ["ours", "2", "67.5 ± 3.5", "0.0", "55.0", "5.0"]
+    assert cells[8:] == ["5.0", "2.0", "2.0", "3.0", "21.0"]
+    assert "| 45.0 |" in " ".join(theirs.split())
+
+
+def test_the_scene_table_shows_learned_and_end() -> None:
+    text = scene_table(runs_of(OURS))
+    assert "85.0 -> 80.0" in text  # b: (80 + 90) / 2 -> (70 + 90) / 2
+    assert text.splitlines()[0].split() == ["strategy", "a", "b"]
+
+
+def test_differences_are_paired_by_seed_and_frame() -> None:
+    runs = runs_of(OURS + THEIRS)
+    ours, theirs = ([r for r in runs if r.strategy == s] for s in ("ours", "theirs"))
+    found = difference(ours, theirs)
+    assert found is not None
+    # Seed 0 alone: b 14 against 4 of 20, a 12 against 14.
+    assert 100 * found.mean == pytest.approx((50 - 10) / 2)
+    assert found.low < found.mean < found.high
+    assert "ours - theirs" in difference_table(runs, "ours")
+    other = runs_of(lines("other", 7, [[16], [4, 14]]))
+    assert difference(ours, other) is None
+    assert "other" not in difference_table([*ours, *other], "ours")
+
+
+def test_the_summary_holds_whole_matrices_and_no_nan() -> None:
+    joint = [outcome("joint", 0, 1, scene, 18) for scene in "ba"]
+    found = summary(runs_of(OURS + joint))
+    assert found["joint"][0]["accuracy_5cm_5deg"] == [[None, None], [90.0, 90.0]]  # pyright: ignore[reportIndexIssue]
+    assert found["joint"][0]["total_forgetting"] is None  # pyright: ignore[reportIndexIssue]
+    assert [run["seed"] for run in found["ours"]] == [0, 1]  # pyright: ignore[reportGeneralTypeIssues]
+
+
+def test_runs_in_another_order_are_compared_by_name() -> None:
+    flipped = [outcome("theirs", 0, 0, "a", 10)]
+    flipped += [outcome("theirs", 0, 1, "a", 12), outcome("theirs", 0, 1, "b", 14)]
+    found = difference(runs_of(OURS)[:1], runs_of(flipped))
+    assert found is not None
+    assert found.mean == pytest.approx(0)
+    assert isinstance(runs_of(flipped)[0], Run)
