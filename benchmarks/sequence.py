@@ -193,6 +193,7 @@ class Runner:
 
         frames = Candidates(scene.train, known.heads[0], rows, seed)
         known.memories = [keep(scene.train, frames, rule, options, SHORT_SIDE, refined)]
+        known.notes = [{}]
         return known
 
     def _alone_beside(self, known: Knowledge, number: int, seed: int) -> Knowledge:
@@ -208,6 +209,7 @@ class Runner:
         after.heads.append(head)
         after.scenes.append(replace(alone.scenes[0], cell=cell))
         after.memories.append(None)
+        after.notes.append({})
         return after
 
 

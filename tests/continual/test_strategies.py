@@ -11,6 +11,7 @@ from evercal.continual.candidates import Candidates
 from evercal.continual.spdd import SpddOptions, spdd_loss
 from evercal.continual.strategies import (
     OUTPUT_WEIGHT_PX_PER_M,
+    RELATION_TEMPERATURE,
     REPLAY_CLAMP_PX,
     REPLAY_WEIGHT,
     STRATEGIES,
@@ -19,7 +20,10 @@ from evercal.continual.strategies import (
     anchored_reprojection,
     bounded_by_teacher,
     old_output,
+    relations,
     reprojection,
+    steady_reprojection,
+    stored_output,
 )
 from evercal.datasets.frame import Frame
 from evercal.geometry import SE3, Camera
@@ -65,13 +69,17 @@ def rows(count: int) -> Rows:
         torch.eye(4)[:3].repeat(count, 1, 1),
     )
     zero = torch.zeros(count, dtype=torch.long)
-    return Rows(torch.zeros(count, 1), zero, torch.zeros(count, 1), target, zero)
+    truth = torch.tensor([off_by(0.0)] * count)
+    return Rows(torch.zeros(count, 1), zero, torch.zeros(count, 1), target, zero, truth)
 
 
-def says(points: list[list[float]]) -> HeadOutput:
+def says(points: list[list[float]], hidden: list[list[float]] | None = None) -> HeadOutput:
     """A head's output with these points (camera frame, metres)."""
     where = torch.tensor(points, requires_grad=True)
-    return HeadOutput(torch.zeros(len(points), 2), torch.zeros(len(points), 1, 3), where)
+    zero = torch.zeros(len(points), 2)
+    if hidden is not None:
+        return HeadOutput(zero, torch.zeros(len(points), 1, 3), where, torch.tensor(hidden))
+    return HeadOutput(zero, torch.zeros(len(points), 1, 3), where, zero)
 
 
 def off_by(pixels: float) -> list[float]:
@@ -123,6 +131,40 @@ def test_a_teacher_bounds_only_who_is_worse_than_it() -> None:
     assert float(cost.detach()) == pytest.approx(expected, rel=1e-5)
 
 
+def test_stored_output_by_hand() -> None:
+    # Two rows 3 px (6 cm) off; what was said of the first is the truth, of the second nothing.
+    told = rows(2)
+    assert told.stored is not None
+    told.stored[1] = torch.nan
+    cost = stored_output(says([off_by(3.0)] * 2), says([off_by(9.0)] * 2), told, 1.0)
+    expected = 0.5 * math.tanh(3.0) + 0.5 * OUTPUT_WEIGHT_PX_PER_M * 0.06
+    assert float(cost.detach()) == pytest.approx(expected, rel=1e-5)
+
+
+def test_relations_by_hand() -> None:
+    # To the teacher rows 0 and 1 are alike and row 2 differs; the student has 1 and 2 alike.
+    right = [off_by(0.0)] * 3
+    teacher = says(right, [[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    student = says(right, [[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+    near = 1 / (1 + math.exp(-1 / RELATION_TEMPERATURE))
+    # Row 0: teacher near and far, student halves. Row 1: swapped. Row 2: halves, student far, near.
+    row_0 = near * math.log(2 * near) + (1 - near) * math.log(2 * (1 - near))
+    row_1 = near * math.log(near / (1 - near)) + (1 - near) * math.log((1 - near) / near)
+    row_2 = -0.5 * (math.log(2 * near) + math.log(2 * (1 - near)))
+    cost = relations(student, teacher, rows(3), 1.0)
+    assert float(cost.detach()) == pytest.approx((row_0 + row_1 + row_2) / 3, rel=1e-4)
+    assert float(relations(teacher, teacher, rows(3), 1.0).detach()) == pytest.approx(0, abs=1e-6)
+
+
+def test_a_steady_clamp_does_not_follow_the_schedule() -> None:
+    costs = [
+        float(steady_reprojection(says([off_by(3.0)]), says([off_by(9.0)]), rows(1), t).detach())
+        for t in (0.0, 1.0)
+    ]
+    tau = REPLAY_CLAMP_PX
+    assert costs == pytest.approx([tau * math.tanh(3.0 / tau)] * 2, rel=1e-5)
+
+
 def test_a_teacher_behind_the_camera_holds_nothing() -> None:
     behind = says([[0.0, 0.0, -DEPTH_M]])  # projects to the very pixel, if one divides blindly
     cost = anchored_reprojection(says([off_by(0.0)]), behind, rows(1), 0.0)
@@ -151,7 +193,7 @@ def test_the_papers_penalty_is_spdd_with_its_defaults() -> None:
         def draw(*shape: int) -> Tensor:
             return torch.randn(*shape, generator=generator)
 
-        return HeadOutput(draw(5, centres), draw(5, centres, 3), draw(5, 3))
+        return HeadOutput(draw(5, centres), draw(5, centres, 3), draw(5, 3), draw(5, 4))
 
     teacher, student = output(6), output(8)
     for name in ("sars_spdd", "sars_spdd_filled"):

@@ -83,7 +83,7 @@ class Oracle(Head):
             for i, level in enumerate(levels)
         ]
         zero = torch.zeros(len(rows), 1)
-        return HeadOutput(zero, zero[..., None].expand(-1, -1, 3), torch.stack(rows))
+        return HeadOutput(zero, zero[..., None].expand(-1, -1, 3), torch.stack(rows), zero)
 
 
 @dataclass

@@ -315,3 +315,37 @@ def test_progress_says_what_the_last_step_saw(learnable: Learnable) -> None:
     clear = (camera[:, 2] > 0.1) & (residual.abs().sum(-1) < 1000)
     inside = clear & (residual.norm(dim=-1) < 5)
     assert first.inlier_share == pytest.approx(float(inside.float().mean()), abs=0.05)
+
+
+def test_a_rule_that_adds_gradients_up_is_plain_replay(learnable: Learnable) -> None:
+    buffers = [learnable(scene)[0] for scene in range(3)]
+    heads = []
+
+    def penalty(output: HeadOutput, rows: Rows, progress: float) -> Tensor:
+        return output.points.abs().mean()
+
+    for combine in (None, lambda g: g.new + g.memory.mean(0)):
+        head = head_for(buffers)
+        replay = Replay(buffers[:2], penalty, combine=combine)
+        # Plain descent, which tells sums of gradients apart where Adam and Muon would not.
+        fitter = Fitter(head, buffers[2:], replay, OPTIONS, 0)
+        next(fitter.run())
+        heads.append({name: value.grad for name, value in head.named_parameters()})
+    for name, gradient in heads[0].items():
+        assert gradient is not None
+        torch.testing.assert_close(heads[1][name], gradient, atol=2e-3, rtol=2e-2)
+
+
+def test_a_restraint_pulls_the_weights(learnable: Learnable) -> None:
+    buffer, _ = learnable()
+    norms = []
+    for strength in (0.0, 1e3):
+        head = head_for([buffer])
+        anchor = head.logit.detach().clone()
+
+        def restraint(head: Head = head, anchor: Tensor = anchor, s: float = strength) -> Tensor:
+            return s * (head.logit - anchor).square().sum()
+
+        list(Fitter(head, [buffer], None, OPTIONS, 0, restraint).run())
+        norms.append(float((head.logit.detach() - anchor).norm()))
+    assert norms[1] < 0.3 * norms[0]

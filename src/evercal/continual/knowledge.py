@@ -8,6 +8,7 @@ from torch import Tensor
 
 from evercal.continual.atlas import Atlas, Cell
 from evercal.continual.memory import Memory
+from evercal.continual.notes import Notes
 from evercal.geometry.camera import Camera
 from evercal.models.descriptor import Descriptor
 from evercal.models.encoder import Encoder
@@ -85,6 +86,14 @@ class Knowledge:
     """In order of arrival; the index is the scene index of head and atlas."""
     memories: list[Memory | None] = field(default_factory=list)
     """What is remembered of each scene."""
+    notes: list[Notes] = field(default_factory=list)
+    """What the strategy noted about each scene (`continual.notes`)."""
+
+    @property
+    def memory_bytes(self) -> int:
+        """Size of all that is kept for later stages: remembered frames and notes."""
+        frames = sum(memory.bytes for memory in self.memories if memory is not None)
+        return frames + sum(value.nbytes for note in self.notes for value in note.values())
 
     @property
     def atlas(self) -> Atlas:
@@ -109,6 +118,7 @@ class Knowledge:
             copy.deepcopy(self.heads),
             list(self.scenes),
             list(self.memories),
+            list(self.notes),
         )
 
 

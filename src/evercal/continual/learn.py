@@ -4,6 +4,7 @@ import copy
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from evercal.continual.atlas import Cell
 from evercal.continual.candidates import Candidates
 from evercal.continual.knowledge import Knowledge, SceneRecord, prototypes, refine
 from evercal.continual.memory import Memory, remember
+from evercal.continual.notes import Finished, Notes
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.datasets.frame import Frame, Scene
 from evercal.errors import InputError
@@ -153,7 +155,10 @@ def learn(
     if strategy.penalty is not None and teacher is not None:
         replay = yield from _replay(known, strategy, teacher, options)
     fit = options.fit
-    fitter = Fitter(head, buffers, replay, fit, options.seed)
+    restraint = None
+    if strategy.restraint is not None and known.notes:
+        restraint = partial(strategy.restraint, head, known.notes)
+    fitter = Fitter(head, buffers, replay, fit, options.seed, restraint)
     if fitter_state:
         fitter.load(dict(fitter_state))
     for progress in fitter.run():
@@ -259,7 +264,7 @@ def _replay(
     known: Knowledge, strategy: Strategy, teacher: Head, options: StageOptions
 ) -> Iterator[Event]:
     """Encodes what is remembered and binds the penalty to the frozen teacher."""
-    buffers = []
+    buffers, references = [], []
     for i, (memory, record) in enumerate(zip(known.memories, known.scenes, strict=True)):
         if memory is None or not memory.images:
             continue
@@ -268,6 +273,10 @@ def _replay(
         frames = memory.frames()
         for done in fill(buffer, frames, plan, known.encoder, known.descriptor):
             yield Encoding(done, len(frames) * plan.passes)
+        note = known.notes[i]
+        if "points" in note:
+            buffer.stored = note["points"].float() + note["origin"]
+        references.append(note.get("reference", torch.tensor(torch.nan)))
         buffers.append(buffer)
     cost = strategy.penalty
     assert cost is not None
@@ -279,7 +288,15 @@ def _replay(
 
     if not buffers:
         return None
-    return Replay(buffers, penalty, strategy.penalty_per_scene, strategy.protection)
+    return Replay(
+        buffers,
+        penalty,
+        strategy.penalty_per_scene,
+        strategy.protection,
+        strategy.combine,
+        torch.stack(references),
+        strategy.interfered,
+    )
 
 
 def _finish(
@@ -299,6 +316,7 @@ def _finish(
     memory = keep(frames, candidates, strategy, options, after.short_side, refined)
     after.scenes.append(record)
     after.memories.append(memory)
+    after.notes.append(note_of(after, buffer, options))
     return Stage(after, options.fit.iterations, len(memory.images) if memory else 0)
 
 
@@ -330,6 +348,31 @@ def keep(
     if refined is not None:
         kept = [replace(frame, camera=refined) for frame in kept]
     return remember(kept, short_side)
+
+
+def note_of(known: Knowledge, buffer: FeatureBuffer, options: StageOptions) -> Notes:
+    """What the strategy notes about the newest scene, whose frames are chosen already.
+
+    Args:
+        known: with the scene's record and memory.
+        buffer: rows of its training frames.
+        options: the stage's.
+    """
+    note = STRATEGIES[known.strategy].note
+    if note is None:
+        return {}
+
+    def remembered() -> FeatureBuffer:
+        memory = known.memories[-1]
+        assert memory is not None, "a strategy that notes what it remembers selects frames"
+        found = FeatureBuffer(buffer.scene, buffer.atlas_from_base)
+        view = replace(options.fill.view, short_side=known.short_side)
+        plan = replace(options.fill, passes=1, view=view)
+        for _ in fill(found, memory.frames(), plan, known.encoder, known.descriptor):
+            pass
+        return found
+
+    return note(Finished(known.heads[-1].eval(), buffer, remembered, known.notes))
 
 
 class _Pacer:

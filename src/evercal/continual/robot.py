@@ -9,6 +9,7 @@
         head.safetensors            weights (fp16, centres fp32); of a shared head only the
                                     newest stage's remains
         memory.safetensors          remembered frames
+        notes.safetensors           what else the strategy noted
         prototypes.safetensors
         report.json
       learning/                     checkpoints of an interrupted stage
@@ -54,10 +55,14 @@ HEAD = "head.safetensors"
 STAGE_FILES = (
     HEAD,
     "memory.safetensors",
+    "notes.safetensors",
     "prototypes.safetensors",
     "report.json",
     "scene.json",
 )
+
+
+MEMORY_FILES = ("memory.safetensors", "notes.safetensors")
 
 
 class Robot:
@@ -148,6 +153,8 @@ class Robot:
             known.scenes.append(_read_record(folder))
             memory = folder / "memory.safetensors"
             known.memories.append(Memory.from_tensors(_load(memory)) if memory.exists() else None)
+            notes = folder / "notes.safetensors"
+            known.notes.append(_load(notes) if notes.exists() else {})
             shared = STRATEGIES[known.strategy].heads == "one"
             if not shared or name == stages[-1]:
                 known.heads.append(_read_head(folder, known))
@@ -174,6 +181,8 @@ class Robot:
         _write_head(folder, known.heads[-1])
         if memory is not None:
             _save(folder / "memory.safetensors", memory.to_tensors())
+        if known.notes[-1]:
+            _save(folder / "notes.safetensors", known.notes[-1])
         write_json(folder / "report.json", report)
         replace_folder(folder, self.root / STAGES / name)
         stages = [*self.stages, name]
@@ -272,7 +281,7 @@ class Robot:
         for stage in self.stages:
             files += [self.root / STAGES / stage / file for file in STAGE_FILES]
         sizes = {file: file.stat().st_size for file in files if file.exists()}
-        memory = sum(size for file, size in sizes.items() if file.name == "memory.safetensors")
+        memory = sum(size for file, size in sizes.items() if file.name in MEMORY_FILES)
         return {"memory": memory, "rest": sum(sizes.values()) - memory}
 
 

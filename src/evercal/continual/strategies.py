@@ -1,6 +1,6 @@
 """Strategies: small records of functions, and the literal dict that names them all."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,10 +16,21 @@ from evercal.continual.exemplars import (
     select_leverage,
     select_reservoir,
 )
+from evercal.continual.notes import (
+    Finished,
+    Notes,
+    elastic,
+    elastic_online,
+    note_fisher,
+    note_fisher_online,
+    note_points,
+    note_reference,
+)
 from evercal.continual.selection import SarsOptions, select_sars
 from evercal.continual.spdd import SpddOptions, spdd_loss
-from evercal.models.head import HeadOutput
+from evercal.models.head import Head, HeadOutput
 from evercal.training.buffer import Rows
+from evercal.training.gradients import Combine, averaged_constraint, episodic_barrier, gem
 from evercal.training.loss import LossOptions, clamp_px, reprojection_loss
 
 Select = Callable[[Candidates, int], np.ndarray]
@@ -49,12 +60,22 @@ class Strategy:
     protection: float = 0.0
     """How strongly updates of shared matrices spare the directions that each remembered scene uses
     (`training.protection`)."""
+    combine: Combine | None = None
+    """How gradients of remembered scenes join that of the new one; None adds them up."""
+    interfered: bool = False
+    """Whether those views are replayed that the new rows are about to spoil most."""
+    note: Callable[[Finished], dict[str, Tensor]] | None = None
+    """What is noted about a finished scene beside its frames."""
+    restraint: Callable[[Head, Sequence[Notes]], Tensor] | None = None
+    """What the weights cost, given the notes about all earlier scenes."""
 
 
 REPLAY_CLAMP_PX = 5.0
 TEACHER_LIMIT_PX = 10.0
 OUTPUT_WEIGHT_PX_PER_M = 50.0
 REPLAY_WEIGHT = 0.25
+RELATED_ROWS = 512
+RELATION_TEMPERATURE = 0.2
 PROTECTION = 0.25
 
 
@@ -126,6 +147,47 @@ def bounded_by_teacher(
     return 0.5 * truth + 0.5 * OUTPUT_WEIGHT_PX_PER_M * pulled
 
 
+def steady_reprojection(
+    student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float
+) -> Tensor:
+    """Reprojection with a fixed clamp, for rules that compare losses of different times."""
+    options = LossOptions()
+    return reprojection_loss(student.points, rows.target, REPLAY_CLAMP_PX, options)[0].mean()
+
+
+def stored_output(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
+    """Replay of DER++ for points: half the truth, half what was said when the scene was learned.
+
+    The stored points belong to remembered frames as they are; augmented views have the truth alone.
+    """
+    assert rows.stored is not None, "strategies with this penalty note their points"
+    kept = ~rows.stored[:, 0].isnan()
+    drift = (student.points[kept] - rows.stored[kept]).abs().sum(-1)
+    held = drift.sum() / max(len(drift), 1)
+    truth = reprojection(student, teacher, rows, progress)
+    return 0.5 * truth + 0.5 * OUTPUT_WEIGHT_PX_PER_M * held
+
+
+def relations(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
+    """Replay of Co2L for points: the truth, and how alike rows are to one another.
+
+    The instance-wise relation distillation of Cha et al. (ICCV 2021): the Kullback-Leibler
+    divergence between softmaxed similarities of the old model's features and of the new one's, at
+    one temperature, so that agreement is free. Its contrastive loss takes classes and has no
+    counterpart.
+    """
+
+    def similarity(hidden: Tensor) -> Tensor:
+        unit = torch.nn.functional.normalize(hidden[:RELATED_ROWS], dim=-1)
+        others = ~torch.eye(len(unit), dtype=torch.bool)
+        logits = (unit @ unit.T / RELATION_TEMPERATURE)[others].view(len(unit), -1)
+        return logits.log_softmax(-1)
+
+    old, new = similarity(teacher.hidden.detach()), similarity(student.hidden)
+    moved = (old.exp() * (old - new)).sum(-1).mean()
+    return reprojection(student, teacher, rows, progress) + moved
+
+
 def anchored_reprojection(
     student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float
 ) -> Tensor:
@@ -178,6 +240,52 @@ STRATEGIES: dict[str, Strategy] = {
         source="Aljundi et al., Gradient based sample selection, NeurIPS 2019",
         select=_gradients,
         penalty=reprojection,
+    ),
+    "mir": Strategy(
+        source="Aljundi et al., Maximally interfered retrieval, NeurIPS 2019",
+        select=_reservoir,
+        penalty=reprojection,
+        interfered=True,
+    ),
+    "der": Strategy(
+        source="Buzzega et al., Dark experience (DER++), NeurIPS 2020, ported to points",
+        select=_reservoir,
+        penalty=stored_output,
+        note=note_points,
+    ),
+    "co2l": Strategy(
+        source="Cha et al., Co2L's relation distillation, ICCV 2021, ported to points",
+        select=_reservoir,
+        penalty=relations,
+    ),
+    "agem": Strategy(
+        source="Chaudhry et al., Efficient lifelong learning with A-GEM, ICLR 2019",
+        select=_reservoir,
+        penalty=steady_reprojection,
+        combine=averaged_constraint,
+    ),
+    "gem": Strategy(
+        source="Lopez-Paz and Ranzato, Gradient episodic memory, NeurIPS 2017",
+        select=_reservoir,
+        penalty=steady_reprojection,
+        combine=gem,
+    ),
+    "gec": Strategy(
+        source="Lai et al., GEC, NeurIPS 2025, several constraints",
+        select=_reservoir,
+        penalty=steady_reprojection,
+        combine=episodic_barrier,
+        note=note_reference,
+    ),
+    "ewc": Strategy(
+        source="Kirkpatrick et al., Elastic weight consolidation, PNAS 2017, a term per scene",
+        note=note_fisher,
+        restraint=elastic,
+    ),
+    "ewc_online": Strategy(
+        source="Schwarz et al., Progress and compress, ICML 2018, one running term",
+        note=note_fisher_online,
+        restraint=elastic_online,
     ),
     "sars_spdd": Strategy(
         source="Li et al., Continual Hand-Eye Calibration, arXiv 2604.15814, Algorithms 1 and 2",

@@ -21,7 +21,7 @@ import numpy as np
 from evercal.continual import strategies as rules
 from evercal.continual.candidates import Candidates
 from evercal.continual.knowledge import Knowledge
-from evercal.continual.learn import Stage, StageOptions, keep, learn
+from evercal.continual.learn import Stage, StageOptions, keep, learn, note_of
 from evercal.continual.robot import Robot, head_bytes, with_fit
 from evercal.continual.strategies import STRATEGIES
 from evercal.datasets import Scene
@@ -202,6 +202,7 @@ class _Run:
         refined = known.scenes[0].refined_camera
         memory = keep(train, frames, self.rule, options, known.short_side, refined)
         known.memories = [memory]
+        known.notes = [note_of(known, rows(), options)] if self.rule.note else [{}]
         report = first.report()
         report["seconds"] = float(report["seconds"]) + time.perf_counter() - began
         report["frames_kept"] = len(memory.images) if memory else 0
@@ -242,7 +243,6 @@ class _Run:
         self._cached(known)
         learned = {scene.name: scene for scene in self.scenes[: number + 1]}
         results = evaluate(Localizer(known), learned)
-        memory = sum(m.bytes for m in known.memories if m is not None)
         size = sum(head_bytes(head) for head in known.heads)
         return tuple(
             outcome_of(
@@ -251,7 +251,7 @@ class _Run:
                 seed=self.seed,
                 stage=number,
                 seconds=seconds,
-                memory_bytes=memory,
+                memory_bytes=known.memory_bytes,
                 head_bytes=size,
                 frames_kept=kept,
             )

@@ -146,12 +146,11 @@ def _learn_scene(
         raise
     known = stage.knowledge
     known.scenes[-1] = with_fit(known.scenes[-1], *fit_threshold(known, held_out))
-    memories = [memory.bytes for memory in known.memories if memory is not None]
     report = LearnReport(
         scene.name,
         time.perf_counter() - began,
         stage.iterations,
-        sum(memories),
+        known.memory_bytes,
         sum(head_bytes(head) for head in known.heads),
         stage.frames_kept,
         len(train),

@@ -61,10 +61,13 @@ class HeadOutput:
     """(n, K, 3) per centre or (n, 1, 3) shared, metres, already divided by the scale."""
     points: Tensor
     """(n, 3) fp32 scene coordinates in the atlas frame, metres."""
+    hidden: Tensor
+    """(n, width) fp32 activations of the last hidden layer."""
 
     def part(self, where: slice) -> "HeadOutput":
         """The rows of a slice."""
-        return HeadOutput(self.logits[where], self.offsets[where], self.points[where])
+        parts = (self.logits, self.offsets, self.points, self.hidden)
+        return HeadOutput(*(part[where] for part in parts))
 
 
 class Head(nn.Module):
@@ -246,7 +249,7 @@ class Head(nn.Module):
         offsets = raw[..., :3] / homogeneous_scale(raw[..., 3:])
         share = logits.softmax(-1)
         points = (share.unsqueeze(-1) * (self.centres[rows] + offsets)).sum(1)
-        return HeadOutput(logits, offsets, points)
+        return HeadOutput(logits, offsets, points, hidden)
 
 
 def homogeneous_scale(raw: Tensor) -> Tensor:

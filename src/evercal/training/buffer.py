@@ -32,6 +32,8 @@ class Rows:
     """Where each row must project to."""
     index: Tensor
     """(n,) position in the buffer, for what is stored beside it."""
+    stored: Tensor | None = None
+    """(n, 3) points that a head once gave to these rows, NaN where none were kept."""
 
     def part(self, where: slice) -> "Rows":
         """The rows of a slice."""
@@ -43,6 +45,7 @@ class Rows:
             self.descriptor[where],
             target,
             self.index[where],
+            None if self.stored is None else self.stored[where],
         )
 
 
@@ -59,6 +62,8 @@ class FeatureBuffer:
         self.scene, self.atlas_from_base = scene, atlas_from_base
         self.correctable = correctable
         self.views = 0
+        self.stored: Tensor | None = None
+        """(m, 3) points that a head once gave to the first m rows."""
         self._parts: list[dict[str, Tensor]] = []
         self._taken = 0
         self._merged: dict[str, Tensor] | None = None
@@ -129,7 +134,12 @@ class FeatureBuffer:
         view = t["view"][index].long()
         target = Target(t["pixels"][index], t["intrinsics"][view], t["camera_from_atlas"][view])
         scene = torch.full((len(index),), self.scene)
-        return Rows(t["features"][index], scene, t["descriptors"][view], target, index)
+        stored = None
+        if self.stored is not None:
+            kept = index < len(self.stored)
+            stored = self.stored[index.clamp(max=len(self.stored) - 1)].float()
+            stored = torch.where(kept[:, None], stored, torch.nan)
+        return Rows(t["features"][index], scene, t["descriptors"][view], target, index, stored)
 
 
 def _merge(parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
@@ -152,7 +162,13 @@ def join(parts: Sequence[Rows]) -> Rows:
         torch.cat([t.intrinsics for t in targets]),
         torch.cat([t.camera_from_atlas for t in targets]),
     )
-    return Rows(cat("features"), cat("scene"), cat("descriptor"), target, cat("index"))
+    stored = None
+    if any(part.stored is not None for part in parts):
+        none = torch.nan
+        stored = torch.cat(
+            [torch.full((len(p.scene), 3), none) if p.stored is None else p.stored for p in parts]
+        )
+    return Rows(cat("features"), cat("scene"), cat("descriptor"), target, cat("index"), stored)
 
 
 @torch.inference_mode()

@@ -11,6 +11,8 @@ from torch.nn import functional as F
 
 from evercal.models.head import Head, HeadOutput
 from evercal.training.buffer import FeatureBuffer, Rows, join
+from evercal.training.gradients import Combine, Gradients
+from evercal.training.interference import most_interfered
 from evercal.training.loss import LossOptions, clamp_px, reprojection_loss
 from evercal.training.precision import autocast
 from evercal.training.protection import Protection
@@ -20,6 +22,8 @@ INLIER_PX = 5.0
 MUON_STEPS = 3
 # While points are still far off, their errors say nothing about the lens.
 LENS_FROM_PX = 20.0
+# How often it is looked anew which views the new rows are about to spoil.
+INTERFERENCE_STEPS = 20
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,13 @@ class Replay:
     then brings rows of its own; else all share `FitOptions.replay_batch`."""
     protection: float = 0.0
     """How strongly updates spare the directions that their rows use (see `Protection`)."""
+    combine: Combine | None = None
+    """How the gradient of each scene's penalty joins that of the new rows; None adds them up."""
+    references: Tensor | None = None
+    """(scenes,) penalty of each scene when it was just learned, for `combine`."""
+    interfered: bool = False
+    """Whether only rows of those views are replayed that the new rows are about to spoil most
+    (`training.interference`)."""
 
     @property
     def emphasis(self) -> int:
@@ -97,6 +108,14 @@ class Fitter:
 
     The rows of step k are a function of (seed, k), so a resumed run sees what an uninterrupted one
     would have seen.
+
+    Args:
+        head: trained in place.
+        buffers: rows of the scenes being learned.
+        replay: rows of remembered scenes.
+        options: how.
+        seed: of everything that is drawn.
+        restraint: what the weights themselves cost.
     """
 
     def __init__(
@@ -106,8 +125,10 @@ class Fitter:
         replay: Replay | None,
         options: FitOptions,
         seed: int,
+        restraint: Callable[[], Tensor] | None = None,
     ):
         self.head, self.buffers, self.replay = head, buffers, replay
+        self.restraint = restraint
         self.options, self.seed, self.step = options, seed, 0
         hidden, decay, plain = [], [], []
         for name, parameter in head.named_parameters():
@@ -134,6 +155,7 @@ class Fitter:
                 torch.optim.Muon(matrices, weight_decay=decay_rate, ns_steps=MUON_STEPS)
             )
 
+        self._spoiled: list[Tensor] = []
         self._spare: Callable[[], AbstractContextManager[None]] = nullcontext
         if replay is not None and replay.protection > 0:
             strength = replay.emphasis * replay.protection
@@ -151,10 +173,9 @@ class Fitter:
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
         share = options.batch // len(self.buffers)
         parts = [buffer.draw(share, generator) for buffer in self.buffers]
-        fresh = sum(len(part.scene) for part in parts)
         if replay is not None:
-            each = replayed_rows(options, replay) // len(replay.buffers)
-            parts += [buffer.draw(each, generator) for buffer in replay.buffers]
+            parts += self._replayed(parts, replay, generator)
+        fresh = share * len(self.buffers)
         rows = join(parts)
         if self.head.options.condition == "descriptor":
             noise = torch.randn(rows.descriptor.shape, generator=generator)
@@ -175,14 +196,22 @@ class Fitter:
         points = output.points[:fresh]
         cost, error = reprojection_loss(points, new.target, tau, options.loss, lens)
         loss = cost.mean()
-        if replay is not None:
+        if self.restraint is not None:
+            loss = loss + self.restraint()
+        for optimiser in self._optimisers:
+            optimiser.zero_grad()
+        if replay is None:
+            loss.backward()
+        elif replay.combine is None:
             old = slice(fresh, None)
             cost_of_old = replay.penalty(output.part(old), rows.part(old), progress)
             scenes = len(replay.buffers) if replay.per_scene else 1
-            loss = loss + scenes * replay.emphasis * cost_of_old
-        for optimiser in self._optimisers:
-            optimiser.zero_grad()
-        loss.backward()
+            (loss + scenes * replay.emphasis * cost_of_old).backward()
+        else:
+            each = (len(rows.scene) - fresh) // len(replay.buffers)
+            slices = [slice(i, i + each) for i in range(fresh, len(rows.scene), each)]
+            old_costs = [replay.penalty(output.part(s), rows.part(s), progress) for s in slices]
+            self._join_gradients(loss, old_costs, replay)
         with self._spare():
             for optimiser in self._optimisers:
                 optimiser.step()
@@ -190,10 +219,57 @@ class Fitter:
         inliers = float((error < INLIER_PX).float().mean())
         return Progress(self.step, options.iterations, float(cost.mean().detach()), inliers)
 
+    def _replayed(
+        self, fresh: Sequence[Rows], replay: Replay, generator: torch.Generator
+    ) -> list[Rows]:
+        """The same number of rows of each remembered scene."""
+        each = replayed_rows(self.options, replay) // len(replay.buffers)
+        if not replay.interfered:
+            return [buffer.draw(each, generator) for buffer in replay.buffers]
+        if self.step % INTERFERENCE_STEPS == 0 or not self._spoiled:
+            rate = one_cycle(self.options, self.step)
+            self._spoiled = [
+                most_interfered(self.head, join(fresh), buffer, rate, generator)
+                for buffer in replay.buffers
+            ]
+        rows = []
+        for buffer, views in zip(replay.buffers, self._spoiled, strict=True):
+            where = torch.nonzero(torch.isin(buffer.tensors["view"], views))[:, 0]
+            drawn = torch.randint(len(where), (each,), generator=generator)
+            rows.append(buffer.rows(where[drawn]))
+        return rows
+
+    def _join_gradients(self, loss: Tensor, old: Sequence[Tensor], replay: Replay) -> None:
+        """Leaves in `.grad` what the rule makes of the gradients of new and remembered rows."""
+        assert replay.combine is not None
+        parameters = list(self.head.parameters())
+
+        def flat(cost: Tensor, more: Sequence[Tensor] = ()) -> tuple[Tensor, tuple[Tensor, ...]]:
+            found = torch.autograd.grad(
+                cost, [*parameters, *more], retain_graph=True, materialize_grads=True
+            )
+            own, rest = found[: len(parameters)], found[len(parameters) :]
+            return torch.cat([part.flatten() for part in own]), rest
+
+        new, (lens,) = flat(loss, [self.lens])
+        memory = torch.stack([flat(cost)[0] for cost in old])
+        losses = torch.stack([cost.detach() for cost in old])
+        references = torch.full_like(losses, torch.nan)
+        if replay.references is not None:
+            references = replay.references
+        joined = replay.combine(Gradients(new, memory, losses, references, self.step))
+        self.lens.grad = lens
+        start = 0
+        for parameter in parameters:
+            end = start + parameter.numel()
+            parameter.grad = joined[start:end].view_as(parameter)
+            start = end
+
     def state(self) -> dict[str, Tensor]:
         """What `load` needs to go on from here, as named tensors."""
         state = {f"head.{k}": v for k, v in self.head.state_dict().items()}
         state["lens"] = self.lens.detach()
+        state |= {f"spoiled.{i}": views for i, views in enumerate(self._spoiled)}
         for which, optimiser in enumerate(self._optimisers):
             for i, slots in optimiser.state_dict()["state"].items():
                 state |= {f"optimiser.{which}.{i}.{name}": v for name, v in slots.items()}
@@ -206,6 +282,8 @@ class Fitter:
         head = {k.removeprefix("head."): v for k, v in state.items() if k.startswith("head.")}
         self.head.load_state_dict(head)
         self.lens.data.copy_(state["lens"])
+        spoiled = sum(key.startswith("spoiled.") for key in state)
+        self._spoiled = [state[f"spoiled.{i}"] for i in range(spoiled)]
         for which, optimiser in enumerate(self._optimisers):
             slots: dict[int, dict[str, Tensor]] = {}
             prefix = f"optimiser.{which}."
