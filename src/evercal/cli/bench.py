@@ -45,6 +45,8 @@ class Bench:
     """Optimiser steps of a stage; the preset's when left out."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
     """What is remembered of a scene: a share of its frames (10%) or bytes (5MB)."""
+    plugin: Annotated[Path | None, arg(metavar="FILE.py", help_behavior_hint="")] = None
+    """File with strategies of one's own (see examples/my_strategy.py)."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-bench")
     """Folder of results; the same command continues there."""
     json: bool = False
@@ -53,8 +55,11 @@ class Bench:
     def run(self) -> int:
         """Runs what is missing and prints the tables."""
         seeds = _numbers(self.seeds)
+        from evercal.continual.plugin import load_plugin
         from evercal.evaluation.bench import BenchOptions, run_bench
 
+        if self.plugin is not None:
+            load_plugin(self.plugin)
         options = BenchOptions(
             self._stage, _words(self.strategies), seeds, self.order, settings={"suite": self.suite}
         )
