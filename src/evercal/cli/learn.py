@@ -37,7 +37,7 @@ class Learn:
     name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """What the scene is called in the store; its own name when left out."""
     strategy: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """evercal (if new), finetune, sars_spdd, sars_spdd_filled or isolation; a store keeps it."""
+    """How scenes share the network: evercal (if new), or a method to compare; a store keeps it."""
     preset: Literal["fast", "demo", "bench", "paper"] = "fast"
     """How much work: fast takes minutes on two cores, demo and bench less, paper wants a GPU."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
