@@ -43,6 +43,9 @@ def test_bench_and_its_report(
     report = run("bench-report", tmp_path / "out")
     assert report.code == 0
     assert "| evercal " in (tmp_path / "out" / "tables.md").read_text()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count("<img ") == 4
+    assert "evercal - finetune" in page
 
 
 @pytest.mark.parametrize(

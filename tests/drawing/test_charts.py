@@ -1,5 +1,6 @@
 """Charts hold the numbers they were given; pixels are only checked to be a picture."""
 
+import itertools
 import subprocess
 import sys
 
@@ -8,7 +9,14 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from evercal.drawing import charts, error_curve, forgetting_curves, trajectory
+from evercal.drawing import (
+    accuracy_against_size,
+    charts,
+    error_curve,
+    forgetting_curves,
+    scene_bars,
+    trajectory,
+)
 
 
 @pytest.fixture
@@ -50,6 +58,25 @@ def test_each_panel_starts_when_its_scene_is_learned(figures: list[Figure]) -> N
 def test_any_number_of_scenes_has_its_panels(figures: list[Figure], count: int) -> None:
     forgetting_curves({"m": np.full((count, count), 50.0)}, [str(i) for i in range(count)])
     assert sum(panel.get_visible() for panel in figures[0].axes) == count + 1
+
+
+def test_bars_stand_beside_each_other_and_as_high_as_told(figures: list[Figure]) -> None:
+    data = scene_bars({"ours": [90.0, 80.0, 70.0], "other": [10.0, 20.0, 30.0]}, ["a", "b", "c"])
+    assert is_picture(data)
+    bars = [bar for group in figures[0].axes[0].containers for bar in group]  # pyright: ignore[reportGeneralTypeIssues]
+    assert [bar.get_height() for bar in bars] == [90, 80, 70, 10, 20, 30]
+    left = sorted((bar.get_x(), bar.get_x() + bar.get_width()) for bar in bars)
+    assert all(a[1] <= b[0] for a, b in itertools.pairwise(left))
+    with pytest.raises(ValueError, match="3 scenes need as many numbers"):
+        scene_bars({"ours": [1.0]}, ["a", "b", "c"])
+
+
+def test_a_point_for_every_method(figures: list[Figure]) -> None:
+    assert is_picture(accuracy_against_size({"ours": (3.2, 80.0), "all": (40.0, 85.0)}, "memory"))
+    axes = figures[0].axes[0]
+    points = [tuple(np.array(line.get_xydata())[0]) for line in axes.lines]
+    assert points == [(3.2, 80.0), (40.0, 85.0)]
+    assert axes.get_xlabel() == "memory (MB)"
 
 
 def test_the_error_curve_counts_frames_without_a_pose_as_never(figures: list[Figure]) -> None:

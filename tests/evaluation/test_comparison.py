@@ -9,11 +9,12 @@ import pytest
 from evercal.errors import InputError
 from evercal.evaluation.comparison import (
     Run,
+    as_text,
     difference,
-    difference_table,
-    method_table,
+    difference_rows,
+    method_rows,
     runs_of,
-    scene_table,
+    scene_rows,
     summary,
 )
 from evercal.evaluation.outcomes import Outcome
@@ -78,27 +79,26 @@ def test_joint_training_has_a_last_row_and_nothing_to_forget() -> None:
     run = runs_of(OURS + joint)[-1]
     assert run.scores().final_accuracy == pytest.approx(90)
     assert math.isnan(run.scores().total_forgetting)
-    row = next(line for line in method_table([run]).splitlines() if line.startswith("joint"))
-    assert row.split()[1:7] == ["1", "90.0", "0.0", "90.0", "-", "-"]
+    _, row = method_rows([run])
+    assert row[:7] == ["joint", "1", "90.0", "0.0", "90.0", "-", "-"]
 
 
 def test_the_method_table_shows_means_and_spread() -> None:
-    text = method_table(runs_of(OURS + THEIRS), "markdown")
-    ours, theirs = (
-        next(line for line in text.splitlines() if f"| {name} " in line)
-        for name in ("ours", "theirs")
-    )
-    cells = [cell.strip() for cell in ours.split("|")[1:-1]]
+    header, ours, theirs = method_rows(runs_of(OURS + THEIRS))
     # Finals 65 and 70; last scene 60 and 50; forgetting 10 and 0; one of 20 frames is misplaced.
-    assert cells[:6] == ["ours", "2", "67.5 ± 3.5", "0.0", "55.0", "5.0"]
-    assert cells[8:] == ["5.0", "2.0", "2.0", "3.0", "21.0"]
-    assert "| 45.0 |" in " ".join(theirs.split())
+    assert ours[:6] == ["ours", "2", "67.5 ± 3.5", "0.0", "55.0", "5.0"]
+    assert ours[8:] == ["5.0", "2.0", "2.0", "3.0", "21.0"]
+    assert theirs[2] == "45.0"
+    text = as_text([header, ours, theirs], "markdown")
+    assert [line.count("|") for line in text.splitlines()] == [14] * 4
 
 
 def test_the_scene_table_shows_learned_and_end() -> None:
-    text = scene_table(runs_of(OURS))
-    assert "85.0 -> 80.0" in text  # b: (80 + 90) / 2 -> (70 + 90) / 2
-    assert text.splitlines()[0].split() == ["strategy", "a", "b"]
+    # b: (80 + 90) / 2 -> (70 + 90) / 2
+    assert scene_rows(runs_of(OURS)) == [
+        ["strategy", "a", "b"],
+        ["ours", "55.0 -> 55.0", "85.0 -> 80.0"],
+    ]
 
 
 def test_differences_are_paired_by_seed_and_frame() -> None:
@@ -109,10 +109,10 @@ def test_differences_are_paired_by_seed_and_frame() -> None:
     # Seed 0 alone: b 14 against 4 of 20, a 12 against 14.
     assert 100 * found.mean == pytest.approx((50 - 10) / 2)
     assert found.low < found.mean < found.high
-    assert "ours - theirs" in difference_table(runs, "ours")
+    assert difference_rows(runs, "ours")[1][:2] == ["ours - theirs", "+20.0"]
     other = runs_of(lines("other", 7, [[16], [4, 14]]))
     assert difference(ours, other) is None
-    assert "other" not in difference_table([*ours, *other], "ours")
+    assert len(difference_rows([*ours, *other], "ours")) == 1
 
 
 def test_the_summary_holds_whole_matrices_and_no_nan() -> None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from evercal.datasets import Scene
     from evercal.evaluation.comparison import Run
 
-TABLES = "tables.md"
+TABLES, PAGE = "tables.md", "report.html"
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Bench:
 
 @dataclass(frozen=True)
 class BenchReport:
-    """Make the tables of a benchmark anew from its results."""
+    """Make tables and report of a benchmark anew from its results."""
 
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder of results."""
@@ -117,6 +117,7 @@ class BenchReport:
 
 
 def _show(folder: Path, reference: str, as_json: bool) -> int:
+    from evercal.cli.bench_page import bench_page
     from evercal.evaluation.comparison import runs_of, summary
     from evercal.evaluation.outcomes import RESULTS, read
     from evercal.storage import write_bytes
@@ -125,22 +126,23 @@ def _show(folder: Path, reference: str, as_json: bool) -> int:
         raise InputError(f"{folder}: no results here; make some with 'evercal bench'")
     runs = runs_of(read(folder))
     write_bytes(folder / TABLES, (_tables(runs, reference, "markdown") + "\n").encode())
+    write_bytes(folder / PAGE, bench_page(runs, reference).encode())
     if as_json:
         print_json({"strategies": summary(runs)})
         return 0
     print(_tables(runs, reference, "terminal"))
-    print(f"wrote {folder / TABLES}")
+    print(f"wrote {folder / PAGE} and {folder / TABLES}")
     print_next("evercal", "bench-report", folder)
     return 0
 
 
 def _tables(runs: "list[Run]", reference: str, style: Literal["terminal", "markdown"]) -> str:
-    from evercal.evaluation.comparison import difference_table, method_table, scene_table
+    from evercal.evaluation.comparison import as_text, difference_rows, method_rows, scene_rows
 
-    parts = [method_table(runs, style), scene_table(runs, style)]
+    parts = [method_rows(runs), scene_rows(runs)]
     if len({run.strategy for run in runs}) > 1:
-        parts.append(difference_table(runs, reference, style))
-    return "\n\n".join(parts)
+        parts.append(difference_rows(runs, reference))
+    return "\n\n".join(as_text(rows, style) for rows in parts)
 
 
 def _words(text: str) -> tuple[str, ...]:

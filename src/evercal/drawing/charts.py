@@ -1,4 +1,4 @@
-"""Charts as PNG bytes: forgetting, error curves, trajectories.
+"""Charts as PNG bytes: forgetting, accuracy by scene and by size, error curves, trajectories.
 
 Colours are those of Okabe and Ito, which the colour-blind can tell apart; line styles and markers
 differ as well. Nothing global is touched: no pyplot, no style, no backend setting.
@@ -100,6 +100,58 @@ def error_curve(
     axes.set_ylabel("share of frames (%)", fontsize=9)
     _finish(axes)
     axes.legend(loc="lower right", fontsize=9, frameon=False)
+    return _png(figure)
+
+
+def scene_bars(
+    methods: Mapping[str, ArrayLike], scenes: Sequence[str], quantity: str = "accuracy (%)"
+) -> bytes:
+    """A group of bars for each scene, one bar per method.
+
+    Args:
+        methods: Per method (N,) numbers, 0 to 100.
+        scenes: The N names.
+        quantity: What the numbers are.
+
+    Raises:
+        ValueError: Not as many numbers as scenes, or no scene.
+    """
+    figure = _figure(1.6 + 0.22 * len(scenes) * (len(methods) + 1), 3.2)
+    axes = figure.subplots()
+    width = 1.0 / (len(methods) + 1)
+    for index, (name, values) in enumerate(methods.items()):
+        heights = np.asarray(values, dtype=np.float64)
+        if heights.shape != (len(scenes),) or not len(scenes):
+            raise ValueError(f"{name}: {len(scenes)} scenes need as many numbers, got {heights}")
+        left = np.arange(len(scenes)) + index * width
+        colour = _COLOURS[index % len(_COLOURS)]
+        hatch = ("", "//", "..", "xx")[index // len(_COLOURS) % 4]
+        axes.bar(left, heights, 0.9 * width, align="edge", color=colour, hatch=hatch, label=name)
+    middle = np.arange(len(scenes)) + 0.5 * len(methods) * width
+    axes.set_xticks(middle, scenes, rotation=30 if len(scenes) > 4 else 0)
+    axes.set_ylabel(quantity, fontsize=9)
+    _finish(axes)
+    figure.legend(loc="outside upper center", ncols=5, frameon=False, fontsize=9)
+    return _png(figure)
+
+
+def accuracy_against_size(methods: Mapping[str, tuple[float, float]], quantity: str) -> bytes:
+    """One point per method: what it reaches, and how many megabytes it keeps for that.
+
+    Args:
+        methods: Per method (megabytes, accuracy in per cent).
+        quantity: What takes the megabytes.
+    """
+    figure = _figure(5.4, 3.4)
+    axes = figure.subplots()
+    for index, (name, (size, accuracy)) in enumerate(methods.items()):
+        axes.plot(size, accuracy, **{**_style(index, name), "markersize": 6, "linestyle": ""})
+        axes.annotate(name, (size, accuracy), xytext=(5, 4), textcoords="offset points", fontsize=8)
+    axes.set_xlim(left=0)
+    axes.margins(x=0.2)
+    axes.set_xlabel(f"{quantity} (MB)", fontsize=9)
+    axes.set_ylabel("accuracy (%)", fontsize=9)
+    _finish(axes)
     return _png(figure)
 
 

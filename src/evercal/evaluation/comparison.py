@@ -14,6 +14,9 @@ from evercal.evaluation.tables import Style, table
 
 BLOCK = 10
 
+Rows = list[list[str]]
+"""A table's cells, its header first."""
+
 
 @dataclass(frozen=True)
 class Run:
@@ -75,22 +78,26 @@ def runs_of(outcomes: Sequence[Outcome]) -> list[Run]:
     return found
 
 
-def method_table(runs: Sequence[Run], style: Style = "terminal") -> str:
+def as_text(rows: Rows, style: Style = "terminal") -> str:
+    """A table as text."""
+    return table(rows[0], rows[1:], style)
+
+
+def method_rows(runs: Sequence[Run]) -> Rows:
     """One row per strategy: means over seeds, and the spread of the first column."""
-    header = ["strategy", "runs", *(name for name, _ in _COLUMNS)]
-    rows = []
+    rows = [["strategy", "runs", *(name for name, _ in _COLUMNS)]]
     for name, of in by_strategy(runs).items():
         first = [_COLUMNS[0][1](run) for run in of]
         spread = f" ± {np.std(first, ddof=1):.1f}" if len(of) > 1 else ""
         cells = [_mean([value(run) for run in of]) for _, value in _COLUMNS]
         rows.append([name, str(len(of)), cells[0] + spread, *cells[1:]])
-    return table(header, rows, style)
+    return rows
 
 
-def scene_table(runs: Sequence[Run], style: Style = "terminal") -> str:
+def scene_rows(runs: Sequence[Run]) -> Rows:
     """One row per strategy, a column per scene: accuracy when learned and at the end."""
     names = sorted(runs[0].scenes)
-    rows = []
+    rows = [["strategy", *names]]
     for strategy, of in by_strategy(runs).items():
         cells = []
         for name in names:
@@ -98,16 +105,16 @@ def scene_table(runs: Sequence[Run], style: Style = "terminal") -> str:
             learned = _mean([matrix[i, i] for matrix, i in matrices])
             cells.append(f"{learned} -> {_mean([matrix[-1, i] for matrix, i in matrices])}")
         rows.append([strategy, *cells])
-    return table(["strategy", *names], rows, style)
+    return rows
 
 
-def difference_table(runs: Sequence[Run], reference: str, style: Style = "terminal") -> str:
+def difference_rows(runs: Sequence[Run], reference: str) -> Rows:
     """How much better `reference` ends than each other strategy, on the seeds that both ran.
 
     Bounds are those of a paired bootstrap over runs and blocks of 10 frames.
     """
     grouped = by_strategy(runs)
-    rows = []
+    rows = [["difference in points", "mean", "95 % low", "95 % high"]]
     for other, of in grouped.items():
         if other == reference or reference not in grouped:
             continue
@@ -115,7 +122,7 @@ def difference_table(runs: Sequence[Run], reference: str, style: Style = "termin
         if d is not None:
             cells = [f"{100 * value:+.1f}" for value in (d.mean, d.low, d.high)]
             rows.append([f"{reference} - {other}", *cells])
-    return table(["difference in points", "mean", "95 % low", "95 % high"], rows, style)
+    return rows
 
 
 def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
