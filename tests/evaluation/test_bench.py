@@ -172,7 +172,8 @@ def test_suites(tmp_path: Path) -> None:
         "bedroom",
         "living",
     ]
-    assert [len(SUITES[name].scenes) for name in ("sim-7", "sim-12", "i7s")] == [7, 12, 7]
+    sizes = [len(SUITES[name].scenes) for name in ("sim-7", "sim-12", "i7s", "i12s")]
+    assert sizes == [7, 12, 7, 12]
     refused: list[tuple[Callable[[], object], str]] = [
         (lambda: load_suite("nonsense"), "suite 'nonsense': unknown; choose one of sim-mini"),
         (lambda: load_suite("sim-mini", None, ["attic"]), "scene 'attic': not in suite sim-mini"),

@@ -24,7 +24,7 @@ class Bench:
     """Compare strategies on a sequence of scenes; what is done is kept, what is missing is run."""
 
     suite: Annotated[Positional[str], arg(metavar="SUITE")]
-    """sim-mini (in the package), sim, sim-7, sim-12, real2, i7s, or custom."""
+    """sim-mini (in the package), sim, sim-7, sim-12, real2, i7s, i12s, or custom."""
     recordings: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="")
     ] = ()

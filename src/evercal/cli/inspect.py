@@ -16,7 +16,7 @@ class Inspect:
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
     """Folder of the recorded scene."""
     format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """Format of the folder, generic or 7scenes; recognised when left out."""
+    """Format of the folder, generic, 7scenes or 12scenes; recognised when left out."""
     json: bool = False
     """Print one JSON object."""
 

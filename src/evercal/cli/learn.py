@@ -47,7 +47,7 @@ class Learn:
     encoder: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Encoder weights from 'evercal pretrain', for a new store; else the shipped ones."""
     format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """Format of the scene folder, generic or 7scenes; recognised when left out."""
+    """Format of the scene folder, generic, 7scenes or 12scenes; recognised when left out."""
     seed: int = 0
     """Of everything that is drawn."""
     json: bool = False

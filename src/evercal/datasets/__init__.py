@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from evercal.datasets import generic, seven_scenes
+from evercal.datasets import generic, seven_scenes, twelve_scenes
 from evercal.datasets.frame import Frame as Frame
 from evercal.datasets.frame import Scene as Scene
 from evercal.datasets.images import image_size as image_size
@@ -28,6 +28,7 @@ class Format:
 FORMATS: dict[str, Format] = {
     "generic": Format(generic.detect, generic.load),
     "7scenes": Format(seven_scenes.detect, seven_scenes.load),
+    "12scenes": Format(twelve_scenes.detect, twelve_scenes.load),
 }
 
 
@@ -54,8 +55,8 @@ def load_scene(
         format = next((key for key, entry in FORMATS.items() if entry.detect(root)), None)
     if format is None:
         raise InputError(
-            f"{root}: no known scene format; expected scene.json (generic) or TrainSplit.txt,"
-            f" TestSplit.txt and seq-XX folders (7scenes)"
+            f"{root}: no known scene format; expected scene.json (generic), TrainSplit.txt,"
+            f" TestSplit.txt and seq-XX folders (7scenes), or info.txt and data (12scenes)"
         )
     scene = FORMATS[format].load(root)
     return scene if name is None else dataclasses.replace(scene, name=name)

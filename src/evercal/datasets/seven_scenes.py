@@ -16,18 +16,14 @@ import os
 import re
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from evercal.datasets.frame import Frame, Scene
 from evercal.datasets.images import image_size
+from evercal.datasets.pose_files import read_numbers, tracked_frames
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
+from evercal.geometry import Camera
 
 _SPLITS = ("TrainSplit.txt", "TestSplit.txt")
 _FOCAL_AT_640 = 525.0
-# Poses printed with few digits, or chained in float32, drift this far from a rotation.
-_ROTATION_TOLERANCE = 1e-2
 
 
 def detect(root: Path) -> bool:
@@ -55,7 +51,7 @@ def load(root: str | os.PathLike[str]) -> Scene:
     if not (images[0] or images[1]):
         raise InputError(f"{root}: {_SPLITS[0]} and {_SPLITS[1]} are empty; name a sequence in one")
     camera = _camera(root, (images[0] + images[1])[0])
-    train, test = (_frames(root, split, camera) for split in images)
+    train, test = (_frames(split, camera) for split in images)
     untracked = len(images[0]) + len(images[1]) - len(train) - len(test)
     return Scene(root.resolve().name, train, test, untracked)
 
@@ -96,31 +92,10 @@ def _images(folder: Path) -> list[Path]:
     return [folder / name for name in names]
 
 
-def _frames(root: Path, images: list[Path], camera: Camera) -> tuple[Frame, ...]:
-    matrices = np.empty((len(images), 4, 4))
-    files = [image.with_name(_stem(image.name) + ".pose.txt") for image in images]
-    for matrix, file in zip(matrices, files, strict=True):
-        matrix[...] = _numbers(file, 16, "4x4 base_from_camera").reshape(4, 4)
-    tracked = np.flatnonzero(np.isfinite(matrices).all(axis=(1, 2)))
-    poses = _poses(matrices[tracked], [files[i] for i in tracked])
-    return tuple(
-        Frame(
-            f"{images[i].parent.name}/{_stem(images[i].name)}", images[i], camera, base_from_camera
-        )
-        for i, base_from_camera in zip(tracked, poses, strict=True)
-    )
-
-
-def _poses(matrices: NDArray[np.float64], files: list[Path]) -> SE3:
-    try:
-        return SE3.from_matrix(matrices, _ROTATION_TOLERANCE)
-    except ValueError:
-        for matrix, file in zip(matrices, files, strict=True):
-            try:
-                SE3.from_matrix(matrix, _ROTATION_TOLERANCE)
-            except ValueError as error:
-                raise InputError(f"{file}: broken pose: {error}; mend or remove it") from None
-        raise
+def _frames(images: list[Path], camera: Camera) -> tuple[Frame, ...]:
+    names = [f"{image.parent.name}/{_stem(image.name)}" for image in images]
+    poses = [image.with_name(_stem(image.name) + ".pose.txt") for image in images]
+    return tracked_frames(names, images, poses, camera)
 
 
 def _camera(root: Path, image: Path) -> Camera:
@@ -129,28 +104,11 @@ def _camera(root: Path, image: Path) -> Camera:
     if not file.exists():
         focal = _FOCAL_AT_640 * max(width, height) / 640.0
         return Camera(width, height, focal, focal, width / 2, height / 2)
-    matrix = _numbers(file, 9, "3x3 intrinsic").reshape(3, 3)
+    matrix = read_numbers(file, 9, "3x3 intrinsic").reshape(3, 3)
     try:
         return Camera.from_matrix(matrix, width, height)
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
-
-
-def _numbers(file: Path, count: int, what: str) -> NDArray[np.float64]:
-    """Plain float() on the words: np.loadtxt takes longer per file than reading the file."""
-    try:
-        words = file.read_bytes().split()
-    except OSError:
-        raise InputError(f"{file}: missing; it holds the {what} matrix") from None
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count:
-        raise InputError(
-            f"{file}: expected a {what} matrix of {count} numbers, got {len(words)} words"
-        )
-    return np.array(numbers)
 
 
 def _stem(name: str) -> str:

@@ -25,7 +25,8 @@ class Suite:
 def _folders(data: Path | None, names: Sequence[str]) -> list[Scene]:
     if data is None:
         raise InputError("this suite needs its recordings: give their folder with --data")
-    return [load_scene(data / name, name=name) for name in names]
+    # A scene's name is a word: apt1/kitchen becomes apt1-kitchen.
+    return [load_scene(data / name, name=name.replace("/", "-")) for name in names]
 
 
 def _packaged(data: Path | None, names: Sequence[str]) -> list[Scene]:
@@ -51,6 +52,16 @@ SUITES: dict[str, Suite] = {
     "i7s": Suite(
         ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "stairs"),
         "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/",
+        _folders,
+    ),
+    "i12s": Suite(
+        (
+            *(f"apt1/{room}" for room in ("kitchen", "living")),
+            *(f"apt2/{room}" for room in ("bed", "kitchen", "living", "luke")),
+            *(f"office1/{room}" for room in ("gates362", "gates381", "lounge", "manolis")),
+            *(f"office2/{room}" for room in ("5a", "5b")),
+        ),
+        "https://graphics.stanford.edu/projects/reloc/",
         _folders,
     ),
 }
