@@ -46,6 +46,7 @@ def test_bench_and_its_report(
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("<img ") == 4
     assert "evercal - finetune" in page
+    assert r"\multicolumn{3}{c}{finetune}" in (tmp_path / "out" / "table.tex").read_text()
 
 
 @pytest.mark.parametrize(

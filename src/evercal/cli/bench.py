@@ -1,6 +1,7 @@
 """`evercal bench` and `evercal bench-report`."""
 
 import dataclasses
+import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from evercal.datasets import Scene
     from evercal.evaluation.comparison import Run
 
-TABLES, PAGE = "tables.md", "report.html"
+TABLES, PAGE, LATEX, SETTINGS = "tables.md", "report.html", "table.tex", "settings.json"
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,7 @@ class BenchReport:
 def _show(folder: Path, reference: str, as_json: bool) -> int:
     from evercal.cli.bench_page import bench_page
     from evercal.evaluation.comparison import runs_of, summary
+    from evercal.evaluation.latex import paper_table
     from evercal.evaluation.outcomes import RESULTS, read
     from evercal.storage import write_bytes
 
@@ -127,11 +129,13 @@ def _show(folder: Path, reference: str, as_json: bool) -> int:
     runs = runs_of(read(folder))
     write_bytes(folder / TABLES, (_tables(runs, reference, "markdown") + "\n").encode())
     write_bytes(folder / PAGE, bench_page(runs, reference).encode())
+    settings = json.loads((folder / SETTINGS).read_text())
+    write_bytes(folder / LATEX, (paper_table(runs, str(settings["suite"])) + "\n").encode())
     if as_json:
         print_json({"strategies": summary(runs)})
         return 0
     print(_tables(runs, reference, "terminal"))
-    print(f"wrote {folder / PAGE} and {folder / TABLES}")
+    print(f"wrote {folder / PAGE}, {TABLES} and {LATEX}")
     print_next("evercal", "bench-report", folder)
     return 0
 
