@@ -204,7 +204,7 @@ def test_replayed_rows_grow_with_the_scenes_that_count(
 
 @pytest.mark.parametrize(
     ("remembered", "per_scene", "expected"),
-    [(1, False, 1), (2, False, 1), (1, True, 1), (2, True, 4), (3, True, 6)],
+    [(1, False, 1), (2, False, 1), (1, True, 1), (2, True, 2), (3, True, 3)],
 )
 def test_remembered_scenes_cost_each_or_together(
     remembered: int, per_scene: bool, expected: float, learnable: Learnable

@@ -73,10 +73,10 @@ class Strategy:
 REPLAY_CLAMP_PX = 5.0
 TEACHER_LIMIT_PX = 10.0
 OUTPUT_WEIGHT_PX_PER_M = 50.0
-REPLAY_WEIGHT = 0.25
+REPLAY_WEIGHT = 0.5
 RELATED_ROWS = 512
 RELATION_TEMPERATURE = 0.2
-PROTECTION = 0.25
+PROTECTION = 0.5
 
 
 def _sars(frames: Candidates, capacity: int) -> np.ndarray:

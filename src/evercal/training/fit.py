@@ -81,8 +81,8 @@ class Replay:
     penalty: Penalty
     """Loss on a batch of their rows."""
     per_scene: bool = False
-    """Whether the penalty is one scene's, and counts for each (`emphasis`). Every further scene
-    then brings rows of its own; else all share `FitOptions.replay_batch`."""
+    """Whether the penalty is one scene's, and counts once for each. Every further scene then brings
+    rows of its own; else all share `FitOptions.replay_batch`."""
     protection: float = 0.0
     """How strongly updates spare the directions that their rows use (see `Protection`)."""
     combine: Combine | None = None
@@ -92,15 +92,6 @@ class Replay:
     interfered: bool = False
     """Whether only rows of those views are replayed that the new rows are about to spoil most
     (`training.interference`)."""
-
-    @property
-    def emphasis(self) -> int:
-        """How much each remembered scene counts.
-
-        Two scenes have room beside each other; with more, what is lost adds up from stage to stage
-        and each must be held twice as firmly. Three times is too much for the new one (measured).
-        """
-        return min(len(self.buffers), 2) if self.per_scene else 1
 
 
 class Fitter:
@@ -158,8 +149,7 @@ class Fitter:
         self._spoiled: list[Tensor] = []
         self._spare: Callable[[], AbstractContextManager[None]] = nullcontext
         if replay is not None and replay.protection > 0:
-            strength = replay.emphasis * replay.protection
-            self._spare = Protection(head, replay.buffers, strength, seed).damped
+            self._spare = Protection(head, replay.buffers, replay.protection, seed).damped
 
     def run(self) -> Iterator[Progress]:
         """Trains to the end, yielding after every step."""
@@ -206,7 +196,7 @@ class Fitter:
             old = slice(fresh, None)
             cost_of_old = replay.penalty(output.part(old), rows.part(old), progress)
             scenes = len(replay.buffers) if replay.per_scene else 1
-            (loss + scenes * replay.emphasis * cost_of_old).backward()
+            (loss + scenes * cost_of_old).backward()
         else:
             each = (len(rows.scene) - fresh) // len(replay.buffers)
             slices = [slice(i, i + each) for i in range(fresh, len(rows.scene), each)]
