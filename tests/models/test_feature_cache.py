@@ -65,3 +65,16 @@ def test_a_file_cut_short_is_made_again(tmp_path: Path) -> None:
     assert encoder.seen == 2
     assert encoder(image) is not None
     assert encoder.seen == 2
+
+
+@torch.inference_mode()
+def test_a_full_folder_is_read_but_not_written(tmp_path: Path) -> None:
+    images = torch.rand(6, 1, 16, 16, generator=torch.Generator().manual_seed(1))
+    encoder = Counting()
+    cache_features(encoder, tmp_path, limit_bytes=40)  # 16 bytes an image
+    before = encoder(images)
+    kept = list(tmp_path.rglob("*.npy"))
+    assert 0 < len(kept) < 6
+    assert torch.equal(encoder(images), before)
+    assert encoder.seen == 12 - len(kept)
+    assert list(tmp_path.rglob("*.npy")) == kept

@@ -10,7 +10,11 @@ import torch
 from torch import Tensor, nn
 
 
-def cache_features(encoder: nn.Module, folder: Path) -> None:
+LIMIT_BYTES = 8_000_000_000
+"""Of a folder: beyond, features are found but no longer kept."""
+
+
+def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int = LIMIT_BYTES) -> None:
     """Makes a frozen encoder look up what it has encoded before, and note what it has not.
 
     From then on features have half precision, found or not, so that results do not depend on what
@@ -19,6 +23,7 @@ def cache_features(encoder: nn.Module, folder: Path) -> None:
     Args:
         encoder: changed in place; its weights and type stay what they are.
         folder: where features are kept, one file per image; made when missing.
+        limit_bytes: how large the folder may grow.
     """
     weights = hashlib.blake2b(digest_size=8)
     for value in encoder.state_dict().values():
@@ -26,8 +31,10 @@ def cache_features(encoder: nn.Module, folder: Path) -> None:
     folder = folder / weights.hexdigest()
     folder.mkdir(parents=True, exist_ok=True)
     compute = encoder.forward
+    room = limit_bytes - sum(entry.stat().st_size for entry in os.scandir(folder))
 
     def forward(grey: Tensor) -> Tensor:
+        nonlocal room
         names = [_name(image) for image in grey]
         found = [_read(folder / name) for name in names]
         missing = [i for i, value in enumerate(found) if value is None]
@@ -35,7 +42,9 @@ def cache_features(encoder: nn.Module, folder: Path) -> None:
             made = compute(grey[missing]).half()
             for i, value in zip(missing, made, strict=True):
                 found[i] = value
-                _write(folder / names[i], value)
+                if room > value.nbytes:
+                    _write(folder / names[i], value)
+                    room -= value.nbytes
         return torch.stack([value.float() for value in found if value is not None])
 
     encoder.forward = forward
