@@ -190,16 +190,8 @@ def test_replay_gets_remembered_rows_evenly_and_its_cost_is_trained(learnable: L
 @pytest.mark.parametrize(
     ("scenes", "rows"), [(1, 60), (2, 60), (3, 90), (7, 210), (8, 240), (12, 240), (500, 500)]
 )
-def test_replayed_rows_grow_with_the_scenes_that_count(
-    scenes: int, rows: int, learnable: Learnable
-) -> None:
-    buffers = [learnable()[0]] * scenes
-
-    def penalty(output: HeadOutput, rows: Rows, progress: float) -> Tensor:
-        return output.points.sum()
-
-    assert replayed_rows(OPTIONS, Replay(buffers, penalty, per_scene=True)) == rows
-    assert replayed_rows(OPTIONS, Replay(buffers, penalty)) == max(60, scenes)
+def test_replayed_rows_grow_with_the_scenes(scenes: int, rows: int) -> None:
+    assert replayed_rows(OPTIONS, scenes) == rows
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-
 LIMIT_BYTES = 8_000_000_000
 """Of a folder: beyond, features are found but no longer kept."""
 

@@ -35,7 +35,8 @@ class FitOptions:
     batch: int = 2048
     """Rows of the scenes being learned in a step."""
     replay_batch: int = 1024
-    """Replayed rows in a step, drawn evenly from all remembered scenes."""
+    """Replayed rows in a step, drawn evenly from up to two remembered scenes; see
+    `replayed_rows` for more."""
     peak_rate: float = 4e-3
     """Peak of the one-cycle learning rate (cosine up and down) of AdamW."""
     muon_rate: float = 0.02
@@ -81,8 +82,7 @@ class Replay:
     penalty: Penalty
     """Loss on a batch of their rows."""
     per_scene: bool = False
-    """Whether the penalty is one scene's, and counts once for each. Every further scene then brings
-    rows of its own; else all share `FitOptions.replay_batch`."""
+    """Whether the penalty is one scene's, and counts once for each."""
     protection: float = 0.0
     """How strongly updates spare the directions that their rows use (see `Protection`)."""
     combine: Combine | None = None
@@ -213,7 +213,7 @@ class Fitter:
         self, fresh: Sequence[Rows], replay: Replay, generator: torch.Generator
     ) -> list[Rows]:
         """The same number of rows of each remembered scene."""
-        each = replayed_rows(self.options, replay) // len(replay.buffers)
+        each = replayed_rows(self.options, len(replay.buffers)) // len(replay.buffers)
         if not replay.interfered:
             return [buffer.draw(each, generator) for buffer in replay.buffers]
         if self.step % INTERFERENCE_STEPS == 0 or not self._spoiled:
@@ -285,14 +285,13 @@ class Fitter:
             optimiser.load_state_dict({"state": slots, "param_groups": groups})
 
 
-def replayed_rows(options: FitOptions, replay: Replay) -> int:
+def replayed_rows(options: FitOptions, scenes: int) -> int:
     """Rows that a step replays from all remembered scenes together, at least one of each.
 
-    Where every scene counts, one or two share `replay_batch` and each further one brings half as
-    many, up to four times the batch.
+    One or two scenes share `replay_batch` and each further one brings half as many, up to four
+    times the batch.
     """
-    scenes = len(replay.buffers)
-    shares = min(max(2, scenes), 8) if replay.per_scene else 2
+    shares = min(max(2, scenes), 8)
     return max(scenes, shares * options.replay_batch // 2)
 
 
