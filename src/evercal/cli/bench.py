@@ -22,7 +22,10 @@ TABLES, PAGE, LATEX, SETTINGS = "tables.md", "report.html", "table.tex", "settin
 
 @dataclass(frozen=True)
 class Bench:
-    """Compare strategies on a sequence of scenes; what is done is kept, what is missing is run."""
+    """Compare strategies on a sequence of scenes; what is done is kept, what is missing is run.
+
+    Under torchrun several processes share every training.
+    """
 
     suite: Annotated[Positional[str], arg(metavar="SUITE")]
     """sim-mini (in the package), sim, sim-7, sim-12, real2, i7s, i12s, or custom."""
@@ -58,19 +61,25 @@ class Bench:
         seeds = _numbers(self.seeds)
         from evercal.continual.plugin import load_plugin
         from evercal.evaluation.bench import BenchOptions, run_bench
+        from evercal.training.distributed import join_processes, rank, wait_for_all
 
         if self.plugin is not None:
             load_plugin(self.plugin)
+        join_processes()
+        out = self.out if rank() == 0 else _mirror(self.out)
+        wait_for_all()
         options = BenchOptions(
             self._stage, _words(self.strategies), seeds, self.order, settings={"suite": self.suite}
         )
         said = sys.stderr if self.json else sys.stdout
-        for step in run_bench(self._scenes(), options, self.out):
+        for step in run_bench(self._scenes(), options, out):
+            if rank():
+                continue
             found = ", ".join(f"{o.scene} {100 * o.correct().mean():.1f}" for o in step.outcomes)
             seconds = f" ({step.outcomes[0].seconds:.0f} s)" if step.outcomes else ""
             line = f"[{step.done}/{step.total}] {step.strategy} seed {step.seed}: "
             print(line + (found or "noted") + seconds, file=said, flush=True)
-        return _show(self.out, _words(self.strategies)[0], self.json)
+        return 0 if rank() else _show(self.out, _words(self.strategies)[0], self.json)
 
     def _scenes(self) -> "list[Scene]":
         from evercal.datasets import load_scene
@@ -115,6 +124,27 @@ class BenchReport:
     def run(self) -> int:
         """Prints and writes the tables."""
         return _show(self.folder, self.reference, self.json)
+
+
+def _mirror(out: Path) -> Path:
+    """A folder for a process that trains along with the first, and whose results nobody reads.
+
+    It begins with what is done already, so that all run the same, and shares the features.
+    """
+    import atexit
+    import shutil
+    import tempfile
+
+    folder = Path(tempfile.mkdtemp(prefix="evercal-bench-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    for name in ("settings.json", "results.jsonl"):
+        if (out / name).exists():
+            shutil.copy(out / name, folder / name)
+    if (out / "runs").exists():
+        shutil.copytree(out / "runs", folder / "runs")
+    (out / "features").mkdir(parents=True, exist_ok=True)
+    (folder / "features").symlink_to((out / "features").absolute())
+    return folder
 
 
 def _show(folder: Path, reference: str, as_json: bool) -> int:

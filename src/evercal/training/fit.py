@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from evercal.models.head import Head, HeadOutput
 from evercal.training.buffer import FeatureBuffer, Rows, join
+from evercal.training.distributed import average, own_share, processes
 from evercal.training.gradients import Combine, Gradients
 from evercal.training.interference import most_interfered
 from evercal.training.loss import LossOptions, clamp_px, reprojection_loss
@@ -165,6 +166,8 @@ class Fitter:
         parts = [buffer.draw(share, generator) for buffer in self.buffers]
         if replay is not None:
             parts += self._replayed(parts, replay, generator)
+        parts = [own_share(part) for part in parts]
+        share //= processes()
         fresh = share * len(self.buffers)
         rows = join(parts)
         if self.head.options.condition == "descriptor":
@@ -202,6 +205,9 @@ class Fitter:
             slices = [slice(i, i + each) for i in range(fresh, len(rows.scene), each)]
             old_costs = [replay.penalty(output.part(s), rows.part(s), progress) for s in slices]
             self._join_gradients(loss, old_costs, replay)
+        if replay is None or replay.combine is None:
+            every = [*self.head.parameters(), self.lens]
+            average(parameter.grad for parameter in every if parameter.grad is not None)
         with self._spare():
             for optimiser in self._optimisers:
                 optimiser.step()
@@ -244,6 +250,7 @@ class Fitter:
         new, (lens,) = flat(loss, [self.lens])
         memory = torch.stack([flat(cost)[0] for cost in old])
         losses = torch.stack([cost.detach() for cost in old])
+        average([new, lens, memory, losses])  # before they join: rules are not linear
         references = torch.full_like(losses, torch.nan)
         if replay.references is not None:
             references = replay.references
