@@ -113,6 +113,8 @@ def test_a_stop_inside_a_stage_resumes_it(
     arcs: Arcs, options: BenchOptions, done: tuple[Path, list[bench.Step]], tmp_path: Path
 ) -> None:
     alone = replace(options, strategies=("evercal",))
+    # What a kill inside the first commit leaves behind.
+    (tmp_path / "runs" / "evercal-0" / "stages" / ".0001-one").mkdir(parents=True)
 
     def stop(event: object) -> None:
         raise KeyboardInterrupt

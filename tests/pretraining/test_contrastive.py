@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from evercal.errors import InputError
 from evercal.models.encoder import LocalEncoder
 from evercal.pretraining import contrastive
 from evercal.pretraining.contrastive import (
@@ -252,3 +253,19 @@ def test_training_lowers_the_loss(data: PretrainData, tmp_path: Path) -> None:
     losses = [float(line.split()[3]) for line in said]
     assert np.mean(losses[-3:]) < 0.93 * np.mean(losses[:2])
     assert losses[0] < math.log(3 * 64 + len(cell_pixels())) + 1
+
+
+def test_an_earlier_run_can_be_gone_on_from(data: PretrainData, tmp_path: Path) -> None:
+    said: list[str] = []
+    first, second = tmp_path / "first", tmp_path / "second"
+    for folder in (first, second):
+        folder.mkdir()
+    before = train_encoder(data, replace(OPTIONS, steps=2), first, said.append)
+    start = replace(OPTIONS, steps=1, peak_rate=1e-9, init=str(first / "encoder.pt"))
+    after = train_encoder(data, start, second, said.append)
+    for name, value in after.named_parameters():
+        torch.testing.assert_close(value, before.state_dict()[name], atol=1e-6, rtol=0)
+    (tmp_path / "nonsense.pt").write_bytes(b"nonsense")
+    for bad in (tmp_path / "nonsense.pt", tmp_path / "none.pt"):
+        with pytest.raises(InputError, match=r"not the encoder\.pt of a run"):
+            train_encoder(data, replace(start, init=str(bad)), tmp_path, said.append)

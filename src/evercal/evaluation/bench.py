@@ -178,6 +178,7 @@ class _Run:
         """
         if (self.store / MANIFEST).exists():
             return
+        shutil.rmtree(self.store, ignore_errors=True)  # left by a commit that was killed
         scene = self.scenes[0]
         shared = self.out / "runs" / f"first-{scene.name}-{self.seed}"
         if not (shared / MANIFEST).exists():

@@ -70,6 +70,8 @@ class PretrainOptions:
     """Optimiser steps of the global descriptor."""
     seed: int = 1
     """Of everything that is drawn."""
+    init: str | None = None
+    """Checkpoint `encoder.pt` of an earlier run to start from; random weights when left out."""
 
 
 @dataclass(frozen=True)
@@ -244,6 +246,8 @@ def train_encoder(
         optimiser, options.peak_rate, total_steps=options.steps, pct_start=0.05
     )
     checkpoint, step = folder / "encoder.pt", 0
+    if options.init is not None:
+        encoder.load_state_dict(_earlier(Path(options.init)))
     if checkpoint.is_file():
         saved = torch.load(checkpoint, weights_only=True)
         if saved["options"] == json.dumps(asdict(options)):
@@ -286,6 +290,21 @@ def train_encoder(
             losses.clear()
             _save(checkpoint, encoder, optimiser, schedule, step, options)
     return encoder
+
+
+def _earlier(checkpoint: Path) -> dict[str, Tensor]:
+    """Weights of an earlier run.
+
+    Raises:
+        InputError: no checkpoint of ours, or of an encoder with another layout.
+    """
+    try:
+        found = torch.load(checkpoint, weights_only=True)["encoder"]
+        LocalEncoder(fused=False).load_state_dict(found)
+    except Exception as error:
+        reason = (str(error).splitlines() or [repr(error)])[0]
+        raise InputError(f"--init {checkpoint}: not the encoder.pt of a run ({reason})") from error
+    return found
 
 
 def _validation(data: PretrainData, folder: Path) -> dict[str, list[tuple[Tensor, Tensor, Tensor]]]:
