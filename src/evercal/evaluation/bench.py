@@ -38,8 +38,10 @@ from evercal.localization.teach import (
     learn_scene,
     open_or_create,
 )
+from evercal.models.descriptor import DESCRIPTOR_FILE
+from evercal.models.encoder import ENCODER_FILE
 from evercal.models.feature_cache import cache_features
-from evercal.storage import MANIFEST, hold_settings
+from evercal.storage import MANIFEST, hold_settings, sha256_file
 from evercal.training.buffer import FeatureBuffer, fill
 
 Order = Literal["given", "reversed", "shuffled"]
@@ -131,6 +133,7 @@ def _settings(scenes: Sequence[Scene], options: BenchOptions) -> dict[str, objec
     return {
         **asdict(replace(stage, seed=0, fill=replace(stage.fill, seed=0))),
         "replay": replay,
+        "networks": [sha256_file(file)[:12] for file in (ENCODER_FILE, DESCRIPTOR_FILE)],
         "order": options.order,
         "short_side": options.short_side,
         "scenes": [[scene.name, len(scene.train), len(scene.test)] for scene in scenes],
