@@ -13,8 +13,11 @@ from evercal.cli.console import print_json, print_next
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from evercal.continual.learn import StageOptions
     from evercal.datasets import Scene
+    from evercal.evaluation.bench import BenchOptions, Step
     from evercal.evaluation.comparison import Run
 
 TABLES, PAGE, LATEX, SETTINGS = "tables.md", "report.html", "table.tex", "settings.json"
@@ -51,6 +54,8 @@ class Bench:
     """What is remembered of a scene: a share of its frames (10%) or bytes (5MB)."""
     plugin: Annotated[Path | None, arg(metavar="FILE.py", help_behavior_hint="")] = None
     """File with strategies of one's own (see examples/my_strategy.py)."""
+    ray: Annotated[str | None, arg(metavar="ADDRESS", help_behavior_hint="")] = None
+    """Ray cluster to run on, `local` for this machine; one run after the other when left out."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-bench")
     """Folder of results; the same command continues there."""
     json: bool = False
@@ -60,7 +65,7 @@ class Bench:
         """Runs what is missing and prints the tables."""
         seeds = _numbers(self.seeds)
         from evercal.continual.plugin import load_plugin
-        from evercal.evaluation.bench import BenchOptions, run_bench
+        from evercal.evaluation.bench import BenchOptions
         from evercal.training.distributed import join_processes, rank, wait_for_all
 
         if self.plugin is not None:
@@ -69,10 +74,15 @@ class Bench:
         out = self.out if rank() == 0 else _mirror(self.out)
         wait_for_all()
         options = BenchOptions(
-            self._stage, _words(self.strategies), seeds, self.order, settings={"suite": self.suite}
+            self._stage,
+            _words(self.strategies),
+            seeds,
+            self.order,
+            settings={"suite": self.suite},
+            features=self.out.absolute() / "features",
         )
         said = sys.stderr if self.json else sys.stdout
-        for step in run_bench(self._scenes(), options, out):
+        for step in self._steps(options, out):
             if rank():
                 continue
             found = ", ".join(f"{o.scene} {100 * o.correct().mean():.1f}" for o in step.outcomes)
@@ -80,6 +90,14 @@ class Bench:
             line = f"[{step.done}/{step.total}] {step.strategy} seed {step.seed}: "
             print(line + (found or "noted") + seconds, file=said, flush=True)
         return 0 if rank() else _show(self.out, _words(self.strategies)[0], self.json)
+
+    def _steps(self, options: "BenchOptions", out: Path) -> "Iterator[Step]":
+        from evercal.evaluation.bench import run_bench
+        from evercal.evaluation.cluster import run_on_ray
+
+        if self.ray is None:
+            return run_bench(self._scenes(), options, out)
+        return run_on_ray(self._scenes(), options, out, self.ray, self.plugin)
 
     def _scenes(self) -> "list[Scene]":
         from evercal.datasets import load_scene
@@ -129,7 +147,7 @@ class BenchReport:
 def _mirror(out: Path) -> Path:
     """A folder for a process that trains along with the first, and whose results nobody reads.
 
-    It begins with what is done already, so that all run the same, and shares the features.
+    It begins with what is done already, so that all run the same.
     """
     import atexit
     import shutil
@@ -142,8 +160,6 @@ def _mirror(out: Path) -> Path:
             shutil.copy(out / name, folder / name)
     if (out / "runs").exists():
         shutil.copytree(out / "runs", folder / "runs")
-    (out / "features").mkdir(parents=True, exist_ok=True)
-    (folder / "features").symlink_to((out / "features").absolute())
     return folder
 
 

@@ -63,6 +63,8 @@ class BenchOptions:
     """Working size of images, pixels."""
     settings: dict[str, object] = field(default_factory=dict)
     """What else decides the results, for settings.json."""
+    features: Path | None = None
+    """Where encoded views are kept; in the folder of results when None."""
 
 
 @dataclass(frozen=True)
@@ -98,23 +100,37 @@ def run_bench(
     Yields:
         A `Step` after every stage that was run.
     """
+    total = len(options.seeds) * len(options.strategies) * len(scenes)
+    missing = begin_bench(scenes, options, out)
+    found = {(o.strategy, o.seed, o.stage) for o in outcomes.read(out)}
+    done = total - len(missing) * len(scenes)
+    for seed, strategy in missing:
+        ordered = in_order(scenes, options.order, seed)
+        for stage, these in _Run(ordered, options, out, strategy, seed).stages(on_event):
+            if (strategy, seed, stage) not in found:
+                outcomes.append(out, these)
+            yield Step(strategy, seed, these, done + stage + 1, total)
+        done += len(scenes)
+
+
+def begin_bench(scenes: Sequence[Scene], options: BenchOptions, out: Path) -> list[tuple[int, str]]:
+    """Checks what is asked against the folder of results.
+
+    Returns:
+        (seed, strategy) of the runs whose last stage is not there yet, in order.
+
+    Raises:
+        InputError: see `run_bench`.
+    """
     if len(scenes) < 2:
         raise InputError(f"{len(scenes)} scene: forgetting takes two or more; give more scenes")
     unknown = [name for name in options.strategies if name not in STRATEGIES]
     if unknown:
         raise InputError(f"strategy {unknown[0]!r}: unknown; choose from {', '.join(STRATEGIES)}")
     hold_settings(out / "settings.json", _settings(scenes, options))
-    found = {(o.strategy, o.seed, o.stage) for o in outcomes.read(out)}
+    found = {(o.strategy, o.seed) for o in outcomes.read(out) if o.stage == len(scenes) - 1}
     runs = [(seed, strategy) for seed in options.seeds for strategy in options.strategies]
-    total, last = len(runs) * len(scenes), len(scenes) - 1
-    for i, (seed, strategy) in enumerate(runs):
-        if (strategy, seed, last) in found:
-            continue
-        ordered = in_order(scenes, options.order, seed)
-        for stage, these in _Run(ordered, options, out, strategy, seed).stages(on_event):
-            if (strategy, seed, stage) not in found:
-                outcomes.append(out, these)
-            yield Step(strategy, seed, these, i * len(scenes) + stage + 1, total)
+    return [(seed, strategy) for seed, strategy in runs if (strategy, seed) not in found]
 
 
 def in_order(scenes: Sequence[Scene], order: Order, seed: int) -> list[Scene]:
@@ -149,6 +165,7 @@ class _Run:
     ):
         self.scenes, self.options, self.out = scenes, options, out
         self.strategy, self.seed, self.rule = strategy, seed, STRATEGIES[strategy]
+        self.features = options.features or out / "features"
         self.store = out / "runs" / f"{strategy}-{seed}"
 
     def stages(self, on_event: OnEvent | None) -> Iterator[tuple[int, tuple[Outcome, ...]]]:
@@ -171,7 +188,7 @@ class _Run:
             self.options.stage(self.seed),
             strategy,
             short_side=self.options.short_side,
-            cache=self.out / "features",
+            cache=self.features,
         )
 
     def _begin(self, on_event: OnEvent | None) -> None:
@@ -213,7 +230,7 @@ class _Run:
         open_or_create(self.store, self._how(self.strategy)).commit(known, report)
 
     def _cached(self, known: Knowledge) -> None:
-        cache_features(known.encoder, self.out / "features")  # pyright: ignore[reportArgumentType]
+        cache_features(known.encoder, self.features)  # pyright: ignore[reportArgumentType]
 
     def _joint(self, on_event: OnEvent | None) -> Iterator[tuple[int, tuple[Outcome, ...]]]:
         """All scenes at once, with the steps of all stages; the stages before only note a scene."""
