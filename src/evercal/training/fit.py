@@ -193,21 +193,7 @@ class Fitter:
             loss = loss + self.restraint()
         for optimiser in self._optimisers:
             optimiser.zero_grad()
-        if replay is None:
-            loss.backward()
-        elif replay.combine is None:
-            old = slice(fresh, None)
-            cost_of_old = replay.penalty(output.part(old), rows.part(old), progress)
-            scenes = len(replay.buffers) if replay.per_scene else 1
-            (loss + scenes * cost_of_old).backward()
-        else:
-            each = (len(rows.scene) - fresh) // len(replay.buffers)
-            slices = [slice(i, i + each) for i in range(fresh, len(rows.scene), each)]
-            old_costs = [replay.penalty(output.part(s), rows.part(s), progress) for s in slices]
-            self._join_gradients(loss, old_costs, replay)
-        if replay is None or replay.combine is None:
-            every = [*self.head.parameters(), self.lens]
-            average(parameter.grad for parameter in every if parameter.grad is not None)
+        self._backward(loss, output, rows, fresh)
         with self._spare():
             for optimiser in self._optimisers:
                 optimiser.step()
@@ -234,6 +220,24 @@ class Fitter:
             drawn = torch.randint(len(where), (each,), generator=generator)
             rows.append(buffer.rows(where[drawn]))
         return rows
+
+    def _backward(self, loss: Tensor, output: HeadOutput, rows: Rows, fresh: int) -> None:
+        """Leaves the gradients of a step in `.grad`: of the loss on the first `fresh` rows, and of
+        what the others cost."""
+        replay, progress = self.replay, self.step / self.options.iterations
+        if replay is not None and replay.combine is not None:
+            each = (len(rows.scene) - fresh) // len(replay.buffers)
+            slices = [slice(i, i + each) for i in range(fresh, len(rows.scene), each)]
+            old_costs = [replay.penalty(output.part(s), rows.part(s), progress) for s in slices]
+            self._join_gradients(loss, old_costs, replay)
+            return
+        if replay is not None:
+            old = slice(fresh, None)
+            cost_of_old = replay.penalty(output.part(old), rows.part(old), progress)
+            loss = loss + (len(replay.buffers) if replay.per_scene else 1) * cost_of_old
+        loss.backward()
+        every = [*self.head.parameters(), self.lens]
+        average(parameter.grad for parameter in every if parameter.grad is not None)
 
     def _join_gradients(self, loss: Tensor, old: Sequence[Tensor], replay: Replay) -> None:
         """Leaves in `.grad` what the rule makes of the gradients of new and remembered rows."""
