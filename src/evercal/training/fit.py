@@ -222,8 +222,7 @@ class Fitter:
         return rows
 
     def _backward(self, loss: Tensor, output: HeadOutput, rows: Rows, fresh: int) -> None:
-        """Leaves the gradients of a step in `.grad`: of the loss on the first `fresh` rows, and of
-        what the others cost."""
+        """Leaves in `.grad` the gradients of `loss`, on `fresh` rows, and of replaying the rest."""
         replay, progress = self.replay, self.step / self.options.iterations
         if replay is not None and replay.combine is not None:
             each = (len(rows.scene) - fresh) // len(replay.buffers)
