@@ -23,6 +23,8 @@ VERBS = (
     "verify",
     "inspect",
     "simulate",
+    "bench",
+    "bench-report",
     "pretrain",
 )
 
@@ -82,15 +84,19 @@ def test_arguments_have_names_and_explanations(run: Any) -> None:
     assert "--no-json" not in text
 
 
-def test_strategies_and_presets_in_the_help_are_those_there_are(run: Any) -> None:
+def test_presets_in_the_help_are_those_there_are(run: Any) -> None:
     from evercal.continual.presets import PRESETS
-    from evercal.continual.strategies import STRATEGIES
 
     text = " ".join(run("learn", "--help").out.replace("│", " ").split())
     assert f"--preset {{{','.join(PRESETS)}}}" in text
-    listed = text.partition("--strategy NAME ")[2].partition(";")[0]
-    named = {word.strip(",") for word in listed.split()} & set(STRATEGIES)
-    assert named == {name for name, entry in STRATEGIES.items() if entry.data == "stage"}
+
+
+def test_the_page_on_methods_names_every_strategy_and_no_other() -> None:
+    from evercal.continual.strategies import STRATEGIES
+
+    page = (Path(__file__).parents[2] / "docs" / "methods.md").read_text()
+    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
+    assert {name for row in rows for name in re.findall(r"`(\w+)`", row)} == set(STRATEGIES)
 
 
 def test_version(run: Any) -> None:
