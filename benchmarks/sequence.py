@@ -14,7 +14,7 @@ from tabulate import tabulate
 from evercal.continual import strategies
 from evercal.continual.candidates import Candidates
 from evercal.continual.knowledge import Knowledge
-from evercal.continual.learn import Stage, StageOptions, keep, learn
+from evercal.continual.learn import Stage, StageOptions, keep, learn, plain_rows
 from evercal.continual.presets import preset
 from evercal.continual.robot import head_bytes, with_fit
 from evercal.continual.strategies import STRATEGIES as RULES
@@ -27,7 +27,7 @@ from evercal.localization.teach import fit_threshold, hold_out
 from evercal.models.descriptor import load_descriptor
 from evercal.models.encoder import load_encoder
 from evercal.storage import hold_settings
-from evercal.training.buffer import FeatureBuffer, fill
+from evercal.training.buffer import FeatureBuffer
 
 SHORT_SIDE = 240
 PAPER_BACKBONE = ("sars_spdd",)
@@ -186,10 +186,7 @@ class Runner:
 
         def rows() -> FeatureBuffer:
             buffer = FeatureBuffer(0, known.scenes[0].cell.atlas_from_base)
-            plain = replace(options.fill, passes=1)
-            for _ in fill(buffer, scene.train, plain, known.encoder, known.descriptor):
-                pass
-            return buffer
+            return plain_rows(buffer, scene.train, known, options)
 
         frames = Candidates(scene.train, known.heads[0], rows, seed)
         known.memories = [keep(scene.train, frames, rule, options, SHORT_SIDE, refined)]

@@ -81,8 +81,7 @@ def bench_page(runs: Sequence[Run], reference: str) -> str:
 
 
 def _ends(run: Run, names: Sequence[str]) -> list[float]:
-    last = dict(zip(run.scenes, run.last, strict=True))
-    return [100 * float(last[name].correct().mean()) for name in names]
+    return [100 * float(run.end(name).correct().mean()) for name in names]
 
 
 def _curves(runs: Sequence[Run]) -> dict[str, np.ndarray]:

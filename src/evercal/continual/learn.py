@@ -366,13 +366,20 @@ def note_of(known: Knowledge, buffer: FeatureBuffer, options: StageOptions) -> N
         memory = known.memories[-1]
         assert memory is not None, "a strategy that notes what it remembers selects frames"
         found = FeatureBuffer(buffer.scene, buffer.atlas_from_base)
-        view = replace(options.fill.view, short_side=known.short_side)
-        plan = replace(options.fill, passes=1, view=view)
-        for _ in fill(found, memory.frames(), plan, known.encoder, known.descriptor):
-            pass
-        return found
+        return plain_rows(found, memory.frames(), known, options)
 
     return note(Finished(known.heads[-1].eval(), buffer, remembered, known.notes))
+
+
+def plain_rows(
+    buffer: FeatureBuffer, frames: Sequence[Frame], known: Knowledge, options: StageOptions
+) -> FeatureBuffer:
+    """Encodes frames as they are into a buffer, and gives it back."""
+    view = replace(options.fill.view, short_side=known.short_side)
+    plan = replace(options.fill, passes=1, view=view)
+    for _ in fill(buffer, frames, plan, known.encoder, known.descriptor):
+        pass
+    return buffer
 
 
 class _Pacer:

@@ -53,10 +53,7 @@ def _images(root: Path) -> list[Path]:
 def _tested(root: Path, frames: int) -> int:
     """How many of the frames, from the first on, are for testing."""
     file = root / "split.txt"
-    try:
-        text = file.read_text()
-    except (OSError, UnicodeDecodeError):
-        raise InputError(f"{file}: missing; its first line says '... [frames=N]'") from None
+    text = _text(file, "its first line says '... [frames=N]'")
     match = re.search(r"\[frames=(\d+)\]", text.split("\n")[0])
     if match is None:
         raise InputError(f"{file}: the first line holds no '[frames=N]'")
@@ -67,10 +64,7 @@ def _tested(root: Path, frames: int) -> int:
 
 def _camera(root: Path, image: Path) -> Camera:
     file = root / "info.txt"
-    try:
-        text = file.read_text()
-    except (OSError, UnicodeDecodeError):
-        raise InputError(f"{file}: missing; it holds m_calibrationColorIntrinsic") from None
+    text = _text(file, "it holds m_calibrationColorIntrinsic")
     found = dict(re.findall(r"^\s*(\w+)\s*=\s*(.+?)\s*$", text, re.MULTILINE))
     try:
         numbers = [float(word) for word in found["m_calibrationColorIntrinsic"].split()]
@@ -82,6 +76,13 @@ def _camera(root: Path, image: Path) -> Camera:
             f"{file}: needs m_colorWidth, m_colorHeight and m_calibrationColorIntrinsic ({error!r})"
         ) from None
     return camera.resized(*image_size(image))
+
+
+def _text(file: Path, holds: str) -> str:
+    try:
+        return file.read_text()
+    except (OSError, UnicodeDecodeError):
+        raise InputError(f"{file}: missing; {holds}") from None
 
 
 def _frames(images: list[Path], camera: Camera) -> tuple[Frame, ...]:

@@ -13,6 +13,7 @@ import shutil
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +22,7 @@ import numpy as np
 from evercal.continual import strategies as rules
 from evercal.continual.candidates import Candidates
 from evercal.continual.knowledge import Knowledge
-from evercal.continual.learn import Stage, StageOptions, keep, learn, note_of
+from evercal.continual.learn import Stage, StageOptions, keep, learn, note_of, plain_rows
 from evercal.continual.robot import Robot, head_bytes, with_fit
 from evercal.continual.strategies import STRATEGIES
 from evercal.datasets import Scene
@@ -42,7 +43,7 @@ from evercal.models.descriptor import DESCRIPTOR_FILE
 from evercal.models.encoder import ENCODER_FILE
 from evercal.models.feature_cache import cache_features
 from evercal.storage import MANIFEST, hold_settings, sha256_file
-from evercal.training.buffer import FeatureBuffer, fill
+from evercal.training.buffer import FeatureBuffer
 
 Order = Literal["given", "reversed", "shuffled"]
 
@@ -178,6 +179,7 @@ class _Run:
             if number >= len(Robot.open(self.store).stages):
                 learn_scene(self.store, self.scenes[number], self._how(self.strategy), on_event)
             robot = Robot.open(self.store)
+            self._cached(robot.known)
             report = robot.report()
             seconds, kept = float(report["seconds"]), int(report["frames_kept"])
             yield number, self._judge(robot.known, number, seconds, kept)
@@ -210,14 +212,12 @@ class _Run:
         train, _ = hold_out(scene.train)
         options = self.options.stage(self.seed)
 
+        self._cached(known)
+
+        @cache
         def rows() -> FeatureBuffer:
-            self._cached(known)
             buffer = FeatureBuffer(0, known.scenes[0].cell.atlas_from_base)
-            plan = replace(options.fill, passes=1)
-            plan = replace(plan, view=replace(plan.view, short_side=known.short_side))
-            for _ in fill(buffer, train, plan, known.encoder, known.descriptor):
-                pass
-            return buffer
+            return plain_rows(buffer, train, known, options)
 
         frames = Candidates(train, known.heads[0], rows, self.seed)
         refined = known.scenes[0].refined_camera
@@ -261,7 +261,6 @@ class _Run:
     def _judge(
         self, known: Knowledge, number: int, seconds: float, kept: int
     ) -> tuple[Outcome, ...]:
-        self._cached(known)
         learned = {scene.name: scene for scene in self.scenes[: number + 1]}
         results = evaluate(Localizer(known), learned)
         size = sum(head_bytes(head) for head in known.heads)

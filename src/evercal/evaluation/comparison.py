@@ -34,7 +34,11 @@ class Run:
     @property
     def last(self) -> list[Outcome]:
         """What is known of every scene at the end, in order of learning."""
-        return [self.outcomes[len(self.scenes) - 1, scene] for scene in self.scenes]
+        return [self.end(scene) for scene in self.scenes]
+
+    def end(self, scene: str) -> Outcome:
+        """What is known of one scene at the end."""
+        return self.outcomes[len(self.scenes) - 1, scene]
 
     def matrix(self, thresholds: tuple[float, float] = COARSE) -> np.ndarray:
         """(N, N) accuracies in per cent: row i after stage i, column j the scene of stage j.
@@ -133,7 +137,7 @@ def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
     names = sorted(pairs[0][0].scenes)
 
     def flags(which: int, name: str) -> np.ndarray:
-        ends = [next(o for o in pair[which].last if o.scene == name) for pair in pairs]
+        ends = [pair[which].end(name) for pair in pairs]
         return np.array([end.correct() for end in ends], float)
 
     first, second = ([flags(which, name) for name in names] for which in (0, 1))

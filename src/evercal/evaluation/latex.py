@@ -80,7 +80,7 @@ _NONE = (math.nan, math.nan)
 
 def _cells(runs: Sequence[Run], scene: str, thresholds: tuple[float, float]) -> list[str]:
     """Median error in cm and deg, and accuracy, of a scene at the end."""
-    ends = [next(o for o in run.last if o.scene == scene) for run in runs]
+    ends = [run.end(scene) for run in runs]
     centimetres = [100 * _median(end.translation_m) for end in ends]
     degrees = [math.degrees(_median(end.rotation_rad)) for end in ends]
     accuracy = [100 * float(end.correct(thresholds).mean()) for end in ends]
