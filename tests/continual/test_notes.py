@@ -8,7 +8,6 @@ from torch import Tensor
 
 from evercal.continual.learn import Stage, StageOptions, learn
 from evercal.continual.notes import (
-    CLAMP_PX,
     EWC_STRENGTH,
     FISHER_DECAY,
     Finished,
@@ -21,7 +20,7 @@ from evercal.continual.notes import (
 )
 from evercal.models.head import Head, HeadOptions
 from evercal.training.buffer import FeatureBuffer, fill
-from evercal.training.loss import LossOptions, reprojection_loss
+from evercal.training.loss import STEADY_CLAMP_PX, LossOptions, reprojection_loss
 
 from .stages import Blank, Rooms
 
@@ -125,7 +124,7 @@ def test_the_reference_is_a_loss_at_a_fixed_clamp(finished: Finished) -> None:
     rows = buffer.rows(torch.arange(len(buffer)))
     with torch.no_grad():
         points = finished.head(rows.features.float(), 1, rows.descriptor).points
-        loss, _ = reprojection_loss(points, rows.target, CLAMP_PX, LossOptions())
+        loss, _ = reprojection_loss(points, rows.target, STEADY_CLAMP_PX, LossOptions())
     found = float(note_reference(finished)["reference"])
     # 8,192 rows are drawn with replacement.
     assert found == pytest.approx(float(loss.mean()), abs=5 * float(loss.std()) / 90)

@@ -10,15 +10,13 @@ from torch import Tensor
 from evercal.datasets.frame import Frame
 from evercal.models.head import Head
 from evercal.training.buffer import FeatureBuffer, Rows
-from evercal.training.loss import LossOptions, reprojection_loss
+from evercal.training.loss import steady_loss
 
 RELIABLE_PX = 10.0
 PARTS = 625
 """Of a scene, for coverage: as many as the 25 x 25 clusters of HSCNet that Buff-CS counts."""
 PART_POINTS = 20_000
 GRADIENT_ROWS = 256
-CLAMP_PX = 5.0
-"""Fixed: with the schedule of the training, the clamp would decide and not the frames."""
 
 
 class Candidates:
@@ -84,7 +82,7 @@ class Candidates:
         for i in range(len(self)):
             rows = self._of(i)
             points = self._head.decode(self._hidden(rows).float(), self._buffer.scene).points
-            _, error = reprojection_loss(points, rows.target, CLAMP_PX, LossOptions())
+            _, error = steady_loss(points, rows.target)
             found.append(points[error < RELIABLE_PX].double().numpy())
         every = np.concatenate(found)
         if not len(every):
@@ -108,7 +106,7 @@ class Candidates:
             with torch.no_grad():
                 hidden = self._hidden(rows).float()
             points = head.decode(hidden, self._buffer.scene).points
-            loss, _ = reprojection_loss(points, rows.target, CLAMP_PX, LossOptions())
+            loss, _ = steady_loss(points, rows.target)
             by_logit, by_offset = torch.autograd.grad(loss.mean(), parameters)
             shared = len(by_offset) != len(by_logit)
             parts = (by_logit[own], by_offset if shared else by_offset[own])

@@ -11,12 +11,10 @@ from torch import Tensor
 
 from evercal.models.head import Head
 from evercal.training.buffer import FeatureBuffer
-from evercal.training.loss import LossOptions, reprojection_loss
+from evercal.training.loss import steady_loss
 
 Notes = Mapping[str, Tensor]
 
-CLAMP_PX = 5.0
-"""Fixed: losses at different times must be comparable."""
 REFERENCE_ROWS = 8192
 FISHER_IMAGES = 200
 FISHER_ROWS = 256
@@ -44,7 +42,7 @@ def note_reference(scene: Finished) -> dict[str, Tensor]:
     rows = buffer.draw(REFERENCE_ROWS, torch.Generator().manual_seed(buffer.scene))
     with torch.no_grad():
         points = scene.head(rows.features.float(), buffer.scene, rows.descriptor).points
-        cost, _ = reprojection_loss(points, rows.target, CLAMP_PX, LossOptions())
+        cost, _ = steady_loss(points, rows.target)
     return {"reference": cost.mean()}
 
 
@@ -78,7 +76,7 @@ def note_fisher(scene: Finished) -> dict[str, Tensor]:
         some = index[torch.randint(len(index), (FISHER_ROWS,), generator=generator)]
         rows = buffer.rows(some)
         points = head(rows.features.float(), buffer.scene, rows.descriptor).points
-        cost, _ = reprojection_loss(points, rows.target, CLAMP_PX, LossOptions())
+        cost, _ = steady_loss(points, rows.target)
         found = torch.autograd.grad(cost.mean(), list(parameters.values()), materialize_grads=True)
         for name, gradient in zip(parameters, found, strict=True):
             total[name] += gradient.square()

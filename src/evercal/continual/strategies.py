@@ -31,7 +31,7 @@ from evercal.continual.spdd import SpddOptions, spdd_loss
 from evercal.models.head import Head, HeadOutput
 from evercal.training.buffer import Rows
 from evercal.training.gradients import Combine, averaged_constraint, episodic_barrier, gem
-from evercal.training.loss import LossOptions, clamp_px, reprojection_loss
+from evercal.training.loss import LossOptions, clamp_px, reprojection_loss, steady_loss
 
 Select = Callable[[Candidates, int], np.ndarray]
 """Which frames stay: (frames of a finished scene, capacity) -> indices in recorded order."""
@@ -115,9 +115,9 @@ def _spdd(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float)
 def reprojection(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
     """Plain experience replay: remembered rows cost what new ones cost, the schedule included."""
     options = LossOptions()
-    return reprojection_loss(student.points, rows.target, clamp_px(options, progress), options)[
-        0
-    ].mean()
+    tau = clamp_px(options, progress)
+    cost, _ = reprojection_loss(student.points, rows.target, tau, options)
+    return cost.mean()
 
 
 def old_output(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
@@ -138,9 +138,8 @@ def bounded_by_teacher(
     The teacher is the model before the stage, where the original stores its outputs when a frame
     enters the buffer.
     """
-    options = LossOptions()
-    _, error = reprojection_loss(student.points, rows.target, REPLAY_CLAMP_PX, options)
-    _, bound = reprojection_loss(teacher.points, rows.target, REPLAY_CLAMP_PX, options)
+    _, error = steady_loss(student.points, rows.target)
+    _, bound = steady_loss(teacher.points, rows.target)
     drift = (student.points - teacher.points.detach()).abs().sum(-1)
     pulled = torch.where(error > bound, drift, torch.zeros_like(drift)).mean()
     truth = reprojection(student, teacher, rows, progress)
@@ -151,8 +150,8 @@ def steady_reprojection(
     student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float
 ) -> Tensor:
     """Reprojection with a fixed clamp, for rules that compare losses of different times."""
-    options = LossOptions()
-    return reprojection_loss(student.points, rows.target, REPLAY_CLAMP_PX, options)[0].mean()
+    cost, _ = steady_loss(student.points, rows.target)
+    return cost.mean()
 
 
 def stored_output(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:

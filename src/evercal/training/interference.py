@@ -7,10 +7,8 @@ from torch import Tensor
 
 from evercal.models.head import Head
 from evercal.training.buffer import FeatureBuffer, Rows
-from evercal.training.loss import LossOptions, reprojection_loss
+from evercal.training.loss import steady_loss
 
-CLAMP_PX = 5.0
-"""Fixed, so that losses before and after can be compared."""
 CANDIDATES = 48
 CHOSEN = 8
 ROWS = 64
@@ -45,7 +43,7 @@ def most_interfered(
     moved = copy.deepcopy(head)
     before = _losses(head, rows, len(drawn))
     points = moved(fresh.features.float(), fresh.scene, fresh.descriptor).points
-    cost, _ = reprojection_loss(points, fresh.target, CLAMP_PX, LossOptions())
+    cost, _ = steady_loss(points, fresh.target)
     parameters = list(moved.parameters())
     found = torch.autograd.grad(cost.mean(), parameters, materialize_grads=True)
     with torch.no_grad():
@@ -60,5 +58,5 @@ def most_interfered(
 def _losses(head: Head, rows: Rows, views: int) -> Tensor:
     """(views,) mean loss of each view's rows."""
     points = head(rows.features.float(), rows.scene, rows.descriptor).points
-    loss, _ = reprojection_loss(points, rows.target, CLAMP_PX, LossOptions())
+    loss, _ = steady_loss(points, rows.target)
     return loss.view(views, -1).mean(1)

@@ -10,6 +10,7 @@ from torch import Tensor
 MIN_DEPTH_M = 0.1
 MAX_DEPTH_M = 1000.0
 MAX_ERROR_PX = 1000.0
+STEADY_CLAMP_PX = 5.0
 # A wide lens' corner: beyond it a polynomial in the radius means nothing.
 MAX_RADIUS2 = 1.0
 
@@ -98,3 +99,11 @@ def reprojection_loss(
     loss = torch.where(valid, robust, proxy)
     pixels = torch.where(valid, residual.detach().norm(dim=-1), torch.inf)
     return loss, pixels
+
+
+def steady_loss(points: Tensor, target: Target) -> tuple[Tensor, Tensor]:
+    """`reprojection_loss` with a fixed clamp, so that losses of different times can be compared.
+
+    With the schedule of the training, the clamp would decide and not the points.
+    """
+    return reprojection_loss(points, target, STEADY_CLAMP_PX, LossOptions())
