@@ -172,7 +172,7 @@ class Runner:
 
     def _first(self, strategy: str, number: int, seed: int) -> Knowledge:
         """A scene learned by a fresh network, shared by all strategies that start the same way."""
-        scene, rule = self.lessons[number], RULES[strategy]
+        scene = self.lessons[number]
         # With centres known in advance the whole sequence matters.
         context = "+".join(self.names) if strategy in PAPER_BACKBONE else ""
         key = (context, scene.name, seed, len(scene.train))
@@ -189,7 +189,7 @@ class Runner:
             return plain_rows(buffer, scene.train, known, options)
 
         frames = Candidates(scene.train, known.heads[0], rows, seed)
-        known.memories = [keep(scene.train, frames, rule, options, SHORT_SIDE, refined)]
+        known.memories = [keep(known, scene.train, frames, options, refined)]
         known.notes = [{}]
         return known
 

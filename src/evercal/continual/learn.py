@@ -15,6 +15,7 @@ from evercal.continual.candidates import Candidates
 from evercal.continual.knowledge import Knowledge, SceneRecord, prototypes, refine
 from evercal.continual.memory import Memory, remember
 from evercal.continual.notes import Finished, Notes
+from evercal.continual.recall import remembered_depths
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.datasets.frame import Frame, Scene
 from evercal.errors import InputError
@@ -312,8 +313,7 @@ def _finish(
     camera = frames[0].camera
     record = SceneRecord(scene.name, camera, cell, descriptors, len(frames), refined)
     candidates = Candidates(frames, after.heads[-1], lambda: buffer, options.seed)
-    strategy = STRATEGIES[after.strategy]
-    memory = keep(frames, candidates, strategy, options, after.short_side, refined)
+    memory = keep(after, frames, candidates, options, refined)
     after.scenes.append(record)
     after.memories.append(memory)
     after.notes.append(note_of(after, buffer, options))
@@ -321,33 +321,36 @@ def _finish(
 
 
 def keep(
+    known: Knowledge,
     frames: Sequence[Frame],
     candidates: Candidates,
-    strategy: Strategy,
     options: StageOptions,
-    short_side: int,
     refined: Camera | None,
 ) -> Memory | None:
     """What a strategy remembers of a scene's training frames, at most N_b of them.
 
     Args:
+        known: whose strategy selects.
         frames: in recorded order.
         candidates: the same frames as selectors see them.
-        strategy: whose rule selects.
         options: size of the memory.
-        short_side: working size of images, pixels.
         refined: the camera as training corrected it; replay takes it as given.
     """
+    strategy, short_side = STRATEGIES[known.strategy], known.short_side
     if strategy.select is None:
         return None
     capacity = max(1, int(options.memory_share * len(frames) + 1e-9))
     if options.memory_bytes is not None:
         one = remember(frames[:1], short_side).bytes
         capacity = min(len(frames), max(1, options.memory_bytes // one))
-    kept = [frames[i] for i in strategy.select(candidates, capacity)]
+    chosen = strategy.select(candidates, capacity)
     if refined is not None:
-        kept = [replace(frame, camera=refined) for frame in kept]
-    return remember(kept, short_side)
+        frames = [replace(frame, camera=refined) for frame in frames]
+    memory = remember([frames[i] for i in chosen], short_side)
+    if strategy.recall:
+        depths = remembered_depths(known, chosen, frames, candidates)
+        memory = replace(memory, inverse_depth=depths)
+    return memory
 
 
 def note_of(known: Knowledge, buffer: FeatureBuffer, options: StageOptions) -> Notes:

@@ -30,11 +30,15 @@ class Memory:
     """Intrinsics at working size, one per image."""
     base_from_camera: SE3
     """(n,) poses in the scene's base frame."""
+    inverse_depth: tuple[Tensor, ...] = ()
+    """(cells,) half floats of each image, per metre along the optical axis; none where a strategy
+    does not recall."""
 
     @property
     def bytes(self) -> int:
-        """Size of `to_tensors`: images, their lengths, poses and intrinsics."""
-        return sum(map(len, self.images)) + len(self.images) * 8 * (1 + 14 + 1 + 7)
+        """Size of `to_tensors`: images, their lengths, poses, intrinsics and inverse depths."""
+        depths = sum(depth.nbytes + 8 for depth in self.inverse_depth)
+        return sum(map(len, self.images)) + len(self.images) * 8 * (1 + 14 + 1 + 7) + depths
 
     def frames(self) -> list[Frame]:
         """The remembered frames, decoded."""
@@ -54,7 +58,8 @@ class Memory:
         """As named tensors.
 
         `images` (bytes, joined), `lengths` (n,), `cameras` (n, 14), `distortion` (n,) number of
-        coefficients, `poses` (n, 7) quaternion wxyz and metres.
+        coefficients, `poses` (n, 7) quaternion wxyz and metres; with depths also `inverse_depth`
+        (joined) and `cells` (n,), how many of each image.
         """
         joined = np.frombuffer(b"".join(self.images), np.uint8).copy()
         cameras = np.zeros((len(self.images), 14))
@@ -64,7 +69,11 @@ class Memory:
         poses = np.concatenate(
             [self.base_from_camera.rotation_wxyz, self.base_from_camera.translation_m], -1
         )
-        return {
+        depths = {}
+        if self.inverse_depth:
+            depths["inverse_depth"] = torch.cat(self.inverse_depth)
+            depths["cells"] = torch.tensor([len(depth) for depth in self.inverse_depth])
+        return depths | {
             "images": torch.from_numpy(joined),
             "lengths": torch.tensor([len(image) for image in self.images]),
             "cameras": torch.from_numpy(cameras),
@@ -88,7 +97,10 @@ class Memory:
             fx, fy, cx, cy = rest[:4]
             cameras.append(Camera(int(width), int(height), fx, fy, cx, cy, distortion))
         poses = tensors["poses"].numpy()
-        return cls(images, tuple(cameras), SE3(poses[:, :4], poses[:, 4:]))
+        each: tuple[Tensor, ...] = ()
+        if "cells" in tensors:
+            each = tensors["inverse_depth"].split(tensors["cells"].tolist())
+        return cls(images, tuple(cameras), SE3(poses[:, :4], poses[:, 4:]), each)
 
 
 def remember(frames: Sequence[Frame], short_side: int) -> Memory:

@@ -64,6 +64,9 @@ class Strategy:
     """How gradients of remembered scenes join that of the new one; None adds them up."""
     interfered: bool = False
     """Whether those views are replayed that the new rows are about to spoil most."""
+    recall: bool = False
+    """Whether remembered frames also answer: cells of an image are matched to theirs, whose depths
+    are then part of the memory (`continual.recall`)."""
     note: Callable[[Finished], dict[str, Tensor]] | None = None
     """What is noted about a finished scene beside its frames."""
     restraint: Callable[[Head, Sequence[Notes]], Tensor] | None = None
@@ -208,7 +211,15 @@ def anchored_reprojection(
 
 STRATEGIES: dict[str, Strategy] = {
     "evercal": Strategy(
-        source="this project: scene codes, own centres, anchored replay, protection",
+        source="this project: scene codes, own centres, anchored replay, protection, recall",
+        select=_sars_filled,
+        penalty=anchored_reprojection,
+        penalty_per_scene=True,
+        protection=PROTECTION,
+        recall=True,
+    ),
+    "evercal_network": Strategy(
+        source="the same without recall: the network alone answers",
         select=_sars_filled,
         penalty=anchored_reprojection,
         penalty_per_scene=True,

@@ -221,7 +221,7 @@ class _Run:
 
         frames = Candidates(train, known.heads[0], rows, self.seed)
         refined = known.scenes[0].refined_camera
-        memory = keep(train, frames, self.rule, options, known.short_side, refined)
+        memory = keep(known, train, frames, options, refined)
         known.memories = [memory]
         known.notes = [note_of(known, rows(), options)] if self.rule.note else [{}]
         report = first.report()

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Lock
 from typing import Self
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from evercal.continual.knowledge import Knowledge
+from evercal.continual.recall import Expected, Recall
 from evercal.errors import InputError
 from evercal.geometry.camera import Camera
 from evercal.localization.estimate import PoseEstimate
@@ -44,11 +46,16 @@ class _Hypothesis:
     pose: PnpResult | None
     cells: int
     pixels: np.ndarray
+    """(m, 2): the cells once for every source of points."""
     points_m: np.ndarray
+    """(m, 3)."""
 
     @property
     def inliers(self) -> int:
-        return int(self.pose.inliers.sum()) if self.pose else 0
+        """Cells with a point that agrees, whatever its source."""
+        if self.pose is None:
+            return 0
+        return int(self.pose.inliers.reshape(-1, self.cells).any(0).sum())
 
 
 class Localizer:
@@ -63,6 +70,8 @@ class Localizer:
         self.known, self.options = known, options or LocalizeOptions()
         self._view = ViewOptions(short_side=known.short_side)
         self._prototypes = [record.prototypes.float() for record in known.scenes]
+        self._recalls: dict[int, Recall | None] = {}
+        self._lock = Lock()
         for head in known.heads:
             head.eval()
 
@@ -213,14 +222,37 @@ class Localizer:
         head, local = self.known.head_for(scene)
         with autocast():
             output = head(features, local, descriptor.expand(len(features), -1))
-        points = output.points.double().numpy()
+        points, cells = output.points, len(features)
         pixels = ideal_cell_pixels(camera, self.known.encoder.stride).astype(float)
+        recall = self._recall(scene)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        pose = solve_pnp(pixels, points, intrinsics, self.options.pnp)
+        own = points
+        if recall is not None:
+            points = torch.cat([own, recall.match(features)])
+            pixels = np.concatenate([pixels, pixels])
+        pose = solve_pnp(pixels, points.double().numpy(), intrinsics, self.options.pnp)
+        if recall is not None and pose is not None:
+            expected = Expected(
+                torch.from_numpy(pixels[:cells]).float(),
+                torch.from_numpy(intrinsics).float(),
+                torch.from_numpy(pose.world_from_camera.inverse().matrix()[:3]).float(),
+            )
+            points = torch.cat([own, recall.match(features, expected)])
+            pose = solve_pnp(pixels, points.double().numpy(), intrinsics, self.options.pnp)
+        points = points.double().numpy()
         if pose is not None and self._one_answer():
             found = self.known.atlas.scene_at(pose.world_from_camera.translation_m)
             scene = scene if found is None else found
-        return _Hypothesis(scene, camera, pose, len(pixels), pixels, points)
+        return _Hypothesis(scene, camera, pose, cells, pixels, points)
+
+    def _recall(self, scene: int) -> Recall | None:
+        """The remembered frames of a scene, encoded when they are first needed."""
+        with self._lock:
+            if scene not in self._recalls:
+                memory = self.known.memories[scene]
+                sweeps = memory is not None and memory.inverse_depth
+                self._recalls[scene] = Recall(self.known, scene) if sweeps else None
+            return self._recalls[scene]
 
     def _answer(self, best: _Hypothesis, began: float) -> PoseEstimate:
         def answer(status, reason, **found) -> PoseEstimate:
