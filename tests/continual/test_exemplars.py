@@ -8,6 +8,7 @@ from evercal.continual.exemplars import (
     select_coverage,
     select_gradients,
     select_herding,
+    select_hybrid,
     select_leverage,
     select_reservoir,
 )
@@ -23,6 +24,20 @@ def test_a_reservoir_keeps_every_frame_equally_often() -> None:
     share = np.bincount(kept, minlength=20) / runs
     # Five standard deviations of a share of 1/4.
     assert np.abs(share - 0.25).max() < 5 * np.sqrt(0.25 * 0.75 / runs)
+
+
+def test_hybrid_keeps_what_is_new_and_fills_up_with_the_rest() -> None:
+    # A camera that stands still but for three jumps: steps of 0, 20, 0, 0, 30, 0, 40, 0 degrees.
+    angles = np.deg2rad([0.0, 0, 20, 20, 20, 50, 50, 90, 90])
+    features = 3.0 * np.stack([np.cos(angles), np.sin(angles)], 1)
+    for seed in range(10):
+        assert select_hybrid(features, 4, rng(seed)).tolist() == [0, 2, 5, 7]
+        assert set(select_hybrid(features, 3, rng(seed))) < {0, 2, 5, 7}
+        assert {0, 2, 5, 7} < set(select_hybrid(features, 6, rng(seed)))
+        assert len(select_hybrid(features, 6, rng(seed))) == 6
+    # A plain reservoir has no such preference.
+    plain = [select_reservoir(9, 4, rng(seed)).tolist() for seed in range(20)]
+    assert [0, 2, 5, 7] not in plain
 
 
 def test_herding_by_hand() -> None:

@@ -298,7 +298,7 @@ def test_replay_keeps_an_old_scene(
     before, after = arc_known
     assert median_error_m(before, arcs[0]) < 0.1
     assert median_error_m(after, arcs[1]) < 0.15
-    control = replace(before, strategy="finetune")
+    control = replace(before, strategy="finetune", memories=[None])
     short = replace(arc_stage, fit=replace(arc_stage.fit, iterations=200))
     forgot = outcome(learn(control, arcs[1], short))
     kept = median_error_m(after, arcs[0])

@@ -30,7 +30,7 @@ def options(arc_stage: StageOptions) -> BenchOptions:
         fill = replace(arc_stage.fill, passes=1, seed=seed)
         return replace(arc_stage, fit=fit, fill=fill, replay_passes=1, seed=seed)
 
-    return BenchOptions(stage, ("evercal", "finetune", "joint"), seeds=(0,), short_side=120)
+    return BenchOptions(stage, ("er", "finetune", "joint"), seeds=(0,), short_side=120)
 
 
 def told(outcomes: list[Outcome]) -> list[Outcome]:
@@ -50,8 +50,8 @@ def done(
 def test_every_strategy_is_judged_after_every_stage(done: tuple[Path, list[bench.Step]]) -> None:
     out, steps = done
     assert [(s.strategy, s.done, s.total) for s in steps] == [
-        ("evercal", 1, 6),
-        ("evercal", 2, 6),
+        ("er", 1, 6),
+        ("er", 2, 6),
         ("finetune", 3, 6),
         ("finetune", 4, 6),
         ("joint", 5, 6),
@@ -59,7 +59,7 @@ def test_every_strategy_is_judged_after_every_stage(done: tuple[Path, list[bench
     ]
     found = [(o.strategy, o.stage, o.scene) for o in read(out)]
     rows = [(0, "one"), (1, "one"), (1, "two")]
-    expected = [(s, stage, scene) for s in ("evercal", "finetune") for stage, scene in rows]
+    expected = [(s, stage, scene) for s in ("er", "finetune") for stage, scene in rows]
     assert found == [*expected, ("joint", 1, "one"), ("joint", 1, "two")]
     assert {len(o.frames) for o in read(out)} == {24}
 
@@ -68,7 +68,7 @@ def test_strategies_start_from_the_same_first_stage(done: tuple[Path, list[bench
     out, _ = done
     ours, control = (
         next(o for o in read(out) if o.strategy == name and o.stage == 0)
-        for name in ("evercal", "finetune")
+        for name in ("er", "finetune")
     )
     assert ours.translation_m == control.translation_m
     assert ours.memory_bytes > control.memory_bytes == 0
@@ -99,20 +99,20 @@ def test_a_stop_between_stages_does_not_show(
     tmp_path: Path,
     stop: int,
 ) -> None:
-    alone = replace(options, strategies=("evercal",))
+    alone = replace(options, strategies=("er",))
     steps = run_bench(arcs, alone, tmp_path)
     for _ in range(stop):
         next(steps)
     steps.close()
     list(run_bench(arcs, alone, tmp_path))
-    expected = [o for o in read(done[0]) if o.strategy == "evercal"]
+    expected = [o for o in read(done[0]) if o.strategy == "er"]
     assert told(read(tmp_path)) == told(expected)
 
 
 def test_a_stop_inside_a_stage_resumes_it(
     arcs: Arcs, options: BenchOptions, done: tuple[Path, list[bench.Step]], tmp_path: Path
 ) -> None:
-    alone = replace(options, strategies=("evercal",))
+    alone = replace(options, strategies=("er",))
     # What a kill inside the first commit leaves behind.
     (tmp_path / "runs" / "evercal-0" / "stages" / ".0001-one").mkdir(parents=True)
 
@@ -123,13 +123,13 @@ def test_a_stop_inside_a_stage_resumes_it(
         list(run_bench(arcs, alone, tmp_path, stop))
     assert read(tmp_path) == []
     list(run_bench(arcs, alone, tmp_path))
-    expected = [o for o in read(done[0]) if o.strategy == "evercal"]
+    expected = [o for o in read(done[0]) if o.strategy == "er"]
     assert told(read(tmp_path)) == told(expected)
 
 
 def test_results_make_runs(done: tuple[Path, list[bench.Step]]) -> None:
     runs = runs_of(read(done[0]))
-    assert [run.strategy for run in runs] == ["evercal", "finetune", "joint"]
+    assert [run.strategy for run in runs] == ["er", "finetune", "joint"]
     assert {run.scenes for run in runs} == {("one", "two")}
 
 
@@ -137,7 +137,7 @@ def test_results_make_runs(done: tuple[Path, list[bench.Step]]) -> None:
     ("change", "message"),
     [
         ({"order": "reversed"}, "order 'given', now it is 'reversed'"),
-        ({"strategies": ("evercal", "magic")}, "strategy 'magic': unknown; choose from evercal"),
+        ({"strategies": ("er", "magic")}, "strategy 'magic': unknown; choose from evercal"),
         ({"settings": {"suite": "other"}}, "suite None, now it is 'other'"),
     ],
 )

@@ -16,6 +16,7 @@ from evercal.evaluation.comparison import (
     runs_of,
     scene_rows,
     summary,
+    threshold_rows,
 )
 from evercal.evaluation.outcomes import Outcome
 
@@ -80,17 +81,25 @@ def test_joint_training_has_a_last_row_and_nothing_to_forget() -> None:
     assert run.scores().final_accuracy == pytest.approx(90)
     assert math.isnan(run.scores().total_forgetting)
     _, row = method_rows([run])
-    assert row[:7] == ["joint", "1", "90.0", "0.0", "90.0", "-", "-"]
+    assert row[:8] == ["joint", "1", "90.0", "0.0", "-", "90.0", "-", "-"]
 
 
 def test_the_method_table_shows_means_and_spread() -> None:
     header, ours, theirs = method_rows(runs_of(OURS + THEIRS))
-    # Finals 65 and 70; last scene 60 and 50; forgetting 10 and 0; one of 20 frames is misplaced.
-    assert ours[:6] == ["ours", "2", "67.5 ± 3.5", "0.0", "55.0", "5.0"]
-    assert ours[8:] == ["5.0", "2.0", "2.0", "3.0", "21.0"]
+    # Finals 65 and 70; last scene 60 and 50; forgetting 10 and 0; one of 20 frames is misplaced;
+    # along the way (80 + 70 + 60) / 3 and (90 + 90 + 50) / 3.
+    assert ours[:7] == ["ours", "2", "67.5 ± 3.5", "0.0", "73.3", "55.0", "5.0"]
+    assert ours[9:] == ["5.0", "2.0", "2.0", "3.0", "21.0"]
     assert theirs[2] == "45.0"
     text = as_text([header, ours, theirs], "markdown")
-    assert [line.count("|") for line in text.splitlines()] == [14] * 4
+    assert [line.count("|") for line in text.splitlines()] == [15] * 4
+
+
+def test_bounds_are_strict() -> None:
+    header, ours = threshold_rows(runs_of(OURS))
+    assert header == ["strategy", "10 cm 10 deg", "5 cm 5 deg", "2 cm 2 deg", "1 cm 1 deg"]
+    # Errors are 2 cm or 30 cm.
+    assert ours == ["ours", "67.5", "67.5", "0.0", "0.0"]
 
 
 def test_the_scene_table_shows_learned_and_end() -> None:

@@ -149,6 +149,8 @@ def test_continual_scores_by_hand() -> None:
     assert found.forgetting == pytest.approx((20 + 15 - 6) / 3)
     assert found.backward_transfer == pytest.approx((-15 - 10 + 6) / 3)
     assert found.last_scene_accuracy == 40.0
+    total = 90 + 95 + 80 + 70 + 85 + 60 + 75 + 70 + 66 + 40
+    assert found.accuracy_along == pytest.approx(total / 10)
 
 
 def test_what_stands_above_the_diagonal_does_not_count() -> None:

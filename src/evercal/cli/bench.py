@@ -187,9 +187,15 @@ def _show(folder: Path, reference: str, as_json: bool) -> int:
 
 
 def _tables(runs: "list[Run]", reference: str, style: Literal["terminal", "markdown"]) -> str:
-    from evercal.evaluation.comparison import as_text, difference_rows, method_rows, scene_rows
+    from evercal.evaluation.comparison import (
+        as_text,
+        difference_rows,
+        method_rows,
+        scene_rows,
+        threshold_rows,
+    )
 
-    parts = [method_rows(runs), scene_rows(runs)]
+    parts = [method_rows(runs), threshold_rows(runs), scene_rows(runs)]
     if len({run.strategy for run in runs}) > 1:
         parts.append(difference_rows(runs, reference))
     return "\n\n".join(as_text(rows, style) for rows in parts)

@@ -21,6 +21,7 @@ from evercal.evaluation.comparison import (
     difference_rows,
     method_rows,
     scene_rows,
+    threshold_rows,
 )
 
 
@@ -45,7 +46,13 @@ def bench_page(runs: Sequence[Run], reference: str) -> str:
         for name, of in grouped.items()
     }
     sections = [
-        Section("Methods", [_table(method_rows(runs), "Means over runs; accuracy in per cent")]),
+        Section(
+            "Methods",
+            [
+                _table(method_rows(runs), "Means over runs; accuracy in per cent"),
+                _table(threshold_rows(runs), "At the end, under looser and tighter bounds"),
+            ],
+        ),
         Section(
             "Scenes",
             [

@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+ROUNDING = 1e-9
 GSS_COMPARED = 10
 """Remembered frames that gradient-based selection compares a new one with."""
 
@@ -33,6 +34,32 @@ def select_reservoir(count: int, capacity: int, rng: np.random.Generator) -> np.
         if place < capacity:
             kept[place] = frame
     return np.sort(np.array(kept, dtype=np.int64))
+
+
+def select_hybrid(features: np.ndarray, capacity: int, rng: np.random.Generator) -> np.ndarray:
+    """A reservoir of novel frames, after the hybrid replay of Bahadir et al. (MVA 2024).
+
+    A frame enters the stream of the reservoir only if it is novel: less alike to the last one that
+    did than the median of neighbouring frames is. What is known of the original is its abstract
+    (reservoir, and a test of new data for novelty); the measure is ours. Places that are left when
+    too few frames are novel are filled with a reservoir of the others.
+
+    Args:
+        features: (n, c) of the frames in recorded order; rows are scaled to unit length.
+        capacity: frames to keep.
+        rng: of the draws.
+    """
+    unit = _unit(features)
+    step = 1 - (unit[1:] * unit[:-1]).sum(1)
+    floor = float(np.median(step)) if len(step) else 0.0
+    novel: list[int] = []
+    for frame in range(len(unit)):
+        if not novel or 1 - float(unit[frame] @ unit[novel[-1]]) > floor + ROUNDING:
+            novel.append(frame)
+    kept = np.array(novel, dtype=np.int64)[select_reservoir(len(novel), capacity, rng)]
+    others = np.setdiff1d(np.arange(len(unit)), novel)
+    more = select_reservoir(len(others), capacity - len(kept), rng)
+    return np.sort(np.concatenate([kept, others[more]]))
 
 
 def select_herding(features: np.ndarray, capacity: int) -> np.ndarray:

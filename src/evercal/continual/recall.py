@@ -68,6 +68,14 @@ class Expected:
     camera_from_atlas: Tensor
     """(3, 4)."""
 
+    @classmethod
+    def from_pose(
+        cls, pixels: np.ndarray, intrinsics: np.ndarray, atlas_from_camera: SE3
+    ) -> "Expected":
+        """From a pose in the atlas, pixels (n, 2) and (4,) intrinsics."""
+        pose = atlas_from_camera.inverse().matrix()[:3]
+        return cls(*(torch.tensor(part).float() for part in (pixels, intrinsics, pose)))
+
     def near(self, points: Tensor) -> Tensor:
         """(n, m) bool: point (m, 3) projects to within `NEAR_PX` of a cell."""
         pose = self.camera_from_atlas
@@ -77,6 +85,18 @@ class Expected:
         close = (self.pixels[:, None, 0] - seen[:, 0]).abs() < NEAR_PX
         close &= (self.pixels[:, None, 1] - seen[:, 1]).abs() < NEAR_PX
         return close & (within[:, 2] > 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Likeness:
+    """An image beside the remembered frames that show most of it."""
+
+    features: Tensor
+    """(n, channels) of its cells."""
+    among: Tensor
+    """(m,) which of the remembered cells were looked at."""
+    value: Tensor
+    """(n, m) cosine."""
 
 
 class Recall:
@@ -110,26 +130,32 @@ class Recall:
         self._points = self._points_at(torch.arange(len(self._pixels)), self._pixels)
 
     @torch.inference_mode()
-    def match(self, features: Tensor, expected: "Expected | None" = None) -> Tensor:
-        """Points (n, 3) in the atlas of the remembered cells that (n, channels) features resemble.
+    def look(self, features: Tensor) -> Likeness:
+        """How alike (n, channels) features of an image are to what is remembered."""
+        among = self._candidates(features)
+        value = (features.to(self._keys.dtype) @ self._keys[among].T).float()
+        return Likeness(features, among, value)
+
+    @torch.inference_mode()
+    def points(self, found: Likeness, expected: Expected | None = None) -> Tensor:
+        """Points (n, 3) in the atlas of the remembered cells that an image's cells resemble most.
 
         To a fraction of a cell: a parabola through the likeness of its neighbours tells where in
         the remembered frame the surface lies that the query's cell is centred on.
 
         Args:
-            features: of the query's cells.
+            found: what `look` said.
             expected: where a cell shows what, roughly; remembered cells that a pose puts elsewhere
                 are then out of question.
         """
-        among = self._candidates(features)
-        likeness = (features.to(self._keys.dtype) @ self._keys[among].T).float()
+        value = found.value
         if expected is not None:
-            likeness = likeness.masked_fill(~expected.near(self._points[among]), -2.0)
-        best = among[likeness.argmax(1)]
+            value = value.masked_fill(~expected.near(self._points[found.among]), -2.0)
+        best = found.among[value.argmax(1)]
         ways = self._ways[best]
         around = torch.cat([best[:, None], best[:, None] + ways], 1)
-        value = (features[:, None] * self._keys[around].float()).sum(-1)
-        middle, left, right, up, down = value.unbind(1)
+        likeness = (found.features[:, None] * self._keys[around].float()).sum(-1)
+        middle, left, right, up, down = likeness.unbind(1)
         du = parabola(left, middle, right) * ((ways[:, 0] != 0) & (ways[:, 1] != 0))
         dv = parabola(up, middle, down) * ((ways[:, 2] != 0) & (ways[:, 3] != 0))
         return self._points_at(best, self._pixels[best] + self._stride * torch.stack([du, dv], 1))

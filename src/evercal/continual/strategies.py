@@ -13,6 +13,7 @@ from evercal.continual.exemplars import (
     select_coverage,
     select_gradients,
     select_herding,
+    select_hybrid,
     select_leverage,
     select_reservoir,
 )
@@ -93,6 +94,10 @@ def _sars_filled(frames: Candidates, capacity: int) -> np.ndarray:
 
 def _reservoir(frames: Candidates, capacity: int) -> np.ndarray:
     return select_reservoir(len(frames), capacity, frames.rng())
+
+
+def _hybrid(frames: Candidates, capacity: int) -> np.ndarray:
+    return select_hybrid(frames.features(), capacity, frames.rng())
 
 
 def _herding(frames: Candidates, capacity: int) -> np.ndarray:
@@ -218,6 +223,7 @@ STRATEGIES: dict[str, Strategy] = {
         protection=PROTECTION,
         recall=True,
     ),
+    "finetune": Strategy(source="control: the head and steps of evercal, no replay"),
     "evercal_network": Strategy(
         source="the same without recall: the network alone answers",
         select=_sars_filled,
@@ -225,10 +231,14 @@ STRATEGIES: dict[str, Strategy] = {
         penalty_per_scene=True,
         protection=PROTECTION,
     ),
-    "finetune": Strategy(source="control: the head and steps of evercal, no replay"),
     "er": Strategy(
         source="experience replay from a reservoir (Vitter, 1985): random frames, true poses",
         select=_reservoir,
+        penalty=reprojection,
+    ),
+    "hybrid": Strategy(
+        source="Bahadir et al., continual hand-eye calibration, Mach. Vis. Appl. 2024 (abstract)",
+        select=_hybrid,
         penalty=reprojection,
     ),
     "icarl": Strategy(

@@ -209,7 +209,7 @@ class _Run:
         began = time.perf_counter()
         known = first.known.fork()
         known.strategy = self.strategy
-        train, _ = hold_out(scene.train)
+        train, aside = hold_out(scene.train)
         options = self.options.stage(self.seed)
 
         self._cached(known)
@@ -224,6 +224,8 @@ class _Run:
         memory = keep(known, train, frames, options, refined)
         known.memories = [memory]
         known.notes = [note_of(known, rows(), options)] if self.rule.note else [{}]
+        if self.rule.recall:  # more cells agree, so more must
+            known.scenes[0] = with_fit(known.scenes[0], *fit_threshold(known, aside))
         report = first.report()
         report["seconds"] = float(report["seconds"]) + time.perf_counter() - began
         report["frames_kept"] = len(memory.images) if memory else 0

@@ -13,6 +13,8 @@ from evercal.evaluation.statistics import Interval, paired_difference
 from evercal.evaluation.tables import Style, table
 
 BLOCK = 10
+BOUNDS = ((0.10, np.deg2rad(10)), COARSE, (0.02, np.deg2rad(2)), FINE)
+"""Metres and radians under which accuracy is asked."""
 
 Rows = list[list[str]]
 """A table's cells, its header first."""
@@ -57,7 +59,7 @@ class Run:
         matrix = self.matrix(thresholds)
         if not np.isfinite(matrix[np.tril_indices(len(matrix))]).all():
             final, newest = float(matrix[-1].mean()), float(matrix[-1, -1])
-            return ContinualScores(final, math.nan, math.nan, math.nan, newest)
+            return ContinualScores(final, math.nan, math.nan, math.nan, newest, math.nan)
         return continual_scores(matrix)
 
 
@@ -95,6 +97,16 @@ def method_rows(runs: Sequence[Run]) -> Rows:
         spread = f" ± {np.std(first, ddof=1):.1f}" if len(of) > 1 else ""
         cells = [_mean([value(run) for run in of]) for _, value in _COLUMNS]
         rows.append([name, str(len(of)), cells[0] + spread, *cells[1:]])
+    return rows
+
+
+def threshold_rows(runs: Sequence[Run]) -> Rows:
+    """One row per strategy: final accuracy in per cent under looser and tighter bounds."""
+    rows = [["strategy", *(f"{100 * m:.0f} cm {np.rad2deg(r):.0f} deg" for m, r in BOUNDS)]]
+    for name, of in by_strategy(runs).items():
+        rows.append(
+            [name, *(_mean([run.scores(bound).final_accuracy for run in of]) for bound in BOUNDS)]
+        )
     return rows
 
 
@@ -192,6 +204,7 @@ def _seconds(run: Run) -> float:
 _COLUMNS: tuple[tuple[str, Callable[[Run], float]], ...] = (
     ("final %", lambda run: run.scores().final_accuracy),
     ("1 cm 1 deg %", lambda run: run.scores(FINE).final_accuracy),
+    ("ACC", lambda run: run.scores().accuracy_along),
     ("last scene %", lambda run: run.scores().last_scene_accuracy),
     ("TFR", lambda run: run.scores().total_forgetting),
     ("forgetting", lambda run: run.scores().forgetting),

@@ -113,6 +113,8 @@ class ContinualScores:
     """Mean change from just after learning a scene to the end (Lopez-Paz and Ranzato 2017)."""
     last_scene_accuracy: float
     """Accuracy on the scene learned last: can it still learn?"""
+    accuracy_along: float
+    """ACC: mean over all stages and the scenes known at each (Diaz-Rodriguez et al. 2018)."""
 
     def to_dict(self) -> dict[str, object]:
         """Plain values for JSON; None where one scene alone leaves nothing to forget."""
@@ -209,8 +211,9 @@ def continual_scores(accuracies: ArrayLike) -> ContinualScores:
         raise ValueError("accuracies on and below the diagonal are finite, got inf or nan")
     last = matrix[-1]
     final, newest = float(last.mean()), float(last[-1])
+    along = float(matrix[np.tril_indices(count)].mean())
     if count == 1:
-        return ContinualScores(final, math.nan, math.nan, math.nan, newest)
+        return ContinualScores(final, math.nan, math.nan, math.nan, newest, along)
     old = range(count - 1)
     best = np.array([matrix[j:, j].max() for j in old])
     best_before = np.array([matrix[j:-1, j].max() for j in old])
@@ -220,6 +223,7 @@ def continual_scores(accuracies: ArrayLike) -> ContinualScores:
         forgetting=float((best_before - last[:-1]).mean()),
         backward_transfer=float((last - np.diag(matrix))[:-1].mean()),
         last_scene_accuracy=newest,
+        accuracy_along=along,
     )
 
 

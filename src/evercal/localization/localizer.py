@@ -35,6 +35,8 @@ class LocalizeOptions:
     """Scenes whose best prototype is less similar than the best scene's by more are not tried."""
     pnp: PnpOptions = field(default_factory=PnpOptions)
     """RANSAC settings."""
+    refine: PnpOptions = field(default_factory=lambda: PnpOptions(threshold_px=3.0))
+    """The same once a first pose told where to look among remembered frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,28 +224,31 @@ class Localizer:
         head, local = self.known.head_for(scene)
         with autocast():
             output = head(features, local, descriptor.expand(len(features), -1))
-        points, cells = output.points, len(features)
         pixels = ideal_cell_pixels(camera, self.known.encoder.stride).astype(float)
-        recall = self._recall(scene)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        own = points
-        if recall is not None:
-            points = torch.cat([own, recall.match(features)])
-            pixels = np.concatenate([pixels, pixels])
-        pose = solve_pnp(pixels, points.double().numpy(), intrinsics, self.options.pnp)
-        if recall is not None and pose is not None:
-            expected = Expected(
-                torch.from_numpy(pixels[:cells]).float(),
-                torch.from_numpy(intrinsics).float(),
-                torch.from_numpy(pose.world_from_camera.inverse().matrix()[:3]).float(),
-            )
-            points = torch.cat([own, recall.match(features, expected)])
-            pose = solve_pnp(pixels, points.double().numpy(), intrinsics, self.options.pnp)
-        points = points.double().numpy()
+        cells, own = len(features), output.points
+
+        def solve(points: Tensor, options: PnpOptions) -> PnpResult | None:
+            every = np.tile(pixels, (len(points) // cells, 1))
+            return solve_pnp(every, points.double().numpy(), intrinsics, options)
+
+        recall = self._recall(scene)
+        if recall is None:
+            points = own
+            pose = solve(points, self.options.pnp)
+        else:
+            found = recall.look(features)
+            points = torch.cat([own, recall.points(found)])
+            pose = solve(points, self.options.pnp)
+            if pose is not None:
+                expected = Expected.from_pose(pixels, intrinsics, pose.world_from_camera)
+                points = torch.cat([own, recall.points(found, expected)])
+                pose = solve(points, self.options.refine)
         if pose is not None and self._one_answer():
-            found = self.known.atlas.scene_at(pose.world_from_camera.translation_m)
-            scene = scene if found is None else found
-        return _Hypothesis(scene, camera, pose, cells, pixels, points)
+            other = self.known.atlas.scene_at(pose.world_from_camera.translation_m)
+            scene = scene if other is None else other
+        every = np.tile(pixels, (len(points) // cells, 1))
+        return _Hypothesis(scene, camera, pose, cells, every, points.double().numpy())
 
     def _recall(self, scene: int) -> Recall | None:
         """The remembered frames of a scene, encoded when they are first needed."""

@@ -1,0 +1,110 @@
+"""Remembered frames of a box room answer for a view beside them; the room's surfaces are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load, save
+
+from evercal.continual.atlas import Cell
+from evercal.continual.knowledge import Knowledge, SceneRecord
+from evercal.continual.memory import Memory, remember
+from evercal.continual.recall import FRAMES, Expected, Recall
+from evercal.datasets.frame import Frame
+from evercal.geometry.se3 import SE3
+from evercal.models.descriptor import load_descriptor
+from evercal.models.encoder import load_encoder
+from evercal.simulation.box_room import BoxRoom, default_camera
+from evercal.training.buffer import encode
+from evercal.training.views import ViewOptions, frame_view, ideal_cell_pixels
+
+CAMERA = default_camera(320, 240)
+CELL = Cell((7.0, -3.0, 2.0), 10.0, (0.5, 0.25, 1.0))
+
+
+@pytest.fixture(scope="module")
+def room() -> BoxRoom:
+    return BoxRoom(31, texture_px=256)
+
+
+def surface(room: BoxRoom, pose: SE3) -> np.ndarray:
+    """(cells, 3) what a view's cells show, base frame."""
+    pixels = ideal_cell_pixels(CAMERA, 8).astype(float)
+    rays = CAMERA.unproject(pixels) @ pose.rotation_matrix().T
+    return room.intersect(pose.translation_m, rays)[0]
+
+
+def frame(room: BoxRoom, pose: SE3, name: str = "query") -> Frame:
+    return Frame(name, room.render(CAMERA, pose), CAMERA, pose)
+
+
+@pytest.fixture(scope="module")
+def known(room: BoxRoom) -> Knowledge:
+    """Every sixth frame of a walk, with true depths."""
+    walk = room.path(72, 3)
+    poses = [walk[i] for i in range(0, 72, 6)]
+    memory = remember([frame(room, pose, str(i)) for i, pose in enumerate(poses)], 240)
+    depths = [
+        torch.from_numpy(1 / pose.inverse().apply(surface(room, pose))[:, 2]).half()
+        for pose in poses
+    ]
+    memory = replace(memory, inverse_depth=tuple(depths))
+    record = SceneRecord("box", CAMERA, CELL, torch.zeros(1, 128).half(), 72)
+    encoder, descriptor = load_encoder(), load_descriptor()
+    return Knowledge(encoder, descriptor, "evercal", 240, [], [record], [memory], [{}])
+
+
+def seen(known: Knowledge, query: Frame) -> torch.Tensor:
+    features, _ = encode([frame_view(query, 8, ViewOptions())], known.encoder, known.descriptor)
+    return features[0].flatten(1).T
+
+
+def errors_px(points: torch.Tensor, pose: SE3) -> np.ndarray:
+    """How far from their cells points in the atlas project at the true pose."""
+    inside = (CELL.atlas_from_base @ pose).inverse().apply(points.double().numpy())
+    inside[inside[:, 2] < 0.05] = [0, 0, 0.05]
+    return np.linalg.norm(CAMERA.project(inside) - ideal_cell_pixels(CAMERA, 8), axis=1)
+
+
+def test_points_lie_where_the_query_sees_them(room: BoxRoom, known: Knowledge) -> None:
+    recall = Recall(known, 0)
+    pose = room.path(72, 3)[21]  # half-way between two remembered frames
+    found = recall.look(seen(known, frame(room, pose)))
+    alone = errors_px(recall.points(found), pose)
+    assert np.mean(alone < 5) > 0.4
+    pixels = ideal_cell_pixels(CAMERA, 8)
+    camera = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])
+    atlas_from_camera = CELL.atlas_from_base @ pose
+    expected = Expected.from_pose(pixels, camera, atlas_from_camera)
+    guided = errors_px(recall.points(found, expected), pose)
+    assert np.mean(guided < 5) > np.mean(alone < 5) + 0.02
+    # Whole cells would be 3 pixels off in the median.
+    assert np.median(guided[guided < 10]) < 2.2
+    wrong = SE3.exp(np.array([0.0, 0, 0, 0, 0.5, 0]))
+    misled = Expected.from_pose(pixels, camera, atlas_from_camera @ wrong)
+    assert np.mean(errors_px(recall.points(found, misled), pose) < 5) < 0.05
+
+
+def test_only_frames_that_show_the_same_are_looked_at(room: BoxRoom, known: Knowledge) -> None:
+    memory = known.memories[0]
+    assert memory is not None
+    assert len(memory.images) > FRAMES
+    found = Recall(known, 0).look(seen(known, memory.frames()[5]))
+    assert len(found.among) == FRAMES * 1200
+    assert set(range(5 * 1200, 6 * 1200)) <= set(found.among.tolist())
+    assert float(found.value.max(1).values.median()) > 0.99
+
+
+def test_depths_come_back_from_a_file_and_count(known: Knowledge) -> None:
+    memory = known.memories[0]
+    assert memory is not None
+    tensors = memory.to_tensors()
+    assert memory.bytes == sum(tensor.nbytes for tensor in tensors.values())
+    plain = replace(memory, inverse_depth=())
+    assert memory.bytes == plain.bytes + len(memory.images) * (2 * 1200 + 8)
+    back = Memory.from_tensors(load(save(tensors)))
+    assert len(back.inverse_depth) == len(memory.images)
+    for a, b in zip(back.inverse_depth, memory.inverse_depth, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+    assert Memory.from_tensors(load(save(plain.to_tensors()))).inverse_depth == ()
