@@ -44,7 +44,7 @@ def test_bench_and_its_report(
     assert report.code == 0
     assert "| evercal " in (tmp_path / "out" / "tables.md").read_text()
     page = (tmp_path / "out" / "report.html").read_text()
-    assert page.count("<img ") == 4
+    assert page.count("<img ") == 6
     assert "evercal - finetune" in page
     assert r"\multicolumn{3}{c}{finetune}" in (tmp_path / "out" / "table.tex").read_text()
 

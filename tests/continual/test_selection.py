@@ -15,6 +15,7 @@ from evercal.continual.selection import (
     select_random,
     select_sars,
     select_uniform,
+    smallest_pair,
 )
 
 
@@ -278,3 +279,14 @@ def test_options_are_checked():
         SarsOptions(radius=-0.1)
     with pytest.raises(ValueError, match="rotation_weight"):
         SarsOptions(rotation_weight=math.nan)
+
+
+def test_the_smallest_pair_by_hand():
+    # A metre along x is the longest side; the second pair is 0.25 apart and turned by 0.1 rad.
+    positions = np.array([[0.0, 0, 0], [0.25, 0, 0], [1.0, 0, 0]])
+    turned = [math.cos(0.05), 0, 0, math.sin(0.05)]
+    quaternions = np.array([[1.0, 0, 0, 0], turned, [-1.0, 0, 0, 0]])
+    kept = np.array([0, 1, 2])
+    assert smallest_pair(positions, quaternions, kept) == pytest.approx(0.35)
+    assert smallest_pair(positions, quaternions, kept[[0, 2]]) == pytest.approx(1.0)
+    assert smallest_pair(positions, quaternions, kept[:1]) == math.inf

@@ -14,6 +14,7 @@ from evercal.drawing import (
     charts,
     error_curve,
     forgetting_curves,
+    kept_places,
     scene_bars,
     trajectory,
 )
@@ -77,6 +78,19 @@ def test_a_point_for_every_method(figures: list[Figure]) -> None:
     points = [tuple(np.array(line.get_xydata())[0]) for line in axes.lines]
     assert points == [(3.2, 80.0), (40.0, 85.0)]
     assert axes.get_xlabel() == "memory (MB)"
+
+
+def test_every_kept_place_is_a_point_of_its_panel(figures: list[Figure]) -> None:
+    rng = np.random.default_rng(0)
+    places = {"ours": rng.normal(size=(9, 3)), "all": rng.normal(size=(4, 3)) + 5}
+    assert is_picture(kept_places(places))
+    assert [axes.get_title() for axes in figures[0].axes] == ["ours (9)", "all (4)"]
+    first, second = figures[0].axes
+    assert first.get_xlim() == second.get_xlim()  # places can be compared between panels
+    with pytest.raises(ValueError, match="one method or more"):
+        kept_places({})
+    with pytest.raises(ValueError, match=r"\(3, 2\)"):
+        kept_places({"flat": np.zeros((3, 2))})
 
 
 def test_the_error_curve_counts_frames_without_a_pose_as_never(figures: list[Figure]) -> None:

@@ -72,7 +72,9 @@ def test_strategies_start_from_the_same_first_stage(done: tuple[Path, list[bench
     )
     assert ours.translation_m == control.translation_m
     assert ours.memory_bytes > control.memory_bytes == 0
-    assert ours.frames_kept == 2
+    assert ours.frames_kept == len(ours.kept_m) == 2
+    assert 0 < ours.closest <= 2 * ours.covering
+    assert control.kept_m == ()
     # Stores of finished runs are gone, the first scene and the features stay for other strategies.
     assert [path.name for path in (out / "runs").iterdir()] == ["first-one-0"]
 

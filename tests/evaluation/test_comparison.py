@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from evercal.evaluation.comparison import (
     method_rows,
     runs_of,
     scene_rows,
+    selector_rows,
     summary,
     threshold_rows,
 )
@@ -100,6 +102,14 @@ def test_bounds_are_strict() -> None:
     assert header == ["strategy", "10 cm 10 deg", "5 cm 5 deg", "2 cm 2 deg", "1 cm 1 deg"]
     # Errors are 2 cm or 30 cm.
     assert ours == ["ours", "67.5", "67.5", "0.0", "0.0"]
+
+
+def test_selectors_are_told_by_how_their_frames_lie() -> None:
+    kept = {"kept_m": ((0.0, 0, 0), (1.0, 0, 0)), "covering": 0.6, "closest": 0.25}
+    tell = [replace(o, **kept) if o.stage == "ba".index(o.scene) else o for o in OURS]
+    header, ours = selector_rows(runs_of(tell + THEIRS))
+    assert header == ["strategy", "frames kept", "covering radius", "smallest pair"]
+    assert ours == ["ours", "2.0", "0.60", "0.25"]
 
 
 def test_the_scene_table_shows_learned_and_end() -> None:

@@ -1,5 +1,6 @@
 """Lines of results: nothing is lost on the way, and a kill costs at most the last one."""
 
+import json
 import math
 from pathlib import Path
 
@@ -35,6 +36,22 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     append(tmp_path, [first])
     append(tmp_path, [second, outcome(1, "a")])
     assert read(tmp_path) == [first, second, outcome(1, "a")]
+
+
+def test_what_was_kept_is_told_where_it_is_known(tmp_path: Path) -> None:
+    told = outcome(kept_m=((0.5, 1.0, -2.0), (1.5, 0.0, 0.25)), covering=0.75, closest=math.inf)
+    append(tmp_path, [told, outcome(1)])
+    first, second = read(tmp_path)
+    assert first == outcome(kept_m=told.kept_m, covering=0.75)  # one frame has no pair
+    assert math.isnan(first.closest)
+    assert math.isnan(second.covering)
+    # Lines of before these fields.
+    path = tmp_path / RESULTS
+    record = json.loads(path.read_text().splitlines()[1])
+    for name in ("kept_m", "covering", "closest"):
+        del record[name]
+    path.write_text(json.dumps(record) + "\n")
+    assert read(tmp_path) == [outcome(1)]
 
 
 @pytest.mark.parametrize("cut", [1, 40])

@@ -192,13 +192,15 @@ def _tables(runs: "list[Run]", reference: str, style: Literal["terminal", "markd
         difference_rows,
         method_rows,
         scene_rows,
+        selector_rows,
         threshold_rows,
     )
 
     parts = [method_rows(runs), threshold_rows(runs), scene_rows(runs)]
     if len({run.strategy for run in runs}) > 1:
         parts.append(difference_rows(runs, reference))
-    return "\n\n".join(as_text(rows, style) for rows in parts)
+    parts.append(selector_rows(runs))
+    return "\n\n".join(as_text(rows, style) for rows in parts if len(rows) > 1)
 
 
 def _words(text: str) -> tuple[str, ...]:

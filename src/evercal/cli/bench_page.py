@@ -12,6 +12,7 @@ from evercal.drawing import (
     error_curve,
     forgetting_curves,
     html_page,
+    kept_places,
     scene_bars,
 )
 from evercal.evaluation.comparison import (
@@ -21,6 +22,7 @@ from evercal.evaluation.comparison import (
     difference_rows,
     method_rows,
     scene_rows,
+    selector_rows,
     threshold_rows,
 )
 
@@ -72,6 +74,20 @@ def bench_page(runs: Sequence[Run], reference: str) -> str:
                 [Picture(forgetting_curves(curves, order), "What became of each scene")],
             )
         )
+    kept = _kept(runs)
+    if kept:
+        sections.append(
+            Section(
+                "What stays",
+                [
+                    _table(selector_rows(runs), "In the metric of SARS: scene sides and radians"),
+                    *(
+                        Picture(kept_places(of), f"Remembered cameras of {scene}")
+                        for scene, of in kept.items()
+                    ),
+                ],
+            )
+        )
     if len(grouped) > 1:
         said = "Paired bootstrap over runs and blocks of 10 frames; real where 0 lies outside."
         sections.append(Section("Differences", [_table(difference_rows(runs, reference), said)]))
@@ -100,6 +116,16 @@ def _curves(runs: Sequence[Run]) -> dict[str, np.ndarray]:
         matrix = np.mean([run.matrix() for run in of], axis=0)
         if np.isfinite(matrix[np.tril_indices(len(matrix))]).all():
             found[name] = matrix
+    return found
+
+
+def _kept(runs: Sequence[Run]) -> dict[str, dict[str, np.ndarray]]:
+    """For each scene the remembered camera positions of each strategy's first run."""
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for name, of in by_strategy(runs).items():
+        for outcome in of[0].outcomes.values():
+            if outcome.kept_m:
+                found.setdefault(outcome.scene, {})[name] = np.array(outcome.kept_m)
     return found
 
 

@@ -345,3 +345,16 @@ def covering_radius(
     for frame in np.asarray(kept, dtype=np.int64):
         np.minimum(gap, space.distances(int(frame)), out=gap)
     return float(gap.max(initial=0.0))
+
+
+def smallest_pair(
+    positions_m: np.ndarray,
+    quaternions_wxyz: np.ndarray,
+    kept: np.ndarray,
+    rotation_weight: float = 1.0,
+) -> float:
+    """Return the smallest distance D between two kept frames; infinite for fewer than two."""
+    space = PoseSpace.of(positions_m, quaternions_wxyz, rotation_weight)
+    chosen = np.asarray(kept, dtype=np.int64)
+    near = [space.distances(int(a))[chosen[i + 1 :]].min() for i, a in enumerate(chosen[:-1])]
+    return float(min(near, default=np.inf))

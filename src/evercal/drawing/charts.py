@@ -205,6 +205,35 @@ def trajectory(
     return _png(figure)
 
 
+def kept_places(methods: Mapping[str, ArrayLike]) -> bytes:
+    """Where the cameras of remembered frames stood, one panel per method, seen obliquely.
+
+    Args:
+        methods: Per method (n, 3) metres, n >= 1.
+
+    Raises:
+        ValueError: No method, or positions that are not (n, 3).
+    """
+    places = {name: np.asarray(where, dtype=np.float64) for name, where in methods.items()}
+    wrong = [where.shape for where in places.values() if where.ndim != 2 or where.shape[1] != 3]
+    if wrong or not places:
+        raise ValueError(f"positions are (n, 3) for one method or more, got {wrong or 'none'}")
+    every = np.concatenate(list(places.values()))
+    middle, reach = (every.max(0) + every.min(0)) / 2, max(float(np.ptp(every, axis=0).max()), 0.1)
+    columns = min(4, len(places))
+    rows = -(-len(places) // columns)
+    figure = _figure(2.4 * columns, 2.3 * rows)
+    for index, (name, where) in enumerate(places.items()):
+        panel = figure.add_subplot(rows, columns, index + 1, projection="3d")
+        panel.scatter(*where.T, s=12, color=_COLOURS[0])  # pyright: ignore[reportArgumentType]
+        for axis, centre in zip("xyz", middle, strict=True):
+            getattr(panel, f"set_{axis}lim")(centre - reach / 2, centre + reach / 2)
+            getattr(panel, f"set_{axis}label")(f"{axis} (m)", fontsize=7, labelpad=-8)
+        panel.tick_params(labelsize=6, pad=-3)
+        panel.set_title(f"{name} ({len(where)})", fontsize=9)
+    return _png(figure)
+
+
 def _without_leaps(path: NDArray[np.float64]) -> NDArray[np.float64]:
     """A path (n, 2) with gaps where one recording ends and the next begins somewhere else."""
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)

@@ -24,12 +24,14 @@ from evercal.continual.candidates import Candidates
 from evercal.continual.knowledge import Knowledge
 from evercal.continual.learn import Stage, StageOptions, keep, learn, note_of, plain_rows
 from evercal.continual.robot import Robot, head_bytes, with_fit
+from evercal.continual.selection import covering_radius, smallest_pair
 from evercal.continual.strategies import STRATEGIES
 from evercal.datasets import Scene
 from evercal.errors import InputError
 from evercal.evaluation import outcomes
 from evercal.evaluation.outcomes import Outcome, outcome_of
 from evercal.evaluation.protocol import evaluate
+from evercal.geometry.se3 import SE3
 from evercal.localization.localizer import Localizer
 from evercal.localization.teach import (
     LearnOptions,
@@ -276,6 +278,23 @@ class _Run:
                 memory_bytes=known.memory_bytes,
                 head_bytes=size,
                 frames_kept=kept,
+                **(self._spread(known, number) if name == self.scenes[number].name else {}),
             )
             for name in learned
         )
+
+    def _spread(self, known: Knowledge, number: int) -> dict[str, object]:
+        """How the frames kept of a stage's scene lie among those learned."""
+        memory = known.memories[number]
+        if memory is None or not memory.images:
+            return {}
+        train, _ = hold_out(self.scenes[number].train)
+        poses = SE3.stack([f.base_from_camera for f in train if f.base_from_camera is not None])
+        stood = memory.base_from_camera.translation_m
+        gaps = np.linalg.norm(poses.translation_m[:, None] - stood[None], axis=-1)
+        places = poses.translation_m, poses.rotation_wxyz, gaps.argmin(0)
+        return {
+            "kept_m": tuple(tuple(round(float(v), 4) for v in row) for row in stood),
+            "covering": covering_radius(*places),
+            "closest": smallest_pair(*places),
+        }

@@ -110,6 +110,18 @@ def threshold_rows(runs: Sequence[Run]) -> Rows:
     return rows
 
 
+def selector_rows(runs: Sequence[Run]) -> Rows:
+    """One row per strategy that keeps frames: how they lie among those learned, mean of scenes."""
+    rows = [["strategy", "frames kept", "covering radius", "smallest pair"]]
+    for name, of in by_strategy(runs).items():
+        told = [o for run in of for o in run.outcomes.values() if o.kept_m]
+        if told:
+            cells = [np.mean([getattr(o, key) for o in told]) for key in ("covering", "closest")]
+            frames = f"{np.mean([o.frames_kept for o in told]):.1f}"
+            rows.append([name, frames, *(f"{value:.2f}" for value in cells)])
+    return rows
+
+
 def scene_rows(runs: Sequence[Run]) -> Rows:
     """One row per strategy, a column per scene: accuracy when learned and at the end."""
     names = sorted(runs[0].scenes)

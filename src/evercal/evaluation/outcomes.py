@@ -16,6 +16,8 @@ from evercal.errors import InputError
 from evercal.evaluation.metrics import COARSE, FrameResult
 
 RESULTS = "results.jsonl"
+_LATER = {"kept_m", "covering", "closest"}
+"""Fields that older results lack."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,12 @@ class Outcome:
     """All heads as stored."""
     frames_kept: int
     """Remembered frames of the stage's scene."""
+    kept_m: tuple[tuple[float, float, float], ...] = ()
+    """Where the cameras of these stood, base frame; told once, when the scene was learned."""
+    covering: float = math.nan
+    """Largest distance, in the metric of SARS, from a training frame to one that was kept."""
+    closest: float = math.nan
+    """Smallest such distance between two that were kept."""
 
     def correct(self, thresholds: tuple[float, float] = COARSE) -> np.ndarray:
         """(frames,) bool: both errors strictly below (metres, radians)."""
@@ -104,13 +112,20 @@ def _plain(outcome: Outcome) -> dict[str, object]:
     record = asdict(outcome)
     for name in ("translation_m", "rotation_rad"):
         record[name] = [round(v, 6) if math.isfinite(v) else None for v in record[name]]
+    for name in ("covering", "closest"):
+        record[name] = record[name] if math.isfinite(record[name]) else None
     return record
 
 
 def _outcome(record: object) -> Outcome:
-    if not isinstance(record, dict) or record.keys() != {field.name for field in fields(Outcome)}:
+    names = {field.name for field in fields(Outcome)}
+    if not isinstance(record, dict) or not names - _LATER <= record.keys() <= names:
         raise KeyError("other fields")
     for name, value in record.items():
-        if isinstance(value, list):
+        if name == "kept_m":
+            record[name] = tuple(map(tuple, value))
+        elif isinstance(value, list):
             record[name] = tuple(math.inf if v is None else v for v in value)
+        elif value is None:
+            record[name] = math.nan
     return Outcome(**record)  # pyright: ignore[reportArgumentType]
