@@ -1,4 +1,4 @@
-"""`python -m benchmarks real|speed|rooms ...`: makes what docs/results.md reports."""
+"""`python -m benchmarks real|speed|rooms|gate ...`: makes what docs/results.md reports."""
 
 import os
 import sys
@@ -65,16 +65,29 @@ def rooms(
     run(out, suites, samples, views)
 
 
+def gate(update: bool = False) -> int:
+    """Fails where accuracy, speed or size is worse than the committed baseline allows.
+
+    Args:
+        update: write what is measured as the new baseline.
+    """
+    from benchmarks.gate import run
+
+    return run(update)
+
+
 def main() -> int:
-    """Runs one benchmark."""
+    """Runs one benchmark; `--gate` is short for `gate`."""
     from evercal.errors import InputError
 
+    args = ["gate", *sys.argv[2:]] if sys.argv[1:2] == ["--gate"] else sys.argv[1:]
+    verbs = {"real": real, "speed": speed, "rooms": rooms, "gate": gate}
     try:
-        tyro.extras.subcommand_cli_from_dict({"real": real, "speed": speed, "rooms": rooms})
+        code = tyro.extras.subcommand_cli_from_dict(verbs, args=args)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    return 0
+    return code or 0
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
 """Results of different settings never share a folder."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from benchmarks import sequence
+from benchmarks import gate, sequence
 from evercal.errors import InputError
 
 
@@ -34,3 +35,29 @@ def test_results_of_other_rules_are_refused(
     monkeypatch.setitem(sequence.RULES, "evercal", stronger)
     with pytest.raises(InputError, match=r"other settings: rules .*9\.0"):
         sequence.Runner([], tmp_path / "results")
+
+
+def test_the_gate_knows_directions_and_tolerances() -> None:
+    points = gate.Metric("%", "higher", 5.0)
+    assert points.holds(80.0, 75.0)
+    assert not points.holds(80.0, 74.9)
+    ratio = gate.Metric("kernels", "lower", 0.5)
+    assert ratio.holds(4.0, 6.0)
+    assert not ratio.holds(4.0, 6.1)
+
+
+def test_the_gate_names_what_is_worse(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = dict.fromkeys(gate.CONTRACT, 50.0)
+    rows, broken = gate.judge(now, now)
+    assert broken == []
+    assert {row[-1] for row in rows} == {"yes"}
+    worse = {**now, "accuracy, 5 cm 5 deg": 20.0, "learning": 200.0}
+    assert gate.judge(now, worse)[1] == ["accuracy, 5 cm 5 deg", "learning"]
+    # What has no baseline is not waved through.
+    known = {name: value for name, value in now.items() if name != "head"}
+    assert gate.judge(known, now)[1] == ["head"]
+
+
+def test_the_baseline_covers_the_contract() -> None:
+    baseline = json.loads(gate.BASELINE.read_text())
+    assert baseline.keys() == gate.CONTRACT.keys()

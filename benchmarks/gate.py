@@ -1,0 +1,140 @@
+"""The contract: what a change may not make worse, against a committed baseline.
+
+Times are ratios to a reference kernel timed in the same run, so that they carry over between
+machines of one kind. Accuracy is that of one rendered room of the package, learned with the preset
+`bench`: its test frames, which nothing is tuned on.
+"""
+
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from evercal.continual.presets import preset
+from evercal.continual.selection import SarsOptions, select_sars
+from evercal.evaluation import evaluate, scores
+from evercal.evaluation.tables import table
+from evercal.localization.localizer import Localizer
+from evercal.localization.teach import LearnOptions, learn_scene
+from evercal.simulation.mini import mini_rooms
+from evercal.training.buffer import encode
+from evercal.training.views import ViewOptions, frame_view
+
+BASELINE = Path(__file__).parent / "baseline.json"
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One line of the contract."""
+
+    unit: str
+    """What the number counts."""
+    better: Literal["higher", "lower"]
+    """Its direction."""
+    tolerance: float
+    """How much worse than the baseline it may be: points for `%`, a share of it otherwise."""
+
+    def holds(self, baseline: float, now: float) -> bool:
+        """Whether `now` is not worse than allowed."""
+        slack = self.tolerance if self.unit == "%" else self.tolerance * baseline
+        return now >= baseline - slack if self.better == "higher" else now <= baseline + slack
+
+
+CONTRACT: dict[str, Metric] = {
+    "accuracy, 5 cm 5 deg": Metric("%", "higher", 8.0),
+    "accuracy, 2 cm 2 deg": Metric("%", "higher", 12.0),
+    "accuracy of the network alone, 5 cm 5 deg": Metric("%", "higher", 16.0),
+    "memory of a frame": Metric("kB", "lower", 0.05),
+    "head": Metric("kB", "lower", 0.02),
+    "learning": Metric("kernels", "lower", 0.5),
+    "encoding an image": Metric("kernels", "lower", 0.5),
+    "localizing an image": Metric("kernels", "lower", 0.5),
+    "SARS, 4,000 poses": Metric("kernels", "lower", 0.5),
+}
+
+
+def measure() -> dict[str, float]:
+    """All numbers of the contract; some two minutes on two cores."""
+    room = mini_rooms()[0].scene
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        report = learn_scene(Path(folder) / "store", room, LearnOptions(preset("bench")))
+        learning = time.perf_counter() - began
+        localizer = Localizer.open(Path(folder) / "store")
+    kernel = _seconds(_reference)
+    right = evaluate(localizer, {room.name: room})
+    found = scores(right)
+    near = [r.translation_error_m < 0.02 and r.rotation_error_rad < np.deg2rad(2) for r in right]
+    known = localizer.known
+    view = frame_view(room.test[0], known.encoder.stride, ViewOptions())
+    image = room.test[0].read_image()
+    encoding = _seconds(lambda: encode([view], known.encoder, known.descriptor))
+    localizing = _seconds(lambda: localizer.localize(image))
+    alone = known.fork()
+    alone.memories = [None]
+    network = scores(evaluate(Localizer(alone), {room.name: room}))
+    rng = np.random.default_rng(0)
+    places, turns = rng.normal(size=(4000, 3)), rng.normal(size=(4000, 4))
+    selecting = _seconds(lambda: select_sars(places, turns, 400, SarsOptions(radius=0.0)), 3)
+    return {
+        "accuracy, 5 cm 5 deg": found.mean_accuracy_5cm_5deg,
+        "accuracy, 2 cm 2 deg": 100 * float(np.mean(near)),
+        "accuracy of the network alone, 5 cm 5 deg": network.mean_accuracy_5cm_5deg,
+        "memory of a frame": report.memory_bytes / report.frames_kept / 1e3,
+        "head": report.head_bytes / 1e3,
+        "learning": learning / kernel,
+        "encoding an image": encoding / kernel,
+        "localizing an image": localizing / kernel,
+        "SARS, 4,000 poses": selecting / kernel,
+    }
+
+
+def run(update: bool) -> int:
+    """Measures and prints the table; writes the baseline or says whether the contract holds."""
+    now = measure()
+    if update or not BASELINE.exists():
+        rounded = {name: round(value, 3) for name, value in now.items()}
+        BASELINE.write_text(json.dumps(rounded, indent=2) + "\n")
+    baseline = json.loads(BASELINE.read_text())
+    rows, broken = judge(baseline, now)
+    print(table(["metric", "unit", "better", "baseline", "now", "holds"], rows, "terminal"))
+    if broken:
+        print(f"worse than allowed: {', '.join(broken)}")
+    return 1 if broken else 0
+
+
+def judge(baseline: dict[str, float], now: dict[str, float]) -> tuple[list[list[str]], list[str]]:
+    """Rows of the table, and the names of what is worse than allowed or not in the baseline."""
+    rows, broken = [], []
+    for name, metric in CONTRACT.items():
+        known = baseline.get(name)
+        holds = known is not None and metric.holds(known, now[name])
+        if not holds:
+            broken.append(name)
+        was = "-" if known is None else f"{known:.1f}"
+        said = "yes" if holds else "NO"
+        rows.append([name, metric.unit, metric.better, was, f"{now[name]:.1f}", said])
+    return rows, broken
+
+
+def _reference() -> None:
+    """The kernel that times are told in: twenty fp32 products of 512 x 512."""
+    a = torch.ones(512, 512)
+    for _ in range(20):
+        a = (a @ a).clamp(max=1.0)
+
+
+def _seconds(work: Callable[[], object], repeat: int = 20) -> float:
+    work()
+    times = []
+    for _ in range(repeat):
+        began = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - began)
+    return float(np.median(times))
