@@ -53,8 +53,8 @@ def test_bench_and_its_report(
     ("words", "message"),
     [
         (["attic"], "suite 'attic': unknown; choose one of sim-mini"),
-        (["custom"], "suite custom: scene folders are for the suite custom"),
-        (["sim-mini", "somewhere"], "suite sim-mini: scene folders are for the suite custom"),
+        (["custom"], "suite custom: scene folders are for the suites custom and regions"),
+        (["sim-mini", "somewhere"], "suite sim-mini: scene folders are for the suites custom"),
         (["sim-mini", "--strategies", "evercal,magic"], "strategy 'magic': unknown; choose from"),
         (["sim-mini", "--seeds", "0,one"], "--seeds 0,one: give numbers"),
         (["sim-mini", "--seeds", ","], "--seeds ,: give numbers"),

@@ -7,20 +7,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
+from evercal.datasets import Frame, Scene
 from evercal.errors import InputError
 from evercal.evaluation import bench
 from evercal.evaluation.bench import BenchOptions, in_order, run_bench
 from evercal.evaluation.comparison import runs_of
 from evercal.evaluation.outcomes import RESULTS, Outcome, read
-from evercal.evaluation.suites import SUITES, load_suite
+from evercal.evaluation.suites import SUITES, load_suite, regions
+from evercal.geometry import SE3, Camera
 
 if TYPE_CHECKING:
     from evercal.continual.learn import StageOptions
-    from evercal.datasets import Scene
 
-Arcs = tuple["Scene", "Scene"]
+Arcs = tuple[Scene, Scene]
+CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -188,3 +191,27 @@ def test_suites(tmp_path: Path) -> None:
     for call, message in refused:
         with pytest.raises(InputError, match=message):
             call()
+
+
+def test_regions_share_the_base_frame_and_split_every_frame() -> None:
+    def look(x: float, name: str) -> Frame:
+        return Frame(
+            name,
+            np.zeros((3, 4, 3), np.uint8),
+            CAMERA,
+            SE3(np.array([1.0, 0, 0, 0]), np.array([x, 0, 0])),
+        )
+
+    # Three places; the recording goes to the middle one first.
+    xs = [5.0] * 20 + [0.0] * 20 + [9.0] * 20
+    train = tuple(look(x + 0.001 * i, f"train-{i}") for i, x in enumerate(xs))
+    test = tuple(look(x, f"test-{x}") for x in (0.2, 8.7, 5.1, 0.1))
+    found = regions(Scene("hall", train, test), 3)
+    assert [scene.name for scene in found] == ["hall-1", "hall-2", "hall-3"]
+    assert {scene.base for scene in found} == {"hall"}
+    assert [scene.train for scene in found] == [train[:20], train[20:40], train[40:]]
+    assert [len(scene.test) for scene in found] == [1, 2, 1]
+    assert found[0].test == test[2:3]
+    for parts, message in ((1, "--parts 1"), (4, "are too few")):
+        with pytest.raises(InputError, match=message):
+            regions(Scene("hall", train, test), parts)

@@ -2,7 +2,7 @@
 
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -52,6 +52,19 @@ def frame(number: int, base_from_camera: SE3 | None) -> Frame:
 
 def scene(name: str, *test: Frame, train: tuple[Frame, ...] = ()) -> Scene:
     return Scene(name, train, test)
+
+
+def test_a_pose_in_a_scene_of_the_same_base_frame_is_measured_too() -> None:
+    answers = {0: Answer("ok", "b", pose(1.25)), 1: Answer("ok", "a", pose(9.0))}
+    for base in ("kitchen", None):
+        scenes = {
+            "a": replace(scene("a", frame(0, pose(1.0))), base=base),
+            "b": replace(scene("b", frame(1, pose(9.0))), base=base),
+        }
+        first, second = evaluate(Fake(answers), scenes)
+        expected = (0.25, 0.0) if base else (math.inf, math.inf)
+        assert (first.translation_error_m, second.translation_error_m) == pytest.approx(expected)
+        assert first.wrong_scene  # it is another region all the same
 
 
 def test_only_a_pose_in_the_right_scene_is_measured() -> None:

@@ -31,11 +31,11 @@ class Bench:
     """
 
     suite: Annotated[Positional[str], arg(metavar="SUITE")]
-    """sim-mini (in the package), sim, sim-7, sim-12, real2, i7s, i12s, or custom."""
+    """sim-mini (in the package), sim, sim-7, sim-12, real2, i7s, i12s, custom, or regions."""
     recordings: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="")
     ] = ()
-    """Scene folders of the suite custom, in order of learning."""
+    """Scene folders of the suite custom, in order of learning; one for the suite regions."""
     strategies: Annotated[str, arg(metavar="A,B")] = "evercal,joint,finetune,er,sars_spdd"
     """Names with commas between; the first is compared with the others."""
     seeds: Annotated[str, arg(metavar="0,1")] = "0,1,2"
@@ -46,6 +46,8 @@ class Bench:
     """Only these scenes of the suite; all when left out."""
     data: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder of the suite's recordings, a folder per scene."""
+    parts: int = 4
+    """Stages that the suite regions makes of one scene."""
     preset: Literal["fast", "demo", "bench", "paper"] = "bench"
     """How much work a stage is."""
     steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
@@ -101,12 +103,18 @@ class Bench:
 
     def _scenes(self) -> "list[Scene]":
         from evercal.datasets import load_scene
-        from evercal.evaluation.suites import load_suite
+        from evercal.evaluation.suites import load_suite, regions
 
-        if (self.suite == "custom") != bool(self.recordings):
+        if (self.suite in ("custom", "regions")) != bool(self.recordings):
             raise InputError(
-                f"suite {self.suite}: scene folders are for the suite custom, and it needs them"
+                f"suite {self.suite}: scene folders are for the suites custom and regions, and "
+                "these need them"
             )
+        if self.suite == "regions":
+            scenes = [load_scene(path) for path in self.recordings]
+            if len(scenes) > 1:
+                raise InputError(f"suite regions: one scene, got {len(scenes)}")
+            return regions(scenes[0], self.parts)
         if self.suite == "custom":
             return [load_scene(path) for path in self.recordings]
         return load_suite(self.suite, self.data, _words(self.scenes))

@@ -61,3 +61,5 @@ class Scene:
     """Frames to score on; never learned from."""
     untracked: int = 0
     """How many recorded frames were left out because they have no valid pose."""
+    base: str | None = None
+    """What its base frame is called, where scenes share one; None if it is the scene's own."""

@@ -64,7 +64,8 @@ def evaluate(
     """Localizes every test image of all scenes, one at a time and in random order, and scores it.
 
     The localizer sees an image and its camera only. Names are used afterwards: errors count if
-    the scene that was found is the frame's, and are infinite otherwise. Test frames whose pose is
+    the scene that was found is the frame's, or has the same base frame (`Scene.base`), and are
+    infinite otherwise. Test frames whose pose is
     not known cannot be scored and are left out.
 
     Args:
@@ -88,7 +89,7 @@ def evaluate(
     results: dict[int, FrameResult] = {}
     for done, index in enumerate(np.random.default_rng(seed).permutation(len(jobs)), start=1):
         name, frame = jobs[index]
-        results[int(index)] = _result(localizer, name, frame, near[index])
+        results[int(index)] = _result(localizer, name, frame, near[index], _alike(name, scenes))
         if on_frame is not None:
             on_frame(done, len(jobs))
     return [results[index] for index in range(len(jobs))]
@@ -109,13 +110,21 @@ def _test_frames(localizer: SceneLocalizer, name: str, scene: Scene) -> list[Fra
     return frames
 
 
-def _result(localizer: SceneLocalizer, name: str, frame: Frame, near: bool) -> FrameResult:
+def _alike(name: str, scenes: Mapping[str, Scene]) -> set[str]:
+    """The scenes in whose base frame a scene's poses are told."""
+    base = scenes[name].base
+    return {name} | {n for n, scene in scenes.items() if base is not None and scene.base == base}
+
+
+def _result(
+    localizer: SceneLocalizer, name: str, frame: Frame, near: bool, alike: set[str]
+) -> FrameResult:
     start = time.perf_counter()
     estimate = localizer.localize(frame.read_image(), frame.camera)
     milliseconds = 1e3 * (time.perf_counter() - start)
     metres = radians = np.inf
     truth, found = frame.base_from_camera, estimate.base_from_camera
-    if estimate.status == "ok" and estimate.scene == name:
+    if estimate.status == "ok" and estimate.scene in alike:
         assert truth is not None
         assert found is not None, "an estimate whose status is ok has a pose"
         metres, radians = pose_distance(truth, found)

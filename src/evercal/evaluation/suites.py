@@ -1,13 +1,18 @@
 """Suites: named sequences of scenes that methods are compared on."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from evercal.datasets import Scene, load_scene
+import numpy as np
+
+from evercal.datasets import Frame, Scene, load_scene
 from evercal.errors import InputError
 from evercal.simulation.cell import SUITES as ROOMS
 from evercal.simulation.mini import mini_rooms
+
+MIN_REGION = 16
+"""Training frames; `learn_scene` asks for as many."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,8 @@ def load_suite(name: str, data: Path | None = None, only: Sequence[str] = ()) ->
         InputError: unknown suite or scene; a scene whose folder is missing, with where to get it.
     """
     if name not in SUITES:
-        raise InputError(f"suite {name!r}: unknown; choose one of {', '.join(SUITES)}")
+        known = ", ".join([*SUITES, "custom", "regions"])
+        raise InputError(f"suite {name!r}: unknown; choose one of {known}")
     suite = SUITES[name]
     unknown = [scene for scene in only if scene not in suite.scenes]
     if unknown:
@@ -95,3 +101,45 @@ def load_suite(name: str, data: Path | None = None, only: Sequence[str] = ()) ->
                 f"leave it out with --scenes"
             )
     return suite.load(data, names)
+
+
+def regions(scene: Scene, parts: int) -> list[Scene]:
+    """One scene as a sequence of its regions, after Bahadir et al. (Mach. Vis. Appl. 2024).
+
+    Regions are k-means cells of the points a metre ahead of the training cameras, in the order in
+    which the recording first comes to them; test frames go to the nearest. All share one base
+    frame, so a pose found in a neighbouring region counts.
+
+    Raises:
+        InputError: fewer than two parts, or a region that is too small to learn or to judge.
+    """
+    from scipy.cluster.vq import kmeans2, vq
+
+    if parts < 2:
+        raise InputError(f"--parts {parts}: give at least 2")
+    train, test = (
+        tuple(f for f in frames if f.base_from_camera is not None)
+        for frames in (scene.train, scene.test)
+    )
+    if len(train) < parts or not test:
+        raise InputError(f"{scene.name}: {len(train)} training and {len(test)} test frames")
+    centres, region = kmeans2(_ahead(train), parts, minit="++", rng=np.random.default_rng(0))
+    nearest, _ = vq(_ahead(test), centres)
+    found = []
+    for number, part in enumerate(dict.fromkeys(region.tolist()), start=1):
+        learned = tuple(f for f, r in zip(train, region, strict=True) if r == part)
+        judged = tuple(f for f, r in zip(test, nearest, strict=True) if r == part)
+        name = f"{scene.name}-{number}"
+        if len(learned) < MIN_REGION or not judged:
+            raise InputError(
+                f"{name}: {len(learned)} training and {len(judged)} test frames are too few (at "
+                f"least {MIN_REGION} and 1); give fewer --parts"
+            )
+        found.append(replace(scene, name=name, train=learned, test=judged, base=scene.name))
+    return found
+
+
+def _ahead(frames: Sequence[Frame]) -> np.ndarray:
+    """(n, 3) points a metre ahead of the cameras."""
+    poses = [frame.base_from_camera for frame in frames if frame.base_from_camera is not None]
+    return np.stack([pose.translation_m + pose.rotation_matrix()[:, 2] for pose in poses])
