@@ -186,6 +186,7 @@ def test_suites(tmp_path: Path) -> None:
         (lambda: load_suite("sim-mini", None, ["attic"]), "scene 'attic': not in suite sim-mini"),
         (lambda: load_suite("real2"), "--data"),
         (lambda: load_suite("i7s", tmp_path), "chess is missing; get it from https://www.micro"),
+        (lambda: load_suite("sim-mini", poses=tmp_path), "--poses are for i7s and i12s"),
         (lambda: load_suite("sim", tmp_path), "bedroom is missing; get it from evercal simulate"),
     ]
     for call, message in refused:

@@ -46,6 +46,9 @@ class Bench:
     """Only these scenes of the suite; all when left out."""
     data: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder of the suite's recordings, a folder per scene."""
+    poses: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Structure-from-motion poses for i7s and i12s (Brachmann et al., ICCV 2021); the original ones
+    when left out."""
     parts: int = 4
     """Stages that the suite regions makes of one scene."""
     preset: Literal["fast", "demo", "bench", "paper"] = "bench"
@@ -80,7 +83,7 @@ class Bench:
             _words(self.strategies),
             seeds,
             self.order,
-            settings={"suite": self.suite},
+            settings={"suite": self.suite, "poses": "sfm" if self.poses else "original"},
             features=self.out.absolute() / "features",
         )
         said = sys.stderr if self.json else sys.stdout
@@ -117,7 +120,7 @@ class Bench:
             return regions(scenes[0], self.parts)
         if self.suite == "custom":
             return [load_scene(path) for path in self.recordings]
-        return load_suite(self.suite, self.data, _words(self.scenes))
+        return load_suite(self.suite, self.data, _words(self.scenes), self.poses)
 
     def _stage(self, seed: int) -> "StageOptions":
         from evercal.cli.learn import parse_memory

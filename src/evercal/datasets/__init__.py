@@ -12,6 +12,7 @@ from evercal.datasets.frame import Scene as Scene
 from evercal.datasets.images import image_size as image_size
 from evercal.datasets.images import read_image as read_image
 from evercal.datasets.images import write_image as write_image
+from evercal.datasets.sfm_poses import with_sfm_poses as with_sfm_poses
 from evercal.errors import InputError
 
 

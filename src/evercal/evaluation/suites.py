@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evercal.datasets import Frame, Scene, load_scene
+from evercal.datasets import Frame, Scene, load_scene, with_sfm_poses
 from evercal.errors import InputError
 from evercal.simulation.cell import SUITES as ROOMS
 from evercal.simulation.mini import mini_rooms
@@ -72,16 +72,21 @@ SUITES: dict[str, Suite] = {
 }
 
 
-def load_suite(name: str, data: Path | None = None, only: Sequence[str] = ()) -> list[Scene]:
+def load_suite(
+    name: str, data: Path | None = None, only: Sequence[str] = (), poses: Path | None = None
+) -> list[Scene]:
     """The scenes of a suite in order of learning.
 
     Args:
         name: key of `SUITES`.
         data: folder that holds a folder for each scene; not for `sim-mini`.
         only: names of scenes to take, in the suite's order; all when empty.
+        poses: folder of structure-from-motion poses (`datasets.sfm_poses`) to take instead of those
+            of i7s or i12s.
 
     Raises:
-        InputError: unknown suite or scene; a scene whose folder is missing, with where to get it.
+        InputError: unknown suite or scene; a scene whose folder is missing, with where to get it;
+            poses for another suite.
     """
     if name not in SUITES:
         known = ", ".join([*SUITES, "custom", "regions"])
@@ -100,7 +105,13 @@ def load_suite(name: str, data: Path | None = None, only: Sequence[str] = ()) ->
                 f"suite {name}: {data / missing[0]} is missing; get it from {suite.source}, or "
                 f"leave it out with --scenes"
             )
-    return suite.load(data, names)
+    scenes = suite.load(data, names)
+    if poses is None:
+        return scenes
+    if name not in ("i7s", "i12s"):
+        raise InputError(f"suite {name}: --poses are for i7s and i12s")
+    called = [scene.replace("/", "_") for scene in names]
+    return [with_sfm_poses(s, poses, n) for s, n in zip(scenes, called, strict=True)]
 
 
 def regions(scene: Scene, parts: int) -> list[Scene]:
