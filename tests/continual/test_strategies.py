@@ -1,12 +1,14 @@
 """The rules of the strategies, on rows small enough to do by hand."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from evercal.continual import strategies
 from evercal.continual.candidates import Candidates
 from evercal.continual.spdd import SpddOptions, spdd_loss
 from evercal.continual.strategies import (
@@ -26,6 +28,7 @@ from evercal.continual.strategies import (
     stored_output,
 )
 from evercal.datasets.frame import Frame
+from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.models.head import Head, HeadOptions, HeadOutput
 from evercal.training.buffer import FeatureBuffer, Rows
@@ -252,3 +255,18 @@ def test_fine_tuning_differs_from_ours_in_replay_alone() -> None:
     assert control.penalty is None
     for field in ("data", "heads"):
         assert getattr(ours, field) == getattr(control, field)
+
+
+def test_any_selector_goes_with_any_penalty(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = dict(STRATEGIES)
+    monkeypatch.setattr(strategies, "STRATEGIES", known)
+    made = strategies.compose("sars_filled+spdd")
+    ours = STRATEGIES["sars_spdd_filled"]
+    assert (made.select, made.penalty) == (ours.select, ours.penalty)
+    assert known["sars_filled+spdd"] is made
+    assert strategies.compose("sars_filled+spdd") is made
+    plain = strategies.compose("reservoir+reprojection")
+    assert plain == replace(STRATEGIES["er"], source=plain.source)
+    for name in ("nonsense", "sars+", "sars+nonsense", "+spdd", "nonsense+spdd"):
+        with pytest.raises(InputError, match=r"unknown; choose from evercal.* SELECTOR\+PENALTY"):
+            strategies.compose(name)

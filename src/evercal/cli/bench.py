@@ -37,7 +37,7 @@ class Bench:
     ] = ()
     """Scene folders of the suite custom, in order of learning; one for the suite regions."""
     strategies: Annotated[str, arg(metavar="A,B")] = "evercal,joint,finetune,er,sars_spdd"
-    """Names with commas between; the first is compared with the others."""
+    """Names with commas between, or SELECTOR+PENALTY; the first is compared with the others."""
     seeds: Annotated[str, arg(metavar="0,1")] = "0,1,2"
     """One run each."""
     order: Literal["given", "reversed", "shuffled"] = "given"

@@ -29,6 +29,7 @@ from evercal.continual.notes import (
 )
 from evercal.continual.selection import SarsOptions, select_sars
 from evercal.continual.spdd import SpddOptions, spdd_loss
+from evercal.errors import InputError
 from evercal.models.head import Head, HeadOutput
 from evercal.training.buffer import Rows
 from evercal.training.gradients import Combine, averaged_constraint, episodic_barrier, gem
@@ -323,3 +324,43 @@ STRATEGIES: dict[str, Strategy] = {
     ),
     "joint": Strategy(source="all frames of all scenes at once, restarted", data="all"),
 }
+
+SELECTORS: dict[str, Select] = {
+    "reservoir": _reservoir,
+    "hybrid": _hybrid,
+    "herding": _herding,
+    "coverage": _coverage,
+    "leverage": _leverage,
+    "gradients": _gradients,
+    "sars": _sars,
+    "sars_filled": _sars_filled,
+}
+"""Which frames stay, for `compose`."""
+
+PENALTIES: dict[str, Penalty] = {
+    "reprojection": reprojection,
+    "old_output": old_output,
+    "bounded": bounded_by_teacher,
+    "relations": relations,
+    "anchored": anchored_reprojection,
+    "spdd": _spdd,
+}
+"""What replay costs, for `compose`."""
+
+
+def compose(name: str) -> Strategy:
+    """The strategy `SELECTOR+PENALTY`, such as `sars+reprojection`; it is in STRATEGIES from now on.
+
+    Raises:
+        InputError: a name without a plus, or a part that is not known.
+    """
+    selector, plus, penalty = name.partition("+")
+    if not plus or selector not in SELECTORS or penalty not in PENALTIES:
+        raise InputError(
+            f"strategy {name!r}: unknown; choose from {', '.join(STRATEGIES)}, or SELECTOR+PENALTY "
+            f"of {', '.join(SELECTORS)} and {', '.join(PENALTIES)}"
+        )
+    source = f"composed: {selector} selects, replay costs {penalty}"
+    return STRATEGIES.setdefault(
+        name, Strategy(source, select=SELECTORS[selector], penalty=PENALTIES[penalty])
+    )

@@ -127,9 +127,9 @@ def begin_bench(scenes: Sequence[Scene], options: BenchOptions, out: Path) -> li
     """
     if len(scenes) < 2:
         raise InputError(f"{len(scenes)} scene: forgetting takes two or more; give more scenes")
-    unknown = [name for name in options.strategies if name not in STRATEGIES]
-    if unknown:
-        raise InputError(f"strategy {unknown[0]!r}: unknown; choose from {', '.join(STRATEGIES)}")
+    for name in options.strategies:
+        if name not in STRATEGIES:
+            rules.compose(name)
     hold_settings(out / "settings.json", _settings(scenes, options))
     found = {(o.strategy, o.seed) for o in outcomes.read(out) if o.stage == len(scenes) - 1}
     runs = [(seed, strategy) for seed in options.seeds for strategy in options.strategies]
