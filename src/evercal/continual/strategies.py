@@ -349,7 +349,7 @@ PENALTIES: dict[str, Penalty] = {
 
 
 def compose(name: str) -> Strategy:
-    """The strategy `SELECTOR+PENALTY`, such as `sars+reprojection`; it is in STRATEGIES from now on.
+    """The strategy `SELECTOR+PENALTY`, such as `sars+reprojection`, now one of STRATEGIES.
 
     Raises:
         InputError: a name without a plus, or a part that is not known.

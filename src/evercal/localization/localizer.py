@@ -23,6 +23,8 @@ from evercal.training.precision import autocast
 from evercal.training.views import View, ViewOptions, ideal_cell_pixels, plain_view
 
 ASPECT_TOLERANCE = 0.01
+# Every so many-th point tells where to look; the pose itself comes from all.
+GLANCE = 2
 
 
 @dataclass(frozen=True)
@@ -228,9 +230,9 @@ class Localizer:
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         cells, own = len(features), output.points
 
-        def solve(points: Tensor, options: PnpOptions) -> PnpResult | None:
-            every = np.tile(pixels, (len(points) // cells, 1))
-            return solve_pnp(every, points.double().numpy(), intrinsics, options)
+        def solve(points: Tensor, options: PnpOptions, step: int = 1) -> PnpResult | None:
+            every = np.tile(pixels, (len(points) // cells, 1))[::step]
+            return solve_pnp(every, points[::step].double().numpy(), intrinsics, options)
 
         recall = self._recall(scene)
         if recall is None:
@@ -238,11 +240,11 @@ class Localizer:
             pose = solve(points, self.options.pnp)
         else:
             found = recall.look(features)
-            points = torch.cat([own, recall.points(found)])
-            pose = solve(points, self.options.pnp)
+            points = torch.cat([own, recall.points(found, own)])
+            pose = solve(points, self.options.pnp, GLANCE)
             if pose is not None:
-                expected = Expected.from_pose(pixels, intrinsics, pose.world_from_camera)
-                points = torch.cat([own, recall.points(found, expected)])
+                expected = Expected(camera, pose.world_from_camera)
+                points = torch.cat([own, recall.points(found, own, expected)])
                 pose = solve(points, self.options.refine)
         if pose is not None and self._one_answer():
             other = self.known.atlas.scene_at(pose.world_from_camera.translation_m)
