@@ -13,8 +13,9 @@ from tabulate import tabulate
 
 from evercal.continual import strategies
 from evercal.continual.candidates import Candidates
+from evercal.continual.keeping import keep, plain_rows
 from evercal.continual.knowledge import Knowledge
-from evercal.continual.learn import Stage, StageOptions, keep, learn, plain_rows
+from evercal.continual.learn import Stage, StageOptions, learn
 from evercal.continual.presets import preset
 from evercal.continual.robot import head_bytes, with_fit
 from evercal.continual.strategies import STRATEGIES as RULES
@@ -182,14 +183,14 @@ class Runner:
         known = _first_stages[key].fork()
         known.strategy = strategy
         refined = known.scenes[0].refined_camera
-        options = stage_options(seed)
 
         def rows() -> FeatureBuffer:
             buffer = FeatureBuffer(0, known.scenes[0].cell.atlas_from_base)
-            return plain_rows(buffer, scene.train, known, options)
+            return plain_rows(buffer, scene.train, known)
 
         frames = Candidates(scene.train, known.heads[0], rows, seed)
-        known.memories = [keep(known, scene.train, frames, options, refined)]
+        capacity = stage_options(seed).capacity(scene.train, SHORT_SIDE)
+        known.memories = [keep(known, scene.train, frames, capacity, refined)]
         known.notes = [{}]
         return known
 

@@ -12,10 +12,9 @@ from torch import Tensor
 
 from evercal.continual.atlas import Cell
 from evercal.continual.candidates import Candidates
+from evercal.continual.keeping import keep, note_of
 from evercal.continual.knowledge import Knowledge, SceneRecord, prototypes, refine
-from evercal.continual.memory import Memory, remember
-from evercal.continual.notes import Finished, Notes
-from evercal.continual.recall import remembered_depths
+from evercal.continual.memory import remember
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.datasets.frame import Frame, Scene
 from evercal.errors import InputError
@@ -49,6 +48,13 @@ class StageOptions:
     """Atlas coordinates of all centres, known in advance (HeadOptions.centres `fixed`)."""
     seed: int = 0
     """Of everything that is drawn."""
+
+    def capacity(self, frames: Sequence[Frame], short_side: int) -> int:
+        """N_b in frames, at least 1, for a scene of these training frames."""
+        if self.memory_bytes is None:
+            return max(1, int(self.memory_share * len(frames) + 1e-9))
+        one = remember(frames[:1], short_side).bytes
+        return min(len(frames), max(1, self.memory_bytes // one))
 
 
 @dataclass
@@ -313,76 +319,12 @@ def _finish(
     camera = frames[0].camera
     record = SceneRecord(scene.name, camera, cell, descriptors, len(frames), refined)
     candidates = Candidates(frames, after.heads[-1], lambda: buffer, options.seed)
-    memory = keep(after, frames, candidates, options, refined)
+    capacity = options.capacity(frames, after.short_side)
+    memory = keep(after, frames, candidates, capacity, refined)
     after.scenes.append(record)
     after.memories.append(memory)
-    after.notes.append(note_of(after, buffer, options))
+    after.notes.append(note_of(after, buffer))
     return Stage(after, options.fit.iterations, len(memory.images) if memory else 0)
-
-
-def keep(
-    known: Knowledge,
-    frames: Sequence[Frame],
-    candidates: Candidates,
-    options: StageOptions,
-    refined: Camera | None,
-) -> Memory | None:
-    """What a strategy remembers of a scene's training frames, at most N_b of them.
-
-    Args:
-        known: whose strategy selects.
-        frames: in recorded order.
-        candidates: the same frames as selectors see them.
-        options: size of the memory.
-        refined: the camera as training corrected it; replay takes it as given.
-    """
-    strategy, short_side = STRATEGIES[known.strategy], known.short_side
-    if strategy.select is None:
-        return None
-    capacity = max(1, int(options.memory_share * len(frames) + 1e-9))
-    if options.memory_bytes is not None:
-        one = remember(frames[:1], short_side).bytes
-        capacity = min(len(frames), max(1, options.memory_bytes // one))
-    chosen = strategy.select(candidates, capacity)
-    if refined is not None:
-        frames = [replace(frame, camera=refined) for frame in frames]
-    memory = remember([frames[i] for i in chosen], short_side)
-    if strategy.recall:
-        depths = remembered_depths(known, chosen, frames, candidates)
-        memory = replace(memory, inverse_depth=depths)
-    return memory
-
-
-def note_of(known: Knowledge, buffer: FeatureBuffer, options: StageOptions) -> Notes:
-    """What the strategy notes about the newest scene, whose frames are chosen already.
-
-    Args:
-        known: with the scene's record and memory.
-        buffer: rows of its training frames.
-        options: the stage's.
-    """
-    note = STRATEGIES[known.strategy].note
-    if note is None:
-        return {}
-
-    def remembered() -> FeatureBuffer:
-        memory = known.memories[-1]
-        assert memory is not None, "a strategy that notes what it remembers selects frames"
-        found = FeatureBuffer(buffer.scene, buffer.atlas_from_base)
-        return plain_rows(found, memory.frames(), known, options)
-
-    return note(Finished(known.heads[-1].eval(), buffer, remembered, known.notes))
-
-
-def plain_rows(
-    buffer: FeatureBuffer, frames: Sequence[Frame], known: Knowledge, options: StageOptions
-) -> FeatureBuffer:
-    """Encodes frames as they are into a buffer, and gives it back."""
-    view = replace(options.fill.view, short_side=known.short_side)
-    plan = replace(options.fill, passes=1, view=view)
-    for _ in fill(buffer, frames, plan, known.encoder, known.descriptor):
-        pass
-    return buffer
 
 
 class _Pacer:

@@ -21,8 +21,9 @@ import numpy as np
 
 from evercal.continual import strategies as rules
 from evercal.continual.candidates import Candidates
+from evercal.continual.keeping import keep, note_of, plain_rows
 from evercal.continual.knowledge import Knowledge
-from evercal.continual.learn import Stage, StageOptions, keep, learn, note_of, plain_rows
+from evercal.continual.learn import Stage, StageOptions, learn
 from evercal.continual.robot import Robot, head_bytes, with_fit
 from evercal.continual.selection import covering_radius, smallest_pair
 from evercal.continual.strategies import STRATEGIES
@@ -212,20 +213,19 @@ class _Run:
         known = first.known.fork()
         known.strategy = self.strategy
         train, aside = hold_out(scene.train)
-        options = self.options.stage(self.seed)
-
         self._cached(known)
 
         @cache
         def rows() -> FeatureBuffer:
             buffer = FeatureBuffer(0, known.scenes[0].cell.atlas_from_base)
-            return plain_rows(buffer, train, known, options)
+            return plain_rows(buffer, train, known)
 
         frames = Candidates(train, known.heads[0], rows, self.seed)
         refined = known.scenes[0].refined_camera
-        memory = keep(known, train, frames, options, refined)
+        capacity = self.options.stage(self.seed).capacity(train, known.short_side)
+        memory = keep(known, train, frames, capacity, refined)
         known.memories = [memory]
-        known.notes = [note_of(known, rows(), options)] if self.rule.note else [{}]
+        known.notes = [note_of(known, rows())] if self.rule.note else [{}]
         if self.rule.recall:  # more cells agree, so more must
             known.scenes[0] = with_fit(known.scenes[0], *fit_threshold(known, aside))
         report = first.report()
