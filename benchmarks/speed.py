@@ -10,6 +10,9 @@ import numpy as np
 from evercal.continual.selection import SarsOptions, select_sars
 from evercal.datasets.images import read_image
 from evercal.localization.localizer import Localizer
+from evercal.simulation.box_room import default_camera
+from evercal.training.buffer import encode
+from evercal.training.views import ViewOptions, plain_view
 
 
 def run(store: Path, image: Path, repeat: int) -> None:
@@ -23,6 +26,17 @@ def run(store: Path, image: Path, repeat: int) -> None:
         localizer.localize(read_image(image))
         one.append(1000 * (time.perf_counter() - began))
     print(f"localize, decoding included: median {np.median(one):.1f} ms, worst {max(one):.1f} ms")
+    known, plain = localizer.known, read_image(image)
+    height, width = plain.shape[:2]
+    view = plain_view(
+        plain, default_camera(width, height), known.encoder.stride, ViewOptions(known.short_side)
+    )
+    features = []
+    for _ in range(repeat):
+        began = time.perf_counter()
+        encode([view], known.encoder, known.descriptor)
+        features.append(1000 * (time.perf_counter() - began))
+    print(f"features of one image: median {np.median(features):.1f} ms, worst {max(features):.1f}")
     images = [read_image(image) for _ in range(repeat)]
     localizer.localize_batch(images[:8], [None] * 8)
     began = time.perf_counter()
