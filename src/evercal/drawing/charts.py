@@ -222,7 +222,7 @@ def kept_places(methods: Mapping[str, ArrayLike]) -> bytes:
     middle, reach = (every.max(0) + every.min(0)) / 2, max(float(np.ptp(every, axis=0).max()), 0.1)
     columns = min(4, len(places))
     rows = -(-len(places) // columns)
-    figure = _figure(2.4 * columns, 2.3 * rows)
+    figure = _figure(2.6 * columns, 2.3 * rows)
     for index, (name, where) in enumerate(places.items()):
         panel = figure.add_subplot(rows, columns, index + 1, projection="3d")
         panel.scatter(*where.T, s=12, color=_COLOURS[0])  # pyright: ignore[reportArgumentType]

@@ -65,6 +65,9 @@ class _Hypothesis:
 class Localizer:
     """Finds the camera in any of the scenes that a store knows.
 
+    The first image of a scene waits until the frames remembered of it are encoded: about a second
+    for 60 frames on two cores.
+
     Args:
         known: networks, atlas and scene records.
         options: how.
