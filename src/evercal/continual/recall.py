@@ -25,7 +25,7 @@ from evercal.training.sweep import PosedCells, beside, inverse_depths, parabola
 from evercal.training.views import View, ViewOptions, frame_view
 
 OTHER_VIEWS = 12
-FRAMES = 8
+FRAMES = 6
 """Remembered frames that an image is matched to."""
 NEAR_PX = 20.0
 VOTERS = 16

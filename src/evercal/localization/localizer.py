@@ -24,7 +24,7 @@ from evercal.training.views import View, ViewOptions, ideal_cell_pixels, plain_v
 
 ASPECT_TOLERANCE = 0.01
 # Every so many-th point tells where to look; the pose itself comes from all.
-GLANCE = 2
+GLANCE = 4
 
 
 @dataclass(frozen=True)

@@ -54,6 +54,8 @@ def solve_pnp(
         "max_reproj_error": options.threshold_px,
         "max_iterations": options.max_iterations,
         "min_iterations": options.min_iterations,
+        # The library would try three times as often as its own bound asks for.
+        "dyn_num_trials_mult": 1.0,
     }
     pose, info = poselib.estimate_absolute_pose(pixels, points_m, camera, ransac, {})
     inliers = np.asarray(info["inliers"], bool)
