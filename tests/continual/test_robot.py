@@ -203,7 +203,7 @@ def test_a_store_of_another_version_is_refused(
 def test_two_stores_share_nothing(
     taught: Stages, tmp_path: Path, make: Make, tree: Tree, answers: Answers
 ) -> None:
-    stages = taught["isolation"]  # no memory answers for a head that is gone
+    stages = taught["evercal"]
     a, b = make(tmp_path / "a", stages[:1]), make(tmp_path / "b", stages[:1])
     before = tree(tmp_path / "b")
     a.begin({"scene": "beta"})
