@@ -267,6 +267,19 @@ def test_any_selector_goes_with_any_penalty(monkeypatch: pytest.MonkeyPatch) -> 
     assert strategies.compose("sars_filled+spdd") is made
     plain = strategies.compose("reservoir+reprojection")
     assert plain == replace(STRATEGIES["er"], source=plain.source)
-    for name in ("nonsense", "sars+", "sars+nonsense", "+spdd", "nonsense+spdd"):
+    assert not plain.recall
+    recalled = strategies.compose("sars_filled+anchored+recall")
+    assert recalled.recall
+    assert recalled.select == STRATEGIES["evercal"].select
+    for name in (
+        "nonsense",
+        "sars+",
+        "sars+spdd+",
+        "sars+spdd+recall+recall",
+        "sars+spdd+more",
+        "sars+nonsense",
+        "+spdd",
+        "nonsense+spdd",
+    ):
         with pytest.raises(InputError, match=r"unknown; choose from evercal.* SELECTOR\+PENALTY"):
             strategies.compose(name)

@@ -349,18 +349,17 @@ PENALTIES: dict[str, Penalty] = {
 
 
 def compose(name: str) -> Strategy:
-    """The strategy `SELECTOR+PENALTY`, such as `sars+reprojection`, now one of STRATEGIES.
+    """The strategy `SELECTOR+PENALTY` or `SELECTOR+PENALTY+recall`, now one of STRATEGIES.
 
     Raises:
         InputError: a name without a plus, or a part that is not known.
     """
-    selector, plus, penalty = name.partition("+")
-    if not plus or selector not in SELECTORS or penalty not in PENALTIES:
+    selector, penalty, *more = [*name.split("+"), ""][:4]
+    if selector not in SELECTORS or penalty not in PENALTIES or more not in ([""], ["recall", ""]):
         raise InputError(
             f"strategy {name!r}: unknown; choose from {', '.join(STRATEGIES)}, or SELECTOR+PENALTY "
-            f"of {', '.join(SELECTORS)} and {', '.join(PENALTIES)}"
+            f"(+recall) of {', '.join(SELECTORS)} and {', '.join(PENALTIES)}"
         )
     source = f"composed: {selector} selects, replay costs {penalty}"
-    return STRATEGIES.setdefault(
-        name, Strategy(source, select=SELECTORS[selector], penalty=PENALTIES[penalty])
-    )
+    made = Strategy(source, SELECTORS[selector], PENALTIES[penalty], recall="recall" in more)
+    return STRATEGIES.setdefault(name, made)
