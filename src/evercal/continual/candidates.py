@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evercal.datasets.frame import Frame
+from evercal.datasets.frame import Frame, known_poses
 from evercal.models.head import Head
 from evercal.training.buffer import FeatureBuffer, Rows
 from evercal.training.loss import reprojection_error, steady_loss
@@ -32,10 +32,10 @@ class Candidates:
     def __init__(
         self, frames: Sequence[Frame], head: Head, rows: Callable[[], FeatureBuffer], seed: int
     ):
-        poses = [f.base_from_camera for f in frames if f.base_from_camera is not None]
-        self.positions_m = np.stack([pose.translation_m for pose in poses])
+        poses = known_poses(frames)
+        self.positions_m = poses.translation_m
         """(n, 3) camera positions in the base frame."""
-        self.quaternions_wxyz = np.stack([pose.rotation_wxyz for pose in poses])
+        self.quaternions_wxyz = poses.rotation_wxyz
         """(n, 4) camera orientations."""
         self._head, self._rows, self._seed = head, rows, seed
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from evercal.continual.candidates import Candidates
 from evercal.continual.knowledge import Knowledge
-from evercal.datasets.frame import Frame
+from evercal.datasets.frame import Frame, known_poses
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.training.buffer import encode
@@ -45,7 +45,7 @@ def remembered_depths(
     """
     stride = known.encoder.stride
     cameras = [frame.camera.short_side_resized(known.short_side) for frame in frames]
-    poses = SE3.stack([f.base_from_camera for f in frames if f.base_from_camera is not None])
+    poses = known_poses(frames)
 
     def cells(i: int) -> PosedCells:
         return PosedCells(seen.local_features(i), cameras[i], poses[i], stride)

@@ -1,7 +1,7 @@
 """Strategies: small records of functions, and the literal dict that names them all."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -215,23 +215,22 @@ def anchored_reprojection(
     return REPLAY_WEIGHT * (cost.mean() + OUTPUT_WEIGHT_PX_PER_M * held.mean())
 
 
+_NETWORK = Strategy(
+    source="the same without recall: the network alone answers",
+    select=_sars_filled,
+    penalty=anchored_reprojection,
+    penalty_per_scene=True,
+    protection=PROTECTION,
+)
+
 STRATEGIES: dict[str, Strategy] = {
-    "evercal": Strategy(
+    "evercal": replace(
+        _NETWORK,
         source="this project: scene codes, own centres, anchored replay, protection, recall",
-        select=_sars_filled,
-        penalty=anchored_reprojection,
-        penalty_per_scene=True,
-        protection=PROTECTION,
         recall=True,
     ),
     "finetune": Strategy(source="control: the head and steps of evercal, no replay"),
-    "evercal_network": Strategy(
-        source="the same without recall: the network alone answers",
-        select=_sars_filled,
-        penalty=anchored_reprojection,
-        penalty_per_scene=True,
-        protection=PROTECTION,
-    ),
+    "evercal_network": _NETWORK,
     "er": Strategy(
         source="experience replay from a reservoir (Vitter, 1985): random frames, true poses",
         select=_reservoir,

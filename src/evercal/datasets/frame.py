@@ -1,5 +1,6 @@
 """What every dataset yields: frames with a camera and poses, in scenes with a train/test split."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,6 +48,11 @@ class Frame:
                 f" {self.camera.width}x{self.camera.height}; give the intrinsics of this image size"
             )
         return image
+
+
+def known_poses(frames: Iterable[Frame]) -> SE3:
+    """(n,) base_from_camera of the frames that have one."""
+    return SE3.stack([f.base_from_camera for f in frames if f.base_from_camera is not None])
 
 
 @dataclass(frozen=True, eq=False)

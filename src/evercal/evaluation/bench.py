@@ -27,12 +27,11 @@ from evercal.continual.learn import Stage, StageOptions, learn
 from evercal.continual.robot import Robot, head_bytes, with_fit
 from evercal.continual.selection import covering_radius, smallest_pair
 from evercal.continual.strategies import STRATEGIES
-from evercal.datasets import Scene
+from evercal.datasets import Scene, known_poses
 from evercal.errors import InputError
 from evercal.evaluation import outcomes
 from evercal.evaluation.outcomes import Outcome, outcome_of
 from evercal.evaluation.protocol import evaluate
-from evercal.geometry.se3 import SE3
 from evercal.localization.localizer import Localizer
 from evercal.localization.teach import (
     LearnOptions,
@@ -289,7 +288,7 @@ class _Run:
         if memory is None or not memory.images:
             return {}
         train, _ = hold_out(self.scenes[number].train)
-        poses = SE3.stack([f.base_from_camera for f in train if f.base_from_camera is not None])
+        poses = known_poses(train)
         stood = memory.base_from_camera.translation_m
         gaps = np.linalg.norm(poses.translation_m[:, None] - stood[None], axis=-1)
         places = poses.translation_m, poses.rotation_wxyz, gaps.argmin(0)

@@ -1,13 +1,13 @@
 """How a store is examined: the test images of all scenes in one list, no scene given away."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.datasets import Frame, Scene
+from evercal.datasets import Frame, Scene, known_poses
 from evercal.errors import InputError
 from evercal.evaluation.metrics import FrameResult, Status, near_training
 from evercal.geometry import SE3, Camera, pose_distance
@@ -143,11 +143,7 @@ def _result(
 
 
 def _near(scene: Scene, frames: Sequence[Frame]) -> list[bool]:
-    return near_training(_poses(scene.train), _poses(frames)).tolist()
-
-
-def _poses(frames: Iterable[Frame]) -> SE3:
-    return SE3.stack([f.base_from_camera for f in frames if f.base_from_camera is not None])
+    return near_training(known_poses(scene.train), known_poses(frames)).tolist()
 
 
 def _listed(names: Sequence[str]) -> str:

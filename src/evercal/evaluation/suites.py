@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from evercal.datasets import Frame, Scene, load_scene, with_sfm_poses
+from evercal.datasets import Frame, Scene, known_poses, load_scene, with_sfm_poses
 from evercal.errors import InputError
+from evercal.localization.teach import MIN_TRAIN_FRAMES
 from evercal.simulation.cell import SUITES as ROOMS
 from evercal.simulation.mini import mini_rooms
-
-MIN_REGION = 16
-"""Training frames; `learn_scene` asks for as many."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +89,8 @@ def load_suite(
     if name not in SUITES:
         known = ", ".join([*SUITES, "custom", "regions"])
         raise InputError(f"suite {name!r}: unknown; choose one of {known}")
+    if poses is not None and name not in ("i7s", "i12s"):
+        raise InputError(f"suite {name}: --poses are for i7s and i12s")
     suite = SUITES[name]
     unknown = [scene for scene in only if scene not in suite.scenes]
     if unknown:
@@ -108,8 +108,6 @@ def load_suite(
     scenes = suite.load(data, names)
     if poses is None:
         return scenes
-    if name not in ("i7s", "i12s"):
-        raise InputError(f"suite {name}: --poses are for i7s and i12s")
     called = [scene.replace("/", "_") for scene in names]
     return [with_sfm_poses(s, poses, n) for s, n in zip(scenes, called, strict=True)]
 
@@ -141,10 +139,10 @@ def regions(scene: Scene, parts: int) -> list[Scene]:
         learned = tuple(f for f, r in zip(train, region, strict=True) if r == part)
         judged = tuple(f for f, r in zip(test, nearest, strict=True) if r == part)
         name = f"{scene.name}-{number}"
-        if len(learned) < MIN_REGION or not judged:
+        if len(learned) < MIN_TRAIN_FRAMES or not judged:
             raise InputError(
                 f"{name}: {len(learned)} training and {len(judged)} test frames are too few (at "
-                f"least {MIN_REGION} and 1); give fewer --parts"
+                f"least {MIN_TRAIN_FRAMES} and 1); give fewer --parts"
             )
         found.append(replace(scene, name=name, train=learned, test=judged, base=scene.name))
     return found
@@ -152,5 +150,5 @@ def regions(scene: Scene, parts: int) -> list[Scene]:
 
 def _ahead(frames: Sequence[Frame]) -> np.ndarray:
     """(n, 3) points a metre ahead of the cameras."""
-    poses = [frame.base_from_camera for frame in frames if frame.base_from_camera is not None]
-    return np.stack([pose.translation_m + pose.rotation_matrix()[:, 2] for pose in poses])
+    poses = known_poses(frames)
+    return poses.translation_m + poses.rotation_matrix()[:, :, 2]

@@ -231,13 +231,14 @@ class Localizer:
             output = head(features, local, descriptor.expand(len(features), -1))
         pixels = ideal_cell_pixels(camera, self.known.encoder.stride).astype(float)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        cells, own = len(features), output.points
+        recall, own = self._recall(scene), output.points
+        if recall is not None:
+            pixels = np.tile(pixels, (2, 1))
 
         def solve(points: Tensor, options: PnpOptions, step: int = 1) -> PnpResult | None:
-            every = np.tile(pixels, (len(points) // cells, 1))[::step]
-            return solve_pnp(every, points[::step].double().numpy(), intrinsics, options)
+            some = points[::step].double().numpy()
+            return solve_pnp(pixels[::step], some, intrinsics, options)
 
-        recall = self._recall(scene)
         if recall is None:
             points = own
             pose = solve(points, self.options.pnp)
@@ -252,8 +253,7 @@ class Localizer:
         if pose is not None and self._one_answer():
             other = self.known.atlas.scene_at(pose.world_from_camera.translation_m)
             scene = scene if other is None else other
-        every = np.tile(pixels, (len(points) // cells, 1))
-        return _Hypothesis(scene, camera, pose, cells, every, points.double().numpy())
+        return _Hypothesis(scene, camera, pose, len(features), pixels, points.double().numpy())
 
     def _recall(self, scene: int) -> Recall | None:
         """The remembered frames of a scene, encoded when they are first needed."""

@@ -34,6 +34,7 @@ from evercal.simulation.box_room import BoxRoom, default_camera
 from evercal.storage.manifest import MANIFEST
 from evercal.training.fit import Progress
 
+MIN_TRAIN_FRAMES = 16
 HELD_OUT_EVERY = 100
 HELD_OUT_BLOCK = 4
 NEGATIVE_ROOM_SEED = 8_990
@@ -190,10 +191,10 @@ def _check(robot: Robot, scene: Scene, options: LearnOptions) -> None:
             f"strategy {robot.known.strategy!r}: learns all scenes at once, so a scene cannot be "
             "added to a store; start a new store with another strategy"
         )
-    if len(scene.train) < 16:
+    if len(scene.train) < MIN_TRAIN_FRAMES:
         raise InputError(
             f"scene {scene.name!r}: {len(scene.train)} training frames are too few; "
-            "give at least 16"
+            f"give at least {MIN_TRAIN_FRAMES}"
         )
 
 
