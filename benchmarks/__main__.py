@@ -10,19 +10,13 @@ import tyro
 DATA_VARIABLE = "EVERCAL_REAL_DATA"
 
 
-def real(
-    data: Path | None = None,
-    out: Path = Path("runs/real"),
-    seeds: tuple[int, ...] = (0, 1, 2),
-    tables: tuple[Literal["fast", "two", "four"], ...] = ("fast", "two", "four"),
-) -> None:
-    """Learns real scenes and prints accuracy tables; finished runs are kept and not repeated.
+def real(data: Path | None = None, out: Path = Path("runs/real"), seed: int = 0) -> None:
+    """Learns each real scene alone, preset `fast`; finished runs are kept and not repeated.
 
     Args:
         data: folder with `redkitchen` and `fr1_rpy` (7-Scenes layout); else EVERCAL_REAL_DATA.
-        out: where stores and per-frame results are kept.
-        seeds: of the runs of tables `two` and `four`; `fast` uses the first.
-        tables: which tables to make.
+        out: where stores and results are kept.
+        seed: of the runs.
     """
     where = data or (Path(found) if (found := os.environ.get(DATA_VARIABLE)) else None)
     if where is None:
@@ -30,7 +24,7 @@ def real(
         return
     from benchmarks.real import run
 
-    run(where, out, seeds, tables)
+    run(where, out, seed)
 
 
 def speed(store: Path, image: Path, repeat: int = 50) -> None:

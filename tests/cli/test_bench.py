@@ -11,6 +11,7 @@ import pytest
 
 from evercal.cli import bench as verb
 from evercal.datasets import generic
+from evercal.evaluation.outcomes import RESULTS
 
 if TYPE_CHECKING:
     from evercal.continual.learn import StageOptions
@@ -44,7 +45,8 @@ def test_bench_and_its_report(
     assert report.code == 0
     assert "| evercal " in (tmp_path / "out" / "tables.md").read_text()
     page = (tmp_path / "out" / "report.html").read_text()
-    assert page.count("<img ") == 6
+    assert page.count("<img ") == 8
+    assert "seen from the estimated pose" in page
     assert "evercal - finetune" in page
     assert r"\multicolumn{3}{c}{finetune}" in (tmp_path / "out" / "table.tex").read_text()
 
@@ -58,6 +60,7 @@ def test_bench_and_its_report(
         (["sim-mini", "--strategies", "evercal,magic"], "strategy 'magic': unknown; choose from"),
         (["sim-mini", "--seeds", "0,one"], "--seeds 0,one: give numbers"),
         (["sim-mini", "--seeds", ","], "--seeds ,: give numbers"),
+        (["sim-mini", "--strategies", "er@fast"], "strategy 'er@fast': unknown; choose from"),
         (["sim-mini", "--steps", "0"], "--steps 0: give a number >= 1"),
         (["sim-mini", "--memory", "all"], "--memory all: give a share"),
         (["sim-mini", "--scenes", "bedroom"], "two or more"),
@@ -75,3 +78,32 @@ def test_a_folder_without_results(run: Any, tmp_path: Path) -> None:
     found = run("bench-report", tmp_path)
     assert found.code == 2
     assert "no results here" in found.err[0]
+
+
+def test_settings_are_chosen_on_training_frames(
+    run: Any, small: None, arcs: tuple[Scene, Scene], tmp_path: Path
+) -> None:
+    folders = []
+    for scene in arcs:
+        folders.append(tmp_path / scene.name)
+        generic.write(folders[-1], replace(scene, train=scene.train[:30], test=scene.test[:2]))
+    words = ["custom", *folders, "--strategies", "er,er@3", "--seeds", "0", "--held-out"]
+    assert run("bench", *words, "--out", tmp_path / "out").code == 0
+    lines = [json.loads(line) for line in (tmp_path / "out" / RESULTS).read_text().splitlines()]
+    learned = {frame.name for scene in arcs for frame in scene.train}
+    assert {line["strategy"] for line in lines} == {"er", "er@3"}
+    assert {len(line["frames"]) for line in lines} == {6}
+    assert {name for line in lines for name in line["frames"]} <= learned
+    # Results on test frames do not mix with these.
+    found = run("bench", *words[:-1], "--out", tmp_path / "out")
+    assert found.code == 2
+    assert "now it is 'test frames'" in " ".join(found.err)
+
+
+def test_the_backbone_of_the_paper() -> None:
+    ours, paper = (verb.Bench("sim-mini", backbone=b, steps=7) for b in ("evercal", "paper"))
+    stage = paper._stage(3)
+    assert (stage.seed, stage.fit.iterations) == (3, 7)
+    assert stage.head.centres == "fixed"
+    assert stage.head.width == ours._stage(3).head.width
+    assert ours._stage(3).head.condition == "code"

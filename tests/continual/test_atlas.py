@@ -7,7 +7,7 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 
-from evercal.continual.atlas import MIN_CELL_M, Atlas, Cell, paper_grid, spiral
+from evercal.continual.atlas import MIN_CELL_M, Atlas, Cell, combined_centres, paper_grid, spiral
 from evercal.errors import InputError
 
 
@@ -127,3 +127,20 @@ def test_seven_and_twelve_scenes_stand_in_rows_of_three_and_four() -> None:
         [0, 0], [0, -5], [0, -10], [-5, 0], [-5, -5], [-5, -10], [-10, 0]
     ]  # fmt: skip
     assert paper_grid(12)[11].tolist() == [-10, -15, 0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_centres_of_all_scenes_lie_where_their_cameras_will(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scenes = [rng.uniform(-1, 1, (n, 3)) + rng.normal(0, 30, 3) for n in (30, 3, 40, 25, 20)]
+    centres = np.array(combined_centres(scenes, 6, seed))
+    assert len(centres) == 6 + 3 + 6 + 6 + 6
+    assert combined_centres(scenes, 6, seed) == tuple(map(tuple, centres))
+    atlas = Atlas("paper", len(scenes))
+    for positions in scenes:
+        own, centres = np.split(centres, [min(6, len(positions))])
+        in_atlas = atlas.place(positions).atlas_from_base.apply(positions)
+        # Each is a mean of cameras, and near one.
+        assert (own >= in_atlas.min(0) - 1e-9).all()
+        assert (own <= in_atlas.max(0) + 1e-9).all()
+    np.testing.assert_array_equal([c.centre_m for c in atlas.cells], paper_grid(5))

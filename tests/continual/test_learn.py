@@ -188,7 +188,7 @@ def test_the_new_scene_stands_in_its_cell(
         # Means of groups of cameras lie within the box around all.
         assert (centres >= in_atlas.min(0) - 1e-5).all()
         assert (centres <= in_atlas.max(0) + 1e-5).all()
-        assert after.atlas.scene_at(centres[0]) == i
+        assert after.atlas().scene_at(centres[0]) == i
 
 
 def test_replayed_rows_are_the_old_scenes_and_their_teacher_stays_as_it_was(
@@ -304,3 +304,28 @@ def test_replay_keeps_an_old_scene(
     kept = median_error_m(after, arcs[0])
     assert kept < 0.15
     assert kept < median_error_m(forgot, arcs[0]) / 3
+
+
+def test_strength_weighs_penalty_and_restraint(
+    first: dict[str, Knowledge],
+    rooms: Rooms,
+    quick: StageOptions,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def learned(name: str, **change: object) -> dict[str, Tensor]:
+        rule = replace(STRATEGIES[name], **change)  # pyright: ignore[reportArgumentType]
+        with monkeypatch.context() as patch:
+            patch.setitem(STRATEGIES, name, rule)
+            return weights(outcome(continued(first[name], rooms, quick)).heads[0])
+
+    def free(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
+        return 0 * student.points.sum()
+
+    for name, nothing in (("er", {"penalty": free}), ("ewc", {"restraint": None})):
+        without = learned(name, **nothing)
+        assert_same(learned(name, strength=0.0), without)
+        moved = [
+            sum(float((now[key] - without[key]).abs().sum()) for key in without)
+            for now in (learned(name), learned(name, strength=1000.0))
+        ]
+        assert 0 < moved[0] < moved[1]

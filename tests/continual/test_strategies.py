@@ -283,3 +283,18 @@ def test_any_selector_goes_with_any_penalty(monkeypatch: pytest.MonkeyPatch) -> 
     ):
         with pytest.raises(InputError, match=r"unknown; choose from evercal.* SELECTOR\+PENALTY"):
             strategies.compose(name)
+
+
+def test_a_name_may_say_how_much_a_rule_weighs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(strategies, "STRATEGIES", dict(STRATEGIES))
+    ours = strategies.compose("icarl@0.3")
+    assert ours.strength == pytest.approx(0.3 * STRATEGIES["icarl"].strength)
+    assert replace(ours, source="", strength=1) == replace(
+        STRATEGIES["icarl"], source="", strength=1
+    )
+    assert strategies.STRATEGIES["icarl@0.3"] is ours
+    assert strategies.compose("sars+spdd@3").strength == 3
+    assert strategies.compose("icarl") is STRATEGIES["icarl"]
+    for name in ("icarl@", "icarl@-1", "icarl@x", "@3", "nonsense@3", "sars+nonsense@2"):
+        with pytest.raises(InputError, match="unknown; choose from"):
+            strategies.compose(name)

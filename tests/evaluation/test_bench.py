@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from evercal.continual.presets import PRESETS, on_paper_backbone
+from evercal.continual.robot import Robot
 from evercal.datasets import Frame, Scene
 from evercal.errors import InputError
 from evercal.evaluation import bench
 from evercal.evaluation.bench import BenchOptions, in_order, run_bench
 from evercal.evaluation.comparison import runs_of
 from evercal.evaluation.outcomes import RESULTS, Outcome, read
-from evercal.evaluation.suites import SUITES, load_suite, regions
+from evercal.evaluation.suites import SUITES, held_out, load_suite, regions
 from evercal.geometry import SE3, Camera
 
 if TYPE_CHECKING:
@@ -192,6 +194,47 @@ def test_suites(tmp_path: Path) -> None:
     for call, message in refused:
         with pytest.raises(InputError, match=message):
             call()
+
+
+def test_what_is_held_out_to_choose_settings_is_training_frames() -> None:
+    def look(i: int, posed: bool = True) -> Frame:
+        pose = SE3(np.array([1.0, 0, 0, 0]), np.zeros(3)) if posed else None
+        return Frame(str(i), np.zeros((3, 4, 3), np.uint8), CAMERA, pose)
+
+    train = (look(-1, posed=False), *(look(i) for i in range(30)))
+    scene = held_out(Scene("hall", train, (look(99),)))
+    assert [int(f.name) for f in scene.test] == [6, 7, 8, 21, 22, 23]
+    assert [f.name for f in scene.train] == [
+        str(i) for i in range(30) if i not in (6, 7, 8, 21, 22, 23)
+    ]
+    with pytest.raises(InputError, match=r"hall: 12 of 15 .* leave out --held-out"):
+        held_out(Scene("hall", train[:16], ()))
+
+
+def test_the_paper_knows_all_centres_from_the_start(
+    arcs: Arcs, options: BenchOptions, tmp_path: Path
+) -> None:
+    def stage(seed: int) -> StageOptions:
+        few = options.stage(seed)
+        made = on_paper_backbone(replace(few, head=replace(few.head, width=24)))
+        return replace(made, head=replace(made.head, centres_per_scene=5))
+
+    asked = replace(options, stage=stage, strategies=("sars_spdd", "joint", "evercal"))
+    run = bench._Run(list(arcs), asked, tmp_path, "evercal", 0)
+    assert (run.stage.grid_scenes, len(run.stage.fixed_centres_m)) == (2, 10)
+    assert run.stage.head.width == 24
+    assert run.stage.head.condition == "descriptor"
+    assert run.stage.fit.iterations == options.stage(0).fit.iterations
+    assert run.stage.fit.peak_rate == PRESETS["paper"].fit.peak_rate
+    steps = list(run_bench(arcs, asked, tmp_path))
+    assert [s.strategy for s in steps] == [n for n in asked.strategies for _ in arcs]
+    first = Robot.open(tmp_path / "runs" / "first-one-0").known
+    # No scene brings any of its own.
+    assert len(first.heads[0].centres) == 10
+    assert first.scenes[0].cell.side_m == 5.0
+    ends = {o.strategy: o for o in read(tmp_path) if (o.stage, o.scene) == (1, "two")}
+    # Twelve steps teach this network nothing, but what is remembered answers all the same.
+    assert ends["evercal"].correct().sum() > ends["joint"].correct().sum() == 0
 
 
 def test_regions_share_the_base_frame_and_split_every_frame() -> None:

@@ -43,6 +43,10 @@ def test_a_cluster_gives_what_a_loop_gives(
     steps = list(run_on_ray(few, options, spread, "local"))
     assert [(s.strategy, s.done, s.total) for s in steps] == [("evercal", 3, 4), ("evercal", 4, 4)]
     list(run_bench(few, options, plain))
+    names = [sorted(path.name for path in (at / "views").iterdir()) for at in (plain, spread)]
+    assert (
+        names[0] == names[1] == [f"{s}-{r}.npz" for s in options.strategies for r in ("one", "two")]
+    )
     for a, b in zip(told(plain), told(spread), strict=True):
         assert (a.strategy, a.stage, a.scene, a.frames) == (b.strategy, b.stage, b.scene, b.frames)
         # Another process may use another number of threads, and sums round otherwise.

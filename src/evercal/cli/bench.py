@@ -53,10 +53,15 @@ class Bench:
     """Stages that the suite regions makes of one scene."""
     preset: Literal["fast", "demo", "bench", "paper"] = "bench"
     """How much work a stage is."""
+    backbone: Literal["evercal", "paper"] = "evercal"
+    """The network: ours, or the paper's with all centres known in advance and every stage at the
+    full rate."""
     steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Optimiser steps of a stage; the preset's when left out."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
     """What is remembered of a scene: a share of its frames (10%) or bytes (5MB)."""
+    held_out: bool = False
+    """Judge on a fifth of the training frames instead of the test frames, to choose settings."""
     plugin: Annotated[Path | None, arg(metavar="FILE.py", help_behavior_hint="")] = None
     """File with strategies of one's own (see examples/my_strategy.py)."""
     ray: Annotated[str | None, arg(metavar="ADDRESS", help_behavior_hint="")] = None
@@ -83,7 +88,11 @@ class Bench:
             _words(self.strategies),
             seeds,
             self.order,
-            settings={"suite": self.suite, "poses": "sfm" if self.poses else "original"},
+            settings={
+                "suite": self.suite,
+                "poses": "sfm" if self.poses else "original",
+                "judged": "held-out training frames" if self.held_out else "test frames",
+            },
             features=self.out.absolute() / "features",
         )
         said = sys.stderr if self.json else sys.stdout
@@ -105,6 +114,12 @@ class Bench:
         return run_on_ray(self._scenes(), options, out, self.ray, self.plugin)
 
     def _scenes(self) -> "list[Scene]":
+        from evercal.evaluation.suites import held_out
+
+        scenes = self._recorded()
+        return [held_out(scene) for scene in scenes] if self.held_out else scenes
+
+    def _recorded(self) -> "list[Scene]":
         from evercal.datasets import load_scene
         from evercal.evaluation.suites import load_suite, regions
 
@@ -124,10 +139,12 @@ class Bench:
 
     def _stage(self, seed: int) -> "StageOptions":
         from evercal.cli.learn import parse_memory
-        from evercal.continual.presets import preset
+        from evercal.continual.presets import on_paper_backbone, preset
 
         share, count = parse_memory(self.memory)
         stage = preset(self.preset, seed)
+        if self.backbone == "paper":
+            stage = on_paper_backbone(stage)
         steps = stage.fit.iterations if self.steps is None else self.steps
         if steps < 1:
             raise InputError(f"--steps {steps}: give a number >= 1")
@@ -176,17 +193,24 @@ def _mirror(out: Path) -> Path:
 
 def _show(folder: Path, reference: str, as_json: bool) -> int:
     from evercal.cli.bench_page import bench_page
-    from evercal.evaluation.comparison import runs_of, summary
+    from evercal.cli.bench_views import view_pictures
+    from evercal.evaluation.comparison import by_strategy, runs_of, summary
     from evercal.evaluation.latex import paper_table
     from evercal.evaluation.outcomes import RESULTS, read
+    from evercal.evaluation.views import read_views
+    from evercal.simulation.cell import SUITES
     from evercal.storage import write_bytes
 
     if not (folder / RESULTS).is_file():
         raise InputError(f"{folder}: no results here; make some with 'evercal bench'")
     runs = runs_of(read(folder))
     write_bytes(folder / TABLES, (_tables(runs, reference, "markdown") + "\n").encode())
-    write_bytes(folder / PAGE, bench_page(runs, reference).encode())
     settings = json.loads((folder / SETTINGS).read_text())
+    suite = SUITES.get(str(settings["suite"]))
+    rooms = {name: (kind, seed) for name, kind, seed in suite.rooms} if suite else {}
+    ranked = sorted(by_strategy(runs), key=lambda name: name != reference)
+    pictures = view_pictures(read_views(folder), ranked, rooms)
+    write_bytes(folder / PAGE, bench_page(runs, reference, pictures).encode())
     write_bytes(folder / LATEX, (paper_table(runs, str(settings["suite"])) + "\n").encode())
     if as_json:
         print_json({"strategies": summary(runs)})

@@ -27,12 +27,13 @@ from evercal.evaluation.comparison import (
 )
 
 
-def bench_page(runs: Sequence[Run], reference: str) -> str:
+def bench_page(runs: Sequence[Run], reference: str, pictures: Sequence[Picture] = ()) -> str:
     """The whole page.
 
     Args:
         runs: whose last stage is done.
         reference: the strategy that others are compared with.
+        pictures: what the methods see (`bench_views`).
     """
     grouped = by_strategy(runs)
     names = sorted(runs[0].scenes)
@@ -74,6 +75,9 @@ def bench_page(runs: Sequence[Run], reference: str) -> str:
                 [Picture(forgetting_curves(curves, order), "What became of each scene")],
             )
         )
+    if pictures:
+        said = "A test image of each scene, and the scene at the pose that each method found for it"
+        sections.append(Section("At the end, seen from the estimated pose", [said, *pictures]))
     kept = _kept(runs)
     if kept:
         sections.append(

@@ -4,7 +4,7 @@ Every scene keeps its own base frame; `atlas_from_base` only shifts it into the 
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -89,6 +89,27 @@ class Atlas:
             if np.abs(position_m[:2] - cell.centre_m[:2]).max() <= cell.side_m / 2:
                 return i
         return None
+
+
+def combined_centres(
+    positions_m: Sequence[np.ndarray], count: int, seed: int
+) -> tuple[tuple[float, float, float], ...]:
+    """Cluster centres of all scenes in the paper's layout, known before the first is learned.
+
+    Args:
+        positions_m: (n, 3) camera positions of each scene in its base frame.
+        count: centres of a scene, by k-means.
+        seed: of the k-means.
+    """
+    from scipy.cluster.vq import kmeans2
+
+    atlas, found = Atlas("paper", len(positions_m)), []
+    for positions in positions_m:
+        shift = atlas.place(positions).atlas_from_base
+        some = min(count, len(np.unique(positions, axis=0)))
+        means, _ = kmeans2(shift.apply(positions), some, minit="++", rng=seed)
+        found += [(float(x), float(y), float(z)) for x, y, z in means]
+    return tuple(found)
 
 
 def spiral() -> Iterator[np.ndarray]:

@@ -95,10 +95,13 @@ class Knowledge:
         frames = sum(memory.bytes for memory in self.memories if memory is not None)
         return frames + sum(value.nbytes for note in self.notes for value in note.values())
 
-    @property
-    def atlas(self) -> Atlas:
-        """Cells of the scenes known so far."""
-        atlas = Atlas()
+    def atlas(self, grid_scenes: int = 0) -> Atlas:
+        """Cells of the scenes known so far.
+
+        Args:
+            grid_scenes: of the paper's layout; 0 for the open one.
+        """
+        atlas = Atlas("paper", grid_scenes) if grid_scenes else Atlas()
         atlas.cells = [record.cell for record in self.scenes]
         return atlas
 

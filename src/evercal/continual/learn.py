@@ -15,6 +15,7 @@ from evercal.continual.candidates import Candidates
 from evercal.continual.keeping import keep, note_of
 from evercal.continual.knowledge import Knowledge, SceneRecord, prototypes, refine
 from evercal.continual.memory import remember
+from evercal.continual.notes import Notes
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.datasets.frame import Frame, Scene
 from evercal.errors import InputError
@@ -46,6 +47,9 @@ class StageOptions:
     """N_b as a size instead; frames are counted at the size of the first one."""
     fixed_centres_m: tuple[tuple[float, float, float], ...] = ()
     """Atlas coordinates of all centres, known in advance (HeadOptions.centres `fixed`)."""
+    grid_scenes: int = 0
+    """Scenes of the combined grid (`Atlas` layout `paper`), if they are known in advance; 0 gives
+    each the next free place."""
     seed: int = 0
     """Of everything that is drawn."""
 
@@ -137,7 +141,7 @@ def learn(
     after = known.fork()
     teacher = copy.deepcopy(after.heads[-1]).eval() if after.heads else None
     positions = np.stack([_pose(frame).translation_m for frame in scene.train])
-    cell = after.atlas.place(positions)
+    cell = after.atlas(options.grid_scenes).place(positions)
     head, local = _head_for_stage(after, strategy, options, cell, positions)
     correctable = _correctable(scene.train)
     buffer = FeatureBuffer(local, cell.atlas_from_base, correctable)
@@ -164,7 +168,7 @@ def learn(
     fit = options.fit
     restraint = None
     if strategy.restraint is not None and known.notes:
-        restraint = partial(strategy.restraint, head, known.notes)
+        restraint = partial(_weighed, strategy, head, known.notes)
     fitter = Fitter(head, buffers, replay, fit, options.seed, restraint)
     if fitter_state:
         fitter.load(dict(fitter_state))
@@ -291,7 +295,7 @@ def _replay(
     def penalty(student: HeadOutput, rows: Rows, progress: float) -> Tensor:
         with torch.no_grad(), autocast():
             before = teacher(rows.features.float(), rows.scene, rows.descriptor)
-        return cost(student, before, rows, progress)
+        return strategy.strength * cost(student, before, rows, progress)
 
     if not buffers:
         return None
@@ -304,6 +308,11 @@ def _replay(
         torch.stack(references),
         strategy.interfered,
     )
+
+
+def _weighed(strategy: Strategy, head: Head, notes: Sequence[Notes]) -> Tensor:
+    assert strategy.restraint is not None
+    return strategy.strength * strategy.restraint(head, notes)
 
 
 def _finish(

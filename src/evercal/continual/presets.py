@@ -59,3 +59,15 @@ def preset(name: str, seed: int = 0) -> StageOptions:
     """A preset with everything drawn from `seed`."""
     options = PRESETS[name]
     return replace(options, seed=seed, fill=replace(options.fill, seed=seed))
+
+
+def on_paper_backbone(options: StageOptions) -> StageOptions:
+    """As much work with the paper's network and optimiser in place of ours.
+
+    The descriptor in the input, centres that are known in advance (`fixed_centres_m`), no
+    whitening, and every stage at the full peak rate; width, steps and rows of a step stay.
+    """
+    paper = PRESETS["paper"]
+    head = replace(paper.head, width=options.head.width, centres="fixed")
+    work = {name: getattr(options.fit, name) for name in ("iterations", "batch", "replay_batch")}
+    return replace(options, head=head, fit=replace(paper.fit, **work))

@@ -1,5 +1,6 @@
 """Strategies: small records of functions, and the literal dict that names them all."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -52,6 +53,8 @@ class Strategy:
     """Which frames of a finished scene are remembered; None keeps none."""
     penalty: Penalty | None = None
     """What replayed rows cost."""
+    strength: float = 1.0
+    """What `penalty` and `restraint` are multiplied by."""
     penalty_per_scene: bool = False
     """Whether every remembered scene costs that much, or (the paper) all of them together: then a
     scene counts less with every one that follows."""
@@ -348,16 +351,30 @@ PENALTIES: dict[str, Penalty] = {
 
 
 def compose(name: str) -> Strategy:
-    """The strategy `SELECTOR+PENALTY` or `SELECTOR+PENALTY+recall`, now one of STRATEGIES.
+    """A strategy made of others by its name, from now on one of STRATEGIES.
+
+    Args:
+        name: `SELECTOR+PENALTY`, the same with `+recall`, or a strategy and by how much its
+            penalty and restraint are to weigh more: `icarl@0.3`.
 
     Raises:
-        InputError: a name without a plus, or a part that is not known.
+        InputError: any other name that is not known yet.
     """
+    if name in STRATEGIES:
+        return STRATEGIES[name]
+    plain, weighed, factor = name.rpartition("@")
+    if weighed and re.fullmatch(r"\d*\.?\d+", factor):
+        rule = compose(plain)
+        source = f"{rule.source}, weighing {factor} times as much"
+        return STRATEGIES.setdefault(
+            name, replace(rule, source=source, strength=rule.strength * float(factor))
+        )
     selector, penalty, *more = [*name.split("+"), ""][:4]
     if selector not in SELECTORS or penalty not in PENALTIES or more not in ([""], ["recall", ""]):
         raise InputError(
             f"strategy {name!r}: unknown; choose from {', '.join(STRATEGIES)}, or SELECTOR+PENALTY "
-            f"(+recall) of {', '.join(SELECTORS)} and {', '.join(PENALTIES)}"
+            f"(+recall) of {', '.join(SELECTORS)} and {', '.join(PENALTIES)}, or one of these and "
+            "its weight as in er@0.3"
         )
     source = f"composed: {selector} selects, replay costs {penalty}"
     made = Strategy(source, SELECTORS[selector], PENALTIES[penalty], recall="recall" in more)

@@ -2,6 +2,7 @@
 
     OUT/settings.json             what decides the results; a folder of other settings is refused
     OUT/results.jsonl             see `evaluation.outcomes`
+    OUT/views/                    see `evaluation.views`; of each strategy's first run
     OUT/features/                 encoded views, shared by all runs; may be deleted
     OUT/runs/STRATEGY-SEED/       a store under way, gone when its sequence is done
     OUT/runs/first-SCENE-SEED/    the first scene, which all strategies learn alike
@@ -20,6 +21,7 @@ from typing import Literal
 import numpy as np
 
 from evercal.continual import strategies as rules
+from evercal.continual.atlas import combined_centres
 from evercal.continual.candidates import Candidates
 from evercal.continual.keeping import keep, note_of, plain_rows
 from evercal.continual.knowledge import Knowledge
@@ -32,6 +34,7 @@ from evercal.errors import InputError
 from evercal.evaluation import outcomes
 from evercal.evaluation.outcomes import Outcome, outcome_of
 from evercal.evaluation.protocol import evaluate
+from evercal.evaluation.views import keep_views
 from evercal.localization.localizer import Localizer
 from evercal.localization.teach import (
     LearnOptions,
@@ -55,7 +58,8 @@ class BenchOptions:
     """What is compared."""
 
     stage: Callable[[int], StageOptions]
-    """How a scene is learned, given the seed."""
+    """How a scene is learned, given the seed. With `centres: fixed` and none given, those of all
+    scenes are there from the start, in the paper's combined grid."""
     strategies: tuple[str, ...]
     """Keys of STRATEGIES."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -128,8 +132,7 @@ def begin_bench(scenes: Sequence[Scene], options: BenchOptions, out: Path) -> li
     if len(scenes) < 2:
         raise InputError(f"{len(scenes)} scene: forgetting takes two or more; give more scenes")
     for name in options.strategies:
-        if name not in STRATEGIES:
-            rules.compose(name)
+        rules.compose(name)
     hold_settings(out / "settings.json", _settings(scenes, options))
     found = {(o.strategy, o.seed) for o in outcomes.read(out) if o.stage == len(scenes) - 1}
     runs = [(seed, strategy) for seed in options.seeds for strategy in options.strategies]
@@ -152,6 +155,11 @@ def _settings(scenes: Sequence[Scene], options: BenchOptions) -> dict[str, objec
     return {
         **asdict(replace(stage, seed=0, fill=replace(stage.fill, seed=0))),
         "replay": replay,
+        "strengths": {
+            name: rule.strength
+            for name, rule in STRATEGIES.items()
+            if rule.strength != 1 and "@" not in name
+        },
         "networks": [sha256_file(file)[:12] for file in (ENCODER_FILE, DESCRIPTOR_FILE)],
         "order": options.order,
         "short_side": options.short_side,
@@ -170,6 +178,11 @@ class _Run:
         self.strategy, self.seed, self.rule = strategy, seed, STRATEGIES[strategy]
         self.features = options.features or out / "features"
         self.store = out / "runs" / f"{strategy}-{seed}"
+        self.stage = options.stage(seed)
+        if self.stage.head.centres == "fixed" and not self.stage.fixed_centres_m:
+            places = [known_poses(hold_out(scene.train)[0]).translation_m for scene in scenes]
+            found = combined_centres(places, self.stage.head.centres_per_scene, seed)
+            self.stage = replace(self.stage, grid_scenes=len(scenes), fixed_centres_m=found)
 
     def stages(self, on_event: OnEvent | None) -> Iterator[tuple[int, tuple[Outcome, ...]]]:
         """(number, outcomes) of the stages that were not done before."""
@@ -189,7 +202,7 @@ class _Run:
 
     def _how(self, strategy: str) -> LearnOptions:
         return LearnOptions(
-            self.options.stage(self.seed),
+            self.stage,
             strategy,
             short_side=self.options.short_side,
             cache=self.features,
@@ -221,7 +234,7 @@ class _Run:
 
         frames = Candidates(train, known.heads[0], rows, self.seed)
         refined = known.scenes[0].refined_camera
-        capacity = self.options.stage(self.seed).capacity(train, known.short_side)
+        capacity = self.stage.capacity(train, known.short_side)
         memory = keep(known, train, frames, capacity, refined)
         known.memories = [memory]
         known.notes = [note_of(known, rows())] if self.rule.note else [{}]
@@ -265,7 +278,10 @@ class _Run:
         self, known: Knowledge, number: int, seconds: float, kept: int
     ) -> tuple[Outcome, ...]:
         learned = {scene.name: scene for scene in self.scenes[: number + 1]}
-        results = evaluate(Localizer(known), learned)
+        localizer = Localizer(known)
+        results = evaluate(localizer, learned)
+        if number == len(self.scenes) - 1:
+            keep_views(self.out, self.strategy, localizer, self.scenes)
         size = sum(head_bytes(head) for head in known.heads)
         return tuple(
             outcome_of(

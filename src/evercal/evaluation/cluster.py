@@ -11,6 +11,8 @@ from evercal.errors import InputError
 from evercal.evaluation import outcomes
 from evercal.evaluation.bench import BenchOptions, Step, begin_bench, run_bench
 from evercal.evaluation.outcomes import Outcome
+from evercal.evaluation.views import VIEWS
+from evercal.storage import write_bytes
 
 
 def run_on_ray(
@@ -59,8 +61,12 @@ def run_on_ray(
         while tasks:
             (ready,), _ = ray.wait(list(tasks), num_returns=1)
             seed, strategy = tasks.pop(ready)
-            found = ray.get(ready)
+            found, views = ray.get(ready)
             outcomes.append(out, found)
+            for name, data in views.items():
+                (out / VIEWS).mkdir(exist_ok=True)
+                if not (out / VIEWS / name).exists():
+                    write_bytes(out / VIEWS / name, data)
             for stage in range(len(scenes)):
                 done += 1
                 these = tuple(o for o in found if o.stage == stage)
@@ -69,14 +75,17 @@ def run_on_ray(
         ray.shutdown()
 
 
-def _one_run(scenes: list[Scene], options: BenchOptions, plugin: Path | None) -> list[Outcome]:
-    """A task: one strategy, one seed, in a folder of its own."""
+def _one_run(
+    scenes: list[Scene], options: BenchOptions, plugin: Path | None
+) -> tuple[list[Outcome], dict[str, bytes]]:
+    """A task: one strategy, one seed, in a folder of its own; its outcomes and views."""
     if plugin is not None:
         load_plugin(plugin)
     with tempfile.TemporaryDirectory(prefix="evercal-bench-") as folder:
         for _ in run_bench(scenes, options, Path(folder)):
             pass
-        return outcomes.read(Path(folder))
+        views = {path.name: path.read_bytes() for path in (Path(folder) / VIEWS).iterdir()}
+        return outcomes.read(Path(folder)), views
 
 
 def _ray():

@@ -112,6 +112,26 @@ def load_suite(
     return [with_sfm_poses(s, poses, n) for s, n in zip(scenes, called, strict=True)]
 
 
+def held_out(scene: Scene) -> Scene:
+    """The scene for choosing settings: its test frames are not looked at.
+
+    Of ten equal runs of training frames the third and the eighth are judged, the others learned.
+
+    Raises:
+        InputError: fewer posed training frames than a scene needs after that.
+    """
+    frames = [f for f in scene.train if f.base_from_camera is not None]
+    tenth = [10 * i // len(frames) for i in range(len(frames))]
+    learned = tuple(f for f, part in zip(frames, tenth, strict=True) if part not in (2, 7))
+    judged = tuple(f for f, part in zip(frames, tenth, strict=True) if part in (2, 7))
+    if len(learned) < MIN_TRAIN_FRAMES:
+        raise InputError(
+            f"{scene.name}: {len(learned)} of {len(frames)} training frames are left to learn, "
+            f"at least {MIN_TRAIN_FRAMES} are needed; leave out --held-out"
+        )
+    return replace(scene, train=learned, test=judged)
+
+
 def regions(scene: Scene, parts: int) -> list[Scene]:
     """One scene as a sequence of its regions, after Bahadir et al. (Mach. Vis. Appl. 2024).
 

@@ -210,7 +210,7 @@ class Localizer:
 
     def _candidates(self, descriptor: Tensor, cameras: list[Camera | None]) -> list[int]:
         """Scenes to try, the likeliest first."""
-        if self._one_answer():
+        if self._one_answer() and not any(map(self._has_depths, range(len(cameras)))):
             return [next(i for i, c in enumerate(cameras) if c is not None)]
         likeness = [float((p @ descriptor).max()) for p in self._prototypes]
         usable = [i for i, c in enumerate(cameras) if c is not None]
@@ -251,7 +251,7 @@ class Localizer:
                 points = torch.cat([own, recall.points(found, own, expected)])
                 pose = solve(points, self.options.refine)
         if pose is not None and self._one_answer():
-            other = self.known.atlas.scene_at(pose.world_from_camera.translation_m)
+            other = self.known.atlas().scene_at(pose.world_from_camera.translation_m)
             scene = scene if other is None else other
         return _Hypothesis(scene, camera, pose, len(features), pixels, points.double().numpy())
 
@@ -259,10 +259,13 @@ class Localizer:
         """The remembered frames of a scene, encoded when they are first needed."""
         with self._lock:
             if scene not in self._recalls:
-                memory = self.known.memories[scene]
-                sweeps = memory is not None and memory.inverse_depth
-                self._recalls[scene] = Recall(self.known, scene) if sweeps else None
+                recall = Recall(self.known, scene) if self._has_depths(scene) else None
+                self._recalls[scene] = recall
             return self._recalls[scene]
+
+    def _has_depths(self, scene: int) -> bool:
+        memory = self.known.memories[scene]
+        return memory is not None and bool(memory.inverse_depth)
 
     def _answer(self, best: _Hypothesis, began: float) -> PoseEstimate:
         def answer(status, reason, **found) -> PoseEstimate:
@@ -283,7 +286,7 @@ class Localizer:
 
         if best.pose is None:
             return answer("failed", "no pose agrees with at least 6 cells of the image")
-        found = self.known.atlas.scene_at(best.pose.world_from_camera.translation_m)
+        found = self.known.atlas().scene_at(best.pose.world_from_camera.translation_m)
         if found is None or (found != best.scene and not self._one_answer()):
             return answer("failed", "the pose lies outside the cell of its scene")
         record = self.known.scenes[found]
