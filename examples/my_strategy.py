@@ -10,8 +10,9 @@ import numpy as np
 from torch import Tensor
 
 from evercal.continual.candidates import Candidates
+from evercal.continual.penalties import reprojection
 from evercal.continual.selection import select_farthest
-from evercal.continual.strategies import Strategy, reprojection
+from evercal.continual.strategies import Strategy
 from evercal.models.head import HeadOutput
 from evercal.training.buffer import Rows
 

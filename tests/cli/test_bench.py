@@ -107,3 +107,5 @@ def test_the_backbone_of_the_paper() -> None:
     assert stage.head.centres == "fixed"
     assert stage.head.width == ours._stage(3).head.width
     assert ours._stage(3).head.condition == "code"
+    shared = verb.Bench("sim-mini", backbone="paper", offsets="shared")._stage(0)
+    assert (shared.head.offsets, shared.head.centres) == ("shared", "fixed")

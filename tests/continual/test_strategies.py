@@ -10,15 +10,12 @@ from torch import Tensor
 
 from evercal.continual import strategies
 from evercal.continual.candidates import Candidates
-from evercal.continual.spdd import SpddOptions, spdd_loss
-from evercal.continual.strategies import (
+from evercal.continual.penalties import (
     OUTPUT_WEIGHT_PX_PER_M,
     RELATION_TEMPERATURE,
     REPLAY_CLAMP_PX,
     REPLAY_WEIGHT,
-    STRATEGIES,
     TEACHER_LIMIT_PX,
-    Strategy,
     anchored_reprojection,
     bounded_by_teacher,
     old_output,
@@ -27,6 +24,8 @@ from evercal.continual.strategies import (
     steady_reprojection,
     stored_output,
 )
+from evercal.continual.spdd import SpddOptions, spdd_loss
+from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.datasets.frame import Frame
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera

@@ -14,6 +14,7 @@ from evercal.training.gradients import (
     averaged_constraint,
     episodic_barrier,
     gem,
+    moving_barrier,
 )
 
 
@@ -23,6 +24,7 @@ def gradients(
     losses: list[float] | None = None,
     references: list[float] | None = None,
     step: int = 100,
+    before: list[float] | None = None,
 ) -> Gradients:
     count = len(memory)
     return Gradients(
@@ -30,6 +32,7 @@ def gradients(
         torch.tensor(memory),
         torch.tensor(losses or [1.0] * count),
         torch.tensor(references or [1.0] * count),
+        torch.tensor(before or [float("nan")] * count),
         step,
     )
 
@@ -75,6 +78,16 @@ def test_the_barrier_begins_with_plain_replay_and_needs_a_reference() -> None:
     assert episodic_barrier(unknown).tolist() == [2.0, -3.0]
 
 
+def test_the_moving_barrier_looks_at_the_step_before() -> None:
+    # Far above what the scene had when it was learned, but just as much as a step ago.
+    g = gradients([2.0, -3.0], [[0.0, 1.0]], [9.0], [1.0], before=[9.0])
+    expected = torch.tensor([2.0, -GEC_ALPHA * GEC_SLACK * 9.0])
+    torch.testing.assert_close(moving_barrier(g), expected, atol=1e-4, rtol=0)
+    assert moving_barrier(g)[1] < 0 < episodic_barrier(g)[1]
+    first = gradients([2.0, -3.0], [[0.0, 1.0]], [9.0], [1.0])
+    assert moving_barrier(first).tolist() == [2.0, -3.0]
+
+
 def nearest(g: Gradients, bound: Tensor) -> np.ndarray:
     """The quadratic programme solved by another road."""
     new, memory = g.new.double().numpy(), g.memory.double().numpy()
@@ -98,6 +111,7 @@ def test_rules_give_the_nearest_gradient_that_is_allowed(seed: int) -> None:
         torch.randn(count, 7, generator=generator),
         1 + torch.rand(count, generator=generator),
         1 + torch.rand(count, generator=generator),
+        torch.full((count,), torch.nan),
         50,
     )
     zero = torch.zeros(count)

@@ -56,6 +56,8 @@ class Bench:
     backbone: Literal["evercal", "paper"] = "evercal"
     """The network: ours, or the paper's with all centres known in advance and every stage at the
     full rate."""
+    offsets: Literal["per_centre", "shared"] = "per_centre"
+    """An offset and scale for each centre (the paper), or one for all (GLACE)."""
     steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Optimiser steps of a stage; the preset's when left out."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
@@ -150,6 +152,7 @@ class Bench:
             raise InputError(f"--steps {steps}: give a number >= 1")
         return dataclasses.replace(
             stage,
+            head=dataclasses.replace(stage.head, offsets=self.offsets),
             fit=dataclasses.replace(stage.fit, iterations=steps),
             memory_share=stage.memory_share if share is None else share,
             memory_bytes=count,

@@ -20,6 +20,7 @@ from typing import Literal
 
 import numpy as np
 
+from evercal.continual import penalties
 from evercal.continual import strategies as rules
 from evercal.continual.atlas import combined_centres
 from evercal.continual.candidates import Candidates
@@ -150,8 +151,8 @@ def in_order(scenes: Sequence[Scene], order: Order, seed: int) -> list[Scene]:
 
 def _settings(scenes: Sequence[Scene], options: BenchOptions) -> dict[str, object]:
     stage = options.stage(0)
-    replay = [rules.REPLAY_CLAMP_PX, rules.TEACHER_LIMIT_PX]
-    replay += [rules.OUTPUT_WEIGHT_PX_PER_M, rules.REPLAY_WEIGHT, rules.PROTECTION]
+    replay = [penalties.REPLAY_CLAMP_PX, penalties.TEACHER_LIMIT_PX]
+    replay += [penalties.OUTPUT_WEIGHT_PX_PER_M, penalties.REPLAY_WEIGHT, rules.PROTECTION]
     return {
         **asdict(replace(stage, seed=0, fill=replace(stage.fill, seed=0))),
         "replay": replay,

@@ -148,6 +148,7 @@ class Fitter:
             )
 
         self._spoiled: list[Tensor] = []
+        self._losses: Tensor | None = None  # of remembered scenes in the step before
         self._spare: Callable[[], AbstractContextManager[None]] = nullcontext
         if replay is not None and replay.protection > 0:
             self._spare = Protection(head, replay.buffers, replay.protection, seed).damped
@@ -257,7 +258,9 @@ class Fitter:
         references = torch.full_like(losses, torch.nan)
         if replay.references is not None:
             references = replay.references
-        joined = replay.combine(Gradients(new, memory, losses, references, self.step))
+        before = torch.full_like(losses, torch.nan) if self._losses is None else self._losses
+        joined = replay.combine(Gradients(new, memory, losses, references, before, self.step))
+        self._losses = losses
         self.lens.grad = lens
         start = 0
         for parameter in parameters:
@@ -270,6 +273,8 @@ class Fitter:
         state = {f"head.{k}": v for k, v in self.head.state_dict().items()}
         state["lens"] = self.lens.detach()
         state |= {f"spoiled.{i}": views for i, views in enumerate(self._spoiled)}
+        if self._losses is not None:
+            state["losses"] = self._losses
         for which, optimiser in enumerate(self._optimisers):
             for i, slots in optimiser.state_dict()["state"].items():
                 state |= {f"optimiser.{which}.{i}.{name}": v for name, v in slots.items()}
@@ -284,6 +289,7 @@ class Fitter:
         self.lens.data.copy_(state["lens"])
         spoiled = sum(key.startswith("spoiled.") for key in state)
         self._spoiled = [state[f"spoiled.{i}"] for i in range(spoiled)]
+        self._losses = state.get("losses")
         for which, optimiser in enumerate(self._optimisers):
             slots: dict[int, dict[str, Tensor]] = {}
             prefix = f"optimiser.{which}."

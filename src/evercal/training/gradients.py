@@ -5,7 +5,7 @@ no rule here: it is what one backward pass gives.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -24,6 +24,8 @@ class Gradients:
     """(t,) those losses."""
     references: Tensor
     """(t,) the same losses when the scene was just learned; NaN where nothing was noted."""
+    before: Tensor
+    """(t,) the same losses in the step before; NaN in the first step."""
     step: int
     """Of the stage."""
 
@@ -79,6 +81,14 @@ def episodic_barrier(g: Gradients) -> Tensor:
         return g.new
     memory, bound = g.memory[active], bound[active]
     return g.new + _dual(memory, memory @ g.new, bound) @ memory
+
+
+def moving_barrier(g: Gradients) -> Tensor:
+    """The same with the references of the original's Algorithm 1: the losses of the step before.
+
+    Then no step may raise a remembered loss by over 5 %, and nothing stops many small ones.
+    """
+    return episodic_barrier(replace(g, references=g.before))
 
 
 def _dual(memory: Tensor, along: Tensor, bound: Tensor) -> Tensor:
