@@ -237,6 +237,20 @@ def test_the_paper_knows_all_centres_from_the_start(
     assert ends["evercal"].correct().sum() > ends["joint"].correct().sum() == 0
 
 
+def test_joint_training_may_remember_too(
+    arcs: Arcs, options: BenchOptions, done: tuple[Path, list[bench.Step]], tmp_path: Path
+) -> None:
+    list(run_bench(arcs, replace(options, strategies=("joint_recall",)), tmp_path))
+    ours = {o.scene: o for o in read(tmp_path)}
+    plain = {o.scene: o for o in read(done[0]) if o.strategy == "joint"}
+    assert ours.keys() == plain.keys() == {"one", "two"}
+    assert ours["two"].frames_kept == len(ours["two"].kept_m) == 2
+    assert ours["one"].memory_bytes > plain["one"].memory_bytes == 0
+    # The memory is of both scenes, and answers for both.
+    for scene in ours:
+        assert ours[scene].correct().sum() > plain[scene].correct().sum()
+
+
 def test_regions_share_the_base_frame_and_split_every_frame() -> None:
     def look(x: float, name: str) -> Frame:
         return Frame(

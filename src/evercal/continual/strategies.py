@@ -241,6 +241,12 @@ STRATEGIES: dict[str, Strategy] = {
         heads="per_scene",
     ),
     "joint": Strategy(source="all frames of all scenes at once, restarted", data="all"),
+    "joint_recall": Strategy(
+        source="the same with the memory of evercal: what evercal could reach",
+        select=_sars_filled,
+        data="all",
+        recall=True,
+    ),
 }
 
 SELECTORS: dict[str, Select] = {

@@ -27,10 +27,11 @@ from evercal.continual.candidates import Candidates
 from evercal.continual.keeping import keep, note_of, plain_rows
 from evercal.continual.knowledge import Knowledge
 from evercal.continual.learn import Stage, StageOptions, learn
+from evercal.continual.memory import Memory
 from evercal.continual.robot import Robot, head_bytes, with_fit
 from evercal.continual.selection import covering_radius, smallest_pair
 from evercal.continual.strategies import STRATEGIES
-from evercal.datasets import Scene, known_poses
+from evercal.datasets import Frame, Scene, known_poses
 from evercal.errors import InputError
 from evercal.evaluation import outcomes
 from evercal.evaluation.outcomes import Outcome, outcome_of
@@ -227,16 +228,8 @@ class _Run:
         known.strategy = self.strategy
         train, aside = hold_out(scene.train)
         self._cached(known)
-
-        @cache
-        def rows() -> FeatureBuffer:
-            buffer = FeatureBuffer(0, known.scenes[0].cell.atlas_from_base)
-            return plain_rows(buffer, train, known)
-
-        frames = Candidates(train, known.heads[0], rows, self.seed)
-        refined = known.scenes[0].refined_camera
-        capacity = self.stage.capacity(train, known.short_side)
-        memory = keep(known, train, frames, capacity, refined)
+        rows = self._rows(known, 0, train)
+        memory = self._kept(known, 0, train, rows)
         known.memories = [memory]
         known.notes = [note_of(known, rows())] if self.rule.note else [{}]
         if self.rule.recall:  # more cells agree, so more must
@@ -245,6 +238,32 @@ class _Run:
         report["seconds"] = float(report["seconds"]) + time.perf_counter() - began
         report["frames_kept"] = len(memory.images) if memory else 0
         open_or_create(self.store, self._how(self.strategy)).commit(known, report)
+
+    def _rows(
+        self, known: Knowledge, number: int, train: Sequence[Frame]
+    ) -> Callable[[], FeatureBuffer]:
+        """Rows of a scene's training frames as they are, encoded when they are first asked for."""
+
+        @cache
+        def rows() -> FeatureBuffer:
+            _, local = known.head_for(number)
+            buffer = FeatureBuffer(local, known.scenes[number].cell.atlas_from_base)
+            return plain_rows(buffer, train, known)
+
+        return rows
+
+    def _kept(
+        self,
+        known: Knowledge,
+        number: int,
+        train: Sequence[Frame],
+        rows: Callable[[], FeatureBuffer],
+    ) -> Memory | None:
+        """What the strategy remembers of a scene, with the head as it is now."""
+        head, _ = known.head_for(number)
+        frames = Candidates(train, head, rows, self.seed)
+        capacity = self.stage.capacity(train, known.short_side)
+        return keep(known, train, frames, capacity, known.scenes[number].refined_camera)
 
     def _cached(self, known: Knowledge) -> None:
         cache_features(known.encoder, self.features)  # pyright: ignore[reportArgumentType]
@@ -270,10 +289,13 @@ class _Run:
                     on_event(event)
             if not last:
                 yield number, ()
-        for i, (_, aside) in enumerate(split):
+        for i, (train, aside) in enumerate(split):
+            known.memories[i] = self._kept(known, i, train, self._rows(known, i, train))
             known.scenes[i] = with_fit(known.scenes[i], *fit_threshold(known, aside, i))
         seconds = time.perf_counter() - began
-        yield len(lessons) - 1, self._judge(known, len(lessons) - 1, seconds, 0)
+        kept = known.memories[-1]
+        frames_kept = len(kept.images) if kept else 0
+        yield len(lessons) - 1, self._judge(known, len(lessons) - 1, seconds, frames_kept)
 
     def _judge(
         self, known: Knowledge, number: int, seconds: float, kept: int
