@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from evercal.continual.learn import StageOptions
     from evercal.datasets import Scene
     from evercal.evaluation.bench import BenchOptions, Step
-    from evercal.evaluation.comparison import Run
+    from evercal.evaluation.comparison import Rows, Run
 
 TABLES, PAGE, LATEX, SETTINGS = "tables.md", "report.html", "table.tex", "settings.json"
 
@@ -198,7 +198,7 @@ def _show(folder: Path, reference: str, as_json: bool) -> int:
     from evercal.cli.bench_page import bench_page
     from evercal.cli.bench_views import view_pictures
     from evercal.evaluation.comparison import by_strategy, runs_of, summary
-    from evercal.evaluation.latex import paper_table
+    from evercal.evaluation.latex import paper_tables
     from evercal.evaluation.outcomes import RESULTS, read
     from evercal.evaluation.views import read_views
     from evercal.simulation.cell import SUITES
@@ -207,26 +207,29 @@ def _show(folder: Path, reference: str, as_json: bool) -> int:
     if not (folder / RESULTS).is_file():
         raise InputError(f"{folder}: no results here; make some with 'evercal bench'")
     runs = runs_of(read(folder))
-    write_bytes(folder / TABLES, (_tables(runs, reference, "markdown") + "\n").encode())
     settings = json.loads((folder / SETTINGS).read_text())
-    suite = SUITES.get(str(settings["suite"]))
+    name = str(settings["suite"])
+    parts = _parts(runs, reference, name)
+    write_bytes(folder / TABLES, (_text(parts, "markdown") + "\n").encode())
+    suite = SUITES.get(name)
     rooms = {name: (kind, seed) for name, kind, seed in suite.rooms} if suite else {}
     ranked = sorted(by_strategy(runs), key=lambda name: name != reference)
     pictures = view_pictures(read_views(folder), ranked, rooms)
-    write_bytes(folder / PAGE, bench_page(runs, reference, pictures).encode())
-    write_bytes(folder / LATEX, (paper_table(runs, str(settings["suite"])) + "\n").encode())
+    write_bytes(folder / PAGE, bench_page(runs, reference, name, pictures).encode())
+    write_bytes(folder / LATEX, (paper_tables(runs, name) + "\n").encode())
     if as_json:
         print_json({"strategies": summary(runs)})
         return 0
-    print(_tables(runs, reference, "terminal"))
+    print(_text(parts, "terminal"))
     print(f"wrote {folder / PAGE}, {TABLES} and {LATEX}")
     print_next("evercal", "bench-report", folder)
     return 0
 
 
-def _tables(runs: "list[Run]", reference: str, style: Literal["terminal", "markdown"]) -> str:
+def _parts(runs: "list[Run]", reference: str, suite: str) -> "list[Rows]":
+    """The tables, those without a row left out."""
+    from evercal.evaluation.ablation import ablation_rows, grid_rows
     from evercal.evaluation.comparison import (
-        as_text,
         difference_rows,
         method_rows,
         scene_rows,
@@ -235,10 +238,15 @@ def _tables(runs: "list[Run]", reference: str, style: Literal["terminal", "markd
     )
 
     parts = [method_rows(runs), threshold_rows(runs), scene_rows(runs)]
-    if len({run.strategy for run in runs}) > 1:
-        parts.append(difference_rows(runs, reference))
-    parts.append(selector_rows(runs))
-    return "\n\n".join(as_text(rows, style) for rows in parts if len(rows) > 1)
+    parts += [difference_rows(runs, reference), selector_rows(runs)]
+    parts += [ablation_rows(runs, suite), grid_rows(runs)]
+    return [rows for rows in parts if len(rows) > 1]
+
+
+def _text(parts: "list[Rows]", style: Literal["terminal", "markdown"]) -> str:
+    from evercal.evaluation.comparison import as_text
+
+    return "\n\n".join(as_text(rows, style) for rows in parts)
 
 
 def _words(text: str) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from evercal.drawing import (
     kept_places,
     scene_bars,
 )
+from evercal.evaluation.ablation import ablation_rows, grid_rows
 from evercal.evaluation.comparison import (
     Rows,
     Run,
@@ -27,12 +28,15 @@ from evercal.evaluation.comparison import (
 )
 
 
-def bench_page(runs: Sequence[Run], reference: str, pictures: Sequence[Picture] = ()) -> str:
+def bench_page(
+    runs: Sequence[Run], reference: str, suite: str = "", pictures: Sequence[Picture] = ()
+) -> str:
     """The whole page.
 
     Args:
         runs: whose last stage is done.
         reference: the strategy that others are compared with.
+        suite: its name.
         pictures: what the methods see (`bench_views`).
     """
     grouped = by_strategy(runs)
@@ -92,6 +96,19 @@ def bench_page(runs: Sequence[Run], reference: str, pictures: Sequence[Picture] 
                 ],
             )
         )
+    parts = [
+        _table(rows, said)
+        for rows, said in (
+            (
+                ablation_rows(runs, suite),
+                "After the paper's Table 4; bounds of a paired bootstrap",
+            ),
+            (grid_rows(runs), "Final accuracy (TFR) by which frames stay and what replay costs"),
+        )
+        if len(rows) > 1
+    ]
+    if parts:
+        sections.append(Section("What each part gives", parts))
     if len(grouped) > 1:
         said = "Paired bootstrap over runs and blocks of 10 frames; real where 0 lies outside."
         sections.append(Section("Differences", [_table(difference_rows(runs, reference), said)]))

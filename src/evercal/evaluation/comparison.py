@@ -204,6 +204,13 @@ def _fine_median_cm(run: Run) -> float:
     return 100 * float(np.median(right)) if len(right) else math.nan
 
 
+def _fine_accuracy(run: Run) -> float:
+    """Accuracy among frames that were given the right scene."""
+    right = np.concatenate([np.isfinite(o.translation_m) for o in run.last])
+    correct = np.concatenate([o.correct() for o in run.last])
+    return 100 * float(correct[right].mean()) if right.any() else math.nan
+
+
 def _wrong_scene(run: Run) -> float:
     return 100 * float(np.mean([np.mean(o.wrong_scene) for o in run.last]))
 
@@ -223,6 +230,7 @@ _COLUMNS: tuple[tuple[str, Callable[[Run], float]], ...] = (
     ("BWT", lambda run: run.scores().backward_transfer),
     ("wrong scene %", _wrong_scene),
     ("median cm, right scene", _fine_median_cm),
+    ("%, right scene", _fine_accuracy),
     ("memory MB", lambda run: run.last[0].memory_bytes / 1e6),
     ("heads MB", lambda run: run.last[0].head_bytes / 1e6),
     ("s", _seconds),

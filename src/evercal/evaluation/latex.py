@@ -1,4 +1,6 @@
-"""The layout of the paper's Tables 1 to 3: scenes down, methods across, error and accuracy each.
+"""The layout of the paper's tables: scenes down, methods across, error and accuracy each.
+
+Tables 1 to 3 are of this kind; Table 4, the ablation, follows where its strategies were run.
 
 Published numbers stand beside ours where the data are the same; they are those of Li et al.,
 "Continual Hand-Eye Calibration for Open-world Robotic Manipulation", arXiv 2604.15814.
@@ -9,6 +11,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from evercal.evaluation.ablation import ablation_rows
 from evercal.evaluation.comparison import Run, by_strategy
 from evercal.evaluation.metrics import COARSE, FINE
 
@@ -33,6 +36,23 @@ PUBLISHED: Mapping[str, Mapping[str, tuple[float, float]]] = {
     },
 }
 """By suite and strategy: final accuracy and TFR, per cent."""
+
+
+def paper_tables(runs: Sequence[Run], suite: str) -> str:
+    """`paper_table` and, where its strategies were run, `ablation_table`."""
+    found = [paper_table(runs, suite), ablation_table(runs, suite)]
+    return "\n\n".join(table for table in found if table)
+
+
+def ablation_table(runs: Sequence[Run], suite: str) -> str:
+    """A LaTeX table (booktabs) of what each step of an ablation gave; empty without one."""
+    header, *rows = ablation_rows(runs, suite)
+    if not rows:
+        return ""
+    lines = [rf"\begin{{tabular}}{{ll{'r' * (len(header) - 2)}}}", r"\toprule"]
+    lines += [rf"{' & '.join(map(_escaped, row))} \\" for row in (header, *rows)]
+    lines.insert(3, r"\midrule")
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
 
 
 def paper_table(runs: Sequence[Run], suite: str) -> str:
@@ -102,4 +122,4 @@ def _number(value: float) -> str:
 
 
 def _escaped(name: str) -> str:
-    return name.replace("_", r"\_")
+    return name.replace("_", r"\_").replace("%", r"\%")
