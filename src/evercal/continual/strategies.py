@@ -89,6 +89,9 @@ class Strategy:
 
 
 PROTECTION = 0.5
+WEIGHTS: dict[Penalty, float] = {reprojection: 0.3, old_output: 0.3, relations: 0.3}
+"""Strengths that did best on held-out frames, of three tried for every penalty (docs/results.md);
+1 for all others."""
 
 
 def _sars(frames: Candidates, capacity: int) -> np.ndarray:
@@ -148,16 +151,19 @@ STRATEGIES: dict[str, Strategy] = {
         source="experience replay from a reservoir (Vitter, 1985): random frames, true poses",
         select=_reservoir,
         penalty=reprojection,
+        strength=WEIGHTS[reprojection],
     ),
     "hybrid": Strategy(
         source="Bahadir et al., continual hand-eye calibration, Mach. Vis. Appl. 2024 (abstract)",
         select=_hybrid,
         penalty=reprojection,
+        strength=WEIGHTS[reprojection],
     ),
     "icarl": Strategy(
         source="Rebuffi et al., iCaRL, CVPR 2017, ported to points",
         select=_herding,
         penalty=old_output,
+        strength=WEIGHTS[old_output],
     ),
     "buff_cs": Strategy(
         source="Wang et al., Continual Learning for Image-Based Camera Localization, ICCV 2021",
@@ -168,16 +174,19 @@ STRATEGIES: dict[str, Strategy] = {
         source="Qi et al., FedCBDR's global-perspective data replay, NeurIPS 2025",
         select=_leverage,
         penalty=reprojection,
+        strength=WEIGHTS[reprojection],
     ),
     "gss": Strategy(
         source="Aljundi et al., Gradient based sample selection, NeurIPS 2019",
         select=_gradients,
         penalty=reprojection,
+        strength=WEIGHTS[reprojection],
     ),
     "mir": Strategy(
         source="Aljundi et al., Maximally interfered retrieval, NeurIPS 2019",
         select=_reservoir,
         penalty=reprojection,
+        strength=WEIGHTS[reprojection],
         interfered=True,
     ),
     "der": Strategy(
@@ -190,6 +199,7 @@ STRATEGIES: dict[str, Strategy] = {
         source="Cha et al., Co2L's relation distillation, ICCV 2021, ported to points",
         select=_reservoir,
         penalty=relations,
+        strength=WEIGHTS[relations],
     ),
     "agem": Strategy(
         source="Chaudhry et al., Efficient lifelong learning with A-GEM, ICLR 2019",
@@ -300,5 +310,8 @@ def compose(name: str) -> Strategy:
             "its weight as in er@0.3"
         )
     source = f"composed: {selector} selects, replay costs {penalty}"
-    made = Strategy(source, SELECTORS[selector], PENALTIES[penalty], recall="recall" in more)
+    cost = PENALTIES[penalty]
+    made = Strategy(
+        source, SELECTORS[selector], cost, WEIGHTS.get(cost, 1.0), recall="recall" in more
+    )
     return STRATEGIES.setdefault(name, made)
