@@ -237,6 +237,15 @@ def test_the_paper_knows_all_centres_from_the_start(
     assert ends["evercal"].correct().sum() > ends["joint"].correct().sum() == 0
 
 
+def test_a_running_note_begins_with_the_first_scene(
+    arcs: Arcs, options: BenchOptions, tmp_path: Path
+) -> None:
+    steps = list(run_bench(arcs, replace(options, strategies=("ewc_online",)), tmp_path))
+    sizes = [step.outcomes[0].memory_bytes for step in steps]
+    # One anchor and one Fisher matrix a scene, both of the whole head.
+    assert 0 < sizes[0] < sizes[1]
+
+
 def test_joint_training_may_remember_too(
     arcs: Arcs, options: BenchOptions, done: tuple[Path, list[bench.Step]], tmp_path: Path
 ) -> None:

@@ -230,7 +230,7 @@ class _Run:
         self._cached(known)
         rows = self._rows(known, 0, train)
         memory = self._kept(known, 0, train, rows)
-        known.memories = [memory]
+        known.memories, known.notes = [memory], []  # not those of who learned it
         known.notes = [note_of(known, rows())] if self.rule.note else [{}]
         if self.rule.recall:  # more cells agree, so more must
             known.scenes[0] = with_fit(known.scenes[0], *fit_threshold(known, aside))
