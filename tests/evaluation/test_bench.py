@@ -15,7 +15,7 @@ from evercal.continual.robot import Robot
 from evercal.datasets import Frame, Scene
 from evercal.errors import InputError
 from evercal.evaluation import bench
-from evercal.evaluation.bench import BenchOptions, in_order, run_bench
+from evercal.evaluation.bench import BenchOptions, begin_bench, in_order, run_bench
 from evercal.evaluation.comparison import runs_of
 from evercal.evaluation.outcomes import RESULTS, Outcome, read
 from evercal.evaluation.suites import SUITES, held_out, load_suite, regions
@@ -157,6 +157,13 @@ def test_other_settings_and_unknown_strategies_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=message):
         next(run_bench(arcs, replace(options, **change), done[0]))  # pyright: ignore[reportArgumentType]
+
+
+def test_made_up_strategies_join_what_is_there(
+    arcs: Arcs, options: BenchOptions, done: tuple[Path, list[bench.Step]]
+) -> None:
+    more = replace(options, strategies=("er", "reservoir+old_output", "er@3"))
+    assert begin_bench(arcs, more, done[0]) == [(0, "reservoir+old_output"), (0, "er@3")]
 
 
 def test_one_scene_cannot_be_forgotten(arcs: Arcs, options: BenchOptions, tmp_path: Path) -> None:

@@ -157,11 +157,7 @@ def _settings(scenes: Sequence[Scene], options: BenchOptions) -> dict[str, objec
     return {
         **asdict(replace(stage, seed=0, fill=replace(stage.fill, seed=0))),
         "replay": replay,
-        "strengths": {
-            name: rule.strength
-            for name, rule in STRATEGIES.items()
-            if rule.strength != 1 and "@" not in name
-        },
+        "weights": {cost.__name__: weight for cost, weight in rules.WEIGHTS.items()},
         "networks": [sha256_file(file)[:12] for file in (ENCODER_FILE, DESCRIPTOR_FILE)],
         "order": options.order,
         "short_side": options.short_side,
