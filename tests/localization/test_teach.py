@@ -137,7 +137,7 @@ def fit(
         return teach.fit_threshold(blank("evercal"), frames)
 
 
-def test_the_threshold_lies_a_third_of_the_way_up(
+def test_the_threshold_lies_a_sixth_of_the_way_up(
     monkeypatch: pytest.MonkeyPatch, blank: Callable[[str], Knowledge]
 ) -> None:
     # 41 values in equal steps: the 5 % and 95 % quantiles are the 3rd and the 39th.
@@ -145,7 +145,7 @@ def test_the_threshold_lies_a_third_of_the_way_up(
     negatives = [0.001 * i for i in range(41)]
     threshold, _ = fit(monkeypatch, blank, positives[::-1], negatives)
     top, low = 0.038, 0.52
-    assert threshold == pytest.approx(top + (low - top) / 3)
+    assert threshold == pytest.approx(top + (low - top) / 6)
     assert max(negatives) < threshold < min(a.ratio for a in positives)
 
 
