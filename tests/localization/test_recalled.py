@@ -10,7 +10,7 @@ import pytest
 
 from evercal.continual.knowledge import Knowledge
 from evercal.continual.learn import Stage, learn
-from evercal.localization.localizer import Localizer
+from evercal.localization.localizer import LocalizeOptions, Localizer
 from evercal.models.descriptor import load_descriptor
 from evercal.models.encoder import load_encoder
 
@@ -72,3 +72,34 @@ def test_a_batch_says_the_same(unlearned: Knowledge, arcs: tuple[Scene, Scene]) 
     for frame, found in zip(frames, batch, strict=True):
         single = Localizer(unlearned).localize(frame.read_image(), frame.camera)
         assert (found.status, found.inliers) == (single.status, single.inliers)
+
+
+def test_remembered_cells_vote_for_the_scene(
+    unlearned: Knowledge, arcs: tuple[Scene, Scene], arc_stage: StageOptions
+) -> None:
+    options = replace(
+        arc_stage, fit=replace(arc_stage.fit, iterations=12), memory_share=0.5, replay_passes=1
+    )
+    *_, stage = learn(unlearned, arcs[1], options)
+    assert isinstance(stage, Stage)
+    known = stage.knowledge
+    # Descriptors that say the opposite of the truth.
+    first, second = known.scenes
+    known.scenes = [
+        replace(first, prototypes=second.prototypes),
+        replace(second, prototypes=first.prototypes),
+    ]
+    only = LocalizeOptions(candidates=1)
+
+    def right(known: Knowledge) -> int:
+        localizer = Localizer(known, only)
+        return sum(
+            localizer.localize(frame.read_image(), frame.camera).scene == scene.name
+            for scene in arcs
+            for frame in scene.test[::4]
+        )
+
+    assert right(known) >= 11  # of 12
+    # Without depths nothing is recalled, and the descriptors decide.
+    known.memories = [m and replace(m, inverse_depth=()) for m in known.memories]
+    assert right(known) == 0

@@ -155,6 +155,19 @@ class Recall:
         return Likeness(features, among, features.to(keys.dtype) @ keys.T)
 
     @torch.inference_mode()
+    def likeness(self, features: Tensor) -> np.ndarray:
+        """How alike the most similar of all remembered cells is to a few cells of an image.
+
+        Args:
+            features: (n, channels) of the image's cells.
+
+        Returns:
+            (v,) whole numbers in the order of the cosines, of every 16th cell.
+        """
+        voters = features[::VOTERS].to(self._keys.dtype)
+        return _ordered(voters @ self._keys.T).max(1)
+
+    @torch.inference_mode()
     def points(
         self, found: Likeness, otherwise: Tensor, expected: Expected | None = None
     ) -> Tensor:

@@ -33,6 +33,9 @@ class LocalizeOptions:
 
     candidates: int = 3
     """At most this many scenes are tried for an image."""
+    votes: float = 0.3
+    """Where frames are recalled, cells vote for the scene that remembers the most similar one;
+    scenes with a smaller share of the best scene's votes are not tried."""
     margin: float = 0.15
     """Scenes whose best prototype is less similar than the best scene's by more are not tried."""
     pnp: PnpOptions = field(default_factory=PnpOptions)
@@ -177,7 +180,7 @@ class Localizer:
     ) -> PoseEstimate:
         best: _Hypothesis | None = None
         cameras = self._cameras(camera, shape)
-        for scene in self._candidates(descriptor, cameras):
+        for scene in self._candidates(features, descriptor, cameras):
             lens = cameras[scene]
             assert lens is not None
             trial = self._hypothesis(features, descriptor, scene, lens)
@@ -208,12 +211,21 @@ class Localizer:
             )
         return found
 
-    def _candidates(self, descriptor: Tensor, cameras: list[Camera | None]) -> list[int]:
+    def _candidates(
+        self, features: Tensor, descriptor: Tensor, cameras: list[Camera | None]
+    ) -> list[int]:
         """Scenes to try, the likeliest first."""
-        if self._one_answer() and not any(map(self._has_depths, range(len(cameras)))):
-            return [next(i for i, c in enumerate(cameras) if c is not None)]
-        likeness = [float((p @ descriptor).max()) for p in self._prototypes]
         usable = [i for i, c in enumerate(cameras) if c is not None]
+        recalls = [self._recall(i) for i in usable]
+        if len(usable) > 1 and None not in recalls:
+            alike = np.stack([recall.likeness(features) for recall in recalls if recall])
+            votes = np.bincount(alike.argmax(0), minlength=len(usable))
+            order = np.argsort(-votes, kind="stable")
+            enough = self.options.votes * votes.max()
+            return [usable[i] for i in order if votes[i] >= enough][: self.options.candidates]
+        if self._one_answer():
+            return usable[:1]
+        likeness = {i: float((self._prototypes[i] @ descriptor).max()) for i in usable}
         usable.sort(key=lambda i: -likeness[i])
         floor = likeness[usable[0]] - self.options.margin
         return [i for i in usable if likeness[i] >= floor][: self.options.candidates]
