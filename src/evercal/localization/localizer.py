@@ -68,7 +68,7 @@ class _Hypothesis:
 class Localizer:
     """Finds the camera in any of the scenes that a store knows.
 
-    The first image of a scene waits until the frames remembered of it are encoded: about a second
+    The first image waits until the frames remembered of all scenes are encoded: about a second
     for 60 frames on two cores.
 
     Args:
