@@ -200,7 +200,6 @@ def _show(folder: Path, reference: str, as_json: bool) -> int:
     from evercal.evaluation.comparison import by_strategy, runs_of, summary
     from evercal.evaluation.latex import paper_tables
     from evercal.evaluation.outcomes import RESULTS, read
-    from evercal.evaluation.views import read_views
     from evercal.simulation.cell import SUITES
     from evercal.storage import write_bytes
 
@@ -214,7 +213,7 @@ def _show(folder: Path, reference: str, as_json: bool) -> int:
     suite = SUITES.get(name)
     rooms = {name: (kind, seed) for name, kind, seed in suite.rooms} if suite else {}
     ranked = sorted(by_strategy(runs), key=lambda name: name != reference)
-    pictures = view_pictures(read_views(folder), ranked, rooms)
+    pictures = view_pictures(folder, ranked, rooms)
     write_bytes(folder / PAGE, bench_page(runs, reference, name, pictures).encode())
     write_bytes(folder / LATEX, (paper_tables(runs, name) + "\n").encode())
     if as_json:
