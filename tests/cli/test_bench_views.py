@@ -55,7 +55,9 @@ def made(out: Path, **found: str | None) -> None:
 
 
 def sheet(data: bytes) -> np.ndarray:
-    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    return image
 
 
 def test_points_are_drawn_where_nothing_can_be_rendered(tmp_path: Path) -> None:
