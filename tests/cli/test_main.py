@@ -96,7 +96,9 @@ def test_the_page_on_methods_names_every_strategy_and_no_other() -> None:
 
     page = (Path(__file__).parents[2] / "docs" / "methods.md").read_text()
     rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
-    assert {name for row in rows for name in re.findall(r"`(\w+)`", row)} == set(STRATEGIES)
+    # Other tests may have composed some more.
+    listed = {name for name in STRATEGIES if name.isidentifier()}
+    assert {name for row in rows for name in re.findall(r"`(\w+)`", row)} == listed
 
 
 def test_version(run: Any) -> None:
