@@ -91,6 +91,17 @@ class Atlas:
         return None
 
 
+def camera_clusters(positions_m: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """(k, 3) means of camera positions (n, 3); k is `count`, or the number of spots if less."""
+    from scipy.cluster.vq import kmeans2
+
+    if count == 1:
+        return positions_m.mean(0, keepdims=True)
+    count = min(count, len(np.unique(positions_m, axis=0)))
+    means, _ = kmeans2(positions_m, count, minit="++", rng=np.random.default_rng(seed))
+    return means
+
+
 def combined_centres(
     positions_m: Sequence[np.ndarray], count: int, seed: int
 ) -> tuple[tuple[float, float, float], ...]:
@@ -101,13 +112,10 @@ def combined_centres(
         count: centres of a scene, by k-means.
         seed: of the k-means.
     """
-    from scipy.cluster.vq import kmeans2
-
     atlas, found = Atlas("paper", len(positions_m)), []
     for positions in positions_m:
         shift = atlas.place(positions).atlas_from_base
-        some = min(count, len(np.unique(positions, axis=0)))
-        means, _ = kmeans2(shift.apply(positions), some, minit="++", rng=seed)
+        means = camera_clusters(shift.apply(positions), count, seed)
         found += [(float(x), float(y), float(z)) for x, y, z in means]
     return tuple(found)
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evercal.continual.atlas import Cell
+from evercal.continual.atlas import Cell, camera_clusters
 from evercal.continual.candidates import Candidates
 from evercal.continual.keeping import keep, note_of
 from evercal.continual.knowledge import Knowledge, SceneRecord, prototypes, refine
@@ -237,16 +237,9 @@ def _sample(buffers: Sequence[FeatureBuffer], seed: int) -> Tensor:
 
 def _new_centres(head: Head, options: StageOptions, positions: np.ndarray) -> Tensor:
     """(k, 3) centres that the scene adds, from its camera positions (n, 3) in the atlas."""
-    from scipy.cluster.vq import kmeans2
-
     kind, count = head.options.centres, head.options.centres_per_scene
     if kind == "grow":
-        if count == 1:
-            return torch.from_numpy(positions.mean(0, keepdims=True)).float()
-        count = min(count, len(np.unique(positions, axis=0)))
-        rng = np.random.default_rng(options.seed)
-        centres, _ = kmeans2(positions, count, minit="++", rng=rng)
-        return torch.from_numpy(centres).float()
+        return torch.from_numpy(camera_clusters(positions, count, options.seed)).float()
     if head.scenes > 0:
         return torch.zeros(0, 3)
     if kind == "fixed":

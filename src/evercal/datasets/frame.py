@@ -50,6 +50,11 @@ class Frame:
         return image
 
 
+def posed(frames: Iterable[Frame]) -> tuple[Frame, ...]:
+    """The frames whose pose is known."""
+    return tuple(frame for frame in frames if frame.base_from_camera is not None)
+
+
 def known_poses(frames: Iterable[Frame]) -> SE3:
     """(n,) base_from_camera of the frames that have one."""
     return SE3.stack([f.base_from_camera for f in frames if f.base_from_camera is not None])

@@ -193,9 +193,8 @@ class _Run:
                 learn_scene(self.store, self.scenes[number], self._how(self.strategy), on_event)
             robot = Robot.open(self.store)
             self._cached(robot.known)
-            report = robot.report()
-            seconds, kept = float(report["seconds"]), int(report["frames_kept"])
-            yield number, self._judge(robot.known, number, seconds, kept)
+            seconds = float(robot.report()["seconds"])
+            yield number, self._judge(robot.known, number, seconds)
         shutil.rmtree(self.store)
 
     def _how(self, strategy: str) -> LearnOptions:
@@ -289,19 +288,15 @@ class _Run:
             known.memories[i] = self._kept(known, i, train, self._rows(known, i, train))
             known.scenes[i] = with_fit(known.scenes[i], *fit_threshold(known, aside, i))
         seconds = time.perf_counter() - began
-        kept = known.memories[-1]
-        frames_kept = len(kept.images) if kept else 0
-        yield len(lessons) - 1, self._judge(known, len(lessons) - 1, seconds, frames_kept)
+        yield len(lessons) - 1, self._judge(known, len(lessons) - 1, seconds)
 
-    def _judge(
-        self, known: Knowledge, number: int, seconds: float, kept: int
-    ) -> tuple[Outcome, ...]:
+    def _judge(self, known: Knowledge, number: int, seconds: float) -> tuple[Outcome, ...]:
         learned = {scene.name: scene for scene in self.scenes[: number + 1]}
         localizer = Localizer(known)
         results = evaluate(localizer, learned)
         if number == len(self.scenes) - 1:
             keep_views(self.out, self.strategy, localizer, self.scenes)
-        size = sum(head_bytes(head) for head in known.heads)
+        size, memory = sum(head_bytes(head) for head in known.heads), known.memories[number]
         return tuple(
             outcome_of(
                 [r for r in results if r.scene == name],
@@ -311,7 +306,7 @@ class _Run:
                 seconds=seconds,
                 memory_bytes=known.memory_bytes,
                 head_bytes=size,
-                frames_kept=kept,
+                frames_kept=len(memory.images) if memory else 0,
                 **(self._spread(known, number) if name == self.scenes[number].name else {}),
             )
             for name in learned

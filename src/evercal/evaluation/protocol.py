@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.datasets import Frame, Scene, known_poses
+from evercal.datasets import Frame, Scene, known_poses, posed
 from evercal.errors import InputError
 from evercal.evaluation.metrics import FrameResult, Status, near_training
 from evercal.geometry import SE3, Camera, pose_distance
@@ -95,13 +95,13 @@ def evaluate(
     return [results[index] for index in range(len(jobs))]
 
 
-def _test_frames(localizer: SceneLocalizer, name: str, scene: Scene) -> list[Frame]:
+def _test_frames(localizer: SceneLocalizer, name: str, scene: Scene) -> tuple[Frame, ...]:
     if name not in localizer.scenes:
         raise InputError(
             f"scene {name!r} is not in the store, which knows {_listed(localizer.scenes)};"
             f" give it as NAME=SCENE with the name under which it was learned"
         )
-    frames = [frame for frame in scene.test if frame.base_from_camera is not None]
+    frames = posed(scene.test)
     if not frames:
         raise InputError(
             f"scene {name!r} has {len(scene.test)} test frames, none with a known pose;"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evercal.datasets import Frame, Scene, known_poses, load_scene, with_sfm_poses
+from evercal.datasets import Frame, Scene, known_poses, load_scene, posed, with_sfm_poses
 from evercal.errors import InputError
 from evercal.localization.teach import MIN_TRAIN_FRAMES
 from evercal.simulation.cell import SUITES as ROOMS
@@ -120,7 +120,7 @@ def held_out(scene: Scene) -> Scene:
     Raises:
         InputError: fewer posed training frames than a scene needs after that.
     """
-    frames = [f for f in scene.train if f.base_from_camera is not None]
+    frames = posed(scene.train)
     tenth = [10 * i // len(frames) for i in range(len(frames))]
     learned = tuple(f for f, part in zip(frames, tenth, strict=True) if part not in (2, 7))
     judged = tuple(f for f, part in zip(frames, tenth, strict=True) if part in (2, 7))
@@ -146,10 +146,7 @@ def regions(scene: Scene, parts: int) -> list[Scene]:
 
     if parts < 2:
         raise InputError(f"--parts {parts}: give at least 2")
-    train, test = (
-        tuple(f for f in frames if f.base_from_camera is not None)
-        for frames in (scene.train, scene.test)
-    )
+    train, test = posed(scene.train), posed(scene.test)
     if len(train) < parts or not test:
         raise InputError(f"{scene.name}: {len(train)} training and {len(test)} test frames")
     centres, region = kmeans2(_ahead(train), parts, minit="++", rng=np.random.default_rng(0))

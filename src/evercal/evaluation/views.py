@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.datasets import Frame, Scene
+from evercal.datasets import Frame, Scene, posed
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.localizer import Localizer
 from evercal.storage import write_bytes
@@ -63,8 +63,8 @@ def keep_views(out: Path, strategy: str, localizer: Localizer, scenes: Sequence[
         path = out / VIEWS / f"{strategy}-{scene.name}.npz"
         if path.exists():
             continue
-        posed = [frame for frame in scene.test if frame.base_from_camera is not None]
-        frame = posed[len(posed) // 2]
+        tests = posed(scene.test)
+        frame = tests[len(tests) // 2]
         estimate = localizer.localize(frame.read_image(), frame.camera)
         points, grey = np.zeros((0, 3), np.float32), np.zeros(0, np.uint8)
         for other in scenes:
@@ -111,9 +111,9 @@ def _read(path: Path) -> SceneView:
 
 def _points(localizer: Localizer, scene: Scene) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Points (n, 3) of a scene and their grey values (n,)."""
-    posed = [frame for frame in scene.train if frame.base_from_camera is not None]
-    with_depth = [frame for frame in posed if frame.depth is not None]
-    frames = with_depth or posed
+    train = posed(scene.train)
+    with_depth = [frame for frame in train if frame.depth is not None]
+    frames = with_depth or train
     points, grey = [np.zeros((0, 3))], [np.zeros(0)]
     for number in np.linspace(0, len(frames) - 1, FRAMES).astype(int):
         frame = frames[number]
