@@ -70,7 +70,8 @@ def errors_px(points: torch.Tensor, pose: SE3) -> np.ndarray:
 def test_points_lie_where_the_query_sees_them(room: BoxRoom, known: Knowledge) -> None:
     recall = Recall(known, 0)
     pose = room.path(72, 3)[21]  # half-way between two remembered frames
-    found = recall.look(seen(known, frame(room, pose)))
+    features = seen(known, frame(room, pose))
+    found = recall.look(features, recall.vote(features))
     nowhere = torch.full((1200, 3), 1e3)
     alone = errors_px(recall.points(found, nowhere), pose)
     assert np.mean(alone < 5) > 0.4
@@ -85,11 +86,18 @@ def test_points_lie_where_the_query_sees_them(room: BoxRoom, known: Knowledge) -
     assert np.mean(errors_px(recall.points(found, nowhere, misled), pose) < 5) < 0.05
 
 
-def test_only_frames_that_show_the_same_are_looked_at(room: BoxRoom, known: Knowledge) -> None:
+@pytest.mark.parametrize("shortlist", [FRAMES, 100])
+def test_only_frames_that_show_the_same_are_looked_at(
+    known: Knowledge, shortlist: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("evercal.continual.recall.SHORTLIST", shortlist)
     memory = known.memories[0]
     assert memory is not None
     assert len(memory.images) > FRAMES
-    found = Recall(known, 0).look(seen(known, memory.frames()[5]))
+    recall, features = Recall(known, 0), seen(known, memory.frames()[5])
+    votes = recall.vote(features)
+    assert np.bincount(votes.frame).argmax() == 5
+    found = recall.look(features, votes)
     assert len(found.among) == FRAMES * 1200
     assert set(range(5 * 1200, 6 * 1200)) <= set(found.among.tolist())
     assert float(found.value.float().max(1).values.median()) > 0.99

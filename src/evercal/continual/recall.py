@@ -28,8 +28,12 @@ OTHER_VIEWS = 12
 FRAMES = 6
 """Remembered frames that an image is matched to."""
 NEAR_PX = 20.0
+SHORTLIST = 24
+"""Remembered frames among which those are looked for."""
 VOTERS = 16
-"""Every so many-th cell votes for them."""
+"""Every so many-th cell of an image votes for scenes and frames."""
+COARSE = 3
+"""Scenes and the short list are voted for by every so many-th row and column of their cells."""
 
 
 def remembered_depths(
@@ -89,6 +93,16 @@ class Expected:
         return np.concatenate(cells), np.concatenate(which)
 
 
+@dataclass(frozen=True)
+class Votes:
+    """Which remembered cell of a scene a few cells of an image resemble most."""
+
+    value: np.ndarray
+    """(v,) how much, as whole numbers in the order of the cosines."""
+    frame: np.ndarray
+    """(v,) the remembered frame that it belongs to."""
+
+
 @dataclass(frozen=True, eq=False)
 class Likeness:
     """An image beside the remembered frames that show most of it."""
@@ -132,12 +146,15 @@ class Recall:
         view = ViewOptions(short_side=known.short_side)
         views = [frame_view(frame, stride, view) for frame in frames]
         self._count = np.array([len(v.valid) for v in views])
+        self._first = np.cumsum(self._count) - self._count
         self._frame = torch.arange(len(views)).repeat_interleave(torch.from_numpy(self._count))
-        keys = [_features(v, known) for v in views]
         # Half the bytes, and twice the speed where the processor multiplies it.
-        self._keys = torch.cat(keys).to(torch.bfloat16 if fast_bfloat16() else torch.float32)
+        kind = torch.bfloat16 if fast_bfloat16() else torch.float32
+        self._keys = torch.cat([_features(v, known).to(kind) for v in views])
         grids = [(v.grey.shape[0] // stride, v.grey.shape[1] // stride) for v in views]
         self._ways = torch.cat([_ways(h, w) for h, w in grids])
+        coarse = torch.cat([_coarse(h, w) for h, w in grids])
+        self._coarse, self._coarse_frame = self._keys[coarse], self._frame[coarse].numpy()
         self._stride = stride
         self._pixels = torch.from_numpy(np.concatenate([v.cell_pixels for v in views]))
         self._intrinsics = torch.from_numpy(np.stack([v.intrinsics for v in views]))
@@ -148,24 +165,23 @@ class Recall:
         self._points = self._points_at(every, self._pixels).double().numpy()
 
     @torch.inference_mode()
-    def look(self, features: Tensor) -> Likeness:
-        """How alike (n, channels) features of an image are to what is remembered."""
-        among = self._candidates(features)
-        keys = self._keys if len(among) == len(self._keys) else self._keys[among]
-        return Likeness(features, among, features.to(keys.dtype) @ keys.T)
+    def vote(self, features: Tensor) -> Votes:
+        """What a few of (n, channels) features of an image resemble most, roughly."""
+        alike = _ordered(self._voters(features) @ self._coarse.T)
+        return Votes(alike.max(1), self._coarse_frame[alike.argmax(1)])
 
     @torch.inference_mode()
-    def likeness(self, features: Tensor) -> np.ndarray:
-        """How alike the most similar of all remembered cells is to a few cells of an image.
+    def look(self, features: Tensor, votes: Votes) -> Likeness:
+        """How alike (n, channels) features of an image are to what is remembered.
 
         Args:
-            features: (n, channels) of the image's cells.
-
-        Returns:
-            (v,) whole numbers in the order of the cosines, of every 16th cell.
+            features: of the image's cells.
+            votes: what `vote` said of them.
         """
-        voters = features[::VOTERS].to(self._keys.dtype)
-        return _ordered(voters @ self._keys.T).max(1)
+        frames = self._chosen(features, votes)
+        among = self._rows(frames)
+        keys = self._keys if len(frames) == len(self._count) else self._keys[among]
+        return Likeness(features, among, features.to(keys.dtype) @ keys.T)
 
     @torch.inference_mode()
     def points(
@@ -209,15 +225,25 @@ class Recall:
         points = torch.einsum("nij,nj->ni", pose[:, :3, :3], ray * self._depth_m[cells][:, None])
         return points + pose[:, :3, 3]
 
-    def _candidates(self, features: Tensor) -> np.ndarray:
-        """Rows of the frames that most of a few cells find their likeness in."""
+    def _chosen(self, features: Tensor, votes: Votes) -> np.ndarray:
+        """The frames that most of a few cells find their likeness in."""
         if len(self._count) <= FRAMES:
-            return np.arange(len(self._keys))
-        voters = features[::VOTERS].to(self._keys.dtype)
-        votes = self._frame[_ordered(voters @ self._keys.T).argmax(1)]
-        chosen = np.argsort(-np.bincount(votes, minlength=len(self._count)), kind="stable")[:FRAMES]
-        first = np.cumsum(self._count) - self._count
-        return np.concatenate([first[i] + np.arange(int(self._count[i])) for i in chosen])
+            return np.arange(len(self._count))
+        listed = self._most(votes.frame, SHORTLIST)
+        rows = self._rows(listed)
+        alike = _ordered(self._voters(features) @ self._keys[rows].T)
+        return self._most(self._frame[rows[alike.argmax(1)]].numpy(), FRAMES)
+
+    def _most(self, frames: np.ndarray, count: int) -> np.ndarray:
+        """The frames named most often, the most often named first."""
+        return np.argsort(-np.bincount(frames, minlength=len(self._count)), kind="stable")[:count]
+
+    def _rows(self, frames: np.ndarray) -> np.ndarray:
+        """The remembered cells of frames."""
+        return np.concatenate([self._first[i] + np.arange(int(self._count[i])) for i in frames])
+
+    def _voters(self, features: Tensor) -> Tensor:
+        return features[::VOTERS].to(self._keys.dtype)
 
 
 def _ordered(value: Tensor) -> np.ndarray:
@@ -232,6 +258,13 @@ def _ordered(value: Tensor) -> np.ndarray:
 def _features(view: View, known: Knowledge) -> Tensor:
     features, _ = encode([view], known.encoder, known.descriptor)
     return features[0].flatten(1).T
+
+
+def _coarse(rows: int, columns: int) -> Tensor:
+    """(cells,) bool: every third row and column of the cells of a frame."""
+    chosen = torch.zeros(rows, columns, dtype=torch.bool)
+    chosen[COARSE // 2 :: COARSE, COARSE // 2 :: COARSE] = True
+    return chosen.flatten()
 
 
 def _ways(rows: int, columns: int) -> Tensor:

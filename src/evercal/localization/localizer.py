@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from evercal.continual.knowledge import Knowledge
-from evercal.continual.recall import Expected, Recall
+from evercal.continual.recall import Expected, Recall, Votes
 from evercal.errors import InputError
 from evercal.geometry.camera import Camera
 from evercal.localization.estimate import PoseEstimate
@@ -42,6 +42,14 @@ class LocalizeOptions:
     """RANSAC settings."""
     refine: PnpOptions = field(default_factory=lambda: PnpOptions(threshold_px=3.0))
     """The same once a first pose told where to look among remembered frames."""
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What an image has in common with the remembered frames of a scene."""
+
+    recall: Recall
+    votes: Votes
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,13 +188,17 @@ class Localizer:
     ) -> PoseEstimate:
         best: _Hypothesis | None = None
         cameras = self._cameras(camera, shape)
-        for scene in self._candidates(features, descriptor, cameras):
+        usable = [i for i, c in enumerate(cameras) if c is not None]
+        recalls = {i: recall for i in usable if (recall := self._recall(i)) is not None}
+        looks = {i: _Look(recall, recall.vote(features)) for i, recall in recalls.items()}
+        for scene in self._candidates(descriptor, usable, looks):
             lens = cameras[scene]
             assert lens is not None
-            trial = self._hypothesis(features, descriptor, scene, lens)
+            trial = self._hypothesis(features, descriptor, scene, lens, looks.get(scene))
             own = cameras[trial.scene]
             if own is not None and own != lens:  # the head found another scene: with its camera
-                trial = self._hypothesis(features, descriptor, trial.scene, own)
+                look = looks.get(trial.scene)
+                trial = self._hypothesis(features, descriptor, trial.scene, own, look)
             if best is None or trial.inliers > best.inliers:
                 best = trial
         assert best is not None
@@ -212,13 +224,11 @@ class Localizer:
         return found
 
     def _candidates(
-        self, features: Tensor, descriptor: Tensor, cameras: list[Camera | None]
+        self, descriptor: Tensor, usable: list[int], looks: dict[int, _Look]
     ) -> list[int]:
         """Scenes to try, the likeliest first."""
-        usable = [i for i, c in enumerate(cameras) if c is not None]
-        recalls = [self._recall(i) for i in usable]
-        if len(usable) > 1 and None not in recalls:
-            alike = np.stack([recall.likeness(features) for recall in recalls if recall])
+        if len(usable) > 1 and len(looks) == len(usable):
+            alike = np.stack([looks[i].votes.value for i in usable])
             votes = np.bincount(alike.argmax(0), minlength=len(usable))
             order = np.argsort(-votes, kind="stable")
             enough = self.options.votes * votes.max()
@@ -236,26 +246,32 @@ class Localizer:
 
     @torch.inference_mode()
     def _hypothesis(
-        self, features: Tensor, descriptor: Tensor, scene: int, camera: Camera
+        self,
+        features: Tensor,
+        descriptor: Tensor,
+        scene: int,
+        camera: Camera,
+        look: _Look | None,
     ) -> _Hypothesis:
         head, local = self.known.head_for(scene)
         with autocast():
             output = head(features, local, descriptor.expand(len(features), -1))
         pixels = ideal_cell_pixels(camera, self.known.encoder.stride).astype(float)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        recall, own = self._recall(scene), output.points
-        if recall is not None:
+        own = output.points
+        if look is not None:
             pixels = np.tile(pixels, (2, 1))
 
         def solve(points: Tensor, options: PnpOptions, step: int = 1) -> PnpResult | None:
             some = points[::step].double().numpy()
             return solve_pnp(pixels[::step], some, intrinsics, options)
 
-        if recall is None:
+        if look is None:
             points = own
             pose = solve(points, self.options.pnp)
         else:
-            found = recall.look(features)
+            recall = look.recall
+            found = recall.look(features, look.votes)
             points = torch.cat([own, recall.points(found, own)])
             pose = solve(points, self.options.pnp, GLANCE)
             if pose is not None:
