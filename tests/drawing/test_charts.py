@@ -1,6 +1,7 @@
 """Charts hold the numbers they were given; pixels are only checked to be a picture."""
 
 import itertools
+import math
 import subprocess
 import sys
 
@@ -73,7 +74,14 @@ def test_bars_stand_beside_each_other_and_as_high_as_told(figures: list[Figure])
 
 
 def test_a_point_for_every_method(figures: list[Figure]) -> None:
-    assert is_picture(accuracy_against_size({"ours": (3.2, 80.0), "all": (40.0, 85.0)}, "memory"))
+    two = {"ours": (3.2, 80.0), "all": (40.0, 85.0)}
+    assert is_picture(accuracy_against_size(two, "memory"))
+    # Without a size there is no point, and the others keep their colours.
+    assert accuracy_against_size(two | {"joint": (math.nan, 90.0)}, "memory") == (
+        accuracy_against_size(two, "memory")
+    )
+    first = {"joint": (math.nan, 90.0)} | two
+    assert accuracy_against_size(first, "memory") != accuracy_against_size(two, "memory")
     axes = figures[0].axes[0]
     points = [tuple(np.array(line.get_xydata())[0]) for line in axes.lines]
     assert points == [(3.2, 80.0), (40.0, 85.0)]

@@ -70,9 +70,12 @@ def test_a_weighed_strategy_is_another() -> None:
 
 
 def test_latex_has_the_ablation_where_there_is_one() -> None:
-    text = ablation_table(runs(icarl=10, sars_spdd=12), "i12s")
+    alone, two = runs(icarl=10), runs(icarl=10, sars_spdd=12)
+    steps = ablation_rows(two, "i12s")
+    text = ablation_table(steps)
     assert r"as printed & + SARS + SPDD & 60.0 &" in text
     assert text.startswith(r"\begin{tabular}{llrrrr}")
-    assert ablation_table(runs(icarl=10), "i12s") == ""
-    assert paper_tables(runs(icarl=10), "i12s").count("tabular") == 2
-    assert paper_tables(runs(icarl=10, sars_spdd=12), "i12s").count("tabular") == 4
+    none = ablation_rows(alone, "i12s")
+    assert ablation_table(none) == ""
+    assert paper_tables(alone, "i12s", none).count("tabular") == 2
+    assert paper_tables(two, "i12s", steps).count("tabular") == 4

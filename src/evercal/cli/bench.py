@@ -1,7 +1,6 @@
 """`evercal bench` and `evercal bench-report`."""
 
 import dataclasses
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +17,8 @@ if TYPE_CHECKING:
     from evercal.continual.learn import StageOptions
     from evercal.datasets import Scene
     from evercal.evaluation.bench import BenchOptions, Step
-    from evercal.evaluation.comparison import Rows, Run
 
-TABLES, PAGE, LATEX, SETTINGS = "tables.md", "report.html", "table.tex", "settings.json"
+TABLES, PAGE, LATEX = "tables.md", "report.html", "table.tex"
 
 
 @dataclass(frozen=True)
@@ -167,12 +165,15 @@ class BenchReport:
     """Folder of results."""
     reference: Annotated[str, arg(metavar="NAME")] = "evercal"
     """The strategy that the others are compared with."""
+    beside: Annotated[tuple[Path, ...], arg(metavar="DIR...", help_behavior_hint="")] = ()
+    """Other folders of results to show beside it, of the same scenes under other settings, such as
+    another --memory."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
         """Prints and writes the tables."""
-        return _show(self.folder, self.reference, self.json)
+        return _show(self.folder, self.reference, self.json, self.beside)
 
 
 def _mirror(out: Path) -> Path:
@@ -194,58 +195,35 @@ def _mirror(out: Path) -> Path:
     return folder
 
 
-def _show(folder: Path, reference: str, as_json: bool) -> int:
+def _show(folder: Path, reference: str, as_json: bool, beside: tuple[Path, ...] = ()) -> int:
     from evercal.cli.bench_page import bench_page
     from evercal.cli.bench_views import view_pictures
-    from evercal.evaluation.comparison import by_strategy, runs_of, summary
+    from evercal.evaluation.comparison import as_text, summary
     from evercal.evaluation.latex import paper_tables
-    from evercal.evaluation.outcomes import RESULTS, read
+    from evercal.evaluation.report import read_report
     from evercal.simulation.cell import SUITES
     from evercal.storage import write_bytes
 
-    if not (folder / RESULTS).is_file():
-        raise InputError(f"{folder}: no results here; make some with 'evercal bench'")
-    runs = runs_of(read(folder))
-    settings = json.loads((folder / SETTINGS).read_text())
-    name = str(settings["suite"])
-    parts = _parts(runs, reference, name)
-    write_bytes(folder / TABLES, (_text(parts, "markdown") + "\n").encode())
-    suite = SUITES.get(name)
+    report = read_report(folder, reference, beside)
+    tables = report.tables()
+
+    def text(style: Literal["terminal", "markdown"]) -> str:
+        return "\n\n".join(as_text(rows, style) for rows in tables.told())
+
+    write_bytes(folder / TABLES, (text("markdown") + "\n").encode())
+    suite = SUITES.get(report.suite)
     rooms = {name: (kind, seed) for name, kind, seed in suite.rooms} if suite else {}
-    ranked = sorted(by_strategy(runs), key=lambda name: name != reference)
-    pictures = view_pictures(folder, ranked, rooms)
-    write_bytes(folder / PAGE, bench_page(runs, reference, name, pictures).encode())
-    write_bytes(folder / LATEX, (paper_tables(runs, name) + "\n").encode())
+    pictures = view_pictures(folder, report.drawn, rooms)
+    write_bytes(folder / PAGE, bench_page(report, tables, pictures).encode())
+    latex = paper_tables(report.runs, report.suite, tables.ablation)
+    write_bytes(folder / LATEX, (latex + "\n").encode())
     if as_json:
-        print_json({"strategies": summary(runs)})
+        print_json({"strategies": summary([*report.runs, *report.beside])})
         return 0
-    print(_text(parts, "terminal"))
+    print(text("terminal"))
     print(f"wrote {folder / PAGE}, {TABLES} and {LATEX}")
     print_next("evercal", "bench-report", folder)
     return 0
-
-
-def _parts(runs: "list[Run]", reference: str, suite: str) -> "list[Rows]":
-    """The tables, those without a row left out."""
-    from evercal.evaluation.ablation import ablation_rows, grid_rows
-    from evercal.evaluation.comparison import (
-        difference_rows,
-        method_rows,
-        scene_rows,
-        selector_rows,
-        threshold_rows,
-    )
-
-    parts = [method_rows(runs), threshold_rows(runs), scene_rows(runs)]
-    parts += [difference_rows(runs, reference), selector_rows(runs)]
-    parts += [ablation_rows(runs, suite), grid_rows(runs)]
-    return [rows for rows in parts if len(rows) > 1]
-
-
-def _text(parts: "list[Rows]", style: Literal["terminal", "markdown"]) -> str:
-    from evercal.evaluation.comparison import as_text
-
-    return "\n\n".join(as_text(rows, style) for rows in parts)
 
 
 def _words(text: str) -> tuple[str, ...]:

@@ -15,38 +15,30 @@ from evercal.drawing import (
     kept_places,
     scene_bars,
 )
-from evercal.evaluation.ablation import ablation_rows, grid_rows
-from evercal.evaluation.comparison import (
-    Rows,
-    Run,
-    by_strategy,
-    difference_rows,
-    method_rows,
-    scene_rows,
-    selector_rows,
-    threshold_rows,
-)
+from evercal.evaluation.comparison import Rows, Run, by_strategy
+from evercal.evaluation.report import Report, Tables
 
 
-def bench_page(
-    runs: Sequence[Run], reference: str, suite: str = "", pictures: Sequence[Picture] = ()
-) -> str:
+def bench_page(report: Report, tables: Tables, pictures: Sequence[Picture] = ()) -> str:
     """The whole page.
 
     Args:
-        runs: whose last stage is done.
-        reference: the strategy that others are compared with.
-        suite: its name.
+        report: results.
+        tables: what they say.
         pictures: what the methods see (`bench_views`).
     """
-    grouped = by_strategy(runs)
+    runs = [run for run in report.runs if run.strategy in report.drawn]
+    grouped = {name: by_strategy(runs)[name] for name in report.drawn}
     names = sorted(runs[0].scenes)
     ends = {
         name: np.mean([_ends(run, names) for run in of], axis=0) for name, of in grouped.items()
     }
     sizes = {
-        name: (float(np.mean([r.last[0].memory_bytes for r in of])) / 1e6, float(ends[name].mean()))
-        for name, of in grouped.items()
+        name: (
+            float(np.mean([run.memory_mb for run in of])),
+            float(np.mean([run.scores().final_accuracy for run in of])),
+        )
+        for name, of in (grouped | by_strategy(report.beside)).items()
     }
     errors = {
         name: np.concatenate([o.translation_m for run in of for o in run.last])
@@ -56,17 +48,17 @@ def bench_page(
         Section(
             "Methods",
             [
-                _table(method_rows(runs), "Means over runs; accuracy in per cent"),
-                _table(threshold_rows(runs), "At the end, under looser and tighter bounds"),
+                _table(tables.methods, "Means over runs; accuracy in per cent"),
+                _table(tables.thresholds, "At the end, under looser and tighter bounds"),
             ],
         ),
         Section(
             "Scenes",
             [
                 _table(
-                    scene_rows(runs), "Test frames within 5 cm and 5 deg: when learned, at the end"
+                    tables.scenes, "Test frames within 5 cm and 5 deg: when learned, at the end"
                 ),
-                Picture(scene_bars(ends, names), "At the end"),
+                Picture(scene_bars(ends, names), f"At the end{_left_out(report)}"),
             ],
         ),
     ]
@@ -82,13 +74,13 @@ def bench_page(
     if pictures:
         said = "A test image of each scene, and the scene at the pose that each method found for it"
         sections.append(Section("At the end, seen from the estimated pose", [said, *pictures]))
-    kept = _kept(runs)
+    kept = _kept(report.runs)
     if kept:
         sections.append(
             Section(
                 "What stays",
                 [
-                    _table(selector_rows(runs), "In the metric of SARS: scene sides and radians"),
+                    _table(tables.selectors, "In the metric of SARS: scene sides and radians"),
                     *(
                         Picture(kept_places(of), f"Remembered cameras of {scene}")
                         for scene, of in kept.items()
@@ -99,29 +91,29 @@ def bench_page(
     parts = [
         _table(rows, said)
         for rows, said in (
-            (
-                ablation_rows(runs, suite),
-                "After the paper's Table 4; bounds of a paired bootstrap",
-            ),
-            (grid_rows(runs), "Final accuracy (TFR) by which frames stay and what replay costs"),
+            (tables.ablation, "After the paper's Table 4; bounds of a paired bootstrap"),
+            (tables.grid, "Final accuracy (TFR) by which frames stay and what replay costs"),
         )
         if len(rows) > 1
     ]
     if parts:
         sections.append(Section("What each part gives", parts))
-    if len(grouped) > 1:
+    if len(tables.differences) > 1:
         said = "Paired bootstrap over runs and blocks of 10 frames; real where 0 lies outside."
-        sections.append(Section("Differences", [_table(difference_rows(runs, reference), said)]))
-    sections.append(
-        Section(
-            "Errors and memory",
-            [
-                Picture(error_curve(errors), "All scenes at the end"),
-                Picture(accuracy_against_size(sizes, "memory"), "What accuracy takes"),
-            ],
-        )
-    )
+        sections.append(Section("Differences", [_table(tables.differences, said)]))
+    last: list[str | Table | Picture] = [
+        Picture(error_curve(errors), "All scenes at the end"),
+        Picture(accuracy_against_size(sizes, "memory"), "What accuracy takes"),
+    ]
+    if report.beside:
+        last.append(_table(tables.beside, "The same scenes under other settings"))
+    sections.append(Section("Errors and memory", last))
     return html_page("evercal bench", sections)
+
+
+def _left_out(report: Report) -> str:
+    left = len(by_strategy(report.runs)) - len(report.drawn)
+    return f"; {left} strategies with fewer runs are in the tables alone" if left else ""
 
 
 def _ends(run: Run, names: Sequence[str]) -> list[float]:
@@ -129,25 +121,33 @@ def _ends(run: Run, names: Sequence[str]) -> list[float]:
 
 
 def _curves(runs: Sequence[Run]) -> dict[str, np.ndarray]:
-    """Mean matrices of strategies that were judged after every stage, if the order is the same."""
+    """Mean matrices of the strategies if the order of scenes is the same in all runs."""
     if len({run.scenes for run in runs}) > 1:
         return {}
-    found = {}
-    for name, of in by_strategy(runs).items():
-        matrix = np.mean([run.matrix() for run in of], axis=0)
-        if np.isfinite(matrix[np.tril_indices(len(matrix))]).all():
-            found[name] = matrix
-    return found
+    return {
+        name: np.mean([run.matrix() for run in of], axis=0)
+        for name, of in by_strategy(runs).items()
+    }
 
 
 def _kept(runs: Sequence[Run]) -> dict[str, dict[str, np.ndarray]]:
-    """For each scene the remembered camera positions of each strategy's first run."""
-    found: dict[str, dict[str, np.ndarray]] = {}
+    """For each scene the remembered camera positions of the strategies' first runs.
+
+    Those that keep the same frames are named together.
+    """
+    same: dict[str, dict[tuple[tuple[float, float, float], ...], list[str]]] = {}
     for name, of in by_strategy(runs).items():
         for outcome in of[0].outcomes.values():
             if outcome.kept_m:
-                found.setdefault(outcome.scene, {})[name] = np.array(outcome.kept_m)
-    return found
+                same.setdefault(outcome.scene, {}).setdefault(outcome.kept_m, []).append(name)
+    return {
+        scene: {_together(names): np.array(places) for places, names in of.items()}
+        for scene, of in same.items()
+    }
+
+
+def _together(names: Sequence[str]) -> str:
+    return names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")
 
 
 def _table(rows: Rows, caption: str) -> Table:

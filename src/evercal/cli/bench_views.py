@@ -14,7 +14,6 @@ from evercal.storage import write_bytes
 
 Image = NDArray[np.uint8]
 
-SHOWN = 7
 CELL_PX = 240
 
 
@@ -25,11 +24,11 @@ def view_pictures(
 
     Args:
         out: folder of results; what is rendered is kept there, beside the views.
-        strategies: which are shown, at most seven, in order.
+        strategies: which are shown, in order.
         rooms: kind and seed of scenes that the simulator made; their bare shapes are rendered where
             the extra `sim` is installed, points are drawn for others.
     """
-    views = [view for view in read_views(out) if view.strategy in strategies[:SHOWN]]
+    views = [view for view in read_views(out) if view.strategy in strategies]
     views.sort(key=lambda view: strategies.index(view.strategy))
     for room, model in rooms.items():
         _render(out, [view for view in views if view.found == room], model)

@@ -28,7 +28,7 @@ def forgetting_curves(
 
     Args:
         methods: Per method (N, N): row i after stage i, column j the scene learned in stage j.
-            What stands above the diagonal is not drawn.
+            What stands above the diagonal is not drawn, nor what is NaN.
         scenes: The N names in order of learning.
         quantity: What the numbers are.
 
@@ -139,14 +139,27 @@ def accuracy_against_size(methods: Mapping[str, tuple[float, float]], quantity: 
     """One point per method: what it reaches, and how many megabytes it keeps for that.
 
     Args:
-        methods: Per method (megabytes, accuracy in per cent).
+        methods: Per method (megabytes, accuracy in per cent); without a point where the first is
+            NaN.
         quantity: What takes the megabytes.
     """
     figure = _figure(5.4, 3.4)
     axes = figure.subplots()
-    for index, (name, (size, accuracy)) in enumerate(methods.items()):
+    lowest = -math.inf
+    drawn = [i for i, (size, _) in enumerate(methods.values()) if not math.isnan(size)]
+    names, values = list(methods), list(methods.values())
+    for index in sorted(drawn, key=lambda i: values[i][1]):
+        name, (size, accuracy) = names[index], values[index]
         axes.plot(size, accuracy, **{**_style(index, name), "markersize": 6, "linestyle": ""})
-        axes.annotate(name, (size, accuracy), xytext=(5, 4), textcoords="offset points", fontsize=8)
+        lowest = max(lowest + 5, accuracy)  # one name above the other where points lie together
+        axes.annotate(
+            name,
+            (size, accuracy),
+            xytext=(9, (lowest - accuracy) * 2.1 - 3),
+            textcoords="offset points",
+            fontsize=8,
+            arrowprops={"arrowstyle": "-", "color": "0.7", "linewidth": 0.6},
+        )
     axes.set_xlim(left=0)
     axes.margins(x=0.2)
     axes.set_xlabel(f"{quantity} (MB)", fontsize=9)

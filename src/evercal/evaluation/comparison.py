@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from evercal.continual.strategies import STRATEGIES
 from evercal.errors import InputError
 from evercal.evaluation.metrics import COARSE, FINE, ContinualScores, continual_scores
 from evercal.evaluation.outcomes import Outcome
@@ -41,6 +42,14 @@ class Run:
     def end(self, scene: str) -> Outcome:
         """What is known of one scene at the end."""
         return self.outcomes[len(self.scenes) - 1, scene]
+
+    @property
+    def memory_mb(self) -> float:
+        """Megabytes that stay of the scenes at the end; NaN where all frames are needed again."""
+        rule = STRATEGIES.get(self.strategy)
+        if rule is not None and rule.data == "all":
+            return math.nan
+        return self.last[0].memory_bytes / 1e6
 
     def matrix(self, thresholds: tuple[float, float] = COARSE) -> np.ndarray:
         """(N, N) accuracies in per cent: row i after stage i, column j the scene of stage j.
@@ -231,7 +240,7 @@ _COLUMNS: tuple[tuple[str, Callable[[Run], float]], ...] = (
     ("wrong scene %", _wrong_scene),
     ("median cm, right scene", _fine_median_cm),
     ("%, right scene", _fine_accuracy),
-    ("memory MB", lambda run: run.last[0].memory_bytes / 1e6),
+    ("memory MB", lambda run: run.memory_mb),
     ("heads MB", lambda run: run.last[0].head_bytes / 1e6),
     ("s", _seconds),
 )

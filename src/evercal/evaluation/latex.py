@@ -11,8 +11,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from evercal.evaluation.ablation import ablation_rows
-from evercal.evaluation.comparison import Run, by_strategy
+from evercal.evaluation.comparison import Rows, Run, by_strategy
 from evercal.evaluation.metrics import COARSE, FINE
 
 PUBLISHED: Mapping[str, Mapping[str, tuple[float, float]]] = {
@@ -38,15 +37,15 @@ PUBLISHED: Mapping[str, Mapping[str, tuple[float, float]]] = {
 """By suite and strategy: final accuracy and TFR, per cent."""
 
 
-def paper_tables(runs: Sequence[Run], suite: str) -> str:
+def paper_tables(runs: Sequence[Run], suite: str, ablation: Rows) -> str:
     """`paper_table` and, where its strategies were run, `ablation_table`."""
-    found = [paper_table(runs, suite), ablation_table(runs, suite)]
+    found = [paper_table(runs, suite), ablation_table(ablation)]
     return "\n\n".join(table for table in found if table)
 
 
-def ablation_table(runs: Sequence[Run], suite: str) -> str:
-    """A LaTeX table (booktabs) of what each step of an ablation gave; empty without one."""
-    header, *rows = ablation_rows(runs, suite)
+def ablation_table(ablation: Rows) -> str:
+    """A LaTeX table (booktabs) of what `ablation_rows` found; empty if that is a header alone."""
+    header, *rows = ablation
     if not rows:
         return ""
     lines = [rf"\begin{{tabular}}{{ll{'r' * (len(header) - 2)}}}", r"\toprule"]

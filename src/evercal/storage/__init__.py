@@ -10,3 +10,4 @@ from evercal.storage.manifest import sha256_file as sha256_file
 from evercal.storage.manifest import verify as verify
 from evercal.storage.manifest import write_manifest as write_manifest
 from evercal.storage.settings import hold_settings as hold_settings
+from evercal.storage.settings import read_settings as read_settings

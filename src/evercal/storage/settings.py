@@ -21,12 +21,7 @@ def hold_settings(path: Path, settings: Mapping[str, object]) -> None:
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, settings)
-    try:
-        before = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(before, dict):
-            raise ValueError
-    except ValueError:
-        raise InputError(f"{path}: no settings in JSON; remove the folder and start anew") from None
+    before = read_settings(path)
     now = json.loads(json.dumps(settings))
     for key in sorted({*before, *now}):
         a, b = before.get(key), now.get(key)
@@ -35,3 +30,18 @@ def hold_settings(path: Path, settings: Mapping[str, object]) -> None:
                 f"{path.parent}: was begun with other settings: {key} {a!r}, now it is {b!r}; "
                 f"give another --out or the same settings"
             )
+
+
+def read_settings(path: Path) -> dict[str, object]:
+    """What `hold_settings` noted.
+
+    Raises:
+        InputError: there is none that can be read.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(found, dict):
+            raise ValueError
+    except (OSError, ValueError):
+        raise InputError(f"{path}: no settings in JSON; remove the folder and start anew") from None
+    return found
