@@ -52,17 +52,8 @@ SCHEMA = 1
 LEARNING = "learning"
 STAGES = "stages"
 HEAD = "head.safetensors"
-STAGE_FILES = (
-    HEAD,
-    "memory.safetensors",
-    "notes.safetensors",
-    "prototypes.safetensors",
-    "report.json",
-    "scene.json",
-)
-
-
 MEMORY_FILES = ("memory.safetensors", "notes.safetensors")
+STAGE_FILES = (HEAD, *MEMORY_FILES, "prototypes.safetensors", "report.json", "scene.json")
 
 
 class Robot:
