@@ -6,7 +6,8 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.evaluation import outcomes
-from evercal.evaluation.report import SETTINGS, read_report
+from evercal.evaluation.outcomes import SETTINGS
+from evercal.evaluation.report import read_report
 from evercal.storage import write_json
 
 from .test_comparison import lines
@@ -78,7 +79,9 @@ def test_the_best_first_and_seven_in_figures(tmp_path: Path) -> None:
 
 
 def test_who_needs_all_frames_has_no_memory_to_compare(tmp_path: Path) -> None:
-    header, ours, joint = read_report(folder(tmp_path, "here", 18), "evercal").tables().methods
-    column = header.index("memory MB")
-    assert float(ours[column]) >= 0
-    assert joint[column] == "-"
+    here = folder(tmp_path, "here", 18)
+    tables = read_report(here, "evercal", [folder(tmp_path, "there", 18)]).tables()
+    for header, ours, joint in (tables.methods, tables.beside):
+        column = header.index("memory MB")
+        assert float(ours[column]) >= 0
+        assert joint[column] == "-"

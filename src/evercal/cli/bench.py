@@ -185,9 +185,11 @@ def _mirror(out: Path) -> Path:
     import shutil
     import tempfile
 
+    from evercal.evaluation.outcomes import RESULTS, SETTINGS
+
     folder = Path(tempfile.mkdtemp(prefix="evercal-bench-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    for name in ("settings.json", "results.jsonl"):
+    for name in (SETTINGS, RESULTS):
         if (out / name).exists():
             shutil.copy(out / name, folder / name)
     if (out / "runs").exists():

@@ -113,7 +113,7 @@ def bench_page(report: Report, tables: Tables, pictures: Sequence[Picture] = ())
 
 def _left_out(report: Report) -> str:
     left = len(by_strategy(report.runs)) - len(report.drawn)
-    return f"; {left} strategies with fewer runs are in the tables alone" if left else ""
+    return f"; {left} more strategies are in the tables alone" if left else ""
 
 
 def _ends(run: Run, names: Sequence[str]) -> list[float]:

@@ -135,7 +135,7 @@ def begin_bench(scenes: Sequence[Scene], options: BenchOptions, out: Path) -> li
         raise InputError(f"{len(scenes)} scene: forgetting takes two or more; give more scenes")
     for name in options.strategies:
         rules.compose(name)
-    hold_settings(out / "settings.json", _settings(scenes, options))
+    hold_settings(out / outcomes.SETTINGS, _settings(scenes, options))
     found = {(o.strategy, o.seed) for o in outcomes.read(out) if o.stage == len(scenes) - 1}
     runs = [(seed, strategy) for seed in options.seeds for strategy in options.strategies]
     return [(seed, strategy) for seed, strategy in runs if (strategy, seed) not in found]

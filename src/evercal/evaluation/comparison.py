@@ -46,7 +46,7 @@ class Run:
     @property
     def memory_mb(self) -> float:
         """Megabytes that stay of the scenes at the end; NaN where all frames are needed again."""
-        rule = STRATEGIES.get(self.strategy)
+        rule = STRATEGIES.get(self.last[0].strategy)  # whatever a report calls it
         if rule is not None and rule.data == "all":
             return math.nan
         return self.last[0].memory_bytes / 1e6

@@ -15,7 +15,7 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.evaluation.metrics import COARSE, FrameResult
 
-RESULTS = "results.jsonl"
+RESULTS, SETTINGS = "results.jsonl", "settings.json"
 _LATER = {"kept_m", "covering", "closest"}
 """Fields that older results lack."""
 

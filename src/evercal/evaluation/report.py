@@ -19,10 +19,9 @@ from evercal.evaluation.comparison import (
     selector_rows,
     threshold_rows,
 )
-from evercal.evaluation.outcomes import RESULTS, read
+from evercal.evaluation.outcomes import RESULTS, SETTINGS, read
 from evercal.storage import read_settings
 
-SETTINGS = "settings.json"
 DRAWN = 7
 
 
