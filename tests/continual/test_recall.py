@@ -86,11 +86,7 @@ def test_points_lie_where_the_query_sees_them(room: BoxRoom, known: Knowledge) -
     assert np.mean(errors_px(recall.points(found, nowhere, misled), pose) < 5) < 0.05
 
 
-@pytest.mark.parametrize("shortlist", [FRAMES, 100])
-def test_only_frames_that_show_the_same_are_looked_at(
-    known: Knowledge, shortlist: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("evercal.continual.recall.SHORTLIST", shortlist)
+def test_only_frames_that_show_the_same_are_looked_at(known: Knowledge) -> None:
     memory = known.memories[0]
     assert memory is not None
     assert len(memory.images) > FRAMES

@@ -28,12 +28,8 @@ OTHER_VIEWS = 12
 FRAMES = 6
 """Remembered frames that an image is matched to."""
 NEAR_PX = 20.0
-SHORTLIST = 24
-"""Remembered frames among which those are looked for."""
 VOTERS = 16
 """Every so many-th cell of an image votes for scenes and frames."""
-COARSE = 3
-"""Scenes and the short list are voted for by every so many-th row and column of their cells."""
 
 
 def remembered_depths(
@@ -146,15 +142,12 @@ class Recall:
         view = ViewOptions(short_side=known.short_side)
         views = [frame_view(frame, stride, view) for frame in frames]
         self._count = np.array([len(v.valid) for v in views])
-        self._first = np.cumsum(self._count) - self._count
         self._frame = torch.arange(len(views)).repeat_interleave(torch.from_numpy(self._count))
         # Half the bytes, and twice the speed where the processor multiplies it.
         kind = torch.bfloat16 if fast_bfloat16() else torch.float32
         self._keys = torch.cat([_features(v, known).to(kind) for v in views])
         grids = [(v.grey.shape[0] // stride, v.grey.shape[1] // stride) for v in views]
         self._ways = torch.cat([_ways(h, w) for h, w in grids])
-        coarse = torch.cat([_coarse(h, w) for h, w in grids])
-        self._coarse, self._coarse_frame = self._keys[coarse], self._frame[coarse].numpy()
         self._stride = stride
         self._pixels = torch.from_numpy(np.concatenate([v.cell_pixels for v in views]))
         self._intrinsics = torch.from_numpy(np.stack([v.intrinsics for v in views]))
@@ -166,9 +159,9 @@ class Recall:
 
     @torch.inference_mode()
     def vote(self, features: Tensor) -> Votes:
-        """What a few of (n, channels) features of an image resemble most, roughly."""
-        alike = _ordered(self._voters(features) @ self._coarse.T)
-        return Votes(alike.max(1), self._coarse_frame[alike.argmax(1)])
+        """What a few of (n, channels) features of an image resemble most."""
+        alike = _ordered(features[::VOTERS].to(self._keys.dtype) @ self._keys.T)
+        return Votes(alike.max(1), self._frame[alike.argmax(1)].numpy())
 
     @torch.inference_mode()
     def look(self, features: Tensor, votes: Votes) -> Likeness:
@@ -178,9 +171,8 @@ class Recall:
             features: of the image's cells.
             votes: what `vote` said of them.
         """
-        frames = self._chosen(features, votes)
-        among = self._rows(frames)
-        keys = self._keys if len(frames) == len(self._count) else self._keys[among]
+        among = self._voted_for(votes)
+        keys = self._keys if len(among) == len(self._keys) else self._keys[among]
         return Likeness(features, among, features.to(keys.dtype) @ keys.T)
 
     @torch.inference_mode()
@@ -225,25 +217,14 @@ class Recall:
         points = torch.einsum("nij,nj->ni", pose[:, :3, :3], ray * self._depth_m[cells][:, None])
         return points + pose[:, :3, 3]
 
-    def _chosen(self, features: Tensor, votes: Votes) -> np.ndarray:
-        """The frames that most of a few cells find their likeness in."""
+    def _voted_for(self, votes: Votes) -> np.ndarray:
+        """The cells of the frames that most votes are for."""
         if len(self._count) <= FRAMES:
-            return np.arange(len(self._count))
-        listed = self._most(votes.frame, SHORTLIST)
-        rows = self._rows(listed)
-        alike = _ordered(self._voters(features) @ self._keys[rows].T)
-        return self._most(self._frame[rows[alike.argmax(1)]].numpy(), FRAMES)
-
-    def _most(self, frames: np.ndarray, count: int) -> np.ndarray:
-        """The frames named most often, the most often named first."""
-        return np.argsort(-np.bincount(frames, minlength=len(self._count)), kind="stable")[:count]
-
-    def _rows(self, frames: np.ndarray) -> np.ndarray:
-        """The remembered cells of frames."""
-        return np.concatenate([self._first[i] + np.arange(int(self._count[i])) for i in frames])
-
-    def _voters(self, features: Tensor) -> Tensor:
-        return features[::VOTERS].to(self._keys.dtype)
+            return np.arange(len(self._keys))
+        named = np.bincount(votes.frame, minlength=len(self._count))
+        chosen = np.argsort(-named, kind="stable")[:FRAMES]
+        first = np.cumsum(self._count) - self._count
+        return np.concatenate([first[i] + np.arange(int(self._count[i])) for i in chosen])
 
 
 def _ordered(value: Tensor) -> np.ndarray:
@@ -258,13 +239,6 @@ def _ordered(value: Tensor) -> np.ndarray:
 def _features(view: View, known: Knowledge) -> Tensor:
     features, _ = encode([view], known.encoder, known.descriptor)
     return features[0].flatten(1).T
-
-
-def _coarse(rows: int, columns: int) -> Tensor:
-    """(cells,) bool: every third row and column of the cells of a frame."""
-    chosen = torch.zeros(rows, columns, dtype=torch.bool)
-    chosen[COARSE // 2 :: COARSE, COARSE // 2 :: COARSE] = True
-    return chosen.flatten()
 
 
 def _ways(rows: int, columns: int) -> Tensor:
