@@ -27,8 +27,11 @@ def bench_page(report: Report, tables: Tables, pictures: Sequence[Picture] = ())
         tables: what they say.
         pictures: what the methods see (`bench_views`).
     """
-    runs = [run for run in report.runs if run.strategy in report.drawn]
-    grouped = {name: by_strategy(runs)[name] for name in report.drawn}
+    every = by_strategy(report.runs)
+    grouped = {name: every[name] for name in report.drawn}
+    runs = [run for of in grouped.values() for run in of]
+    left = len(every) - len(grouped)
+    more = f"; {left} more strategies are in the tables alone" if left else ""
     names = sorted(runs[0].scenes)
     ends = {
         name: np.mean([_ends(run, names) for run in of], axis=0) for name, of in grouped.items()
@@ -58,7 +61,7 @@ def bench_page(report: Report, tables: Tables, pictures: Sequence[Picture] = ())
                 _table(
                     tables.scenes, "Test frames within 5 cm and 5 deg: when learned, at the end"
                 ),
-                Picture(scene_bars(ends, names), f"At the end{_left_out(report)}"),
+                Picture(scene_bars(ends, names), f"At the end{more}"),
             ],
         ),
     ]
@@ -109,11 +112,6 @@ def bench_page(report: Report, tables: Tables, pictures: Sequence[Picture] = ())
         last.append(_table(tables.beside, "The same scenes under other settings"))
     sections.append(Section("Errors and memory", last))
     return html_page("evercal bench", sections)
-
-
-def _left_out(report: Report) -> str:
-    left = len(by_strategy(report.runs)) - len(report.drawn)
-    return f"; {left} more strategies are in the tables alone" if left else ""
 
 
 def _ends(run: Run, names: Sequence[str]) -> list[float]:
