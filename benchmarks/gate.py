@@ -16,16 +16,16 @@ from typing import Literal
 import numpy as np
 import torch
 
+from evercal.benchmark.tables import table
+from evercal.continual.learn_scene import LearnOptions, learn_scene
 from evercal.continual.presets import preset
-from evercal.continual.selection import SarsOptions, select_sars
 from evercal.evaluation import evaluate, scores
 from evercal.evaluation.metrics import correct
-from evercal.evaluation.tables import table
+from evercal.features.encode import encode
+from evercal.features.views import ViewOptions, frame_view
 from evercal.localization.localizer import Localizer
-from evercal.localization.teach import LearnOptions, learn_scene
+from evercal.mapping.selection import SarsOptions, select_sars
 from evercal.simulation.mini import mini_rooms
-from evercal.training.buffer import encode
-from evercal.training.views import ViewOptions, frame_view
 
 BASELINE = Path(__file__).parent / "baseline.json"
 
@@ -72,13 +72,13 @@ def measure() -> dict[str, float]:
     right = evaluate(localizer, {room.name: room})
     found = scores(right)
     (near,) = correct(right, (0.02, np.deg2rad(2))).values()
-    known = localizer.known
-    view = frame_view(room.test[0], known.encoder.stride, ViewOptions())
+    maps = localizer.maps
+    view = frame_view(room.test[0], maps.encoder.stride, ViewOptions())
     image = room.test[0].read_image()
-    encoding = _seconds(lambda: encode([view], known.encoder, known.descriptor))
+    encoding = _seconds(lambda: encode([view], maps.encoder, maps.descriptor))
     localizing = _seconds(lambda: localizer.localize(image))
-    alone = known.fork()
-    alone.memories = [None]
+    alone = maps.copy_for_training()
+    alone.keyframes = [None]
     network = scores(evaluate(Localizer(alone), {room.name: room}))
     rng = np.random.default_rng(0)
     places, turns = rng.normal(size=(4000, 3)), rng.normal(size=(4000, 4))
@@ -114,11 +114,11 @@ def judge(baseline: dict[str, float], now: dict[str, float]) -> tuple[list[list[
     """Rows of the table, and the names of what is worse than allowed or not in the baseline."""
     rows, broken = [], []
     for name, metric in CONTRACT.items():
-        known = baseline.get(name)
-        holds = known is not None and metric.holds(known, now[name])
+        maps = baseline.get(name)
+        holds = maps is not None and metric.holds(maps, now[name])
         if not holds:
             broken.append(name)
-        was = "-" if known is None else f"{known:.1f}"
+        was = "-" if maps is None else f"{maps:.1f}"
         said = "yes" if holds else "NO"
         rows.append([name, metric.unit, metric.better, was, f"{now[name]:.1f}", said])
     return rows, broken

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from tabulate import tabulate
 
+from evercal.continual.learn_scene import LearnOptions, learn_scene
 from evercal.continual.presets import preset
 from evercal.datasets import load_scene
 from evercal.evaluation.metrics import scores
 from evercal.evaluation.protocol import evaluate
 from evercal.localization.localizer import Localizer
-from evercal.localization.teach import LearnOptions, learn_scene
 
 REAL = ("redkitchen", "fr1_rpy")
 COLUMNS = (

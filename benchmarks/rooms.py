@@ -11,9 +11,9 @@ from evercal.drawing import contact_sheet, encode_image
 from evercal.simulation.box_room import default_camera
 from evercal.simulation.cell import SUITES
 from evercal.simulation.cell_paths import sweep_shots
-from evercal.simulation.renderer import Renderer, RenderOptions, choose_variant
-from evercal.simulation.robot import Panda
-from evercal.simulation.rooms import room
+from evercal.simulation.furnished.panda import Panda
+from evercal.simulation.furnished.renderer import Renderer, RenderOptions, choose_variant
+from evercal.simulation.furnished.rooms import room
 from evercal.storage import write_bytes
 
 TIMED, COLUMNS = 6, 4

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from evercal.continual.selection import SarsOptions, select_sars
 from evercal.datasets.images import read_image
+from evercal.features.encode import encode
+from evercal.features.views import ViewOptions, plain_view
 from evercal.localization.localizer import Localizer
+from evercal.mapping.selection import SarsOptions, select_sars
 from evercal.simulation.box_room import default_camera
-from evercal.training.buffer import encode
-from evercal.training.views import ViewOptions, plain_view
 
 
 def run(store: Path, image: Path, repeat: int) -> None:
@@ -26,15 +26,15 @@ def run(store: Path, image: Path, repeat: int) -> None:
         localizer.localize(read_image(image))
         one.append(1000 * (time.perf_counter() - began))
     print(f"localize, decoding included: median {np.median(one):.1f} ms, worst {max(one):.1f} ms")
-    known, plain = localizer.known, read_image(image)
+    maps, plain = localizer.maps, read_image(image)
     height, width = plain.shape[:2]
     view = plain_view(
-        plain, default_camera(width, height), known.encoder.stride, ViewOptions(known.short_side)
+        plain, default_camera(width, height), maps.encoder.stride, ViewOptions(maps.short_side)
     )
     features = []
     for _ in range(repeat):
         began = time.perf_counter()
-        encode([view], known.encoder, known.descriptor)
+        encode([view], maps.encoder, maps.descriptor)
         features.append(1000 * (time.perf_counter() - began))
     print(f"features of one image: median {np.median(features):.1f} ms, worst {max(features):.1f}")
     images = [read_image(image) for _ in range(repeat)]

@@ -9,17 +9,17 @@ ones, and replays them with their true poses and, half as strong, the old networ
 import numpy as np
 from torch import Tensor
 
-from evercal.continual.candidates import Candidates
-from evercal.continual.penalties import reprojection
-from evercal.continual.selection import select_farthest
+from evercal.continual.frame_statistics import FrameStatistics
+from evercal.continual.methods.penalties import reprojection
 from evercal.continual.strategies import Strategy
-from evercal.models.head import HeadOutput
-from evercal.training.buffer import Rows
+from evercal.mapping.selection import select_farthest
+from evercal.networks.buffer import Rows
+from evercal.networks.head import HeadOutput
 
 PIXELS_PER_METRE = 25.0
 
 
-def select(frames: Candidates, capacity: int) -> np.ndarray:
+def select(frames: FrameStatistics, capacity: int) -> np.ndarray:
     """Which frames stay: indices in recorded order, at most `capacity`."""
     return select_farthest(frames.positions_m, frames.quaternions_wxyz, capacity)
 

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from evercal.continual.knowledge import Knowledge
     from evercal.continual.learn import StageOptions
     from evercal.datasets.frame import Scene
+    from evercal.mapping.scene_maps import SceneMaps
 
 
 def _room(seed: int, name: str, size: tuple[int, int], span: int, every: int = 1) -> Scene:
@@ -64,34 +64,34 @@ def rooms(one_thread: None) -> tuple[Scene, Scene, Scene]:
 def quick() -> StageOptions:
     """A stage of eight steps for `rooms`."""
     from evercal.continual.learn import StageOptions
-    from evercal.models.head import HeadOptions
-    from evercal.training.buffer import FillPlan
-    from evercal.training.fit import FitOptions
-    from evercal.training.views import ViewOptions
+    from evercal.features.views import ViewOptions
+    from evercal.networks.buffer import EncodePlan
+    from evercal.networks.head import HeadOptions
+    from evercal.networks.trainer import FitOptions
 
     return StageOptions(
         head=HeadOptions(width=16, centres_per_scene=3),
         fit=FitOptions(iterations=8, batch=64, replay_batch=32),
-        fill=FillPlan(passes=2, cells=24, view=ViewOptions(short_side=48)),
-        replay_passes=2,
+        encode=EncodePlan(views_per_frame=2, cells=24, view=ViewOptions(short_side=48)),
+        replay_views_per_frame=2,
     )
 
 
 @pytest.fixture(scope="session")
-def blank(one_thread: None) -> Callable[[str], Knowledge]:
+def blank(one_thread: None) -> Callable[[str], SceneMaps]:
     """Makes a robot that knows nothing, with tiny random networks, given its strategy."""
     import torch
 
-    from evercal.continual.knowledge import Knowledge
-    from evercal.models.descriptor import GlobalDescriptor
-    from evercal.models.encoder import LocalEncoder
+    from evercal.features.descriptor import GlobalDescriptor
+    from evercal.features.encoder import LocalEncoder
+    from evercal.mapping.scene_maps import SceneMaps
 
     torch.manual_seed(0)
     encoder = LocalEncoder(stem=(4, 4), inner=8, blocks=1, width=8).eval()
     descriptor = GlobalDescriptor(8, maps=2, hidden=4, width=8).eval()
     for parameter in (*encoder.parameters(), *descriptor.parameters()):
         parameter.data = parameter.data.half().float()  # as they are stored
-    return lambda strategy: Knowledge(encoder, descriptor, strategy, 48)
+    return lambda strategy: SceneMaps(encoder, descriptor, strategy, 48)
 
 
 @pytest.fixture(scope="session")
@@ -105,32 +105,32 @@ def arcs(one_thread: None) -> tuple[Scene, Scene]:
 def arc_stage() -> StageOptions:
     """Enough training for `arcs`."""
     from evercal.continual.learn import StageOptions
-    from evercal.models.head import HeadOptions
-    from evercal.training.buffer import FillPlan
-    from evercal.training.fit import FitOptions
-    from evercal.training.views import ViewOptions
+    from evercal.features.views import ViewOptions
+    from evercal.networks.buffer import EncodePlan
+    from evercal.networks.head import HeadOptions
+    from evercal.networks.trainer import FitOptions
 
     return StageOptions(
         head=HeadOptions(width=64),
         fit=FitOptions(iterations=600, batch=384, replay_batch=256, peak_rate=7e-3),
-        fill=FillPlan(passes=2, view=ViewOptions(short_side=120)),
+        encode=EncodePlan(views_per_frame=2, view=ViewOptions(short_side=120)),
     )
 
 
 @pytest.fixture(scope="session")
-def arc_known(arcs: tuple[Scene, Scene], arc_stage: StageOptions) -> tuple[Knowledge, Knowledge]:
+def arc_maps(arcs: tuple[Scene, Scene], arc_stage: StageOptions) -> tuple[SceneMaps, SceneMaps]:
     """What is known after the first arc, and after both."""
-    from evercal.continual.knowledge import Knowledge
     from evercal.continual.learn import Stage, learn
-    from evercal.models.descriptor import load_descriptor
-    from evercal.models.encoder import load_encoder
+    from evercal.features.descriptor import load_descriptor
+    from evercal.features.encoder import load_encoder
+    from evercal.mapping.scene_maps import SceneMaps
 
-    known = [Knowledge(load_encoder(), load_descriptor(), "evercal", 120)]
+    maps = [SceneMaps(load_encoder(), load_descriptor(), "evercal", 120)]
     for arc in arcs:
-        *_, stage = learn(known[-1], arc, arc_stage)
+        *_, stage = learn(maps[-1], arc, arc_stage)
         assert isinstance(stage, Stage)
-        known.append(stage.knowledge)
-    return known[1], known[2]
+        maps.append(stage.maps)
+    return maps[1], maps[2]
 
 
 @pytest.fixture(scope="session")

@@ -73,7 +73,7 @@ def test_folders_import_only_from_folders_above() -> None:
 
 def test_planted_violations_are_found(tmp_path: Path) -> None:
     plants = {
-        "geometry/plain.py": "import evercal.models.head",
+        "geometry/plain.py": "import evercal.networks.head",
         "geometry/from_package.py": "from evercal import models",
         "geometry/root.py": "import evercal",
         "storage/lazy.py": "def f():\n    from evercal.datasets import load_scene",

@@ -7,6 +7,9 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from evercal.continual.learn_scene import LearnOptions as LearnOptions
+    from evercal.continual.learn_scene import LearnReport as LearnReport
+    from evercal.continual.learn_scene import learn_scene as learn_scene
     from evercal.datasets import Frame as Frame
     from evercal.datasets import Scene as Scene
     from evercal.datasets import load_scene as load_scene
@@ -15,9 +18,6 @@ if TYPE_CHECKING:
     from evercal.geometry import Camera as Camera
     from evercal.localization.estimate import PoseEstimate as PoseEstimate
     from evercal.localization.localizer import Localizer as Localizer
-    from evercal.localization.teach import LearnOptions as LearnOptions
-    from evercal.localization.teach import LearnReport as LearnReport
-    from evercal.localization.teach import learn_scene as learn_scene
 
 __version__ = "0.1.0"
 
@@ -26,13 +26,13 @@ _PUBLIC = {
     "Camera": "evercal.geometry",
     "Frame": "evercal.datasets",
     "InputError": "evercal.errors",
-    "LearnOptions": "evercal.localization.teach",
-    "LearnReport": "evercal.localization.teach",
+    "LearnOptions": "evercal.continual.learn_scene",
+    "LearnReport": "evercal.continual.learn_scene",
     "Localizer": "evercal.localization.localizer",
     "PoseEstimate": "evercal.localization.estimate",
     "SE3": "evercal.geometry",
     "Scene": "evercal.datasets",
-    "learn_scene": "evercal.localization.teach",
+    "learn_scene": "evercal.continual.learn_scene",
     "load_scene": "evercal.datasets",
 }
 

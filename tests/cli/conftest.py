@@ -39,32 +39,33 @@ def run(capfd: pytest.CaptureFixture[str]) -> Run:
 @pytest.fixture(scope="module", autouse=True)
 def tiny(one_thread: None) -> Iterator[None]:
     """Learning takes a second; thresholds, which take longer to fit, believe every pose."""
+    from evercal.continual import learn_scene as teach
     from evercal.continual.presets import PRESETS
-    from evercal.localization import teach
 
     demo = PRESETS["demo"]
     stage = replace(
         demo,
         head=replace(demo.head, width=32),
         fit=replace(demo.fit, iterations=4, batch=64, replay_batch=32),
-        fill=replace(demo.fill, passes=1),
-        replay_passes=1,
+        encode=replace(demo.encode, views_per_frame=1),
+        replay_views_per_frame=1,
     )
     with pytest.MonkeyPatch.context() as patch:
         for name in ("fast", "demo"):
             patch.setitem(PRESETS, name, stage)
-        patch.setattr(teach, "fit_threshold", lambda known, held_out: (0.0, 1.0))
+        patch.setattr(teach, "fit_threshold", lambda maps, held_out: (0.0, 1.0))
         yield
 
 
 @pytest.fixture(scope="session")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Folders of the scenes `box-room-41` and `box-room-42`, 24 training and 6 test frames each."""
-    from evercal.simulation.box_room import write_box_room
+    from evercal.datasets import generic
+    from evercal.simulation.box_room import box_room_scene
 
     root = tmp_path_factory.mktemp("rooms")
     for seed in (41, 42):
-        write_box_room(root / str(seed), seed, 24, 6)
+        generic.write(root / str(seed), box_room_scene(seed, 24, 6))
     return root / "41", root / "42"
 
 

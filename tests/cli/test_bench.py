@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from evercal.benchmark.results import RESULTS
 from evercal.cli import bench as verb
 from evercal.datasets import generic
-from evercal.evaluation.outcomes import RESULTS
 
 if TYPE_CHECKING:
     from evercal.continual.learn import StageOptions

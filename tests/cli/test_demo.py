@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evercal.cli import demo, demo_page
+from evercal.cli import demo
 from evercal.cli.demo import DemoOptions
-from evercal.cli.demo_outcome import DemoOutcome, FixedCamera
 from evercal.datasets import Frame, Scene, read_image
 from evercal.geometry import SE3
+from evercal.reports import demo_page
+from evercal.reports.demo_outcome import DemoOutcome, FixedCamera
 from evercal.simulation import mini
 from evercal.simulation.box_room import box_room_scene
 from evercal.simulation.mini import CellRoom

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from evercal.cli.evaluate import load_named
-from evercal.cli.evaluate_page import Watch
 from evercal.datasets import load_scene
 from evercal.errors import InputError
 from evercal.evaluation import evaluate
 from evercal.localization.localizer import Localizer
+from evercal.reports.evaluate_page import Watch
 
 
 def test_json_is_the_contract(run: Any, store: Path, rooms: Any) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evercal.cli.inspection import Inspection, inspect_scene, turning_shares
 from evercal.datasets import Frame, Scene, load_scene
+from evercal.datasets.inspection import Inspection, inspect_scene, turning_shares
 from evercal.geometry import SE3, Camera
 from evercal.simulation.box_room import BoxRoom, look_at
 

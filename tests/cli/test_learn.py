@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from evercal.cli.learn import LearnBars, check_name, parse_memory, posed
-from evercal.datasets import Scene, load_scene
+from evercal.cli.learn import LearnBars, check_name, parse_memory
+from evercal.datasets import Scene, load_scene, posed_scene
 from evercal.errors import InputError
 
 
 def test_first_and_last_line_and_the_report(run: Any, tmp_path: Path, rooms: Any) -> None:
-    from evercal.localization.teach import LearnReport
+    from evercal.continual.learn_scene import LearnReport
 
     told = run("learn", tmp_path / "s", rooms[0], "--name", "cell", "--memory", "60kB")
     first, *_, last = told.out.splitlines()
@@ -208,5 +208,5 @@ def test_frames_without_a_pose_count_as_untracked(rooms: Any) -> None:
     scene = load_scene(rooms[0])
     lost = tuple(dataclasses.replace(frame, base_from_camera=None) for frame in scene.train[:3])
     mixed = Scene("mixed", lost + scene.train[3:], scene.test, untracked=4)
-    assert posed(mixed).train == scene.train[3:]
-    assert posed(mixed).untracked == 7
+    assert posed_scene(mixed).train == scene.train[3:]
+    assert posed_scene(mixed).untracked == 7

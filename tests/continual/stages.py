@@ -5,20 +5,20 @@ from collections.abc import Callable, Iterable, Iterator
 import torch
 from torch import Tensor
 
-from evercal.continual.knowledge import Knowledge
 from evercal.continual.learn import Event, Resume, Stage, StageOptions, learn
 from evercal.datasets.frame import Scene
-from evercal.models.head import Head
+from evercal.mapping.scene_maps import SceneMaps
+from evercal.networks.head import Head
 
-Blank = Callable[[str], Knowledge]
+Blank = Callable[[str], SceneMaps]
 Rooms = tuple[Scene, Scene, Scene]
 
 
-def outcome(events: Iterable[Event]) -> Knowledge:
+def outcome(events: Iterable[Event]) -> SceneMaps:
     """What is known after a stage that ran to its end."""
     *_, stage = events
     assert isinstance(stage, Stage)
-    return stage.knowledge
+    return stage.maps
 
 
 def weights(head: Head) -> dict[str, Tensor]:
@@ -34,7 +34,7 @@ def assert_same(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
 
 
 def continued(
-    known: Knowledge, rooms: Rooms, options: StageOptions, resume: Resume | None = None
+    maps: SceneMaps, rooms: Rooms, options: StageOptions, resume: Resume | None = None
 ) -> Iterator[Event]:
     """The events of the second stage, `beta`, for any strategy."""
-    return learn(known, rooms[1], options, resume, earlier=rooms[:1])
+    return learn(maps, rooms[1], options, resume, earlier=rooms[:1])

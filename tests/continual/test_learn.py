@@ -12,7 +12,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.knowledge import Knowledge
 from evercal.continual.learn import (
     Checkpoint,
     Encoding,
@@ -23,18 +22,19 @@ from evercal.continual.learn import (
 from evercal.continual.strategies import STRATEGIES
 from evercal.datasets.frame import Frame, Scene
 from evercal.errors import InputError
+from evercal.features.precision import autocast
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.localizer import Localizer
-from evercal.models.head import HeadOutput
-from evercal.training.buffer import Rows
-from evercal.training.fit import Progress
-from evercal.training.precision import autocast
+from evercal.mapping.scene_maps import SceneMaps
+from evercal.networks.buffer import Rows
+from evercal.networks.head import HeadOutput
+from evercal.networks.trainer import Progress
 
 from .stages import Blank, Rooms, assert_same, continued, outcome, weights
 
 
 def test_events_come_in_order(
-    first: dict[str, Knowledge], rooms: Rooms, quick: StageOptions
+    first: dict[str, SceneMaps], rooms: Rooms, quick: StageOptions
 ) -> None:
     # Encode the scene, hand over its rows, encode what is remembered, train, finish.
     events = list(continued(first["evercal"], rooms, quick))
@@ -60,43 +60,43 @@ def test_events_come_in_order(
 
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_a_stage_leaves_what_it_was_given_alone(
-    name: str, first: dict[str, Knowledge], rooms: Rooms, quick: StageOptions
+    name: str, first: dict[str, SceneMaps], rooms: Rooms, quick: StageOptions
 ) -> None:
-    known = first[name]
-    before = [weights(head) for head in known.heads]
-    slopes = [copy.deepcopy(p.grad) for head in known.heads for p in head.parameters()]
-    scenes, memories = list(known.scenes), list(known.memories)
-    modes = [module.training for module in known.heads[0].modules()]
-    after = outcome(continued(known, rooms, quick))
-    for head, state in zip(known.heads, before, strict=True):
+    maps = first[name]
+    before = [weights(head) for head in maps.heads]
+    slopes = [copy.deepcopy(p.grad) for head in maps.heads for p in head.parameters()]
+    scenes, keyframes = list(maps.scenes), list(maps.keyframes)
+    modes = [module.training for module in maps.heads[0].modules()]
+    after = outcome(continued(maps, rooms, quick))
+    for head, state in zip(maps.heads, before, strict=True):
         assert_same(weights(head), state)
-    parameters = [p for head in known.heads for p in head.parameters()]
+    parameters = [p for head in maps.heads for p in head.parameters()]
     for parameter, slope in zip(parameters, slopes, strict=True):
         assert (parameter.grad is None) == (slope is None)
         assert slope is None or torch.equal(torch.as_tensor(parameter.grad), slope)
-    assert all(a is b for a, b in zip(known.scenes, scenes, strict=True))
-    assert all(a is b for a, b in zip(known.memories, memories, strict=True))
-    assert [module.training for module in known.heads[0].modules()] == modes
+    assert all(a is b for a, b in zip(maps.scenes, scenes, strict=True))
+    assert all(a is b for a, b in zip(maps.keyframes, keyframes, strict=True))
+    assert [module.training for module in maps.heads[0].modules()] == modes
     assert [record.name for record in after.scenes] == ["alpha", "beta"]
-    assert after.scenes[0].cell == known.scenes[0].cell
-    assert len(after.memories) == 2
+    assert after.scenes[0].cell == maps.scenes[0].cell
+    assert len(after.keyframes) == 2
     # And it did learn something.
     name = "first.0.weight"
-    assert not torch.equal(weights(after.heads[-1])[name], weights(known.heads[-1])[name])
+    assert not torch.equal(weights(after.heads[-1])[name], weights(maps.heads[-1])[name])
 
 
 def test_fine_tuning_is_the_same_but_for_the_memory(
-    first: dict[str, Knowledge], rooms: Rooms, quick: StageOptions
+    first: dict[str, SceneMaps], rooms: Rooms, quick: StageOptions
 ) -> None:
     # The control makes the very same first head: there is nothing to replay yet.
     assert_same(weights(first["finetune"].heads[0]), weights(first["evercal"].heads[0]))
-    assert first["finetune"].memories == [None]
+    assert first["finetune"].keyframes == [None]
     *_, stage = continued(first["finetune"], rooms, quick)
     assert isinstance(stage, Stage)
     assert stage.frames_kept == 0
-    assert stage.knowledge.memories == [None, None]
+    assert stage.maps.keyframes == [None, None]
     ours = outcome(continued(first["evercal"], rooms, quick)).heads[0]
-    assert not torch.equal(ours.code, stage.knowledge.heads[0].code)
+    assert not torch.equal(ours.code, stage.maps.heads[0].code)
 
 
 @pytest.mark.parametrize("count", [16, 20, 27, 30])
@@ -104,10 +104,12 @@ def test_memory_holds_at_most_a_tenth(
     count: int, blank: Blank, rooms: Rooms, quick: StageOptions
 ) -> None:
     scene = replace(rooms[0], train=rooms[0].train[:count])
-    least = replace(quick, fit=replace(quick.fit, iterations=1), fill=replace(quick.fill, passes=1))
+    least = replace(
+        quick, fit=replace(quick.fit, iterations=1), encode=replace(quick.encode, views_per_frame=1)
+    )
     *_, stage = learn(blank("evercal"), scene, least)
     assert isinstance(stage, Stage)
-    memory = stage.knowledge.memories[0]
+    memory = stage.maps.keyframes[0]
     assert memory is not None
     assert len(memory.images) == stage.frames_kept
     assert 1 <= len(memory.images) <= count / 10
@@ -120,11 +122,13 @@ def test_memory_holds_at_most_a_tenth(
 
 
 def test_memory_may_be_given_in_bytes(blank: Blank, rooms: Rooms, quick: StageOptions) -> None:
-    least = replace(quick, fit=replace(quick.fit, iterations=1), fill=replace(quick.fill, passes=1))
+    least = replace(
+        quick, fit=replace(quick.fit, iterations=1), encode=replace(quick.encode, views_per_frame=1)
+    )
     sizes = []
     for budget in (4_000, 12_000, 10**9):
-        known = outcome(learn(blank("evercal"), rooms[0], replace(least, memory_bytes=budget)))
-        memory = known.memories[0]
+        maps = outcome(learn(blank("evercal"), rooms[0], replace(least, memory_bytes=budget)))
+        memory = maps.keyframes[0]
         assert memory is not None
         assert memory.bytes <= 1.25 * budget  # frames are counted at the size of the first
         sizes.append(len(memory.images))
@@ -132,12 +136,12 @@ def test_memory_may_be_given_in_bytes(blank: Blank, rooms: Rooms, quick: StageOp
 
 
 def test_isolation_keeps_one_head_each(
-    first: dict[str, Knowledge], rooms: Rooms, quick: StageOptions
+    first: dict[str, SceneMaps], rooms: Rooms, quick: StageOptions
 ) -> None:
-    known = first["isolation"]
-    after = outcome(continued(known, rooms, quick))
+    maps = first["isolation"]
+    after = outcome(continued(maps, rooms, quick))
     assert [head.scenes for head in after.heads] == [1, 1]
-    assert_same(weights(after.heads[0]), weights(known.heads[0]))
+    assert_same(weights(after.heads[0]), weights(maps.heads[0]))
     assert after.head_for(0) == (after.heads[0], 0)
     assert after.head_for(1) == (after.heads[1], 0)
     shared = outcome(continued(first["evercal"], rooms, quick))
@@ -146,19 +150,19 @@ def test_isolation_keeps_one_head_each(
 
 
 def test_joint_trains_on_all_scenes_and_needs_them(
-    first: dict[str, Knowledge], rooms: Rooms, quick: StageOptions
+    first: dict[str, SceneMaps], rooms: Rooms, quick: StageOptions
 ) -> None:
-    known = first["joint"]
-    after = outcome(continued(known, rooms, quick))
+    maps = first["joint"]
+    after = outcome(continued(maps, rooms, quick))
     assert [head.scenes for head in after.heads] == [2]
-    head, old = after.heads[0], known.heads[0]
+    head, old = after.heads[0], maps.heads[0]
     torch.testing.assert_close(head.centres[head.centre_scene == 0], old.centres)
     with pytest.raises((InputError, ValueError)):
-        list(learn(known, rooms[1], quick))
+        list(learn(maps, rooms[1], quick))
 
 
 def test_the_input_is_whitened_by_the_first_scene_and_stays_so(
-    first: dict[str, Knowledge], rooms: Rooms, quick: StageOptions
+    first: dict[str, SceneMaps], rooms: Rooms, quick: StageOptions
 ) -> None:
     before = first["evercal"].heads[0]
     assert not torch.equal(before.feature_map, torch.eye(before.features))
@@ -172,7 +176,7 @@ def test_the_input_is_whitened_by_the_first_scene_and_stays_so(
 
 
 def test_the_new_scene_stands_in_its_cell(
-    first: dict[str, Knowledge], rooms: Rooms, quick: StageOptions
+    first: dict[str, SceneMaps], rooms: Rooms, quick: StageOptions
 ) -> None:
     after = outcome(continued(first["evercal"], rooms, quick))
     head = after.heads[0]
@@ -192,13 +196,13 @@ def test_the_new_scene_stands_in_its_cell(
 
 
 def test_replayed_rows_are_the_old_scenes_and_their_teacher_stays_as_it_was(
-    first: dict[str, Knowledge],
+    first: dict[str, SceneMaps],
     rooms: Rooms,
     quick: StageOptions,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    known = first["evercal"]
-    memory = known.memories[0]
+    maps = first["evercal"]
+    memory = maps.keyframes[0]
     assert memory is not None
     seen: list[tuple[HeadOutput, Rows, float]] = []
 
@@ -207,14 +211,14 @@ def test_replayed_rows_are_the_old_scenes_and_their_teacher_stays_as_it_was(
         return student.points.square().mean()
 
     monkeypatch.setitem(STRATEGIES, "evercal", replace(STRATEGIES["evercal"], penalty=spy))
-    list(learn(known, rooms[1], quick))
+    list(learn(maps, rooms[1], quick))
     assert [progress for *_, progress in seen] == [i / 8 for i in range(8)]
-    centres = known.scenes[0].cell.atlas_from_base.apply(memory.base_from_camera.translation_m)
+    centres = maps.scenes[0].cell.atlas_from_base.apply(memory.base_from_camera.translation_m)
     for teacher, rows, _ in seen:
         assert len(rows.scene) == 32
         assert not rows.scene.any()
         with torch.no_grad(), autocast():
-            expected = known.heads[0](rows.features.float(), rows.scene, rows.descriptor)
+            expected = maps.heads[0](rows.features.float(), rows.scene, rows.descriptor)
         torch.testing.assert_close(teacher.points, expected.points)
         assert not teacher.points.requires_grad
         # Every row was seen from a remembered camera: augmentation turns, but does not move it.
@@ -225,7 +229,7 @@ def test_replayed_rows_are_the_old_scenes_and_their_teacher_stays_as_it_was(
 
 
 def test_everything_comes_from_the_seed(
-    first: dict[str, Knowledge], rooms: Rooms, quick: StageOptions
+    first: dict[str, SceneMaps], rooms: Rooms, quick: StageOptions
 ) -> None:
     torch.manual_seed(12345)  # the state of the world does not matter
     again = outcome(continued(first["evercal"], rooms, quick))
@@ -253,10 +257,10 @@ def test_training_sees_images_as_the_localizer_does(
     blank: Blank, rooms: Rooms, quick: StageOptions
 ) -> None:
     # The working size is the store's, whatever the plan for views says.
-    plan = replace(quick.fill, passes=1, view=replace(quick.fill.view, short_side=96))
-    stage = replace(quick, fill=plan, fit=replace(quick.fit, iterations=1))
-    known = blank("evercal")
-    for event in learn(known, rooms[0], stage):
+    plan = replace(quick.encode, views_per_frame=1, view=replace(quick.encode.view, short_side=96))
+    stage = replace(quick, encode=plan, fit=replace(quick.fit, iterations=1))
+    maps = blank("evercal")
+    for event in learn(maps, rooms[0], stage):
         if isinstance(event, Checkpoint) and event.rows:
             cells = len(event.rows["features"]) / len(event.rows["intrinsics"])
             assert cells == (64 // 8) * (48 // 8)
@@ -281,10 +285,10 @@ def test_a_camera_that_stands_still(
 
 
 def test_replay_keeps_an_old_scene(
-    arcs: tuple[Scene, Scene], arc_stage: StageOptions, arc_known: tuple[Knowledge, Knowledge]
+    arcs: tuple[Scene, Scene], arc_stage: StageOptions, arc_maps: tuple[SceneMaps, SceneMaps]
 ) -> None:
-    def median_error_m(known: Knowledge, scene: Scene) -> float:
-        localizer, errors = Localizer(known), []
+    def median_error_m(maps: SceneMaps, scene: Scene) -> float:
+        localizer, errors = Localizer(maps), []
         for frame in scene.test[::3]:
             found = localizer.localize(frame.read_image(), frame.camera)
             ok = found.scene == scene.name and found.base_from_camera is not None
@@ -295,10 +299,10 @@ def test_replay_keeps_an_old_scene(
                 errors.append(np.inf)
         return float(np.median(errors))
 
-    before, after = arc_known
+    before, after = arc_maps
     assert median_error_m(before, arcs[0]) < 0.1
     assert median_error_m(after, arcs[1]) < 0.15
-    control = replace(before, strategy="finetune", memories=[None])
+    control = replace(before, strategy="finetune", keyframes=[None])
     short = replace(arc_stage, fit=replace(arc_stage.fit, iterations=200))
     forgot = outcome(learn(control, arcs[1], short))
     kept = median_error_m(after, arcs[0])
@@ -307,7 +311,7 @@ def test_replay_keeps_an_old_scene(
 
 
 def test_strength_weighs_penalty_and_restraint(
-    first: dict[str, Knowledge],
+    first: dict[str, SceneMaps],
     rooms: Rooms,
     quick: StageOptions,
     monkeypatch: pytest.MonkeyPatch,

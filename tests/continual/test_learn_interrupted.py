@@ -10,7 +10,6 @@ import torch
 from safetensors.torch import load, save
 
 from evercal.continual import learn as learn_module
-from evercal.continual.knowledge import Knowledge
 from evercal.continual.learn import (
     Checkpoint,
     Encoding,
@@ -18,7 +17,8 @@ from evercal.continual.learn import (
     Resume,
     StageOptions,
 )
-from evercal.training.fit import Progress
+from evercal.mapping.scene_maps import SceneMaps
+from evercal.networks.trainer import Progress
 
 from .stages import Rooms, assert_same, continued, outcome, weights
 
@@ -27,7 +27,7 @@ def saved(checkpoint: Checkpoint) -> Checkpoint:
     """The checkpoint as a file would give it back."""
     rows, state = (
         load(save({k: v.contiguous() for k, v in part.items()})) if part else {}
-        for part in (checkpoint.rows, checkpoint.fitter)
+        for part in (checkpoint.rows, checkpoint.trainer)
     )
     return Checkpoint(rows, state)
 
@@ -41,7 +41,7 @@ def interrupted(
         if isinstance(event, Checkpoint):
             checkpoints.append(saved(event))
             if stop(checkpoints):
-                fitters = [c.fitter for c in checkpoints if c.fitter]
+                fitters = [c.trainer for c in checkpoints if c.trainer]
                 return Resume([c.rows for c in checkpoints if c.rows], (fitters or [{}])[-1])
     return None
 
@@ -49,8 +49,8 @@ def interrupted(
 STOPS: dict[str, Callable[[Sequence[Checkpoint]], bool]] = {
     "first rows": lambda c: len(c) == 1,
     "halfway through encoding": lambda c: len(c) == 4,
-    "first step": lambda c: bool(c[-1].fitter),
-    "fifth step": lambda c: sum(bool(x.fitter) for x in c) == 5,
+    "first step": lambda c: bool(c[-1].trainer),
+    "fifth step": lambda c: sum(bool(x.trainer) for x in c) == 5,
 }
 
 
@@ -59,17 +59,17 @@ STOPS: dict[str, Callable[[Sequence[Checkpoint]], bool]] = {
 def test_an_interruption_does_not_show(
     name: str,
     where: str,
-    first: dict[str, Knowledge],
+    first: dict[str, SceneMaps],
     rooms: Rooms,
     quick: StageOptions,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    known = first[name]
-    whole = outcome(continued(known, rooms, quick))
+    maps = first[name]
+    whole = outcome(continued(maps, rooms, quick))
     monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
-    resume = interrupted(continued(known, rooms, quick), STOPS[where])
+    resume = interrupted(continued(maps, rooms, quick), STOPS[where])
     assert resume is not None
-    again = list(continued(known, rooms, quick, resume))
+    again = list(continued(maps, rooms, quick, resume))
     assert_same(weights(outcome(again).heads[-1]), weights(whole.heads[-1]))
     a, b = outcome(again), whole
     assert torch.equal(a.scenes[-1].prototypes, b.scenes[-1].prototypes)
@@ -84,25 +84,25 @@ def test_an_interruption_does_not_show(
 
 
 def test_interrupted_twice(
-    first: dict[str, Knowledge],
+    first: dict[str, SceneMaps],
     rooms: Rooms,
     quick: StageOptions,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    known = first["evercal"]
-    whole = outcome(continued(known, rooms, quick))
+    maps = first["evercal"]
+    whole = outcome(continued(maps, rooms, quick))
     monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
-    once = interrupted(continued(known, rooms, quick), STOPS["halfway through encoding"])
+    once = interrupted(continued(maps, rooms, quick), STOPS["halfway through encoding"])
     assert once is not None
-    twice = interrupted(continued(known, rooms, quick, once), STOPS["fifth step"])
+    twice = interrupted(continued(maps, rooms, quick, once), STOPS["fifth step"])
     assert twice is not None
-    resume = Resume([*once.rows, *twice.rows], twice.fitter)
-    again = outcome(continued(known, rooms, quick, resume))
+    resume = Resume([*once.rows, *twice.rows], twice.trainer)
+    again = outcome(continued(maps, rooms, quick, resume))
     assert_same(weights(again.heads[0]), weights(whole.heads[0]))
 
 
 def test_a_checkpoint_keeps_its_value(
-    first: dict[str, Knowledge],
+    first: dict[str, SceneMaps],
     rooms: Rooms,
     quick: StageOptions,
     monkeypatch: pytest.MonkeyPatch,
@@ -115,4 +115,4 @@ def test_a_checkpoint_keeps_its_value(
             kept.append((event, copy.deepcopy(event)))
     for event, then in kept:
         assert_same(dict(event.rows), dict(then.rows))
-        assert_same(dict(event.fitter), dict(then.fitter))
+        assert_same(dict(event.trainer), dict(then.trainer))

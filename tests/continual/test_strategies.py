@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from evercal.continual import strategies
-from evercal.continual.candidates import Candidates
-from evercal.continual.penalties import (
+from evercal.continual.frame_statistics import FrameStatistics
+from evercal.continual.methods.penalties import (
     OUTPUT_WEIGHT_PX_PER_M,
     RELATION_TEMPERATURE,
     REPLAY_CLAMP_PX,
@@ -18,20 +18,20 @@ from evercal.continual.penalties import (
     TEACHER_LIMIT_PX,
     anchored_reprojection,
     bounded_by_teacher,
+    fixed_clamp_reprojection,
     old_output,
     relations,
     reprojection,
-    steady_reprojection,
     stored_output,
 )
-from evercal.continual.spdd import SpddOptions, spdd_loss
+from evercal.continual.methods.spdd import SpddOptions, spdd_loss
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.datasets.frame import Frame
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.models.head import Head, HeadOptions, HeadOutput
-from evercal.training.buffer import FeatureBuffer, Rows
-from evercal.training.loss import Target
+from evercal.networks.buffer import FeatureBuffer, Rows
+from evercal.networks.head import Head, HeadOptions, HeadOutput
+from evercal.networks.loss import Target
 
 DEPTH_M, FOCAL_PX = 2.0, 100.0
 IDLE = SE3.identity()
@@ -39,7 +39,7 @@ SELECTING = [name for name, strategy in STRATEGIES.items() if strategy.select is
 REPLAYING = [name for name, strategy in STRATEGIES.items() if strategy.penalty is not None]
 
 
-class Known(Candidates):
+class Known(FrameStatistics):
     """Frames of a camera that moves by random steps; what a head would say is made up."""
 
     def __init__(self, positions: np.ndarray, quaternions: np.ndarray):
@@ -160,7 +160,9 @@ def test_relations_by_hand() -> None:
 
 def test_a_steady_clamp_does_not_follow_the_schedule() -> None:
     costs = [
-        float(steady_reprojection(says([off_by(3.0)]), says([off_by(9.0)]), rows(1), t).detach())
+        float(
+            fixed_clamp_reprojection(says([off_by(3.0)]), says([off_by(9.0)]), rows(1), t).detach()
+        )
         for t in (0.0, 1.0)
     ]
     tau = REPLAY_CLAMP_PX

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evercal.benchmark.suites import load_suite
 from evercal.datasets import load_scene, twelve_scenes, write_image
 from evercal.errors import InputError
-from evercal.evaluation.suites import load_suite
 from evercal.geometry import SE3, pose_distance
 
 INFO = """m_versionNumber = 4

@@ -17,13 +17,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from evercal.continual.atlas import Atlas
-from evercal.continual.knowledge import Knowledge, SceneRecord
+from evercal.features.descriptor import GlobalDescriptor
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.estimate import PoseEstimate
-from evercal.models.descriptor import GlobalDescriptor
-from evercal.models.head import Head, HeadOptions, HeadOutput
+from evercal.mapping.atlas import Atlas
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord
+from evercal.networks.head import Head, HeadOptions, HeadOutput
 from evercal.simulation.box_room import BoxRoom, default_camera
 
 SHORT = 120
@@ -50,12 +50,12 @@ class LevelDescriptor(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.known: dict[int, list[float]] = {}
+        self.maps: dict[int, list[float]] = {}
         self.width = 4
 
     def forward(self, features: Tensor) -> Tensor:
         levels = (255 * features.mean((1, 2, 3))).round().int().tolist()
-        rows = [self.known.get(level, [0.0, 0.0, 0.0, 1.0]) for level in levels]
+        rows = [self.maps.get(level, [0.0, 0.0, 0.0, 1.0]) for level in levels]
         return F.normalize(torch.tensor(rows), dim=-1)
 
 
@@ -90,7 +90,7 @@ class Oracle(Head):
 class World:
     """Some scenes of one room, and the images that show them."""
 
-    known: Knowledge
+    maps: SceneMaps
     oracle: Oracle
     levels: int = 10
     truth: dict[int, SE3] = field(default_factory=dict)
@@ -123,18 +123,18 @@ class World:
         rays = small.unproject(np.array(grid)) @ base_from_camera.rotation_matrix().T
         points, _ = room().intersect(base_from_camera.translation_m, rays)
         points[rng.permutation(len(points))[round(right * len(points)) :]] = rng.normal(0, 5, 3)
-        cell = self.known.scenes[scene].cell
+        cell = self.maps.scenes[scene].cell
         told = torch.from_numpy(cell.atlas_from_base.apply(points)).float()
         self.oracle.told[scene if say is None else say, level] = told
         nearest = [0.0] * 4
         nearest[scene] = 1.0
-        cast(LevelDescriptor, self.known.descriptor).known[level] = nearest
+        cast(LevelDescriptor, self.maps.descriptor).maps[level] = nearest
         self.truth[level] = base_from_camera
         return np.full((height, width, 3), level, np.uint8)
 
     def looks_like(self, image: np.ndarray, descriptor: list[float]) -> None:
         """Gives an image another descriptor than that of the scene it shows."""
-        cast(LevelDescriptor, self.known.descriptor).known[int(image[0, 0, 0])] = descriptor
+        cast(LevelDescriptor, self.maps.descriptor).maps[int(image[0, 0, 0])] = descriptor
 
     def assert_right(self, found: PoseEstimate, image: np.ndarray, scene: str) -> None:
         """The answer is `ok` and the pose that the image was registered with."""
@@ -157,8 +157,8 @@ def world(
         record = SceneRecord(f"scene-{i}", camera, cell, prototypes, 100)
         scenes.append(replace(record, inlier_threshold=threshold))
     descriptor = cast(GlobalDescriptor, LevelDescriptor())
-    known = Knowledge(LevelEncoder(), descriptor, "evercal", SHORT, [oracle], scenes, [None] * 9)
-    return World(known, oracle)
+    maps = SceneMaps(LevelEncoder(), descriptor, "evercal", SHORT, [oracle], scenes, [None] * 9)
+    return World(maps, oracle)
 
 
 @pytest.fixture(name="world")

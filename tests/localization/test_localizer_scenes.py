@@ -21,7 +21,7 @@ def test_noise_is_not_located(world: Any) -> None:
     where = world(threshold=0.2)
     for scene in (0, 1) * 60:
         where.view(scene)
-    localizer = Localizer(where.known)
+    localizer = Localizer(where.maps)
     for seed in range(5):
         rng = np.random.default_rng(seed)
         noise = rng.integers(0, 256, (120, 160, 3)).astype(np.uint8)
@@ -40,7 +40,7 @@ def test_a_pose_outside_the_cell_of_its_scene_fails(world: Any) -> None:
     where = world()
     image = where.view(1, say=0)
     where.looks_like(image, [1.0, 0, 0, 0])
-    found = Localizer(where.known).localize(image)
+    found = Localizer(where.maps).localize(image)
     assert found.status == "failed"
     assert "cell" in found.reason
     assert found.scene is None
@@ -50,8 +50,8 @@ def test_a_pose_outside_the_cell_of_its_scene_fails(world: Any) -> None:
 
 def test_too_few_cells_of_an_image(world: Any) -> None:
     where = world((default_camera(160, 120),))
-    where.known.short_side = 16  # 2 cells of 16 x 21 pixels: no pose has 6 inliers
-    found = Localizer(where.known).localize(where.view(0))
+    where.maps.short_side = 16  # 2 cells of 16 x 21 pixels: no pose has 6 inliers
+    found = Localizer(where.maps).localize(where.view(0))
     assert found.status == "failed"
     assert "6 cells" in found.reason
     assert found.inliers == 0
@@ -61,7 +61,7 @@ def test_too_few_cells_of_an_image(world: Any) -> None:
 @pytest.mark.parametrize(("right", "status"), [(0.35, "unknown_scene"), (0.75, "ok")])
 def test_the_threshold_of_a_scene_decides(right: float, status: str, world: Any) -> None:
     where = world(threshold=0.5)
-    found = Localizer(where.known).localize(where.view(0, right=right))
+    found = Localizer(where.maps).localize(where.view(0, right=right))
     assert found.status == status
     assert found.inlier_ratio == pytest.approx(right, abs=0.03)
     assert (found.base_from_camera is None) == (status != "ok")
@@ -69,16 +69,16 @@ def test_the_threshold_of_a_scene_decides(right: float, status: str, world: Any)
         assert "50 %" in found.reason
         assert "scene-0" in found.reason
     # Each scene has its own: the other one believes less, or more.
-    where.known.scenes[0] = replace(where.known.scenes[0], inlier_threshold=0.5 - 0.25)
-    assert Localizer(where.known).localize(where.view(0, right=right)).status == "ok"
+    where.maps.scenes[0] = replace(where.maps.scenes[0], inlier_threshold=0.5 - 0.25)
+    assert Localizer(where.maps).localize(where.view(0, right=right)).status == "ok"
 
 
 def test_the_covariance_is_scaled_by_what_the_scene_learned(world: Any) -> None:
     found = []
     for scale in (1.0, 7.0):
         where = world()
-        where.known.scenes[0] = replace(where.known.scenes[0], covariance_scale=scale)
-        found.append(Localizer(where.known).localize(where.view(0)))
+        where.maps.scenes[0] = replace(where.maps.scenes[0], covariance_scale=scale)
+        found.append(Localizer(where.maps).localize(where.view(0)))
     assert found[0].covariance is not None
     assert found[1].covariance is not None
     np.testing.assert_allclose(found[1].covariance, 7 * found[0].covariance, rtol=1e-9)
@@ -91,7 +91,7 @@ def test_candidates_are_chosen_by_prototypes(world: Any) -> None:
     def asked(descriptor: list[float], options: LocalizeOptions) -> list[int]:
         where.looks_like(image, descriptor)
         where.oracle.asked.clear()
-        Localizer(where.known, options).localize(image)
+        Localizer(where.maps, options).localize(image)
         return list(where.oracle.asked)
 
     likes = [0.6, 0.5, 0.4, 0.3]  # length 0.927: cosines 0.647, 0.539, 0.431, 0.323
@@ -101,9 +101,9 @@ def test_candidates_are_chosen_by_prototypes(world: Any) -> None:
     assert asked(likes, LocalizeOptions(candidates=9, margin=0.23)) == [0, 1, 2]
     assert asked([0.1, 0.2, 0.9, 0.3], LocalizeOptions(candidates=2, margin=2.0)) == [2, 3]
     # The best of a scene's prototypes speaks for it.
-    record = where.known.scenes[3]
+    record = where.maps.scenes[3]
     more = torch.tensor([[0.0, 0, 0, 1], [1, 0, 0, 0]]).half()
-    where.known.scenes[3] = replace(record, prototypes=more)
+    where.maps.scenes[3] = replace(record, prototypes=more)
     assert sorted(asked([0.9, 0.1, 0.1, 0], LocalizeOptions(margin=0.1))) == [0, 3]
 
 
@@ -112,9 +112,9 @@ def test_of_the_candidates_the_one_with_most_inliers_wins(world: Any) -> None:
     image = where.view(2)
     # It looks more like scene 0, but only scene 2 explains it.
     where.looks_like(image, [1.0, 0.9, 0.95, 0])
-    where.assert_right(Localizer(where.known).localize(image), image, "scene-2")
+    where.assert_right(Localizer(where.maps).localize(image), image, "scene-2")
     assert where.oracle.asked == [0, 2, 1]
-    blind = Localizer(where.known, LocalizeOptions(candidates=1)).localize(image)
+    blind = Localizer(where.maps, LocalizeOptions(candidates=1)).localize(image)
     assert blind.inlier_ratio < 0.1
 
 
@@ -123,12 +123,12 @@ def test_a_head_that_decides_itself_is_asked_once_and_the_atlas_tells_the_scene(
     for scene in (2, 0, 1):
         image = where.view(scene)
         where.oracle.asked.clear()
-        where.assert_right(Localizer(where.known).localize(image), image, f"scene-{scene}")
+        where.assert_right(Localizer(where.maps).localize(image), image, f"scene-{scene}")
         assert len(where.oracle.asked) == 1
     image = where.view(1)
     told = where.oracle.told[1, int(image[0, 0, 0])]
     told += 500.0  # far from all cells
-    found = Localizer(where.known).localize(image)
+    found = Localizer(where.maps).localize(image)
     assert found.status == "failed"
     assert "cell" in found.reason
 
@@ -138,4 +138,4 @@ def test_a_head_that_decides_itself_takes_the_camera_of_the_scene_it_finds(world
     where = world((CAMERA, wide), condition="descriptor")
     for scene, camera in enumerate((CAMERA, wide)):
         image = where.view(scene, camera)
-        where.assert_right(Localizer(where.known).localize(image), image, f"scene-{scene}")
+        where.assert_right(Localizer(where.maps).localize(image), image, f"scene-{scene}")

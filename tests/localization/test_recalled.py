@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from evercal.continual.knowledge import Knowledge
 from evercal.continual.learn import Stage, learn
+from evercal.features.descriptor import load_descriptor
+from evercal.features.encoder import load_encoder
 from evercal.localization.localizer import LocalizeOptions, Localizer
-from evercal.models.descriptor import load_descriptor
-from evercal.models.encoder import load_encoder
+from evercal.mapping.scene_maps import SceneMaps
 
 if TYPE_CHECKING:
     from evercal.continual.learn import StageOptions
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="module")
-def unlearned(arcs: tuple[Scene, Scene], arc_stage: StageOptions) -> Knowledge:
+def unlearned(arcs: tuple[Scene, Scene], arc_stage: StageOptions) -> SceneMaps:
     """The first arc after a dozen steps; half of its frames are remembered."""
     fit = replace(arc_stage.fit, iterations=12)
     options = replace(arc_stage, fit=fit, memory_share=0.5)
-    blank = Knowledge(load_encoder(), load_descriptor(), "evercal", 120)
+    blank = SceneMaps(load_encoder(), load_descriptor(), "evercal", 120)
     *_, stage = learn(blank, arcs[0], options)
     assert isinstance(stage, Stage)
-    return stage.knowledge
+    return stage.maps
 
 
-def located(known: Knowledge, scene: Scene) -> tuple[list[PoseEstimate], float]:
+def located(maps: SceneMaps, scene: Scene) -> tuple[list[PoseEstimate], float]:
     """Answers for every third test frame, and their median error in metres."""
-    localizer, answers, errors = Localizer(known), [], []
+    localizer, answers, errors = Localizer(maps), [], []
     for frame in scene.test[::3]:
         found = localizer.localize(frame.read_image(), frame.camera)
         answers.append(found)
@@ -45,9 +45,9 @@ def located(known: Knowledge, scene: Scene) -> tuple[list[PoseEstimate], float]:
 
 
 def test_remembered_frames_answer_where_the_network_cannot(
-    unlearned: Knowledge, arcs: tuple[Scene, Scene]
+    unlearned: SceneMaps, arcs: tuple[Scene, Scene]
 ) -> None:
-    memory = unlearned.memories[0]
+    memory = unlearned.keyframes[0]
     assert memory is not None
     assert len(memory.inverse_depth) == len(memory.images) == 12
     answers, error_m = located(unlearned, arcs[0])
@@ -58,14 +58,14 @@ def test_remembered_frames_answer_where_the_network_cannot(
             assert found.pixels is not None
             assert found.points_m is not None
             assert len(found.pixels) == len(found.points_m) >= found.inliers
-    alone = replace(unlearned, memories=[None])
+    alone = replace(unlearned, keyframes=[None])
     assert located(alone, arcs[0])[1] > 0.2
     # Without depths, as older stores and other strategies have it, nothing is recalled.
-    plain = replace(unlearned, memories=[replace(memory, inverse_depth=())])
+    plain = replace(unlearned, keyframes=[replace(memory, inverse_depth=())])
     assert located(plain, arcs[0])[1] == located(alone, arcs[0])[1]
 
 
-def test_a_batch_says_the_same(unlearned: Knowledge, arcs: tuple[Scene, Scene]) -> None:
+def test_a_batch_says_the_same(unlearned: SceneMaps, arcs: tuple[Scene, Scene]) -> None:
     frames = arcs[0].test[:4]
     localizer = Localizer(unlearned)
     batch = localizer.localize_batch([f.read_image() for f in frames], [f.camera for f in frames])
@@ -75,31 +75,34 @@ def test_a_batch_says_the_same(unlearned: Knowledge, arcs: tuple[Scene, Scene]) 
 
 
 def test_remembered_cells_vote_for_the_scene(
-    unlearned: Knowledge, arcs: tuple[Scene, Scene], arc_stage: StageOptions
+    unlearned: SceneMaps, arcs: tuple[Scene, Scene], arc_stage: StageOptions
 ) -> None:
     options = replace(
-        arc_stage, fit=replace(arc_stage.fit, iterations=12), memory_share=0.5, replay_passes=1
+        arc_stage,
+        fit=replace(arc_stage.fit, iterations=12),
+        memory_share=0.5,
+        replay_views_per_frame=1,
     )
     *_, stage = learn(unlearned, arcs[1], options)
     assert isinstance(stage, Stage)
-    known = stage.knowledge
+    maps = stage.maps
     # Descriptors that say the opposite of the truth.
-    first, second = known.scenes
-    known.scenes = [
+    first, second = maps.scenes
+    maps.scenes = [
         replace(first, prototypes=second.prototypes),
         replace(second, prototypes=first.prototypes),
     ]
     only = LocalizeOptions(candidates=1)
 
-    def right(known: Knowledge) -> int:
-        localizer = Localizer(known, only)
+    def right(maps: SceneMaps) -> int:
+        localizer = Localizer(maps, only)
         return sum(
             localizer.localize(frame.read_image(), frame.camera).scene == scene.name
             for scene in arcs
             for frame in scene.test[::4]
         )
 
-    assert right(known) >= 11  # of 12
+    assert right(maps) >= 11  # of 12
     # Without depths nothing is recalled, and the descriptors decide.
-    known.memories = [m and replace(m, inverse_depth=()) for m in known.memories]
-    assert right(known) == 0
+    maps.keyframes = [m and replace(m, inverse_depth=()) for m in maps.keyframes]
+    assert right(maps) == 0

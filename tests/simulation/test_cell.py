@@ -9,8 +9,9 @@ import pytest
 
 from evercal.datasets import load_scene
 from evercal.errors import InputError
-from evercal.simulation import cell, renderer
+from evercal.simulation import cell
 from evercal.simulation.cell import SimulateOptions, Suite, simulate
+from evercal.simulation.furnished import renderer
 
 TINY = SimulateOptions(frames=4, size=(32, 24), samples=1)
 

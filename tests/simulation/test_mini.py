@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3, pose_distance
-from evercal.simulation.mini import FOLDER, CellRoom, clay_views, mini_rooms
+from evercal.simulation.mini import FOLDER, CellRoom, mini_rooms, untextured_renders
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_clay_views_lie_over_the_images(rooms: tuple[CellRoom, ...]) -> None:
     pose = frame.base_from_camera
     assert pose is not None
     off = pose @ SE3.exp([0.1, 0.05, 0, 0, 0, 0.05])
-    right, wrong = clay_views(room.model, [frame, frame], [pose, off])
+    right, wrong = untextured_renders(room.model, [frame, frame], [pose, off])
     assert right.shape == frame.read_image().shape
 
     def edges(image: np.ndarray) -> np.ndarray:

@@ -5,21 +5,21 @@ from pathlib import Path
 import pytest
 
 from evercal.errors import InputError
-from evercal.storage import hold_settings
+from evercal.storage import lock_settings
 
 
 def test_first_settings_are_kept_and_others_refused(tmp_path: Path) -> None:
     file = tmp_path / "new" / "settings.json"
-    hold_settings(file, {"steps": 3, "sizes": (1, 2)})
+    lock_settings(file, {"steps": 3, "sizes": (1, 2)})
     before = file.read_bytes()
-    hold_settings(file, {"steps": 3, "sizes": (1, 2)})  # tuples come back as lists
+    lock_settings(file, {"steps": 3, "sizes": (1, 2)})  # tuples come back as lists
     for other, message in (
         ({"steps": 4, "sizes": (1, 2)}, r"new: .*steps 3, now it is 4; give another --out"),
         ({"steps": 3}, r"sizes \[1, 2\], now it is None"),
         ({"steps": 3, "sizes": (1, 2), "seed": 0}, "seed None, now it is 0"),
     ):
         with pytest.raises(InputError, match=message):
-            hold_settings(file, other)
+            lock_settings(file, other)
     assert file.read_bytes() == before
 
 
@@ -28,5 +28,5 @@ def test_settings_that_cannot_be_read_are_named(tmp_path: Path, text: str) -> No
     file = tmp_path / "settings.json"
     file.write_text(text)
     with pytest.raises(InputError, match=r"settings\.json: no settings in JSON"):
-        hold_settings(file, {})
+        lock_settings(file, {})
     assert file.read_text() == text

@@ -14,9 +14,9 @@ from evercal.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from evercal.benchmark.bench import BenchOptions, Step
     from evercal.continual.learn import StageOptions
     from evercal.datasets import Scene
-    from evercal.evaluation.bench import BenchOptions, Step
 
 TABLES, PAGE, LATEX = "tables.md", "report.html", "table.tex"
 
@@ -74,9 +74,9 @@ class Bench:
     def run(self) -> int:
         """Runs what is missing and prints the tables."""
         seeds = _numbers(self.seeds)
+        from evercal.benchmark.bench import BenchOptions
         from evercal.continual.plugin import load_plugin
-        from evercal.evaluation.bench import BenchOptions
-        from evercal.training.distributed import join_processes, rank, wait_for_all
+        from evercal.networks.distributed import join_processes, rank, wait_for_all
 
         if self.plugin is not None:
             load_plugin(self.plugin)
@@ -106,22 +106,22 @@ class Bench:
         return 0 if rank() else _show(self.out, _words(self.strategies)[0], self.json)
 
     def _steps(self, options: "BenchOptions", out: Path) -> "Iterator[Step]":
-        from evercal.evaluation.bench import run_bench
-        from evercal.evaluation.cluster import run_on_ray
+        from evercal.benchmark.bench import run_bench
+        from evercal.benchmark.ray_runs import run_on_ray
 
         if self.ray is None:
             return run_bench(self._scenes(), options, out)
         return run_on_ray(self._scenes(), options, out, self.ray, self.plugin)
 
     def _scenes(self) -> "list[Scene]":
-        from evercal.evaluation.suites import held_out
+        from evercal.benchmark.suites import held_out
 
         scenes = self._recorded()
         return [held_out(scene) for scene in scenes] if self.held_out else scenes
 
     def _recorded(self) -> "list[Scene]":
+        from evercal.benchmark.suites import load_suite, regions
         from evercal.datasets import load_scene
-        from evercal.evaluation.suites import load_suite, regions
 
         if (self.suite in ("custom", "regions")) != bool(self.recordings):
             raise InputError(
@@ -165,7 +165,7 @@ class BenchReport:
     """Folder of results."""
     reference: Annotated[str, arg(metavar="NAME")] = "evercal"
     """The strategy that the others are compared with."""
-    beside: Annotated[tuple[Path, ...], arg(metavar="DIR...", help_behavior_hint="")] = ()
+    compare_with: Annotated[tuple[Path, ...], arg(metavar="DIR...", help_behavior_hint="")] = ()
     """Other folders of results to show beside it, of the same scenes under other settings, such as
     another --memory."""
     json: bool = False
@@ -173,7 +173,7 @@ class BenchReport:
 
     def run(self) -> int:
         """Prints and writes the tables."""
-        return _show(self.folder, self.reference, self.json, self.beside)
+        return _show(self.folder, self.reference, self.json, self.compare_with)
 
 
 def _mirror(out: Path) -> Path:
@@ -185,7 +185,7 @@ def _mirror(out: Path) -> Path:
     import shutil
     import tempfile
 
-    from evercal.evaluation.outcomes import RESULTS, SETTINGS
+    from evercal.benchmark.results import RESULTS, SETTINGS
 
     folder = Path(tempfile.mkdtemp(prefix="evercal-bench-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -197,30 +197,30 @@ def _mirror(out: Path) -> Path:
     return folder
 
 
-def _show(folder: Path, reference: str, as_json: bool, beside: tuple[Path, ...] = ()) -> int:
-    from evercal.cli.bench_page import bench_page
-    from evercal.cli.bench_views import view_pictures
-    from evercal.evaluation.comparison import as_text, summary
-    from evercal.evaluation.latex import paper_tables
-    from evercal.evaluation.report import read_report
+def _show(folder: Path, reference: str, as_json: bool, compare_with: tuple[Path, ...] = ()) -> int:
+    from evercal.benchmark.comparison import as_text, summary
+    from evercal.benchmark.latex import paper_tables
+    from evercal.benchmark.report_data import read_report
+    from evercal.reports.bench_page import bench_page
+    from evercal.reports.bench_views import view_pictures
     from evercal.simulation.cell import SUITES
     from evercal.storage import write_bytes
 
-    report = read_report(folder, reference, beside)
+    report = read_report(folder, reference, compare_with)
     tables = report.tables()
 
     def text(style: Literal["terminal", "markdown"]) -> str:
-        return "\n\n".join(as_text(rows, style) for rows in tables.told())
+        return "\n\n".join(as_text(rows, style) for rows in tables.non_empty())
 
     write_bytes(folder / TABLES, (text("markdown") + "\n").encode())
     suite = SUITES.get(report.suite)
     rooms = {name: (kind, seed) for name, kind, seed in suite.rooms} if suite else {}
-    pictures = view_pictures(folder, report.drawn, rooms)
+    pictures = view_pictures(folder, report.plotted, rooms)
     write_bytes(folder / PAGE, bench_page(report, tables, pictures).encode())
     latex = paper_tables(report.runs, report.suite, tables.ablation)
     write_bytes(folder / LATEX, (latex + "\n").encode())
     if as_json:
-        print_json({"strategies": summary([*report.runs, *report.beside])})
+        print_json({"strategies": summary([*report.runs, *report.compare_with])})
         return 0
     print(text("terminal"))
     print(f"wrote {folder / PAGE}, {TABLES} and {LATEX}")

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 from evercal.cli.console import print_json, print_next
-from evercal.cli.demo_outcome import METHODS, DemoOutcome, FixedCamera
 from evercal.errors import InputError
+from evercal.reports.demo_outcome import METHODS, DemoOutcome, FixedCamera
 
 if TYPE_CHECKING:
     from evercal.continual.learn import StageOptions
@@ -73,9 +73,9 @@ def run_demo(out: Path, options: DemoOptions, say: Callable[[str], None] = _quie
     Raises:
         InputError: `out` holds something else under a name that the demo needs.
     """
-    from evercal.cli.demo_page import write_pictures
     from evercal.datasets import write_image
     from evercal.localization.localizer import Localizer
+    from evercal.reports.demo_page import write_pictures
     from evercal.simulation.mini import mini_rooms
     from evercal.storage import MANIFEST, replace_folder
 
@@ -133,9 +133,9 @@ def _run_method(
     say: Callable[[str], None],
 ) -> None:
     from evercal.cli.learn import LearnBars
+    from evercal.continual.learn_scene import LearnOptions, learn_scene
     from evercal.continual.presets import preset
     from evercal.localization.localizer import Localizer
-    from evercal.localization.teach import LearnOptions, learn_scene
 
     how = LearnOptions(options.stage or preset("demo"), method)
     outcome.accuracy[method], outcome.seconds[method] = [], []

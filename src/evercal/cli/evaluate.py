@@ -35,9 +35,10 @@ class Evaluate:
         scenes = load_named(self.scenes)
         if self.report is not None and not self.report.absolute().parent.is_dir():
             raise InputError(f"--report {self.report}: its folder does not exist; make it first")
-        from evercal.cli.evaluate_page import Watch, evaluation_page
-        from evercal.evaluation import evaluate, score_table, scores
+        from evercal.benchmark.tables import score_table
+        from evercal.evaluation import evaluate, scores
         from evercal.localization.localizer import Localizer
+        from evercal.reports.evaluate_page import Watch, evaluation_page
         from evercal.storage import write_bytes
 
         watch = Watch(Localizer.open(self.store), scenes)

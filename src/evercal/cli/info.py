@@ -20,26 +20,26 @@ class Info:
 
     def run(self) -> int:
         """Opens the store and describes it."""
-        from evercal.continual.robot import Robot, head_bytes
+        from evercal.mapping.store import Store, head_bytes
 
-        robot = Robot.open(self.store)
-        known, used = robot.known, robot.bytes()
+        store = Store.open(self.store)
+        maps, used = store.maps, store.bytes()
         scenes = [
             {
                 "name": record.name,
                 "train_frames": record.train_frames,
-                "memory_bytes": memory.bytes if memory is not None else 0,
+                "memory_bytes": keyframes.bytes if keyframes is not None else 0,
                 "inlier_threshold": record.inlier_threshold,
                 "camera": record.camera.to_dict(),
                 "cell": asdict(record.cell),
             }
-            for record, memory in zip(known.scenes, known.memories, strict=True)
+            for record, keyframes in zip(maps.scenes, maps.keyframes, strict=True)
         ]
-        heads = sum(head_bytes(head) for head in known.heads)
+        heads = sum(head_bytes(head) for head in maps.heads)
         content = {
             "store": str(self.store),
-            "strategy": known.strategy,
-            "short_side": known.short_side,
+            "strategy": maps.strategy,
+            "short_side": maps.short_side,
             "head_bytes": heads,
             "memory_bytes": used["memory"],
             "total_bytes": used["memory"] + used["rest"],
@@ -50,7 +50,7 @@ class Info:
             return 0
         print(
             f"{self.store}: {len(scenes)} scene{'s' if len(scenes) != 1 else ''}, strategy"
-            f" {known.strategy}, images at {known.short_side} px"
+            f" {maps.strategy}, images at {maps.short_side} px"
         )
         print(
             f"{size(used['memory'] + used['rest'])} in all: head {size(heads)},"

@@ -22,8 +22,8 @@ class Inspect:
 
     def run(self) -> int:
         """Reads the scene and the first image of every camera."""
-        from evercal.cli.inspection import inspect_scene
         from evercal.datasets import load_scene
+        from evercal.datasets.inspection import inspect_scene
 
         scene = load_scene(self.scene, self.format)
         found = inspect_scene(scene)

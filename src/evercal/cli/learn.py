@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
     from evercal.continual.learn import Checkpoint, Encoding
-    from evercal.datasets import Scene
-    from evercal.localization.teach import LearnOptions
-    from evercal.training.fit import Progress
+    from evercal.continual.learn_scene import LearnOptions
+    from evercal.networks.trainer import Progress
 
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
 _UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
@@ -60,13 +59,13 @@ class Learn:
             raise InputError(f"--centres {self.centres}: give a number >= 1")
         if self.seed < 0:
             raise InputError(f"--seed {self.seed}: give a number >= 0")
-        from evercal.datasets import load_scene
-        from evercal.localization.teach import hold_out, learn_scene
+        from evercal.continual.learn_scene import learn_scene, validation_split
+        from evercal.datasets import load_scene, posed_scene
 
-        scene = posed(load_scene(self.scene, self.format, self.name))
+        scene = posed_scene(load_scene(self.scene, self.format, self.name))
         check_name(scene.name)
         options = self._options(share, count)
-        held_out = len(hold_out(scene.train)[1])
+        held_out = len(validation_split(scene.train)[1])
         start = (
             f"{scene.name}: {len(scene.train)} training frames, {scene.untracked} untracked left"
             f" out, {held_out} held out to learn what is unknown"
@@ -96,8 +95,8 @@ class Learn:
         return str(self.scene) if self.name is None else f"{name}={self.scene}"
 
     def _options(self, share: float | None, count: int | None) -> "LearnOptions":
+        from evercal.continual.learn_scene import LearnOptions
         from evercal.continual.presets import preset
-        from evercal.localization.teach import LearnOptions
 
         if self.encoder is not None and not self.encoder.is_file():
             raise InputError(f"--encoder {self.encoder}: no such file")
@@ -112,8 +111,8 @@ class Learn:
 
     def _strategy(self) -> str:
         """The strategy asked for, else the store's; refuses what a store cannot change later."""
-        from evercal.continual.robot import Robot
         from evercal.continual.strategies import STRATEGIES
+        from evercal.mapping.store import Store
         from evercal.storage import MANIFEST
 
         if self.strategy is not None:
@@ -127,20 +126,20 @@ class Learn:
                 raise InputError(f"--strategy {self.strategy}: unknown; use {', '.join(usable)}")
         if not (self.store / MANIFEST).exists():
             return self.strategy or "evercal"
-        known = Robot.open(self.store).known
+        maps = Store.open(self.store).maps
         if self.encoder is not None:
             raise InputError(
                 f"--encoder {self.encoder}: {self.store} keeps the encoder it was made with; leave"
                 f" the option out or start a new store"
             )
-        made_with = known.heads[-1].options.centres_per_scene if known.heads else self.centres
-        shared = STRATEGIES[known.strategy].heads == "one"
+        made_with = maps.heads[-1].options.centres_per_scene if maps.heads else self.centres
+        shared = STRATEGIES[maps.strategy].heads == "one"
         if shared and self.centres is not None and self.centres != made_with:
             raise InputError(
                 f"--centres {self.centres}: {self.store} was made with {made_with} for each scene;"
                 f" leave the option out or start a new store"
             )
-        return self.strategy or known.strategy
+        return self.strategy or maps.strategy
 
 
 def parse_memory(text: str) -> tuple[float | None, int | None]:
@@ -174,13 +173,6 @@ def check_name(name: str) -> None:
         )
 
 
-def posed(scene: "Scene") -> "Scene":
-    """The scene without training frames that have no pose, which count as untracked."""
-    train = tuple(frame for frame in scene.train if frame.base_from_camera is not None)
-    lost = len(scene.train) - len(train)
-    return dataclasses.replace(scene, train=train, untracked=scene.untracked + lost)
-
-
 class LearnBars:
     """Shows the events of learning as progress bars on stderr; a context that closes them.
 
@@ -210,7 +202,7 @@ class LearnBars:
     def __call__(self, event: "Encoding | Progress | Checkpoint") -> None:
         """Takes one event."""
         from evercal.continual.learn import Encoding
-        from evercal.training.fit import Progress
+        from evercal.networks.trainer import Progress
 
         if self._start:
             print(self._start, file=self._stream, flush=True)

@@ -68,8 +68,8 @@ class Localize:
         self, localizer: "Localizer", camera: "Camera | None"
     ) -> list[tuple[Path, "PoseEstimate", float]]:
         """Per image its path, the answer and the milliseconds that it took, decoding included."""
-        from evercal.cli.pictures import draw_estimate, scene_camera
         from evercal.datasets import read_image, write_image
+        from evercal.reports.pictures import draw_estimate, scene_camera
 
         answers = []
         with progress_bar("localizing", len(self.images), "image") as bar:

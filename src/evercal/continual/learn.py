@@ -2,7 +2,7 @@
 
 import copy
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -10,20 +10,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evercal.continual.atlas import Cell, camera_clusters
-from evercal.continual.candidates import Candidates
-from evercal.continual.keeping import keep, note_of
-from evercal.continual.knowledge import Knowledge, SceneRecord, prototypes, refine
-from evercal.continual.memory import remember
-from evercal.continual.notes import Notes
+from evercal.continual.finish_scene import method_state_of, select_keyframes
+from evercal.continual.frame_statistics import FrameStatistics
+from evercal.continual.method_state import MethodState
+from evercal.continual.methods.mir import mir_views
+from evercal.continual.methods.preconditioning import preconditioner
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.datasets.frame import Frame, Scene
 from evercal.errors import InputError
+from evercal.features.precision import autocast
 from evercal.geometry.camera import Camera
-from evercal.models.head import Head, HeadOptions, HeadOutput
-from evercal.training.buffer import FeatureBuffer, FillPlan, Rows, fill
-from evercal.training.fit import FitOptions, Fitter, Progress, Replay
-from evercal.training.precision import autocast
+from evercal.mapping.atlas import Cell, camera_clusters
+from evercal.mapping.keyframes import store_keyframes
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord, corrected_camera, prototypes
+from evercal.mapping.store import Checkpoint, Resume
+from evercal.networks.buffer import EncodePlan, FeatureBuffer, Rows, encode_frames
+from evercal.networks.head import Head, HeadOptions, HeadOutput
+from evercal.networks.trainer import FitOptions, HeadTrainer, Progress, Replay
 
 CHECKPOINT_SECONDS = 10.0
 WHITENING_ROWS = 20_000
@@ -37,9 +40,9 @@ class StageOptions:
     """Shape of a new head; a later stage keeps the head it finds."""
     fit: FitOptions = field(default_factory=FitOptions)
     """Training."""
-    fill: FillPlan = field(default_factory=FillPlan)
+    encode: EncodePlan = field(default_factory=EncodePlan)
     """Views of the new scene's frames."""
-    replay_passes: int = 4
+    replay_views_per_frame: int = 4
     """Views of every remembered frame."""
     memory_share: float = 0.10
     """N_b as a share of the scene's training frames."""
@@ -57,7 +60,7 @@ class StageOptions:
         """N_b in frames, at least 1, for a scene of these training frames."""
         if self.memory_bytes is None:
             return max(1, int(self.memory_share * len(frames) + 1e-9))
-        one = remember(frames[:1], short_side).bytes
+        one = store_keyframes(frames[:1], short_side).bytes
         return min(len(frames), max(1, self.memory_bytes // one))
 
 
@@ -72,30 +75,10 @@ class Encoding:
 
 
 @dataclass
-class Checkpoint:
-    """A state from which `learn` can go on; only what is new since the last one."""
-
-    rows: Mapping[str, Tensor]
-    """Feature rows encoded since the last checkpoint; empty when there are none."""
-    fitter: Mapping[str, Tensor]
-    """State of the training; empty while the encoder is at work."""
-
-
-@dataclass
-class Resume:
-    """What checkpoints left behind."""
-
-    rows: Sequence[Mapping[str, Tensor]]
-    """The `rows` of all checkpoints in order."""
-    fitter: Mapping[str, Tensor]
-    """The last non-empty `fitter`."""
-
-
-@dataclass
 class Stage:
     """A finished stage."""
 
-    knowledge: Knowledge
+    knowledge: SceneMaps
     """What is known now; thresholds are not fitted yet."""
     iterations: int
     """Optimiser steps."""
@@ -107,7 +90,7 @@ Event = Encoding | Progress | Checkpoint | Stage
 
 
 def learn(
-    known: Knowledge,
+    maps: SceneMaps,
     scene: Scene,
     options: StageOptions,
     resume: Resume | None = None,
@@ -116,7 +99,7 @@ def learn(
     """Learns one more scene.
 
     Args:
-        known: what is known so far; not changed.
+        maps: what is known so far; not changed.
         scene: its training frames are learned, its test frames are not looked at.
         options: how.
         resume: where an interrupted run of the same call stood.
@@ -128,17 +111,17 @@ def learn(
     Yields:
         `Encoding` and `Progress` as it goes, a `Checkpoint` every 10 seconds, a `Stage` at the end.
     """
-    strategy = STRATEGIES[known.strategy]
-    if strategy.data == "all" and len(earlier) != len(known.scenes):
+    strategy = STRATEGIES[maps.strategy]
+    if strategy.data == "all" and len(earlier) != len(maps.scenes):
         raise InputError(
-            f"strategy {known.strategy!r}: learns all scenes at once and needs the "
-            f"{len(known.scenes)} earlier ones again, got {len(earlier)}; give them, or take "
+            f"strategy {maps.strategy!r}: learns all scenes at once and needs the "
+            f"{len(maps.scenes)} earlier ones again, got {len(earlier)}; give them, or take "
             "another strategy"
         )
     # Views are made at the size at which the localizer will see images.
-    view = replace(options.fill.view, short_side=known.short_side)
-    options = replace(options, fill=replace(options.fill, view=view))
-    after = known.fork()
+    view = replace(options.encode.view, short_side=maps.short_side)
+    options = replace(options, encode=replace(options.encode, view=view))
+    after = maps.copy_for_training()
     teacher = copy.deepcopy(after.heads[-1]).eval() if after.heads else None
     positions = np.stack([_pose(frame).translation_m for frame in scene.train])
     cell = after.atlas(options.grid_scenes).place(positions)
@@ -146,12 +129,12 @@ def learn(
     correctable = _correctable(scene.train)
     buffer = FeatureBuffer(local, cell.atlas_from_base, correctable)
     pacer = _Pacer()
-    past_rows, fitter_state = (resume.rows, resume.fitter) if resume else ((), {})
+    past_rows, fitter_state = (resume.rows, resume.trainer) if resume else ((), {})
     for rows in past_rows:
         buffer.restore(rows)
     frames = scene.train
-    for done in fill(buffer, frames, options.fill, known.encoder, known.descriptor):
-        yield Encoding(done, len(frames) * options.fill.passes)
+    for done in encode_frames(buffer, frames, options.encode, maps.encoder, maps.descriptor):
+        yield Encoding(done, len(frames) * options.encode.views_per_frame)
         if pacer.due():
             yield Checkpoint(buffer.take_new(), {})
     new = buffer.take_new()
@@ -159,29 +142,29 @@ def learn(
         yield Checkpoint(new, {})
     buffers = [buffer]
     if strategy.data == "all":
-        buffers += yield from _refill(known, earlier, options)
+        buffers += yield from _refill(maps, earlier, options)
     if head.options.whiten and (strategy.data == "all" or head.scenes == 1):
         head.whiten(_sample(buffers, options.seed))
     replay = None
     if strategy.penalty is not None and teacher is not None:
-        replay = yield from _replay(known, strategy, teacher, options)
+        replay = yield from _replay(maps, strategy, teacher, options)
     fit = options.fit
-    restraint = None
-    if strategy.restraint is not None and known.notes:
-        restraint = partial(_weighed, strategy, head, known.notes)
-    fitter = Fitter(head, buffers, replay, fit, options.seed, restraint)
+    regularizer = None
+    if strategy.regularizer is not None and maps.method_states:
+        regularizer = partial(_weighed, strategy, head, maps.method_states)
+    trainer = HeadTrainer(head, buffers, replay, fit, options.seed, regularizer)
     if fitter_state:
-        fitter.load(dict(fitter_state))
-    for progress in fitter.run():
+        trainer.load(dict(fitter_state))
+    for progress in trainer.run():
         yield progress
         if pacer.due():
-            yield Checkpoint({}, fitter.state())
+            yield Checkpoint({}, trainer.state())
     refined: list[Camera | None] = [None] * len(buffers)
-    if fit.lens_rate > 0 and fit.iterations > 0:
+    if fit.intrinsics_rate > 0 and fit.iterations > 0:
         nominal = [scene.train[0].camera, *[other.train[0].camera for other in earlier]]
         for i, buffer_ in enumerate(buffers):
             if buffer_.correctable:
-                refined[i] = refine(nominal[i], fitter.lens[i].detach())
+                refined[i] = corrected_camera(nominal[i], trainer.correction[i].detach())
     for i, camera in enumerate(refined[1:]):
         after.scenes[i] = replace(after.scenes[i], refined_camera=camera)
     yield _finish(after, scene, cell, buffer, options, refined[0])
@@ -198,7 +181,7 @@ def _pose(frame: Frame):
 
 
 def _head_for_stage(
-    after: Knowledge,
+    after: SceneMaps,
     strategy: Strategy,
     options: StageOptions,
     cell: Cell,
@@ -223,7 +206,7 @@ def _head_for_stage(
     return head, local
 
 
-def _fresh_head(after: Knowledge, shape: HeadOptions, seed: int) -> Head:
+def _fresh_head(after: SceneMaps, shape: HeadOptions, seed: int) -> Head:
     torch.manual_seed(seed)
     return Head(after.encoder.width, after.descriptor.width, shape)
 
@@ -246,41 +229,41 @@ def _new_centres(head: Head, options: StageOptions, positions: np.ndarray) -> Te
         return torch.tensor(options.fixed_centres_m).reshape(-1, 3)
     from itertools import islice
 
-    from evercal.continual.atlas import spiral
+    from evercal.mapping.atlas import spiral
 
     return torch.tensor(np.stack(list(islice(spiral(), count)))).float()
 
 
-def _refill(known: Knowledge, earlier: Sequence[Scene], options: StageOptions) -> Iterator[Event]:
+def _refill(maps: SceneMaps, earlier: Sequence[Scene], options: StageOptions) -> Iterator[Event]:
     """Encodes all earlier scenes again (strategies with `data: all`)."""
     buffers = []
-    for i, (scene, record) in enumerate(zip(earlier, known.scenes, strict=True)):
+    for i, (scene, record) in enumerate(zip(earlier, maps.scenes, strict=True)):
         correctable = _correctable(scene.train)
         buffer = FeatureBuffer(i, record.cell.atlas_from_base, correctable)
-        plan = options.fill
-        for done in fill(buffer, scene.train, plan, known.encoder, known.descriptor):
-            yield Encoding(done, len(scene.train) * plan.passes)
+        plan = options.encode
+        for done in encode_frames(buffer, scene.train, plan, maps.encoder, maps.descriptor):
+            yield Encoding(done, len(scene.train) * plan.views_per_frame)
         buffers.append(buffer)
     return buffers
 
 
 def _replay(
-    known: Knowledge, strategy: Strategy, teacher: Head, options: StageOptions
+    maps: SceneMaps, strategy: Strategy, teacher: Head, options: StageOptions
 ) -> Iterator[Event]:
     """Encodes what is remembered and binds the penalty to the frozen teacher."""
     buffers, references = [], []
-    for i, (memory, record) in enumerate(zip(known.memories, known.scenes, strict=True)):
-        if memory is None or not memory.images:
+    for i, (keyframes, record) in enumerate(zip(maps.keyframes, maps.scenes, strict=True)):
+        if keyframes is None or not keyframes.images:
             continue
         buffer = FeatureBuffer(i, record.cell.atlas_from_base)
-        plan = replace(options.fill, passes=options.replay_passes)
-        frames = memory.frames()
-        for done in fill(buffer, frames, plan, known.encoder, known.descriptor):
-            yield Encoding(done, len(frames) * plan.passes)
-        note = known.notes[i]
-        if "points" in note:
-            buffer.stored = note["points"].float() + note["origin"]
-        references.append(note.get("reference", torch.tensor(torch.nan)))
+        plan = replace(options.encode, views_per_frame=options.replay_views_per_frame)
+        frames = keyframes.frames()
+        for done in encode_frames(buffer, frames, plan, maps.encoder, maps.descriptor):
+            yield Encoding(done, len(frames) * plan.views_per_frame)
+        state = maps.method_states[i]
+        if "points" in state:
+            buffer.stored = state["points"].float() + state["origin"]
+        references.append(state.get("reference", torch.tensor(torch.nan)))
         buffers.append(buffer)
     cost = strategy.penalty
     assert cost is not None
@@ -296,20 +279,20 @@ def _replay(
         buffers,
         penalty,
         strategy.penalty_per_scene,
-        strategy.protection,
+        preconditioner(strategy.preconditioning),
         strategy.combine,
         torch.stack(references),
-        strategy.interfered,
+        mir_views if strategy.mir else None,
     )
 
 
-def _weighed(strategy: Strategy, head: Head, notes: Sequence[Notes]) -> Tensor:
-    assert strategy.restraint is not None
-    return strategy.strength * strategy.restraint(head, notes)
+def _weighed(strategy: Strategy, head: Head, method_states: Sequence[MethodState]) -> Tensor:
+    assert strategy.regularizer is not None
+    return strategy.strength * strategy.regularizer(head, method_states)
 
 
 def _finish(
-    after: Knowledge,
+    after: SceneMaps,
     scene: Scene,
     cell: Cell,
     buffer: FeatureBuffer,
@@ -320,13 +303,13 @@ def _finish(
     descriptors = prototypes(buffer.tensors["descriptors"][: len(frames)])
     camera = frames[0].camera
     record = SceneRecord(scene.name, camera, cell, descriptors, len(frames), refined)
-    candidates = Candidates(frames, after.heads[-1], lambda: buffer, options.seed)
+    statistics = FrameStatistics(frames, after.heads[-1], lambda: buffer, options.seed)
     capacity = options.capacity(frames, after.short_side)
-    memory = keep(after, frames, candidates, capacity, refined)
+    keyframes = select_keyframes(after, frames, statistics, capacity, refined)
     after.scenes.append(record)
-    after.memories.append(memory)
-    after.notes.append(note_of(after, buffer))
-    return Stage(after, options.fit.iterations, len(memory.images) if memory else 0)
+    after.keyframes.append(keyframes)
+    after.method_states.append(method_state_of(after, buffer))
+    return Stage(after, options.fit.iterations, len(keyframes.images) if keyframes else 0)
 
 
 class _Pacer:

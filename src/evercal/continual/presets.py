@@ -4,10 +4,10 @@ from dataclasses import replace
 from typing import Literal
 
 from evercal.continual.learn import StageOptions
-from evercal.models.head import HeadOptions
-from evercal.training.buffer import FillPlan
-from evercal.training.fit import FitOptions
-from evercal.training.loss import LossOptions
+from evercal.networks.buffer import EncodePlan
+from evercal.networks.head import HeadOptions
+from evercal.networks.loss import LossOptions
+from evercal.networks.trainer import FitOptions
 
 Preset = Literal["fast", "demo", "bench", "paper"]
 
@@ -16,21 +16,21 @@ PRESETS: dict[str, StageOptions] = {
     "fast": StageOptions(
         head=HeadOptions(width=384),
         fit=FitOptions(iterations=2400, batch=2048, replay_batch=1024),
-        fill=FillPlan(passes=4),
+        encode=EncodePlan(views_per_frame=4),
     ),
     # At most 45 s a scene of about 100 frames.
     "demo": StageOptions(
         head=HeadOptions(width=256),
         fit=FitOptions(iterations=1000, batch=2048, replay_batch=1024),
-        fill=FillPlan(passes=3),
-        replay_passes=4,
+        encode=EncodePlan(views_per_frame=3),
+        replay_views_per_frame=4,
     ),
     # At most 30 s a stage.
     "bench": StageOptions(
         head=HeadOptions(width=256),
         fit=FitOptions(iterations=600, batch=2048, replay_batch=1024),
-        fill=FillPlan(passes=1),
-        replay_passes=2,
+        encode=EncodePlan(views_per_frame=1),
+        replay_views_per_frame=2,
     ),
     # The paper's settings, for a GPU; Sim takes 5,000 steps.
     "paper": StageOptions(
@@ -50,7 +50,7 @@ PRESETS: dict[str, StageOptions] = {
             warm_share=0.3,
             loss=LossOptions(schedule="circle", clamp_start_px=50.0),
         ),
-        fill=FillPlan(passes=8, cells=1024),
+        encode=EncodePlan(views_per_frame=8, cells=1024),
     ),
 }
 
@@ -58,7 +58,7 @@ PRESETS: dict[str, StageOptions] = {
 def preset(name: str, seed: int = 0) -> StageOptions:
     """A preset with everything drawn from `seed`."""
     options = PRESETS[name]
-    return replace(options, seed=seed, fill=replace(options.fill, seed=seed))
+    return replace(options, seed=seed, encode=replace(options.encode, seed=seed))
 
 
 def on_paper_backbone(options: StageOptions) -> StageOptions:

@@ -8,8 +8,35 @@ from typing import Literal
 import numpy as np
 from torch import Tensor
 
-from evercal.continual.candidates import Candidates
-from evercal.continual.exemplars import (
+from evercal.continual.frame_statistics import FrameStatistics
+from evercal.continual.method_state import (
+    FinishedScene,
+    MethodState,
+    after_scene_fisher,
+    after_scene_fisher_online,
+    after_scene_points,
+    after_scene_reference,
+    ewc_online_penalty,
+    ewc_penalty,
+)
+from evercal.continual.methods.gradient_constraints import (
+    averaged_constraint,
+    episodic_barrier,
+    gem,
+    moving_barrier,
+)
+from evercal.continual.methods.penalties import (
+    Penalty,
+    anchored_reprojection,
+    bounded_by_teacher,
+    fixed_clamp_reprojection,
+    old_output,
+    relations,
+    reprojection,
+    spdd,
+    stored_output,
+)
+from evercal.continual.selection_by_features import (
     select_coverage,
     select_gradients,
     select_herding,
@@ -17,39 +44,12 @@ from evercal.continual.exemplars import (
     select_leverage,
     select_reservoir,
 )
-from evercal.continual.notes import (
-    Finished,
-    Notes,
-    elastic,
-    elastic_online,
-    note_fisher,
-    note_fisher_online,
-    note_points,
-    note_reference,
-)
-from evercal.continual.penalties import (
-    Penalty,
-    anchored_reprojection,
-    bounded_by_teacher,
-    old_output,
-    relations,
-    reprojection,
-    spdd,
-    steady_reprojection,
-    stored_output,
-)
-from evercal.continual.selection import SarsOptions, select_sars
 from evercal.errors import InputError
-from evercal.models.head import Head
-from evercal.training.gradients import (
-    Combine,
-    averaged_constraint,
-    episodic_barrier,
-    gem,
-    moving_barrier,
-)
+from evercal.mapping.selection import SarsOptions, select_sars
+from evercal.networks.gradients import Combine
+from evercal.networks.head import Head
 
-Select = Callable[[Candidates, int], np.ndarray]
+Select = Callable[[FrameStatistics, int], np.ndarray]
 """Which frames stay: (frames of a finished scene, capacity) -> indices in recorded order."""
 
 
@@ -64,7 +64,7 @@ class Strategy:
     penalty: Penalty | None = None
     """What replayed rows cost."""
     strength: float = 1.0
-    """What `penalty` and `restraint` are multiplied by."""
+    """What `penalty` and `regularizer` are multiplied by."""
     penalty_per_scene: bool = False
     """Whether every remembered scene costs that much, or (the paper) all of them together: then a
     scene counts less with every one that follows."""
@@ -72,62 +72,62 @@ class Strategy:
     """Train on the new scene, or on every frame of every scene from scratch."""
     heads: Literal["one", "per_scene"] = "one"
     """One head for all scenes, or one each."""
-    protection: float = 0.0
+    preconditioning: float = 0.0
     """How strongly updates of shared matrices spare the directions that each remembered scene uses
-    (`training.protection`)."""
+    (`continual.methods.preconditioning`)."""
     combine: Combine | None = None
     """How gradients of remembered scenes join that of the new one; None adds them up."""
-    interfered: bool = False
+    mir: bool = False
     """Whether those views are replayed that the new rows are about to spoil most."""
     recall: bool = False
     """Whether remembered frames also answer: cells of an image are matched to theirs, whose depths
     are then part of the memory (`continual.recall`)."""
-    note: Callable[[Finished], dict[str, Tensor]] | None = None
+    after_scene: Callable[[FinishedScene], dict[str, Tensor]] | None = None
     """What is noted about a finished scene beside its frames."""
-    restraint: Callable[[Head, Sequence[Notes]], Tensor] | None = None
+    regularizer: Callable[[Head, Sequence[MethodState]], Tensor] | None = None
     """What the weights cost, given the notes about all earlier scenes."""
 
 
-PROTECTION = 0.5
+PRECONDITIONING = 0.5
 WEIGHTS: dict[Penalty, float] = {reprojection: 0.3, old_output: 0.3, relations: 0.3}
 """Strengths that did best on held-out frames, of three tried for every penalty (docs/results.md);
 1 for all others."""
 
 
-def _sars(frames: Candidates, capacity: int) -> np.ndarray:
+def _sars(frames: FrameStatistics, capacity: int) -> np.ndarray:
     return select_sars(frames.positions_m, frames.quaternions_wxyz, capacity, SarsOptions())
 
 
-def _sars_filled(frames: Candidates, capacity: int) -> np.ndarray:
+def _sars_filled(frames: FrameStatistics, capacity: int) -> np.ndarray:
     fill = SarsOptions(fill=True)
     return select_sars(frames.positions_m, frames.quaternions_wxyz, capacity, fill)
 
 
-def _reservoir(frames: Candidates, capacity: int) -> np.ndarray:
+def _reservoir(frames: FrameStatistics, capacity: int) -> np.ndarray:
     return select_reservoir(len(frames), capacity, frames.rng())
 
 
-def _hybrid(frames: Candidates, capacity: int) -> np.ndarray:
+def _hybrid(frames: FrameStatistics, capacity: int) -> np.ndarray:
     return select_hybrid(frames.features(), capacity, frames.rng())
 
 
-def _herding(frames: Candidates, capacity: int) -> np.ndarray:
+def _herding(frames: FrameStatistics, capacity: int) -> np.ndarray:
     return select_herding(frames.features(), capacity)
 
 
-def _leverage(frames: Candidates, capacity: int) -> np.ndarray:
+def _leverage(frames: FrameStatistics, capacity: int) -> np.ndarray:
     return select_leverage(frames.features(), capacity, frames.rng())
 
 
-def _coverage(frames: Candidates, capacity: int) -> np.ndarray:
+def _coverage(frames: FrameStatistics, capacity: int) -> np.ndarray:
     return select_coverage(frames.visible_parts(), capacity, frames.rng())
 
 
-def _coverage_redundant(frames: Candidates, capacity: int) -> np.ndarray:
+def _coverage_redundant(frames: FrameStatistics, capacity: int) -> np.ndarray:
     return select_coverage(frames.visible_parts(), capacity, frames.rng(), "redundant")
 
 
-def _gradients(frames: Candidates, capacity: int) -> np.ndarray:
+def _gradients(frames: FrameStatistics, capacity: int) -> np.ndarray:
     return select_gradients(frames.gradients(), capacity, frames.rng())
 
 
@@ -136,7 +136,7 @@ _NETWORK = Strategy(
     select=_sars_filled,
     penalty=anchored_reprojection,
     penalty_per_scene=True,
-    protection=PROTECTION,
+    preconditioning=PRECONDITIONING,
 )
 
 STRATEGIES: dict[str, Strategy] = {
@@ -187,13 +187,13 @@ STRATEGIES: dict[str, Strategy] = {
         select=_reservoir,
         penalty=reprojection,
         strength=WEIGHTS[reprojection],
-        interfered=True,
+        mir=True,
     ),
     "der": Strategy(
         source="Buzzega et al., Dark experience (DER++), NeurIPS 2020, ported to points",
         select=_reservoir,
         penalty=stored_output,
-        note=note_points,
+        after_scene=after_scene_points,
     ),
     "co2l": Strategy(
         source="Cha et al., Co2L's relation distillation, ICCV 2021, ported to points",
@@ -204,37 +204,37 @@ STRATEGIES: dict[str, Strategy] = {
     "agem": Strategy(
         source="Chaudhry et al., Efficient lifelong learning with A-GEM, ICLR 2019",
         select=_reservoir,
-        penalty=steady_reprojection,
+        penalty=fixed_clamp_reprojection,
         combine=averaged_constraint,
     ),
     "gem": Strategy(
         source="Lopez-Paz and Ranzato, Gradient episodic memory, NeurIPS 2017",
         select=_reservoir,
-        penalty=steady_reprojection,
+        penalty=fixed_clamp_reprojection,
         combine=gem,
     ),
     "gec": Strategy(
         source="Lai et al., GEC, NeurIPS 2025, several constraints",
         select=_reservoir,
-        penalty=steady_reprojection,
+        penalty=fixed_clamp_reprojection,
         combine=episodic_barrier,
-        note=note_reference,
+        after_scene=after_scene_reference,
     ),
     "gec_moving": Strategy(
         source="the same with the references of its Algorithm 1, the losses of the step before",
         select=_reservoir,
-        penalty=steady_reprojection,
+        penalty=fixed_clamp_reprojection,
         combine=moving_barrier,
     ),
     "ewc": Strategy(
         source="Kirkpatrick et al., Elastic weight consolidation, PNAS 2017, a term per scene",
-        note=note_fisher,
-        restraint=elastic,
+        after_scene=after_scene_fisher,
+        regularizer=ewc_penalty,
     ),
     "ewc_online": Strategy(
         source="Schwarz et al., Progress and compress, ICML 2018, one running term",
-        note=note_fisher_online,
-        restraint=elastic_online,
+        after_scene=after_scene_fisher_online,
+        regularizer=ewc_online_penalty,
     ),
     "sars_spdd": Strategy(
         source="Li et al., Continual Hand-Eye Calibration, arXiv 2604.15814, Algorithms 1 and 2",

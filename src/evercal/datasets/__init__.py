@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evercal.datasets import generic, seven_scenes, twelve_scenes
+from evercal.datasets.frame import MIN_TRAIN_FRAMES as MIN_TRAIN_FRAMES
 from evercal.datasets.frame import Frame as Frame
 from evercal.datasets.frame import Scene as Scene
 from evercal.datasets.frame import known_poses as known_poses
 from evercal.datasets.frame import posed as posed
+from evercal.datasets.frame import posed_scene as posed_scene
 from evercal.datasets.images import image_size as image_size
 from evercal.datasets.images import read_image as read_image
 from evercal.datasets.images import write_image as write_image

@@ -1,7 +1,7 @@
 """What every dataset yields: frames with a camera and poses, in scenes with a train/test split."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from evercal.datasets.images import read_image
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
+
+MIN_TRAIN_FRAMES = 16
+"""Posed training frames that a scene needs to be learned."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,3 +77,10 @@ class Scene:
     """How many recorded frames were left out because they have no valid pose."""
     base: str | None = None
     """What its base frame is called, where scenes share one; None if it is the scene's own."""
+
+
+def posed_scene(scene: Scene) -> Scene:
+    """The scene without training frames that have no pose, which count as untracked."""
+    train = posed(scene.train)
+    lost = len(scene.train) - len(train)
+    return replace(scene, train=train, untracked=scene.untracked + lost)

@@ -6,12 +6,8 @@ from evercal.evaluation.metrics import SceneScores as SceneScores
 from evercal.evaluation.metrics import Scores as Scores
 from evercal.evaluation.metrics import continual_scores as continual_scores
 from evercal.evaluation.metrics import correct as correct
-from evercal.evaluation.metrics import near_training as near_training
 from evercal.evaluation.metrics import scores as scores
 from evercal.evaluation.protocol import evaluate as evaluate
 from evercal.evaluation.statistics import Interval as Interval
 from evercal.evaluation.statistics import block_bootstrap as block_bootstrap
 from evercal.evaluation.statistics import paired_difference as paired_difference
-from evercal.evaluation.tables import continual_table as continual_table
-from evercal.evaluation.tables import matrix_table as matrix_table
-from evercal.evaluation.tables import score_table as score_table

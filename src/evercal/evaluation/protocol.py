@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from evercal.datasets import Frame, Scene, known_poses, posed
 from evercal.errors import InputError
-from evercal.evaluation.metrics import FrameResult, Status, near_training
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.evaluation.metrics import FrameResult, Status
+from evercal.geometry import SE3, Camera, near_training, pose_distance
 
 
 class Estimate(Protocol):

@@ -1,1 +1,1 @@
-"""From an image to a pose with uncertainty or an honest no; and `teach`, which learns a scene."""
+"""From an image to the pose of its camera."""

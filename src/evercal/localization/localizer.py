@@ -12,19 +12,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evercal.continual.knowledge import Knowledge
-from evercal.continual.recall import Expected, Recall, Votes
 from evercal.errors import InputError
+from evercal.features.encode import ENCODE_BATCH, encode
+from evercal.features.precision import autocast
+from evercal.features.views import View, ViewOptions, ideal_cell_pixels, plain_view
 from evercal.geometry.camera import Camera
 from evercal.localization.estimate import PoseEstimate
+from evercal.localization.keyframe_matcher import KeyframeMatcher, PosePrior, Votes
 from evercal.localization.pnp import PnpOptions, PnpResult, solve_pnp
-from evercal.training.buffer import ENCODE_BATCH, encode
-from evercal.training.precision import autocast
-from evercal.training.views import View, ViewOptions, ideal_cell_pixels, plain_view
+from evercal.mapping.scene_maps import SceneMaps
 
 ASPECT_TOLERANCE = 0.01
 # Every so many-th point tells where to look; the pose itself comes from all.
-GLANCE = 4
+FIRST_PASS_STRIDE = 4
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class LocalizeOptions:
 class _Look:
     """What an image has in common with the remembered frames of a scene."""
 
-    recall: Recall
+    matcher: KeyframeMatcher
     votes: Votes
 
 
@@ -80,17 +80,17 @@ class Localizer:
     for 60 frames on two cores.
 
     Args:
-        known: networks, atlas and scene records.
+        maps: networks, atlas and scene records.
         options: how.
     """
 
-    def __init__(self, known: Knowledge, options: LocalizeOptions | None = None):
-        self.known, self.options = known, options or LocalizeOptions()
-        self._view = ViewOptions(short_side=known.short_side)
-        self._prototypes = [record.prototypes.float() for record in known.scenes]
-        self._recalls: dict[int, Recall | None] = {}
+    def __init__(self, maps: SceneMaps, options: LocalizeOptions | None = None):
+        self.maps, self.options = maps, options or LocalizeOptions()
+        self._view = ViewOptions(short_side=maps.short_side)
+        self._prototypes = [record.prototypes.float() for record in maps.scenes]
+        self._matchers: dict[int, KeyframeMatcher | None] = {}
         self._lock = Lock()
-        for head in known.heads:
+        for head in maps.heads:
             head.eval()
 
     @classmethod
@@ -110,17 +110,17 @@ class Localizer:
         Raises:
             InputError: not a store, an empty one, or a damaged file.
         """
-        from evercal.continual.robot import Robot
+        from evercal.mapping.store import Store
 
-        robot = Robot.open(Path(store), encoder)
-        if not robot.known.scenes:
+        opened = Store.open(Path(store), encoder)
+        if not opened.maps.scenes:
             raise InputError(f"store {store}: no scene learned yet; run 'evercal learn' first")
-        return cls(robot.known, options)
+        return cls(opened.maps, options)
 
     @property
     def scenes(self) -> tuple[str, ...]:
         """Names of the scenes, in order of learning."""
-        return tuple(record.name for record in self.known.scenes)
+        return tuple(record.name for record in self.maps.scenes)
 
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         """Camera pose of one image.
@@ -172,10 +172,10 @@ class Localizer:
                 "give the intrinsics of this image (any size of the same proportions will do)"
             )
         plain = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
-        return plain_view(image, plain, self.known.encoder.stride, self._view)
+        return plain_view(image, plain, self.maps.encoder.stride, self._view)
 
     def _encode(self, views: Sequence[View]) -> tuple[Tensor, Tensor]:
-        features, descriptors = encode(views, self.known.encoder, self.known.descriptor)
+        features, descriptors = encode(views, self.maps.encoder, self.maps.descriptor)
         return features.flatten(2).transpose(1, 2), descriptors
 
     def _locate(
@@ -189,8 +189,8 @@ class Localizer:
         best: _Hypothesis | None = None
         cameras = self._cameras(camera, shape)
         usable = [i for i, c in enumerate(cameras) if c is not None]
-        recalls = {i: recall for i in usable if (recall := self._recall(i)) is not None}
-        looks = {i: _Look(recall, recall.vote(features)) for i, recall in recalls.items()}
+        matchers = {i: matcher for i in usable if (matcher := self._matcher(i)) is not None}
+        looks = {i: _Look(matcher, matcher.retrieve(features)) for i, matcher in matchers.items()}
         for scene in self._candidates(descriptor, usable, looks):
             lens = cameras[scene]
             assert lens is not None
@@ -207,18 +207,18 @@ class Localizer:
     def _cameras(self, camera: Camera | None, shape: tuple[int, ...]) -> list[Camera | None]:
         """Intrinsics at working size under each scene, None where the proportions do not fit."""
         height, width = shape[:2]
-        small = Camera(width, height, 1, 1, 0, 0).short_side_resized(self.known.short_side)
+        small = Camera(width, height, 1, 1, 0, 0).short_side_resized(self.maps.short_side)
         found: list[Camera | None] = []
-        for record in self.known.scenes:
-            lens = record.lens(camera)
+        for record in self.maps.scenes:
+            lens = record.query_camera(camera)
             fits = _same_shape(lens, width, height)
             found.append(lens.resized(small.width, small.height) if fits else None)
         if not any(found):
-            known = ", ".join(
-                f"{r.name} {r.camera.width}x{r.camera.height}" for r in self.known.scenes
+            maps = ", ".join(
+                f"{r.name} {r.camera.width}x{r.camera.height}" for r in self.maps.scenes
             )
             raise InputError(
-                f"image {width}x{height}: its proportions fit no known camera ({known}); "
+                f"image {width}x{height}: its proportions fit no known camera ({maps}); "
                 "give its intrinsics with --camera"
             )
         return found
@@ -242,7 +242,7 @@ class Localizer:
 
     def _one_answer(self) -> bool:
         """Whether the head itself decides which scene answers (condition `descriptor`)."""
-        return self.known.heads[0].options.condition == "descriptor" and len(self.known.heads) == 1
+        return self.maps.heads[0].options.condition == "descriptor" and len(self.maps.heads) == 1
 
     @torch.inference_mode()
     def _hypothesis(
@@ -253,10 +253,10 @@ class Localizer:
         camera: Camera,
         look: _Look | None,
     ) -> _Hypothesis:
-        head, local = self.known.head_for(scene)
+        head, local = self.maps.head_for(scene)
         with autocast():
             output = head(features, local, descriptor.expand(len(features), -1))
-        pixels = ideal_cell_pixels(camera, self.known.encoder.stride).astype(float)
+        pixels = ideal_cell_pixels(camera, self.maps.encoder.stride).astype(float)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         own = output.points
         if look is not None:
@@ -270,30 +270,30 @@ class Localizer:
             points = own
             pose = solve(points, self.options.pnp)
         else:
-            recall = look.recall
-            found = recall.look(features, look.votes)
-            points = torch.cat([own, recall.points(found, own)])
-            pose = solve(points, self.options.pnp, GLANCE)
+            matcher = look.matcher
+            found = matcher.match(features, look.votes)
+            points = torch.cat([own, matcher.lift(found, own)])
+            pose = solve(points, self.options.pnp, FIRST_PASS_STRIDE)
             if pose is not None:
-                expected = Expected(camera, pose.world_from_camera)
-                points = torch.cat([own, recall.points(found, own, expected)])
+                expected = PosePrior(camera, pose.world_from_camera)
+                points = torch.cat([own, matcher.lift(found, own, expected)])
                 pose = solve(points, self.options.refine)
         if pose is not None and self._one_answer():
-            other = self.known.atlas().scene_at(pose.world_from_camera.translation_m)
+            other = self.maps.atlas().scene_at(pose.world_from_camera.translation_m)
             scene = scene if other is None else other
         return _Hypothesis(scene, camera, pose, len(features), pixels, points.double().numpy())
 
-    def _recall(self, scene: int) -> Recall | None:
+    def _matcher(self, scene: int) -> KeyframeMatcher | None:
         """The remembered frames of a scene, encoded when they are first needed."""
         with self._lock:
-            if scene not in self._recalls:
-                recall = Recall(self.known, scene) if self._has_depths(scene) else None
-                self._recalls[scene] = recall
-            return self._recalls[scene]
+            if scene not in self._matchers:
+                matcher = KeyframeMatcher(self.maps, scene) if self._has_depths(scene) else None
+                self._matchers[scene] = matcher
+            return self._matchers[scene]
 
     def _has_depths(self, scene: int) -> bool:
-        memory = self.known.memories[scene]
-        return memory is not None and bool(memory.inverse_depth)
+        keyframes = self.maps.keyframes[scene]
+        return keyframes is not None and bool(keyframes.inverse_depth)
 
     def _answer(self, best: _Hypothesis, began: float) -> PoseEstimate:
         def answer(status, reason, **found) -> PoseEstimate:
@@ -314,10 +314,10 @@ class Localizer:
 
         if best.pose is None:
             return answer("failed", "no pose agrees with at least 6 cells of the image")
-        found = self.known.atlas().scene_at(best.pose.world_from_camera.translation_m)
+        found = self.maps.atlas().scene_at(best.pose.world_from_camera.translation_m)
         if found is None or (found != best.scene and not self._one_answer()):
             return answer("failed", "the pose lies outside the cell of its scene")
-        record = self.known.scenes[found]
+        record = self.maps.scenes[found]
         ratio = best.inliers / best.cells
         if ratio < record.inlier_threshold:
             need = f"{100 * record.inlier_threshold:.0f} %"

@@ -8,14 +8,13 @@ The robot base frame: origin on the floor in the middle of the room, z up, metre
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
 from evercal.datasets.frame import Frame, Scene
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
-from evercal.simulation.textures import dead_leaves, one_over_f
+from evercal.simulation.furnished.textures import dead_leaves, one_over_f
 
 NEAR_M = 0.05
 
@@ -265,14 +264,6 @@ def box_room_scene(seed: int, train: int, test: int, camera: Camera | None = Non
 
     name = f"box-room-{seed}"
     return Scene(name, record("train", train, 1), record("test", test, 2))
-
-
-def write_box_room(root: Path, seed: int, train: int, test: int) -> Scene:
-    """Makes `box_room_scene` and writes it as a generic folder at `root`; returns it as loaded."""
-    from evercal.datasets import generic
-
-    generic.write(root, box_room_scene(seed, train, test))
-    return generic.load(root)
 
 
 def _draw(

@@ -28,9 +28,9 @@ from evercal.simulation.cell_paths import (
     sees_work_area,
     sweep_shots,
 )
-from evercal.simulation.renderer import Renderer, RenderOptions, choose_variant, mitsuba
-from evercal.simulation.robot import Panda
-from evercal.simulation.rooms import RESERVED, Room, room
+from evercal.simulation.furnished.panda import Panda
+from evercal.simulation.furnished.renderer import Renderer, RenderOptions, choose_variant, mitsuba
+from evercal.simulation.furnished.rooms import RESERVED, Room, room
 from evercal.storage import hold_settings, write_bytes, write_json
 
 CALIBRATION_FRAMES = 25

@@ -13,8 +13,8 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.simulation.box_room import look_at
-from evercal.simulation.robot import HOME_RAD
-from evercal.simulation.rooms import Room
+from evercal.simulation.furnished.panda import HOME_RAD
+from evercal.simulation.furnished.rooms import Room
 
 WORK_AREA_M = np.array([0.45, 0.0, 0.15])
 """What cameras look towards, base frame."""

@@ -12,10 +12,10 @@ from evercal.datasets import Frame, Scene, load_scene
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.simulation.cell import SUITES
-from evercal.simulation.materials import plain
-from evercal.simulation.renderer import Renderer, RenderOptions
-from evercal.simulation.robot import HOME_RAD, Panda
-from evercal.simulation.rooms import room
+from evercal.simulation.furnished.materials import plain
+from evercal.simulation.furnished.panda import HOME_RAD, Panda
+from evercal.simulation.furnished.renderer import Renderer, RenderOptions
+from evercal.simulation.furnished.rooms import room
 
 FOLDER = Path(__file__).parent / "sim_mini"
 
@@ -44,7 +44,9 @@ def mini_rooms() -> tuple[CellRoom, ...]:
     )
 
 
-def clay_views(model: tuple[str, int], frames: list[Frame], poses: list[SE3]) -> list[np.ndarray]:
+def untextured_renders(
+    model: tuple[str, int], frames: list[Frame], poses: list[SE3]
+) -> list[np.ndarray]:
     """What the room's bare shapes look like to the cameras of `frames` at `poses`.
 
     Args:

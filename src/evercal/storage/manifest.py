@@ -65,6 +65,15 @@ def read_manifest(root: str | os.PathLike[str]) -> dict[str, object]:
     return _read(Path(root))["payload"]
 
 
+def listed_files(root: str | os.PathLike[str]) -> tuple[str, ...]:
+    """Relative paths of the files that the manifest lists; they are not checked, see `verify`.
+
+    Raises:
+        InputError: As `read_manifest`.
+    """
+    return tuple(_read(Path(root))["files"])
+
+
 def verify(root: str | os.PathLike[str]) -> list[str]:
     """Compares every listed file with its size and checksum.
 

@@ -8,7 +8,7 @@ from evercal.errors import InputError
 from evercal.storage.atomic import write_json
 
 
-def hold_settings(path: Path, settings: Mapping[str, object]) -> None:
+def lock_settings(path: Path, settings: Mapping[str, object]) -> None:
     """Notes the settings of a run that may be taken up again, or refuses to mix it with another.
 
     Args:
@@ -33,7 +33,7 @@ def hold_settings(path: Path, settings: Mapping[str, object]) -> None:
 
 
 def read_settings(path: Path) -> dict[str, object]:
-    """What `hold_settings` noted.
+    """What `lock_settings` noted.
 
     Raises:
         InputError: there is none that can be read.

@@ -1,0 +1,1 @@
+"""Methods compared over sequences of scenes: suites, runs, results on disk, tables."""

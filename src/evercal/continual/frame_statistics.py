@@ -1,0 +1,126 @@
+"""What selectors may ask about the frames of a scene that was just learned."""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from evercal.datasets.frame import Frame, known_poses
+from evercal.networks.buffer import FeatureBuffer, Rows
+from evercal.networks.head import Head
+from evercal.networks.loss import fixed_clamp_loss, reprojection_error
+
+RELIABLE_PX = 10.0
+PARTS = 625
+"""Of a scene, for coverage: as many as the 25 x 25 clusters of HSCNet that Buff-CS counts."""
+PART_POINTS = 20_000
+GRADIENT_ROWS = 256
+
+
+class FrameStatistics:
+    """Frames of one scene in recorded order; everything but poses is computed when asked for.
+
+    Args:
+        frames: n posed training frames.
+        head: as it is after learning them.
+        rows: gives a buffer whose first n views are these frames as they are.
+        seed: of whatever a selector draws.
+    """
+
+    def __init__(
+        self, frames: Sequence[Frame], head: Head, rows: Callable[[], FeatureBuffer], seed: int
+    ):
+        poses = known_poses(frames)
+        self.positions_m = poses.translation_m
+        """(n, 3) camera positions in the base frame."""
+        self.quaternions_wxyz = poses.rotation_wxyz
+        """(n, 4) camera orientations."""
+        self._head, self._rows, self._seed = head, rows, seed
+
+    def __len__(self) -> int:
+        return len(self.positions_m)
+
+    def rng(self) -> np.random.Generator:
+        """A generator for a selector that draws; the same with every call."""
+        return np.random.default_rng([self._seed, 31])
+
+    @cached_property
+    def _buffer(self) -> FeatureBuffer:
+        return self._rows()
+
+    @cached_property
+    def _first_rows(self) -> Tensor:
+        """(n + 1,) where the rows of each frame begin, and where the last end."""
+        count = torch.bincount(self._buffer.tensors["view"].long(), minlength=len(self))
+        return torch.cat([torch.zeros(1, dtype=torch.long), count[: len(self)].cumsum(0)])
+
+    def _of(self, frame: int) -> Rows:
+        start, end = self._first_rows[frame : frame + 2].tolist()
+        return self._buffer.rows(torch.arange(start, end))
+
+    def local_features(self, frame: int) -> Tensor:
+        """(cells, channels) feature rows of a frame as it is."""
+        return self._of(frame).features.float()
+
+    @torch.no_grad()
+    def depths_m(self, frame: int) -> np.ndarray:
+        """(cells,) depths of a frame's cells along its optical axis, as the head believes them."""
+        rows = self._of(frame)
+        points = self._head.decode(self._hidden(rows).float(), self._buffer.scene).points
+        _, in_camera = reprojection_error(points, rows.target)
+        return in_camera[:, 2].double().numpy()
+
+    def _hidden(self, rows: Rows) -> Tensor:
+        return self._head.hidden(rows.features.float(), self._buffer.scene, rows.descriptor)
+
+    @torch.no_grad()
+    def features(self) -> np.ndarray:
+        """(n, width) activations of the last hidden layer, mean over each image."""
+        pooled = [self._hidden(self._of(i)).mean(0) for i in range(len(self))]
+        return torch.stack(pooled).double().numpy()
+
+    @torch.no_grad()
+    def visible_parts(self) -> list[np.ndarray]:
+        """For each frame the numbers of the parts of the scene that it shows.
+
+        Parts are at most 625 k-means cells of the points that the head predicts and that reproject
+        within 10 px; they stand in for the labels of Buff-CS, which few scenes have.
+        """
+        from scipy.cluster.vq import kmeans, vq
+
+        found = []
+        for i in range(len(self)):
+            rows = self._of(i)
+            points = self._head.decode(self._hidden(rows).float(), self._buffer.scene).points
+            _, error = fixed_clamp_loss(points, rows.target)
+            found.append(points[error < RELIABLE_PX].double().numpy())
+        every = np.concatenate(found)
+        if not len(every):
+            return [np.zeros(0, dtype=np.int64) for _ in found]
+        rng = self.rng()
+        some = every[rng.permutation(len(every))[:PART_POINTS]]
+        start = some[rng.permutation(len(some))[:PARTS]]
+        centres, _ = kmeans(some, start, thresh=1e-3)
+        return [np.unique(vq(points, centres)[0]) for points in found]
+
+    def gradients(self) -> np.ndarray:
+        """(n, p) gradients of each frame's loss by the scene's own logits and offsets."""
+        head, generator = self._head, torch.Generator().manual_seed(self._seed)
+        parameters = (head.logit, head.offset)
+        own = torch.nonzero(head.centre_scene == self._buffer.scene)[:, 0]
+        found = []
+        for i in range(len(self)):
+            start, end = self._first_rows[i : i + 2].tolist()
+            drawn = torch.randint(start, end, (GRADIENT_ROWS,), generator=generator)
+            rows = self._buffer.rows(drawn)
+            with torch.no_grad():
+                hidden = self._hidden(rows).float()
+            points = head.decode(hidden, self._buffer.scene).points
+            loss, _ = fixed_clamp_loss(points, rows.target)
+            by_logit, by_offset = torch.autograd.grad(loss.mean(), parameters)
+            shared = len(by_offset) != len(by_logit)
+            parts = (by_logit[own], by_offset if shared else by_offset[own])
+            found.append(torch.cat([part.flatten() for part in parts]))
+        return torch.stack(found).double().numpy()

@@ -1,0 +1,257 @@
+"""`learn_scene`: what the command line, the API and the benchmarks call to learn a scene."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import torch
+from filelock import FileLock, Timeout
+
+from evercal.continual.learn import Encoding, Stage, StageOptions, learn
+from evercal.continual.strategies import STRATEGIES, Strategy
+from evercal.datasets.frame import MIN_TRAIN_FRAMES, Frame, Scene, posed_scene
+from evercal.errors import InputError
+from evercal.features.feature_cache import cache_features
+from evercal.features.weights_file import network_bytes
+from evercal.localization.acceptance import fit_threshold
+from evercal.mapping.store import Checkpoint, Resume, Store, head_bytes, with_fit
+from evercal.networks.trainer import Progress
+from evercal.storage.manifest import MANIFEST
+
+HELD_OUT_EVERY = 100
+HELD_OUT_BLOCK = 4
+
+
+@dataclass(frozen=True)
+class LearnOptions:
+    """How a scene is learned into a store."""
+
+    stage: StageOptions = field(default_factory=StageOptions)
+    """Network and training."""
+    strategy: str = "evercal"
+    """Key of STRATEGIES; a store keeps the strategy it was made with."""
+    encoder: Path | torch.nn.Module | None = None
+    """Another encoder than the shipped one: a file for a new store, or a module of one's own."""
+    short_side: int = 240
+    """Working size of images in a new store, pixels."""
+    cache: Path | None = None
+    """Folder for features of views, for many runs over the same frames (`cache_features`)."""
+
+
+@dataclass(frozen=True)
+class LearnReport:
+    """What came out."""
+
+    scene: str
+    """Its name in the store."""
+    seconds: float
+    """Wall time of this call; a resumed run counts from the resumption."""
+    iterations: int
+    """Optimiser steps of the stage."""
+    memory_bytes: int
+    """What replay keeps of all scenes."""
+    head_bytes: int
+    """All heads, as stored."""
+    frames_kept: int
+    """Frames of this scene in memory."""
+    train_frames: int
+    """Frames learned."""
+    held_out_frames: int
+    """Frames kept aside to fit the threshold of the unknown."""
+    inlier_threshold: float
+    """Smallest inlier ratio that is believed."""
+    resumed: bool
+    """Whether an interrupted run was continued."""
+
+
+OnEvent = Callable[[Encoding | Progress | Checkpoint], None]
+
+
+def learn_scene(
+    store: Path, scene: Scene, options: LearnOptions, on_event: OnEvent | None = None
+) -> LearnReport:
+    """Learns a scene into a store, or goes on where an interrupted call of the same kind stopped.
+
+    Args:
+        store: folder of the store; made when missing.
+        scene: its training frames are learned; a few of them are held out to fit the threshold of
+            the unknown place. Its test frames are not looked at.
+        options: how.
+        on_event: called with everything that happens, for progress bars.
+
+    Raises:
+        InputError: too few frames, a name that the store knows already, another strategy than the
+            store's, a store that is none or that another process is learning into.
+    """
+    with _store_lock(store):
+        return _learn_scene(store, scene, options, on_event)
+
+
+@contextmanager
+def _store_lock(store: Path) -> Iterator[None]:
+    """Holds the lock that keeps a second learner out of a store; it lies beside the store."""
+    path = store.with_name(f".{store.name}.lock")
+    lock = FileLock(path)
+    try:
+        store.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise InputError(
+            f"store {store}: another process is learning into it; wait until it has finished"
+        ) from None
+    except OSError as error:
+        raise InputError(f"store {store}: cannot be written ({error.strerror})") from error
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        lock.release()
+
+
+def _learn_scene(
+    store: Path, scene: Scene, options: LearnOptions, on_event: OnEvent | None
+) -> LearnReport:
+    began = time.perf_counter()
+    scene = posed_scene(scene)
+    opened = open_or_create(store, options)
+    _check(opened, scene, options)
+    if options.cache is not None and isinstance(opened.maps.encoder, torch.nn.Module):
+        cache_features(opened.maps.encoder, options.cache)
+    train, held_out = validation_split(scene.train)
+    train_split = replace(scene, train=train)
+    resume = opened.begin(_identity(opened, scene, options))
+    try:
+        stage = run_stage(opened, train_split, options.stage, resume, on_event)
+    except InputError:
+        opened.abandon()  # bad input: no interrupted stage worth going on with
+        raise
+    maps = stage.maps
+    maps.scenes[-1] = with_fit(maps.scenes[-1], *fit_threshold(maps, held_out))
+    report = LearnReport(
+        scene.name,
+        time.perf_counter() - began,
+        stage.iterations,
+        maps.memory_bytes,
+        sum(head_bytes(head) for head in maps.heads),
+        stage.frames_kept,
+        len(train),
+        len(held_out),
+        maps.scenes[-1].inlier_threshold,
+        resume is not None,
+    )
+    opened.commit(maps, asdict(report))
+    return report
+
+
+def open_or_create(store: Path, options: LearnOptions) -> Store:
+    """The store at a path, or a new one when there is none yet.
+
+    Raises:
+        InputError: as `Store.open` and `Store.create`, or a strategy that is none.
+    """
+    if (store / MANIFEST).exists():
+        own = options.encoder if isinstance(options.encoder, torch.nn.Module) else None
+        opened = Store.open(store, own)
+        strategy_of(opened)
+        return opened
+    if options.strategy not in STRATEGIES:
+        names = ", ".join(STRATEGIES)
+        raise InputError(f"strategy {options.strategy!r}: unknown; choose one of {names}")
+    return Store.create(store, options.strategy, options.short_side, options.encoder)
+
+
+def strategy_of(store: Store) -> Strategy:
+    """How scenes are learned into a store.
+
+    Raises:
+        InputError: it was made with a strategy that is not known here.
+    """
+    name = store.maps.strategy
+    if name not in STRATEGIES:
+        raise InputError(
+            f"store {store.root}: made with strategy {name!r}, this evercal has "
+            f"{', '.join(STRATEGIES)}; update evercal"
+        )
+    return STRATEGIES[name]
+
+
+def _check(opened: Store, scene: Scene, options: LearnOptions) -> None:
+    names = [record.name for record in opened.maps.scenes]
+    if scene.name in names:
+        raise InputError(
+            f"scene {scene.name!r}: the store has a scene of this name; give another with --name"
+        )
+    if not scene.name or set(scene.name) & set("/\\") or scene.name.startswith("."):
+        raise InputError(
+            f"scene name {scene.name!r}: names become folders; give one without slashes (--name)"
+        )
+    if opened.maps.strategy != options.strategy:
+        raise InputError(
+            f"strategy {options.strategy!r}: the store was made with {opened.maps.strategy!r}; "
+            "go on with that one or start a new store"
+        )
+    if strategy_of(opened).data == "all" and names:
+        raise InputError(
+            f"strategy {opened.maps.strategy!r}: learns all scenes at once, so a scene cannot be "
+            "added to a store; start a new store with another strategy"
+        )
+    if len(scene.train) < MIN_TRAIN_FRAMES:
+        raise InputError(
+            f"scene {scene.name!r}: {len(scene.train)} training frames are too few; "
+            f"give at least {MIN_TRAIN_FRAMES}"
+        )
+
+
+def _identity(opened: Store, scene: Scene, options: LearnOptions) -> dict[str, object]:
+    """Whatever changes the outcome of a stage: only the same identity may be resumed."""
+    poses = hashlib.sha256()
+    for frame in scene.train:
+        assert frame.base_from_camera is not None, "frames without a pose are left out before"
+        poses.update(frame.name.encode())
+        poses.update(frame.base_from_camera.matrix().tobytes())
+    networks = hashlib.sha256()
+    for kind in ("encoder", "descriptor"):
+        module = getattr(opened.maps, kind)
+        assert isinstance(module, torch.nn.Module)
+        networks.update(network_bytes(module, kind))
+    stages = list(opened.stages)
+    return {
+        "scene": scene.name,
+        "networks": networks.hexdigest(),
+        "frames": poses.hexdigest(),
+        "camera": scene.train[0].camera.to_dict(),
+        "stage": json.loads(json.dumps(asdict(options.stage))),
+        "strategy": options.strategy,
+        "stages": stages,
+    }
+
+
+def run_stage(
+    opened: Store,
+    train_split: Scene,
+    options: StageOptions,
+    resume: Resume | None,
+    on_event: OnEvent | None,
+) -> Stage:
+    """Drives `learn` to its end, writing checkpoints to the store."""
+    for event in learn(opened.maps, train_split, options, resume):
+        if isinstance(event, Stage):
+            return event
+        if isinstance(event, Checkpoint):
+            opened.checkpoint(event)
+        if on_event is not None:
+            on_event(event)
+    raise AssertionError("learn() ends with a Stage")
+
+
+def validation_split(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
+    """Splits recorded frames: those to learn, and blocks of 4 in every 100 (at least one)."""
+    every = min(HELD_OUT_EVERY, len(frames))
+    middle = every // 2
+    aside = [middle <= i % every < middle + HELD_OUT_BLOCK for i in range(len(frames))]
+    learned = tuple(f for f, out in zip(frames, aside, strict=True) if not out)
+    return learned, tuple(f for f, out in zip(frames, aside, strict=True) if out)

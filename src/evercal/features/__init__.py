@@ -1,0 +1,1 @@
+"""Dense features of an image: what the encoder sees of it, encoder, descriptor, their weights."""

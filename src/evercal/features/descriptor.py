@@ -1,0 +1,108 @@
+"""The global descriptor: one vector per image that says which place it shows."""
+
+import json
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from evercal.errors import InputError
+from evercal.features.encoder import WEIGHTS
+from evercal.features.weights_file import load_strictly
+
+DESCRIPTOR_FILE = WEIGHTS / "descriptor.safetensors"
+
+
+class GlobalDescriptor(nn.Module):
+    """Attention-weighted pooling of local features, one vector per image.
+
+    Each cell's feature is lifted by a small MLP, several attention maps pool it (as NetVLAD's soft
+    assignment does, Arandjelovic et al., CVPR 2016), and the result is projected.
+
+    Args:
+        inputs: channels of the local features.
+        maps: attention maps.
+        hidden: channels that each map pools.
+        width: length of the descriptor.
+    """
+
+    def __init__(self, inputs: int, maps: int = 8, hidden: int = 64, width: int = 128):
+        super().__init__()
+        self.width = width
+        self.settings = {"inputs": inputs, "maps": maps, "hidden": hidden, "width": width}
+        self.lift = nn.Conv2d(inputs, hidden, 1)
+        self.value = nn.Conv2d(hidden, hidden, 1)
+        self.attention = nn.Conv2d(hidden, maps, 1)
+        self.project = nn.Linear(maps * hidden, width)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(b, inputs, h, w) local features of any grid size -> (b, width) unit vectors."""
+        lifted = F.relu(self.lift(features))
+        weights = self.attention(lifted).flatten(2).softmax(-1)
+        pooled = torch.einsum("bmn,bcn->bmc", weights, self.value(lifted).flatten(2))
+        pooled = F.normalize(pooled, dim=-1).flatten(1)
+        return F.normalize(self.project(pooled), dim=-1)
+
+
+class PooledDescriptor(nn.Module):
+    """A descriptor without trained weights, for encoders that bring none of their own.
+
+    Mean and deviation of the features over the image, through a fixed random projection.
+
+    Args:
+        inputs: channels of the local features.
+        width: length of the descriptor.
+    """
+
+    projection: Tensor
+
+    def __init__(self, inputs: int, width: int = 128):
+        super().__init__()
+        self.width = width
+        self.settings = {"inputs": inputs, "width": width}
+        generator = torch.Generator().manual_seed(0)
+        projection = torch.randn(2 * inputs, width, generator=generator) / inputs**0.5
+        self.register_buffer("projection", projection)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(b, inputs, h, w) local features of any grid size -> (b, width) unit vectors."""
+        cells = features.flatten(2)
+        pooled = torch.cat([cells.mean(-1), cells.std(-1)], -1)
+        return F.normalize(F.normalize(pooled, dim=-1) @ self.projection, dim=-1)
+
+
+Descriptor = GlobalDescriptor | PooledDescriptor
+
+
+def load_descriptor(path: Path | None = None) -> Descriptor:
+    """Reads a descriptor, ready for inference; the shipped one when `path` is None.
+
+    Raises:
+        InputError: no such file, or not a descriptor file.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = DESCRIPTOR_FILE if path is None else path
+    if not path.is_file():
+        raise InputError(f"descriptor {path}: no such file")
+    try:
+        with safe_open(path, "pt") as file:
+            settings = json.loads((file.metadata() or {})["descriptor"])
+            state = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
+        pooled = settings.pop("layout", None) == PooledDescriptor.__name__
+        descriptor = PooledDescriptor(**settings) if pooled else GlobalDescriptor(**settings)
+    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+        raise InputError(f"descriptor {path}: not an evercal descriptor ({error!r})") from error
+    load_strictly(descriptor, state, f"descriptor {path}: not an evercal descriptor")
+    return descriptor.eval()
+
+
+def descriptor_for(encoder_file: Path, inputs: int) -> Descriptor:
+    """The descriptor to go with a user's encoder: its sibling file, or one without training."""
+    sibling = encoder_file.with_name(DESCRIPTOR_FILE.name)
+    if sibling.is_file() and sibling != encoder_file:
+        found = load_descriptor(sibling)
+        if found.settings["inputs"] == inputs:
+            return found
+    return PooledDescriptor(inputs)

@@ -1,0 +1,269 @@
+"""The frozen local encoder: an image in, one feature vector per 8x8 pixel cell out.
+
+Ours is trained on procedural images alone (`evercal.features.pretraining`). ACE's published layout is read
+too, for users who have that file and may use it, and any module with `stride` and `width` will do.
+"""
+
+from pathlib import Path
+from typing import Protocol, cast, runtime_checkable
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from evercal.errors import InputError
+from evercal.features.weights_file import load_strictly
+
+WEIGHTS = Path(__file__).parent / "weights"
+ENCODER_FILE = WEIGHTS / "encoder.safetensors"
+
+
+@runtime_checkable
+class Encoder(Protocol):
+    """What the rest of the project asks of a local encoder."""
+
+    stride: int
+    """Pixels per cell. Cell (i, j) stands for pixel (stride (j + 0.5) - 0.5, same for i)."""
+    width: int
+    """Channels of a feature vector."""
+
+    def __call__(self, grey: Tensor) -> Tensor:
+        """(b, 1, h, w) in [0, 1] -> (b, width, h // stride, w // stride)."""
+        ...
+
+
+class _ConvBlock(nn.Sequential):
+    """Convolution and batch norm; `fused` holds the inference form with the norm folded in."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, fused: bool):
+        padding = kernel // 2 if stride == 1 else 0
+        conv = nn.Conv2d(inputs, outputs, kernel, stride, padding, bias=fused)
+        super().__init__(conv) if fused else super().__init__(conv, nn.BatchNorm2d(outputs))
+
+
+class _Residual(nn.Module):
+    def __init__(self, width: int, fused: bool):
+        super().__init__()
+        self.layers = nn.ModuleList(_ConvBlock(width, width, k, 1, fused) for k in (3, 1, 3))
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = x
+        for i, layer in enumerate(self.layers):
+            y = layer(y) if i == 2 else F.relu(layer(y))
+        return F.relu(x + y)
+
+
+class LocalEncoder(nn.Module):
+    """Stride-8 convolutional encoder whose receptive fields sit exactly on the cell centres.
+
+    Space-to-depth and 2x2 convolutions shrink the image, so cell (i, j) is centred on pixel
+    (8 j + 3.5, 8 i + 3.5), pixel (0, 0) being the centre of the first pixel. (Strided 3x3
+    convolutions would be centred on (8 j, 8 i), half a cell off, which scale changes make visible.)
+
+    Args:
+        stem: channels at 1/2 and 1/4 resolution.
+        inner: channels at 1/8 resolution.
+        blocks: residual blocks (3x3, 1x1, 3x3) at 1/8 resolution.
+        width: output channels.
+        fused: batch norm folded into the convolutions (inference); training builds False.
+    """
+
+    stride = 8
+
+    def __init__(
+        self,
+        stem: tuple[int, int] = (32, 64),
+        inner: int = 160,
+        blocks: int = 3,
+        width: int = 128,
+        fused: bool = True,
+    ):
+        super().__init__()
+        self.width = width
+        self.settings = {"stem": list(stem), "inner": inner, "blocks": blocks, "width": width}
+        self.stem = nn.ModuleList(
+            [
+                _ConvBlock(4, stem[0], 3, 1, fused),
+                _ConvBlock(stem[0], stem[0], 3, 1, fused),
+                _ConvBlock(stem[0], stem[1], 2, 2, fused),
+                _ConvBlock(stem[1], stem[1], 3, 1, fused),
+                _ConvBlock(stem[1], inner, 2, 2, fused),
+            ]
+        )
+        self.blocks = nn.ModuleList(_Residual(inner, fused) for _ in range(blocks))
+        self.project = nn.Conv2d(inner, width, 1)
+
+    def forward(self, grey: Tensor) -> Tensor:
+        """Encodes a batch.
+
+        Args:
+            grey: (b, 1, h, w) in [0, 1]; the part beyond a multiple of 8 is cut off.
+
+        Returns:
+            (b, width, h // 8, w // 8), each cell's vector with unit length.
+        """
+        height, width = (side // 8 * 8 for side in grey.shape[-2:])
+        x = standardise(grey[..., :height, :width])
+        x = F.pixel_unshuffle(x, 2).contiguous(memory_format=torch.channels_last)
+        for layer in self.stem:
+            x = F.relu(layer(x))
+        for block in self.blocks:
+            x = block(x)
+        return F.normalize(self.project(x).float(), dim=1)
+
+    def fuse(self) -> "LocalEncoder":
+        """The same function with batch norm folded in, for inference and shipping."""
+        settings, training = self.settings, self.training
+        twin = LocalEncoder(
+            stem=(settings["stem"][0], settings["stem"][1]),
+            inner=settings["inner"],
+            blocks=settings["blocks"],
+            width=settings["width"],
+        )
+        source = [m for m in self.modules() if isinstance(m, _ConvBlock)]
+        target = [m for m in twin.modules() if isinstance(m, _ConvBlock)]
+        for a, b in zip(source, target, strict=True):
+            conv = cast(nn.Conv2d, a[0])
+            if len(a) == 2:
+                conv = fuse_conv_bn_eval(conv.eval(), cast(nn.BatchNorm2d, a[1]).eval())
+            b[0].load_state_dict(conv.state_dict())
+        twin.project.load_state_dict(self.project.state_dict())
+        self.train(training)
+        return twin.eval()
+
+
+def standardise(grey: Tensor) -> Tensor:
+    """Each image to mean 0 and standard deviation 1: exposure and contrast drop out."""
+    mean = grey.mean(dim=(-3, -2, -1), keepdim=True)
+    deviation = grey.std(dim=(-3, -2, -1), keepdim=True)
+    return (grey - mean) / (deviation + 1e-3)
+
+
+class AceEncoder(nn.Module):
+    """The layer layout of ACE's published encoder (Brachmann et al., CVPR 2023), without weights.
+
+    Stride 8, grey input normalised as (x - 0.4) / 0.25, `width` output channels. Its weight file
+    has a non-commercial licence of its own and is not shipped here: bring yours.
+    """
+
+    stride = 8
+
+    def __init__(self, width: int = 512):
+        super().__init__()
+        self.width = width
+        self.settings = {"width": width}
+
+        def conv(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Conv2d:
+            return nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2)
+
+        self.conv1 = conv(1, 32, 3)
+        self.conv2 = conv(32, 64, 3, 2)
+        self.conv3 = conv(64, 128, 3, 2)
+        self.conv4 = conv(128, 256, 3, 2)
+        self.res1_conv1, self.res1_conv2 = conv(256, 256, 3), conv(256, 256, 1)
+        self.res1_conv3 = conv(256, 256, 3)
+        self.res2_conv1, self.res2_conv2 = conv(256, 512, 3), conv(512, 512, 1)
+        self.res2_conv3 = conv(512, width, 3)
+        self.res2_skip = conv(256, width, 1)
+
+    def forward(self, grey: Tensor) -> Tensor:
+        """(b, 1, h, w) in [0, 1] -> (b, width, h // 8, w // 8); the rest beyond 8 is cut off."""
+        height, width = (side // 8 * 8 for side in grey.shape[-2:])
+        x = (grey[..., :height, :width] - 0.4) / 0.25
+        for layer in (self.conv1, self.conv2, self.conv3, self.conv4):
+            x = F.relu(layer(x))
+        y = x
+        for layer in (self.res1_conv1, self.res1_conv2, self.res1_conv3):
+            y = F.relu(layer(y))
+        x = x + y
+        y = F.relu(self.res2_conv2(F.relu(self.res2_conv1(x))))
+        return (self.res2_skip(x) + F.relu(self.res2_conv3(y))).float()
+
+
+def checked_encoder(module: nn.Module) -> Encoder:
+    """A user's module as an encoder, frozen.
+
+    Raises:
+        InputError: it lacks `stride` or `width`, or gives something else than (b, width, h, w).
+    """
+    if not isinstance(module, Encoder):
+        raise InputError(
+            f"encoder {type(module).__name__}: needs integer attributes 'stride' and 'width'"
+        )
+    module.eval().requires_grad_(False)
+    side = 8 * module.stride
+    with torch.inference_mode():
+        shape = tuple(module(torch.zeros(1, 1, side, side)).shape)
+    if shape != (1, module.width, 8, 8):
+        raise InputError(
+            f"encoder {type(module).__name__}: made {shape} of a (1, 1, {side}, {side}) image, "
+            f"its stride {module.stride} and width {module.width} promise (1, {module.width}, 8, 8)"
+        )
+    return module
+
+
+def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:
+    """Reads an encoder, ready for inference.
+
+    Args:
+        path: a file written by `evercal pretrain` (safetensors), or ACE's published weight file
+            (a torch state dict, read with `weights_only`); the shipped encoder when None.
+
+    Raises:
+        InputError: no such file, or a file in neither layout; keys and shapes must match exactly.
+    """
+    path = ENCODER_FILE if path is None else path
+    if not path.is_file():
+        raise InputError(f"encoder {path}: no such file")
+    if path.suffix == ".safetensors":
+        return _load_own(path)
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        reason = (str(error).splitlines() or [repr(error)])[0]  # torch's own go on for ten lines
+        raise InputError(f"encoder {path}: not a readable torch weight file ({reason})") from error
+    return ace_encoder_from_state(state, str(path))
+
+
+def ace_encoder_from_state(state: object, name: str) -> AceEncoder:
+    """Builds an `AceEncoder` from a state dict in ACE's layout, strictly.
+
+    Raises:
+        InputError: a key or a shape that is not in the layout; the first one is named.
+    """
+    if not isinstance(state, dict) or "res2_skip.weight" not in state:
+        raise InputError(
+            f"encoder {name}: not ACE's layout (no tensor 'res2_skip.weight'); "
+            "give ACE's published encoder file or one written by 'evercal pretrain'"
+        )
+    shape = getattr(state["res2_skip.weight"], "shape", ())
+    encoder = AceEncoder(int(shape[0]) if len(shape) == 4 else 512)
+    load_strictly(encoder, state, f"encoder {name}: does not match ACE's layout")
+    return encoder.eval()
+
+
+def _load_own(path: Path) -> LocalEncoder | AceEncoder:
+    import json
+
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "pt") as file:
+            settings = json.loads((file.metadata() or {})["encoder"])
+            state = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
+        if settings.get("layout") == AceEncoder.__name__:
+            return ace_encoder_from_state(state, str(path))
+        if settings.get("layout", LocalEncoder.__name__) != LocalEncoder.__name__:
+            made = settings["layout"]
+            raise InputError(f"encoder {path}: made by the module {made!r}; give it to open this")
+        stem = (settings["stem"][0], settings["stem"][1])
+        encoder = LocalEncoder(stem, settings["inner"], settings["blocks"], settings["width"])
+    except (SafetensorError, KeyError, ValueError) as error:
+        raise InputError(f"encoder {path}: not an evercal encoder file ({error!r})") from error
+    load_strictly(encoder, state, f"encoder {path}: not an evercal encoder file")
+    return cast(LocalEncoder, _channels_last(encoder.eval()))
+
+
+def _channels_last(module: nn.Module) -> nn.Module:
+    return module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]

@@ -1,0 +1,197 @@
+"""Image pairs with known correspondence: dead leaves under homographies, rooms under parallax."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3
+from evercal.simulation.box_room import BoxRoom, look_at
+from evercal.simulation.furnished.textures import dead_leaves
+
+HEIGHT, WIDTH = 192, 256
+PER_ANCHOR = 4
+FIRST_ROOM_SEED = 1_000
+"""Rooms for pretraining, of boxes or furnished, start here: tests, demos and benchmarks use seeds
+below."""
+VALIDATION_ROOM_SEED = FIRST_ROOM_SEED + 7_000
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two grey images and where the same surface points lie in both."""
+
+    images: np.ndarray
+    """(2, HEIGHT, WIDTH) uint8."""
+    pixels: np.ndarray
+    """(2, n, 2) float32: row k is one surface point in both images, (u, v) in pixels."""
+
+
+def pinhole(focal: float) -> Camera:
+    """The camera of an image here, its principal point in the middle; `focal` in pixels."""
+    return Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+
+
+def cell_pixels() -> np.ndarray:
+    """((HEIGHT / 8) (WIDTH / 8), 2) centres of the stride-8 cells, (u, v) in pixels."""
+    v, u = np.mgrid[0 : HEIGHT // 8, 0 : WIDTH // 8]
+    return np.stack([u, v], -1).reshape(-1, 2) * 8.0 + 3.5
+
+
+def inside(pixels: np.ndarray, margin: float = 3.5) -> np.ndarray:
+    """(n,) bool: at least `margin` pixels from the border."""
+    u, v = pixels[:, 0], pixels[:, 1]
+    return (u >= margin) & (u <= WIDTH - 1 - margin) & (v >= margin) & (v <= HEIGHT - 1 - margin)
+
+
+def random_homography(side: int, rng: np.random.Generator) -> np.ndarray:
+    """(3, 3) map from image pixels to pixels of a square picture with the given side."""
+    import cv2
+
+    scale = np.exp(rng.uniform(np.log(0.6), np.log(1.7)))
+    angle = rng.normal(0, 0.3)
+    c, s = np.cos(angle), np.sin(angle)
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [WIDTH / 2, HEIGHT / 2] * scale
+    corners = corners @ np.array([[c, s], [-s, c]])
+    corners *= 1 + rng.uniform(-0.2, 0.2, (4, 2))
+    corners += side / 2 + rng.uniform(-0.12, 0.12, 2) * side
+    border = np.array([[0, 0], [WIDTH - 1, 0], [WIDTH - 1, HEIGHT - 1], [0, HEIGHT - 1]])
+    return cv2.getPerspectiveTransform(border.astype(np.float32), corners.astype(np.float32))
+
+
+def homography_pair(picture: np.ndarray, rng: np.random.Generator) -> Pair:
+    """Two random perspective views of one grey (s, s) uint8 picture."""
+    import cv2
+
+    maps = [random_homography(picture.shape[0], rng) for _ in range(2)]
+    flags = cv2.INTER_AREA | cv2.WARP_INVERSE_MAP
+    images = [
+        cv2.warpPerspective(picture, m, (WIDTH, HEIGHT), flags=flags, borderMode=cv2.BORDER_REFLECT)
+        for m in maps
+    ]
+    first = cell_pixels() + rng.uniform(-3.5, 3.5, (HEIGHT * WIDTH // 64, 2))
+    second = cv2.perspectiveTransform(first[None], np.linalg.inv(maps[1]) @ maps[0])[0]
+    on_picture = cv2.perspectiveTransform(first[None], maps[0])[0]
+    keep = inside(first) & inside(second)
+    keep &= ((on_picture >= 0) & (on_picture < picture.shape[0])).all(-1)
+    return Pair(np.stack(images), np.stack([first[keep], second[keep]]).astype(np.float32))
+
+
+class Views(Protocol):
+    """Views of one room: every `PER_ANCHOR` in a row look at roughly the same part."""
+
+    images: np.ndarray
+    """(n, HEIGHT, WIDTH) uint8 grey."""
+    base_from_camera: SE3
+    """(n,) poses."""
+    cameras: tuple[Camera, ...]
+    """n pinholes; the focal length differs between anchors."""
+
+    def hit(self, view: int, pixels: np.ndarray) -> np.ndarray:
+        """(n, 3) surface points that (n, 2) pixels of a view show; not finite where none is."""
+        ...
+
+    def sees(self, view: int, points_m: np.ndarray) -> np.ndarray:
+        """(n,) bool: no surface hides the (n, 3) points, which project into the view."""
+        ...
+
+
+@dataclass(eq=False)
+class RoomViews:
+    """`Views` of a box room."""
+
+    images: np.ndarray
+    base_from_camera: SE3
+    cameras: tuple[Camera, ...]
+    geometry: BoxRoom
+    """The room; its textures are dropped to save memory, its rectangles stay."""
+
+    def hit(self, view: int, pixels: np.ndarray) -> np.ndarray:
+        """See `Views`."""
+        pose = self.base_from_camera[view]
+        rays = self.cameras[view].unproject(pixels) @ pose.rotation_matrix().T
+        return self.geometry.intersect(pose.translation_m, rays)[0]
+
+    def sees(self, view: int, points_m: np.ndarray) -> np.ndarray:
+        """See `Views`."""
+        eye = self.base_from_camera[view].translation_m
+        _, depth = self.geometry.intersect(eye, points_m - eye)
+        return np.abs(depth - 1.0) < 0.01  # 1: the first thing hit is the point itself
+
+
+def room_views(seed: int, anchors: int = 5, per_anchor: int = PER_ANCHOR) -> RoomViews:
+    """Draws a room from `anchors * per_anchor` cameras that differ by parallax, scale and roll."""
+    import cv2
+
+    rng = np.random.default_rng([seed, 77])
+    room = BoxRoom(seed, texture_px=256)
+    poses, cameras, images = [], [], []
+    for _ in range(anchors):
+        camera = pinhole(rng.uniform(0.65, 1.15) * WIDTH)
+        anchor = room.random_view(rng)
+        axis = anchor.rotation_matrix()[:, 2]
+        _, depth = room.intersect(anchor.translation_m, axis[None])
+        target = anchor.translation_m + axis * min(float(depth[0]), 6.0)
+        for k in range(per_anchor):
+            eye = anchor.translation_m + (k > 0) * rng.normal(0, [0.45, 0.45, 0.25])
+            limit = room.size_m[:2] / 2 - 0.3
+            eye[:2] = np.clip(eye[:2], -limit, limit)
+            eye[2] = np.clip(eye[2], 0.3, room.size_m[2] - 0.2)
+            aim = target + (k > 0) * rng.normal(0, 0.35, 3)
+            pose = look_at(eye, aim, rng.normal(0, 0.15))
+            poses.append(pose)
+            cameras.append(camera)
+            images.append(cv2.cvtColor(room.render(camera, pose), cv2.COLOR_RGB2GRAY))
+    room.surfaces = [
+        type(s)(s.corner_m, s.edge_u_m, s.edge_v_m, (s.pyramid[-1],)) for s in room.surfaces
+    ]
+    return RoomViews(np.stack(images), SE3.stack(poses), tuple(cameras), room)
+
+
+def view_pair(views: Views, first: int, second: int, rng: np.random.Generator) -> Pair:
+    """Corresponding pixels of two views of a room, with what is hidden in either left out."""
+    pixels = cell_pixels() + rng.uniform(-3.5, 3.5, (HEIGHT * WIDTH // 64, 2))
+    points = views.hit(first, pixels)
+    in_b = views.base_from_camera[second].inverse().apply(points)
+    front = np.isfinite(in_b[:, 2]) & (in_b[:, 2] > 0.05)
+    in_b[~front] = [0, 0, 1]
+    seen = views.cameras[second].project(in_b)
+    keep = np.flatnonzero(front & inside(pixels) & inside(seen))
+    keep = keep[views.sees(second, points[keep])]
+    images = views.images[[first, second]]
+    return Pair(images, np.stack([pixels[keep], seen[keep]]).astype(np.float32))
+
+
+def photometric(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Exposure, contrast, gamma, shading, blur and noise, as cameras disagree; uint8 in and out."""
+    import cv2
+
+    x = image.astype(np.float32) / 255.0
+    if rng.random() < 0.35:
+        sigma = rng.uniform(0.4, 1.4)
+        x = cv2.GaussianBlur(x, (0, 0), sigma)
+    if rng.random() < 0.25:  # motion blur
+        length = int(rng.integers(3, 8))
+        middle = length // 2  # of an odd kernel: an even one would move the picture
+        kernel = np.zeros((2 * middle + 1, 2 * middle + 1), np.float32)
+        angle = rng.uniform(0, np.pi)
+        half = (length - 1) / 2
+        for step in np.linspace(-half, half, 2 * length):
+            row, column = middle + step * np.sin(angle), middle + step * np.cos(angle)
+            kernel[round(row), round(column)] = 1
+        x = cv2.filter2D(x, -1, kernel / kernel.sum())
+    x = np.clip(x, 0, 1) ** np.exp(rng.normal(0, 0.25))
+    x = (x - 0.5) * np.exp(rng.normal(0, 0.2)) + 0.5 + rng.normal(0, 0.08)
+    slope = rng.normal(0, 0.08, 2)
+    v, u = np.mgrid[-0.5 : 0.5 : x.shape[0] * 1j, -0.5 : 0.5 : x.shape[1] * 1j]
+    x = x * (1 + slope[0] * v + slope[1] * u)
+    x = x + rng.normal(0, rng.uniform(0.002, 0.03), x.shape)
+    return (np.clip(x, 0, 1) * 255).astype(np.uint8)
+
+
+def leaf_picture(rng: np.random.Generator, side: int = 448) -> np.ndarray:
+    """One grey (side, side) uint8 dead-leaves picture."""
+    import cv2
+
+    return cv2.cvtColor(dead_leaves(side, side, rng), cv2.COLOR_RGB2GRAY)

@@ -1,0 +1,45 @@
+"""Which poses lie near others."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.geometry.se3 import SE3, pose_distance
+
+NEAR_M, NEAR_RAD = 0.05, math.radians(5.0)
+_PAIRS_AT_ONCE = 1 << 19
+
+
+def near_training(train_poses: SE3, test_poses: SE3) -> NDArray[np.bool_]:
+    """Which test frames have a training frame nearer than 5 cm and 5 deg.
+
+    The bounds are those of accuracy and as strict, so that the share of such frames is what the
+    best lookup of a training frame could reach without any geometry.
+
+    Args:
+        train_poses: (n,), may be empty.
+        test_poses: (m,) in the same base frame.
+
+    Returns:
+        (m,) bool.
+
+    Raises:
+        ValueError: Something other than two batches of poses.
+    """
+    if len(train_poses.shape) != 1 or len(test_poses.shape) != 1:
+        raise ValueError(
+            f"near_training takes poses (n,) and (m,), got {train_poses.shape}, {test_poses.shape}"
+        )
+    near = np.zeros(len(test_poses), dtype=np.bool_)
+    rows = max(1, _PAIRS_AT_ONCE // max(1, len(train_poses)))
+    for start in range(0, len(test_poses), rows):
+        block = test_poses.translation_m[start : start + rows]
+        offset = block[:, None] - train_poses.translation_m[None]
+        squared = np.einsum("mnk,mnk->mn", offset, offset)
+        # Few pairs are close in metres; only those are worth a rotation. The slack keeps rounding
+        # out of the decision, which pose_distance alone makes.
+        test, train = np.nonzero(squared < NEAR_M**2 * (1 + 1e-9))
+        metres, radians = pose_distance(test_poses[start + test], train_poses[train])
+        near[start + test[(metres < NEAR_M) & (radians < NEAR_RAD)]] = True
+    return near

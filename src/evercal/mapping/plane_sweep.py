@@ -1,0 +1,240 @@
+"""How far away the cells of a view are: a plane sweep over other posed views of its scene.
+
+A single reprojection does not see depth, and a head that fits it view by view has the depth of a
+cell right to no more than some percent. Other views that show the same surface decide it: along a
+cell's ray, features agree best where the surface is (Collins, A space-sweep approach, CVPR 1996).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from evercal.datasets.frame import Frame, known_poses
+from evercal.features.views import ideal_cell_pixels
+from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3
+
+NEAR_M, FAR_M = 0.25, 12.0
+PLANES = 96
+SEEN_BY = 4
+"""A depth is scored by the mean similarity over its 4 best views, for others may be occluded."""
+SMOOTHING = 0.7
+"""Share of a cell's neighbours in its likeness to a depth."""
+GUESS_WEIGHT, GUESS_SPREAD = 0.2, 0.15
+"""What nearness to the guess is worth, as likeness; spread in parts of the depth."""
+PARALLAX_RAD = np.deg2rad([4.0, 20.0, 35.0])
+"""Parallax of a good view: at least the first, at most the second, useless from the third on."""
+SOURCE_VIEWS = 12
+"""Views that a keyframe's depths are swept through, at most."""
+MIN_SHARED = 0.1
+PROBES = 64
+ALIKE = 0.4
+OUTLIER_PX = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class PosedCells:
+    """The encoded cells of a plain view."""
+
+    features: Tensor
+    """(h * w, channels) unit vectors, row-major over the grid of cells."""
+    camera: Camera
+    """At working size."""
+    base_from_camera: SE3
+    """Pose of the view."""
+    stride: int
+    """Pixels per cell."""
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of cells."""
+        return self.camera.height // self.stride, self.camera.width // self.stride
+
+    def rays(self) -> np.ndarray:
+        """(h * w, 3) rays through the cell centres in the camera frame, at depth 1."""
+        c, pixels = self.camera, ideal_cell_pixels(self.camera, self.stride).astype(float)
+        plane = (pixels - [c.cx, c.cy]) / [c.fx, c.fy]
+        return np.concatenate([plane, np.ones((len(plane), 1))], 1)
+
+
+def keyframe_depths(
+    chosen: np.ndarray,
+    frames: Sequence[Frame],
+    short_side: int,
+    stride: int,
+    features: Callable[[int], Tensor],
+    guess_m: Callable[[int], np.ndarray],
+) -> tuple[Tensor, ...]:
+    """Inverse depths (cells,) of each keyframe, half floats, swept through its scene's frames.
+
+    Args:
+        chosen: which of the frames are keyframes.
+        frames: all training frames of a scene.
+        short_side: working size of images, pixels.
+        stride: of the encoder.
+        features: (cells, channels) of a frame, given its number.
+        guess_m: (cells,) depths of a frame, roughly.
+    """
+    cameras = [frame.camera.short_side_resized(short_side) for frame in frames]
+    poses = known_poses(frames)
+
+    def cells(i: int) -> PosedCells:
+        return PosedCells(features(i), cameras[i], poses[i], stride)
+
+    depths = []
+    for i in chosen.tolist():
+        view, guess = cells(i), guess_m(i)
+        others = select_source_views(guess, view, poses, cameras, SOURCE_VIEWS)
+        depths.append(inverse_depths(view, [cells(j) for j in others], guess).half())
+    return tuple(depths)
+
+
+def select_source_views(
+    depth_m: np.ndarray, view: PosedCells, poses: SE3, cameras: Sequence[Camera], count: int
+) -> list[int]:
+    """Which of n other views tell the depths of a view best: they see the same under parallax.
+
+    Args:
+        depth_m: (h * w,) depths, roughly.
+        view: whose cells these are.
+        poses: (n,) base_from_camera.
+        cameras: n, at working size.
+        count: how many at most.
+    """
+    some = np.linspace(0, len(depth_m) - 1, PROBES).astype(int)
+    points = view.base_from_camera.apply(view.rays()[some] * depth_m[some, None])
+    own = points - view.base_from_camera.translation_m
+    own /= np.linalg.norm(own, axis=-1, keepdims=True)
+    worth = np.zeros(len(poses))
+    few, enough, many = PARALLAX_RAD
+    for i, (pose, camera) in enumerate(zip(poses, cameras, strict=True)):
+        within = pose.inverse().apply(points)
+        pixels = camera.project(np.where(within[:, 2:] > 0.1, within, [0, 0, 1]))
+        seen = (within[:, 2] > 0.1) & (pixels > 0).all(-1)
+        seen &= (pixels < [camera.width, camera.height]).all(-1)
+        other = points - pose.translation_m
+        other /= np.linalg.norm(other, axis=-1, keepdims=True) + 1e-9
+        parallax = np.arccos(np.clip((own * other).sum(-1), -1, 1))
+        useful = np.clip(parallax / few, 0, 1) * np.clip((many - parallax) / (many - enough), 0, 1)
+        worth[i] = (seen * useful).mean()
+    best = np.argsort(-worth, kind="stable")[:count]
+    return [int(i) for i in best if worth[i] > MIN_SHARED]
+
+
+def inverse_depths(view: PosedCells, others: Sequence[PosedCells], guess_m: np.ndarray) -> Tensor:
+    """Inverse depth of every cell along the optical axis.
+
+    First the plane whose cells look most alike in other views and near the guess, then two
+    Gauss-Newton steps along the ray towards the places, to a fraction of a cell, where each other
+    view looks most alike.
+
+    Args:
+        view: whose cells are asked for.
+        others: see `select_source_views`; with none the guess stands.
+        guess_m: (h * w,) depths in metres, roughly right.
+
+    Returns:
+        (h * w,) per metre, within 1 / 12 and 1 / 0.25.
+    """
+    guess = torch.from_numpy(1 / np.clip(guess_m, NEAR_M, FAR_M)).float()
+    if not others:
+        return guess
+    sources = [_SourceView(view, other) for other in others]
+    planes = torch.linspace(1 / FAR_M, 1 / NEAR_M, PLANES)
+    spread = planes.expand(len(guess), PLANES)
+    alike = torch.stack([source.along(spread) for source in sources])
+    score = alike.topk(min(SEEN_BY, len(sources)), 0).values.mean(0)
+    volume = score.T.reshape(1, PLANES, *view.grid)
+    near = F.avg_pool2d(volume, 3, 1, 1, count_include_pad=False)
+    score = (volume + SMOOTHING * (near - volume)).view(PLANES, -1).T
+    off = (planes[None] / guess[:, None]).log() / GUESS_SPREAD
+    score = score + GUESS_WEIGHT * torch.exp(-0.5 * off * off)
+    found = planes[score.argmax(1)]
+    for _ in range(2):
+        pull, hold = torch.zeros_like(found), torch.full_like(found, 1e-3)
+        for source in sources:
+            pull_one, hold_one = source.step(found)
+            pull, hold = pull + pull_one, hold + hold_one
+        found = (found + (pull / hold).clamp(-0.1, 0.1)).clamp(1 / FAR_M, 1 / NEAR_M)
+    return found
+
+
+class _SourceView:
+    """One other view, asked where it shows what a cell shows."""
+
+    def __init__(self, view: PosedCells, other: PosedCells):
+        self.other, (self.rows, self.columns) = other, other.grid
+        turn = other.base_from_camera.inverse() @ view.base_from_camera
+        self.ray = view.rays() @ turn.rotation_matrix().T
+        self.shift = turn.translation_m
+        self.alike = (view.features @ other.features.T).view(-1, *other.grid)
+
+    def pixels(self, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (..., 2) of cells at inverse depths (cells, ...), and which are in front."""
+        ray = self.ray.reshape(len(self.ray), *[1] * (inverse.ndim - 1), 3)
+        point = ray + inverse[..., None] * self.shift
+        front = point[..., 2] > 0.05
+        return self.other.camera.project(np.where(front[..., None], point, [0, 0, 1])), front
+
+    def along(self, inverse: Tensor) -> Tensor:
+        """(cells, planes) likeness at inverse depths, 0 where this view sees nothing."""
+        pixels, front = self.pixels(inverse.double().numpy())
+        size = np.array([self.columns, self.rows]) * self.other.stride
+        inside = front & (pixels > -4).all(-1) & (pixels < size + 4).all(-1)
+        grid = torch.from_numpy((pixels + 0.5) / size * 2 - 1).float()
+        found = F.grid_sample(
+            self.alike[:, None], grid[:, None], align_corners=False, padding_mode="border"
+        )
+        return found[:, 0, 0].clamp(min=0) * torch.from_numpy(inside)
+
+    def step(self, inverse: Tensor) -> tuple[Tensor, Tensor]:
+        """Right and left side (cells,) of the normal equation of each cell's inverse depth."""
+        at = inverse.double().numpy()
+        pixels, front = self.pixels(at)
+        delta = 1e-4
+        slope = torch.from_numpy((self.pixels(at + delta)[0] - pixels) / delta).float()
+        here = torch.from_numpy(pixels).float()
+        stride = self.other.stride
+        cell = ((here - (stride - 1) / 2) / stride).round()
+        last = torch.tensor([self.columns - 2, self.rows - 2])
+        inside = torch.from_numpy(front) & (cell >= 1).all(1) & (cell <= last).all(1)
+        column, row = cell.clamp(min=1).minimum(last.float()).long().unbind(1)
+        where, likeness = peak(self.alike, row, column)
+        residual = stride * where + (stride - 1) / 2 - here
+        weight = inside * (likeness - ALIKE).clamp(min=0) ** 2
+        weight = weight / (1 + (residual.norm(dim=1) / OUTLIER_PX) ** 2)
+        return weight * (slope * residual).sum(1), weight * (slope * slope).sum(1)
+
+
+def peak(alike: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
+    """The most alike cell of the 3x3 round a cell, to a fraction of a cell.
+
+    Args:
+        alike: (n, h, w) likeness of n cells to those of a view.
+        row: (n,) in 1 .. h - 2.
+        column: (n,) in 1 .. w - 2.
+
+    Returns:
+        (n, 2) column and row, and the likeness (n,) of the whole cell there.
+    """
+    _, height, width = alike.shape
+    n = torch.arange(len(alike))
+    steps = torch.tensor([(v, u) for v in (-1, 0, 1) for u in (-1, 0, 1)])
+    patch = alike[n[:, None], row[:, None] + steps[:, 0], column[:, None] + steps[:, 1]]
+    best = steps[patch.argmax(1)]
+    row = (row + best[:, 0]).clamp(1, height - 2)
+    column = (column + best[:, 1]).clamp(1, width - 2)
+    middle = alike[n, row, column]
+    du = parabola(alike[n, row, column - 1], middle, alike[n, row, column + 1])
+    dv = parabola(alike[n, row - 1, column], middle, alike[n, row + 1, column])
+    return torch.stack([column + du, row + dv], 1), middle
+
+
+def parabola(before: Tensor, middle: Tensor, after: Tensor) -> Tensor:
+    """Where a parabola through three values has its top, within half a step of the middle one."""
+    bend = (before - 2 * middle + after).clamp(max=-1e-3)
+    return (0.5 * (before - after) / bend).clamp(-0.5, 0.5)

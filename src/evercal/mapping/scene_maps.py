@@ -1,0 +1,134 @@
+"""What a store holds in memory: networks, heads, keyframes and a record of every scene."""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from torch import Tensor
+
+from evercal.features.descriptor import Descriptor
+from evercal.features.encoder import Encoder
+from evercal.geometry.camera import Camera
+from evercal.mapping.atlas import Atlas, Cell
+from evercal.mapping.keyframes import Keyframes
+from evercal.networks.head import Head
+
+MAX_PROTOTYPES = 256
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """What stays known of a learned scene beside the head's weights."""
+
+    name: str
+    """Unique in a store."""
+    camera: Camera
+    """Intrinsics of its first training frame."""
+    cell: Cell
+    """Its place in the atlas."""
+    prototypes: Tensor
+    """(p, width) descriptors of training frames spread over the recording, half precision."""
+    train_frames: int
+    """Frames it was learned from."""
+    refined_camera: Camera | None = None
+    """`camera` as training corrected it, with distortion; None where the given one is trusted."""
+    inlier_threshold: float = 0.0
+    """Smallest inlier ratio of a pose that is believed; fitted on held-out training frames."""
+    covariance_scale: float = 1.0
+    """What covariances are multiplied with to match the errors on held-out training frames."""
+
+    def query_camera(self, camera: Camera | None) -> Camera:
+        """Intrinsics for a query: refined if the nominal ones or none are given, else as given."""
+        own = self.camera
+        if camera is None or (
+            not camera.distortion
+            and np.allclose(_proportions(camera), _proportions(own), atol=1e-3)
+        ):
+            return self.refined_camera or own
+        return camera
+
+
+def _proportions(camera: Camera) -> tuple[float, float, float, float]:
+    w, h = camera.width, camera.height
+    return camera.fx / w, camera.fy / h, (camera.cx + 0.5) / w, (camera.cy + 0.5) / h
+
+
+def corrected_camera(camera: Camera, correction: Tensor) -> Camera:
+    """A nominal pinhole with the correction (5,) that training found (see `reprojection_error`)."""
+    focal, dx, dy, k1, k2 = (float(value) for value in correction)
+    return Camera(
+        camera.width,
+        camera.height,
+        camera.fx * (1 + focal),
+        camera.fy * (1 + focal),
+        camera.cx + dx * camera.fx,
+        camera.cy + dy * camera.fy,
+        (k1, k2, 0.0, 0.0),
+    )
+
+
+@dataclass
+class SceneMaps:
+    """Everything that localization and the next stage need."""
+
+    encoder: Encoder
+    """Frozen local encoder."""
+    descriptor: Descriptor
+    """Frozen global descriptor."""
+    strategy: str
+    """Key of STRATEGIES."""
+    short_side: int
+    """Working size of images, pixels."""
+    heads: list[Head] = field(default_factory=list)
+    """One head, or one per scene."""
+    scenes: list[SceneRecord] = field(default_factory=list)
+    """In order of arrival; the index is the scene index of head and atlas."""
+    keyframes: list[Keyframes | None] = field(default_factory=list)
+    """Of each scene; None where nothing is kept."""
+    method_states: list[Mapping[str, Tensor]] = field(default_factory=list)
+    """Named tensors that the strategy keeps of each scene (`continual.method_state`)."""
+
+    @property
+    def memory_bytes(self) -> int:
+        """Size of all that is kept for later stages: keyframes and method states."""
+        frames = sum(keyframes.bytes for keyframes in self.keyframes if keyframes is not None)
+        return frames + sum(
+            value.nbytes for state in self.method_states for value in state.values()
+        )
+
+    def atlas(self, grid_scenes: int = 0) -> Atlas:
+        """Cells of the scenes known so far.
+
+        Args:
+            grid_scenes: of the paper's layout; 0 for the open one.
+        """
+        atlas = Atlas("paper", grid_scenes) if grid_scenes else Atlas()
+        atlas.cells = [record.cell for record in self.scenes]
+        return atlas
+
+    def head_for(self, scene: int) -> tuple[Head, int]:
+        """The head that answers for a scene and the scene's index in that head."""
+        if len(self.heads) == 1 and self.heads[0].scenes > scene:
+            return self.heads[0], scene
+        return self.heads[scene], 0
+
+    def copy_for_training(self) -> "SceneMaps":
+        """A copy whose heads may be trained without touching these."""
+        return SceneMaps(
+            self.encoder,
+            self.descriptor,
+            self.strategy,
+            self.short_side,
+            copy.deepcopy(self.heads),
+            list(self.scenes),
+            list(self.keyframes),
+            list(self.method_states),
+        )
+
+
+def prototypes(descriptors: Tensor) -> Tensor:
+    """At most 256 descriptors (n, width) spread evenly over a recording, half precision."""
+    count = min(MAX_PROTOTYPES, len(descriptors))
+    index = np.linspace(0, len(descriptors) - 1, count).round().astype(int)
+    return descriptors[index].half()

@@ -1,0 +1,1 @@
+"""Fitting a scene-coordinate head to rows of features; knows no method."""

@@ -1,0 +1,1 @@
+"""HTML pages and pictures of what the other folders found out."""

@@ -1,0 +1,1 @@
+"""Furnished rooms with a robot arm, path-traced: furniture, materials, renderer."""

@@ -1,0 +1,315 @@
+"""Path-traced pictures with Mitsuba 3: colour, and depth along the optical axis.
+
+Mitsuba's camera looks along +z with x to the LEFT and y up; ours is OpenCV's (x right, y down).
+Depth does not come from the noisy colour pass: one ray per pixel goes through the pixel's centre.
+"""
+
+import glob
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from evercal.errors import InputError
+from evercal.geometry import SE3, Camera
+from evercal.simulation.furnished.materials import Material
+from evercal.simulation.furnished.shapes import Mesh
+
+_PROBE = """
+import drjit as dr, sys
+dr.set_thread_count(1)
+import mitsuba as mi
+mi.set_variant(sys.argv[1])
+film = {"type": "hdrfilm", "width": 8, "height": 8}
+away = mi.ScalarTransform4f().translate([0, 0, -4])
+scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"},
+    "light": {"type": "constant"}, "ball": {"type": "sphere", "bsdf": {"type": "roughplastic"}},
+    "sensor": {"type": "perspective", "to_world": away, "film": film}})
+assert float(mi.TensorXf(mi.render(scene, spp=1)).array[0]) > 0
+"""
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How a picture is taken."""
+
+    samples: int = 16
+    """Paths per pixel."""
+    denoise: bool = True
+    """Whether Open Image Denoise removes the grain."""
+    exposure_ev: float = 0.0
+    """Brighter (> 0) or darker than the room's own exposure, in stops."""
+    noise: float = 0.0
+    """Standard deviation of sensor noise at mid grey, in parts of full scale."""
+    blur_steps: int = 1
+    """Poses that the samples are spread over while the shutter is open; 1 is no motion blur."""
+
+
+@lru_cache(maxsize=1)
+def mitsuba() -> Any:
+    """The mitsuba module with the fastest variant that works here, see `choose_variant`.
+
+    EVERCAL_MITSUBA_VARIANT names a variant instead; EVERCAL_RENDER_THREADS limits the threads.
+
+    Raises:
+        InputError: The extra `sim` is not installed.
+    """
+    try:
+        import drjit as dr  # pyright: ignore[reportMissingImports]
+        import mitsuba as mi  # pyright: ignore[reportMissingImports]
+        import mitsuba_oidn  # noqa: F401  # pyright: ignore
+    except ImportError:
+        raise InputError(
+            "the simulator needs Mitsuba, which is not installed; run: pip install 'evercal[sim]'"
+        ) from None
+    variant, _ = choose_variant()
+    if "EVERCAL_RENDER_THREADS" in os.environ:
+        dr.set_thread_count(int(os.environ["EVERCAL_RENDER_THREADS"]))
+    mi.set_variant(variant)
+    mi.set_log_level(mi.LogLevel.Error)
+    return mi
+
+
+@lru_cache(maxsize=1)
+def choose_variant() -> tuple[str, str]:
+    """(variant, reason). Candidates are tried in a process of their own: a bad LLVM aborts."""
+    asked = os.environ.get("EVERCAL_MITSUBA_VARIANT")
+    if asked:
+        return asked, "as EVERCAL_MITSUBA_VARIANT says"
+    for library in _llvm_libraries():
+        if _works("llvm_ad_rgb", library):
+            os.environ["DRJIT_LIBLLVM_PATH"] = library
+            return "llvm_ad_rgb", library
+    if _works("cuda_ad_rgb", None):
+        return "cuda_ad_rgb", "no working LLVM, but a GPU"
+    return "scalar_rgb", "slow; neither a working LLVM >= 16 nor a GPU: apt-get install libllvm19"
+
+
+def _llvm_libraries() -> list[str]:
+    """Shared libraries to try, the one the user named or the newest first."""
+    named = os.environ.get("DRJIT_LIBLLVM_PATH")
+    if named:
+        return [named]
+    places = ("/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/lib64/libLLVM*")
+    found = {os.path.realpath(path) for place in places for path in glob.glob(place)}
+    versions = {}
+    for path in found:
+        digits = "".join(c if c.isdigit() else " " for c in os.path.basename(path)).split()
+        if digits:
+            versions.setdefault(int(digits[0]), path)
+    # Older ones lack opaque pointers or abort on processors with AVX-512.
+    return [versions[version] for version in sorted(versions, reverse=True) if version >= 16]
+
+
+def _works(variant: str, library: str | None) -> bool:
+    environment = dict(os.environ)
+    if library:
+        environment["DRJIT_LIBLLVM_PATH"] = library
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE, variant],
+            env=environment,
+            capture_output=True,
+            timeout=120,
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == 0
+
+
+class Renderer:
+    """A set of meshes that can be looked at from anywhere.
+
+    Args:
+        meshes: in the base frame; one Mitsuba mesh is made per material, as many small ones are
+            slow. A mesh with a `name` stays on its own and can be moved.
+        exposure: factor on radiance before it is encoded.
+        max_depth: longest path in segments; 4 is light, up to two surfaces on the way, eye.
+    """
+
+    def __init__(
+        self, meshes: list[tuple[Mesh, Material]], exposure: float = 2.0, max_depth: int = 4
+    ):
+        mi = mitsuba()
+        self._mi = mi
+        self._exposure = exposure
+        self._sensors: dict[Camera, tuple[Any, Any]] = {}
+        scene: dict[str, Any] = {
+            "type": "scene",
+            # Roulette from the first bounce on costs some noise and saves half of the time.
+            "integrator": {"type": "path", "max_depth": max_depth, "rr_depth": 1},
+        }
+        groups: dict[tuple[str, str], tuple[Material, list[Mesh]]] = {}
+        for mesh, material in meshes:
+            key = (material.name, mesh.name)
+            groups.setdefault(key, (material, []))[1].append(mesh)
+        for number, ((_, name), (material, members)) in enumerate(groups.items()):
+            scene[name or f"static{number}"] = _mesh(mi, Mesh.merged(members), material)
+        self._scene = mi.load_dict(scene)
+        self._features = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
+        self._parameters = mi.traverse(self._scene)
+
+    def move(self, moved: dict[str, Mesh]) -> None:
+        """New vertices and normals for named meshes, in the base frame."""
+        for name, mesh in moved.items():
+            for key, value in (("positions", mesh.vertices_m), ("normals", mesh.normals)):
+                old = self._parameters[f"{name}.vertex_{key}"]
+                self._parameters[f"{name}.vertex_{key}"] = type(old)(
+                    np.ascontiguousarray(value, np.float32).ravel()
+                )
+        self._parameters.update()
+
+    def render(
+        self,
+        camera: Camera,
+        base_from_camera: SE3,
+        options: RenderOptions | None = None,
+        seed: int = 0,
+    ) -> np.ndarray:
+        """Takes one picture.
+
+        Args:
+            camera: pinhole with square pixels and no distortion.
+            base_from_camera: pose (), or (n,) poses that the camera passes while the shutter is
+                open.
+            options: samples and the like.
+            seed: of the noise; same seed, same pixels on the same variant.
+
+        Returns:
+            (H, W, 3) uint8 RGB, sRGB-encoded.
+
+        Raises:
+            ValueError: A camera with distortion or with fx and fy that differ.
+        """
+        options = options or RenderOptions()
+        poses = list(base_from_camera) if base_from_camera.shape else [base_from_camera]
+        sensor, parameters = self._sensor(camera)
+        share = max(1, options.samples // len(poses))
+        light = np.zeros((camera.height, camera.width, 3), np.float32)
+        features = np.zeros((camera.height, camera.width, 6), np.float32)
+        for i, pose in enumerate(poses):
+            matrix = pose.matrix() @ np.diag([-1.0, -1.0, 1.0, 1.0])
+            parameters["to_world"] = self._mi.Transform4f(matrix)
+            parameters.update()
+            how = {"sensor": sensor, "seed": (seed * 31 + i) % 2**32}
+            light += np.asarray(self._mi.render(self._scene, spp=share, **how))[..., :3]
+            if options.denoise:
+                few = min(share, 4)
+                seen = self._mi.render(self._scene, integrator=self._features, spp=few, **how)
+                features += np.asarray(seen)[..., -6:]
+        if options.denoise:
+            light = _denoised(light / len(poses), features / len(poses))
+        else:
+            light /= len(poses)
+        radiance = light.astype(float) * self._exposure * 2.0**options.exposure_ev
+        return _encode(radiance, options.noise, np.random.default_rng([seed, 1]))
+
+    def depth(self, camera: Camera, base_from_camera: SE3) -> np.ndarray:
+        """(H, W) float32 metres along the optical axis; 0 where nothing is hit."""
+        mi = self._mi
+        v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+        rays = camera.unproject(np.stack([u, v], -1).reshape(-1, 2))
+        length = np.linalg.norm(rays, axis=-1)
+        directions = (rays / length[:, None]) @ base_from_camera.rotation_matrix().T
+        origin = base_from_camera.translation_m
+        if mi.variant().startswith("scalar"):
+            start = mi.Point3f(*origin.tolist())
+            hits = [
+                self._scene.ray_intersect_preliminary(mi.Ray3f(start, mi.Vector3f(*way.tolist()))).t
+                for way in directions
+            ]
+            distance = np.array(hits, np.float64)
+        else:
+            # Arrays, not constants: a constant would have the kernel compiled for every frame.
+            starts = np.broadcast_to(origin[:, None], (3, len(rays))).astype(np.float32)
+            ray = mi.Ray3f(mi.Point3f(starts), mi.Vector3f(directions.T.astype(np.float32)))
+            hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
+            distance = np.array(hit.t, np.float64)
+        depth = np.where(np.isfinite(distance) & (distance < 1e6), distance / length, 0.0)
+        return depth.reshape(camera.height, camera.width).astype(np.float32)
+
+    def _sensor(self, camera: Camera) -> tuple[Any, Any]:
+        """The sensor of a camera; only its pose changes, so that kernels are compiled once."""
+        if camera not in self._sensors:
+            if any(camera.distortion) or abs(camera.fx - camera.fy) > 1e-6 * camera.fx:
+                raise ValueError(f"rendering takes a pinhole with fx = fy, got {camera}")
+            width, height = camera.width, camera.height
+            sensor = self._mi.load_dict(
+                {
+                    "type": "perspective",
+                    "fov": float(np.degrees(2 * np.arctan(width / 2 / camera.fx))),
+                    "fov_axis": "x",
+                    "near_clip": 0.01,
+                    "far_clip": 1000.0,
+                    "principal_point_offset_x": ((width - 1) / 2 - camera.cx) / width,
+                    "principal_point_offset_y": ((height - 1) / 2 - camera.cy) / height,
+                    "film": {
+                        "type": "hdrfilm",
+                        "width": width,
+                        "height": height,
+                        "rfilter": {"type": "box"},
+                        "component_format": "float32",
+                    },
+                    "sampler": {"type": "multijitter", "sample_count": 16},
+                }
+            )
+            self._sensors[camera] = (sensor, self._mi.traverse(sensor))
+        return self._sensors[camera]
+
+
+def _denoised(light: np.ndarray, features: np.ndarray) -> np.ndarray:
+    """(H, W, 3) radiance without the grain of few samples; textures and edges stay.
+
+    Args:
+        light: (H, W, 3) radiance.
+        features: (H, W, 6) albedo and normal of the first surface.
+    """
+    import mitsuba_oidn as oidn  # pyright: ignore[reportMissingImports]
+
+    albedo = np.ascontiguousarray(np.clip(features[..., :3], 0, 1))
+    normal = np.ascontiguousarray(features[..., 3:])
+    return np.asarray(oidn.denoise(light, albedo, normal, hdr=True))
+
+
+def _encode(radiance: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarray:
+    """Radiance to sRGB bytes; highlights roll off instead of clipping hard."""
+    knee = 0.7
+    over = np.maximum(radiance - knee, 0.0)
+    linear = np.minimum(radiance, knee) + (1 - knee) * (1 - np.exp(-over / (1 - knee)))
+    if noise > 0:  # shot noise grows with the root of the light
+        sigma = noise * np.sqrt(np.clip(linear, 0.01, 1.0) / 0.2)
+        linear = linear + sigma * rng.standard_normal(linear.shape)
+    linear = np.clip(linear, 0.0, 1.0)
+    curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.round(curve * 255).astype(np.uint8)
+
+
+def _mesh(mi: Any, mesh: Mesh, material: Material) -> Any:
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(material.bsdf(mi))
+    light = material.emitter(mi)
+    if light is not None:
+        properties["emitter"] = mi.load_dict(light)
+    made = mi.Mesh(
+        mesh.name or material.name,
+        len(mesh.vertices_m),
+        len(mesh.faces),
+        has_vertex_normals=True,
+        has_vertex_texcoords=True,
+        props=properties,
+    )
+    parameters = mi.traverse(made)
+    for key, value, kind in (
+        ("vertex_positions", mesh.vertices_m, np.float32),
+        ("vertex_normals", mesh.normals, np.float32),
+        ("vertex_texcoords", mesh.uv / material.tile_m, np.float32),
+        ("faces", mesh.faces, np.uint32),
+    ):
+        flat = np.ascontiguousarray(value, kind).ravel()
+        parameters[key] = type(parameters[key])(flat)
+    parameters.update()
+    return made

@@ -1,0 +1,344 @@
+"""Rooms composed from a seed: bedroom, kitchen, living room, each with a robot's table in it.
+
+The base frame is the robot's: origin in the middle of its foot on the table top, x to the front,
+z up. A room is built with its corner at the origin and shifted at the end.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from evercal.simulation.furnished import materials as m
+from evercal.simulation.furnished.clutter import SmallObjects
+from evercal.simulation.furnished.furniture import FurnitureBuilder, Item
+from evercal.simulation.furnished.shapes import Mesh, box, cylinder, lathe, sheet
+from evercal.simulation.furnished.wall_objects import WallObjects
+
+RESERVED = 9000
+"""Seeds from here on belong to nobody's training and tuning."""
+
+FLOOR: tuple[tuple[float, float, float], ...] = (
+    (0.56, 0.40, 0.26), (0.68, 0.53, 0.36), (0.42, 0.29, 0.2), (0.74, 0.62, 0.46),
+)  # fmt: skip
+WALLS: tuple[tuple[float, float, float], ...] = (
+    (0.86, 0.84, 0.79), (0.78, 0.82, 0.80), (0.84, 0.79, 0.70), (0.74, 0.79, 0.84),
+    (0.83, 0.77, 0.76),
+)  # fmt: skip
+
+WALL_YAW_RAD = (0.0, np.pi / 2, np.pi, -np.pi / 2)
+"""How a thing with its back to wall 0 (y high), 1 (x low), 2 (y low) or 3 (x high) is turned, so
+that its front faces the room."""
+
+
+@dataclass(eq=False)
+class Room:
+    """Everything but the robot, in the base frame."""
+
+    kind: str
+    """Bedroom, kitchen or living."""
+    seed: int
+    """What it was composed from."""
+    shell: list[tuple[Mesh, m.Material]]
+    """Walls, floor, ceiling, windows and lamps."""
+    items: list[Item]
+    """Furniture and small things."""
+    low_m: np.ndarray
+    """(3,) lowest corner of the room."""
+    high_m: np.ndarray
+    """(3,) highest corner."""
+
+    def boxes_m(self) -> np.ndarray:
+        """(n, 2, 3) bounding boxes of all things."""
+        return np.stack([item.bounds_m() for item in self.items])
+
+    def meshes(self) -> list[tuple[Mesh, m.Material]]:
+        """All surfaces."""
+        return self.shell + [part for item in self.items for part in item.parts]
+
+    def is_free(self, points_m: np.ndarray, margin_m: float = 0.12) -> np.ndarray:
+        """Whether (n, 3) points lie inside the room and outside all things, with a margin."""
+        inside = (points_m > self.low_m + margin_m) & (points_m < self.high_m - margin_m)
+        boxes = self.boxes_m()
+        low, high = boxes[:, 0] - margin_m, boxes[:, 1] + margin_m
+        hit = (points_m[:, None] > low) & (points_m[:, None] < high)
+        return np.asarray(inside.all(-1) & ~hit.all(-1).any(-1))
+
+
+class _Builder:
+    """Puts things into a room so that no two overlap."""
+
+    def __init__(self, kind: str, seed: int):
+        self.rng = np.random.default_rng([seed, sum(map(ord, kind))])
+        self.size = np.array([self.rng.uniform(5.0, 5.7), self.rng.uniform(4.7, 5.3), 2.55])
+        self.shop = FurnitureBuilder(self.rng)
+        self.trinkets = SmallObjects(self.shop)
+        self.hangings = WallObjects(self.shop)
+        self.items: list[Item] = []
+        self.blocked: list[tuple[Item | None, np.ndarray]] = []
+
+    def add(self, item: Item, gap_m: float = 0.03, host: Item | None = None) -> bool:
+        """Keeps the item unless it would stand in another (but its host) or outside."""
+        bounds = item.bounds_m()
+        if (bounds[0, :2] < -0.01).any() or (bounds[1, :2] > self.size[:2] + 0.01).any():
+            return False
+        for owner, other in self.blocked:
+            if owner is not None and owner is host:
+                continue
+            if (bounds[0] < other[1] + gap_m).all() and (bounds[1] > other[0] - gap_m).all():
+                return False
+        self.items.append(item)
+        self.blocked.append((item, bounds))
+        return True
+
+    def along_wall(self, item: Item, wall: int, at: float, z: float = 0.0) -> bool:
+        """Back to wall 0 (y high), 1 (x low), 2 (y low) or 3 (x high), `at` in 0..1 along it."""
+        x, y, _ = self.size
+        bounds = item.bounds_m()
+        half = (bounds[1, 0] - bounds[0, 0]) / 2 + 0.01
+        length = x if wall % 2 == 0 else y
+        along = half + at * (length - 2 * half)
+        gap = 0.015 if z == 0.0 else 0.003
+        place = ((along, y - gap), (gap, along), (along, gap), (x - gap, along))[wall]
+        return self.add(item.placed(*place, z, WALL_YAW_RAD[wall]))
+
+    def try_wall(self, make: Callable[[], Item], walls: tuple[int, ...], z: float = 0.0) -> bool:
+        """Some free place along one of the walls."""
+        item = make()
+        for _ in range(30):
+            wall = int(self.rng.choice(walls))
+            if self.along_wall(item, wall, float(self.rng.random()), z):
+                return True
+        return False
+
+    def scatter(self, item: Item, makes: list[Callable[[], Item]], count: int) -> None:
+        """Small things on the tops of an item."""
+        for x0, x1, y0, y1, z in item.tops:
+            for _ in range(count):
+                thing = makes[self.rng.integers(len(makes))]()
+                for _ in range(6):
+                    x, y = self.rng.uniform(x0, x1), self.rng.uniform(y0, y1)
+                    yaw = self.rng.uniform(0, 2 * np.pi)
+                    if self.add(
+                        thing.placed(float(x), float(y), z + 0.001, float(yaw)), 0.004, item
+                    ):
+                        break
+
+
+def room(kind: str, seed: int) -> Room:
+    """Composes a room; the same kind and seed give the same room.
+
+    Args:
+        kind: one of `KINDS`.
+        seed: below 9000.
+
+    Raises:
+        ValueError: An unknown kind or a reserved seed.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"room kind is one of {', '.join(KINDS)}, got {kind!r}")
+    if not 0 <= seed < RESERVED:
+        raise ValueError(f"room seeds are 0 to {RESERVED - 1}; later ones are reserved, got {seed}")
+    build = _Builder(kind, seed)
+    shell = _shell(build, kind)
+    base = np.array([0.46 * build.size[0], build.size[1] / 2, 0.0])
+    base[2] = _robot_table(build, base)
+    KINDS[kind](build)
+    _fill_up(build)
+    for item in build.items[1:]:
+        if item.tops:
+            build.scatter(item, _small_things(build.trinkets, kind), 5)
+    shift = -base
+    items = [item.placed(*shift) for item in build.items]
+    shell = [(mesh.shifted(*shift), material) for mesh, material in shell]
+    return Room(kind, seed, shell, items, shift, build.size + shift)
+
+
+def _small_things(t: SmallObjects, kind: str) -> list[Callable[[], Item]]:
+    both = [t.mug, t.books, t.vase, t.plant, t.jar]
+    if kind == "kitchen":
+        return [*both, t.bowl, t.plate, t.bottle, t.carton, t.pot, t.kettle, t.jar]
+    return [*both, t.lamp, t.toy_ball, t.blocks, t.radio, t.bowl, t.bottle]
+
+
+def _robot_table(build: _Builder, base: np.ndarray) -> float:
+    """The table that the robot stands on, with tools and parts in a ring; gives its height."""
+    height = 0.74
+    table = build.shop.table(1.5, 0.95, height).placed(base[0] + 0.3, base[1] + 0.475, 0.0)
+    build.add(table)
+    # The foot of the arm and the middle of the work area stay free.
+    foot = np.array([[base[0] - 0.2, base[1] - 0.2, height], [base[0] + 0.2, base[1] + 0.2, 2.0]])
+    build.blocked.append((None, foot))
+    t = build.trinkets
+    makes = [t.mug, t.blocks, t.carton, t.bowl, t.jar, t.books, t.bottle, t.plant, t.toy_ball]
+    order = build.rng.permutation(len(makes))
+    for k in range(11):
+        thing = makes[order[k % len(makes)]]()
+        for _ in range(25):
+            x = base[0] + build.rng.uniform(-0.35, 0.98)
+            y = base[1] + build.rng.uniform(-0.42, 0.42)
+            near = np.hypot(x - base[0] - 0.45, y - base[1]) < 0.16
+            turned = thing.placed(
+                float(x), float(y), height + 0.001, float(build.rng.uniform(0, 6))
+            )
+            if not near and build.add(turned, 0.01, table):
+                break
+    return height
+
+
+def _bedroom(build: _Builder) -> None:
+    shop = build.shop
+    build.along_wall(shop.bed(), 0, 0.14)
+    build.along_wall(shop.drawers(), 1, 0.3)
+    build.try_wall(shop.wardrobe, (1, 2))
+    build.try_wall(shop.bookcase, (1, 2))
+    build.try_wall(shop.armchair, (2,))
+
+
+def _kitchen(build: _Builder) -> None:
+    shop = build.shop
+    build.along_wall(shop.counter(), 1, 0.6)
+    for at in (0.25, 0.62):
+        build.along_wall(build.hangings.cupboard(), 1, at, 1.45)
+    build.along_wall(shop.fridge(), 1, 0.02)
+    build.try_wall(lambda: shop.table(1.1, 0.7), (0, 2))
+    build.try_wall(lambda: shop.counter(1.8), (0, 2))
+    for _ in range(2):
+        build.try_wall(shop.chair, (0, 2))
+
+
+def _living(build: _Builder) -> None:
+    shop = build.shop
+    build.along_wall(shop.sofa(), 1, 0.6)
+    build.along_wall(shop.round_table(), 1, 0.12)
+    build.try_wall(shop.bookcase, (0, 2))
+    build.try_wall(shop.bookcase, (0, 2))
+    build.try_wall(shop.armchair, (0, 2))
+    build.try_wall(shop.floor_lamp, (0, 1, 2))
+
+
+KINDS: dict[str, Callable[[_Builder], None]] = {
+    "bedroom": _bedroom,
+    "kitchen": _kitchen,
+    "living": _living,
+}
+
+
+def _fill_up(build: _Builder) -> None:
+    """What every room has: a door, chairs, chests, shelves, pictures, plants on the floor."""
+    shop, t, rng = build.shop, build.trinkets, build.rng
+    build.try_wall(build.hangings.door, (3, 2))
+    for make in (
+        shop.drawers,
+        shop.chair,
+        shop.floor_lamp,
+        shop.round_table,
+        shop.chair,
+        shop.drawers,
+    ):
+        build.try_wall(make, (0, 2, 3))
+    build.try_wall(build.hangings.clock, (0, 1, 2), float(rng.uniform(1.75, 1.95)))
+    for _ in range(3):
+        build.try_wall(build.hangings.wall_shelf, (0, 1, 2), float(rng.uniform(1.3, 1.6)))
+    for _ in range(9):
+        build.try_wall(build.hangings.picture, (0, 1, 1, 2, 3), float(rng.uniform(1.25, 1.6)))
+    for make in (t.plant, t.basket, t.toy_ball, t.basket, t.plant):
+        thing = _on_floor(make())
+        for _ in range(20):
+            place = rng.uniform((0.25, 0.25), build.size[:2] - 0.25)
+            rim = np.minimum(place, build.size[:2] - place).min()
+            if rim < 0.9 and build.add(thing.placed(float(place[0]), float(place[1]), 0.0)):
+                break
+
+
+def _on_floor(item: Item) -> Item:
+    """Twice as large for things that also stand on tables."""
+    if item.kind != "plant":
+        return item
+    parts = [
+        (Mesh(2.6 * p.vertices_m, p.faces, p.normals, 2.6 * p.uv), mat) for p, mat in item.parts
+    ]
+    return Item(item.kind, parts)
+
+
+def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
+    """Walls, floor, ceiling, skirting, two windows with curtains, a ceiling lamp, a carpet."""
+    x, y, z = (float(side) for side in build.size)
+    rng, shop = build.rng, build.shop
+    tone = WALLS[rng.integers(len(WALLS))]
+    paint = m.plaster("plaster", tone, rng)
+    accent = m.wallpaper("wallpaper", WALLS[rng.integers(len(WALLS))], rng)
+    if kind == "kitchen":
+        floor = m.tiles("floor", (0.66, 0.62, 0.56), rng, 4, 1.3)
+        accent = m.tiles("splash", WALLS[rng.integers(len(WALLS))], rng, 5, 0.75)
+    else:
+        floor = m.boards("floor", FLOOR[rng.integers(len(FLOOR))], rng)
+    ceiling = m.plaster("ceiling", (0.9, 0.9, 0.88), rng)
+    slabs = [
+        (_panel((0, 0, 0), (x, 0, 0), (0, y, 0)), floor),
+        (_panel((0, y, z), (x, 0, 0), (0, -y, 0)), ceiling),
+        (_panel((0, y, 0), (x, 0, 0), (0, 0, z)), paint),
+        (_panel((0, 0, 0), (0, y, 0), (0, 0, z)), accent),
+        (_panel((x, 0, 0), (-x, 0, 0), (0, 0, z)), paint),
+        (_panel((x, y, 0), (0, -y, 0), (0, 0, z)), paint),
+    ]
+    for px, py, w, d in (
+        (x / 2, 0.008, x, 0.016),
+        (x / 2, y - 0.008, x, 0.016),
+        (0.008, y / 2, 0.016, y),
+        (x - 0.008, y / 2, 0.016, y),
+    ):
+        slabs.append((box(w, d, 0.08, 0.006).shifted(px, py, 0), shop.white))
+    slabs += _window(build, 0, float(rng.uniform(0.45, 0.75)))
+    slabs += _window(build, 2, float(rng.uniform(0.2, 0.5)))
+    slabs += _window(build, 3, float(rng.uniform(0.3, 0.7)))
+    # A broad ceiling lamp keeps shadows soft and noise low.
+    lamp = m.plain("lamp", (1.0, 0.95, 0.87), emission=5.0)
+    slabs.append((cylinder(0.38, 0.05, 0.01, 48).shifted(0.55 * x, y / 2, z - 0.07), lamp))
+    rim = lathe([(0.38, 0), (0.4, 0), (0.4, 0.06), (0.38, 0.06)], 48, 1).shifted(
+        0.55 * x, y / 2, z - 0.06
+    )
+    slabs.append((rim, shop.steel))
+    rug = m.carpet("carpet", tuple(rng.uniform(0.2, 0.6, 3).tolist()), rng)
+    w, d = 0.62 * x, 0.55 * y
+    mat = box(w, d, 0.012, 0.005, bottom=False).shifted(0.5 * x, y / 2, 0.0)
+    uv = (mat.vertices_m[:, :2] - (0.5 * x - w / 2, y / 2 - d / 2)) / (w, d)
+    slabs.append((Mesh(mat.vertices_m, mat.faces, mat.normals, uv), rug))
+    return slabs
+
+
+def _panel(corner: tuple, u: tuple, v: tuple) -> Mesh:
+    """A wall seen from inside whose texture coordinates are metres."""
+    flat = sheet(corner, u, v)
+    return Mesh(
+        flat.vertices_m, flat.faces, flat.normals, flat.uv * (np.linalg.norm(u), np.linalg.norm(v))
+    )
+
+
+def _window(build: _Builder, wall: int, at: float) -> list[tuple[Mesh, m.Material]]:
+    """Daylight behind bars and a sill; curtains on both sides."""
+    shop, rng = build.shop, build.rng
+    w, h, low = float(rng.uniform(1.1, 1.5)), 1.25, 0.9
+    sky = m.plain("sky", (0.86, 0.93, 1.0), emission=4.2)
+    x, y, _ = build.size
+    length = x if wall % 2 == 0 else y
+    along = w / 2 + 0.6 + at * (length - w - 1.2)
+    place = ((along, y, 0.0), (0.0, along, 0.0), (along, 0.0, 0.0), (x, along, 0.0))[wall]
+    yaw = WALL_YAW_RAD[wall]
+    parts = [(sheet((-w / 2, -0.012, low), (w, 0, 0), (0, 0, h)), sky)]
+    for px in (-w / 2, 0.0, w / 2):
+        parts.append((box(0.06, 0.07, h + 0.06, 0.012).shifted(px, -0.03, low - 0.03), shop.white))
+    for pz in (low - 0.03, low + 0.62 * h, low + h):
+        parts.append((box(w, 0.06, 0.05, 0.012).shifted(0, -0.03, pz), shop.white))
+    parts.append(
+        (box(w + 0.2, 0.2, 0.035, 0.014, steps=3).shifted(0, -0.1, low - 0.06), shop.white)
+    )
+    frame = Item("window", parts).placed(*place, yaw)
+    build.blocked.append((None, frame.bounds_m()))
+    for side in (-1, 1):
+        offset = np.array([np.cos(yaw), np.sin(yaw), 0.0]) * side * (w / 2 + 0.22)
+        spot = np.array(place) + offset
+        build.add(
+            build.hangings.curtains(0.42).placed(float(spot[0]), float(spot[1]), 0.0, yaw), -0.25
+        )
+    return frame.parts

@@ -1,1 +1,0 @@
-"""Fitting a head to rows of features: views, buffer, reprojection loss and the loop."""

@@ -1,0 +1,301 @@
+"""SPDD against numbers worked out with `math` alone."""
+
+import math
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Tensor
+
+from evercal.continual.methods.spdd import SpddOptions, spdd_loss
+
+INF = math.inf
+
+
+@dataclass
+class Output:
+    logits: Tensor
+    offsets: Tensor
+    points: Tensor
+
+
+def tensor(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def random_output(rows, centres, seed, shared=False):
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    return Output(3 * draw(rows, centres), draw(rows, 1 if shared else centres, 3), draw(rows, 3))
+
+
+def softmax(values, temperature):
+    powers = [math.exp(v / temperature) for v in values]
+    return [p / sum(powers) for p in powers]
+
+
+def slow_terms(student, teacher, active, temperature):
+    """The docstring of spdd_loss in plain loops, for finite logits and per_centre offsets."""
+    zs, zt = student.logits.tolist(), teacher.logits.tolist()
+    ds, dt = student.offsets.tolist(), teacher.offsets.tolist()
+    rows, old = len(zt), len(zt[0])
+    prior = metric = output = 0.0
+    for n in range(rows):
+        best = sorted(range(old), key=lambda k: -zt[n][k])[: max(1, min(active, old // 2))]
+        p = softmax([zt[n][k] for k in best], temperature)
+        q = softmax([zs[n][k] for k in best] + zs[n][old:], temperature)
+        prior += temperature**2 * sum(a * math.log(a / b) for a, b in zip(p, q, strict=False))
+        metric += sum(abs(ds[n][k][i] - dt[n][k][i]) for k in best for i in range(3))
+        output += sum(abs(a - b) for a, b in zip(student.points[n], teacher.points[n], strict=True))
+    return prior / rows, metric / rows, float(output) / rows
+
+
+def two_rows():
+    """K = 4 centres, so M_a = 2; A is {0, 2} in the first row and {1, 3} in the second."""
+    teacher = Output(
+        tensor([[2.0, -1.0, 1.0, 0.0], [0.0, 3.0, -2.0, 3.5]]),
+        tensor([[[0.0] * 3, [9.0] * 3, [1.0, 2.0, 3.0], [9.0] * 3]] * 2),
+        tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]),
+    )
+    student = Output(
+        tensor([[1.0, 5.0, 1.0, 7.0], [8.0, 3.0, 4.0, 1.5]]),
+        tensor(
+            [
+                [[0.5, -0.25, 0.0], [0.0] * 3, [1.0, 2.0, 4.0], [0.0] * 3],
+                [[7.0] * 3, [9.0, 9.0, 8.0], [7.0] * 3, [9.0, 9.5, 9.0]],
+            ]
+        ),
+        tensor([[0.5, 0.0, -0.25], [1.0, 3.0, 1.0]]),
+    )
+    return student, teacher
+
+
+def test_two_rows_by_hand():
+    student, teacher = two_rows()
+    terms = spdd_loss(student, teacher, SpddOptions(2.0, 3.0, 5.0, temperature=2.0))
+    # Row 1: teacher logits 2, 1 over 2 -> sigmoid(0.5); student 1, 1 -> one half each.
+    p = 1 / (1 + math.exp(-0.5))
+    first = p * math.log(p / 0.5) + (1 - p) * math.log((1 - p) / 0.5)
+    # Row 2: teacher 3.5 against 3 -> sigmoid(0.25); student 1.5 against 3 -> sigmoid(-0.75).
+    p, q = 1 / (1 + math.exp(-0.25)), 1 / (1 + math.exp(0.75))
+    second = p * math.log(p / q) + (1 - p) * math.log((1 - p) / (1 - q))
+    prior = 4 * (first + second) / 2
+    metric = ((0.5 + 0.25 + 1.0) + (1.0 + 0.5)) / 2
+    output = ((0.5 + 0.25) + 2.0) / 2
+    assert terms.prior.item() == pytest.approx(prior, rel=1e-12)
+    assert terms.metric.item() == pytest.approx(metric, rel=1e-12)
+    assert terms.output.item() == pytest.approx(output, rel=1e-12)
+    assert terms.total.item() == pytest.approx(2 * prior + 3 * metric + 5 * output, rel=1e-12)
+
+
+@pytest.mark.parametrize("new", [0, 1, 5])
+@pytest.mark.parametrize(("active", "temperature"), [(1, 1.0), (3, 0.5), (50, 2.0)])
+def test_equals_slow_twin(new, active, temperature):
+    teacher, student = random_output(6, 9, 0), random_output(6, 9 + new, 1)
+    options = SpddOptions(active_centres=active, temperature=temperature)
+    terms = spdd_loss(student, teacher, options)
+    expected = slow_terms(student, teacher, active, temperature)
+    found = terms.prior.item(), terms.metric.item(), terms.output.item()
+    assert found == pytest.approx(expected, rel=1e-10)
+
+
+def test_identical_outputs_cost_nothing():
+    for shared in (False, True):
+        output = random_output(5, 8, 2, shared)
+        terms = spdd_loss(output, output, SpddOptions())
+        assert terms.total.item() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_mass_on_a_new_centre_costs_its_share():
+    teacher = random_output(5, 8, 3)
+    new = tensor([[-4.0], [0.0], [1.0], [3.0], [6.0]])
+    student = Output(
+        torch.cat([teacher.logits, new], dim=1),
+        torch.cat([teacher.offsets, torch.zeros(5, 1, 3, dtype=torch.float64)], dim=1),
+        teacher.points,
+    )
+    expected = 0.0
+    for row, logit in zip(teacher.logits.tolist(), new[:, 0].tolist(), strict=True):
+        kept = sum(math.exp(z / 2) for z in sorted(row)[-4:])
+        expected += 4 * -math.log(kept / (kept + math.exp(logit / 2))) / 5
+    terms = spdd_loss(student, teacher, SpddOptions())
+    assert terms.prior.item() == pytest.approx(expected, rel=1e-10)
+    assert expected > 0.1
+
+    student.logits.requires_grad_()
+    spdd_loss(student, teacher, SpddOptions()).prior.backward()
+    gradient = student.logits.grad
+    assert gradient is not None
+    assert (gradient[:, 8] > 0).all()  # descent lowers the new centre on old rows
+
+
+def test_new_centres_without_mass_cost_nothing_more():
+    teacher, student = random_output(4, 6, 4), random_output(4, 6, 5)
+    before = spdd_loss(student, teacher, SpddOptions()).total.item()
+    for logit in (-1e4, -INF):
+        grown = Output(
+            torch.cat([student.logits, torch.full((4, 3), logit, dtype=torch.float64)], dim=1),
+            torch.cat([student.offsets, torch.ones(4, 3, 3, dtype=torch.float64)], dim=1),
+            student.points,
+        )
+        after = spdd_loss(grown, teacher, SpddOptions()).total.item()
+        assert after == pytest.approx(before, rel=1e-12)
+
+
+def test_logits_and_offsets_outside_the_active_set_are_free():
+    student, teacher = two_rows()
+    before = spdd_loss(student, teacher, SpddOptions())
+    outside = tensor([[0.0, 1.0, 0.0, 1.0], [1.0, 0.0, 1.0, 0.0]])
+    student.logits = student.logits + 100 * outside
+    student.offsets = student.offsets + 7 * outside[:, :, None]
+    after = spdd_loss(student, teacher, SpddOptions())
+    assert after.prior.item() == before.prior.item()
+    assert after.metric.item() == before.metric.item()
+
+
+def test_prior_is_invariant_to_a_common_shift_of_all_logits():
+    teacher, student = random_output(4, 6, 6), random_output(4, 8, 7)
+    before = spdd_loss(student, teacher, SpddOptions()).prior.item()
+    student.logits = student.logits + 11.0
+    assert spdd_loss(student, teacher, SpddOptions()).prior.item() == pytest.approx(before)
+
+
+def test_temperature_scales_logits_and_the_term():
+    teacher, student = random_output(4, 6, 8), random_output(4, 6, 9)
+    cold = spdd_loss(student, teacher, SpddOptions(temperature=1.0)).prior.item()
+    student.logits, teacher.logits = 3 * student.logits, 3 * teacher.logits
+    hot = spdd_loss(student, teacher, SpddOptions(temperature=3.0)).prior.item()
+    assert hot == pytest.approx(9 * cold, rel=1e-12)
+
+
+def test_a_hot_softmax_becomes_a_squared_difference():
+    """For tau -> infinity, tau^2 KL -> half the variance of the logit gaps over A."""
+    teacher, student = random_output(1, 6, 10), random_output(1, 6, 11)
+    best = teacher.logits[0].topk(3).indices
+    gap = (teacher.logits - student.logits)[0, best]
+    limit = 0.5 * gap.var(correction=0).item()
+    found = spdd_loss(student, teacher, SpddOptions(temperature=1e4)).prior.item()
+    assert found == pytest.approx(limit, rel=1e-2)
+
+
+def test_shared_offsets():
+    student, teacher = two_rows()
+    teacher.offsets = tensor([[[0.0, 1.0, 2.0]], [[3.0, 3.0, 3.0]]])
+    student.offsets = tensor([[[0.5, 1.0, 0.0]], [[3.0, 2.0, 3.0]]])
+    terms = spdd_loss(student, teacher, SpddOptions())
+    assert terms.metric.item() == pytest.approx((2.5 + 1.0) / 2)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("new", [0, 2])
+def test_gradients(new, shared):
+    teacher, start = random_output(3, 6, 12, shared), random_output(3, 6 + new, 13, shared)
+
+    def total(logits, offsets, points):
+        return spdd_loss(Output(logits, offsets, points), teacher, SpddOptions(1, 2, 3)).total
+
+    leaves = [x.requires_grad_() for x in (start.logits, start.offsets, start.points)]
+    assert torch.autograd.gradcheck(total, leaves)
+
+
+def test_teacher_gets_no_gradient():
+    teacher, student = random_output(3, 6, 14), random_output(3, 6, 15)
+    leaves = [teacher.logits, teacher.offsets, teacher.points]
+    for leaf in [*leaves, student.logits]:
+        leaf.requires_grad_()
+    spdd_loss(student, teacher, SpddOptions()).total.backward()
+    assert all(leaf.grad is None for leaf in leaves)
+    assert student.logits.grad is not None
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("temperature", [0.1, 2.0])
+def test_masked_centres_give_neither_nan_nor_infinity(dtype, temperature):
+    """Row 0 masks one active centre in the student, row 1 all but one, row 2 all of them."""
+    teacher, student = random_output(3, 6, 16), random_output(3, 8, 17)
+    student.logits[0, teacher.logits[0].argmax()] = -INF
+    teacher.logits[1] = tensor([-INF, -INF, 1.0, -INF, -INF, -INF])
+    teacher.logits[2] = -INF
+    student.logits[:, 7] = -INF
+    for output in (student, teacher):
+        output.logits, output.offsets, output.points = (
+            x.to(dtype) for x in (output.logits, output.offsets, output.points)
+        )
+    leaves = [x.requires_grad_() for x in (student.logits, student.offsets, student.points)]
+    terms = spdd_loss(student, teacher, SpddOptions(temperature=temperature))
+    terms.total.backward()
+    assert math.isfinite(terms.total.item())
+    for leaf in leaves:
+        assert leaf.grad is not None
+        assert leaf.grad.isfinite().all()
+    assert student.offsets.grad is not None
+    assert student.offsets.grad[1].abs().sum(dim=1).nonzero().flatten().tolist() == [2]
+    assert (student.offsets.grad[2] == 0).all()
+
+
+@pytest.mark.parametrize("who", ["teacher", "student", "both"])
+def test_masking_a_centre_equals_leaving_it_out(who):
+    teacher, student = random_output(3, 7, 18), random_output(3, 9, 19)
+    teacher.logits[:, 4] = 20.0  # would be the most active one
+    keep = [k for k in range(9) if k != 4]
+    without = spdd_loss(
+        Output(student.logits[:, keep], student.offsets[:, keep], student.points),
+        Output(teacher.logits[:, keep[:6]], teacher.offsets[:, keep[:6]], teacher.points),
+        SpddOptions(),
+    )
+    if who != "student":
+        teacher.logits[:, 4] = -INF
+    if who != "teacher":
+        student.logits[:, 4] = -INF
+    masked = spdd_loss(student, teacher, SpddOptions())
+    assert masked.total.item() == pytest.approx(without.total.item(), rel=1e-12)
+
+
+def test_the_only_centre_that_both_know_takes_all_probability():
+    teacher, student = random_output(1, 6, 25), random_output(1, 6, 26)
+    teacher.logits[0] = tensor([-INF, -INF, 1.0, -INF, -INF, -INF])
+    assert spdd_loss(student, teacher, SpddOptions()).prior.item() == 0.0
+
+
+def test_a_diverged_student_is_not_hidden():
+    teacher, student = random_output(3, 6, 20), random_output(3, 6, 21)
+    student.logits[1] = math.nan
+    assert math.isnan(spdd_loss(student, teacher, SpddOptions()).total.item())
+
+
+@pytest.mark.parametrize("centres", [1, 2, 3])
+def test_one_centre_stays_active(centres):
+    teacher, student = random_output(3, centres, 22), random_output(3, centres, 23)
+    terms = spdd_loss(student, teacher, SpddOptions())
+    assert terms.prior.item() == 0.0
+    assert terms.metric.item() == pytest.approx(slow_terms(student, teacher, 50, 2.0)[1])
+
+
+def test_no_rows_cost_nothing():
+    empty = random_output(0, 6, 24)
+    assert spdd_loss(empty, empty, SpddOptions()).total.item() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("student", "teacher", "message"),
+    [
+        (random_output(3, 5, 0), random_output(3, 6, 0), "centres are only added"),
+        (random_output(2, 6, 0), random_output(3, 6, 0), "2 rows"),
+        (random_output(3, 6, 0, shared=True), random_output(3, 6, 0), "offsets"),
+    ],
+)
+def test_misuse_is_refused(student, teacher, message):
+    with pytest.raises(ValueError, match=message):
+        spdd_loss(student, teacher, SpddOptions())
+
+
+def test_options_are_checked():
+    with pytest.raises(ValueError, match="temperature"):
+        SpddOptions(temperature=0.0)
+    with pytest.raises(ValueError, match="active_centres"):
+        SpddOptions(active_centres=0)
+    with pytest.raises(ValueError, match="prior_weight"):
+        SpddOptions(prior_weight=-1.0)

@@ -1,0 +1,111 @@
+"""What selectors see of frames: means over the right rows, parts that overlap, true gradients."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from evercal.continual.frame_statistics import PARTS, FrameStatistics
+from evercal.continual.learn import Stage, StageOptions, learn
+from evercal.geometry import SE3
+from evercal.networks.buffer import FeatureBuffer, encode_frames
+from evercal.networks.head import Head, HeadOptions
+from evercal.networks.loss import LossOptions, reprojection_loss
+
+from .stages import Blank, Rooms
+
+
+@pytest.fixture(scope="module")
+def seen(
+    blank: Blank, rooms: Rooms, quick: StageOptions
+) -> tuple[FrameStatistics, Head, FeatureBuffer]:
+    """Frames of `alpha` after some learning, with two views of each in the buffer."""
+    options = replace(quick, fit=replace(quick.fit, iterations=60))
+    *_, stage = learn(blank("finetune"), rooms[0], options)
+    assert isinstance(stage, Stage)
+    maps = stage.maps
+    buffer = FeatureBuffer(0, maps.scenes[0].cell.atlas_from_base)
+    list(encode_frames(buffer, rooms[0].train, quick.encode, maps.encoder, maps.descriptor))
+    head = maps.heads[0].eval()
+    return FrameStatistics(rooms[0].train, head, lambda: buffer, 5), head, buffer
+
+
+def test_features_are_means_over_a_frame(seen: tuple[FrameStatistics, Head, FeatureBuffer]) -> None:
+    candidates, head, buffer = seen
+    found = candidates.features()
+    assert found.shape == (len(candidates), head.options.width) == (30, 16)
+    for frame in (0, 7, 29):
+        where = torch.nonzero(buffer.tensors["view"] == frame)[:, 0]
+        rows = buffer.rows(where)
+        with torch.no_grad():
+            mean = head.hidden(rows.features.float(), 0, rows.descriptor).mean(0)
+        np.testing.assert_allclose(found[frame], mean.numpy(), rtol=1e-5, atol=1e-6)
+
+
+def test_parts_are_shared_by_neighbours(
+    seen: tuple[FrameStatistics, Head, FeatureBuffer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    candidates, _, _ = seen
+    monkeypatch.setattr("evercal.continual.frame_statistics.RELIABLE_PX", 1e3)
+    monkeypatch.setattr("evercal.continual.frame_statistics.PARTS", 40)
+    parts = candidates.visible_parts()
+    assert len(parts) == 30
+    assert all((np.diff(found) > 0).all() and found.min() >= 0 for found in parts)
+    assert max(found.max() for found in parts) < 40 < PARTS
+
+    def overlap(a: np.ndarray, b: np.ndarray) -> float:
+        return len(np.intersect1d(a, b)) / len(np.union1d(a, b))
+
+    near = np.mean([overlap(parts[i], parts[i + 1]) for i in range(29)])
+    far = np.mean([overlap(parts[i], parts[i + 20]) for i in range(10)])
+    assert near > far
+
+
+def test_a_gradient_says_how_the_loss_falls(
+    seen: tuple[FrameStatistics, Head, FeatureBuffer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A small step against a frame's gradient lowers the loss by its squared length."""
+    candidates, head, buffer = seen
+    gradient = candidates.gradients()[3]
+    where = torch.nonzero(buffer.tensors["view"] == 3)[:, 0]
+    generator = torch.Generator().manual_seed(5)
+    each = [torch.nonzero(buffer.tensors["view"] == i)[:, 0] for i in range(4)]
+    draws = [torch.randint(int(w[0]), int(w[-1]) + 1, (256,), generator=generator) for w in each]
+    drawn = draws[3]
+    assert set(drawn.tolist()) <= set(where.tolist())
+    rows = buffer.rows(drawn)
+
+    def loss() -> float:
+        with torch.no_grad():
+            points = head(rows.features.float(), 0, rows.descriptor).points
+            return float(reprojection_loss(points, rows.target, 5.0, LossOptions())[0].mean())
+
+    before, kept = loss(), head.logit.detach().clone()
+    part = torch.from_numpy(gradient[: head.logit.numel()]).float().view_as(head.logit)
+    step = 1e-3 / float(part.norm())
+    with torch.no_grad():
+        head.logit.sub_(step * part)
+    after = loss()
+    with torch.no_grad():
+        head.logit.copy_(kept)
+    assert before - after == pytest.approx(step * float(part.norm()) ** 2, rel=0.1)
+
+
+def test_poses_are_those_of_the_frames_and_draws_repeat(rooms: Rooms) -> None:
+    frames = rooms[1].train
+
+    def never() -> FeatureBuffer:
+        raise AssertionError("poses need no features")
+
+    candidates = FrameStatistics(frames, Head(4, 4, HeadOptions()), never, 9)
+    poses = SE3(candidates.quaternions_wxyz, candidates.positions_m)
+    for i in (0, 11):
+        pose = frames[i].base_from_camera
+        assert pose is not None
+        np.testing.assert_allclose(poses[i].matrix(), pose.matrix(), atol=1e-12)
+    assert candidates.rng().random() == candidates.rng().random()
+    assert (
+        FrameStatistics(frames, Head(4, 4, HeadOptions()), never, 8).rng().random()
+        != candidates.rng().random()
+    )

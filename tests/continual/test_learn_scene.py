@@ -1,0 +1,409 @@
+"""`learn_scene`: what is held out, what is believed, what is refused, and going on after a kill."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from evercal.continual import learn as learn_module
+from evercal.continual import learn_scene as teach
+from evercal.continual.learn import Checkpoint, Encoding, StageOptions
+from evercal.continual.learn_scene import LearnOptions, LearnReport, learn_scene, validation_split
+from evercal.datasets import generic
+from evercal.datasets.frame import Frame, Scene
+from evercal.errors import InputError
+from evercal.geometry.se3 import SE3
+from evercal.localization.estimate import PoseEstimate
+from evercal.localization.localizer import Localizer
+from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.store import Store, head_bytes
+from evercal.networks.trainer import Progress
+from evercal.simulation.box_room import BoxRoom, default_camera
+
+Rooms = tuple[Scene, Scene, Scene]
+Tree = Callable[[Path], dict[str, str]]
+
+
+STRANGERS = teach._negative_images
+
+
+def noise(maps: SceneMaps, *rest: object) -> list[np.ndarray]:
+    """Quick strangers, in place of four rooms that must be made first."""
+    rng = np.random.default_rng(0)
+    return [rng.integers(0, 256, (48, 64, 3)).astype(np.uint8) for _ in range(4)]
+
+
+@pytest.fixture(scope="module")
+def options(quick: StageOptions) -> Iterator[LearnOptions]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(teach, "_strangers", noise)
+        yield LearnOptions(stage=quick, short_side=48)
+
+
+@dataclass
+class Taught:
+    """A store after two scenes."""
+
+    root: Path
+    reports: list[LearnReport]
+    events: list[object]
+
+
+@pytest.fixture(scope="module")
+def taught(options: LearnOptions, rooms: Rooms, tmp_path_factory: pytest.TempPathFactory) -> Taught:
+    root, events = tmp_path_factory.mktemp("taught") / "store", []
+    reports = [learn_scene(root, room, options, events.append) for room in rooms[:2]]
+    return Taught(root, reports, events)
+
+
+@pytest.fixture
+def learned(tree: Tree) -> Tree:
+    """Lists a store without what tells of the time that was needed."""
+    timed = ("manifest.json", "report.json")
+    return lambda root: {k: sha for k, sha in tree(root).items() if not k.endswith(timed)}
+
+
+@pytest.mark.parametrize("count", [16, 17, 30, 99, 100, 101, 250, 1000])
+def test_held_out_frames_are_blocks_of_four(count: int, rooms: Rooms) -> None:
+    some = rooms[0].train[0]
+    frames = [replace(some, name=f"{i:06d}") for i in range(count)]
+    kept, aside = validation_split(frames)
+    assert sorted([*kept, *aside], key=lambda f: f.name) == frames
+    numbers = [int(frame.name) for frame in aside]
+    assert numbers == sorted(numbers)
+    assert [f.name for f in kept] == sorted(f.name for f in kept)
+    assert len(numbers) >= 4
+    starts = [n for n in numbers if n - 1 not in numbers]
+    for start in starts:
+        assert [n in numbers for n in range(start, start + 5)] == [True] * 4 + [False]
+    # A block lies between learned frames, so that its views are new but the place is known.
+    assert 0 not in numbers
+    assert count - 1 not in numbers
+
+
+@pytest.mark.parametrize("count", [16, 30, 100, 150, 300, 1000])
+def test_held_out_frames_are_four_in_a_hundred(count: int, rooms: Rooms) -> None:
+    _, aside = validation_split([rooms[0].train[0]] * count)
+    assert len(aside) == 4 * max(1, (count + 49) // 100)
+
+
+@dataclass
+class Answer:
+    """What the fake localizer says of an image."""
+
+    ratio: float
+    truth: SE3 | None = None
+    estimate: SE3 | None = None
+    covariance: np.ndarray | None = None
+
+
+def fit(
+    monkeypatch: pytest.MonkeyPatch,
+    blank: Callable[[str], SceneMaps],
+    positives: Sequence[Answer],
+    negatives: Sequence[float],
+) -> tuple[float, float]:
+    """`fit_threshold` with given answers to the held-out frames and to the strangers."""
+    said = [*positives, *(Answer(ratio) for ratio in negatives)]
+
+    class Fake:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def localize(self, image: np.ndarray, camera: object = None) -> PoseEstimate:
+            number = int(image.ravel()[0]) + 256 * int(image.ravel()[1])
+            a = said[number]
+            status = "failed" if a.estimate is None else "ok"
+            return PoseEstimate(status, "", "x", a.estimate, a.covariance, 9, a.ratio, 1.0)
+
+    def image(number: int) -> np.ndarray:
+        return np.array([[[number % 256, number // 256, 0]]], np.uint8)
+
+    camera = default_camera(1, 1)
+    frames = [Frame(str(i), image(i), camera, a.truth) for i, a in enumerate(positives)]
+    strangers = [image(i) for i in range(len(positives), len(said))]
+    with monkeypatch.context() as patch:
+        patch.setattr(teach, "Localizer", Fake)
+        patch.setattr(teach, "_strangers", lambda *_: strangers)
+        return teach.fit_threshold(blank("evercal"), frames)
+
+
+def test_the_threshold_lies_a_sixth_of_the_way_up(
+    monkeypatch: pytest.MonkeyPatch, blank: Callable[[str], SceneMaps]
+) -> None:
+    # 41 values in equal steps: the 5 % and 95 % quantiles are the 3rd and the 39th.
+    positives = [Answer(0.5 + 0.01 * i) for i in range(41)]
+    negatives = [0.001 * i for i in range(41)]
+    threshold, _ = fit(monkeypatch, blank, positives[::-1], negatives)
+    top, low = 0.038, 0.52
+    assert threshold == pytest.approx(top + (low - top) / 6)
+    assert max(negatives) < threshold < min(a.ratio for a in positives)
+
+
+def test_strangers_are_not_believed_even_if_known_views_are_no_better(
+    monkeypatch: pytest.MonkeyPatch, blank: Callable[[str], SceneMaps]
+) -> None:
+    threshold, _ = fit(monkeypatch, blank, [Answer(0.05)] * 8, [0.1] * 16)
+    assert threshold == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(1.0, 1.0), (3.0, 9.0), (0.2, 1.0)])
+def test_the_scale_turns_claimed_covariance_into_found_errors(
+    factor: float,
+    expected: float,
+    monkeypatch: pytest.MonkeyPatch,
+    blank: Callable[[str], SceneMaps],
+) -> None:
+    rng = np.random.default_rng(0)
+    positives = []
+    for _ in range(600):
+        truth = SE3.exp(rng.normal(0, 1, 6))
+        root = rng.normal(0, 1, (6, 6)) * np.array([[0.002] * 3 + [0.001] * 3]).T
+        error = factor * root @ rng.normal(0, 1, 6)
+        # As documented: translation in the base frame, rotation about the camera's axes.
+        turned = truth @ SE3.exp(np.array([0, 0, 0, *error[3:]]))
+        estimate = SE3(turned.rotation_wxyz, truth.translation_m + error[:3])
+        positives.append(Answer(0.5, truth, estimate, root @ root.T))
+    for i in range(0, 600, 4):  # poses that are plainly wrong say nothing about precision
+        truth = positives[i].truth
+        assert truth is not None
+        positives[i].estimate = SE3.exp(np.array([2.0, 0, 0, 1, 0, 0])) @ truth
+    _, scale = fit(monkeypatch, blank, positives, [0.0])
+    assert scale == pytest.approx(expected, rel=0.15)
+
+
+def test_unknown_places_are_told_from_known_ones(
+    arc_maps: tuple[SceneMaps, SceneMaps],
+    arcs: tuple[Scene, Scene],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(teach, "_strangers", STRANGERS)
+    maps = replace(arc_maps[0], scenes=list(arc_maps[0].scenes))
+    fitted = teach.fit_threshold(maps, arcs[0].test[:8])
+    maps.scenes[0] = teach.with_fit(maps.scenes[0], *fitted)
+    localizer, camera = Localizer(maps), default_camera(160, 120)
+    right = [localizer.localize(frame.read_image()).status for frame in arcs[0].test[8:]]
+    assert right.count("ok") >= 0.9 * len(right)
+    room = BoxRoom(77, texture_px=96)
+    views = [room.render(camera, room.random_view(np.random.default_rng(i))) for i in range(10)]
+    views.append(np.random.default_rng(0).integers(0, 256, (120, 160, 3)).astype(np.uint8))
+    wrong = [localizer.localize(view).status for view in views]
+    assert wrong.count("ok") <= 1
+
+
+def test_a_report_says_what_is_in_the_store(taught: Taught) -> None:
+    store = Store.open(taught.root)
+    maps = store.maps
+    assert [record.name for record in maps.scenes] == ["alpha", "beta"]
+    for i, report in enumerate(taught.reports):
+        path = taught.root / "stages" / store.stages[i] / "report.json"
+        assert json.loads(path.read_text()) == asdict(report)
+        memory = maps.keyframes[i]
+        assert memory is not None
+        assert report.scene == maps.scenes[i].name
+        assert report.frames_kept == len(memory.images)
+        assert report.train_frames == maps.scenes[i].train_frames
+        assert report.train_frames + report.held_out_frames == 30
+        assert report.frames_kept <= 0.1 * 30
+        assert report.iterations == 8
+        assert report.inlier_threshold == maps.scenes[i].inlier_threshold
+        assert not report.resumed
+        assert 0 < report.seconds < 600
+    last = taught.reports[-1]
+    assert last.memory_bytes == sum(m.bytes for m in maps.keyframes if m is not None)
+    assert taught.reports[0].memory_bytes < last.memory_bytes
+    assert last.head_bytes == head_bytes(maps.heads[0])
+    kinds = {type(event) for event in taught.events}
+    assert kinds == {Encoding, Checkpoint, Progress}
+    assert not (taught.root / "learning").exists()
+
+
+def test_what_cannot_be_learned_is_refused_and_nothing_happens(
+    taught: Taught, rooms: Rooms, options: LearnOptions, tmp_path: Path, tree: Tree
+) -> None:
+    before = tree(taught.root)
+    with pytest.raises(InputError, match=r"'alpha'.*--name"):
+        learn_scene(taught.root, replace(rooms[2], name="alpha"), options)
+    with pytest.raises(InputError, match=r"'finetune'.*'evercal'"):
+        learn_scene(taught.root, rooms[2], replace(options, strategy="finetune"))
+    with pytest.raises(InputError, match="'gamma': 15 training frames"):
+        learn_scene(taught.root, replace(rooms[2], train=rooms[2].train[:15]), options)
+    assert tree(taught.root) == before
+    with pytest.raises(InputError, match="15 training frames"):
+        learn_scene(tmp_path / "new", replace(rooms[2], train=rooms[2].train[:15]), options)
+    with pytest.raises(InputError, match="'magic'"):
+        learn_scene(tmp_path / "new", rooms[2], replace(options, strategy="magic"))
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "thesis.tex").write_text("x")
+    with pytest.raises(InputError, match="not an evercal store"):
+        learn_scene(tmp_path, rooms[2], options)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_joint_store_says_that_it_cannot_go_on_alone(
+    rooms: Rooms, options: LearnOptions, tmp_path: Path, tree: Tree
+) -> None:
+    joint = replace(options, strategy="joint")
+    learn_scene(tmp_path / "store", rooms[0], joint)
+    before = tree(tmp_path / "store")
+    with pytest.raises(InputError, match="joint"):
+        learn_scene(tmp_path / "store", rooms[1], joint)
+    assert tree(tmp_path / "store") == before
+
+
+class Stop(Exception):
+    """Thrown into a run to end it."""
+
+
+def stop_at(kind: str, number: int) -> Callable[[object], None]:
+    """Ends the run at the n-th checkpoint of rows or of the training."""
+    count = [0]
+
+    def watch(event: object) -> None:
+        if isinstance(event, Checkpoint) and getattr(event, kind):
+            count[0] += 1
+            if count[0] == number:
+                raise Stop
+
+    return watch
+
+
+@pytest.mark.parametrize(("kind", "number"), [("rows", 1), ("rows", 3), ("fitter", 5)])
+def test_an_interrupted_scene_goes_on_where_it_stopped(
+    kind: str,
+    number: int,
+    taught: Taught,
+    rooms: Rooms,
+    options: LearnOptions,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    learned: Tree,
+) -> None:
+    monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
+    store = tmp_path / "store"
+    for room in rooms[:2]:  # the first scene of a store and a later one
+        with pytest.raises(Stop):
+            learn_scene(store, room, options, stop_at(kind, number))
+        events: list[object] = []
+        assert learn_scene(store, room, options, events.append).resumed
+        steps = [event.step for event in events if isinstance(event, Progress)]
+        assert steps[0] == (number + 1 if kind == "fitter" else 1)
+    assert learned(store) == learned(taught.root)
+
+
+def test_a_second_learner_is_kept_out(
+    taught: Taught, rooms: Rooms, options: LearnOptions, tmp_path: Path, learned: Tree
+) -> None:
+    store, meanwhile = tmp_path / "store", []
+
+    def intrude(event: object) -> None:
+        if not meanwhile:
+            with pytest.raises(InputError, match="another process is learning into it") as refusal:
+                learn_scene(store, rooms[1], options)
+            meanwhile.append(str(refusal.value))
+
+    learn_scene(store, rooms[0], options, intrude)
+    assert len(meanwhile) == 1
+    learn_scene(store, rooms[1], options)  # later it may
+    assert learned(store) == learned(taught.root)
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+
+
+def test_another_lesson_does_not_resume(
+    taught: Taught,
+    rooms: Rooms,
+    options: LearnOptions,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    learned: Tree,
+) -> None:
+    monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
+    store = tmp_path / "store"
+    alpha = rooms[0]
+    moved = SE3.exp(np.array([0.01, 0, 0, 0, 0, 0]))
+    first = alpha.train[0]
+    assert first.base_from_camera is not None
+    shaken = replace(first, base_from_camera=moved @ first.base_from_camera)
+    others = {
+        "name": (replace(alpha, name="other"), options),
+        "pose": (replace(alpha, train=(shaken, *alpha.train[1:])), options),
+        "seed": (alpha, replace(options, stage=replace(options.stage, seed=3))),
+    }
+    for train_split, asked in others.values():
+        with pytest.raises(Stop):
+            learn_scene(store, train_split, asked, stop_at("fitter", 2))
+        with pytest.raises(Stop):
+            learn_scene(store, alpha, options, stop_at("rows", 1))
+    assert learn_scene(store, alpha, options).resumed  # its own
+    learn_scene(store, rooms[1], options)
+    assert learned(store) == learned(taught.root)
+
+
+CHILD = """
+import json, sys, time
+from pathlib import Path
+from evercal.continual import learn
+from evercal.continual.learn import StageOptions
+from evercal.datasets import generic
+from evercal.continual.learn_scene import LearnOptions, learn_scene
+from evercal.networks.head import HeadOptions
+from evercal.networks.buffer import FillPlan
+from evercal.networks.trainer import FitOptions, Progress
+from evercal.features.views import ViewOptions
+learn.CHECKPOINT_SECONDS = 0.0
+stage = StageOptions(
+    head=HeadOptions(width=16, centres_per_scene=3),
+    fit=FitOptions(iterations=8, batch=64, replay_batch=32),
+    encode=FillPlan(passes=2, cells=24, view=ViewOptions(short_side=48)),
+    replay_passes=2,
+)
+def linger(event):
+    if isinstance(event, Progress) and event.step == 6:
+        print("now", flush=True)
+        time.sleep(600)
+scene = generic.load(Path(sys.argv[2]))
+learn_scene(Path(sys.argv[1]), scene, LearnOptions(stage=stage, short_side=48), linger)
+"""
+
+
+def test_kill_nine(
+    taught: Taught, rooms: Rooms, options: LearnOptions, tmp_path: Path, tree: Tree
+) -> None:
+    generic.write(tmp_path / "beta", rooms[1])
+    beta, store = generic.load(tmp_path / "beta"), tmp_path / "store"
+    learn_scene(store, rooms[0], options)
+    image = rooms[0].train[0].read_image()
+    before, expected = tree(store), Localizer.open(store).localize(image)
+    command = [sys.executable, "-c", CHILD, str(store), str(tmp_path / "beta")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "now\n"
+        child.send_signal(signal.SIGKILL)
+        assert child.wait(60) == -signal.SIGKILL
+    # What was there is there, and says the same.
+    now = tree(store)
+    assert {name: now.get(name) for name in before} == before
+    assert all(name.startswith("learning/") for name in now.keys() - before.keys())
+    found = Localizer.open(store)
+    assert found.scenes == ("alpha",)
+    again = found.localize(image)
+    assert (again.status, again.inliers) == (expected.status, expected.inliers)
+    # And it goes on after the fifth step, to the same end.
+    steps: list[int] = []
+    report = learn_scene(
+        store, beta, options, lambda e: steps.append(e.step) if isinstance(e, Progress) else None
+    )
+    assert report.resumed
+    assert steps == [6, 7, 8]
+    maps, whole = Store.open(store).maps, Store.open(taught.root).maps
+    for name, value in maps.heads[0].state_dict().items():
+        torch.testing.assert_close(value, whole.heads[0].state_dict()[name], rtol=0, atol=2e-3)

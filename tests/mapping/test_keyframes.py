@@ -1,0 +1,97 @@
+"""What is remembered comes back: images nearly, poses and cameras exactly."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from safetensors.torch import load, save
+
+from evercal.datasets.frame import Frame, Scene
+from evercal.features.views import working_image
+from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3
+from evercal.mapping.keyframes import Keyframes, store_keyframes
+
+DISTORTIONS = ((), (0.1, -0.05, 0.001, 0.002), (0.1, -0.05, 0.001, 0.002, 0.01),
+               (0.1, -0.05, 0.001, 0.002, 0.01, 0.02, -0.03, 0.004))  # fmt: skip
+
+
+def through_a_file(memory: Keyframes) -> Keyframes:
+    return Keyframes.from_tensors(load(save(memory.to_tensors())))
+
+
+def test_images_come_back_nearly(rooms: tuple[Scene, ...]) -> None:
+    frames = rooms[0].train[:5]
+    back = store_keyframes(frames, 48).frames()
+    assert len(back) == 5
+    for frame, seen in zip(frames, back, strict=True):
+        grey, _ = working_image(frame.read_image(), frame.camera, 48)
+        image = seen.read_image()
+        assert image.dtype == np.uint8
+        assert (image == image[..., :1]).all()
+        error = image[..., 0].astype(float) - grey
+        assert np.abs(error).mean() < 3.0
+        assert np.abs(error).mean() < 0.1 * grey.std()  # and not another picture
+
+
+def test_poses_and_cameras_come_back_exactly() -> None:
+    rng = np.random.default_rng(0)
+    frames = []
+    for i, distortion in enumerate(DISTORTIONS):
+        width, height = [(64, 48), (48, 64), (101, 77), (640, 480)][i]
+        camera = Camera(width, height, 71.3 + i, 70.1, width / 2.1, height / 1.9, distortion)
+        pose = SE3.exp(rng.normal(size=6))
+        frames.append(Frame(str(i), np.zeros((height, width, 3), np.uint8), camera, pose))
+    memory = store_keyframes(frames, 48)
+    for again in (memory, through_a_file(memory)):
+        assert again.images == memory.images
+        for frame, seen in zip(frames, again.frames(), strict=True):
+            assert seen.camera == frame.camera.short_side_resized(48)
+            assert min(seen.read_image().shape[:2]) == 48
+            assert seen.base_from_camera is not None
+            assert frame.base_from_camera is not None
+            for name in ("rotation_wxyz", "translation_m"):
+                np.testing.assert_allclose(
+                    getattr(seen.base_from_camera, name),
+                    getattr(frame.base_from_camera, name),
+                    rtol=0,
+                    atol=1e-15,
+                )
+
+
+def test_every_byte_is_counted(rooms: tuple[Scene, ...]) -> None:
+    for count in (1, 4):
+        memory = store_keyframes(rooms[1].train[:count], 48)
+        tensors = memory.to_tensors()
+        assert memory.bytes == sum(tensor.nbytes for tensor in tensors.values())
+        assert memory.bytes > sum(map(len, memory.images))
+        # The file adds only a header.
+        assert memory.bytes < len(save(tensors)) < memory.bytes + 1000
+
+
+def test_a_remembered_frame_can_be_remembered_again(rooms: tuple[Scene, ...]) -> None:
+    once = store_keyframes(rooms[2].train[:3], 48)
+    twice = store_keyframes(once.frames(), 48)
+    assert twice.cameras == once.cameras
+    for a, b in zip(once.frames(), twice.frames(), strict=True):
+        difference = a.read_image().astype(float) - b.read_image()
+        assert np.abs(difference).mean() < 1.0
+
+
+@pytest.mark.parametrize("size", [(640, 480), (480, 640)])
+def test_large_images_are_kept_at_working_size(size: tuple[int, int]) -> None:
+    width, height = size
+    ramp = np.linspace(0, 255, width)[None, :, None]
+    image = np.broadcast_to(ramp, (height, width, 3)).astype(np.uint8)
+    camera = Camera(width, height, 500, 500, (width - 1) / 2, (height - 1) / 2)
+    frame = Frame("a", image, camera, SE3.identity())
+    memory = store_keyframes([frame], 120)
+    kept = memory.frames()[0]
+    assert kept.read_image().shape[:2] == (height // 4, width // 4)
+    assert kept.camera.fx == pytest.approx(125)
+    # A pixel keeps its viewing ray: column u of the small image shows column 4 u + 1.5.
+    columns = kept.read_image()[height // 8, :, 0].astype(float)
+    middle = np.arange(8, width // 4 - 8)
+    np.testing.assert_allclose(columns[middle], ramp[0, 4 * middle + 1, 0], atol=2.5)
+    small = replace(frame, image=kept.read_image(), camera=kept.camera)
+    assert store_keyframes([small], 120).bytes < store_keyframes([frame], 480).bytes / 4

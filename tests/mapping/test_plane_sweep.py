@@ -1,0 +1,101 @@
+"""Depths from other views, in a world of walls whose features are known in closed form."""
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional as F
+
+from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3
+from evercal.mapping.plane_sweep import (
+    PosedCells,
+    inverse_depths,
+    parabola,
+    peak,
+    select_source_views,
+)
+
+STRIDE = 8
+CAMERA = Camera(320, 240, 280.0, 280.0, 159.5, 119.5)
+LENS = Camera(320, 240, 280.0, 280.0, 159.5, 119.5, (-0.15, 0.02, 0.0, 0.0))
+
+
+def look_from(x: float, y: float = 0.0, turn_rad: float = 0.0) -> SE3:
+    """A camera beside the origin that looks along z, turned about its own y axis."""
+    return SE3.exp(np.array([x, y, 0, 0, 0, 0])) @ SE3.exp(np.array([0, 0, 0, 0, turn_rad, 0]))
+
+
+def true_depth(rays: np.ndarray, pose: SE3, wall_m: float, tilt: float) -> np.ndarray:
+    """Depth (n,) along the optical axis of the wall z = wall + tilt x."""
+    way = rays @ pose.rotation_matrix().T
+    eye = pose.translation_m
+    along = (wall_m + tilt * eye[0] - eye[2]) / (way[:, 2] - tilt * way[:, 0])
+    return along
+
+
+def cells(
+    pose: SE3, wall_m: float, camera: Camera = CAMERA, tilt: float = 0.0, seed: int = 0
+) -> PosedCells:
+    """A view of a wall whose features vary smoothly over it, with 15 cm from hill to hill."""
+    view = PosedCells(torch.zeros(0), camera, pose, STRIDE)
+    depth = true_depth(view.rays(), pose, wall_m, tilt)
+    points = pose.apply(view.rays() * depth[:, None])
+    rng = np.random.default_rng(seed)
+    waves = rng.normal(0, 2 * np.pi / 0.6, (2, 64))
+    features = np.cos(points[:, :2] @ waves + rng.uniform(0, 2 * np.pi, 64))
+    unit = F.normalize(torch.from_numpy(features).float(), dim=1)
+    return PosedCells(unit, camera, pose, STRIDE)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("tilt", [0.0, 0.3])
+def test_other_views_tell_the_depth(camera: Camera, tilt: float) -> None:
+    view = cells(look_from(0), 2.0, camera, tilt)
+    others = [cells(look_from(x, y), 2.0, camera, tilt) for x, y in ((0.3, 0), (-0.2, 0.2))]
+    truth = true_depth(view.rays(), view.base_from_camera, 2.0, tilt)
+    for off in (0.8, 1.0, 1.3):
+        found = 1 / inverse_depths(view, others, off * truth).numpy()
+        inner = truth.reshape(30, 40)[6:24, 8:32].ravel()
+        error = np.abs(found.reshape(30, 40)[6:24, 8:32].ravel() / inner - 1)
+        assert np.median(error) < 0.01
+        assert np.quantile(error, 0.9) < 0.03
+
+
+def test_views_of_another_wall_do_not_confirm_a_depth() -> None:
+    view = cells(look_from(0), 2.0)
+    strangers = [cells(look_from(0.3), 2.0, seed=5)]
+    found = 1 / inverse_depths(view, strangers, np.full(1200, 1.2)).numpy()
+    assert np.mean(np.abs(found / 2.0 - 1) < 0.02) < 0.2
+
+
+def test_without_other_views_the_guess_stands() -> None:
+    view = cells(look_from(0), 2.0)
+    guess = np.linspace(0.1, 20.0, 1200)
+    found = inverse_depths(view, [], guess)
+    np.testing.assert_allclose(1 / found.numpy(), np.clip(guess, 0.25, 12.0), rtol=1e-5)
+
+
+def test_good_views_see_the_same_from_the_side() -> None:
+    view = cells(look_from(0), 2.0)
+    near, side, wide = look_from(0.01), look_from(0.3), look_from(2.5)
+    away = look_from(0.3, turn_rad=np.pi)
+    beyond = look_from(0.3, turn_rad=np.deg2rad(75))
+    poses = SE3.stack([look_from(0), near, away, side, beyond, wide])
+    depth = np.full(1200, 2.0)
+    assert select_source_views(depth, view, poses, [CAMERA] * 6, 5) == [3]
+    # As many as asked for, the best first.
+    sides = SE3.stack([look_from(0.1), look_from(0.2), look_from(-0.25)])
+    assert len(select_source_views(depth, view, sides, [CAMERA] * 3, 2)) == 2
+
+
+def test_a_peak_is_found_between_cells() -> None:
+    row, column = np.mgrid[0:9, 0:12]
+    hill = 1 - 0.02 * ((row - 4.3) ** 2 + (column - 6.8) ** 2)
+    alike = torch.from_numpy(hill).float()[None]
+    for start in ((4, 6), (5, 7), (4, 7), (3, 6)):
+        where, value = peak(alike, torch.tensor([start[0]]), torch.tensor([start[1]]))
+        np.testing.assert_allclose(where[0].numpy(), [6.8, 4.3], atol=1e-3)
+        assert float(value) == pytest.approx(hill[4, 7], abs=1e-6)
+    # Never further than half a cell.
+    flat = parabola(torch.tensor([0.0]), torch.tensor([0.0]), torch.tensor([1.0]))
+    assert float(flat) == 0.5

@@ -1,0 +1,292 @@
+"""SARS against a slow twin written from Algorithm 1, and the metric against its formula."""
+
+import math
+import time
+
+import numpy as np
+import pytest
+
+from evercal.mapping.selection import (
+    PoseSpace,
+    SarsOptions,
+    covering_radius,
+    fill_radius,
+    select_farthest,
+    select_random,
+    select_sars,
+    select_uniform,
+    smallest_pair,
+)
+
+
+def slow_distance(pa, qa, pb, qb, side, weight):
+    """The paper's formula, one pair at a time."""
+    dot = min(1.0, abs(sum(a * b for a, b in zip(qa, qb, strict=True))))
+    return math.dist(pa, pb) / side + weight * 2.0 * math.acos(dot)
+
+
+def slow_sars(distance, capacity, radius):
+    """Algorithm 1, everything recomputed for every frame."""
+    buffer = []
+    for new in range(len(distance)):
+        if buffer and min(distance[new][j] for j in buffer) < radius:
+            continue
+        if len(buffer) >= capacity:
+            nearest = {
+                j: min((distance[j][k] for k in buffer if k != j), default=math.inf) for j in buffer
+            }
+            buffer.remove(min(sorted(buffer), key=nearest.__getitem__))  # first of equals: older
+        buffer.append(new)
+    return sorted(buffer)
+
+
+def random_walk(rng, n, step=0.05):
+    positions = np.cumsum(rng.normal(size=(n, 3)) * step, axis=0)
+    quaternions = np.cumsum(rng.normal(size=(n, 4)) * step, axis=0)
+    quaternions[:, 0] += 1.0
+    return positions, quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+
+
+def grid_walk(rng, n):
+    """Grid positions 1/4 apart in a box of side 1, four rotations: many ties and repeats."""
+    positions = rng.integers(0, 5, size=(n, 3)) / 4.0
+    positions[:2] = [[0, 0, 0], [1, 1, 1]]
+    angles = rng.integers(0, 4, size=n) * 0.25
+    zero = np.zeros(n)
+    quaternions = np.stack([np.cos(angles / 2), np.sin(angles / 2), zero, zero], axis=1)
+    return positions, quaternions * rng.choice([-1.0, 1.0], size=(n, 1))
+
+
+def metric_table(positions, quaternions, weight=1.0):
+    space = PoseSpace.of(positions, quaternions, weight)
+    return np.stack([space.distances(i) for i in range(len(space))])
+
+
+def test_metric_is_the_formula():
+    rng = np.random.default_rng(0)
+    positions, quaternions = rng.normal(size=(40, 3)), rng.normal(size=(40, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    side = max(positions.max(axis=0) - positions.min(axis=0))
+    table = metric_table(positions, 3.0 * quaternions, weight=0.7)  # length does not matter
+    for i in range(40):
+        for j in range(40):
+            slow = slow_distance(
+                positions[i], quaternions[i], positions[j], quaternions[j], side, 0.7
+            )
+            assert table[i, j] == pytest.approx(slow, abs=1e-7)
+    assert (table == table.T).all()
+
+
+def test_identical_rotations_are_exactly_zero_apart():
+    rng = np.random.default_rng(1)
+    quaternion = rng.normal(size=4)
+    quaternion /= np.linalg.norm(quaternion)
+    table = metric_table(np.zeros((3, 3)), np.stack([quaternion, -quaternion, quaternion]))
+    assert (table == 0.0).all()
+
+
+@pytest.mark.parametrize("angle", [1e-12, 1e-6, 0.1, 1.0, math.pi - 1e-6, math.pi, 4.0, 6.0])
+def test_angle_of_known_rotations(angle):
+    quaternions = np.array([[1, 0, 0, 0], [math.cos(angle / 2), 0, math.sin(angle / 2), 0]])
+    expected = min(angle, 2 * math.pi - angle)
+    table = metric_table(np.zeros((2, 3)), quaternions)
+    assert table[0, 1] == pytest.approx(expected, rel=1e-12, abs=1e-14)
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.02, 0.1, 0.3])
+@pytest.mark.parametrize("capacity", [1, 2, 30, 100, 400])
+@pytest.mark.parametrize("walk", [random_walk, grid_walk])
+def test_sars_equals_slow_twin(walk, capacity, radius):
+    positions, quaternions = walk(np.random.default_rng(2), 300)
+    kept = select_sars(positions, quaternions, capacity, SarsOptions(radius=radius))
+    table = metric_table(positions, quaternions).tolist()
+    assert kept.tolist() == slow_sars(table, capacity, radius)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sars_equals_slow_twin_when_the_camera_stops_and_returns(seed):
+    rng = np.random.default_rng(seed)
+    positions, quaternions = grid_walk(rng, 25)
+    visits = np.repeat(rng.integers(0, 25, size=60), 5)
+    positions, quaternions = positions[visits], quaternions[visits]
+    table = metric_table(positions, quaternions).tolist()
+    for capacity in (5, 20, 40):
+        kept = select_sars(positions, quaternions, capacity, SarsOptions(radius=0.0))
+        assert kept.tolist() == slow_sars(table, capacity, 0.0)
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.25, 0.5])
+def test_sars_equals_twin_with_the_formula_of_the_paper(radius):
+    """Nothing shared with the code: dyadic positions and one rotation make every tie exact."""
+    rng = np.random.default_rng(3)
+    positions, _ = grid_walk(rng, 300)
+    quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (300, 1))
+    table = [
+        [slow_distance(a, quaternions[0], b, quaternions[0], 1.0, 1.0) for b in positions.tolist()]
+        for a in positions.tolist()
+    ]
+    kept = select_sars(positions, quaternions, 40, SarsOptions(radius=radius))
+    assert kept.tolist() == slow_sars(table, 40, radius)
+
+
+def test_older_of_the_closest_pair_leaves():
+    positions = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.5, 0, 0], [1.0, 0, 0]])
+    quaternions = np.tile([1.0, 0, 0, 0], (4, 1))
+    kept = select_sars(positions, quaternions, 3, SarsOptions(radius=0.0))
+    assert kept.tolist() == [1, 2, 3]
+
+
+def test_distance_equal_to_radius_is_accepted_and_scale_does_not_matter():
+    positions = np.array([[0.0, 0, 0], [0.25, 0, 0], [0.5, 0, 0], [1.0, 0, 0]])
+    quaternions = np.tile([1.0, 0, 0, 0], (4, 1))
+    for scale in (1.0, 64.0):
+        assert select_sars(positions * scale, quaternions, 9).tolist() == [0, 2, 3]
+
+
+def test_kept_frames_are_a_radius_apart_and_cover_within_it_while_not_full():
+    positions, quaternions = random_walk(np.random.default_rng(4), 400)
+    kept = select_sars(positions, quaternions, 400, SarsOptions(radius=0.5))
+    table = metric_table(positions, quaternions)[np.ix_(kept, kept)]
+    assert 1 < len(kept) < 400
+    assert table[~np.eye(len(kept), dtype=bool)].min() >= 0.5
+    assert covering_radius(positions, quaternions, kept) < 0.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("capacity", [0, 1, 2, 37, 300, 500])
+def test_fill_keeps_exactly_the_capacity(seed, capacity):
+    positions, quaternions = random_walk(np.random.default_rng(seed), 300)
+    kept = select_sars(positions, quaternions, capacity, SarsOptions(fill=True))
+    assert len(kept) == len(set(kept.tolist())) == min(capacity, 300)
+
+
+@pytest.mark.parametrize("capacity", [2, 37, 299])
+def test_fill_radius_is_the_edge_of_its_bracket(capacity):
+    positions, quaternions = random_walk(np.random.default_rng(5), 300)
+    radius = fill_radius(positions, quaternions, capacity, tolerance=1e-6)
+    counts = [
+        len(select_sars(positions, quaternions, capacity, SarsOptions(radius=r)))
+        for r in (radius, radius + 1e-6)
+    ]
+    assert counts[0] == capacity > counts[1]
+
+
+def test_fill_radius_on_a_line_is_known():
+    """Eleven frames 0.1 apart, in order: three fit at r <= 0.5, four at r <= 0.3."""
+    positions = np.stack([np.arange(11.0), np.zeros(11), np.zeros(11)], axis=1)
+    quaternions = np.tile([1.0, 0, 0, 0], (11, 1))
+    assert fill_radius(positions, quaternions, 3) == pytest.approx(0.5, abs=1e-5)
+    assert fill_radius(positions, quaternions, 4) == pytest.approx(0.3, abs=1e-5)
+
+
+def test_fill_with_repeats_keeps_every_pose():
+    rng = np.random.default_rng(6)
+    positions, quaternions = random_walk(rng, 12)
+    visits = np.concatenate([np.arange(12), rng.integers(0, 12, size=288)])
+    positions, quaternions = positions[visits], quaternions[visits]
+    assert fill_radius(positions, quaternions, 30) == 0.0
+    kept = select_sars(positions, quaternions, 30, SarsOptions(fill=True))
+    assert len(kept) == 30
+    assert set(visits[kept]) == set(range(12))
+    assert covering_radius(positions, quaternions, kept) == 0.0
+
+
+def test_fill_covers_better_than_the_fixed_radius():
+    positions, quaternions = random_walk(np.random.default_rng(7), 1000, step=0.01)
+    fixed = select_sars(positions, quaternions, 100)
+    filled = select_sars(positions, quaternions, 100, SarsOptions(fill=True))
+    assert len(fixed) < 100 == len(filled)
+    assert covering_radius(positions, quaternions, filled) < 0.7 * covering_radius(
+        positions, quaternions, fixed
+    )
+
+
+def test_ten_thousand_poses_in_time():
+    positions, quaternions = random_walk(np.random.default_rng(8), 10_000, step=0.01)
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        assert len(select_sars(positions, quaternions, 1000, SarsOptions(radius=0.0))) == 1000
+        seconds.append(time.perf_counter() - start)
+    assert min(seconds) < 1.0
+
+
+def test_farthest_equals_slow_twin():
+    positions, quaternions = grid_walk(np.random.default_rng(9), 80)
+    table = metric_table(positions, quaternions).tolist()
+    chosen = [0]
+    while len(chosen) < 20:
+        rest = [i for i in range(80) if i not in chosen]
+        chosen.append(max(rest, key=lambda i: min(table[i][j] for j in chosen)))
+    assert select_farthest(positions, quaternions, 20).tolist() == sorted(chosen)
+
+
+def test_farthest_keeps_repeats_only_when_nothing_else_is_left():
+    positions, quaternions = np.zeros((5, 3)), np.tile([1.0, 0, 0, 0], (5, 1))
+    assert select_farthest(positions, quaternions, 9).tolist() == [0, 1, 2, 3, 4]
+
+
+def test_covering_radius_is_the_largest_gap():
+    positions, quaternions = random_walk(np.random.default_rng(10), 60)
+    table = metric_table(positions, quaternions)
+    kept = np.array([3, 20, 55])
+    slow = max(min(table[i, j] for j in kept) for i in range(60))
+    assert covering_radius(positions, quaternions, kept) == slow
+    assert covering_radius(positions, quaternions, kept[:0]) == math.inf
+    assert covering_radius(positions[:0], quaternions[:0], kept[:0]) == 0.0
+
+
+@pytest.mark.parametrize("capacity", [0, 1, 7, 10, 50, 80])
+def test_uniform_and_random_keep_the_capacity(capacity):
+    positions, quaternions = random_walk(np.random.default_rng(11), 50)
+    uniform = select_uniform(positions, quaternions, capacity)
+    drawn = select_random(positions, quaternions, capacity, np.random.default_rng(0))
+    again = select_random(positions, quaternions, capacity, np.random.default_rng(0))
+    for kept in (uniform, drawn):
+        assert len(kept) == min(capacity, 50)
+        assert (np.diff(kept) > 0).all()
+        assert ((kept >= 0) & (kept < 50)).all()
+    assert drawn.tolist() == again.tolist()
+    if 1 < capacity < 50:
+        assert np.ptp(np.diff(uniform)) <= 1
+
+
+def test_no_frames():
+    nothing = np.zeros((0, 3)), np.zeros((0, 4))
+    assert select_sars(*nothing, 5).size == 0
+    assert select_sars(*nothing, 5, SarsOptions(fill=True)).size == 0
+    assert select_uniform(*nothing, 5).size == 0
+    assert select_farthest(*nothing, 5).size == 0
+
+
+@pytest.mark.parametrize(
+    ("positions", "quaternions", "capacity", "message"),
+    [
+        (np.zeros((4, 2)), np.ones((4, 4)), 2, r"\(4, 2\)"),
+        (np.zeros((4, 3)), np.ones((3, 4)), 2, r"\(3, 4\)"),
+        (np.full((4, 3), np.nan), np.ones((4, 4)), 2, "pose 0"),
+        (np.zeros((4, 3)), np.zeros((4, 4)), 2, "zero quaternion"),
+        (np.zeros((4, 3)), np.ones((4, 4)), -1, "capacity is -1"),
+    ],
+)
+def test_misuse_is_refused(positions, quaternions, capacity, message):
+    with pytest.raises(ValueError, match=message):
+        select_sars(positions, quaternions, capacity)
+
+
+def test_options_are_checked():
+    with pytest.raises(ValueError, match="radius"):
+        SarsOptions(radius=-0.1)
+    with pytest.raises(ValueError, match="rotation_weight"):
+        SarsOptions(rotation_weight=math.nan)
+
+
+def test_the_smallest_pair_by_hand():
+    # A metre along x is the longest side; the second pair is 0.25 apart and turned by 0.1 rad.
+    positions = np.array([[0.0, 0, 0], [0.25, 0, 0], [1.0, 0, 0]])
+    turned = [math.cos(0.05), 0, 0, math.sin(0.05)]
+    quaternions = np.array([[1.0, 0, 0, 0], turned, [-1.0, 0, 0, 0]])
+    kept = np.array([0, 1, 2])
+    assert smallest_pair(positions, quaternions, kept) == pytest.approx(0.35)
+    assert smallest_pair(positions, quaternions, kept[[0, 2]]) == pytest.approx(1.0)
+    assert smallest_pair(positions, quaternions, kept[:1]) == math.inf

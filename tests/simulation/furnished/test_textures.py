@@ -1,0 +1,74 @@
+"""Procedural pictures: same seed, same pixels, and the statistics that they promise."""
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from evercal.simulation.furnished.textures import dead_leaves, one_over_f
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0, 2.0])
+def test_noise_has_mean_0_and_deviation_1(exponent: float) -> None:
+    noise = one_over_f(64, exponent, np.random.default_rng(0))
+    assert noise.shape == (64, 64)
+    assert noise.dtype == np.float32
+    assert abs(noise.mean()) < 1e-5
+    assert noise.std() == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0, 1.7])
+def test_amplitude_falls_as_one_over_f_to_the_exponent(exponent: float) -> None:
+    rng = np.random.default_rng(1)
+    power = np.mean([np.abs(np.fft.fft2(one_over_f(128, exponent, rng))) ** 2 for _ in range(8)], 0)
+    frequency = np.hypot(np.fft.fftfreq(128)[:, None], np.fft.fftfreq(128)[None])
+    band = (frequency > 0.03) & (frequency < 0.5)
+    slope, _ = np.polyfit(np.log(frequency[band]), 0.5 * np.log(power[band]), 1)
+    assert slope == pytest.approx(-exponent, abs=0.06)
+
+
+def test_noise_tiles() -> None:
+    """The step over the seam is no larger than the steps inside."""
+    noise = one_over_f(128, 1.8, np.random.default_rng(2))
+    inside = np.abs(np.diff(noise, axis=1)).mean()
+    seam = np.abs(noise[:, 0] - noise[:, -1]).mean()
+    assert seam < 2 * inside
+    assert np.abs(noise[:, 0] - noise[:, 64]).mean() > 4 * inside  # what no tiling looks like
+
+
+@pytest.mark.parametrize("size", [(40, 60), (60, 40), (96, 96)])
+def test_pictures_repeat_with_the_generator(size: tuple[int, int]) -> None:
+    first, again, other = (dead_leaves(*size, np.random.default_rng(seed)) for seed in (3, 3, 4))
+    assert first.shape == (*size, 3)
+    assert first.dtype == np.uint8
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).mean() > 0.5
+
+
+def test_a_picture_does_not_depend_on_those_drawn_before() -> None:
+    """What is kept between calls (the noise bank) must not remember anything."""
+    digest = hashlib.sha256(dead_leaves(48, 48, np.random.default_rng(5)).tobytes()).digest()
+    for seed in range(4):
+        dead_leaves(32, 48, np.random.default_rng(seed))
+    again = dead_leaves(48, 48, np.random.default_rng(5))
+    assert hashlib.sha256(again.tobytes()).digest() == digest
+
+
+def test_pictures_have_range_and_edges_and_differ_in_brightness() -> None:
+    pictures = [dead_leaves(128, 128, np.random.default_rng(seed)).mean(-1) for seed in range(12)]
+    contrast = [picture.std() for picture in pictures]
+    assert min(contrast) > 10
+    assert np.ptp([picture.mean() for picture in pictures]) > 30
+    # Shapes one over another: many small steps and some large ones, unlike noise.
+    steps = np.concatenate([np.abs(np.diff(picture, axis=1)).ravel() for picture in pictures])
+    assert np.median(steps) < 10
+    assert np.mean(steps > 40) > 0.01
+
+
+def test_few_leaves_give_a_calm_picture() -> None:
+    def edges(leaves: int) -> float:
+        rng = np.random.default_rng
+        pictures = [dead_leaves(96, 96, rng(seed), leaves).mean(-1) for seed in range(8)]
+        return float(np.mean([(np.abs(np.diff(p, axis=1)) > 30).mean() for p in pictures]))
+
+    assert edges(0) < edges(20) < edges(200)
