@@ -2,16 +2,8 @@
 
 import math
 
-import pytest
-
-from evercal.evaluation import (
-    SceneScores,
-    Scores,
-    continual_scores,
-    continual_table,
-    matrix_table,
-    score_table,
-)
+from evercal.benchmark.tables import score_table
+from evercal.evaluation import SceneScores, Scores
 
 
 def row(accuracy: float, median: float = 2.0, frames: int = 100) -> SceneScores:
@@ -45,20 +37,3 @@ def test_numbers_that_look_alike_are_left_alone() -> None:
     text = score_table(Scores({"007": row(90.0), "1e3": row(80.0)}, 85.0, 12.0))
     assert "007" in text
     assert "1e3" in text
-
-
-def test_methods_and_missing_numbers() -> None:
-    methods = {"ours": continual_scores([[90, 0], [80, 70]]), "one": continual_scores([[50]])}
-    lines = continual_table(methods, "markdown").splitlines()
-    assert cells(lines[0]) == ["method", "final %", "last scene %", "TFR", "forgetting", "BWT"]
-    assert cells(lines[2]) == ["ours", "75.0", "70.0", "10.0", "10.0", "-10.0"]
-    assert cells(lines[3]) == ["one", "50.0", "50.0", "-", "-", "-"]
-
-
-def test_the_matrix_leaves_the_future_blank() -> None:
-    lines = matrix_table([[90, 12], [80, 70]], ["a", "b"], "markdown").splitlines()
-    assert cells(lines[0]) == ["after", "a", "b"]
-    assert cells(lines[2]) == ["+ a", "90.0", ""]
-    assert cells(lines[3]) == ["+ b", "80.0", "70.0"]
-    with pytest.raises(ValueError, match="2 scenes"):
-        matrix_table([[90.0]], ["a", "b"])

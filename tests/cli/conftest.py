@@ -39,7 +39,7 @@ def run(capfd: pytest.CaptureFixture[str]) -> Run:
 @pytest.fixture(scope="module", autouse=True)
 def tiny(one_thread: None) -> Iterator[None]:
     """Learning takes a second; thresholds, which take longer to fit, believe every pose."""
-    from evercal.continual import learn_scene as teach
+    from evercal.continual import learn_scene
     from evercal.continual.presets import PRESETS
 
     demo = PRESETS["demo"]
@@ -53,7 +53,7 @@ def tiny(one_thread: None) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name in ("fast", "demo"):
             patch.setitem(PRESETS, name, stage)
-        patch.setattr(teach, "fit_threshold", lambda maps, held_out: (0.0, 1.0))
+        patch.setattr(learn_scene, "fit_threshold", lambda maps, held_out: (0.0, 1.0))
         yield
 
 

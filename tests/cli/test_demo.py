@@ -65,7 +65,7 @@ def test_bare_shapes_lie_over_located_images(monkeypatch: pytest.MonkeyPatch) ->
         asked.append((model, frames, poses))
         return [np.full_like(frame.read_image(), 250) for frame in frames]
 
-    monkeypatch.setattr(mini, "clay_views", clay)
+    monkeypatch.setattr(mini, "untextured_renders", clay)
     pose = SE3.identity()
     answers = [(scene.name, pose), ("elsewhere", pose), (scene.name, None)]
     room = CellRoom(scene, model=("living", 3))

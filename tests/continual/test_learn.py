@@ -109,13 +109,13 @@ def test_memory_holds_at_most_a_tenth(
     )
     *_, stage = learn(blank("evercal"), scene, least)
     assert isinstance(stage, Stage)
-    memory = stage.maps.keyframes[0]
-    assert memory is not None
-    assert len(memory.images) == stage.frames_kept
-    assert 1 <= len(memory.images) <= count / 10
+    keyframes = stage.maps.keyframes[0]
+    assert keyframes is not None
+    assert len(keyframes.images) == stage.frames_kept
+    assert 1 <= len(keyframes.images) <= count / 10
     # They are frames of the scene, in recorded order.
     poses = np.stack([f.base_from_camera.matrix() for f in scene.train if f.base_from_camera])
-    kept = memory.base_from_camera.matrix()
+    kept = keyframes.base_from_camera.matrix()
     places = [int(np.abs(poses - pose).max((1, 2)).argmin()) for pose in kept]
     np.testing.assert_allclose(poses[places], kept, atol=1e-12)
     assert places == sorted(set(places))
@@ -128,10 +128,10 @@ def test_memory_may_be_given_in_bytes(blank: Blank, rooms: Rooms, quick: StageOp
     sizes = []
     for budget in (4_000, 12_000, 10**9):
         maps = outcome(learn(blank("evercal"), rooms[0], replace(least, memory_bytes=budget)))
-        memory = maps.keyframes[0]
-        assert memory is not None
-        assert memory.bytes <= 1.25 * budget  # frames are counted at the size of the first
-        sizes.append(len(memory.images))
+        keyframes = maps.keyframes[0]
+        assert keyframes is not None
+        assert keyframes.bytes <= 1.25 * budget  # frames are counted at the size of the first
+        sizes.append(len(keyframes.images))
     assert sizes[0] < sizes[1] < sizes[2] == 30
 
 
@@ -202,8 +202,8 @@ def test_replayed_rows_are_the_old_scenes_and_their_teacher_stays_as_it_was(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     maps = first["evercal"]
-    memory = maps.keyframes[0]
-    assert memory is not None
+    keyframes = maps.keyframes[0]
+    assert keyframes is not None
     seen: list[tuple[HeadOutput, Rows, float]] = []
 
     def spy(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
@@ -213,7 +213,7 @@ def test_replayed_rows_are_the_old_scenes_and_their_teacher_stays_as_it_was(
     monkeypatch.setitem(STRATEGIES, "evercal", replace(STRATEGIES["evercal"], penalty=spy))
     list(learn(maps, rooms[1], quick))
     assert [progress for *_, progress in seen] == [i / 8 for i in range(8)]
-    centres = maps.scenes[0].cell.atlas_from_base.apply(memory.base_from_camera.translation_m)
+    centres = maps.scenes[0].cell.atlas_from_base.apply(keyframes.base_from_camera.translation_m)
     for teacher, rows, _ in seen:
         assert len(rows.scene) == 32
         assert not rows.scene.any()

@@ -1,4 +1,4 @@
-"""`learn_scene`: what is held out, what is believed, what is refused, and going on after a kill."""
+"""`learn_scene`: what is held out, what is refused, and going on after a kill."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -15,29 +15,23 @@ import pytest
 import torch
 
 from evercal.continual import learn as learn_module
-from evercal.continual import learn_scene as teach
 from evercal.continual.learn import Checkpoint, Encoding, StageOptions
 from evercal.continual.learn_scene import LearnOptions, LearnReport, learn_scene, validation_split
 from evercal.datasets import generic
-from evercal.datasets.frame import Frame, Scene
+from evercal.datasets.frame import Scene
 from evercal.errors import InputError
 from evercal.geometry.se3 import SE3
-from evercal.localization.estimate import PoseEstimate
+from evercal.localization import acceptance
 from evercal.localization.localizer import Localizer
-from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Store, head_bytes
 from evercal.networks.trainer import Progress
-from evercal.simulation.box_room import BoxRoom, default_camera
 
 Rooms = tuple[Scene, Scene, Scene]
 Tree = Callable[[Path], dict[str, str]]
 
 
-STRANGERS = teach._negative_images
-
-
-def noise(maps: SceneMaps, *rest: object) -> list[np.ndarray]:
-    """Quick strangers, in place of four rooms that must be made first."""
+def noise(*_: object) -> list[np.ndarray]:
+    """Quick negative images, in place of four rooms that must be made first."""
     rng = np.random.default_rng(0)
     return [rng.integers(0, 256, (48, 64, 3)).astype(np.uint8) for _ in range(4)]
 
@@ -45,7 +39,7 @@ def noise(maps: SceneMaps, *rest: object) -> list[np.ndarray]:
 @pytest.fixture(scope="module")
 def options(quick: StageOptions) -> Iterator[LearnOptions]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(teach, "_strangers", noise)
+        patch.setattr(acceptance, "_negative_images", noise)
         yield LearnOptions(stage=quick, short_side=48)
 
 
@@ -96,110 +90,6 @@ def test_held_out_frames_are_four_in_a_hundred(count: int, rooms: Rooms) -> None
     assert len(aside) == 4 * max(1, (count + 49) // 100)
 
 
-@dataclass
-class Answer:
-    """What the fake localizer says of an image."""
-
-    ratio: float
-    truth: SE3 | None = None
-    estimate: SE3 | None = None
-    covariance: np.ndarray | None = None
-
-
-def fit(
-    monkeypatch: pytest.MonkeyPatch,
-    blank: Callable[[str], SceneMaps],
-    positives: Sequence[Answer],
-    negatives: Sequence[float],
-) -> tuple[float, float]:
-    """`fit_threshold` with given answers to the held-out frames and to the strangers."""
-    said = [*positives, *(Answer(ratio) for ratio in negatives)]
-
-    class Fake:
-        def __init__(self, *_: object) -> None:
-            pass
-
-        def localize(self, image: np.ndarray, camera: object = None) -> PoseEstimate:
-            number = int(image.ravel()[0]) + 256 * int(image.ravel()[1])
-            a = said[number]
-            status = "failed" if a.estimate is None else "ok"
-            return PoseEstimate(status, "", "x", a.estimate, a.covariance, 9, a.ratio, 1.0)
-
-    def image(number: int) -> np.ndarray:
-        return np.array([[[number % 256, number // 256, 0]]], np.uint8)
-
-    camera = default_camera(1, 1)
-    frames = [Frame(str(i), image(i), camera, a.truth) for i, a in enumerate(positives)]
-    strangers = [image(i) for i in range(len(positives), len(said))]
-    with monkeypatch.context() as patch:
-        patch.setattr(teach, "Localizer", Fake)
-        patch.setattr(teach, "_strangers", lambda *_: strangers)
-        return teach.fit_threshold(blank("evercal"), frames)
-
-
-def test_the_threshold_lies_a_sixth_of_the_way_up(
-    monkeypatch: pytest.MonkeyPatch, blank: Callable[[str], SceneMaps]
-) -> None:
-    # 41 values in equal steps: the 5 % and 95 % quantiles are the 3rd and the 39th.
-    positives = [Answer(0.5 + 0.01 * i) for i in range(41)]
-    negatives = [0.001 * i for i in range(41)]
-    threshold, _ = fit(monkeypatch, blank, positives[::-1], negatives)
-    top, low = 0.038, 0.52
-    assert threshold == pytest.approx(top + (low - top) / 6)
-    assert max(negatives) < threshold < min(a.ratio for a in positives)
-
-
-def test_strangers_are_not_believed_even_if_known_views_are_no_better(
-    monkeypatch: pytest.MonkeyPatch, blank: Callable[[str], SceneMaps]
-) -> None:
-    threshold, _ = fit(monkeypatch, blank, [Answer(0.05)] * 8, [0.1] * 16)
-    assert threshold == pytest.approx(0.1)
-
-
-@pytest.mark.parametrize(("factor", "expected"), [(1.0, 1.0), (3.0, 9.0), (0.2, 1.0)])
-def test_the_scale_turns_claimed_covariance_into_found_errors(
-    factor: float,
-    expected: float,
-    monkeypatch: pytest.MonkeyPatch,
-    blank: Callable[[str], SceneMaps],
-) -> None:
-    rng = np.random.default_rng(0)
-    positives = []
-    for _ in range(600):
-        truth = SE3.exp(rng.normal(0, 1, 6))
-        root = rng.normal(0, 1, (6, 6)) * np.array([[0.002] * 3 + [0.001] * 3]).T
-        error = factor * root @ rng.normal(0, 1, 6)
-        # As documented: translation in the base frame, rotation about the camera's axes.
-        turned = truth @ SE3.exp(np.array([0, 0, 0, *error[3:]]))
-        estimate = SE3(turned.rotation_wxyz, truth.translation_m + error[:3])
-        positives.append(Answer(0.5, truth, estimate, root @ root.T))
-    for i in range(0, 600, 4):  # poses that are plainly wrong say nothing about precision
-        truth = positives[i].truth
-        assert truth is not None
-        positives[i].estimate = SE3.exp(np.array([2.0, 0, 0, 1, 0, 0])) @ truth
-    _, scale = fit(monkeypatch, blank, positives, [0.0])
-    assert scale == pytest.approx(expected, rel=0.15)
-
-
-def test_unknown_places_are_told_from_known_ones(
-    arc_maps: tuple[SceneMaps, SceneMaps],
-    arcs: tuple[Scene, Scene],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(teach, "_strangers", STRANGERS)
-    maps = replace(arc_maps[0], scenes=list(arc_maps[0].scenes))
-    fitted = teach.fit_threshold(maps, arcs[0].test[:8])
-    maps.scenes[0] = teach.with_fit(maps.scenes[0], *fitted)
-    localizer, camera = Localizer(maps), default_camera(160, 120)
-    right = [localizer.localize(frame.read_image()).status for frame in arcs[0].test[8:]]
-    assert right.count("ok") >= 0.9 * len(right)
-    room = BoxRoom(77, texture_px=96)
-    views = [room.render(camera, room.random_view(np.random.default_rng(i))) for i in range(10)]
-    views.append(np.random.default_rng(0).integers(0, 256, (120, 160, 3)).astype(np.uint8))
-    wrong = [localizer.localize(view).status for view in views]
-    assert wrong.count("ok") <= 1
-
-
 def test_a_report_says_what_is_in_the_store(taught: Taught) -> None:
     store = Store.open(taught.root)
     maps = store.maps
@@ -207,10 +97,10 @@ def test_a_report_says_what_is_in_the_store(taught: Taught) -> None:
     for i, report in enumerate(taught.reports):
         path = taught.root / "stages" / store.stages[i] / "report.json"
         assert json.loads(path.read_text()) == asdict(report)
-        memory = maps.keyframes[i]
-        assert memory is not None
+        keyframes = maps.keyframes[i]
+        assert keyframes is not None
         assert report.scene == maps.scenes[i].name
-        assert report.frames_kept == len(memory.images)
+        assert report.frames_kept == len(keyframes.images)
         assert report.train_frames == maps.scenes[i].train_frames
         assert report.train_frames + report.held_out_frames == 30
         assert report.frames_kept <= 0.1 * 30
@@ -277,7 +167,7 @@ def stop_at(kind: str, number: int) -> Callable[[object], None]:
     return watch
 
 
-@pytest.mark.parametrize(("kind", "number"), [("rows", 1), ("rows", 3), ("fitter", 5)])
+@pytest.mark.parametrize(("kind", "number"), [("rows", 1), ("rows", 3), ("trainer", 5)])
 def test_an_interrupted_scene_goes_on_where_it_stopped(
     kind: str,
     number: int,
@@ -296,7 +186,7 @@ def test_an_interrupted_scene_goes_on_where_it_stopped(
         events: list[object] = []
         assert learn_scene(store, room, options, events.append).resumed
         steps = [event.step for event in events if isinstance(event, Progress)]
-        assert steps[0] == (number + 1 if kind == "fitter" else 1)
+        assert steps[0] == (number + 1 if kind == "trainer" else 1)
     assert learned(store) == learned(taught.root)
 
 
@@ -318,7 +208,7 @@ def test_a_second_learner_is_kept_out(
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
 
 
-def test_another_lesson_does_not_resume(
+def test_another_stage_does_not_resume(
     taught: Taught,
     rooms: Rooms,
     options: LearnOptions,
@@ -340,7 +230,7 @@ def test_another_lesson_does_not_resume(
     }
     for train_split, asked in others.values():
         with pytest.raises(Stop):
-            learn_scene(store, train_split, asked, stop_at("fitter", 2))
+            learn_scene(store, train_split, asked, stop_at("trainer", 2))
         with pytest.raises(Stop):
             learn_scene(store, alpha, options, stop_at("rows", 1))
     assert learn_scene(store, alpha, options).resumed  # its own
@@ -356,15 +246,15 @@ from evercal.continual.learn import StageOptions
 from evercal.datasets import generic
 from evercal.continual.learn_scene import LearnOptions, learn_scene
 from evercal.networks.head import HeadOptions
-from evercal.networks.buffer import FillPlan
+from evercal.networks.buffer import EncodePlan
 from evercal.networks.trainer import FitOptions, Progress
 from evercal.features.views import ViewOptions
 learn.CHECKPOINT_SECONDS = 0.0
 stage = StageOptions(
     head=HeadOptions(width=16, centres_per_scene=3),
     fit=FitOptions(iterations=8, batch=64, replay_batch=32),
-    encode=FillPlan(passes=2, cells=24, view=ViewOptions(short_side=48)),
-    replay_passes=2,
+    encode=EncodePlan(views_per_frame=2, cells=24, view=ViewOptions(short_side=48)),
+    replay_views_per_frame=2,
 )
 def linger(event):
     if isinstance(event, Progress) and event.step == 6:

@@ -44,15 +44,15 @@ def maps(room: BoxRoom) -> SceneMaps:
     """Every sixth frame of a walk, with true depths."""
     walk = room.path(72, 3)
     poses = [walk[i] for i in range(0, 72, 6)]
-    memory = store_keyframes([frame(room, pose, str(i)) for i, pose in enumerate(poses)], 240)
+    keyframes = store_keyframes([frame(room, pose, str(i)) for i, pose in enumerate(poses)], 240)
     depths = [
         torch.from_numpy(1 / pose.inverse().apply(surface(room, pose))[:, 2]).half()
         for pose in poses
     ]
-    memory = replace(memory, inverse_depth=tuple(depths))
+    keyframes = replace(keyframes, inverse_depth=tuple(depths))
     record = SceneRecord("box", CAMERA, CELL, torch.zeros(1, 128).half(), 72)
     encoder, descriptor = load_encoder(), load_descriptor()
-    return SceneMaps(encoder, descriptor, "evercal", 240, [], [record], [memory], [{}])
+    return SceneMaps(encoder, descriptor, "evercal", 240, [], [record], [keyframes], [{}])
 
 
 def seen(maps: SceneMaps, query: Frame) -> torch.Tensor:
@@ -87,10 +87,10 @@ def test_points_lie_where_the_query_sees_them(room: BoxRoom, maps: SceneMaps) ->
 
 
 def test_only_frames_that_show_the_same_are_looked_at(maps: SceneMaps) -> None:
-    memory = maps.keyframes[0]
-    assert memory is not None
-    assert len(memory.images) > MAX_KEYFRAMES
-    matcher, features = KeyframeMatcher(maps, 0), seen(maps, memory.frames()[5])
+    keyframes = maps.keyframes[0]
+    assert keyframes is not None
+    assert len(keyframes.images) > MAX_KEYFRAMES
+    matcher, features = KeyframeMatcher(maps, 0), seen(maps, keyframes.frames()[5])
     votes = matcher.retrieve(features)
     assert np.bincount(votes.frame).argmax() == 5
     found = matcher.match(features, votes)
@@ -100,14 +100,14 @@ def test_only_frames_that_show_the_same_are_looked_at(maps: SceneMaps) -> None:
 
 
 def test_depths_come_back_from_a_file_and_count(maps: SceneMaps) -> None:
-    memory = maps.keyframes[0]
-    assert memory is not None
-    tensors = memory.to_tensors()
-    assert memory.bytes == sum(tensor.nbytes for tensor in tensors.values())
-    plain = replace(memory, inverse_depth=())
-    assert memory.bytes == plain.bytes + len(memory.images) * (2 * 1200 + 8)
+    keyframes = maps.keyframes[0]
+    assert keyframes is not None
+    tensors = keyframes.to_tensors()
+    assert keyframes.bytes == sum(tensor.nbytes for tensor in tensors.values())
+    plain = replace(keyframes, inverse_depth=())
+    assert keyframes.bytes == plain.bytes + len(keyframes.images) * (2 * 1200 + 8)
     back = Keyframes.from_tensors(load(save(tensors)))
-    assert len(back.inverse_depth) == len(memory.images)
-    for a, b in zip(back.inverse_depth, memory.inverse_depth, strict=True):
+    assert len(back.inverse_depth) == len(keyframes.images)
+    for a, b in zip(back.inverse_depth, keyframes.inverse_depth, strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=0)
     assert Keyframes.from_tensors(load(save(plain.to_tensors()))).inverse_depth == ()

@@ -47,9 +47,9 @@ def located(maps: SceneMaps, scene: Scene) -> tuple[list[PoseEstimate], float]:
 def test_remembered_frames_answer_where_the_network_cannot(
     unlearned: SceneMaps, arcs: tuple[Scene, Scene]
 ) -> None:
-    memory = unlearned.keyframes[0]
-    assert memory is not None
-    assert len(memory.inverse_depth) == len(memory.images) == 12
+    keyframes = unlearned.keyframes[0]
+    assert keyframes is not None
+    assert len(keyframes.inverse_depth) == len(keyframes.images) == 12
     answers, error_m = located(unlearned, arcs[0])
     assert error_m < 0.05
     for found in answers:
@@ -61,7 +61,7 @@ def test_remembered_frames_answer_where_the_network_cannot(
     alone = replace(unlearned, keyframes=[None])
     assert located(alone, arcs[0])[1] > 0.2
     # Without depths, as older stores and other strategies have it, nothing is recalled.
-    plain = replace(unlearned, keyframes=[replace(memory, inverse_depth=())])
+    plain = replace(unlearned, keyframes=[replace(keyframes, inverse_depth=())])
     assert located(plain, arcs[0])[1] == located(alone, arcs[0])[1]
 
 

@@ -16,8 +16,8 @@ DISTORTIONS = ((), (0.1, -0.05, 0.001, 0.002), (0.1, -0.05, 0.001, 0.002, 0.01),
                (0.1, -0.05, 0.001, 0.002, 0.01, 0.02, -0.03, 0.004))  # fmt: skip
 
 
-def through_a_file(memory: Keyframes) -> Keyframes:
-    return Keyframes.from_tensors(load(save(memory.to_tensors())))
+def through_a_file(keyframes: Keyframes) -> Keyframes:
+    return Keyframes.from_tensors(load(save(keyframes.to_tensors())))
 
 
 def test_images_come_back_nearly(rooms: tuple[Scene, ...]) -> None:
@@ -42,9 +42,9 @@ def test_poses_and_cameras_come_back_exactly() -> None:
         camera = Camera(width, height, 71.3 + i, 70.1, width / 2.1, height / 1.9, distortion)
         pose = SE3.exp(rng.normal(size=6))
         frames.append(Frame(str(i), np.zeros((height, width, 3), np.uint8), camera, pose))
-    memory = store_keyframes(frames, 48)
-    for again in (memory, through_a_file(memory)):
-        assert again.images == memory.images
+    keyframes = store_keyframes(frames, 48)
+    for again in (keyframes, through_a_file(keyframes)):
+        assert again.images == keyframes.images
         for frame, seen in zip(frames, again.frames(), strict=True):
             assert seen.camera == frame.camera.short_side_resized(48)
             assert min(seen.read_image().shape[:2]) == 48
@@ -61,12 +61,12 @@ def test_poses_and_cameras_come_back_exactly() -> None:
 
 def test_every_byte_is_counted(rooms: tuple[Scene, ...]) -> None:
     for count in (1, 4):
-        memory = store_keyframes(rooms[1].train[:count], 48)
-        tensors = memory.to_tensors()
-        assert memory.bytes == sum(tensor.nbytes for tensor in tensors.values())
-        assert memory.bytes > sum(map(len, memory.images))
+        keyframes = store_keyframes(rooms[1].train[:count], 48)
+        tensors = keyframes.to_tensors()
+        assert keyframes.bytes == sum(tensor.nbytes for tensor in tensors.values())
+        assert keyframes.bytes > sum(map(len, keyframes.images))
         # The file adds only a header.
-        assert memory.bytes < len(save(tensors)) < memory.bytes + 1000
+        assert keyframes.bytes < len(save(tensors)) < keyframes.bytes + 1000
 
 
 def test_a_remembered_frame_can_be_remembered_again(rooms: tuple[Scene, ...]) -> None:
@@ -85,8 +85,8 @@ def test_large_images_are_kept_at_working_size(size: tuple[int, int]) -> None:
     image = np.broadcast_to(ramp, (height, width, 3)).astype(np.uint8)
     camera = Camera(width, height, 500, 500, (width - 1) / 2, (height - 1) / 2)
     frame = Frame("a", image, camera, SE3.identity())
-    memory = store_keyframes([frame], 120)
-    kept = memory.frames()[0]
+    keyframes = store_keyframes([frame], 120)
+    kept = keyframes.frames()[0]
     assert kept.read_image().shape[:2] == (height // 4, width // 4)
     assert kept.camera.fx == pytest.approx(125)
     # A pixel keeps its viewing ray: column u of the small image shows column 4 u + 1.5.

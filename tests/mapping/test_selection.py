@@ -10,11 +10,8 @@ from evercal.mapping.selection import (
     PoseSpace,
     SarsOptions,
     covering_radius,
-    fill_radius,
     select_farthest,
-    select_random,
     select_sars,
-    select_uniform,
     smallest_pair,
 )
 
@@ -160,23 +157,13 @@ def test_fill_keeps_exactly_the_capacity(seed, capacity):
     assert len(kept) == len(set(kept.tolist())) == min(capacity, 300)
 
 
-@pytest.mark.parametrize("capacity", [2, 37, 299])
-def test_fill_radius_is_the_edge_of_its_bracket(capacity):
-    positions, quaternions = random_walk(np.random.default_rng(5), 300)
-    radius = fill_radius(positions, quaternions, capacity, tolerance=1e-6)
-    counts = [
-        len(select_sars(positions, quaternions, capacity, SarsOptions(radius=r)))
-        for r in (radius, radius + 1e-6)
-    ]
-    assert counts[0] == capacity > counts[1]
-
-
-def test_fill_radius_on_a_line_is_known():
+def test_frames_that_fill_on_a_line_are_known():
     """Eleven frames 0.1 apart, in order: three fit at r <= 0.5, four at r <= 0.3."""
+    fill = SarsOptions(fill=True)
     positions = np.stack([np.arange(11.0), np.zeros(11), np.zeros(11)], axis=1)
     quaternions = np.tile([1.0, 0, 0, 0], (11, 1))
-    assert fill_radius(positions, quaternions, 3) == pytest.approx(0.5, abs=1e-5)
-    assert fill_radius(positions, quaternions, 4) == pytest.approx(0.3, abs=1e-5)
+    assert select_sars(positions, quaternions, 3, fill).tolist() == [0, 5, 10]
+    assert select_sars(positions, quaternions, 4, fill).tolist() == [0, 3, 6, 9]
 
 
 def test_fill_with_repeats_keeps_every_pose():
@@ -184,7 +171,6 @@ def test_fill_with_repeats_keeps_every_pose():
     positions, quaternions = random_walk(rng, 12)
     visits = np.concatenate([np.arange(12), rng.integers(0, 12, size=288)])
     positions, quaternions = positions[visits], quaternions[visits]
-    assert fill_radius(positions, quaternions, 30) == 0.0
     kept = select_sars(positions, quaternions, 30, SarsOptions(fill=True))
     assert len(kept) == 30
     assert set(visits[kept]) == set(range(12))
@@ -236,26 +222,10 @@ def test_covering_radius_is_the_largest_gap():
     assert covering_radius(positions[:0], quaternions[:0], kept[:0]) == 0.0
 
 
-@pytest.mark.parametrize("capacity", [0, 1, 7, 10, 50, 80])
-def test_uniform_and_random_keep_the_capacity(capacity):
-    positions, quaternions = random_walk(np.random.default_rng(11), 50)
-    uniform = select_uniform(positions, quaternions, capacity)
-    drawn = select_random(positions, quaternions, capacity, np.random.default_rng(0))
-    again = select_random(positions, quaternions, capacity, np.random.default_rng(0))
-    for kept in (uniform, drawn):
-        assert len(kept) == min(capacity, 50)
-        assert (np.diff(kept) > 0).all()
-        assert ((kept >= 0) & (kept < 50)).all()
-    assert drawn.tolist() == again.tolist()
-    if 1 < capacity < 50:
-        assert np.ptp(np.diff(uniform)) <= 1
-
-
 def test_no_frames():
     nothing = np.zeros((0, 3)), np.zeros((0, 4))
     assert select_sars(*nothing, 5).size == 0
     assert select_sars(*nothing, 5, SarsOptions(fill=True)).size == 0
-    assert select_uniform(*nothing, 5).size == 0
     assert select_farthest(*nothing, 5).size == 0
 
 

@@ -79,7 +79,7 @@ def test_rooms_are_rendered_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         asked.append((model, len(frames)))
         return [np.full((48, 64, 3), 200, np.uint8) for _ in frames]
 
-    monkeypatch.setattr(mini, "clay_views", clay)
+    monkeypatch.setattr(mini, "untextured_renders", clay)
     made(tmp_path, ours="hall", lost=None)
     for _ in range(2):
         pictures = view_pictures(tmp_path, ["ours", "lost"], {"hall": ("bedroom", 3)})
@@ -91,7 +91,7 @@ def test_rooms_are_rendered_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_without_the_simulator_points_are_drawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mini, "clay_views", lambda *_: [])
+    monkeypatch.setattr(mini, "untextured_renders", lambda *_: [])
     made(tmp_path, ours="hall")
     (picture, _) = view_pictures(tmp_path, ["ours"], {"hall": ("bedroom", 3)})
     assert abs(int(sheet(picture.data)[96, 6 + 246 + 120]) - 90) < 25

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from evercal.datasets import load_scene
+from evercal.datasets import generic, load_scene
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.simulation import box_room
 from evercal.simulation.box_room import (
@@ -18,7 +18,6 @@ from evercal.simulation.box_room import (
     box_room_scene,
     default_camera,
     look_at,
-    write_box_room,
 )
 
 LENS = Camera(160, 120, 140.0, 135.0, 83.0, 57.0)
@@ -284,8 +283,8 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("coarse")
 def test_a_scene_survives_the_disk(tmp_path: Path) -> None:
     memory = box_room_scene(21, 3, 2)
-    written = write_box_room(tmp_path / "room", 21, 3, 2)
-    for loaded in (written, load_scene(tmp_path / "room")):
+    generic.write(tmp_path / "room", memory)
+    for loaded in (generic.load(tmp_path / "room"), load_scene(tmp_path / "room")):
         assert loaded.name == memory.name == "box-room-21"
         for split in ("train", "test"):
             frames, expected = getattr(loaded, split), getattr(memory, split)

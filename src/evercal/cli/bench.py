@@ -114,10 +114,10 @@ class Bench:
         return run_on_ray(self._scenes(), options, out, self.ray, self.plugin)
 
     def _scenes(self) -> "list[Scene]":
-        from evercal.benchmark.suites import held_out
+        from evercal.benchmark.suites import tuning_split
 
         scenes = self._recorded()
-        return [held_out(scene) for scene in scenes] if self.held_out else scenes
+        return [tuning_split(scene) for scene in scenes] if self.held_out else scenes
 
     def _recorded(self) -> "list[Scene]":
         from evercal.benchmark.suites import load_suite, regions

@@ -78,7 +78,7 @@ class Encoding:
 class Stage:
     """A finished stage."""
 
-    knowledge: SceneMaps
+    maps: SceneMaps
     """What is known now; thresholds are not fitted yet."""
     iterations: int
     """Optimiser steps."""

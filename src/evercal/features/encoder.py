@@ -1,6 +1,6 @@
 """The frozen local encoder: an image in, one feature vector per 8x8 pixel cell out.
 
-Ours is trained on procedural images alone (`evercal.features.pretraining`). ACE's published layout is read
+Ours is trained on procedural images alone (`features.pretraining`). ACE's published layout is read
 too, for users who have that file and may use it, and any module with `stride` and `width` will do.
 """
 

@@ -31,7 +31,7 @@ from evercal.simulation.cell_paths import (
 from evercal.simulation.furnished.panda import Panda
 from evercal.simulation.furnished.renderer import Renderer, RenderOptions, choose_variant, mitsuba
 from evercal.simulation.furnished.rooms import RESERVED, Room, room
-from evercal.storage import hold_settings, write_bytes, write_json
+from evercal.storage import lock_settings, write_bytes, write_json
 
 CALIBRATION_FRAMES = 25
 
@@ -143,7 +143,7 @@ def simulate(
     _refuse_full_disk(out, total * width * height * (4 if suite.depth else 2))
     mi = mitsuba()
     settings["renderer"] = f"mitsuba {mi.__version__} {mi.variant()}"
-    hold_settings(out / "render.json", settings)
+    lock_settings(out / "render.json", settings)
     said = f"Mitsuba {mi.__version__}, {': '.join(choose_variant())}"
     camera = default_camera(width, height)
     panda = Panda()
