@@ -102,7 +102,7 @@ def taught(
 ) -> dict[str, list[SceneMaps]]:
     """By strategy: what is known after one, two and three rooms."""
     from evercal.continual.learn import Stage, learn
-    from evercal.mapping.store import with_fit
+    from evercal.mapping.scene_maps import with_fit
 
     found: dict[str, list[SceneMaps]] = {}
     for strategy in ("evercal", "isolation"):

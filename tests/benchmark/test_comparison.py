@@ -106,7 +106,11 @@ def test_bounds_are_strict() -> None:
 
 
 def test_selectors_are_told_by_how_their_frames_lie() -> None:
-    kept = {"kept_m": ((0.0, 0, 0), (1.0, 0, 0)), "covering": 0.6, "closest": 0.25}
+    kept = {
+        "keyframe_positions_m": ((0.0, 0, 0), (1.0, 0, 0)),
+        "covering_radius": 0.6,
+        "min_spacing": 0.25,
+    }
     tell = [replace(o, **kept) if o.stage == "ba".index(o.scene) else o for o in OURS]
     header, ours = selector_rows(runs_of(tell + THEIRS))
     assert header == ["strategy", "frames kept", "covering radius", "smallest pair"]

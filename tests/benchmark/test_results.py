@@ -54,7 +54,7 @@ def test_what_was_kept_is_told_where_it_is_known(tmp_path: Path) -> None:
     # Lines of before these fields.
     path = tmp_path / RESULTS
     record = json.loads(path.read_text().splitlines()[1])
-    for name in ("kept_m", "covering", "closest"):
+    for name in ("keyframe_positions_m", "covering_radius", "min_spacing"):
         del record[name]
     path.write_text(json.dumps(record) + "\n")
     assert read(tmp_path) == [outcome(1)]

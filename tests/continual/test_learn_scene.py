@@ -23,7 +23,8 @@ from evercal.errors import InputError
 from evercal.geometry.se3 import SE3
 from evercal.localization import acceptance
 from evercal.localization.localizer import Localizer
-from evercal.mapping.store import Store, head_bytes
+from evercal.mapping.stage_files import head_bytes
+from evercal.mapping.store import Store
 from evercal.networks.trainer import Progress
 
 Rooms = tuple[Scene, Scene, Scene]

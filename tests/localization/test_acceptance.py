@@ -13,8 +13,7 @@ from evercal.geometry.se3 import SE3
 from evercal.localization import acceptance
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
-from evercal.mapping.scene_maps import SceneMaps
-from evercal.mapping.store import with_fit
+from evercal.mapping.scene_maps import SceneMaps, with_fit
 from evercal.simulation.box_room import BoxRoom, default_camera
 
 

@@ -19,7 +19,8 @@ from evercal.errors import InputError
 from evercal.geometry.se3 import pose_distance
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import SceneMaps
-from evercal.mapping.store import Store, head_bytes
+from evercal.mapping.stage_files import head_bytes
+from evercal.mapping.store import Store
 from evercal.networks.head import Head
 from evercal.storage.manifest import MANIFEST, verify, write_manifest
 

@@ -46,9 +46,10 @@ from evercal.features.feature_cache import cache_features
 from evercal.localization.localizer import Localizer
 from evercal.mapping.atlas import combined_centres
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.scene_maps import SceneMaps, with_fit
 from evercal.mapping.selection import covering_radius, smallest_pair
-from evercal.mapping.store import Store, head_bytes, with_fit
+from evercal.mapping.stage_files import head_bytes
+from evercal.mapping.store import Store
 from evercal.networks.buffer import FeatureBuffer
 from evercal.storage import MANIFEST, lock_settings, sha256_file
 
@@ -325,7 +326,7 @@ class _Run:
         gaps = np.linalg.norm(poses.translation_m[:, None] - stood[None], axis=-1)
         places = poses.translation_m, poses.rotation_wxyz, gaps.argmin(0)
         return {
-            "kept_m": tuple(tuple(round(float(v), 4) for v in row) for row in stood),
-            "covering": covering_radius(*places),
-            "closest": smallest_pair(*places),
+            "keyframe_positions_m": tuple(tuple(round(float(v), 4) for v in row) for row in stood),
+            "covering_radius": covering_radius(*places),
+            "min_spacing": smallest_pair(*places),
         }

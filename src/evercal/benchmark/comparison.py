@@ -125,7 +125,10 @@ def selector_rows(runs: Sequence[Run]) -> Rows:
     for name, of in by_strategy(runs).items():
         told = [o for run in of for o in run.outcomes.values() if o.keyframe_positions_m]
         if told:
-            cells = [np.mean([getattr(o, key) for o in told]) for key in ("covering", "closest")]
+            cells = [
+                np.mean([getattr(o, key) for o in told])
+                for key in ("covering_radius", "min_spacing")
+            ]
             frames = f"{np.mean([o.frames_kept for o in told]):.1f}"
             rows.append([name, frames, *(f"{value:.2f}" for value in cells)])
     return rows

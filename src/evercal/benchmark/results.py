@@ -16,8 +16,14 @@ from evercal.errors import InputError
 from evercal.evaluation.metrics import COARSE, FrameResult
 
 RESULTS, SETTINGS = "results.jsonl", "settings.json"
-_LATER = {"kept_m", "covering", "closest"}
+_LATER = {"keyframe_positions_m", "covering_radius", "min_spacing"}
 """Fields that older results lack."""
+_FORMERLY = {
+    "kept_m": "keyframe_positions_m",
+    "covering": "covering_radius",
+    "closest": "min_spacing",
+}
+"""What older results call them."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +108,7 @@ def read(folder: Path) -> list[SceneResult]:
     found = []
     for number, line in enumerate(data[:whole].splitlines(), start=1):
         try:
-            found.append(_outcome(json.loads(line)))
+            found.append(_result(json.loads(line)))
         except (ValueError, TypeError, KeyError) as error:
             raise InputError(f"{path}: line {number} is not a result ({error!r})") from error
     return found
@@ -112,17 +118,19 @@ def _plain(outcome: SceneResult) -> dict[str, object]:
     record = asdict(outcome)
     for name in ("translation_m", "rotation_rad"):
         record[name] = [round(v, 6) if math.isfinite(v) else None for v in record[name]]
-    for name in ("covering", "closest"):
+    for name in ("covering_radius", "min_spacing"):
         record[name] = record[name] if math.isfinite(record[name]) else None
     return record
 
 
-def _outcome(record: object) -> SceneResult:
+def _result(record: object) -> SceneResult:
     names = {field.name for field in fields(SceneResult)}
+    if isinstance(record, dict):
+        record = {_FORMERLY.get(name, name): value for name, value in record.items()}
     if not isinstance(record, dict) or not names - _LATER <= record.keys() <= names:
         raise KeyError("other fields")
     for name, value in record.items():
-        if name == "kept_m":
+        if name == "keyframe_positions_m":
             record[name] = tuple(map(tuple, value))
         elif isinstance(value, list):
             record[name] = tuple(math.inf if v is None else v for v in value)

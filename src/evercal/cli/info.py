@@ -20,7 +20,8 @@ class Info:
 
     def run(self) -> int:
         """Opens the store and describes it."""
-        from evercal.mapping.store import Store, head_bytes
+        from evercal.mapping.stage_files import head_bytes
+        from evercal.mapping.store import Store
 
         store = Store.open(self.store)
         maps, used = store.maps, store.bytes()

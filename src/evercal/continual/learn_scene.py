@@ -18,7 +18,9 @@ from evercal.errors import InputError
 from evercal.features.feature_cache import cache_features
 from evercal.features.weights_file import network_bytes
 from evercal.localization.acceptance import fit_threshold
-from evercal.mapping.store import Checkpoint, Resume, Store, head_bytes, with_fit
+from evercal.mapping.scene_maps import with_fit
+from evercal.mapping.stage_files import head_bytes
+from evercal.mapping.store import Checkpoint, Resume, Store
 from evercal.networks.trainer import Progress
 from evercal.storage.manifest import MANIFEST
 

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from torch import Tensor
@@ -52,6 +52,11 @@ class SceneRecord:
 def _proportions(camera: Camera) -> tuple[float, float, float, float]:
     w, h = camera.width, camera.height
     return camera.fx / w, camera.fy / h, (camera.cx + 0.5) / w, (camera.cy + 0.5) / h
+
+
+def with_fit(record: SceneRecord, inlier_threshold: float, covariance_scale: float) -> SceneRecord:
+    """The record with what was fitted on held-out frames."""
+    return replace(record, inlier_threshold=inlier_threshold, covariance_scale=covariance_scale)
 
 
 def corrected_camera(camera: Camera, correction: Tensor) -> Camera:

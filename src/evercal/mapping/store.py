@@ -21,7 +21,7 @@ import json
 import re
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -30,13 +30,20 @@ from torch import Tensor, nn
 
 from evercal.errors import InputError
 from evercal.features.descriptor import PooledDescriptor, descriptor_for, load_descriptor
-from evercal.features.encoder import Encoder, checked_encoder, load_encoder
+from evercal.features.encoder import checked_encoder, load_encoder
 from evercal.features.weights_file import network_bytes
-from evercal.geometry.camera import Camera
-from evercal.mapping.atlas import Cell
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord
-from evercal.networks.head import Head, HeadOptions
+from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.stage_files import (
+    HEAD,
+    load_tensors,
+    own_encoder,
+    read_head,
+    read_record,
+    save_tensors,
+    write_head,
+    write_record,
+)
 from evercal.storage.atomic import replace_folder, write_bytes, write_json
 from evercal.storage.manifest import (
     MANIFEST,
@@ -50,7 +57,6 @@ from evercal.storage.manifest import (
 SCHEMA = 1
 LEARNING = "learning"
 STAGES = "stages"
-HEAD = "head.safetensors"
 MEMORY_FILES = ("memory.safetensors", "notes.safetensors")
 STAGE_FILES = (HEAD, *MEMORY_FILES, "prototypes.safetensors", "report.json", "scene.json")
 
@@ -143,7 +149,7 @@ class Store:
         networks = payload["networks"]
         local, descriptor = (str(name) for name in networks)  # type: ignore[attr-defined]
         maps = SceneMaps(
-            load_encoder(root / local) if encoder is None else _own(encoder, root / local),
+            load_encoder(root / local) if encoder is None else own_encoder(encoder, root / local),
             load_descriptor(root / descriptor),
             str(payload["strategy"]),
             int(payload["short_side"]),  # type: ignore[call-overload]
@@ -152,15 +158,14 @@ class Store:
         listed = listed_files(root)
         for name in stages:
             folder = root / STAGES / name
-            maps.scenes.append(_read_record(folder))
-            memory = folder / "memory.safetensors"
-            maps.keyframes.append(
-                Keyframes.from_tensors(_load(memory)) if memory.exists() else None
-            )
-            method_states = folder / "notes.safetensors"
-            maps.method_states.append(_load(method_states) if method_states.exists() else {})
+            maps.scenes.append(read_record(folder))
+            kept = folder / "memory.safetensors"
+            keyframes = Keyframes.from_tensors(load_tensors(kept)) if kept.exists() else None
+            maps.keyframes.append(keyframes)
+            state = folder / "notes.safetensors"
+            maps.method_states.append(load_tensors(state) if state.exists() else {})
             if f"{STAGES}/{name}/{HEAD}" in listed:
-                maps.heads.append(_read_head(folder, maps))
+                maps.heads.append(read_head(folder, maps.encoder.width))
         return cls(root, maps, stages, (local, descriptor))
 
     def commit(self, maps: SceneMaps, report: Mapping[str, object]) -> None:
@@ -170,7 +175,7 @@ class Store:
             maps: the outcome of a stage.
             report: what `report.json` says.
         """
-        record, memory = maps.scenes[-1], maps.keyframes[-1]
+        record, keyframes = maps.scenes[-1], maps.keyframes[-1]
         # A scene may be called anything, a folder may not.
         legal = re.sub(r"[^\w.-]", "_", record.name)[:60]
         name = f"{len(self.stages) + 1:04d}-{legal}"
@@ -179,14 +184,13 @@ class Store:
         folder.mkdir(parents=True)
         if self.networks is None:
             self.networks = self._write_networks(maps)
-        _write_record(folder, record)
-        _save(folder / "prototypes.safetensors", {"prototypes": record.prototypes})
+        write_record(folder, record)
         if maps.heads:
-            _write_head(folder, maps.heads[-1])
-        if memory is not None:
-            _save(folder / "memory.safetensors", memory.to_tensors())
+            write_head(folder, maps.heads[-1])
+        if keyframes is not None:
+            save_tensors(folder / "memory.safetensors", keyframes.to_tensors())
         if maps.method_states[-1]:
-            _save(folder / "notes.safetensors", maps.method_states[-1])
+            save_tensors(folder / "notes.safetensors", maps.method_states[-1])
         write_json(folder / "report.json", report)
         replace_folder(folder, self.root / STAGES / name)
         stages = [*self.stages, name]
@@ -254,11 +258,11 @@ class Store:
             folder.mkdir(parents=True)
             write_json(folder / "stage.json", asked)
             return None
-        rows = [_load(path) for path in sorted(folder.glob("rows-*.safetensors"))]
+        rows = [load_tensors(path) for path in sorted(folder.glob("rows-*.safetensors"))]
         trainer = folder / "trainer.safetensors"
         if not rows:
             return None
-        return Resume(rows, _load(trainer) if trainer.exists() else {})
+        return Resume(rows, load_tensors(trainer) if trainer.exists() else {})
 
     def abandon(self) -> None:
         """Drops the stage under way, and the folder too if nothing else was ever stored in it."""
@@ -271,9 +275,9 @@ class Store:
         folder = self.root / LEARNING
         if checkpoint.rows:
             number = len(list(folder.glob("rows-*.safetensors")))
-            _save(folder / f"rows-{number:05d}.safetensors", checkpoint.rows)
+            save_tensors(folder / f"rows-{number:05d}.safetensors", checkpoint.rows)
         if checkpoint.trainer:
-            _save(folder / "trainer.safetensors", checkpoint.trainer)
+            save_tensors(folder / "trainer.safetensors", checkpoint.trainer)
 
     def report(self) -> dict[str, Any]:
         """What was noted with the newest stage."""
@@ -296,107 +300,3 @@ def _free(root: Path) -> bool:
     names = [path.name for path in root.iterdir()]
     ours = re.compile(rf"{LEARNING}|{STAGES}|(encoder|descriptor)(-\w+)?\.safetensors|\..*\.tmp")
     return not names or (LEARNING in names and all(map(ours.fullmatch, names)))
-
-
-def _own(module: nn.Module, path: Path) -> Encoder:
-    """A user's module with the weights that the store keeps of it."""
-    try:
-        module.load_state_dict({k: v.float() for k, v in _load(path).items()}, strict=True)
-    except RuntimeError as error:
-        first = str(error).splitlines()[-1].strip()
-        raise InputError(f"{path}: not the weights of the encoder given ({first})") from None
-    return checked_encoder(module)
-
-
-def head_bytes(head: Head) -> int:
-    """Size of a head as it is stored: weights in half precision, centres in single."""
-    return sum(value.nbytes for value in _stored(head).values())
-
-
-def _stored(head: Head) -> dict[str, Tensor]:
-    # Centres stay fp32: half floats are 4 to 16 mm apart at the size of an atlas.
-    return {
-        key: value if key == "centres" or not value.is_floating_point() else value.half()
-        for key, value in head.state_dict().items()
-    }
-
-
-def _write_head(folder: Path, head: Head) -> None:
-    settings = {
-        "options": asdict(head.options),
-        "features": head.features,
-        "descriptor": head.descriptor,
-    }
-    _save(folder / HEAD, _stored(head), {"head": json.dumps(settings)})
-
-
-def _read_head(folder: Path, maps: SceneMaps) -> Head:
-    from safetensors import safe_open
-
-    path = folder / HEAD
-    state = _load(path)
-    with safe_open(path, "pt") as file:
-        settings = json.loads((file.metadata() or {})["head"])
-    head = Head(settings["features"], settings["descriptor"], HeadOptions(**settings["options"]))
-    if head.features != maps.encoder.width:
-        raise InputError(f"{path}: made with another encoder than the store's")
-    for name in ("code", "logit", "logit_bias", "offset", "offset_bias"):
-        setattr(head, name, torch.nn.Parameter(torch.zeros(state[name].shape)))
-    head.centres, head.centre_scene = state["centres"], state["centre_scene"]
-    head.load_state_dict(
-        {key: v.float() if v.dtype == torch.half else v for key, v in state.items()}
-    )
-    return head.eval()
-
-
-def _write_record(folder: Path, record: SceneRecord) -> None:
-    content = {
-        "name": record.name,
-        "camera": record.camera.to_dict(),
-        "cell": asdict(record.cell),
-        "train_frames": record.train_frames,
-        "refined_camera": record.refined_camera.to_dict() if record.refined_camera else None,
-        "inlier_threshold": record.inlier_threshold,
-        "covariance_scale": record.covariance_scale,
-    }
-    write_json(folder / "scene.json", content)
-
-
-def _read_record(folder: Path) -> SceneRecord:
-    content = json.loads((folder / "scene.json").read_text())
-    cell, refined = content["cell"], content["refined_camera"]
-    return SceneRecord(
-        content["name"],
-        Camera.from_dict(content["camera"]),
-        Cell(tuple(cell["centre_m"]), cell["side_m"], tuple(cell["origin_m"])),
-        _load(folder / "prototypes.safetensors")["prototypes"],
-        content["train_frames"],
-        Camera.from_dict(refined) if refined else None,
-        content["inlier_threshold"],
-        content["covariance_scale"],
-    )
-
-
-def with_fit(record: SceneRecord, inlier_threshold: float, covariance_scale: float) -> SceneRecord:
-    """The record with what held-out frames taught."""
-    return replace(record, inlier_threshold=inlier_threshold, covariance_scale=covariance_scale)
-
-
-def _save(
-    path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None
-) -> None:
-    from safetensors.torch import save
-
-    write_bytes(path, save({k: v.detach().contiguous() for k, v in tensors.items()}, metadata))
-
-
-def _load(path: Path) -> dict[str, Tensor]:
-    from safetensors import SafetensorError
-    from safetensors.torch import load
-
-    try:
-        return load(path.read_bytes())
-    except (OSError, SafetensorError) as error:
-        raise InputError(
-            f"{path}: not readable ({error}); run 'evercal verify' on the store"
-        ) from None
