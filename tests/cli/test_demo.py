@@ -70,12 +70,12 @@ def test_bare_shapes_lie_over_located_images(monkeypatch: pytest.MonkeyPatch) ->
     answers = [(scene.name, pose), ("elsewhere", pose), (scene.name, None)]
     room = CellRoom(scene, model=("living", 3))
     overlays = demo_page._overlays(Answers(answers), scene)  # pyright: ignore[reportArgumentType]
-    (drawn,) = demo_page._clay_overlays(room, overlays)
+    (drawn,) = demo_page._untextured_overlays(room, overlays)
     ((model, frames, poses),) = asked
     assert (model, frames, poses) == (("living", 3), [scene.test[1]], [pose])
     expected = (frames[0].read_image().astype(int) + 250) // 2
     np.testing.assert_array_equal(drawn, expected)
-    assert demo_page._clay_overlays(CellRoom(scene), overlays) == []
+    assert demo_page._untextured_overlays(CellRoom(scene), overlays) == []
 
 
 @pytest.mark.usefixtures("small")

@@ -125,15 +125,16 @@ def _plain(outcome: SceneResult) -> dict[str, object]:
 
 def _result(record: object) -> SceneResult:
     names = {field.name for field in fields(SceneResult)}
-    if isinstance(record, dict):
-        record = {_FORMERLY.get(name, name): value for name, value in record.items()}
-    if not isinstance(record, dict) or not names - _LATER <= record.keys() <= names:
+    if not isinstance(record, dict):
         raise KeyError("other fields")
-    for name, value in record.items():
+    found = {_FORMERLY.get(name, str(name)): value for name, value in record.items()}
+    if not names - _LATER <= found.keys() <= names:
+        raise KeyError("other fields")
+    for name, value in found.items():
         if name == "keyframe_positions_m":
-            record[name] = tuple(map(tuple, value))
+            found[name] = tuple(map(tuple, value))
         elif isinstance(value, list):
-            record[name] = tuple(math.inf if v is None else v for v in value)
+            found[name] = tuple(math.inf if v is None else v for v in value)
         elif value is None:
-            record[name] = math.nan
-    return SceneResult(**record)  # pyright: ignore[reportArgumentType]
+            found[name] = math.nan
+    return SceneResult(**found)  # pyright: ignore[reportArgumentType]

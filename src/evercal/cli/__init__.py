@@ -73,15 +73,17 @@ def _complain(message: str, as_json: bool) -> int:
 
 def _verbs(first: str) -> dict[str, Any]:
     """All verbs by name."""
-    from evercal.cli.bench import Bench, BenchReport
+    from evercal.cli.bench import Bench
+    from evercal.cli.bench_report import BenchReport
     from evercal.cli.demo import Demo
     from evercal.cli.evaluate import Evaluate
-    from evercal.cli.info import Info, Verify
+    from evercal.cli.info import Info
     from evercal.cli.inspect import Inspect
     from evercal.cli.learn import Learn
     from evercal.cli.localize import Localize
     from evercal.cli.pretrain import Pretrain, pretrain_with_options
     from evercal.cli.simulate import Simulate
+    from evercal.cli.verify import Verify
 
     return {
         "demo": Demo,

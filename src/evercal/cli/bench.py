@@ -1,4 +1,4 @@
-"""`evercal bench` and `evercal bench-report`."""
+"""`evercal bench`."""
 
 import dataclasses
 import sys
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next
+from evercal.cli.bench_report import show_report
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from evercal.benchmark.bench import BenchOptions, Step
     from evercal.continual.learn import StageOptions
     from evercal.datasets import Scene
-
-TABLES, PAGE, LATEX = "tables.md", "report.html", "table.tex"
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,7 @@ class Bench:
             seconds = f" ({step.outcomes[0].seconds:.0f} s)" if step.outcomes else ""
             line = f"[{step.done}/{step.total}] {step.strategy} seed {step.seed}: "
             print(line + (found or "noted") + seconds, file=said, flush=True)
-        return 0 if rank() else _show(self.out, _words(self.strategies)[0], self.json)
+        return 0 if rank() else show_report(self.out, _words(self.strategies)[0], self.json)
 
     def _steps(self, options: "BenchOptions", out: Path) -> "Iterator[Step]":
         from evercal.benchmark.bench import run_bench
@@ -157,25 +155,6 @@ class Bench:
         )
 
 
-@dataclass(frozen=True)
-class BenchReport:
-    """Make tables and report of a benchmark anew from its results."""
-
-    folder: Annotated[Positional[Path], arg(metavar="DIR")]
-    """Folder of results."""
-    reference: Annotated[str, arg(metavar="NAME")] = "evercal"
-    """The strategy that the others are compared with."""
-    compare_with: Annotated[tuple[Path, ...], arg(metavar="DIR...", help_behavior_hint="")] = ()
-    """Other folders of results to show beside it, of the same scenes under other settings, such as
-    another --memory."""
-    json: bool = False
-    """Print one JSON object."""
-
-    def run(self) -> int:
-        """Prints and writes the tables."""
-        return _show(self.folder, self.reference, self.json, self.compare_with)
-
-
 def _mirror(out: Path) -> Path:
     """A folder for a process that trains along with the first, and whose results nobody reads.
 
@@ -195,37 +174,6 @@ def _mirror(out: Path) -> Path:
     if (out / "runs").exists():
         shutil.copytree(out / "runs", folder / "runs")
     return folder
-
-
-def _show(folder: Path, reference: str, as_json: bool, compare_with: tuple[Path, ...] = ()) -> int:
-    from evercal.benchmark.comparison import as_text, summary
-    from evercal.benchmark.latex import paper_tables
-    from evercal.benchmark.report_data import read_report
-    from evercal.reports.bench_page import bench_page
-    from evercal.reports.bench_views import view_pictures
-    from evercal.simulation.cell import SUITES
-    from evercal.storage import write_bytes
-
-    report = read_report(folder, reference, compare_with)
-    tables = report.tables()
-
-    def text(style: Literal["terminal", "markdown"]) -> str:
-        return "\n\n".join(as_text(rows, style) for rows in tables.non_empty())
-
-    write_bytes(folder / TABLES, (text("markdown") + "\n").encode())
-    suite = SUITES.get(report.suite)
-    rooms = {name: (kind, seed) for name, kind, seed in suite.rooms} if suite else {}
-    pictures = view_pictures(folder, report.plotted, rooms)
-    write_bytes(folder / PAGE, bench_page(report, tables, pictures).encode())
-    latex = paper_tables(report.runs, report.suite, tables.ablation)
-    write_bytes(folder / LATEX, (latex + "\n").encode())
-    if as_json:
-        print_json({"strategies": summary([*report.runs, *report.compare_with])})
-        return 0
-    print(text("terminal"))
-    print(f"wrote {folder / PAGE}, {TABLES} and {LATEX}")
-    print_next("evercal", "bench-report", folder)
-    return 0
 
 
 def _words(text: str) -> tuple[str, ...]:

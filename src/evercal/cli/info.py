@@ -1,4 +1,4 @@
-"""`evercal info` and `evercal verify`."""
+"""`evercal info`."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -74,35 +74,6 @@ class Info:
             ]
             for scene in scenes
         ]
-        header = ["scene", "frames learned", "memory", "believed from inliers", "camera"]
+        header = ["scene", "frames learned", "memory", "accepted from inliers", "camera"]
         align = ("left", "right", "right", "right", "right")
         print(tabulate(rows, headers=header, colalign=align, disable_numparse=True))
-
-
-@dataclass(frozen=True)
-class Verify:
-    """Check every file of a store against its checksum."""
-
-    store: Annotated[Positional[Path], arg(metavar="STORE")]
-    """Folder of the store."""
-    json: bool = False
-    """Print one JSON object."""
-
-    def run(self) -> int:
-        """Names every problem; exit code 1 if there is one."""
-        from evercal.storage import verify
-
-        problems = verify(self.store)
-        if self.json:
-            print_json({"store": str(self.store), "ok": not problems, "problems": problems})
-            return 1 if problems else 0
-        for problem in problems:
-            print(problem)
-        if problems:
-            files = "1 file is" if len(problems) == 1 else f"{len(problems)} files are"
-            print(f"{files} damaged; restore from a copy of the store")
-            print_next("evercal", "verify", self.store)
-            return 1
-        print(f"{self.store}: all files are as they were written")
-        print_next("evercal", "localize", self.store, "IMAGE")
-        return 0

@@ -48,7 +48,7 @@ class Learn:
     format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Format of the scene folder, generic, 7scenes or 12scenes; recognised when left out."""
     seed: int = 0
-    """Of everything that is drawn."""
+    """Random seed."""
     json: bool = False
     """Print one JSON object."""
 
@@ -68,7 +68,7 @@ class Learn:
         held_out = len(validation_split(scene.train)[1])
         start = (
             f"{scene.name}: {len(scene.train)} training frames, {scene.untracked} untracked left"
-            f" out, {held_out} held out to learn what is unknown"
+            f" out, {held_out} held out to calibrate the unknown-scene threshold"
         )
         try:
             with LearnBars(start, sys.stderr if self.json else sys.stdout) as bars:
@@ -84,7 +84,8 @@ class Learn:
             f" memory {size(report.memory_bytes)} ({report.frames_kept} frames of this scene),"
             f" head {size(report.head_bytes)}"
         )
-        print(f"a pose is believed from {100 * report.inlier_threshold:.0f} % inliers on")
+        share = f"{100 * report.inlier_threshold:.0f} %"
+        print(f"poses with fewer than {share} inliers are reported as unknown_scene")
         if scene.test:
             print_next("evercal", "evaluate", self.store, self._scene_word(scene.name))
         else:

@@ -2,9 +2,8 @@
 
 import copy
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -12,7 +11,6 @@ from torch import Tensor
 
 from evercal.continual.finish_scene import method_state_of, select_keyframes
 from evercal.continual.frame_statistics import FrameStatistics
-from evercal.continual.method_state import MethodState
 from evercal.continual.methods.mir import mir_views
 from evercal.continual.methods.preconditioning import preconditioner
 from evercal.continual.strategies import STRATEGIES, Strategy
@@ -54,7 +52,7 @@ class StageOptions:
     """Scenes of the combined grid (`Atlas` layout `paper`), if they are known in advance; 0 gives
     each the next free place."""
     seed: int = 0
-    """Of everything that is drawn."""
+    """Random seed."""
 
     def capacity(self, frames: Sequence[Frame], short_side: int) -> int:
         """N_b in frames, at least 1, for a scene of these training frames."""
@@ -126,20 +124,9 @@ def learn(
     positions = np.stack([_pose(frame).translation_m for frame in scene.train])
     cell = after.atlas(options.grid_scenes).place(positions)
     head, local = _head_for_stage(after, strategy, options, cell, positions)
-    correctable = _correctable(scene.train)
-    buffer = FeatureBuffer(local, cell.atlas_from_base, correctable)
+    buffer = FeatureBuffer(local, cell.atlas_from_base, _correctable(scene.train))
     pacer = _Pacer()
-    past_rows, fitter_state = (resume.rows, resume.trainer) if resume else ((), {})
-    for rows in past_rows:
-        buffer.restore(rows)
-    frames = scene.train
-    for done in encode_frames(buffer, frames, options.encode, maps.encoder, maps.descriptor):
-        yield Encoding(done, len(frames) * options.encode.views_per_frame)
-        if pacer.due():
-            yield Checkpoint(buffer.take_new(), {})
-    new = buffer.take_new()
-    if new:
-        yield Checkpoint(new, {})
+    yield from _encoded(buffer, scene, options, maps, resume, pacer)
     buffers = [buffer]
     if strategy.data == "all":
         buffers += yield from _refill(maps, earlier, options)
@@ -148,26 +135,50 @@ def learn(
     replay = None
     if strategy.penalty is not None and teacher is not None:
         replay = yield from _replay(maps, strategy, teacher, options)
-    fit = options.fit
-    regularizer = None
-    if strategy.regularizer is not None and maps.method_states:
-        regularizer = partial(_weighed, strategy, head, maps.method_states)
-    trainer = HeadTrainer(head, buffers, replay, fit, options.seed, regularizer)
-    if fitter_state:
-        trainer.load(dict(fitter_state))
+    regularizer = _regularizer(strategy, head, maps)
+    trainer = HeadTrainer(head, buffers, replay, options.fit, options.seed, regularizer)
+    if resume is not None and resume.trainer:
+        trainer.load(dict(resume.trainer))
     for progress in trainer.run():
         yield progress
         if pacer.due():
             yield Checkpoint({}, trainer.state())
-    refined: list[Camera | None] = [None] * len(buffers)
-    if fit.intrinsics_rate > 0 and fit.iterations > 0:
-        nominal = [scene.train[0].camera, *[other.train[0].camera for other in earlier]]
-        for i, buffer_ in enumerate(buffers):
-            if buffer_.correctable:
-                refined[i] = corrected_camera(nominal[i], trainer.correction[i].detach())
-    for i, camera in enumerate(refined[1:]):
+    refined, *others = _refined_cameras(trainer, [scene, *earlier])
+    for i, camera in enumerate(others):
         after.scenes[i] = replace(after.scenes[i], refined_camera=camera)
-    yield _finish(after, scene, cell, buffer, options, refined[0])
+    yield _finish(after, scene, cell, buffer, options, refined)
+
+
+def _encoded(
+    buffer: FeatureBuffer,
+    scene: Scene,
+    options: StageOptions,
+    maps: SceneMaps,
+    resume: Resume | None,
+    pacer: "_Pacer",
+) -> Iterator[Event]:
+    """Encodes the scene's frames into the buffer, those that an interrupted run left to do."""
+    for rows in resume.rows if resume else ():
+        buffer.restore(rows)
+    plan, total = options.encode, len(scene.train) * options.encode.views_per_frame
+    for done in encode_frames(buffer, scene.train, plan, maps.encoder, maps.descriptor):
+        yield Encoding(done, total)
+        if pacer.due():
+            yield Checkpoint(buffer.take_new(), {})
+    new = buffer.take_new()
+    if new:
+        yield Checkpoint(new, {})
+
+
+def _refined_cameras(trainer: HeadTrainer, scenes: Sequence[Scene]) -> list[Camera | None]:
+    """For each buffer of the trainer its scene's camera as corrected; None where it is trusted."""
+    refined: list[Camera | None] = [None] * len(trainer.buffers)
+    if trainer.options.intrinsics_rate > 0 and trainer.options.iterations > 0:
+        for i, buffer in enumerate(trainer.buffers):
+            if buffer.correctable:
+                nominal = scenes[i].train[0].camera
+                refined[i] = corrected_camera(nominal, trainer.correction[i].detach())
+    return refined
 
 
 def _correctable(frames: Sequence[Frame]) -> bool:
@@ -286,9 +297,12 @@ def _replay(
     )
 
 
-def _weighed(strategy: Strategy, head: Head, method_states: Sequence[MethodState]) -> Tensor:
-    assert strategy.regularizer is not None
-    return strategy.strength * strategy.regularizer(head, method_states)
+def _regularizer(strategy: Strategy, head: Head, maps: SceneMaps) -> Callable[[], Tensor] | None:
+    """What the weights cost, given the states of earlier scenes; None where they cost nothing."""
+    cost = strategy.regularizer
+    if cost is None or not maps.method_states:
+        return None
+    return lambda: strategy.strength * cost(head, maps.method_states)
 
 
 def _finish(

@@ -63,9 +63,9 @@ class LearnReport:
     train_frames: int
     """Frames learned."""
     held_out_frames: int
-    """Frames kept aside to fit the threshold of the unknown."""
+    """Frames held out to calibrate the unknown-scene threshold."""
     inlier_threshold: float
-    """Smallest inlier ratio that is believed."""
+    """Poses with a smaller inlier ratio are reported as unknown_scene."""
     resumed: bool
     """Whether an interrupted run was continued."""
 
@@ -80,8 +80,8 @@ def learn_scene(
 
     Args:
         store: folder of the store; made when missing.
-        scene: its training frames are learned; a few of them are held out to fit the threshold of
-            the unknown place. Its test frames are not looked at.
+        scene: its training frames are learned; a few of them are held out to calibrate the
+            unknown-scene threshold. Its test frames are not looked at.
         options: how.
         on_event: called with everything that happens, for progress bars.
 

@@ -23,7 +23,7 @@ from evercal.localization.pnp import PnpOptions, PnpResult, solve_pnp
 from evercal.mapping.scene_maps import SceneMaps
 
 ASPECT_TOLERANCE = 0.01
-# Every so many-th point tells where to look; the pose itself comes from all.
+# The first RANSAC pass uses every 4th correspondence; the pose itself comes from all.
 FIRST_PASS_STRIDE = 4
 
 

@@ -34,7 +34,7 @@ class SceneRecord:
     refined_camera: Camera | None = None
     """`camera` as training corrected it, with distortion; None where the given one is trusted."""
     inlier_threshold: float = 0.0
-    """Smallest inlier ratio of a pose that is believed; fitted on held-out training frames."""
+    """Poses with a smaller inlier ratio are `unknown_scene`; fitted on held-out training frames."""
     covariance_scale: float = 1.0
     """What covariances are multiplied with to match the errors on held-out training frames."""
 

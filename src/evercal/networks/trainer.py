@@ -112,7 +112,7 @@ class HeadTrainer:
         buffers: rows of the scenes being learned.
         replay: rows of remembered scenes.
         options: how.
-        seed: of everything that is drawn.
+        seed: random seed.
         regularizer: what the weights themselves cost.
     """
 

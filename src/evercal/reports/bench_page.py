@@ -1,6 +1,6 @@
 """The report of a benchmark: tables and figures in one HTML file."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -32,65 +32,48 @@ def bench_page(report: Report, tables: Tables, pictures: Sequence[Picture] = ())
     runs = [run for of in grouped.values() for run in of]
     left = len(every) - len(grouped)
     more = f"; {left} more strategies are in the tables alone" if left else ""
-    names = sorted(runs[0].scenes)
-    ends = {
-        name: np.mean([_ends(run, names) for run in of], axis=0) for name, of in grouped.items()
-    }
-    sizes = {
-        name: (
-            float(np.mean([run.memory_mb for run in of])),
-            float(np.mean([run.scores().final_accuracy for run in of])),
-        )
-        for name, of in (grouped | by_strategy(report.compare_with)).items()
-    }
-    errors = {
-        name: np.concatenate([o.translation_m for run in of for o in run.last])
-        for name, of in grouped.items()
-    }
-    sections = [
-        Section(
-            "Methods",
-            [
-                _table(tables.methods, "Means over runs; accuracy in per cent"),
-                _table(tables.thresholds, "At the end, under looser and tighter bounds"),
-            ],
-        ),
-        Section(
-            "Scenes",
-            [
-                _table(
-                    tables.scenes, "Test frames within 5 cm and 5 deg: when learned, at the end"
-                ),
-                Picture(scene_bars(ends, names), f"At the end{more}"),
-            ],
-        ),
-    ]
+    sections = [_methods(tables), _scenes(grouped, sorted(runs[0].scenes), tables, more)]
     curves = _curves(runs)
     if curves:
-        order = runs[0].scenes
-        sections.append(
-            Section(
-                "Forgetting",
-                [Picture(forgetting_curves(curves, order), "What became of each scene")],
-            )
-        )
+        drawing = forgetting_curves(curves, runs[0].scenes)
+        sections.append(Section("Forgetting", [Picture(drawing, "What became of each scene")]))
     if pictures:
         said = "A test image of each scene, and the scene at the pose that each method found for it"
         sections.append(Section("At the end, seen from the estimated pose", [said, *pictures]))
+    sections += [*_what_stays(report, tables), *_parts(tables), *_differences(tables)]
+    sections.append(_errors_and_memory(grouped, report, tables))
+    return html_page("evercal bench", sections)
+
+
+def _methods(tables: Tables) -> Section:
+    means = _table(tables.methods, "Means over runs; accuracy in per cent")
+    bounds = _table(tables.thresholds, "At the end, under looser and tighter bounds")
+    return Section("Methods", [means, bounds])
+
+
+def _scenes(
+    grouped: Mapping[str, Sequence[Run]], names: Sequence[str], tables: Tables, more: str
+) -> Section:
+    ends = {
+        name: np.mean([_ends(run, names) for run in of], axis=0) for name, of in grouped.items()
+    }
+    said = "Test frames within 5 cm and 5 deg: when learned, at the end"
+    picture = Picture(scene_bars(ends, names), f"At the end{more}")
+    return Section("Scenes", [_table(tables.scenes, said), picture])
+
+
+def _what_stays(report: Report, tables: Tables) -> list[Section]:
     kept = _kept(report.runs)
-    if kept:
-        sections.append(
-            Section(
-                "What stays",
-                [
-                    _table(tables.selectors, "In the metric of SARS: scene sides and radians"),
-                    *(
-                        Picture(kept_places(of), f"Remembered cameras of {scene}")
-                        for scene, of in kept.items()
-                    ),
-                ],
-            )
-        )
+    if not kept:
+        return []
+    table = _table(tables.selectors, "In the metric of SARS: scene sides and radians")
+    places = [
+        Picture(kept_places(of), f"Remembered cameras of {scene}") for scene, of in kept.items()
+    ]
+    return [Section("What stays", [table, *places])]
+
+
+def _parts(tables: Tables) -> list[Section]:
     parts = [
         _table(rows, said)
         for rows, said in (
@@ -99,19 +82,37 @@ def bench_page(report: Report, tables: Tables, pictures: Sequence[Picture] = ())
         )
         if len(rows) > 1
     ]
-    if parts:
-        sections.append(Section("What each part gives", parts))
-    if len(tables.differences) > 1:
-        said = "Paired bootstrap over runs and blocks of 10 frames; real where 0 lies outside."
-        sections.append(Section("Differences", [_table(tables.differences, said)]))
-    last: list[str | Table | Picture] = [
+    return [Section("What each part gives", parts)] if parts else []
+
+
+def _differences(tables: Tables) -> list[Section]:
+    if len(tables.differences) <= 1:
+        return []
+    said = "Paired bootstrap over runs and blocks of 10 frames; real where 0 lies outside."
+    return [Section("Differences", [_table(tables.differences, said)])]
+
+
+def _errors_and_memory(
+    grouped: Mapping[str, Sequence[Run]], report: Report, tables: Tables
+) -> Section:
+    sizes = {
+        name: (
+            float(np.mean([run.memory_mb for run in of])),
+            float(np.mean([run.scores().final_accuracy for run in of])),
+        )
+        for name, of in {**grouped, **by_strategy(report.compare_with)}.items()
+    }
+    errors = {
+        name: np.concatenate([o.translation_m for run in of for o in run.last])
+        for name, of in grouped.items()
+    }
+    parts: list[str | Table | Picture] = [
         Picture(error_curve(errors), "All scenes at the end"),
         Picture(accuracy_against_size(sizes, "memory"), "What accuracy takes"),
     ]
     if report.compare_with:
-        last.append(_table(tables.compare_with, "The same scenes under other settings"))
-    sections.append(Section("Errors and memory", last))
-    return html_page("evercal bench", sections)
+        parts.append(_table(tables.compare_with, "The same scenes under other settings"))
+    return Section("Errors and memory", parts)
 
 
 def _ends(run: Run, names: Sequence[str]) -> list[float]:

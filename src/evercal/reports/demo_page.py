@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from evercal.datasets import Frame, Scene
+    from evercal.drawing import Section
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import Localizer
     from evercal.simulation.mini import CellRoom
@@ -33,62 +34,71 @@ def write_pictures(
         places: the rooms.
         outcome: what was measured.
     """
-    from evercal.drawing import (
-        Picture,
-        Section,
-        Table,
-        contact_sheet,
-        encode_image,
-        forgetting_curves,
-        html_page,
-    )
+    from evercal.drawing import html_page
     from evercal.storage import write_bytes
 
-    scenes = [place.scene for place in places]
-    overlays = [_overlays(localizer, scene) for scene in scenes]
+    overlays = [_overlays(localizer, place.scene) for place in places]
     overview = _overview([max(found, key=lambda o: o.inliers) for found in overlays[:2]], outcome)
     write_bytes(out / "overview.png", overview)
+    sections = [
+        *_results(overview, len(places[0].scene.train), outcome),
+        *_points(places, overlays),
+        *_fixed_cameras(outcome),
+    ]
+    write_bytes(out / "report.html", html_page("evercal demo", sections).encode())
+
+
+def _results(overview: bytes, images: int, outcome: DemoOutcome) -> "list[Section]":
+    """What happened, and how accurate each method was after each room."""
+    from evercal.drawing import Picture, Section, Table, forgetting_curves
+
     rooms = outcome.rooms
     curves = {METHODS[key]: _square(rows, len(rooms)) for key, rows in outcome.accuracy.items()}
     header = ["method", "after", *(f"{room} %" for room in rooms)]
     seconds = [second for times in outcome.seconds.values() for second in times]
     intro = (
-        f"{len(rooms)} virtual rooms were learned one after the other, from {len(scenes[0].train)}"
+        f"{len(rooms)} virtual rooms were learned one after the other, from {images}"
         f" posed images each, by one small network. Fine-tuning is the same network and the same"
         f" number of steps without anything to remember by. A room took {np.mean(seconds):.0f} s on"
         f" average; evercal keeps {outcome.memory_bytes / 1e6:.1f} MB of the rooms in memory. At"
         f" test time nothing says which room an image is from."
     )
-    sheets = [
-        Picture(
-            encode_image(_sheet(overlays), "jpg"), "Test images with the scene points that agree"
-        )
-    ]
-    sections = [
+    table = Table(header, outcome.rows(), "Test frames within 5 cm and 5 deg, per cent")
+    picture = Picture(forgetting_curves(curves, rooms), "What became of each room")
+    return [
         Section("", [intro, Picture(overview, "Left: two test images; right: the first room")]),
-        Section(
-            "Accuracy after each room",
-            [
-                Table(header, outcome.rows(), "Test frames within 5 cm and 5 deg, per cent"),
-                Picture(forgetting_curves(curves, rooms), "What became of each room"),
-            ],
-        ),
-        Section("Predicted points", sheets),
+        Section("Accuracy after each room", [table, picture]),
     ]
+
+
+def _points(places: "Sequence[CellRoom]", overlays: "list[list[_Overlay]]") -> "list[Section]":
+    """Test images with the points that agree, and with the room's bare shapes over them."""
+    from evercal.drawing import Picture, Section, contact_sheet, encode_image
+
+    said = "Test images with the scene points that agree"
+    sheet = encode_image(_sheet(overlays), "jpg")
+    sections = [Section("Predicted points", [Picture(sheet, said)])]
     pairs = zip(places, overlays, strict=True)
-    drawn = [image for place, found in pairs for image in _clay_overlays(place, found)]
-    if drawn:
-        sheet = encode_image(contact_sheet(drawn, _OVERLAYS_PER_ROOM), "jpg")
+    rendered = [image for place, found in pairs for image in _untextured_overlays(place, found)]
+    if rendered:
+        sheet = encode_image(contact_sheet(rendered, _OVERLAYS_PER_ROOM), "jpg")
         said = "The room's bare shapes, rendered at the estimated pose, laid over the test image."
         sections.append(Section("Rendered at the estimated pose", [said, Picture(sheet)]))
-    if outcome.fixed:
-        said = (
-            "A camera stands still while the arm moves. Its pose in the robot's base frame is the"
-            " robust mean over its images; no marker, no motion of the camera."
-        )
-        table = Table(FIXED_HEADER, outcome.fixed_rows(), "evercal after the last room")
-        sections.append(Section("Calibration of a fixed camera", [said, table]))
-    write_bytes(out / "report.html", html_page("evercal demo", sections).encode())
+    return sections
+
+
+def _fixed_cameras(outcome: DemoOutcome) -> "list[Section]":
+    """Where the cameras that stand still were found."""
+    from evercal.drawing import Section, Table
+
+    if not outcome.fixed:
+        return []
+    said = (
+        "A camera stands still while the arm moves. Its pose in the robot's base frame is the"
+        " robust mean over its images; no marker, no motion of the camera."
+    )
+    table = Table(FIXED_HEADER, outcome.fixed_rows(), "evercal after the last room")
+    return [Section("Calibration of a fixed camera", [said, table])]
 
 
 def _square(rows: list[list[float]], count: int) -> np.ndarray:
@@ -132,7 +142,7 @@ def _overlays(localizer: "Localizer", scene: "Scene") -> list[_Overlay]:
     return found
 
 
-def _clay_overlays(place: "CellRoom", overlays: list[_Overlay]) -> list[np.ndarray]:
+def _untextured_overlays(place: "CellRoom", overlays: list[_Overlay]) -> list[np.ndarray]:
     """Test images of a room with its bare shapes over them; none where they cannot be rendered."""
     from evercal.simulation.mini import untextured_renders
 

@@ -69,7 +69,7 @@ class PretrainOptions:
     descriptor_steps: int = 2_000
     """Optimiser steps of the global descriptor."""
     seed: int = 1
-    """Of everything that is drawn."""
+    """Random seed."""
     init: str | None = None
     """Checkpoint `encoder.pt` of an earlier run to start from; random weights when left out."""
 
