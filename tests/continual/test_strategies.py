@@ -245,7 +245,7 @@ def test_every_strategy_says_where_it_is_from_and_hangs_together(
     assert name.isidentifier()
     assert len(strategy.source.split()) >= 4
     # What is remembered is replayed or recalled, and nothing is that was not remembered.
-    assert (strategy.select is None) == (strategy.penalty is None and not strategy.recall)
+    assert (strategy.select is None) == (strategy.penalty is None and not strategy.match_keyframes)
     if strategy.data == "all" or strategy.heads == "per_scene":
         assert strategy.penalty is None
 
@@ -268,9 +268,9 @@ def test_any_selector_goes_with_any_penalty(monkeypatch: pytest.MonkeyPatch) -> 
     assert strategies.compose("sars_filled+spdd") is made
     plain = strategies.compose("reservoir+reprojection")
     assert plain == replace(STRATEGIES["er"], source=plain.source)
-    assert not plain.recall
+    assert not plain.match_keyframes
     recalled = strategies.compose("sars_filled+anchored+recall")
-    assert recalled.recall
+    assert recalled.match_keyframes
     assert recalled.select == STRATEGIES["evercal"].select
     for name in (
         "nonsense",

@@ -1,8 +1,8 @@
 """The benchmark: strategies over a sequence of scenes, what is missing is run, what is done kept.
 
     OUT/settings.json             what decides the results; a folder of other settings is refused
-    OUT/results.jsonl             see `evaluation.outcomes`
-    OUT/views/                    see `evaluation.views`; of each strategy's first run
+    OUT/results.jsonl             see `benchmark.results`
+    OUT/views/                    see `benchmark.scene_views`; of each strategy's first run
     OUT/features/                 encoded views, shared by all runs; may be deleted
     OUT/runs/STRATEGY-SEED/       a store under way, gone when its sequence is done
     OUT/runs/first-SCENE-SEED/    the first scene, which all strategies learn alike
@@ -230,7 +230,7 @@ class _Run:
         keyframes = self._kept(maps, 0, train, rows)
         maps.keyframes, maps.method_states = [keyframes], []  # not those of who learned it
         maps.method_states = [method_state_of(maps, rows())] if self.rule.after_scene else [{}]
-        if self.rule.recall:  # more cells agree, so more must
+        if self.rule.match_keyframes:  # more cells agree, so more must
             maps.scenes[0] = with_fit(maps.scenes[0], *fit_threshold(maps, aside))
         report = first.report()
         report["seconds"] = float(report["seconds"]) + time.perf_counter() - began

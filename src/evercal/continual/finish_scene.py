@@ -38,7 +38,7 @@ def select_keyframes(
     if refined is not None:
         frames = [replace(frame, camera=refined) for frame in frames]
     keyframes = store_keyframes([frames[i] for i in chosen], maps.short_side)
-    if strategy.recall:
+    if strategy.match_keyframes:
         depths = keyframe_depths(
             chosen,
             frames,

@@ -1,6 +1,6 @@
-"""What strategies note about a finished scene beside its frames, and what follows from it.
+"""What methods keep of a finished scene beside its keyframes, and what follows from it.
 
-Notes are named tensors; they are stored with the scene and count as memory.
+A state is named tensors; it is stored with the scene and counts as memory.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +33,7 @@ class FinishedScene:
     remembered: Callable[[], FeatureBuffer]
     """Rows of the frames that stay in memory, as they are."""
     earlier: Sequence[MethodState]
-    """What was noted about earlier scenes."""
+    """What was kept of earlier scenes."""
 
 
 def after_scene_reference(scene: FinishedScene) -> dict[str, Tensor]:
@@ -103,7 +103,7 @@ def after_scene_fisher_online(scene: FinishedScene) -> dict[str, Tensor]:
 def ewc_penalty(head: Head, method_states: Sequence[MethodState]) -> Tensor:
     """EWC (Kirkpatrick et al., PNAS 2017): strength / 2 times sum of F (theta - anchor)^2.
 
-    Over the parameters that were there when a scene was noted; rows of later scenes are free.
+    Over the parameters that were there when a scene was finished; rows of later scenes are free.
     """
     cost = torch.zeros(())
     for name, value in head.named_parameters():

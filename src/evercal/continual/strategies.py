@@ -79,13 +79,13 @@ class Strategy:
     """How gradients of remembered scenes join that of the new one; None adds them up."""
     mir: bool = False
     """Whether those views are replayed that the new rows are about to spoil most."""
-    recall: bool = False
-    """Whether remembered frames also answer: cells of an image are matched to theirs, whose depths
-    are then part of the memory (`continual.recall`)."""
+    match_keyframes: bool = False
+    """Whether keyframes also answer: cells of an image are matched to theirs, whose depths are then
+    kept with them (`localization.keyframe_matcher`)."""
     after_scene: Callable[[FinishedScene], dict[str, Tensor]] | None = None
-    """What is noted about a finished scene beside its frames."""
+    """What is kept of a finished scene beside its keyframes."""
     regularizer: Callable[[Head, Sequence[MethodState]], Tensor] | None = None
-    """What the weights cost, given the notes about all earlier scenes."""
+    """What the weights cost, given the states of all earlier scenes."""
 
 
 PRECONDITIONING = 0.5
@@ -143,7 +143,7 @@ STRATEGIES: dict[str, Strategy] = {
     "evercal": replace(
         _NETWORK,
         source="this project: scene codes, own centres, anchored replay, protection, recall",
-        recall=True,
+        match_keyframes=True,
     ),
     "finetune": Strategy(source="control: the head and steps of evercal, no replay"),
     "evercal_network": _NETWORK,
@@ -255,7 +255,7 @@ STRATEGIES: dict[str, Strategy] = {
         source="the same with the memory of evercal: what evercal could reach",
         select=_sars_filled,
         data="all",
-        recall=True,
+        match_keyframes=True,
     ),
 }
 
@@ -288,7 +288,7 @@ def compose(name: str) -> Strategy:
 
     Args:
         name: `SELECTOR+PENALTY`, the same with `+recall`, or a strategy and by how much its
-            penalty and restraint are to weigh more: `icarl@0.3`.
+            penalty and regularizer are to weigh more: `icarl@0.3`.
 
     Raises:
         InputError: any other name that is not known yet.
@@ -312,6 +312,6 @@ def compose(name: str) -> Strategy:
     source = f"composed: {selector} selects, replay costs {penalty}"
     cost = PENALTIES[penalty]
     made = Strategy(
-        source, SELECTORS[selector], cost, WEIGHTS.get(cost, 1.0), recall="recall" in more
+        source, SELECTORS[selector], cost, WEIGHTS.get(cost, 1.0), match_keyframes="recall" in more
     )
     return STRATEGIES.setdefault(name, made)

@@ -98,16 +98,16 @@ class Similarity:
 
 
 class KeyframeMatcher:
-    """The remembered frames of one scene, encoded, to match images to.
+    """The keyframes of one scene, encoded, to match images to.
 
     Args:
-        maps: with a memory of the scene that has depths.
+        maps: with keyframes of the scene that have depths.
         scene: its index.
     """
 
     def __init__(self, maps: SceneMaps, scene: int):
         keyframes, cell = maps.keyframes[scene], maps.scenes[scene].cell
-        assert keyframes is not None, "only what is remembered can be recalled"
+        assert keyframes is not None, "only keyframes can be matched"
         frames, stride = keyframes.frames(), maps.encoder.stride
         view = ViewOptions(short_side=maps.short_side)
         views = [frame_view(frame, stride, view) for frame in frames]

@@ -1,4 +1,4 @@
-"""`Localizer`: what a robot calls."""
+"""`Localizer`: from an image to the pose of its camera."""
 
 import time
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ class LocalizeOptions:
     candidates: int = 3
     """At most this many scenes are tried for an image."""
     votes: float = 0.3
-    """Where frames are recalled, cells vote for the scene that remembers the most similar one;
+    """Where keyframes are matched, cells vote for the scene that has the most similar one;
     scenes with a smaller share of the best scene's votes are not tried."""
     margin: float = 0.15
     """Scenes whose best prototype is less similar than the best scene's by more are not tried."""

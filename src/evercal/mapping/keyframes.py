@@ -22,7 +22,7 @@ JPEG_QUALITY = 95
 
 @dataclass(frozen=True)
 class Keyframes:
-    """Remembered frames of one scene."""
+    """A few frames of one scene that stay with it."""
 
     images: tuple[bytes, ...]
     """Grey JPEG files at working size."""
@@ -32,7 +32,7 @@ class Keyframes:
     """(n,) poses in the scene's base frame."""
     inverse_depth: tuple[Tensor, ...] = ()
     """(cells,) half floats of each image, per metre along the optical axis; none where a strategy
-    does not recall."""
+    does not match keyframes."""
 
     @property
     def bytes(self) -> int:

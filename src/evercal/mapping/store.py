@@ -104,7 +104,7 @@ class Store:
         short_side: int = 240,
         encoder: Path | nn.Module | None = None,
     ) -> Self:
-        """A robot that knows nothing yet; nothing is written before the first `commit`.
+        """An empty store; nothing is written before the first `commit`.
 
         Args:
             root: folder of the store to be.
@@ -280,7 +280,7 @@ class Store:
             save_tensors(folder / "trainer.safetensors", checkpoint.trainer)
 
     def report(self) -> dict[str, Any]:
-        """What was noted with the newest stage."""
+        """What `commit` was told about the newest stage."""
         return json.loads((self.root / STAGES / self.stages[-1] / "report.json").read_text())
 
     def bytes(self) -> dict[str, int]:

@@ -17,7 +17,7 @@ class Gradients:
     losses: Tensor
     """(t,) those losses."""
     references: Tensor
-    """(t,) the same losses when the scene was just learned; NaN where nothing was noted."""
+    """(t,) the same losses when the scene was just learned; NaN where it was not kept."""
     before: Tensor
     """(t,) the same losses in the step before; NaN in the first step."""
     step: int

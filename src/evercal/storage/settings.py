@@ -33,7 +33,7 @@ def lock_settings(path: Path, settings: Mapping[str, object]) -> None:
 
 
 def read_settings(path: Path) -> dict[str, object]:
-    """What `lock_settings` noted.
+    """What `lock_settings` wrote.
 
     Raises:
         InputError: there is none that can be read.
