@@ -310,7 +310,7 @@ def test_replay_keeps_an_old_scene(
     assert kept < median_error_m(forgot, arcs[0]) / 3
 
 
-def test_strength_weighs_penalty_and_restraint(
+def test_strength_weighs_penalty_and_regularizer(
     first: dict[str, SceneMaps],
     rooms: Rooms,
     quick: StageOptions,
@@ -325,7 +325,7 @@ def test_strength_weighs_penalty_and_restraint(
     def free(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
         return 0 * student.points.sum()
 
-    for name, nothing in (("er", {"penalty": free}), ("ewc", {"restraint": None})):
+    for name, nothing in (("er", {"penalty": free}), ("ewc", {"regularizer": None})):
         without = learned(name, **nothing)
         assert_same(learned(name, strength=0.0), without)
         moved = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from evercal.localization.localizer import Localizer
 from evercal.mapping.stage_files import head_bytes
 from evercal.mapping.store import Store
 from evercal.networks.trainer import Progress
+from evercal.storage import MANIFEST, write_manifest
 
 Rooms = tuple[Scene, Scene, Scene]
 Tree = Callable[[Path], dict[str, str]]
@@ -131,13 +133,27 @@ def test_what_cannot_be_learned_is_refused_and_nothing_happens(
     assert tree(taught.root) == before
     with pytest.raises(InputError, match="15 training frames"):
         learn_scene(tmp_path / "new", replace(rooms[2], train=rooms[2].train[:15]), options)
-    with pytest.raises(InputError, match="'magic'"):
+    with pytest.raises(InputError, match=r"'magic'.*finetune"):
         learn_scene(tmp_path / "new", rooms[2], replace(options, strategy="magic"))
     assert not (tmp_path / "new").exists()
     (tmp_path / "thesis.tex").write_text("x")
     with pytest.raises(InputError, match="not an evercal store"):
         learn_scene(tmp_path, rooms[2], options)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_nothing_is_learned_into_a_store_of_an_unknown_strategy(
+    taught: Taught, rooms: Rooms, options: LearnOptions, tmp_path: Path, tree: Tree
+) -> None:
+    root = tmp_path / "store"
+    shutil.copytree(taught.root, root)
+    manifest = json.loads((root / MANIFEST).read_text())
+    payload = manifest["payload"] | {"strategy": "of the future"}
+    write_manifest(root, payload, list(manifest["files"]))
+    before = tree(root)
+    with pytest.raises(InputError, match=r"'of the future'.*finetune.*update evercal"):
+        learn_scene(root, rooms[2], options)
+    assert tree(root) == before
 
 
 def test_a_joint_store_says_that_it_cannot_go_on_alone(

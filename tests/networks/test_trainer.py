@@ -285,7 +285,7 @@ def test_a_wrong_lens_is_corrected_where_it_may_be(learnable: Learnable) -> None
     options = replace(options, loss=OPTIONS.loss)
     rays = torch.from_numpy(true.unproject(cell_centres(120, 160, 8))).float()
     for correctable, steps in ((True, 400), (False, 30)):
-        buffer, _ = learnable(views=20, correction=true, correctable=correctable)
+        buffer, _ = learnable(views=20, lens=true, correctable=correctable)
         head = head_for([buffer], HeadOptions(width=64))
         trainer = HeadTrainer(head, [buffer], None, replace(options, iterations=steps), 0)
         list(trainer.run())

@@ -24,7 +24,7 @@ POSE = SE3(np.array([1.0, 0, 0, 0]), np.array([0.0, 0.0, -1.0]))
 class Told:
     """Finds every image in one scene, whose only point lies on the optical axis."""
 
-    known = type("", (), {"short_side": 48})
+    maps = type("", (), {"short_side": 48})
 
     def __init__(self, scene: str | None) -> None:
         self.scene = scene

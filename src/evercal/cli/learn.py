@@ -112,6 +112,7 @@ class Learn:
 
     def _strategy(self) -> str:
         """The strategy asked for, else the store's; refuses what a store cannot change later."""
+        from evercal.continual.learn_scene import strategy_of
         from evercal.continual.strategies import STRATEGIES
         from evercal.mapping.store import Store
         from evercal.storage import MANIFEST
@@ -127,14 +128,15 @@ class Learn:
                 raise InputError(f"--strategy {self.strategy}: unknown; use {', '.join(usable)}")
         if not (self.store / MANIFEST).exists():
             return self.strategy or "evercal"
-        maps = Store.open(self.store).maps
+        opened = Store.open(self.store)
+        maps, rule = opened.maps, strategy_of(opened)
         if self.encoder is not None:
             raise InputError(
                 f"--encoder {self.encoder}: {self.store} keeps the encoder it was made with; leave"
                 f" the option out or start a new store"
             )
         made_with = maps.heads[-1].options.centres_per_scene if maps.heads else self.centres
-        shared = STRATEGIES[maps.strategy].heads == "one"
+        shared = rule.heads == "one"
         if shared and self.centres is not None and self.centres != made_with:
             raise InputError(
                 f"--centres {self.centres}: {self.store} was made with {made_with} for each scene;"

@@ -22,7 +22,7 @@ RELATION_TEMPERATURE = 0.2
 
 
 def spdd(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
-    """Replay of the paper: its three distillations (`continual.methods.spdd`), and no ground truth."""
+    """Replay of the paper: its three distillations (see `methods.spdd`), and no truth."""
     return spdd_loss(student, teacher, SpddOptions()).total
 
 
