@@ -122,8 +122,7 @@ def make() -> Callable[[Path, list[SceneMaps]], Store]:
     """Makes a store with given stages, the way `teach` does."""
     import torch
 
-    from evercal.continual.learn import Checkpoint
-    from evercal.mapping.store import Store
+    from evercal.mapping.store import Checkpoint, Store
 
     def store(root: Path, stages: list[SceneMaps]) -> Store:
         first = stages[0]

@@ -38,9 +38,9 @@ def options(arc_stage: StageOptions) -> BenchOptions:
     return BenchOptions(stage, ("er", "finetune", "joint"), seeds=(0,), short_side=120)
 
 
-def told(outcomes: list[SceneResult]) -> list[SceneResult]:
+def told(results: list[SceneResult]) -> list[SceneResult]:
     """What must be the same in every run."""
-    return [replace(outcome, seconds=0.0) for outcome in outcomes]
+    return [replace(result, seconds=0.0) for result in results]
 
 
 @pytest.fixture(scope="module")
@@ -248,7 +248,7 @@ def test_a_running_note_begins_with_the_first_scene(
     arcs: Arcs, options: BenchOptions, tmp_path: Path
 ) -> None:
     steps = list(run_bench(arcs, replace(options, strategies=("ewc_online",)), tmp_path))
-    sizes = [step.outcomes[0].memory_bytes for step in steps]
+    sizes = [step.results[0].memory_bytes for step in steps]
     # One anchor and one Fisher matrix a scene, both of the whole head.
     assert 0 < sizes[0] < sizes[1]
 

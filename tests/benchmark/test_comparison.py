@@ -25,7 +25,7 @@ from evercal.errors import InputError
 FRAMES = 20
 
 
-def outcome(strategy: str, seed: int, stage: int, scene: str, right: int) -> SceneResult:
+def result(strategy: str, seed: int, stage: int, scene: str, right: int) -> SceneResult:
     """`right` of 20 frames are 2 cm off, one is in another scene, the others are 30 cm off."""
     errors = [0.02] * right + [math.inf] + [0.3] * (FRAMES - right - 1)
     return SceneResult(
@@ -48,7 +48,7 @@ def outcome(strategy: str, seed: int, stage: int, scene: str, right: int) -> Sce
 def lines(strategy: str, seed: int, rows: Sequence[Sequence[int]]) -> list[SceneResult]:
     """A run over the scenes b, a: row i holds the right frames after stage i."""
     return [
-        outcome(strategy, seed, stage, "ba"[i], right)
+        result(strategy, seed, stage, "ba"[i], right)
         for stage, row in enumerate(rows)
         for i, right in enumerate(row)
     ]
@@ -78,7 +78,7 @@ def test_a_run_under_way_does_not_count() -> None:
 
 
 def test_joint_training_has_a_last_row_and_nothing_to_forget() -> None:
-    joint = [outcome("joint", 0, 1, scene, 18) for scene in "ba"]
+    joint = [result("joint", 0, 1, scene, 18) for scene in "ba"]
     run = runs_of(OURS + joint)[-1]
     assert run.scores().final_accuracy == pytest.approx(90)
     assert math.isnan(run.scores().total_forgetting)
@@ -140,7 +140,7 @@ def test_differences_are_paired_by_seed_and_frame() -> None:
 
 
 def test_the_summary_holds_whole_matrices_and_no_nan() -> None:
-    joint = [outcome("joint", 0, 1, scene, 18) for scene in "ba"]
+    joint = [result("joint", 0, 1, scene, 18) for scene in "ba"]
     found = summary(runs_of(OURS + joint))
     assert found["joint"][0]["accuracy_5cm_5deg"] == [[None, None], [90.0, 90.0]]  # pyright: ignore[reportIndexIssue]
     assert found["joint"][0]["total_forgetting"] is None  # pyright: ignore[reportIndexIssue]
@@ -148,8 +148,8 @@ def test_the_summary_holds_whole_matrices_and_no_nan() -> None:
 
 
 def test_runs_in_another_order_are_compared_by_name() -> None:
-    flipped = [outcome("theirs", 0, 0, "a", 10)]
-    flipped += [outcome("theirs", 0, 1, "a", 12), outcome("theirs", 0, 1, "b", 14)]
+    flipped = [result("theirs", 0, 0, "a", 10)]
+    flipped += [result("theirs", 0, 1, "a", 12), result("theirs", 0, 1, "b", 14)]
     found = difference(runs_of(OURS)[:1], runs_of(flipped))
     assert found is not None
     assert found.mean == pytest.approx(0)

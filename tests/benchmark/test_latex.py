@@ -9,7 +9,7 @@ from evercal.benchmark.latex import PUBLISHED, paper_table
 from evercal.benchmark.results import SceneResult
 
 
-def outcome(strategy: str, stage: int, scene: str, errors: list[float]) -> SceneResult:
+def result(strategy: str, stage: int, scene: str, errors: list[float]) -> SceneResult:
     return SceneResult(
         strategy,
         0,
@@ -29,9 +29,9 @@ def outcome(strategy: str, stage: int, scene: str, errors: list[float]) -> Scene
 
 RUNS = runs_of(
     [
-        outcome("sars_spdd", 0, "a_1", [0.005, 0.008, 0.02]),
-        outcome("sars_spdd", 1, "a_1", [0.005, 0.02, 0.3]),
-        outcome("sars_spdd", 1, "b", [0.008, math.inf, math.inf]),
+        result("sars_spdd", 0, "a_1", [0.005, 0.008, 0.02]),
+        result("sars_spdd", 1, "a_1", [0.005, 0.02, 0.3]),
+        result("sars_spdd", 1, "b", [0.008, math.inf, math.inf]),
     ]
 )
 
@@ -57,7 +57,7 @@ def test_published_numbers_stand_beside_ours_where_the_data_are_the_same() -> No
     assert r"Mean, published &  &  & 74.9 \\" in text
     assert r"TFR, published &  &  & 6.7 \\" in text  # 6.65
     assert "published" not in paper_table(RUNS, "sim-7")
-    joint = runs_of([outcome("der", 1, scene, [0.01]) for scene in ("a", "b")])
+    joint = runs_of([result("der", 1, scene, [0.01]) for scene in ("a", "b")])
     assert r"Mean, published &  &  & -- \\" in paper_table(joint, "i12s")
     # The paper's own table: SARS and SPDD against the best of the others.
     for suite in PUBLISHED.values():

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def told(folder: Path) -> list[SceneResult]:
-    found = [replace(outcome, seconds=0.0) for outcome in read(folder)]
+    found = [replace(result, seconds=0.0) for result in read(folder)]
     return sorted(found, key=lambda o: (o.strategy, o.seed, o.stage, o.scene))
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from evercal.benchmark import results as outcomes
+from evercal.benchmark import results
 from evercal.benchmark.report_data import read_report
 from evercal.benchmark.results import SETTINGS
 from evercal.errors import InputError
@@ -19,8 +19,8 @@ def folder(root: Path, name: str, right: int, **settings: object) -> Path:
     out.mkdir()
     held = {"suite": "custom", "scenes": [["a", 9, 20], ["b", 9, 20]], "judged": "test frames"}
     write_json(out / SETTINGS, held | settings)
-    outcomes.append(out, lines("evercal", 0, [[16], [right, right]]))
-    outcomes.append(out, lines("joint", 0, [[10], [10, 10]]))
+    results.append(out, lines("evercal", 0, [[16], [right, right]]))
+    results.append(out, lines("joint", 0, [[10], [10, 10]]))
     return out
 
 
@@ -73,9 +73,9 @@ def test_no_results(tmp_path: Path) -> None:
 def test_the_best_first_and_seven_in_figures(tmp_path: Path) -> None:
     here = folder(tmp_path, "here", 12)
     for seed in (0, 1):
-        outcomes.append(here, lines("er", seed, [[16], [4, 4]]))
+        results.append(here, lines("er", seed, [[16], [4, 4]]))
     for right, name in enumerate(("gem", "agem", "mir", "gss", "der", "co2l"), start=14):
-        outcomes.append(here, lines(name, 0, [[16], [right, right]]))
+        results.append(here, lines(name, 0, [[16], [right, right]]))
     report = read_report(here, "evercal")
     ranked = ["co2l", "der", "gss", "mir", "agem", "gem", "evercal", "joint", "er"]
     assert list(dict.fromkeys(run.strategy for run in report.runs)) == ranked

@@ -11,7 +11,7 @@ from evercal.benchmark.results import RESULTS, SceneResult, append, read
 from evercal.errors import InputError
 
 
-def outcome(stage: int = 0, scene: str = "a", **changed: object) -> SceneResult:
+def result(stage: int = 0, scene: str = "a", **changed: object) -> SceneResult:
     made: dict[str, object] = {
         "strategy": "evercal",
         "seed": 0,
@@ -32,21 +32,21 @@ def outcome(stage: int = 0, scene: str = "a", **changed: object) -> SceneResult:
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert read(tmp_path) == []
-    first, second = outcome(), outcome(1, "b")
+    first, second = result(), result(1, "b")
     append(tmp_path, [first])
-    append(tmp_path, [second, outcome(1, "a")])
-    assert read(tmp_path) == [first, second, outcome(1, "a")]
+    append(tmp_path, [second, result(1, "a")])
+    assert read(tmp_path) == [first, second, result(1, "a")]
 
 
 def test_what_was_kept_is_told_where_it_is_known(tmp_path: Path) -> None:
-    told = outcome(
+    told = result(
         keyframe_positions_m=((0.5, 1.0, -2.0), (1.5, 0.0, 0.25)),
         covering_radius=0.75,
         min_spacing=math.inf,
     )
-    append(tmp_path, [told, outcome(1)])
+    append(tmp_path, [told, result(1)])
     first, second = read(tmp_path)
-    assert first == outcome(
+    assert first == result(
         keyframe_positions_m=told.keyframe_positions_m, covering_radius=0.75
     )  # one frame has no pair
     assert math.isnan(first.min_spacing)
@@ -57,22 +57,22 @@ def test_what_was_kept_is_told_where_it_is_known(tmp_path: Path) -> None:
     for name in ("keyframe_positions_m", "covering_radius", "min_spacing"):
         del record[name]
     path.write_text(json.dumps(record) + "\n")
-    assert read(tmp_path) == [outcome(1)]
+    assert read(tmp_path) == [result(1)]
 
 
 @pytest.mark.parametrize("cut", [1, 40])
 def test_a_line_cut_short_is_taken_away(tmp_path: Path, cut: int) -> None:
-    append(tmp_path, [outcome(), outcome(1)])
+    append(tmp_path, [result(), result(1)])
     path = tmp_path / RESULTS
     path.write_bytes(path.read_bytes()[:-cut])
-    assert read(tmp_path) == [outcome()]
-    append(tmp_path, [outcome(1)])
-    assert read(tmp_path) == [outcome(), outcome(1)]
+    assert read(tmp_path) == [result()]
+    append(tmp_path, [result(1)])
+    assert read(tmp_path) == [result(), result(1)]
 
 
 @pytest.mark.parametrize("line", ["nonsense", "[1]", '{"strategy": "evercal"}'])
 def test_a_line_that_is_no_result_is_named(tmp_path: Path, line: str) -> None:
-    append(tmp_path, [outcome()])
+    append(tmp_path, [result()])
     with open(tmp_path / RESULTS, "a", encoding="utf-8") as file:
         file.write(line + "\n")
     with pytest.raises(InputError, match=r"results\.jsonl: line 2 is not a result"):
@@ -80,7 +80,7 @@ def test_a_line_that_is_no_result_is_named(tmp_path: Path, line: str) -> None:
 
 
 def test_correct_is_strictly_below_both() -> None:
-    assert outcome().correct((0.05, 1.0)).tolist() == [True, False, False]
-    assert outcome().correct((0.06, 1.0)).tolist() == [True, False, True]
-    assert outcome().correct((0.06, 0.01)).tolist() == [False, False, True]
-    assert not np.any(outcome().correct((math.inf, 0.0)))
+    assert result().correct((0.05, 1.0)).tolist() == [True, False, False]
+    assert result().correct((0.06, 1.0)).tolist() == [True, False, True]
+    assert result().correct((0.06, 0.01)).tolist() == [False, False, True]
+    assert not np.any(result().correct((math.inf, 0.0)))

@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from evercal.cli.learn import LearnBars, check_name, parse_memory
+from evercal.cli.learn import check_name, parse_memory
+from evercal.cli.learn_bars import LearnBars
 from evercal.datasets import Scene, load_scene, posed_scene
 from evercal.errors import InputError
 

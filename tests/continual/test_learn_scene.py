@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from evercal.continual import learn as learn_module
-from evercal.continual.learn import Checkpoint, Encoding, StageOptions
+from evercal.continual.learn import Encoding, StageOptions
 from evercal.continual.learn_scene import LearnOptions, LearnReport, learn_scene, validation_split
 from evercal.datasets import generic
 from evercal.datasets.frame import Scene
@@ -25,7 +25,7 @@ from evercal.geometry.se3 import SE3
 from evercal.localization import acceptance
 from evercal.localization.localizer import Localizer
 from evercal.mapping.stage_files import head_bytes
-from evercal.mapping.store import Store
+from evercal.mapping.store import Checkpoint, Store
 from evercal.networks.trainer import Progress
 from evercal.storage import MANIFEST, write_manifest
 

@@ -13,14 +13,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.learn import Checkpoint
 from evercal.datasets.frame import Scene
 from evercal.errors import InputError
 from evercal.geometry.se3 import pose_distance
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.stage_files import head_bytes
-from evercal.mapping.store import Store
+from evercal.mapping.store import Checkpoint, Store
 from evercal.networks.head import Head
 from evercal.storage.manifest import MANIFEST, verify, write_manifest
 

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from evercal.continual.learn import Checkpoint
 from evercal.mapping.scene_maps import SceneMaps
-from evercal.mapping.store import Store
+from evercal.mapping.store import Checkpoint, Store
 from evercal.storage.manifest import MANIFEST
 
 Stages = dict[str, list[SceneMaps]]

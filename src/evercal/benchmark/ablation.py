@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from evercal.benchmark.comparison import Rows, Run, by_strategy, difference
+from evercal.benchmark.comparison import Run, TableRows, by_strategy, difference
 from evercal.continual.strategies import PENALTIES, SELECTORS, Strategy, compose
 from evercal.errors import InputError
 
@@ -27,7 +27,7 @@ PUBLISHED = {"i7s": (65.2, 72.0, 74.9), "i12s": (66.0, 90.9, 91.8)}
 """Of the rows as printed, by suite (Li et al., arXiv 2604.15814, Table 4)."""
 
 
-def ablation_rows(runs: Sequence[Run], suite: str = "") -> Rows:
+def ablation_rows(runs: Sequence[Run], suite: str = "") -> TableRows:
     """Table 4: final accuracy and what each step gave, as far as its strategies were run.
 
     Args:
@@ -61,7 +61,7 @@ def ablation_rows(runs: Sequence[Run], suite: str = "") -> Rows:
     return rows
 
 
-def grid_rows(runs: Sequence[Run]) -> Rows:
+def grid_rows(runs: Sequence[Run]) -> TableRows:
     """Final accuracy, a row per selector and a column per penalty; TFR in brackets.
 
     Strategies that differ from a composed one in anything else have no place in it.

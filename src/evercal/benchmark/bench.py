@@ -20,7 +20,7 @@ from typing import Literal
 
 import numpy as np
 
-from evercal.benchmark import results as outcomes
+from evercal.benchmark import results
 from evercal.benchmark.results import SceneResult, scene_result
 from evercal.benchmark.scene_views import keep_views
 from evercal.continual import strategies as rules
@@ -85,7 +85,7 @@ class Step:
     """Which strategy."""
     seed: int
     """Which run."""
-    outcomes: tuple[SceneResult, ...]
+    results: tuple[SceneResult, ...]
     """One per scene learned so far; none for the stages before the last of joint training."""
     done: int
     """Stages done so far, those of earlier calls included."""
@@ -112,13 +112,13 @@ def run_bench(
     """
     total = len(options.seeds) * len(options.strategies) * len(scenes)
     missing = begin_bench(scenes, options, out)
-    found = {(o.strategy, o.seed, o.stage) for o in outcomes.read(out)}
+    found = {(o.strategy, o.seed, o.stage) for o in results.read(out)}
     done = total - len(missing) * len(scenes)
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
         for stage, these in _Run(ordered, options, out, strategy, seed).stages(on_event):
             if (strategy, seed, stage) not in found:
-                outcomes.append(out, these)
+                results.append(out, these)
             yield Step(strategy, seed, these, done + stage + 1, total)
         done += len(scenes)
 
@@ -136,8 +136,8 @@ def begin_bench(scenes: Sequence[Scene], options: BenchOptions, out: Path) -> li
         raise InputError(f"{len(scenes)} scene: forgetting takes two or more; give more scenes")
     for name in options.strategies:
         rules.compose(name)
-    lock_settings(out / outcomes.SETTINGS, _settings(scenes, options))
-    found = {(o.strategy, o.seed) for o in outcomes.read(out) if o.stage == len(scenes) - 1}
+    lock_settings(out / results.SETTINGS, _settings(scenes, options))
+    found = {(o.strategy, o.seed) for o in results.read(out) if o.stage == len(scenes) - 1}
     runs = [(seed, strategy) for seed in options.seeds for strategy in options.strategies]
     return [(seed, strategy) for seed, strategy in runs if (strategy, seed) not in found]
 
@@ -296,13 +296,13 @@ class _Run:
     def _judge(self, maps: SceneMaps, number: int, seconds: float) -> tuple[SceneResult, ...]:
         learned = {scene.name: scene for scene in self.scenes[: number + 1]}
         localizer = Localizer(maps)
-        results = evaluate(localizer, learned)
+        found = evaluate(localizer, learned)
         if number == len(self.scenes) - 1:
             keep_views(self.out, self.strategy, localizer, self.scenes)
         size, keyframes = sum(head_bytes(head) for head in maps.heads), maps.keyframes[number]
         return tuple(
             scene_result(
-                [r for r in results if r.scene == name],
+                [r for r in found if r.scene == name],
                 strategy=self.strategy,
                 seed=self.seed,
                 stage=number,

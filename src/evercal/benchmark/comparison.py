@@ -17,7 +17,7 @@ BLOCK = 10
 BOUNDS = ((0.10, np.deg2rad(10)), COARSE, (0.02, np.deg2rad(2)), FINE)
 """Metres and radians under which accuracy is asked."""
 
-Rows = list[list[str]]
+TableRows = list[list[str]]
 """A table's cells, its header first."""
 
 
@@ -31,7 +31,7 @@ class Run:
     """Which seed."""
     scenes: tuple[str, ...]
     """In order of learning."""
-    outcomes: dict[tuple[int, str], SceneResult]
+    results: dict[tuple[int, str], SceneResult]
     """By stage and scene; of joint training only those of the last stage."""
 
     @property
@@ -41,7 +41,7 @@ class Run:
 
     def end(self, scene: str) -> SceneResult:
         """What is known of one scene at the end."""
-        return self.outcomes[len(self.scenes) - 1, scene]
+        return self.results[len(self.scenes) - 1, scene]
 
     @property
     def memory_mb(self) -> float:
@@ -58,9 +58,9 @@ class Run:
         """
         count = len(self.scenes)
         found = np.full((count, count), math.nan)
-        for (stage, scene), outcome in self.outcomes.items():
+        for (stage, scene), result in self.results.items():
             column = self.scenes.index(scene)
-            found[stage, column] = 100 * outcome.correct(thresholds).mean()
+            found[stage, column] = 100 * result.correct(thresholds).mean()
         return found
 
     def scores(self, thresholds: tuple[float, float] = COARSE) -> ContinualScores:
@@ -72,17 +72,17 @@ class Run:
         return continual_scores(matrix)
 
 
-def runs_of(outcomes: Sequence[SceneResult]) -> list[Run]:
+def runs_of(results: Sequence[SceneResult]) -> list[Run]:
     """The runs whose last stage is done, in the order of their first lines.
 
     Raises:
         InputError: no run is done.
     """
     grouped: dict[tuple[str, int], dict[tuple[int, str], SceneResult]] = {}
-    for outcome in outcomes:
-        run = grouped.setdefault((outcome.strategy, outcome.seed), {})
-        run[outcome.stage, outcome.scene] = outcome
-    count = max((outcome.stage for outcome in outcomes), default=-1) + 1
+    for result in results:
+        run = grouped.setdefault((result.strategy, result.seed), {})
+        run[result.stage, result.scene] = result
+    count = max((result.stage for result in results), default=-1) + 1
     found = []
     for (strategy, seed), of in grouped.items():
         order = tuple(scene for stage, scene in of if stage == count - 1)
@@ -93,12 +93,12 @@ def runs_of(outcomes: Sequence[SceneResult]) -> list[Run]:
     return found
 
 
-def as_text(rows: Rows, style: Style = "terminal") -> str:
+def as_text(rows: TableRows, style: Style = "terminal") -> str:
     """A table as text."""
     return table(rows[0], rows[1:], style)
 
 
-def method_rows(runs: Sequence[Run]) -> Rows:
+def method_rows(runs: Sequence[Run]) -> TableRows:
     """One row per strategy: means over seeds, and the spread of the first column."""
     rows = [["strategy", "runs", *(name for name, _ in _COLUMNS)]]
     for name, of in by_strategy(runs).items():
@@ -109,7 +109,7 @@ def method_rows(runs: Sequence[Run]) -> Rows:
     return rows
 
 
-def threshold_rows(runs: Sequence[Run]) -> Rows:
+def threshold_rows(runs: Sequence[Run]) -> TableRows:
     """One row per strategy: final accuracy in per cent under looser and tighter bounds."""
     rows = [["strategy", *(f"{100 * m:.0f} cm {np.rad2deg(r):.0f} deg" for m, r in BOUNDS)]]
     for name, of in by_strategy(runs).items():
@@ -119,11 +119,11 @@ def threshold_rows(runs: Sequence[Run]) -> Rows:
     return rows
 
 
-def selector_rows(runs: Sequence[Run]) -> Rows:
+def selector_rows(runs: Sequence[Run]) -> TableRows:
     """One row per strategy that keeps frames: how they lie among those learned, mean of scenes."""
     rows = [["strategy", "frames kept", "covering radius", "smallest pair"]]
     for name, of in by_strategy(runs).items():
-        told = [o for run in of for o in run.outcomes.values() if o.keyframe_positions_m]
+        told = [o for run in of for o in run.results.values() if o.keyframe_positions_m]
         if told:
             cells = [
                 np.mean([getattr(o, key) for o in told])
@@ -134,7 +134,7 @@ def selector_rows(runs: Sequence[Run]) -> Rows:
     return rows
 
 
-def scene_rows(runs: Sequence[Run]) -> Rows:
+def scene_rows(runs: Sequence[Run]) -> TableRows:
     """One row per strategy, a column per scene: accuracy when learned and at the end."""
     names = sorted(runs[0].scenes)
     rows = [["strategy", *names]]
@@ -148,7 +148,7 @@ def scene_rows(runs: Sequence[Run]) -> Rows:
     return rows
 
 
-def difference_rows(runs: Sequence[Run], reference: str) -> Rows:
+def difference_rows(runs: Sequence[Run], reference: str) -> TableRows:
     """How much better `reference` ends than each other strategy, on the seeds that both ran.
 
     Bounds are those of a paired bootstrap over runs and blocks of 10 frames.
@@ -228,7 +228,7 @@ def _wrong_scene(run: Run) -> float:
 
 
 def _seconds(run: Run) -> float:
-    stages = {stage: outcome.seconds for (stage, _), outcome in run.outcomes.items()}
+    stages = {stage: result.seconds for (stage, _), result in run.results.items()}
     return float(sum(stages.values()))
 
 

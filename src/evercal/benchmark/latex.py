@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from evercal.benchmark.comparison import Rows, Run, by_strategy
+from evercal.benchmark.comparison import Run, TableRows, by_strategy
 from evercal.evaluation.metrics import COARSE, FINE
 
 PUBLISHED: Mapping[str, Mapping[str, tuple[float, float]]] = {
@@ -37,13 +37,13 @@ PUBLISHED: Mapping[str, Mapping[str, tuple[float, float]]] = {
 """By suite and strategy: final accuracy and TFR, per cent."""
 
 
-def paper_tables(runs: Sequence[Run], suite: str, ablation: Rows) -> str:
+def paper_tables(runs: Sequence[Run], suite: str, ablation: TableRows) -> str:
     """`paper_table` and, where its strategies were run, `ablation_table`."""
     found = [paper_table(runs, suite), ablation_table(ablation)]
     return "\n\n".join(table for table in found if table)
 
 
-def ablation_table(ablation: Rows) -> str:
+def ablation_table(ablation: TableRows) -> str:
     """A LaTeX table (booktabs) of what `ablation_rows` found; empty if that is a header alone."""
     header, *rows = ablation
     if not rows:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from evercal.benchmark import results as outcomes
+from evercal.benchmark import results
 from evercal.benchmark.bench import BenchOptions, Step, begin_bench, run_bench
 from evercal.benchmark.results import SceneResult
 from evercal.benchmark.scene_views import VIEWS
@@ -62,7 +62,7 @@ def run_on_ray(
             (ready,), _ = ray.wait(list(tasks), num_returns=1)
             seed, strategy = tasks.pop(ready)
             found, views = ray.get(ready)
-            outcomes.append(out, found)
+            results.append(out, found)
             for name, data in views.items():
                 (out / VIEWS).mkdir(exist_ok=True)
                 if not (out / VIEWS / name).exists():
@@ -85,7 +85,7 @@ def _one_run(
         for _ in run_bench(scenes, options, Path(folder)):
             pass
         views = {path.name: path.read_bytes() for path in (Path(folder) / VIEWS).iterdir()}
-        return outcomes.read(Path(folder)), views
+        return results.read(Path(folder)), views
 
 
 def _ray():

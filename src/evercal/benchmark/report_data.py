@@ -8,8 +8,8 @@ import numpy as np
 
 from evercal.benchmark.ablation import ablation_rows, grid_rows
 from evercal.benchmark.comparison import (
-    Rows,
     Run,
+    TableRows,
     by_strategy,
     difference_rows,
     method_rows,
@@ -29,18 +29,18 @@ PLOTTED = 7
 class Tables:
     """Rows of each table, its header first; a header alone where there is nothing to say."""
 
-    methods: Rows
-    thresholds: Rows
-    scenes: Rows
-    differences: Rows
-    selectors: Rows
-    ablation: Rows
-    grid: Rows
-    compare_with: Rows
+    methods: TableRows
+    thresholds: TableRows
+    scenes: TableRows
+    differences: TableRows
+    selectors: TableRows
+    ablation: TableRows
+    grid: TableRows
+    compare_with: TableRows
 
-    def non_empty(self) -> list[Rows]:
+    def non_empty(self) -> list[TableRows]:
         """Those with more than a header."""
-        found: list[Rows] = [getattr(self, part.name) for part in fields(self)]
+        found: list[TableRows] = [getattr(self, part.name) for part in fields(self)]
         return [rows for rows in found if len(rows) > 1]
 
 

@@ -82,9 +82,9 @@ def scene_result(results: Sequence[FrameResult], **of: object) -> SceneResult:
     )
 
 
-def append(folder: Path, outcomes: Iterable[SceneResult]) -> None:
+def append(folder: Path, results: Iterable[SceneResult]) -> None:
     """Adds lines to the results of a folder, all of them on the disk when this returns."""
-    lines = [json.dumps(_plain(outcome), allow_nan=False) + "\n" for outcome in outcomes]
+    lines = [json.dumps(_plain(result), allow_nan=False) + "\n" for result in results]
     with open(folder / RESULTS, "a", encoding="utf-8") as file:
         file.write("".join(lines))
         file.flush()
@@ -114,8 +114,8 @@ def read(folder: Path) -> list[SceneResult]:
     return found
 
 
-def _plain(outcome: SceneResult) -> dict[str, object]:
-    record = asdict(outcome)
+def _plain(result: SceneResult) -> dict[str, object]:
+    record = asdict(result)
     for name in ("translation_m", "rotation_rad"):
         record[name] = [round(v, 6) if math.isfinite(v) else None for v in record[name]]
     for name in ("covering_radius", "min_spacing"):

@@ -97,8 +97,8 @@ class Bench:
         for step in self._steps(options, out):
             if rank():
                 continue
-            found = ", ".join(f"{o.scene} {100 * o.correct().mean():.1f}" for o in step.outcomes)
-            seconds = f" ({step.outcomes[0].seconds:.0f} s)" if step.outcomes else ""
+            found = ", ".join(f"{o.scene} {100 * o.correct().mean():.1f}" for o in step.results)
+            seconds = f" ({step.results[0].seconds:.0f} s)" if step.results else ""
             line = f"[{step.done}/{step.total}] {step.strategy} seed {step.seed}: "
             print(line + (found or "noted") + seconds, file=said, flush=True)
         return 0 if rank() else show_report(self.out, _words(self.strategies)[0], self.json)

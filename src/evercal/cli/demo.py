@@ -132,7 +132,7 @@ def _run_method(
     outcome: DemoOutcome,
     say: Callable[[str], None],
 ) -> None:
-    from evercal.cli.learn import LearnBars
+    from evercal.cli.learn_bars import LearnBars
     from evercal.continual.learn_scene import LearnOptions, learn_scene
     from evercal.continual.presets import preset
     from evercal.localization.localizer import Localizer

@@ -5,21 +5,16 @@ import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TextIO
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar, size
+from evercal.cli.console import print_json, print_next, size
+from evercal.cli.learn_bars import LearnBars
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
-    from tqdm import tqdm
-
-    from evercal.continual.learn import Checkpoint, Encoding
     from evercal.continual.learn_scene import LearnOptions
-    from evercal.networks.trainer import Progress
 
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
 _UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
@@ -174,65 +169,3 @@ def check_name(name: str) -> None:
             f"scene name {name!r}: give one with --name that is not empty, does not begin with a"
             f" dot and holds no slash, '=' or line break"
         )
-
-
-class LearnBars:
-    """Shows the events of learning as progress bars on stderr; a context that closes them.
-
-    Args:
-        start: a line to print before the first bar, once learning has really begun.
-        stream: where to; stdout when None.
-    """
-
-    def __init__(self, start: str = "", stream: TextIO | None = None):
-        self._start, self._stream = start, stream
-        self._bar: tqdm | None = None
-        self._training = False
-
-    def __enter__(self) -> "LearnBars":
-        """Nothing is shown yet: bad input is to be told without anything before it."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: "TracebackType | None",
-    ) -> None:
-        """Ends the last bar's line."""
-        self._close()
-
-    def __call__(self, event: "Encoding | Progress | Checkpoint") -> None:
-        """Takes one event."""
-        from evercal.continual.learn import Encoding
-        from evercal.networks.trainer import Progress
-
-        if self._start:
-            print(self._start, file=self._stream, flush=True)
-            self._start = ""
-        if isinstance(event, Progress):
-            bar = self._at(event.step, event.total, training=True)
-            text = f"loss {event.loss:.1f}, {100 * event.inlier_share:.0f} % inliers"
-            bar.set_postfix_str(text, refresh=event.step == event.total)
-            if event.step == event.total:  # what follows takes a while and is not training
-                self._close()
-        elif isinstance(event, Encoding):
-            self._at(event.done, event.total, training=False)
-
-    def _at(self, done: int, total: int, training: bool) -> "tqdm":
-        """The bar moved to `done`; a new one where another task begins."""
-        bar = self._bar
-        if bar is None or training != self._training or total != bar.total or done <= bar.n:
-            self._close()
-            what, unit = ("training", "step") if training else ("encoding", "image")
-            # A resumed task begins where it stood; what was done before must not count as speed.
-            first = done if done > (1 if training else 8) else 0
-            self._training, self._bar = training, progress_bar(what, total, unit, first)
-            bar = self._bar
-        bar.update(done - bar.n)
-        return bar
-
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None

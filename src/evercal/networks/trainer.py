@@ -68,7 +68,7 @@ class Progress:
     """Share of the rows being learned within 5 px at the last step."""
 
 
-Penalty = Callable[[HeadOutput, Rows, float], Tensor]
+ReplayLoss = Callable[[HeadOutput, Rows, float], Tensor]
 """What replay costs: (head output on replayed rows, those rows, progress in [0, 1]) -> scalar."""
 
 
@@ -87,7 +87,7 @@ class Replay:
 
     buffers: Sequence[FeatureBuffer]
     """One per remembered scene."""
-    penalty: Penalty
+    penalty: ReplayLoss
     """Loss on a batch of their rows."""
     per_scene: bool = False
     """Whether the penalty is one scene's, and counts once for each."""

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from evercal.benchmark.comparison import Rows, Run, by_strategy
+from evercal.benchmark.comparison import Run, TableRows, by_strategy
 from evercal.benchmark.report_data import Report, Tables
 from evercal.drawing import (
     Picture,
@@ -136,10 +136,10 @@ def _kept(runs: Sequence[Run]) -> dict[str, dict[str, np.ndarray]]:
     """
     same: dict[str, dict[tuple[tuple[float, float, float], ...], list[str]]] = {}
     for name, of in by_strategy(runs).items():
-        for outcome in of[0].outcomes.values():
-            if outcome.keyframe_positions_m:
-                same.setdefault(outcome.scene, {}).setdefault(
-                    outcome.keyframe_positions_m, []
+        for result in of[0].results.values():
+            if result.keyframe_positions_m:
+                same.setdefault(result.scene, {}).setdefault(
+                    result.keyframe_positions_m, []
                 ).append(name)
     return {
         scene: {_together(names): np.array(places) for places, names in of.items()}
@@ -151,6 +151,6 @@ def _together(names: Sequence[str]) -> str:
     return names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")
 
 
-def _table(rows: Rows, caption: str) -> Table:
+def _table(rows: TableRows, caption: str) -> Table:
     header, *body = rows
     return Table(header, body, caption)
