@@ -16,11 +16,17 @@ ENCODE_BATCH = 8
 
 
 @torch.inference_mode()
+def encode_features(views: Sequence[View], encoder: Encoder) -> Tensor:
+    """Features (b, channels, h, w) of views of one size."""
+    grey = torch.from_numpy(np.stack([view.grey for view in views]))[:, None].float() / 255.0
+    with autocast():
+        return encoder(grey).float()
+
+
+@torch.inference_mode()
 def encode(
     views: Sequence[View], encoder: Encoder, descriptor: Descriptor
 ) -> tuple[Tensor, Tensor]:
     """Features (b, channels, h, w) and descriptors (b, width) of views of one size."""
-    grey = torch.from_numpy(np.stack([view.grey for view in views]))[:, None].float() / 255.0
-    with autocast():
-        features = encoder(grey).float()
+    features = encode_features(views, encoder)
     return features, descriptor(features)

@@ -1,8 +1,9 @@
-"""What stays of a scene: a few frames, as the encoder saw them, counted in bytes.
+"""Keyframes: the few frames that stay of a scene, counted in bytes.
 
 The frames are kept as grey JPEG images at working size, not as feature rows: an image of 320x240
 takes about 25 kB, its 1,200 rows of 128 half floats 307 kB. From the image, the frozen encoder
-makes the same rows again in milliseconds, and augmented views besides.
+makes the same rows again in milliseconds, and augmented views besides. A map adds depths,
+landmarks and a descriptor to each.
 """
 
 from collections.abc import Sequence
@@ -16,8 +17,16 @@ from evercal.datasets.frame import Frame
 from evercal.features.views import working_image
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
+from evercal.mapping.landmarks import Landmarks
 
 JPEG_QUALITY = 95
+_LANDMARK_FIELDS = {
+    "pixels": torch.int16,
+    "inverse_depth": torch.float32,
+    "slope": torch.float32,
+    "sigma": torch.float32,
+}
+"""Fields of `Landmarks`, in order, and how they are stored: 22 bytes a landmark."""
 
 
 @dataclass(frozen=True)
@@ -34,21 +43,32 @@ class Keyframes:
     """(cells,) half floats of each image, per metre along the optical axis; none where a strategy
     does not match keyframes."""
 
+    landmarks: tuple[Landmarks, ...] = ()
+    """Of each image; none where a strategy builds no map."""
+    descriptors: Tensor | None = None
+    """(n, width) VLAD of each image, half floats; None where a strategy builds no map."""
+
     @property
     def bytes(self) -> int:
-        """Size of `to_tensors`: images, their lengths, poses, intrinsics and inverse depths."""
-        depths = sum(depth.nbytes + 8 for depth in self.inverse_depth)
-        return sum(map(len, self.images)) + len(self.images) * 8 * (1 + 14 + 1 + 7) + depths
+        """Size of `to_tensors`."""
+        return sum(tensor.nbytes for tensor in self.to_tensors().values())
 
-    def frames(self) -> list[Frame]:
-        """The remembered frames, decoded."""
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def grey(self, i: int) -> np.ndarray:
+        """(h, w) uint8 image of a keyframe, decoded."""
         import cv2
 
+        grey = cv2.imdecode(np.frombuffer(self.images[i], np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert grey is not None, "a stored image always decodes: its file is checksummed"
+        return np.asarray(grey, np.uint8)
+
+    def frames(self) -> list[Frame]:
+        """The keyframes, decoded."""
         frames = []
-        for i, data in enumerate(self.images):
-            grey = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-            assert grey is not None, "a remembered image always decodes: its file is checksummed"
-            image = np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8)
+        for i in range(len(self.images)):
+            image = np.repeat(self.grey(i)[..., None], 3, axis=-1)
             frames.append(
                 Frame(f"memory-{i:05d}", image, self.cameras[i], self.base_from_camera[i])
             )
@@ -59,7 +79,8 @@ class Keyframes:
 
         `images` (bytes, joined), `lengths` (n,), `cameras` (n, 14), `distortion` (n,) number of
         coefficients, `poses` (n, 7) quaternion wxyz and metres; with depths also `inverse_depth`
-        (joined) and `cells` (n,), how many of each image.
+        (joined) and `cells` (n,), how many of each image; with landmarks their fields (joined,
+        `landmark_*`), their `landmark_counts` (n,) and `descriptors` (n, width).
         """
         joined = np.frombuffer(b"".join(self.images), np.uint8).copy()
         cameras = np.zeros((len(self.images), 14))
@@ -69,10 +90,7 @@ class Keyframes:
         poses = np.concatenate(
             [self.base_from_camera.rotation_wxyz, self.base_from_camera.translation_m], -1
         )
-        depths = {}
-        if self.inverse_depth:
-            depths["inverse_depth"] = torch.cat(self.inverse_depth)
-            depths["cells"] = torch.tensor([len(depth) for depth in self.inverse_depth])
+        depths = self._map_tensors()
         return depths | {
             "images": torch.from_numpy(joined),
             "lengths": torch.tensor([len(image) for image in self.images]),
@@ -80,6 +98,20 @@ class Keyframes:
             "distortion": torch.tensor([len(c.distortion) for c in self.cameras]),
             "poses": torch.from_numpy(poses.reshape(-1, 7)),
         }
+
+    def _map_tensors(self) -> dict[str, Tensor]:
+        tensors: dict[str, Tensor] = {}
+        if self.inverse_depth:
+            tensors["inverse_depth"] = torch.cat(self.inverse_depth)
+            tensors["cells"] = torch.tensor([len(depth) for depth in self.inverse_depth])
+        if self.descriptors is not None:
+            tensors["descriptors"] = self.descriptors
+        if self.landmarks:
+            tensors["landmark_counts"] = torch.tensor([len(marks) for marks in self.landmarks])
+            for name, kind in _LANDMARK_FIELDS.items():
+                joined = np.concatenate([getattr(marks, name) for marks in self.landmarks])
+                tensors[f"landmark_{name}"] = torch.from_numpy(joined).to(kind)
+        return tensors
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, Tensor]) -> "Keyframes":
@@ -100,7 +132,18 @@ class Keyframes:
         each: tuple[Tensor, ...] = ()
         if "cells" in tensors:
             each = tensors["inverse_depth"].split(tensors["cells"].tolist())
-        return cls(images, tuple(cameras), SE3(poses[:, :4], poses[:, 4:]), each)
+        marks = _landmarks_of(tensors) if "landmark_counts" in tensors else ()
+        found = tensors.get("descriptors")
+        return cls(images, tuple(cameras), SE3(poses[:, :4], poses[:, 4:]), each, marks, found)
+
+
+def _landmarks_of(tensors: dict[str, Tensor]) -> tuple[Landmarks, ...]:
+    counts = tensors["landmark_counts"].tolist()
+    columns = [
+        [part.double().numpy() for part in tensors[f"landmark_{name}"].split(counts)]
+        for name in _LANDMARK_FIELDS
+    ]
+    return tuple(Landmarks(*fields) for fields in zip(*columns, strict=True))
 
 
 def store_keyframes(frames: Sequence[Frame], short_side: int) -> Keyframes:
@@ -110,14 +153,19 @@ def store_keyframes(frames: Sequence[Frame], short_side: int) -> Keyframes:
         frames: posed frames, already selected.
         short_side: pixels of the shorter image side.
     """
-    import cv2
-
     images, cameras = [], []
     for frame in frames:
         grey, camera = working_image(frame.read_image(), frame.camera, short_side)
-        done, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        assert done, "OpenCV encodes any uint8 image"
-        images.append(data.tobytes())
+        images.append(jpeg(grey))
         cameras.append(camera)
     poses = [frame.base_from_camera or SE3.identity() for frame in frames]
     return Keyframes(tuple(images), tuple(cameras), SE3.stack(poses))
+
+
+def jpeg(grey: np.ndarray) -> bytes:
+    """A JPEG file of a (h, w) uint8 image."""
+    import cv2
+
+    done, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    assert done, "OpenCV encodes any uint8 image"
+    return data.tobytes()

@@ -125,7 +125,12 @@ def select_source_views(
     return [int(i) for i in best if worth[i] > MIN_SHARED]
 
 
-def inverse_depths(view: PosedCells, others: Sequence[PosedCells], guess_m: np.ndarray) -> Tensor:
+def inverse_depths(
+    view: PosedCells,
+    others: Sequence[PosedCells],
+    guess_m: np.ndarray,
+    guess_weight: float = GUESS_WEIGHT,
+) -> Tensor:
     """Inverse depth of every cell along the optical axis.
 
     First the plane whose cells look most alike in other views and near the guess, then two
@@ -136,6 +141,7 @@ def inverse_depths(view: PosedCells, others: Sequence[PosedCells], guess_m: np.n
         view: whose cells are asked for.
         others: see `select_source_views`; with none the guess stands.
         guess_m: (h * w,) depths in metres, roughly right.
+        guess_weight: what nearness to the guess is worth, as similarity; 0 leaves it out.
 
     Returns:
         (h * w,) per metre, within 1 / 12 and 1 / 0.25.
@@ -152,7 +158,7 @@ def inverse_depths(view: PosedCells, others: Sequence[PosedCells], guess_m: np.n
     near = F.avg_pool2d(volume, 3, 1, 1, count_include_pad=False)
     score = (volume + SMOOTHING * (near - volume)).view(PLANES, -1).T
     off = (planes[None] / guess[:, None]).log() / GUESS_SPREAD
-    score = score + GUESS_WEIGHT * torch.exp(-0.5 * off * off)
+    score = score + guess_weight * torch.exp(-0.5 * off * off)
     found = planes[score.argmax(1)]
     for _ in range(2):
         pull, hold = torch.zeros_like(found), torch.full_like(found, 1e-3)

@@ -10,6 +10,7 @@ from torch import Tensor
 from evercal.features.descriptor import Descriptor
 from evercal.features.encoder import Encoder
 from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3
 from evercal.mapping.atlas import Atlas, Cell
 from evercal.mapping.keyframes import Keyframes
 from evercal.networks.head import Head
@@ -37,6 +38,25 @@ class SceneRecord:
     """Poses with a smaller inlier ratio are `unknown_scene`; fitted on held-out training frames."""
     covariance_scale: float = 1.0
     """What covariances are multiplied with to match the errors on held-out training frames."""
+    min_coverage: float = 0.0
+    """Poses whose landmarks cover a smaller share of the image are `unknown_scene`."""
+    common: SE3 = field(default_factory=SE3.identity)
+    """What the map's poses were multiplied with to become consistent: answers are taken back."""
+    map_sigma: tuple[float, float] = (0.0, 0.0)
+    """Standard deviation of the map's own poses per axis: metres and radians."""
+
+    def stated(self, pose: SE3, covariance: np.ndarray | None) -> tuple[SE3, np.ndarray | None]:
+        """A pose of the map in the frame that the recording states, and its covariance.
+
+        Args:
+            pose: base_from_camera as the map has it.
+            covariance: (6, 6) of translation in the base frame and rotation about camera axes, from
+                the image alone.
+        """
+        if covariance is not None:
+            own = np.repeat(np.square(self.map_sigma), 3)
+            covariance = covariance * self.covariance_scale + np.diag(own)
+        return pose @ self.common.inverse(), covariance
 
     def query_camera(self, camera: Camera | None) -> Camera:
         """Intrinsics for a query: refined if the nominal ones or none are given, else as given."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder, checked_encoder
 from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3
 from evercal.mapping.atlas import Cell
 from evercal.mapping.scene_maps import SceneRecord
 from evercal.networks.head import Head, HeadOptions
@@ -90,6 +91,9 @@ def write_record(folder: Path, record: SceneRecord) -> None:
         "refined_camera": record.refined_camera.to_dict() if record.refined_camera else None,
         "inlier_threshold": record.inlier_threshold,
         "covariance_scale": record.covariance_scale,
+        "min_coverage": record.min_coverage,
+        "common": record.common.matrix().tolist(),
+        "map_sigma": list(record.map_sigma),
     }
     write_json(folder / "scene.json", content)
     save_tensors(folder / "prototypes.safetensors", {"prototypes": record.prototypes})
@@ -108,6 +112,9 @@ def read_record(folder: Path) -> SceneRecord:
         Camera.from_dict(refined) if refined else None,
         content["inlier_threshold"],
         content["covariance_scale"],
+        content["min_coverage"],
+        SE3.from_matrix(content["common"]),
+        (content["map_sigma"][0], content["map_sigma"][1]),
     )
 
 

@@ -1,0 +1,74 @@
+"""VLAD: one vector for a whole image, to find images of the same place (Jegou et al., CVPR 2010).
+
+The features of an image are summed up as differences from the nearest of a few centroids. The
+centroids come from procedural rooms, so nothing about them belongs to any scene.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from evercal.features.encode import encode_features
+from evercal.features.encoder import Encoder
+from evercal.features.views import ViewOptions, plain_view
+from evercal.simulation.box_room import BoxRoom, default_camera
+
+CENTROIDS = 32
+WIDTH = 1024
+_ROOMS = range(8_980, 8_988)
+_VIEWS = 4
+_ROUNDS = 15
+
+
+class Vlad:
+    """Makes a vector of an image's features.
+
+    Args:
+        centroids: (k, channels) unit vectors.
+        projection: (k * channels, width).
+    """
+
+    def __init__(self, centroids: Tensor, projection: Tensor):
+        self.centroids, self.projection = centroids, projection
+
+    @torch.inference_mode()
+    def __call__(self, features: Tensor) -> Tensor:
+        """(cells, channels) unit vectors of an image -> (width,) unit vector."""
+        nearest = (features @ self.centroids.T).argmax(1)
+        sums = torch.zeros_like(self.centroids)
+        sums.index_add_(0, nearest, features - self.centroids[nearest])
+        whole = F.normalize(sums, dim=1).flatten()
+        return F.normalize(whole @ self.projection, dim=0)
+
+
+def vlad_for(encoder: Encoder) -> Vlad:
+    """The VLAD of an encoder; centroids are computed once a process, in about a second."""
+    return _vlad_for(encoder)
+
+
+@lru_cache(maxsize=2)
+def _vlad_for(encoder: Encoder) -> Vlad:
+    features = torch.cat([_room_features(encoder, seed) for seed in _ROOMS])
+    generator = torch.Generator().manual_seed(0)
+    centroids = features[torch.randperm(len(features), generator=generator)[:CENTROIDS]]
+    for _ in range(_ROUNDS):
+        nearest = (features @ centroids.T).argmax(1)
+        sums = torch.zeros_like(centroids).index_add_(0, nearest, features)
+        centroids = F.normalize(sums, dim=1)
+    shape = (centroids.numel(), WIDTH)
+    projection = torch.randn(shape, generator=generator) / shape[0] ** 0.5
+    return Vlad(centroids, projection)
+
+
+def _room_features(encoder: Encoder, seed: int) -> Tensor:
+    """(n, channels) every third feature of some views of a procedural room."""
+    camera, room = default_camera(320, 240), BoxRoom(seed, texture_px=192)
+    rng, rows = np.random.default_rng(seed), []
+    for _ in range(_VIEWS):
+        image = room.render(camera, room.random_view(rng))
+        view = plain_view(image, camera, encoder.stride, ViewOptions())
+        rows.append(encode_features([view], encoder)[0].flatten(1).T[::3])
+    return torch.cat(rows)

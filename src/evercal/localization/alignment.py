@@ -1,0 +1,185 @@
+"""Alignment: landmarks of keyframes are found in an image to a tenth of a pixel, then the pose."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3
+from evercal.localization.keyframe_bank import LoadedKeyframe
+from evercal.localization.pnp import PnpOptions, solve_pnp
+from evercal.localization.pose_refinement import RefinedPose, refine_pose
+from evercal.mapping.landmarks import project_surface
+from evercal.mapping.patches import align_patches, from_level, to_level, whitening
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class AlignmentRound:
+    """One pass over the landmarks."""
+
+    level: int
+    """Of the image pyramid."""
+    iterations: int
+    """Alignment steps of every patch."""
+    landmarks: int
+    """Landmarks looked for, at most."""
+    reach_px: float
+    """How far from where it was expected a landmark may be found, pixels of the image."""
+
+
+@dataclass(frozen=True)
+class AlignmentOptions:
+    """How landmarks are looked for in an image."""
+
+    rounds: tuple[AlignmentRound, ...] = (
+        AlignmentRound(1, 6, 300, 24.0),
+        AlignmentRound(0, 4, 600, 6.0),
+        AlignmentRound(0, 3, 900, 3.0),
+    )
+    """From coarse to fine."""
+    min_correlation: float = 0.7
+    """Smallest normalised cross-correlation of a landmark that was found."""
+    min_found: int = 12
+    """Fewer landmarks make no pose."""
+    found_px: float = 2.0
+    """A landmark agrees with the pose when it was found this near to where it should be."""
+    floor_px: float = 0.1
+    """Alignment error of a perfect patch, pixels."""
+    noise: float = 0.8
+    """Standard deviation of intensities in aligned patches, in deviations of a patch."""
+    tiles: int = 4
+    """The image is divided into this many rows and columns to tell how landmarks spread."""
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """The pose that landmarks tell, and how many of them agree."""
+
+    pose: RefinedPose
+    """In the base frame of the scene."""
+    expected: int
+    """Landmarks that should be visible and were looked for."""
+    pixels: Array
+    """(n, 2) landmarks that agree, pixels of the image."""
+    points_m: Array
+    """(n, 3) the same in the base frame."""
+    coverage: float
+    """Share of the tiles with expected landmarks in which one agrees."""
+
+    @property
+    def share(self) -> float:
+        """Landmarks that agree as a share of those looked for."""
+        return len(self.pixels) / max(self.expected, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    expected: Array
+    pixels: Array
+    points_m: Array
+    whitening: Array
+
+
+def align_pose(
+    pyramid: Sequence[Array],
+    camera: Camera,
+    keyframes: Sequence[LoadedKeyframe],
+    start: SE3,
+    options: AlignmentOptions,
+) -> Alignment | None:
+    """Refines a rough pose by the landmarks of keyframes.
+
+    Args:
+        pyramid: of the image, see `image_pyramid`.
+        camera: intrinsics of its first level, distortion included.
+        keyframes: that show the same place.
+        start: base_from_camera, roughly.
+        options: how.
+
+    Returns:
+        None where too few landmarks are found.
+    """
+    pose, refined, found = start, None, None
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    for number, step in enumerate(options.rounds):
+        found = _look(pyramid, camera, keyframes, pose, step, options)
+        if len(found.pixels) < options.min_found:
+            return None
+        ideal = _undistorted(found.pixels, camera)
+        if number == 0:
+            # Of the first round many are wrong: a sample consensus tells which agree.
+            loose = PnpOptions(threshold_px=4.0, max_iterations=200, min_iterations=20)
+            rough = solve_pnp(ideal, found.points_m, intrinsics, loose)
+            if rough is None:
+                return None
+            pose = rough.world_from_camera
+        refined = refine_pose(ideal, found.points_m, found.whitening, intrinsics, pose)
+        pose = refined.base_from_camera
+    assert refined is not None
+    assert found is not None
+    agree = refined.residual_px < options.found_px
+    if agree.sum() < options.min_found:
+        return None
+    return Alignment(
+        refined,
+        len(found.expected),
+        found.pixels[agree],
+        found.points_m[agree],
+        _coverage(found.expected, found.pixels[agree], camera, options.tiles),
+    )
+
+
+def _look(
+    pyramid: Sequence[Array],
+    camera: Camera,
+    keyframes: Sequence[LoadedKeyframe],
+    pose: SE3,
+    step: AlignmentRound,
+    options: AlignmentOptions,
+) -> _Found:
+    """Landmarks of all keyframes in one round."""
+    inverse = pose.inverse()
+    turn, shift = inverse.rotation_matrix(), inverse.translation_m
+    seen = [project_surface(k.surface_m, turn, shift, camera) for k in keyframes]
+    every = max(1, -(-sum(len(which) for which, _, _ in seen) // step.landmarks))
+    parts = []
+    for keyframe, (which, pixels, affines) in zip(keyframes, seen, strict=True):
+        which, pixels, affines = which[::every], pixels[::every], affines[::every]
+        if not len(which):
+            continue
+        patches = keyframe.patches[step.level].take(which)
+        at, correlation = align_patches(
+            patches, pyramid[step.level], to_level(pixels, step.level), affines, step.iterations
+        )
+        at = from_level(at.astype(np.float64), step.level)
+        good = correlation > options.min_correlation
+        good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
+        spread = patches.inverse_hessian[good]
+        white = whitening(affines[good], spread, options.floor_px, options.noise * 2**step.level)
+        parts.append((pixels, at[good], keyframe.surface_m[0, which[good]], white))
+    if not parts:
+        none = np.zeros((0, 2))
+        return _Found(none, none, np.zeros((0, 3)), np.zeros((0, 2, 2)))
+    return _Found(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _undistorted(pixels: Array, camera: Camera) -> Array:
+    """(n, 2) pixels of the ideal pinhole."""
+    if not any(camera.distortion):
+        return pixels
+    plane = camera.unproject(pixels)[:, :2]
+    return plane * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+
+
+def _coverage(expected: Array, found: Array, camera: Camera, tiles: int) -> float:
+    size = np.array([camera.width, camera.height]) / tiles
+
+    def filled(pixels: Array) -> set[tuple[int, int]]:
+        where = (pixels / size).astype(int).clip(0, tiles - 1)
+        return set(map(tuple, where.tolist()))
+
+    return len(filled(found)) / max(len(filled(expected)), 1)

@@ -1,0 +1,118 @@
+"""All keyframes of a store: found by a global descriptor, decoded and encoded when needed."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from threading import Lock
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from evercal.features.encode import encode_features
+from evercal.features.precision import fast_bfloat16
+from evercal.features.views import ViewOptions, ideal_cell_pixels, plain_view
+from evercal.features.vlad import vlad_for
+from evercal.mapping.patches import Patches, cut_patches, image_pyramid, to_level
+from evercal.mapping.scene_maps import SceneMaps
+
+ALIGNED_LEVELS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedKeyframe:
+    """A keyframe ready to be matched and aligned; coordinates in the base frame of its scene."""
+
+    features: Tensor
+    """(cells, channels), bfloat16 where that is fast."""
+    points_m: np.ndarray
+    """(cells, 3) what the patches of the feature grid show."""
+    surface_m: np.ndarray
+    """(3, n, 3) landmarks and two points beside each, see `Landmarks.surface`."""
+    depth_noise: np.ndarray
+    """(n,) standard deviation of the landmarks' depths as a share of the depth."""
+    position_m: np.ndarray
+    """(3,) where the keyframe was taken."""
+    patches: tuple[Patches, ...]
+    """Templates of the landmarks, one set for each pyramid level."""
+
+
+class KeyframeBank:
+    """The keyframes of all scenes that have a map.
+
+    Args:
+        maps: with keyframes that have descriptors.
+        most_loaded: how many keyframes stay decoded in memory (2 to 3 MB each).
+    """
+
+    def __init__(self, maps: SceneMaps, most_loaded: int):
+        self._maps, self._most, self._lock = maps, most_loaded, Lock()
+        self._loaded: OrderedDict[int, LoadedKeyframe] = OrderedDict()
+        scenes, numbers, descriptors = [], [], []
+        for scene, keyframes in enumerate(maps.keyframes):
+            if keyframes is None or keyframes.descriptors is None:
+                continue
+            scenes.append(np.full(len(keyframes), scene))
+            numbers.append(np.arange(len(keyframes)))
+            descriptors.append(keyframes.descriptors.float())
+        self.scene = np.concatenate([np.zeros(0, int), *scenes])
+        self._number = np.concatenate([np.zeros(0, int), *numbers])
+        self._descriptors = torch.cat(descriptors) if descriptors else None
+
+    def __len__(self) -> int:
+        return len(self.scene)
+
+    def retrieve(
+        self, features: Tensor, scenes: Sequence[int], count: int
+    ) -> NDArray[np.int64]:
+        """The keyframes of some scenes whose descriptors are most alike, best first.
+
+        Args:
+            features: (cells, channels) of the query.
+            scenes: scenes in question.
+            count: how many keyframes.
+        """
+        if self._descriptors is None:
+            return np.zeros(0, np.int64)
+        likeness = (self._descriptors @ vlad_for(self._maps.encoder)(features)).numpy()
+        likeness[~np.isin(self.scene, scenes)] = -np.inf
+        best = np.argpartition(-likeness, min(count, len(likeness) - 1))[:count]
+        best = best[np.argsort(-likeness[best], kind="stable")]
+        return best[np.isfinite(likeness[best])]
+
+    def load(self, index: int) -> LoadedKeyframe:
+        """A keyframe of the bank, by its index."""
+        with self._lock:
+            if index not in self._loaded:
+                self._loaded[index] = self._read(int(self.scene[index]), int(self._number[index]))
+                if len(self._loaded) > self._most:
+                    self._loaded.popitem(last=False)
+            self._loaded.move_to_end(index)
+            return self._loaded[index]
+
+    def _read(self, scene: int, number: int) -> LoadedKeyframe:
+        maps, keyframes = self._maps, self._maps.keyframes[scene]
+        assert keyframes is not None, "only keyframes are in the bank"
+        grey, camera = keyframes.grey(number), keyframes.cameras[number]
+        pose, marks = keyframes.base_from_camera[number], keyframes.landmarks[number]
+        stride = maps.encoder.stride
+        view = plain_view(grey, camera, stride, ViewOptions(short_side=maps.short_side))
+        features = encode_features([view], maps.encoder)[0].flatten(1).T
+        small = camera.short_side_resized(maps.short_side)
+        pixels = ideal_cell_pixels(small, stride).astype(np.float64)
+        plane = (pixels - [small.cx, small.cy]) / [small.fx, small.fy]
+        rays = np.concatenate([plane, np.ones((len(plane), 1))], 1)
+        depth = 1 / keyframes.inverse_depth[number].double().numpy()
+        pyramid = image_pyramid(grey, ALIGNED_LEVELS)
+        return LoadedKeyframe(
+            features.to(torch.bfloat16 if fast_bfloat16() else torch.float32),
+            pose.apply(rays * depth[:, None]),
+            pose.apply(marks.surface(camera)),
+            marks.sigma / marks.inverse_depth,
+            pose.translation_m,
+            tuple(
+                cut_patches(image, to_level(marks.pixels, level))
+                for level, image in enumerate(pyramid)
+            ),
+        )

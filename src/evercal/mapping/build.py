@@ -1,0 +1,364 @@
+"""`build_map`: a recording in, keyframes with adjusted poses and sub-pixel landmarks out."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evercal.datasets.frame import Frame, known_poses
+from evercal.errors import InputError
+from evercal.features.encoder import Encoder
+from evercal.features.vlad import vlad_for
+from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3
+from evercal.mapping.bundle_adjustment import (
+    Adjustment,
+    BundleAdjustment,
+    BundleOptions,
+    BundleTracks,
+)
+from evercal.mapping.keyframes import Keyframes, jpeg
+from evercal.mapping.landmarks import Landmarks
+from evercal.mapping.pose_check import PoseCheckOptions, contradicting_frames
+from evercal.mapping.recording import Recording, WorkingSize
+from evercal.mapping.selection import SarsOptions, select_sars
+from evercal.mapping.tracks import (
+    KeyframeTracks,
+    Observations,
+    TrackOptions,
+    joined,
+    observe,
+    open_keyframe,
+    refine_depths,
+)
+
+_WIDE_STEPS = ((2, 4), (1, 4), (0, 4))
+_PROBES = 64
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """How a map is built."""
+
+    size: WorkingSize = field(default_factory=WorkingSize)
+    """Working sizes of images."""
+    tracks: TrackOptions = field(default_factory=TrackOptions)
+    """How landmarks are found in other frames."""
+    bundle: BundleOptions = field(default_factory=BundleOptions)
+    """Bundle adjustment."""
+    check: PoseCheckOptions = field(default_factory=PoseCheckOptions)
+    """When a stated pose is wrong."""
+    support_frames: int = 250
+    """Frames that take part beside the keyframes, spread evenly; more add time and no precision."""
+    bundle_landmarks: int = 6000
+    """Landmarks in bundle adjustment over all keyframes, at most."""
+    adjust: bool = True
+    """Adjust poses and lens; else they are taken as stated."""
+    rounds: int = 2
+    """Rounds of tracking and adjusting; the second only where the first moved something."""
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """What bundle adjustment changed about a recording, for reports."""
+
+    common_translation_mm: tuple[float, float, float]
+    """Correction common to all stated poses, in the camera frame."""
+    common_rotation_deg: tuple[float, float, float]
+    """Its rotation vector."""
+    focal_percent: float
+    """By how much the focal length was changed."""
+    residual_px: float
+    """Median reprojection error afterwards."""
+    pose_sigma_mm: float
+    """Estimated error of the stated positions, standard deviation per axis."""
+    pose_sigma_deg: float
+    """The same of the stated rotations."""
+    time_shift_frames: float
+    """The images were taken this many frames after their stated poses."""
+    wrong_poses: tuple[str, ...]
+    """Frames whose stated pose contradicts the images; they were left out."""
+    doubtful_poses: tuple[str, ...]
+    """Frames whose stated pose is much further off than most; they were given less weight."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneMap:
+    """The map of one scene."""
+
+    keyframes: Keyframes
+    """With adjusted poses, landmarks and descriptors."""
+    camera: Camera
+    """The lens of the recording as adjusted, at the size of its first frame."""
+    common: SE3
+    """camera_from_stated_camera is its inverse: adjusted = stated @ common."""
+    pose_sigma: tuple[float, float]
+    """Uncertainty of the map itself against the stated frame: metres and radians per axis."""
+    adjusted: Adjusted
+    """What was changed."""
+
+
+OnStage = Callable[[str, int, int], None]
+"""Told what is being done, how many are done and how many there are."""
+
+
+def build_map(
+    frames: Sequence[Frame],
+    encoder: Encoder,
+    capacity: int,
+    options: MapOptions | None = None,
+    on_stage: OnStage | None = None,
+) -> SceneMap:
+    """Builds the map of a scene.
+
+    Args:
+        frames: posed training frames in recorded order.
+        encoder: frozen local encoder.
+        capacity: keyframes to keep.
+        options: how.
+        on_stage: for progress bars.
+
+    Raises:
+        InputError: no two frames see the same, so nothing can be triangulated.
+    """
+    options = options or MapOptions()
+    tell = on_stage or (lambda what, done, total: None)
+    recording, chosen, wrong = _open(frames, encoder, capacity, options, tell)
+    keyframes = []
+    for done, frame in enumerate(chosen.tolist()):
+        tell("mapping", done, len(chosen))
+        keyframe = open_keyframe(recording, frame, options.tracks)
+        refine_depths(recording, keyframe, options.tracks)
+        keyframes.append(keyframe)
+    tell("mapping", len(chosen), len(chosen))
+    if not any(keyframe.kept.any() for keyframe in keyframes):
+        raise InputError(
+            "no two training frames see the same surfaces under parallax: record views from at"
+            " least 10 cm apart, or check that the stated poses belong to these images"
+        )
+    velocity = _velocity(frames, recording)
+    adjustment = None
+    if options.adjust:
+        adjustment = _adjust(recording, keyframes, velocity, options, tell)
+    return _finished(recording, keyframes, adjustment, wrong, options)
+
+
+def _open(
+    frames: Sequence[Frame], encoder: Encoder, capacity: int, options: MapOptions, tell: OnStage
+) -> tuple[Recording, NDArray[np.int64], tuple[str, ...]]:
+    """Frames that take part, which of them are keyframes, and names of those left out."""
+    support = _spread(frames, max(options.support_frames, capacity))
+    recording = Recording([frames[i] for i in support], encoder, options.size)
+    for i in range(len(recording)):
+        tell("encoding", i, len(recording))
+        recording.features(i)
+    tell("encoding", len(recording), len(recording))
+    bad = contradicting_frames(recording, vlad_for(encoder), options.check)
+    wrong = tuple(recording.frames[i].name for i in bad)
+    if len(bad):
+        recording = recording.without(bad)
+    return recording, _spread(recording.frames, capacity), wrong
+
+
+def _spread(frames: Sequence[Frame], capacity: int) -> NDArray[np.int64]:
+    """Frames spread over the poses by SARS with the largest radius that fills the capacity."""
+    if len(frames) <= capacity:
+        return np.arange(len(frames))
+    poses = known_poses(frames)
+    fill = SarsOptions(fill=True)
+    return select_sars(poses.translation_m, poses.rotation_wxyz, capacity, fill)
+
+
+def _velocity(frames: Sequence[Frame], recording: Recording) -> np.ndarray:
+    """(n, 6) motion a frame, camera frame, where the frames before and after are its neighbours.
+
+    Jumps of the recording (blocks left out) are told by steps much longer than the median one.
+    """
+    poses = known_poses(frames)
+    if len(frames) < 3:
+        return np.zeros((len(recording), 6))
+    steps = (poses[:-1].inverse() @ poses[1:]).log()
+    size = np.linalg.norm(steps, axis=1)
+    smooth = size < 4 * np.median(size) + 1e-9
+    velocity = np.zeros((len(frames), 6))
+    both = smooth[:-1] & smooth[1:]
+    velocity[1:-1][both] = (steps[:-1][both] + steps[1:][both]) / 2
+    place = {frame.name: i for i, frame in enumerate(frames)}
+    return velocity[[place[frame.name] for frame in recording.frames]]
+
+
+def _adjust(
+    recording: Recording,
+    keyframes: list[KeyframeTracks],
+    velocity: np.ndarray,
+    options: MapOptions,
+    tell: OnStage,
+) -> Adjustment:
+    stated_cameras = list(recording.cameras)
+    adjustment = None
+    for number in range(options.rounds):
+        tell("adjusting", number, options.rounds)
+        tracks = _bundle_tracks(recording, keyframes, options)
+        problem = BundleAdjustment(recording.stated, stated_cameras, velocity, options.bundle)
+        adjustment = problem.solve(tracks)
+        recording.adjust(adjustment.poses, adjustment.camera)
+        if not _moved(adjustment, stated_cameras[0]):
+            break
+        for keyframe in keyframes:
+            refine_depths(recording, keyframe, options.tracks)
+    tell("adjusting", options.rounds, options.rounds)
+    assert adjustment is not None
+    return adjustment
+
+
+def _moved(adjustment: Adjustment, stated: Camera) -> bool:
+    """Whether anything was adjusted by an amount that landmarks would notice."""
+    common = adjustment.common.log()
+    sizeable = np.linalg.norm(common[:3]) > 2e-4 or np.linalg.norm(common[3:]) > 2e-4
+    loose = adjustment.sigma_m > 3e-4 or adjustment.sigma_rad > 2e-4
+    lens = adjustment.camera is not None and abs(adjustment.camera.fx / stated.fx - 1) > 1e-4
+    return bool(sizeable or loose or lens or _bent(adjustment.camera, stated))
+
+
+def _bent(camera: Camera | None, stated: Camera) -> bool:
+    """Whether the distortion was changed."""
+    if camera is None:
+        return False
+    now, before = ((*c.distortion, 0.0, 0.0)[:2] for c in (camera, stated))
+    return float(np.abs(np.subtract(now, before)).max()) > 1e-3
+
+
+def _bundle_tracks(
+    recording: Recording, keyframes: list[KeyframeTracks], options: MapOptions
+) -> BundleTracks:
+    """A spread subset of the landmarks, in all frames that see enough of their keyframe."""
+    o = options.tracks
+    most = max(30, min(o.landmarks_per_keyframe, options.bundle_landmarks // len(keyframes)))
+    tied = _tied_frames(recording, keyframes, o)
+    parts: list[Observations] = []
+    host, pixels, inverse, start = [], [], [], 0
+    for keyframe, frames in zip(keyframes, tied, strict=True):
+        which = np.flatnonzero(keyframe.kept)
+        if len(which) < most // 2:
+            which = np.arange(len(keyframe.landmarks))
+        if len(which) > most:
+            which = which[np.linspace(0, len(which) - 1, most).astype(int)]
+        if not len(which):
+            continue
+        number = np.full(len(keyframe.landmarks), -1)
+        number[which] = start + np.arange(len(which))
+        for j in frames:
+            seen = observe(recording, keyframe, j, which, _WIDE_STEPS, o.wide_reach_px, o)
+            parts.append(
+                Observations(number[seen.landmark], seen.frame, seen.pixels, seen.whitening)
+            )
+        host.append(np.full(len(which), keyframe.frame))
+        pixels.append(keyframe.landmarks.pixels[which])
+        inverse.append(keyframe.landmarks.inverse_depth[which])
+        start += len(which)
+    seen = joined(parts)
+    often = np.bincount(seen.landmark, minlength=start)[seen.landmark] >= 2
+    return BundleTracks(
+        np.concatenate(host),
+        np.concatenate(pixels),
+        np.concatenate(inverse),
+        seen.landmark[often],
+        seen.frame[often],
+        seen.pixels[often],
+        seen.whitening[often],
+    )
+
+
+def _tied_frames(
+    recording: Recording, keyframes: list[KeyframeTracks], options: TrackOptions
+) -> list[list[int]]:
+    """Frames in which each keyframe's landmarks are looked for."""
+    shared = np.stack([_shared(recording, keyframe) for keyframe in keyframes])
+    best = np.argsort(-shared, axis=0, kind="stable")[: options.frames_per_keyframe]
+    tied = np.zeros(shared.shape, bool)
+    np.put_along_axis(tied, best, True, axis=0)
+    tied &= shared > options.min_shared
+    return [
+        sorted({*np.flatnonzero(row).tolist(), *keyframe.sources} - {keyframe.frame})
+        for row, keyframe in zip(tied, keyframes, strict=True)
+    ]
+
+
+def _shared(recording: Recording, keyframe: KeyframeTracks) -> np.ndarray:
+    """(n,) how much of a keyframe's view every frame sees from a similar direction, 0 to 1."""
+    cells = recording.posed_cells(keyframe.frame)
+    some = np.linspace(0, len(keyframe.cell_inverse_depth) - 1, _PROBES).astype(int)
+    local = cells.rays()[some] / keyframe.cell_inverse_depth[some, None]
+    points = cells.base_from_camera.apply(local)
+    towards = points[None] - recording.translation_m[:, None]
+    unit = towards / (np.linalg.norm(towards, axis=-1, keepdims=True) + 1e-9)
+    within = np.einsum("nji,npj->npi", recording.rotation, towards)
+    shared = np.zeros(len(recording))
+    for i in range(len(recording)):
+        camera, front = recording.cameras[i], within[i, :, 2] > 0.1
+        at = camera.project(np.where(front[:, None], within[i], [0, 0, 1]))
+        inside = front & (at > 0).all(1) & (at < [camera.width, camera.height]).all(1)
+        like = ((unit[i] * unit[keyframe.frame]).sum(1) - 0.7).clip(0, 1) / 0.3
+        shared[i] = (inside * like).mean()
+    shared[keyframe.frame] = 0
+    return shared
+
+
+def _finished(
+    recording: Recording,
+    keyframes: list[KeyframeTracks],
+    adjustment: Adjustment | None,
+    wrong: tuple[str, ...],
+    options: MapOptions,
+) -> SceneMap:
+    numbers = [keyframe.frame for keyframe in keyframes]
+    vlad = vlad_for(recording.encoder)
+    landmarks = []
+    for keyframe in keyframes:
+        kept = np.flatnonzero(keyframe.kept)
+        landmarks.append(keyframe.landmarks.take(kept))
+    complete = Keyframes(
+        tuple(jpeg(recording.grey[i]) for i in numbers),
+        tuple(recording.cameras[i] for i in numbers),
+        recording.poses[np.array(numbers)],
+        tuple(torch.from_numpy(k.cell_inverse_depth).half() for k in keyframes),
+        tuple(landmarks),
+        torch.stack([vlad(recording.features(i)) for i in numbers]).half(),
+    )
+    first = recording.frames[0].camera
+    camera = recording.cameras[0].resized(first.width, first.height)
+    common = adjustment.common if adjustment else SE3.identity()
+    spread = (0.0, 0.0)
+    if adjustment is not None:
+        block = adjustment.covariance[numbers]
+        spread = tuple(
+            float(np.sqrt(np.einsum("nii->ni", block)[:, part].mean()))
+            for part in (slice(0, 3), slice(3, 6))
+        )
+    return SceneMap(
+        complete, camera, common, spread, _adjusted(recording, adjustment, camera, wrong)
+    )
+
+
+def _adjusted(
+    recording: Recording, adjustment: Adjustment | None, camera: Camera, wrong: tuple[str, ...]
+) -> Adjusted:
+    if adjustment is None:
+        zero = (0.0, 0.0, 0.0)
+        return Adjusted(zero, zero, 0.0, float("nan"), 0.0, 0.0, 0.0, wrong, ())
+    six = adjustment.common.log()
+    shift, turn = 1000 * six[:3], np.rad2deg(six[3:])
+    doubtful = np.flatnonzero(adjustment.weight < 0.25)
+    return Adjusted(
+        (float(shift[0]), float(shift[1]), float(shift[2])),
+        (float(turn[0]), float(turn[1]), float(turn[2])),
+        100 * (camera.fx / recording.frames[0].camera.fx - 1),
+        adjustment.residual_px,
+        1000 * adjustment.sigma_m,
+        float(np.rad2deg(adjustment.sigma_rad)),
+        adjustment.shift_frames,
+        wrong,
+        tuple(recording.frames[i].name for i in doubtful),
+    )

@@ -1,0 +1,126 @@
+"""Landmarks: textured pixels of a keyframe, each with its depth, its slant and its uncertainty."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.geometry.camera import Camera
+
+Array = NDArray[np.floating]
+
+MIN_TEXTURE = 1e-4
+"""Smallest minimum eigenvalue (cv2.cornerMinEigenVal, 5x5) of a landmark's pixel."""
+BORDER_PX = 6
+NEAREST_M = 0.05
+_TANGENT_PX = 2.0
+_LEAST_AREA, _MOST_AREA = 0.2, 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """The landmarks of one keyframe."""
+
+    pixels: Array
+    """(n, 2) whole pixels of the keyframe's image."""
+    inverse_depth: Array
+    """(n,) per metre along the optical axis."""
+    slope: Array
+    """(n, 2) change of the inverse depth per pixel: the slant of the surface."""
+    sigma: Array
+    """(n,) standard deviation of the inverse depth, per metre."""
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def take(self, index: np.ndarray) -> "Landmarks":
+        """Some of them."""
+        return Landmarks(
+            self.pixels[index], self.inverse_depth[index], self.slope[index], self.sigma[index]
+        )
+
+    def surface(self, camera: Camera) -> Array:
+        """(3, n, 3) points in the keyframe's camera frame, metres.
+
+        The landmarks themselves, and the points of their surface two pixels to the right and two
+        pixels down.
+
+        Args:
+            camera: of the keyframe's image.
+        """
+        steps = np.array([[0, 0], [_TANGENT_PX, 0], [0, _TANGENT_PX]])
+        pixels = self.pixels[None] + steps[:, None]
+        inverse = self.inverse_depth + (steps @ self.slope.T)
+        return camera.unproject(pixels) / inverse[..., None]
+
+
+def project_surface(
+    points: Array, rotation: Array, translation_m: Array, camera: Camera
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Where a camera should see patches, and how they are warped there.
+
+    Args:
+        points: (3, n, 3), see `Landmarks.surface`, in any frame.
+        rotation: (3, 3) from that frame to the camera's.
+        translation_m: (3,) of the same transform.
+        camera: intrinsics.
+
+    Returns:
+        Which of the n are visible (m,): in front, inside the image by a margin, and neither much
+        larger nor much smaller than in their keyframe; their pixels (m, 2); the affine maps
+        (m, 2, 2) from keyframe pixels to this image.
+    """
+    centre = points[0] @ rotation.T + translation_m
+    front = np.flatnonzero(centre[:, 2] > NEAREST_M)
+    pixels = camera.project(centre[front])
+    high = np.array([camera.width, camera.height]) - BORDER_PX - 1
+    inside = ((pixels > BORDER_PX) & (pixels < high)).all(1)
+    visible, pixels = front[inside], pixels[inside]
+    beside = points[1:, visible] @ rotation.T + translation_m
+    tangents = camera.project(np.maximum(beside, [-np.inf, -np.inf, NEAREST_M])) - pixels
+    affines = tangents.transpose(1, 2, 0) / _TANGENT_PX
+    area = affines[:, 0, 0] * affines[:, 1, 1] - affines[:, 0, 1] * affines[:, 1, 0]
+    right = (area > _LEAST_AREA) & (area < _MOST_AREA)
+    return visible[right], pixels[right], affines[right]
+
+
+def detect(
+    grey: np.ndarray, grid: tuple[int, int], cell_px: float
+) -> tuple[Array, NDArray[np.int64]]:
+    """The most textured pixel of every cell that has texture.
+
+    Args:
+        grey: (h, w) uint8.
+        grid: rows and columns of cells.
+        cell_px: side of a cell in pixels of `grey`.
+
+    Returns:
+        Pixels (n, 2) and the cells (n,) they lie in, row-major.
+    """
+    texture = cv2.cornerMinEigenVal(grey, 5)
+    inner = np.zeros_like(texture)
+    middle = slice(BORDER_PX, -BORDER_PX)
+    inner[middle, middle] = texture[middle, middle]
+    rows, columns = (np.rint(np.arange(n + 1) * cell_px).astype(int) for n in grid)
+    pixels, cells = [], []
+    for i in range(grid[0]):
+        for j in range(grid[1]):
+            block = inner[rows[i] : rows[i + 1], columns[j] : columns[j + 1]]
+            v, u = divmod(int(block.argmax()), block.shape[1])
+            if block[v, u] > MIN_TEXTURE:
+                pixels.append((columns[j] + u, rows[i] + v))
+                cells.append(i * grid[1] + j)
+    return np.array(pixels, float).reshape(-1, 2), np.array(cells, np.int64)
+
+
+def slopes(inverse_depth: Array, grid: tuple[int, int], cell_px: float) -> Array:
+    """(cells, 2) change of inverse depth per pixel, from the inverse depths (cells,) of a grid.
+
+    The inverse depth of a plane is linear in the image, so its gradient is the plane's slant.
+    """
+    field = cv2.medianBlur(inverse_depth.reshape(grid).astype(np.float32), 3)
+    field = cv2.GaussianBlur(field, (0, 0), 1.0)
+    right = cv2.Sobel(field, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
+    down = cv2.Sobel(field, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
+    return np.stack([right, down], -1).reshape(-1, 2).astype(np.float64) / cell_px

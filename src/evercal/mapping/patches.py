@@ -1,0 +1,172 @@
+"""Image patches that are found again in other views to about a tenth of a pixel.
+
+Inverse-compositional Lucas-Kanade alignment (Baker and Matthews, IJCV 2004): the templates, their
+gradients and their Hessians belong to a keyframe and are made once; the other image is only
+sampled. Patches are compared with zero mean and unit deviation, so gain and offset drop out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+
+RADIUS = 5
+SIDE = 2 * RADIUS + 1
+_MOST_ROWS = 30_000  # cv2.remap takes maps of up to 32,767 rows
+_FLAT = 1e-3
+_DAMPING = 1e-2
+_LONGEST_STEP = 2.0
+
+
+def _grid(radius: int) -> Array:
+    steps = np.arange(-radius, radius + 1, dtype=np.float32)
+    return np.stack(np.meshgrid(steps, steps), -1).reshape(-1, 2)
+
+
+_OFFSETS, _WIDE = _grid(RADIUS), _grid(RADIUS + 1)
+
+
+def image_pyramid(grey: np.ndarray, levels: int) -> list[Array]:
+    """Float images (h, w), each half the size of the one before; level 0 is the image itself."""
+    pyramid = [grey.astype(np.float32)]
+    for _ in range(levels - 1):
+        height, width = (side // 2 for side in pyramid[-1].shape)
+        even = pyramid[-1][: 2 * height, : 2 * width]
+        pyramid.append(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA))
+    return pyramid
+
+
+def to_level(pixels: Array, level: int) -> Array:
+    """Pixels (n, 2) of level 0 in another level of the pyramid; pixel centres are whole numbers."""
+    return (pixels + 0.5) / 2**level - 0.5
+
+
+def from_level(pixels: Array, level: int) -> Array:
+    """The inverse of `to_level`."""
+    return (pixels + 0.5) * 2**level - 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Templates of n patches in one level of a keyframe's pyramid."""
+
+    intensity: Array
+    """(n, p) zero mean, unit deviation."""
+    descent: Array
+    """(n, 2, p): the step in keyframe pixels that a difference of intensities asks for."""
+    inverse_hessian: Array
+    """(n, 2, 2) covariance of the aligned position in pixels per unit of intensity noise."""
+
+    def take(self, index: np.ndarray | slice) -> "Patches":
+        """Some of them."""
+        return Patches(self.intensity[index], self.descent[index], self.inverse_hessian[index])
+
+
+def cut_patches(image: Array, pixels: Array) -> Patches:
+    """Patches of 11x11 pixels round (n, 2) pixels of a float image of one pyramid level."""
+    n = len(pixels)
+    wide = _sample(image, pixels[:, None].astype(np.float32) + _WIDE)
+    wide = wide.reshape(n, SIDE + 2, SIDE + 2)
+    slope_u = (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2
+    slope_v = (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2
+    patch = wide[:, 1:-1, 1:-1].reshape(n, -1)
+    patch = patch - patch.mean(1, keepdims=True)
+    deviation = np.sqrt((patch * patch).mean(1, keepdims=True)) + _FLAT
+    gradient = np.stack([slope_u.reshape(n, -1), slope_v.reshape(n, -1)], -1) / deviation[..., None]
+    hessian = gradient.transpose(0, 2, 1) @ gradient + _DAMPING * np.eye(2, dtype=np.float32)
+    inverse = np.linalg.inv(hessian)
+    descent = np.ascontiguousarray((gradient @ inverse).transpose(0, 2, 1))
+    return Patches(patch / deviation, descent, inverse)
+
+
+def align_patches(
+    patches: Patches, image: Array, centres: Array, affines: Array, iterations: int
+) -> tuple[Array, Array]:
+    """Moves patches in another image to where they fit.
+
+    Args:
+        patches: n templates.
+        image: float image (h, w) of the same pyramid level.
+        centres: (n, 2) pixels to start from.
+        affines: (n, 2, 2) from keyframe pixels to pixels of this image round the centre.
+        iterations: Gauss-Newton steps.
+
+    Returns:
+        Pixels (n, 2) and the normalised cross-correlation (n,) there.
+    """
+    if len(centres) > _MOST_ROWS:
+        starts = range(0, len(centres), _MOST_ROWS)
+        parts = [slice(start, start + _MOST_ROWS) for start in starts]
+        done = [align_patches(patches.take(p), image, centres[p], affines[p], iterations) for p in parts]
+        return np.concatenate([d[0] for d in done]), np.concatenate([d[1] for d in done])
+    affines = affines.astype(np.float32)
+    offsets = _OFFSETS @ affines.transpose(0, 2, 1)
+    at = centres.astype(np.float32)
+    for _ in range(iterations):
+        difference = _standardised(_sample(image, at[:, None] + offsets)) - patches.intensity
+        step = (patches.descent @ difference[..., None]).clip(-_LONGEST_STEP, _LONGEST_STEP)
+        at = at - (affines @ step)[..., 0]
+    found = _standardised(_sample(image, at[:, None] + offsets))
+    return at, np.einsum("np,np->n", found, patches.intensity) / found.shape[1]
+
+
+def align_down(
+    levels: Sequence[Patches],
+    pyramid: Sequence[Array],
+    start: Array,
+    affines: Array,
+    steps: Sequence[tuple[int, int]],
+) -> tuple[Array, Array]:
+    """`align_patches` from coarse to fine.
+
+    Args:
+        levels: templates of each pyramid level.
+        pyramid: the other image, as `image_pyramid` gives it.
+        start: (n, 2) pixels of level 0 to start from.
+        affines: (n, 2, 2), see `align_patches`.
+        steps: (level, iterations) in turn.
+
+    Returns:
+        Pixels (n, 2) of level 0 and the correlation (n,) at the last level.
+    """
+    at, correlation = start, np.zeros(len(start))
+    for level, iterations in steps:
+        at, correlation = align_patches(
+            levels[level], pyramid[level], to_level(at, level), affines, iterations
+        )
+        at = from_level(at.astype(np.float64), level)
+    return at, correlation
+
+
+def whitening(affines: Array, inverse_hessian: Array, floor_px: float, noise: float) -> Array:
+    """(n, 2, 2) matrices that make the errors of aligned positions independent, of unit variance.
+
+    A patch on an edge is located well across the edge and badly along it; its Hessian says so.
+
+    Args:
+        affines: (n, 2, 2) from keyframe pixels to pixels of the other image.
+        inverse_hessian: (n, 2, 2) of the patches.
+        floor_px: error of a perfect patch, pixels.
+        noise: standard deviation of intensities, in deviations of a patch.
+    """
+    spread = (affines @ inverse_hessian @ affines.transpose(0, 2, 1)).astype(np.float64)
+    spread = noise**2 * (spread + floor_px**2 * np.eye(2))
+    return np.linalg.cholesky(np.linalg.inv(spread)).transpose(0, 2, 1)
+
+
+def _sample(image: Array, where: Array) -> Array:
+    """(n, p) intensities at (n, p, 2) pixels."""
+    if not len(where):
+        return np.zeros(where.shape[:2], np.float32)
+    flags, border = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
+    return cv2.remap(image, np.ascontiguousarray(where), None, flags, borderMode=border)  # type: ignore[call-overload]
+
+
+def _standardised(patches: Array) -> Array:
+    patches = patches - patches.mean(1, keepdims=True)
+    deviation = np.sqrt(np.einsum("np,np->n", patches, patches) / patches.shape[1]) + _FLAT
+    return patches / deviation[:, None]

@@ -1,0 +1,133 @@
+"""The training frames of a scene while its map is built: images, features, poses, lens."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from evercal.datasets.frame import Frame, known_poses
+from evercal.features.encode import encode_features
+from evercal.features.encoder import Encoder
+from evercal.features.views import View, ViewOptions, plain_view, working_image
+from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3
+from evercal.mapping.patches import image_pyramid
+from evercal.mapping.plane_sweep import PosedCells
+
+PYRAMID_LEVELS = 3
+_PYRAMIDS = 128
+
+
+@dataclass(frozen=True)
+class WorkingSize:
+    """Sizes that images are brought to, pixels of the shorter side."""
+
+    cells: int = 240
+    """For the encoder."""
+    patches: int = 480
+    """For patches, at most: smaller images stay as they are."""
+
+
+class Recording:
+    """Posed training frames at working size; poses and lens change while they are adjusted.
+
+    Args:
+        frames: posed frames of one scene.
+        encoder: frozen local encoder.
+        size: working sizes.
+    """
+
+    def __init__(self, frames: Sequence[Frame], encoder: Encoder, size: WorkingSize):
+        self.frames, self.encoder, self.size = tuple(frames), encoder, size
+        self.stated = known_poses(self.frames)
+        self.rotation = self.stated.rotation_matrix()
+        self.translation_m = self.stated.translation_m.copy()
+        self.grey: list[NDArray[np.uint8]] = []
+        self.cameras: list[Camera] = []
+        for frame in self.frames:
+            image = frame.read_image()
+            short = min(size.patches, *image.shape[:2])
+            grey, camera = working_image(image, frame.camera, short)
+            self.grey.append(grey)
+            self.cameras.append(camera)
+        self._features: dict[int, Tensor] = {}
+        self._pyramids: OrderedDict[int, list[np.ndarray]] = OrderedDict()
+
+    def without(self, left_out: NDArray[np.int64]) -> "Recording":
+        """The recording less some frames; what was computed for the others stays."""
+        keep = [i for i in range(len(self)) if i not in set(left_out.tolist())]
+        rest = Recording.__new__(Recording)
+        rest.frames, rest.encoder, rest.size = (
+            tuple(self.frames[i] for i in keep),
+            self.encoder,
+            self.size,
+        )
+        rest.stated, rest.rotation = self.stated[np.array(keep)], self.rotation[keep]
+        rest.translation_m = self.translation_m[keep]
+        rest.grey, rest.cameras = [self.grey[i] for i in keep], [self.cameras[i] for i in keep]
+        rest._features = {new: self._features[i] for new, i in enumerate(keep)}
+        rest._pyramids = OrderedDict()
+        return rest
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def poses(self) -> SE3:
+        """(n,) base_from_camera as adjusted so far."""
+        matrix = np.zeros((len(self), 4, 4))
+        matrix[:, :3, :3], matrix[:, :3, 3], matrix[:, 3, 3] = self.rotation, self.translation_m, 1
+        return SE3.from_matrix(matrix)
+
+    def cell_camera(self, i: int) -> Camera:
+        """The camera of a frame at the encoder's working size."""
+        return self.cameras[i].short_side_resized(self.size.cells)
+
+    def cell_px(self, i: int) -> float:
+        """Side of a patch of the feature grid, in pixels of the image that patches are cut from."""
+        return self.encoder.stride * self.cameras[i].width / self.cell_camera(i).width
+
+    def view(self, i: int) -> View:
+        """What the encoder sees of a frame."""
+        options = ViewOptions(short_side=self.size.cells)
+        return plain_view(self.grey[i], self.cameras[i], self.encoder.stride, options)
+
+    def features(self, i: int) -> Tensor:
+        """(cells, channels) features of a frame; kept in half precision."""
+        if i not in self._features:
+            features = encode_features([self.view(i)], self.encoder)
+            self._features[i] = features[0].flatten(1).T.half()
+        return self._features[i].float()
+
+    def posed_cells(self, i: int) -> PosedCells:
+        """The encoded cells of a frame with its pose and camera."""
+        pose = self.poses[i]
+        return PosedCells(self.features(i), self.cell_camera(i), pose, self.encoder.stride)
+
+    def pyramid(self, i: int) -> list[np.ndarray]:
+        """Image pyramid of a frame; the last ones used stay in memory."""
+        if i not in self._pyramids:
+            self._pyramids[i] = image_pyramid(self.grey[i], PYRAMID_LEVELS)
+            if len(self._pyramids) > _PYRAMIDS:
+                self._pyramids.popitem(last=False)
+        self._pyramids.move_to_end(i)
+        return self._pyramids[i]
+
+    def relative(self, j: int, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Rotation (3, 3) and translation (3,) of camera j from camera k."""
+        turn = self.rotation[j].T
+        return turn @ self.rotation[k], turn @ (self.translation_m[k] - self.translation_m[j])
+
+    def adjust(self, poses: SE3, camera: Camera | None) -> None:
+        """Takes over adjusted poses (n,) and, where all frames share one, an adjusted camera."""
+        self.rotation, self.translation_m = poses.rotation_matrix(), poses.translation_m
+        if camera is not None:
+            self.cameras = [camera] * len(self)
+
+    def one_camera(self) -> bool:
+        """Whether all frames were taken with the same intrinsics."""
+        return all(camera == self.cameras[0] for camera in self.cameras)
+
