@@ -1,6 +1,7 @@
 """A suite on disk: complete, the same again, continued after a stop; bad input named."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -61,6 +62,28 @@ def test_a_run_cut_off_goes_on_and_ends_the_same(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.matrix(), truth, atol=1e-9)
     with pytest.raises(InputError, match="begun with other settings"):
         next(simulate("sim", cut, SimulateOptions(frames=4, size=(32, 24), samples=2)))
+
+
+@pytest.mark.usefixtures("small")
+def test_a_change_is_recorded_after_the_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "rooms"
+    list(simulate("sim", out, TINY))
+    assert not (out / "kitchen/changed").exists()
+    before = {path: path.read_bytes() for path in out.rglob("*.*")}
+    monkeypatch.setitem(cell.SUITES, "sim", replace(cell.SUITES["sim"], changed=2))
+    steps = list(simulate("sim", out, TINY))
+    assert (steps[-1].done, steps[-1].total) == (12, 12)
+    assert steps[-1].scene == out / "kitchen/changed"
+    assert {path: path.read_bytes() for path in before} == before
+    scene = load_scene(out / "kitchen/changed")
+    assert (scene.name, len(scene.train)) == ("kitchen-changed", 0)
+    assert [frame.name for frame in scene.test] == ["changed-000000", "changed-000001"]
+    for frame in scene.test:
+        assert frame.read_image().shape == (24, 32, 3)
+        assert frame.depth is not None
+        assert frame.depth.exists()
 
 
 def test_bad_input_is_named(tmp_path: Path) -> None:

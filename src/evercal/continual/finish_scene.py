@@ -1,6 +1,6 @@
 """What stays of a scene that was just learned: keyframes, their depths, the method's state."""
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import replace
 
 from evercal.continual.frame_statistics import FrameStatistics
@@ -9,9 +9,9 @@ from evercal.continual.strategies import STRATEGIES
 from evercal.datasets.frame import Frame
 from evercal.features.views import ViewOptions
 from evercal.geometry.camera import Camera
+from evercal.mapping.build import MapOptions, Mapping, SceneMap, map_steps
 from evercal.mapping.keyframes import Keyframes, store_keyframes
-from evercal.mapping.plane_sweep import keyframe_depths
-from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 from evercal.networks.buffer import EncodePlan, FeatureBuffer, encode_frames
 
 
@@ -21,8 +21,9 @@ def select_keyframes(
     statistics: FrameStatistics,
     capacity: int,
     refined: Camera | None,
-) -> Keyframes | None:
-    """The keyframes that a strategy keeps of a scene's training frames, with depths if it matches.
+    mapping: MapOptions,
+) -> Generator[Mapping, None, tuple[Keyframes | None, SceneMap | None]]:
+    """The keyframes that a strategy keeps of a scene's training frames, and their map if it has one.
 
     Args:
         maps: whose strategy selects.
@@ -30,25 +31,35 @@ def select_keyframes(
         statistics: the same frames as selectors see them.
         capacity: N_b, how many at most.
         refined: the camera as training corrected it; replay takes it as given.
+        mapping: how a map is built.
     """
     strategy = STRATEGIES[maps.strategy]
     if strategy.select is None:
-        return None
+        return None, None
     chosen = strategy.select(statistics, capacity)
+    if strategy.build_map:
+        scene_map = yield from map_steps(frames, maps.encoder, chosen, sized(mapping, maps))
+        return scene_map.keyframes, scene_map
     if refined is not None:
         frames = [replace(frame, camera=refined) for frame in frames]
-    keyframes = store_keyframes([frames[i] for i in chosen], maps.short_side)
-    if strategy.match_keyframes:
-        depths = keyframe_depths(
-            chosen,
-            frames,
-            maps.short_side,
-            maps.encoder.stride,
-            statistics.local_features,
-            statistics.depths_m,
-        )
-        keyframes = replace(keyframes, inverse_depth=depths)
-    return keyframes
+    return store_keyframes([frames[i] for i in chosen], maps.short_side), None
+
+
+def sized(options: MapOptions, maps: SceneMaps) -> MapOptions:
+    """The options at the working size of a store."""
+    return replace(options, size=replace(options.size, cells=maps.short_side))
+
+
+def mapped_record(record: SceneRecord, scene_map: SceneMap | None) -> SceneRecord:
+    """A scene's record with what its map adjusted."""
+    if scene_map is None:
+        return record
+    return replace(
+        record,
+        refined_camera=scene_map.camera,
+        common=scene_map.common,
+        map_sigma=scene_map.pose_sigma,
+    )
 
 
 def method_state_of(maps: SceneMaps, buffer: FeatureBuffer) -> MethodState:

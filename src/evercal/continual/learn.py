@@ -2,14 +2,19 @@
 
 import copy
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from evercal.continual.finish_scene import method_state_of, select_keyframes
+from evercal.continual.finish_scene import (
+    mapped_record,
+    method_state_of,
+    select_keyframes,
+    sized,
+)
 from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.methods.mir import mir_views
 from evercal.continual.methods.preconditioning import preconditioner
@@ -19,6 +24,7 @@ from evercal.errors import InputError
 from evercal.features.precision import autocast
 from evercal.geometry.camera import Camera
 from evercal.mapping.atlas import Cell, camera_clusters
+from evercal.mapping.build import MapOptions, Mapping, SceneMap, map_steps, spread_frames
 from evercal.mapping.keyframes import store_keyframes
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord, corrected_camera, prototypes
 from evercal.mapping.store import Checkpoint, Resume
@@ -51,6 +57,8 @@ class StageOptions:
     grid_scenes: int = 0
     """Scenes of the combined grid (`Atlas` layout `paper`), if they are known in advance; 0 gives
     each the next free place."""
+    map: MapOptions = field(default_factory=MapOptions)
+    """Building of the map, where the strategy builds one."""
     seed: int = 0
     """Random seed."""
 
@@ -82,9 +90,11 @@ class Stage:
     """Optimiser steps."""
     frames_kept: int
     """Frames of this scene that stay in memory."""
+    scene_map: SceneMap | None = None
+    """The map that was built, if the strategy builds one."""
 
 
-Event = Encoding | Progress | Checkpoint | Stage
+Event = Encoding | Mapping | Progress | Checkpoint | Stage
 
 
 def learn(
@@ -116,6 +126,9 @@ def learn(
             f"{len(maps.scenes)} earlier ones again, got {len(earlier)}; give them, or take "
             "another strategy"
         )
+    if not strategy.network:
+        yield from _learn_map(maps, scene, options)
+        return
     # Views are made at the size at which the localizer will see images.
     view = replace(options.encode.view, short_side=maps.short_side)
     options = replace(options, encode=replace(options.encode, view=view))
@@ -146,7 +159,8 @@ def learn(
     refined, *others = _refined_cameras(trainer, [scene, *earlier])
     for i, camera in enumerate(others):
         after.scenes[i] = replace(after.scenes[i], refined_camera=camera)
-    yield _finish(after, scene, cell, buffer, options, refined)
+    stage = yield from _finish(after, scene, cell, buffer, options, refined)
+    yield stage
 
 
 def _encoded(
@@ -312,18 +326,36 @@ def _finish(
     buffer: FeatureBuffer,
     options: StageOptions,
     refined: Camera | None,
-) -> Stage:
+) -> Generator[Event, None, Stage]:
     frames = scene.train
     descriptors = prototypes(buffer.tensors["descriptors"][: len(frames)])
     camera = frames[0].camera
     record = SceneRecord(scene.name, camera, cell, descriptors, len(frames), refined)
     statistics = FrameStatistics(frames, after.heads[-1], lambda: buffer, options.seed)
     capacity = options.capacity(frames, after.short_side)
-    keyframes = select_keyframes(after, frames, statistics, capacity, refined)
-    after.scenes.append(record)
+    keyframes, scene_map = yield from select_keyframes(
+        after, frames, statistics, capacity, refined, options.map
+    )
+    after.scenes.append(mapped_record(record, scene_map))
     after.keyframes.append(keyframes)
     after.method_states.append(method_state_of(after, buffer))
-    return Stage(after, options.fit.iterations, len(keyframes.images) if keyframes else 0)
+    kept = len(keyframes) if keyframes else 0
+    return Stage(after, options.fit.iterations, kept, scene_map)
+
+
+def _learn_map(maps: SceneMaps, scene: Scene, options: StageOptions) -> Iterator[Event]:
+    """Learns a scene by building its map; nothing is trained."""
+    after, frames = maps.copy_for_training(), scene.train
+    positions = np.stack([_pose(frame).translation_m for frame in frames])
+    cell = after.atlas(options.grid_scenes).place(positions)
+    chosen = spread_frames(frames, options.capacity(frames, options.map.size.patches))
+    scene_map = yield from map_steps(frames, maps.encoder, chosen, sized(options.map, maps))
+    nothing = torch.zeros(0, after.descriptor.width).half()
+    record = SceneRecord(scene.name, frames[0].camera, cell, nothing, len(frames))
+    after.scenes.append(mapped_record(record, scene_map))
+    after.keyframes.append(scene_map.keyframes)
+    after.method_states.append({})
+    yield Stage(after, 0, len(scene_map.keyframes), scene_map)
 
 
 class _Pacer:

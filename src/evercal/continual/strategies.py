@@ -79,9 +79,10 @@ class Strategy:
     """How gradients of remembered scenes join that of the new one; None adds them up."""
     mir: bool = False
     """Whether those views are replayed that the new rows are about to spoil most."""
-    match_keyframes: bool = False
-    """Whether keyframes also answer: cells of an image are matched to theirs, whose depths are then
-    kept with them (`localization.keyframe_matcher`)."""
+    build_map: bool = False
+    """Whether the keyframes become a map with landmarks, which answers beside the network."""
+    network: bool = True
+    """Whether a network is trained at all; without one the map alone answers."""
     after_scene: Callable[[FinishedScene], dict[str, Tensor]] | None = None
     """What is kept of a finished scene beside its keyframes."""
     regularizer: Callable[[Head, Sequence[MethodState]], Tensor] | None = None
@@ -132,7 +133,7 @@ def _gradients(frames: FrameStatistics, capacity: int) -> np.ndarray:
 
 
 _NETWORK = Strategy(
-    source="the same without recall: the network alone answers",
+    source="this project: scene codes, own centres, anchored replay, preconditioning; no map",
     select=_sars_filled,
     penalty=anchored_reprojection,
     penalty_per_scene=True,
@@ -140,10 +141,14 @@ _NETWORK = Strategy(
 )
 
 STRATEGIES: dict[str, Strategy] = {
-    "evercal": replace(
-        _NETWORK,
-        source="this project: scene codes, own centres, anchored replay, protection, recall",
-        match_keyframes=True,
+    "evercal": Strategy(
+        source="this project: a map of keyframes and sub-pixel landmarks, nothing trained",
+        select=_sars_filled,
+        build_map=True,
+        network=False,
+    ),
+    "evercal_hybrid": replace(
+        _NETWORK, source="this project: the map and the network of evercal_network", build_map=True
     ),
     "finetune": Strategy(source="control: the head and steps of evercal, no replay"),
     "evercal_network": _NETWORK,
@@ -255,7 +260,7 @@ STRATEGIES: dict[str, Strategy] = {
         source="the same with the memory of evercal: what evercal could reach",
         select=_sars_filled,
         data="all",
-        match_keyframes=True,
+        build_map=True,
     ),
 }
 
@@ -312,6 +317,6 @@ def compose(name: str) -> Strategy:
     source = f"composed: {selector} selects, replay costs {penalty}"
     cost = PENALTIES[penalty]
     made = Strategy(
-        source, SELECTORS[selector], cost, WEIGHTS.get(cost, 1.0), match_keyframes="recall" in more
+        source, SELECTORS[selector], cost, WEIGHTS.get(cost, 1.0), build_map="recall" in more
     )
     return STRATEGIES.setdefault(name, made)

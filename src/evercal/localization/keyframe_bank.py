@@ -63,9 +63,7 @@ class KeyframeBank:
     def __len__(self) -> int:
         return len(self.scene)
 
-    def retrieve(
-        self, features: Tensor, scenes: Sequence[int], count: int
-    ) -> NDArray[np.int64]:
+    def retrieve(self, features: Tensor, scenes: Sequence[int], count: int) -> NDArray[np.int64]:
         """The keyframes of some scenes whose descriptors are most alike, best first.
 
         Args:

@@ -354,7 +354,8 @@ class Localizer:
         self, query: _Query, candidate: _Candidate, camera: Camera
     ) -> tuple[np.ndarray, np.ndarray, int]:
         """Pixels (m, 2) at the encoder's size, points (m, 3) in the scene's base frame, and how
-        many patches of the image they stand for."""
+        many patches of the image they stand for.
+        """
         small = camera.short_side_resized(self.maps.short_side)
         pixels = ideal_cell_pixels(small, self.maps.encoder.stride).astype(np.float64)
         features = query.features.flatten(1).T
@@ -409,9 +410,7 @@ class Localizer:
     def _answer(self, best: _Hypothesis, began: float) -> PoseEstimate:
         def refused(status, reason: str) -> PoseEstimate:
             ms = 1000 * (time.perf_counter() - began)
-            return PoseEstimate(
-                status, reason, None, None, None, best.inliers, best.ratio, ms
-            )
+            return PoseEstimate(status, reason, None, None, None, best.inliers, best.ratio, ms)
 
         record = self.maps.scenes[best.scene]
         if best.pose is None:

@@ -1,6 +1,6 @@
 """`build_map`: a recording in, keyframes with adjusted poses and sub-pixel landmarks out."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,7 +20,6 @@ from evercal.mapping.bundle_adjustment import (
     BundleTracks,
 )
 from evercal.mapping.keyframes import Keyframes, jpeg
-from evercal.mapping.landmarks import Landmarks
 from evercal.mapping.pose_check import PoseCheckOptions, contradicting_frames
 from evercal.mapping.recording import Recording, WorkingSize
 from evercal.mapping.selection import SarsOptions, select_sars
@@ -100,39 +99,63 @@ class SceneMap:
     """What was changed."""
 
 
-OnStage = Callable[[str, int, int], None]
-"""Told what is being done, how many are done and how many there are."""
+@dataclass(frozen=True)
+class Mapping:
+    """A map is being built."""
+
+    what: str
+    """Which part of the work."""
+    done: int
+    """Steps of it done."""
+    total: int
+    """Steps of it."""
 
 
 def build_map(
     frames: Sequence[Frame],
     encoder: Encoder,
-    capacity: int,
+    chosen: Sequence[int] | NDArray[np.int64],
     options: MapOptions | None = None,
-    on_stage: OnStage | None = None,
 ) -> SceneMap:
-    """Builds the map of a scene.
+    """Builds the map of a scene; see `map_steps`."""
+    steps = map_steps(frames, encoder, chosen, options or MapOptions())
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return end.value
+
+
+def map_steps(
+    frames: Sequence[Frame],
+    encoder: Encoder,
+    chosen: Sequence[int] | NDArray[np.int64],
+    options: MapOptions,
+) -> Generator[Mapping, None, SceneMap]:
+    """Builds the map of a scene step by step.
 
     Args:
         frames: posed training frames in recorded order.
         encoder: frozen local encoder.
-        capacity: keyframes to keep.
+        chosen: which of them are to be keyframes.
         options: how.
-        on_stage: for progress bars.
 
     Raises:
         InputError: no two frames see the same, so nothing can be triangulated.
+
+    Yields:
+        What is being done, for progress bars.
+
+    Returns:
+        The map.
     """
-    options = options or MapOptions()
-    tell = on_stage or (lambda what, done, total: None)
-    recording, chosen, wrong = _open(frames, encoder, capacity, options, tell)
+    recording, numbers, wrong = yield from _open(frames, encoder, chosen, options)
     keyframes = []
-    for done, frame in enumerate(chosen.tolist()):
-        tell("mapping", done, len(chosen))
+    for done, frame in enumerate(numbers):
         keyframe = open_keyframe(recording, frame, options.tracks)
         refine_depths(recording, keyframe, options.tracks)
         keyframes.append(keyframe)
-    tell("mapping", len(chosen), len(chosen))
+        yield Mapping("mapping", done + 1, len(numbers))
     if not any(keyframe.kept.any() for keyframe in keyframes):
         raise InputError(
             "no two training frames see the same surfaces under parallax: record views from at"
@@ -141,28 +164,35 @@ def build_map(
     velocity = _velocity(frames, recording)
     adjustment = None
     if options.adjust:
-        adjustment = _adjust(recording, keyframes, velocity, options, tell)
+        adjustment = yield from _adjust(recording, keyframes, velocity, options)
     return _finished(recording, keyframes, adjustment, wrong, options)
 
 
 def _open(
-    frames: Sequence[Frame], encoder: Encoder, capacity: int, options: MapOptions, tell: OnStage
-) -> tuple[Recording, NDArray[np.int64], tuple[str, ...]]:
+    frames: Sequence[Frame],
+    encoder: Encoder,
+    chosen: Sequence[int] | NDArray[np.int64],
+    options: MapOptions,
+) -> Generator[Mapping, None, tuple[Recording, list[int], tuple[str, ...]]]:
     """Frames that take part, which of them are keyframes, and names of those left out."""
-    support = _spread(frames, max(options.support_frames, capacity))
+    wanted = {int(i) for i in chosen}
+    support = sorted({*spread_frames(frames, options.support_frames).tolist(), *wanted})
     recording = Recording([frames[i] for i in support], encoder, options.size)
     for i in range(len(recording)):
-        tell("encoding", i, len(recording))
         recording.features(i)
-    tell("encoding", len(recording), len(recording))
+        yield Mapping("encoding", i + 1, len(recording))
     bad = contradicting_frames(recording, vlad_for(encoder), options.check)
     wrong = tuple(recording.frames[i].name for i in bad)
+    keep = sorted(set(range(len(support))) - set(bad.tolist()))
     if len(bad):
         recording = recording.without(bad)
-    return recording, _spread(recording.frames, capacity), wrong
+    keyframes = [new for new, old in enumerate(keep) if support[old] in wanted]
+    if len(keyframes) < len(wanted):  # others take the place of those that were left out
+        keyframes = spread_frames(recording.frames, len(wanted)).tolist()
+    return recording, keyframes, wrong
 
 
-def _spread(frames: Sequence[Frame], capacity: int) -> NDArray[np.int64]:
+def spread_frames(frames: Sequence[Frame], capacity: int) -> NDArray[np.int64]:
     """Frames spread over the poses by SARS with the largest radius that fills the capacity."""
     if len(frames) <= capacity:
         return np.arange(len(frames))
@@ -194,12 +224,11 @@ def _adjust(
     keyframes: list[KeyframeTracks],
     velocity: np.ndarray,
     options: MapOptions,
-    tell: OnStage,
-) -> Adjustment:
+) -> Generator[Mapping, None, Adjustment]:
     stated_cameras = list(recording.cameras)
     adjustment = None
     for number in range(options.rounds):
-        tell("adjusting", number, options.rounds)
+        yield Mapping("adjusting", number, options.rounds)
         tracks = _bundle_tracks(recording, keyframes, options)
         problem = BundleAdjustment(recording.stated, stated_cameras, velocity, options.bundle)
         adjustment = problem.solve(tracks)
@@ -208,7 +237,7 @@ def _adjust(
             break
         for keyframe in keyframes:
             refine_depths(recording, keyframe, options.tracks)
-    tell("adjusting", options.rounds, options.rounds)
+    yield Mapping("adjusting", options.rounds, options.rounds)
     assert adjustment is not None
     return adjustment
 

@@ -101,7 +101,9 @@ def align_patches(
     if len(centres) > _MOST_ROWS:
         starts = range(0, len(centres), _MOST_ROWS)
         parts = [slice(start, start + _MOST_ROWS) for start in starts]
-        done = [align_patches(patches.take(p), image, centres[p], affines[p], iterations) for p in parts]
+        done = [
+            align_patches(patches.take(p), image, centres[p], affines[p], iterations) for p in parts
+        ]
         return np.concatenate([d[0] for d in done]), np.concatenate([d[1] for d in done])
     affines = affines.astype(np.float32)
     offsets = _OFFSETS @ affines.transpose(0, 2, 1)

@@ -130,4 +130,3 @@ class Recording:
     def one_camera(self) -> bool:
         """Whether all frames were taken with the same intrinsics."""
         return all(camera == self.cameras[0] for camera in self.cameras)
-

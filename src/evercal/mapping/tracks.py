@@ -122,9 +122,7 @@ def observe(
     visible, expected, affines = project_surface(surface, turn, shift, recording.cameras[frame])
     which = which[visible]
     templates = tuple(level.take(which) for level in keyframe.patches)
-    pixels, correlation = align_down(
-        templates, recording.pyramid(frame), expected, affines, steps
-    )
+    pixels, correlation = align_down(templates, recording.pyramid(frame), expected, affines, steps)
     good = correlation > options.min_correlation
     good &= np.linalg.norm(pixels - expected, axis=1) < reach_px
     last = steps[-1][0]

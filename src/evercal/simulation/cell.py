@@ -3,6 +3,7 @@
     OUT/bedroom/scene.json, images/, depth/            the moving camera: train and test
     OUT/bedroom/calibration/fixed, bumped, hand        25 frames each, scenes of their own
     OUT/bedroom/calibration/truth.json                 the bump and gripper_from_camera
+    OUT/bedroom/changed                                sim-mini: test frames after a change
 
 A frame appears under its name only when it is whole, and scene.json comes last: a run that was cut
 off goes on where it stopped. Rooms have fixed seeds; `seed` draws the paths.
@@ -21,6 +22,7 @@ from evercal.geometry import SE3, Camera
 from evercal.simulation.box_room import default_camera
 from evercal.simulation.cell_paths import (
     Shot,
+    changed_shots,
     fixed_shots,
     hand_camera,
     hand_joints,
@@ -28,6 +30,7 @@ from evercal.simulation.cell_paths import (
     sees_work_area,
     sweep_shots,
 )
+from evercal.simulation.changed_room import changed_room
 from evercal.simulation.furnished.panda import Panda
 from evercal.simulation.furnished.renderer import Renderer, RenderOptions, choose_variant, mitsuba
 from evercal.simulation.furnished.rooms import RESERVED, Room, room
@@ -52,6 +55,8 @@ class Suite:
     """Whether depth is written."""
     jpeg_quality: int = 95
     """Of the colour images."""
+    changed: int = 0
+    """Test frames per room after small things were moved and lamps switched; see `changed_room`."""
 
 
 _CYCLE = ("bedroom", "kitchen", "living")
@@ -68,7 +73,7 @@ SUITES: dict[str, Suite] = {
     "sim": Suite(_THREE, 3300, (640, 480), 16),
     "sim-7": Suite(_numbered(7, 201), 1000, (320, 240), 16),
     "sim-12": Suite(_numbered(12, 301), 1000, (320, 240), 16),
-    "sim-mini": Suite(_THREE, 130, (320, 240), 16, depth=False, jpeg_quality=85),
+    "sim-mini": Suite(_THREE, 130, (320, 240), 16, depth=False, jpeg_quality=85, changed=20),
 }
 
 
@@ -124,7 +129,7 @@ def simulate(
     suite = _checked(name, options)
     frames = options.frames or suite.frames
     width, height = options.size or suite.size
-    per_room = frames + 3 * CALIBRATION_FRAMES
+    per_room = frames + 3 * CALIBRATION_FRAMES + suite.changed
     total, done = per_room * len(suite.rooms), 0
     taken = RenderOptions(
         samples=options.samples or suite.samples,
@@ -150,11 +155,18 @@ def simulate(
     for scene, kind, room_seed in suite.rooms:
         place = room(kind, room_seed)
         recordings = _recordings(place, panda, frames, options.seed, out / scene)
-        writer = _Writer(place, panda, camera, suite, options.seed, taken, settings)
-        for root, shots in recordings:
-            for _ in writer.record(root, scene, shots):
-                done += 1
-                yield Progress(done, total, root, said)
+        plans = [(place, recordings)]
+        if suite.changed:
+            later, sweep = changed_room(place, options.seed), recordings[0][1]
+            train = SE3.stack([shot.base_from_camera for shot in sweep if shot.split == "train"])
+            shots = changed_shots(later, suite.changed, train, options.seed)
+            plans.append((later, [(out / scene / "changed", shots)]))
+        for where, recordings in plans:
+            writer = _Writer(where, panda, camera, suite, options.seed, taken, settings)
+            for root, shots in recordings:
+                for _ in writer.record(root, scene, shots):
+                    done += 1
+                    yield Progress(done, total, root, said)
 
 
 def _checked(name: str, options: SimulateOptions) -> Suite:

@@ -51,13 +51,30 @@ def sweep_shots(room: Room, frames: int, seed: int) -> list[Shot]:
     """
     train_count = max(1, round(0.7 * frames))
     train = _free_path(room, train_count, [seed, 1])
-    test = _far_from(room, frames - train_count, train, seed)
+    test = _far_from(room, frames - train_count, train, [seed, 9])
     arm_train = _arm_path(train_count, [seed, 2], hold=12)
     arm_test = _arm_path(frames - train_count, [seed, 3], hold=12)
     shots = [Shot(f"train-{i:06d}", "train", train[i], arm_train[i]) for i in range(train_count)]
     for i in range(frames - train_count):
         shots.append(Shot(f"test-{i:06d}", "test", test[i], arm_test[i]))
     return shots
+
+
+def changed_shots(room: Room, frames: int, train: SE3, seed: int) -> list[Shot]:
+    """A moving camera in a room that was changed, on a test path of its own draw.
+
+    Args:
+        room: after the change.
+        frames: all of them test frames.
+        train: (n,) base_from_camera of the training frames, taken before the change.
+        seed: of the paths of camera and arm.
+
+    Raises:
+        InputError: The room leaves no free way.
+    """
+    path = _far_from(room, frames, train, [seed, 10])
+    arm = _arm_path(frames, [seed, 11], hold=12)
+    return [Shot(f"changed-{i:06d}", "test", path[i], arm[i]) for i in range(frames)]
 
 
 def fixed_shots(room: Room, frames: int, seed: int) -> tuple[list[Shot], list[Shot], SE3]:
@@ -172,13 +189,13 @@ def _sweep(frames: int, rng: np.random.Generator) -> SE3:
     return SE3.stack([look_at(*given) for given in zip(position, target, roll, strict=True)])
 
 
-def _far_from(room: Room, frames: int, train: SE3, seed: int) -> SE3:
+def _far_from(room: Room, frames: int, train: SE3, seed: list[int]) -> SE3:
     """A sweep of which few frames lie near a training frame, none very near, shape (frames,)."""
     if frames == 0:
         return SE3.stack([])
     for finer in (1.0, 1.15, 1.3, 1.6, 2.0, 3.0):
         for attempt in range(4):
-            path = _free_path(room, int(np.ceil(frames * finer)), [seed, 9, attempt])
+            path = _free_path(room, int(np.ceil(frames * finer)), [*seed, attempt])
             metres, radians = pose_distance(path[:, None], train[None])
             too_near = ((metres < TOO_NEAR_M) & (radians < TOO_NEAR_RAD)).any(1)
             near = ((metres < NEAR_M) & (radians < NEAR_RAD)).any(1)

@@ -30,6 +30,11 @@ class CellRoom:
     """From a camera that stands still while the arm moves; all frames are test frames."""
     model: tuple[str, int] | None = None
     """Kind and seed of the simulator's room that was recorded."""
+    bumped: Scene | None = None
+    """Like `fixed`, after a bump moved the camera a little; all frames are test frames."""
+    changed: Scene | None = None
+    """From a moving camera after small things were moved or taken away and lamps switched; all
+    frames are test frames."""
 
 
 def mini_rooms() -> tuple[CellRoom, ...]:
@@ -39,6 +44,8 @@ def mini_rooms() -> tuple[CellRoom, ...]:
             load_scene(FOLDER / name),
             load_scene(FOLDER / name / "calibration" / "fixed"),
             (kind, seed),
+            load_scene(FOLDER / name / "calibration" / "bumped"),
+            load_scene(FOLDER / name / "changed"),
         )
         for name, kind, seed in SUITES["sim-mini"].rooms
     )
