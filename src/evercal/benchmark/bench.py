@@ -24,13 +24,17 @@ from evercal.benchmark import results
 from evercal.benchmark.results import SceneResult, scene_result
 from evercal.benchmark.scene_views import keep_views
 from evercal.continual import strategies as rules
-from evercal.continual.finish_scene import method_state_of, plain_rows, select_keyframes
+from evercal.continual.finish_scene import (
+    mapped_record,
+    method_state_of,
+    plain_rows,
+    select_keyframes,
+)
 from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.learn import Stage, StageOptions, learn
 from evercal.continual.learn_scene import (
     LearnOptions,
     OnEvent,
-    fit_threshold,
     learn_scene,
     open_or_create,
     validation_split,
@@ -43,10 +47,12 @@ from evercal.evaluation.protocol import evaluate
 from evercal.features.descriptor import DESCRIPTOR_FILE
 from evercal.features.encoder import ENCODER_FILE
 from evercal.features.feature_cache import cache_features
+from evercal.localization.acceptance import fitted_record
 from evercal.localization.localizer import Localizer
 from evercal.mapping.atlas import combined_centres
+from evercal.mapping.build import finished
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.scene_maps import SceneMaps, with_fit
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 from evercal.mapping.selection import covering_radius, smallest_pair
 from evercal.mapping.stage_files import head_bytes
 from evercal.mapping.store import Store
@@ -217,6 +223,9 @@ class _Run:
             return
         shutil.rmtree(self.store, ignore_errors=True)  # left by a commit that was killed
         scene = self.scenes[0]
+        if not self.rule.network:
+            learn_scene(self.store, scene, self._how(self.strategy), on_event)
+            return
         shared = self.out / "runs" / f"first-{scene.name}-{self.seed}"
         if not (shared / MANIFEST).exists():
             learn_scene(shared, scene, self._how("finetune"), on_event)
@@ -227,11 +236,11 @@ class _Run:
         train, aside = validation_split(scene.train)
         self._cached(maps)
         rows = self._rows(maps, 0, train)
-        keyframes = self._kept(maps, 0, train, rows)
+        keyframes, maps.scenes[0] = self._kept(maps, 0, train, rows)
         maps.keyframes, maps.method_states = [keyframes], []  # not those of who learned it
         maps.method_states = [method_state_of(maps, rows())] if self.rule.after_scene else [{}]
-        if self.rule.match_keyframes:  # more cells agree, so more must
-            maps.scenes[0] = with_fit(maps.scenes[0], *fit_threshold(maps, aside))
+        if self.rule.build_map:  # another threshold than the network's alone
+            maps.scenes[0] = fitted_record(maps, aside, 0)
         report = first.report()
         report["seconds"] = float(report["seconds"]) + time.perf_counter() - began
         report["frames_kept"] = len(keyframes.images) if keyframes else 0
@@ -256,12 +265,16 @@ class _Run:
         number: int,
         train: Sequence[Frame],
         rows: Callable[[], FeatureBuffer],
-    ) -> Keyframes | None:
-        """What the strategy remembers of a scene, with the head as it is now."""
+    ) -> tuple[Keyframes | None, SceneRecord]:
+        """The keyframes of a scene, chosen with the head as it is now, and the scene's record."""
         head, _ = maps.head_for(number)
         frames = FrameStatistics(train, head, rows, self.seed)
         capacity = self.stage.capacity(train, maps.short_side)
-        return select_keyframes(maps, train, frames, capacity, maps.scenes[number].refined_camera)
+        record = maps.scenes[number]
+        keyframes, scene_map = finished(
+            select_keyframes(maps, train, frames, capacity, record.refined_camera, self.stage.map)
+        )
+        return keyframes, mapped_record(record, scene_map)
 
     def _cached(self, maps: SceneMaps) -> None:
         cache_features(maps.encoder, self.features)  # pyright: ignore[reportArgumentType]
@@ -288,8 +301,9 @@ class _Run:
             if not last:
                 yield number, ()
         for i, (train, aside) in enumerate(split):
-            maps.keyframes[i] = self._kept(maps, i, train, self._rows(maps, i, train))
-            maps.scenes[i] = with_fit(maps.scenes[i], *fit_threshold(maps, aside, i))
+            kept = self._kept(maps, i, train, self._rows(maps, i, train))
+            maps.keyframes[i], maps.scenes[i] = kept
+            maps.scenes[i] = fitted_record(maps, aside, i)
         seconds = time.perf_counter() - began
         yield len(train_splits) - 1, self._judge(maps, len(train_splits) - 1, seconds)
 

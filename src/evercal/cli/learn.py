@@ -14,7 +14,8 @@ from evercal.cli.learn_bars import LearnBars
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.continual.learn_scene import LearnOptions
+    from evercal.continual.learn_scene import LearnOptions, LearnReport
+    from evercal.mapping.build import Adjusted
 
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
 _UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
@@ -22,7 +23,7 @@ _UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
 
 @dataclass(frozen=True)
 class Learn:
-    """Learn a scene into a store without spoiling the scenes it knows; goes on after a stop."""
+    """Learn a scene into a store; the scenes it knows stay as they are. Goes on after a stop."""
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the store; made when it is missing."""
@@ -31,11 +32,11 @@ class Learn:
     name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """What the scene is called in the store; its own name when left out."""
     strategy: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """How scenes share the network: evercal (if new), or a method to compare; a store keeps it."""
+    """evercal builds a map, other names train a network; a store keeps the one it was made with."""
     preset: Literal["fast", "demo", "bench", "paper"] = "fast"
-    """How much work: fast takes minutes on two cores, demo and bench less, paper wants a GPU."""
+    """Work of strategies that train a network: fast takes minutes on two cores, paper a GPU."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
-    """What is remembered of the scene: a share of its frames (10%) or bytes (5MB)."""
+    """Keyframes to keep of the scene: a share of its frames (10%) or bytes (5MB)."""
     centres: Annotated[int | None, arg(metavar="M", help_behavior_hint="")] = None
     """Cluster centres that a scene adds to the network; the preset's number when left out."""
     encoder: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -74,13 +75,8 @@ class Learn:
         if self.json:
             print_json(dataclasses.asdict(report))
             return 0
-        print(
-            f"{scene.name}: learned in {report.seconds:.0f} s and {report.iterations} steps;"
-            f" memory {size(report.memory_bytes)} ({report.frames_kept} frames of this scene),"
-            f" head {size(report.head_bytes)}"
-        )
-        share = f"{100 * report.inlier_threshold:.0f} %"
-        print(f"poses with fewer than {share} inliers are reported as unknown_scene")
+        for line in _told(report):
+            print(line)
         if scene.test:
             print_next("evercal", "evaluate", self.store, self._scene_word(scene.name))
         else:
@@ -138,6 +134,51 @@ class Learn:
                 f" leave the option out or start a new store"
             )
         return self.strategy or maps.strategy
+
+
+def _told(report: "LearnReport") -> list[str]:
+    """What came out, in sentences."""
+    steps = f" and {report.iterations} steps" if report.iterations else ""
+    lines = [
+        f"{report.scene}: learned in {report.seconds:.0f} s{steps}; {report.frames_kept} keyframes"
+        f" with {report.landmarks} landmarks; all scenes take {size(report.memory_bytes)}"
+        + (f", the network {size(report.head_bytes)}" if report.head_bytes else "")
+    ]
+    if report.adjusted is not None:
+        lines += adjusted_lines(report.adjusted)
+    else:
+        share = f"{100 * report.inlier_threshold:.0f} %"
+        lines.append(f"poses with fewer than {share} inliers are reported as unknown_scene")
+    return lines
+
+
+def adjusted_lines(adjusted: "Adjusted") -> list[str]:
+    """What bundle adjustment changed about a recording, in sentences."""
+    shift = sum(x * x for x in adjusted.common_translation_mm) ** 0.5
+    turn = sum(x * x for x in adjusted.common_rotation_deg) ** 0.5
+    lines = [
+        f"bundle adjustment: median reprojection error {adjusted.residual_px:.2f} px; stated poses"
+        f" are good to {adjusted.pose_sigma_mm:.1f} mm and {adjusted.pose_sigma_deg:.2f} deg per"
+        f" axis; common transform corrected by {shift:.1f} mm and {turn:.2f} deg; focal length by"
+        f" {adjusted.focal_percent:+.2f} %"
+    ]
+    if abs(adjusted.time_shift_frames) > 0.02:
+        lines.append(
+            f"the images were taken {adjusted.time_shift_frames:+.2f} frame intervals after their"
+            " stated poses: check the clocks"
+        )
+    if adjusted.wrong_poses:
+        lines.append(
+            f"stated poses that contradict the images: {_few(adjusted.wrong_poses)}; left out"
+        )
+    if adjusted.doubtful_poses:
+        lines.append(f"stated poses that were given less weight: {_few(adjusted.doubtful_poses)}")
+    return lines
+
+
+def _few(names: tuple[str, ...], most: int = 8) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def parse_memory(text: str) -> tuple[float | None, int | None]:

@@ -10,8 +10,13 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
     from evercal.continual.learn import Encoding
+    from evercal.mapping.build import Mapping
     from evercal.mapping.store import Checkpoint
     from evercal.networks.trainer import Progress
+
+
+_UNITS = {"encoding": "image", "mapping": "keyframe", "adjusting": "round", "training": "step"}
+_FRESH = {"encoding": 8}
 
 
 class LearnBars:
@@ -25,7 +30,7 @@ class LearnBars:
     def __init__(self, start: str = "", stream: TextIO | None = None):
         self._start, self._stream = start, stream
         self._bar: tqdm | None = None
-        self._training = False
+        self._what = ""
 
     def __enter__(self) -> "LearnBars":
         """Nothing is shown yet: bad input is to be told without anything before it."""
@@ -40,32 +45,36 @@ class LearnBars:
         """Ends the last bar's line."""
         self._close()
 
-    def __call__(self, event: "Encoding | Progress | Checkpoint") -> None:
+    def __call__(self, event: "Encoding | Mapping | Progress | Checkpoint") -> None:
         """Takes one event."""
         from evercal.continual.learn import Encoding
+        from evercal.mapping.build import Mapping
         from evercal.networks.trainer import Progress
 
         if self._start:
             print(self._start, file=self._stream, flush=True)
             self._start = ""
         if isinstance(event, Progress):
-            bar = self._at(event.step, event.total, training=True)
+            bar = self._at("training", event.step, event.total)
             text = f"loss {event.loss:.1f}, {100 * event.inlier_share:.0f} % inliers"
             bar.set_postfix_str(text, refresh=event.step == event.total)
-            if event.step == event.total:  # what follows takes a while and is not training
-                self._close()
         elif isinstance(event, Encoding):
-            self._at(event.done, event.total, training=False)
+            bar = self._at("encoding", event.done, event.total)
+        elif isinstance(event, Mapping):
+            bar = self._at(event.what, event.done, event.total)
+        else:
+            return
+        if bar.n >= event.total and not isinstance(event, Encoding):
+            self._close()  # what follows may take a while and is another task
 
-    def _at(self, done: int, total: int, training: bool) -> "tqdm":
+    def _at(self, what: str, done: int, total: int) -> "tqdm":
         """The bar moved to `done`; a new one where another task begins."""
         bar = self._bar
-        if bar is None or training != self._training or total != bar.total or done <= bar.n:
+        if bar is None or what != self._what or total != bar.total or done < bar.n:
             self._close()
-            what, unit = ("training", "step") if training else ("encoding", "image")
             # A resumed task begins where it stood; what was done before must not count as speed.
-            first = done if done > (1 if training else 8) else 0
-            self._training, self._bar = training, progress_bar(what, total, unit, first)
+            first = done if done > _FRESH.get(what, 1) else 0
+            self._what, self._bar = what, progress_bar(what, total, _UNITS[what], first)
             bar = self._bar
         bar.update(done - bar.n)
         return bar

@@ -23,7 +23,7 @@ def select_keyframes(
     refined: Camera | None,
     mapping: MapOptions,
 ) -> Generator[Mapping, None, tuple[Keyframes | None, SceneMap | None]]:
-    """The keyframes that a strategy keeps of a scene's training frames, and their map if it has one.
+    """The keyframes that a strategy keeps of a scene, and their map if it has one.
 
     Args:
         maps: whose strategy selects.

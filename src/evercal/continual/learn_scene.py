@@ -17,8 +17,8 @@ from evercal.datasets.frame import MIN_TRAIN_FRAMES, Frame, Scene, posed_scene
 from evercal.errors import InputError
 from evercal.features.feature_cache import cache_features
 from evercal.features.weights_file import network_bytes
-from evercal.localization.acceptance import fit_threshold
-from evercal.mapping.scene_maps import with_fit
+from evercal.localization.acceptance import fitted_record
+from evercal.mapping.build import Adjusted, Mapping
 from evercal.mapping.stage_files import head_bytes
 from evercal.mapping.store import Checkpoint, Resume, Store
 from evercal.networks.trainer import Progress
@@ -68,9 +68,13 @@ class LearnReport:
     """Poses with a smaller inlier ratio are reported as unknown_scene."""
     resumed: bool
     """Whether an interrupted run was continued."""
+    landmarks: int = 0
+    """Landmarks of this scene's map."""
+    adjusted: Adjusted | None = None
+    """What bundle adjustment changed about the recording; None where no map was built."""
 
 
-OnEvent = Callable[[Encoding | Progress | Checkpoint], None]
+OnEvent = Callable[[Encoding | Mapping | Progress | Checkpoint], None]
 
 
 def learn_scene(
@@ -132,7 +136,8 @@ def _learn_scene(
         opened.abandon()  # bad input: no interrupted stage worth going on with
         raise
     maps = stage.maps
-    maps.scenes[-1] = with_fit(maps.scenes[-1], *fit_threshold(maps, held_out))
+    maps.scenes[-1] = fitted_record(maps, held_out)
+    kept, scene_map = maps.keyframes[-1], stage.scene_map
     report = LearnReport(
         scene.name,
         time.perf_counter() - began,
@@ -144,6 +149,8 @@ def _learn_scene(
         len(held_out),
         maps.scenes[-1].inlier_threshold,
         resume is not None,
+        sum(map(len, kept.landmarks)) if kept else 0,
+        scene_map.adjusted if scene_map else None,
     )
     opened.commit(maps, asdict(report))
     return report

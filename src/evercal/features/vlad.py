@@ -4,18 +4,23 @@ The features of an image are summed up as differences from the nearest of a few 
 centroids come from procedural rooms, so nothing about them belongs to any scene.
 """
 
+import hashlib
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from safetensors import safe_open
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from evercal.features.encode import encode_features
-from evercal.features.encoder import Encoder
+from evercal.features.encoder import WEIGHTS, Encoder
 from evercal.features.views import ViewOptions, plain_view
+from evercal.features.weights_file import network_bytes
 from evercal.simulation.box_room import BoxRoom, default_camera
 
+VLAD_FILE = WEIGHTS / "vlad.safetensors"
 CENTROIDS = 32
 WIDTH = 1024
 _ROOMS = range(8_980, 8_988)
@@ -45,12 +50,21 @@ class Vlad:
 
 
 def vlad_for(encoder: Encoder) -> Vlad:
-    """The VLAD of an encoder; centroids are computed once a process, in about a second."""
+    """The VLAD of an encoder: the shipped one, or one that is made in some seconds a process."""
     return _vlad_for(encoder)
 
 
 @lru_cache(maxsize=2)
 def _vlad_for(encoder: Encoder) -> Vlad:
+    if isinstance(encoder, nn.Module) and VLAD_FILE.exists():
+        with safe_open(VLAD_FILE, "pt") as file:
+            if (file.metadata() or {}).get("encoder") == _digest(encoder):
+                return _projected(file.get_tensor("centroids").float())
+    return _projected(fit_centroids(encoder))
+
+
+def fit_centroids(encoder: Encoder) -> Tensor:
+    """(k, channels) centroids of the features of procedural rooms, by spherical k-means."""
     features = torch.cat([_room_features(encoder, seed) for seed in _ROOMS])
     generator = torch.Generator().manual_seed(0)
     centroids = features[torch.randperm(len(features), generator=generator)[:CENTROIDS]]
@@ -58,9 +72,26 @@ def _vlad_for(encoder: Encoder) -> Vlad:
         nearest = (features @ centroids.T).argmax(1)
         sums = torch.zeros_like(centroids).index_add_(0, nearest, features)
         centroids = F.normalize(sums, dim=1)
+    return centroids
+
+
+def save_centroids(encoder: nn.Module, path: Path) -> None:
+    """Writes the centroids of an encoder, with the digest of its weights."""
+    from safetensors.torch import save_file
+
+    assert isinstance(encoder, Encoder), "only encoders have features"
+    save_file({"centroids": fit_centroids(encoder).half()}, path, {"encoder": _digest(encoder)})
+
+
+def _projected(centroids: Tensor) -> Vlad:
+    # A fixed random projection keeps angles well enough and a quarter of the numbers.
     shape = (centroids.numel(), WIDTH)
-    projection = torch.randn(shape, generator=generator) / shape[0] ** 0.5
-    return Vlad(centroids, projection)
+    projection = torch.randn(shape, generator=torch.Generator().manual_seed(1))
+    return Vlad(centroids, projection / shape[0] ** 0.5)
+
+
+def _digest(encoder: nn.Module) -> str:
+    return hashlib.sha256(network_bytes(encoder, "encoder")).hexdigest()
 
 
 def _room_features(encoder: Encoder, seed: int) -> Tensor:

@@ -1,6 +1,12 @@
-"""Which poses are accepted: a scene's smallest inlier ratio, fitted when the scene is learned."""
+"""Which poses are accepted, fitted when a scene is learned.
+
+A pose of a map is accepted by its support: the share of the landmarks that should be visible and
+were found where they should be, times the square root of their number. Without a map it is the
+share of the image's patches that agree.
+"""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -8,13 +14,40 @@ import numpy as np
 from evercal.datasets.frame import Frame
 from evercal.geometry.se3 import pose_distance
 from evercal.localization.localizer import Localizer
-from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord, with_fit
 from evercal.simulation.box_room import BoxRoom, default_camera
 
 NEGATIVE_ROOM_SEED = 8_990
 CHI2_6_MEDIAN = 5.348
 ACCEPTANCE_FRACTION = 1 / 6
 """Where the threshold lies between the inlier ratios of negative and of positive images."""
+
+
+MAX_SUPPORT = 1.5
+"""Support that no image of another room reached (docs/experiments/acceptance.md)."""
+MIN_SUPPORT = 0.5
+"""Where the stated poses of a recording fit the images badly, right poses have little support: the
+threshold then falls to half of what held-out frames have, but not below this."""
+MAP_COVARIANCE_SCALE = 1.3
+"""Alignment errors of neighbouring patches go together, so errors are larger than residuals say."""
+
+
+def fitted_record(maps: SceneMaps, held_out: Sequence[Frame], scene: int = -1) -> SceneRecord:
+    """The record of a scene, by default the newest, with its thresholds.
+
+    Args:
+        maps: what is known.
+        held_out: training frames that were not learned.
+        scene: index of the scene.
+    """
+    record, keyframes = maps.scenes[scene], maps.keyframes[scene]
+    if keyframes is None or not keyframes.landmarks:
+        return with_fit(record, *fit_threshold(maps, held_out, scene))
+    localizer = Localizer(maps)
+    support = [localizer.localize(f.read_image(), f.camera).support for f in held_out]
+    low = float(np.quantile(support, 0.05)) if support else 2 * MAX_SUPPORT
+    least = min(max(low / 2, MIN_SUPPORT), MAX_SUPPORT)
+    return replace(record, min_support=least, covariance_scale=MAP_COVARIANCE_SCALE)
 
 
 def fit_threshold(

@@ -45,14 +45,12 @@ class AlignmentOptions:
     """Smallest normalised cross-correlation of a landmark that was found."""
     min_found: int = 12
     """Fewer landmarks make no pose."""
-    found_px: float = 2.0
+    found_px: float = 1.0
     """A landmark agrees with the pose when it was found this near to where it should be."""
     floor_px: float = 0.1
     """Alignment error of a perfect patch, pixels."""
     noise: float = 0.8
     """Standard deviation of intensities in aligned patches, in deviations of a patch."""
-    tiles: int = 4
-    """The image is divided into this many rows and columns to tell how landmarks spread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +65,6 @@ class Alignment:
     """(n, 2) landmarks that agree, pixels of the image."""
     points_m: Array
     """(n, 3) the same in the base frame."""
-    coverage: float
-    """Share of the tiles with expected landmarks in which one agrees."""
 
     @property
     def share(self) -> float:
@@ -78,7 +74,7 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    expected: Array
+    expected: int
     pixels: Array
     points_m: Array
     whitening: Array
@@ -126,10 +122,9 @@ def align_pose(
         return None
     return Alignment(
         refined,
-        len(found.expected),
+        found.expected,
         found.pixels[agree],
         found.points_m[agree],
-        _coverage(found.expected, found.pixels[agree], camera, options.tiles),
     )
 
 
@@ -146,11 +141,12 @@ def _look(
     turn, shift = inverse.rotation_matrix(), inverse.translation_m
     seen = [project_surface(k.surface_m, turn, shift, camera) for k in keyframes]
     every = max(1, -(-sum(len(which) for which, _, _ in seen) // step.landmarks))
-    parts = []
+    parts, expected = [], 0
     for keyframe, (which, pixels, affines) in zip(keyframes, seen, strict=True):
         which, pixels, affines = which[::every], pixels[::every], affines[::every]
         if not len(which):
             continue
+        expected += len(which)
         patches = keyframe.patches[step.level].take(which)
         at, correlation = align_patches(
             patches, pyramid[step.level], to_level(pixels, step.level), affines, step.iterations
@@ -160,11 +156,11 @@ def _look(
         good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
         spread = patches.inverse_hessian[good]
         white = whitening(affines[good], spread, options.floor_px, options.noise * 2**step.level)
-        parts.append((pixels, at[good], keyframe.surface_m[0, which[good]], white))
+        parts.append((at[good], keyframe.surface_m[0, which[good]], white))
     if not parts:
         none = np.zeros((0, 2))
-        return _Found(none, none, np.zeros((0, 3)), np.zeros((0, 2, 2)))
-    return _Found(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        return _Found(0, none, np.zeros((0, 3)), np.zeros((0, 2, 2)))
+    return _Found(expected, *(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _undistorted(pixels: Array, camera: Camera) -> Array:
@@ -173,13 +169,3 @@ def _undistorted(pixels: Array, camera: Camera) -> Array:
         return pixels
     plane = camera.unproject(pixels)[:, :2]
     return plane * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-
-
-def _coverage(expected: Array, found: Array, camera: Camera, tiles: int) -> float:
-    size = np.array([camera.width, camera.height]) / tiles
-
-    def filled(pixels: Array) -> set[tuple[int, int]]:
-        where = (pixels / size).astype(int).clip(0, tiles - 1)
-        return set(map(tuple, where.tolist()))
-
-    return len(filled(found)) / max(len(filled(expected)), 1)

@@ -13,7 +13,7 @@ class PoseEstimate:
     """The answer for one image; failure is a value, not an exception."""
 
     status: Literal["ok", "unknown_scene", "failed"]
-    """`unknown_scene`: a pose was found but too few points agree. `failed`: none was found."""
+    """`unknown_scene`: a pose was found but too little agrees with it. `failed`: none was found."""
     reason: str
     """Why the status is not `ok`; empty otherwise."""
     scene: str | None
@@ -23,12 +23,17 @@ class PoseEstimate:
     covariance: np.ndarray | None
     """(6, 6) of (translation in the base frame, metres; rotation about camera axes, radians)."""
     inliers: int
-    """Cells that reproject within the threshold."""
+    """Landmarks that were found where the pose puts them; without a map, patches that agree."""
     inlier_ratio: float
-    """The same as a share of all cells."""
+    """The same as a share of those that should be visible; without a map, of all patches."""
     milliseconds: float
     """Time from image to answer, decoding not included."""
     pixels: np.ndarray | None = None
-    """(n, 2) inlying cells in the working image, for overlays."""
+    """(n, 2) what agrees, in pixels of the working image, for overlays."""
     points_m: np.ndarray | None = None
     """(n, 3) their scene points in the base frame, metres."""
+
+    @property
+    def support(self) -> float:
+        """`inlier_ratio` times the square root of `inliers`."""
+        return self.inlier_ratio * self.inliers**0.5

@@ -40,8 +40,8 @@ class LocalizeOptions:
 
     candidates: int = 3
     """At most this many scenes are tried for an image."""
-    retrieved: int = 12
-    """Keyframes that the global descriptor proposes."""
+    retrieved: tuple[int, ...] = (12, 48)
+    """Keyframes that the global descriptor proposes; more of them where no pose is accepted."""
     keyframes: int = 6
     """Keyframes of a scene that an image is matched to and aligned with."""
     retrieval_stride: int = 16
@@ -103,10 +103,14 @@ class _Hypothesis:
     covariance: np.ndarray | None = None
     inliers: int = 0
     ratio: float = 0.0
-    coverage: float = 1.0
     pixels: np.ndarray | None = None
     points_m: np.ndarray | None = None
     aligned: bool = False
+
+    @property
+    def support(self) -> float:
+        """See `PoseEstimate.support`."""
+        return self.ratio * self.inliers**0.5
 
 
 class Localizer:
@@ -217,11 +221,14 @@ class Localizer:
         cameras = self._cameras(camera, image.shape)
         usable = [i for i, c in enumerate(cameras) if c is not None]
         best: _Hypothesis | None = None
-        for candidate in self._candidates(query, usable):
-            trial = self._hypothesis(query, candidate, cameras)
-            if best is None or trial.inliers > best.inliers:
-                best = trial
-            if trial.aligned and self._accepted(trial):
+        for count in self.options.retrieved if len(self._bank) else (0,):
+            for candidate in self._candidates(query, usable, count):
+                trial = self._hypothesis(query, candidate, cameras)
+                if best is None or trial.support > best.support:
+                    best = trial
+                if trial.aligned and self._accepted(trial):
+                    return self._answer(trial, began)
+            if count >= len(self._bank):
                 break
         assert best is not None, "at least one scene is tried"
         return self._answer(best, began)
@@ -244,12 +251,12 @@ class Localizer:
             )
         return found
 
-    def _candidates(self, query: _Query, usable: list[int]) -> list[_Candidate]:
-        """Scenes to try, the likeliest first."""
+    def _candidates(self, query: _Query, usable: list[int], count: int) -> list[_Candidate]:
+        """Scenes to try, the likeliest first; `count` keyframes are compared by their patches."""
         features = query.features.flatten(1).T
-        proposed = self._bank.retrieve(features, usable, self.options.retrieved)
-        if len(proposed):
-            return self._voted(features, proposed)
+        ranked = self._bank.retrieve(features, usable)
+        if len(ranked):
+            return self._voted(features, ranked, count)
         none = np.zeros(0, np.int64)
         if self._one_answer():
             return [_Candidate(usable[0], none)]
@@ -261,8 +268,13 @@ class Localizer:
         return [_Candidate(i, none) for i in likely]
 
     @torch.inference_mode()
-    def _voted(self, features: Tensor, proposed: NDArray[np.int64]) -> list[_Candidate]:
-        """Patches of the image vote for the proposed keyframes, and so for scenes."""
+    def _voted(self, features: Tensor, ranked: NDArray[np.int64], count: int) -> list[_Candidate]:
+        """Patches of the image vote for the keyframes that rank first, and so for scenes.
+
+        A scene is tried with the keyframes that got most votes, and where these are too few, with
+        those of its others whose descriptors are most alike.
+        """
+        proposed, rest = ranked[:count], ranked[count:]
         some = features[:: self.options.retrieval_stride]
         best = []
         for index in proposed:
@@ -272,13 +284,16 @@ class Localizer:
         order = np.argsort(-votes, kind="stable")
         scene = self._bank.scene[proposed]
         total = {int(s): int(votes[scene == s].sum()) for s in np.unique(scene)}
-        ranked = sorted(total, key=lambda s: -total[s])
-        enough = self.options.votes * total[ranked[0]]
-        return [
-            _Candidate(s, proposed[order[scene[order] == s][: self.options.keyframes]])
-            for s in ranked[: self.options.candidates]
-            if total[s] >= enough
-        ]
+        likely = sorted(total, key=lambda s: -total[s])[: self.options.candidates]
+        enough = self.options.votes * total[likely[0]]
+        found = []
+        for s in likely:
+            voted = proposed[order[scene[order] == s]]
+            others = rest[self._bank.scene[rest] == s]
+            if total[s] >= enough:
+                both = np.concatenate([voted, others])[: self.options.keyframes]
+                found.append(_Candidate(s, both))
+        return found
 
     def _one_answer(self) -> bool:
         """Whether the network itself decides which scene answers (condition `descriptor`)."""
@@ -317,7 +332,6 @@ class Localizer:
             rough.covariance,
             int(voices),
             float(voices) / cells,
-            1.0,
             pixels[agree],
             points[agree],
         )
@@ -343,7 +357,6 @@ class Localizer:
             found.pose.covariance,
             len(found.pixels),
             found.share,
-            found.coverage,
             (found.pixels + 0.5) * scale - 0.5,
             found.points_m,
             aligned=True,
@@ -353,8 +366,11 @@ class Localizer:
     def _correspondences(
         self, query: _Query, candidate: _Candidate, camera: Camera
     ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Pixels (m, 2) at the encoder's size, points (m, 3) in the scene's base frame, and how
-        many patches of the image they stand for.
+        """What is matched to points of a scene.
+
+        Returns:
+            Pixels (m, 2) at the encoder's working size, points (m, 3) in the scene's base frame,
+            and how many patches of the image they stand for.
         """
         small = camera.short_side_resized(self.maps.short_side)
         pixels = ideal_cell_pixels(small, self.maps.encoder.stride).astype(np.float64)
@@ -405,7 +421,9 @@ class Localizer:
 
     def _accepted(self, best: _Hypothesis) -> bool:
         record = self.maps.scenes[best.scene]
-        return best.ratio >= record.inlier_threshold and best.coverage >= record.min_coverage
+        if best.aligned:
+            return best.support >= record.min_support
+        return best.ratio >= record.inlier_threshold
 
     def _answer(self, best: _Hypothesis, began: float) -> PoseEstimate:
         def refused(status, reason: str) -> PoseEstimate:
@@ -441,14 +459,13 @@ class Localizer:
 
 
 def _why(best: _Hypothesis, record: SceneRecord) -> str:
-    what = "landmarks that should be visible were found" if best.aligned else "patches agree"
+    if best.aligned:
+        return (
+            f"{best.inliers} landmarks, {100 * best.ratio:.0f} % of those that should be visible,"
+            f" were found: support {best.support:.1f}, {record.name} needs {record.min_support:.1f}"
+        )
     need = f"{100 * record.inlier_threshold:.0f} %"
-    if best.ratio < record.inlier_threshold:
-        return f"{100 * best.ratio:.0f} % of the {what}, {record.name} needs {need}"
-    return (
-        f"the landmarks that were found cover {100 * best.coverage:.0f} % of the image,"
-        f" {record.name} needs {100 * record.min_coverage:.0f} %"
-    )
+    return f"{100 * best.ratio:.0f} % of the patches agree, {record.name} needs {need}"
 
 
 def _largest(value: Tensor) -> np.ndarray:

@@ -45,8 +45,8 @@ def refine_pose(
     """
     turn, place = start.rotation_matrix(), start.translation_m
     focal, centre = intrinsics[:2], intrinsics[2:]
-    rotation = np.zeros((3, 3))
-    for _ in range(iterations):
+    variance, information = 1.0, np.eye(6)
+    for _ in range(max(iterations, 1)):
         raw, jacobian = _linearised(pixels, points_m, turn, place, focal, centre)
         residual = (whitening @ raw[..., None])[..., 0]
         jacobian = whitening @ jacobian

@@ -2,6 +2,7 @@
 
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -32,6 +33,8 @@ from evercal.mapping.tracks import (
     open_keyframe,
     refine_depths,
 )
+
+Result = TypeVar("Result")
 
 _WIDE_STEPS = ((2, 4), (1, 4), (0, 4))
 _PROBES = 64
@@ -118,7 +121,11 @@ def build_map(
     options: MapOptions | None = None,
 ) -> SceneMap:
     """Builds the map of a scene; see `map_steps`."""
-    steps = map_steps(frames, encoder, chosen, options or MapOptions())
+    return finished(map_steps(frames, encoder, chosen, options or MapOptions()))
+
+
+def finished(steps: Generator[object, None, Result]) -> Result:
+    """What a generator returns; what it yields is passed over."""
     while True:
         try:
             next(steps)
@@ -362,9 +369,10 @@ def _finished(
     spread = (0.0, 0.0)
     if adjustment is not None:
         block = adjustment.covariance[numbers]
-        spread = tuple(
-            float(np.sqrt(np.einsum("nii->ni", block)[:, part].mean()))
-            for part in (slice(0, 3), slice(3, 6))
+        variance = np.einsum("nii->ni", block)
+        spread = (
+            float(np.sqrt(variance[:, :3].mean())),
+            float(np.sqrt(variance[:, 3:].mean())),
         )
     return SceneMap(
         complete, camera, common, spread, _adjusted(recording, adjustment, camera, wrong)

@@ -252,8 +252,9 @@ class BundleAdjustment:
             shape=(2 * len(j), p),
         )
         mixed = (depth.T @ scaled).tocsr()
-        system = (scaled.T @ scaled).toarray()
-        system -= (mixed.T @ sparse.diags_array(1 / hold) @ mixed).toarray()
+        gram = sparse.csr_array(scaled.T @ scaled)
+        eliminated = sparse.csr_array(mixed.T @ sparse.diags_array(1 / hold) @ mixed)
+        system = (gram - eliminated).toarray()
         slope = scaled.T @ (lin.residual.ravel() * root) - mixed.T @ (pull / hold)
         self._add_priors(system, slope, state)
         state.covariance = np.linalg.inv(system)

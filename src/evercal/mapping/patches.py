@@ -36,7 +36,8 @@ def image_pyramid(grey: np.ndarray, levels: int) -> list[Array]:
     for _ in range(levels - 1):
         height, width = (side // 2 for side in pyramid[-1].shape)
         even = pyramid[-1][: 2 * height, : 2 * width]
-        pyramid.append(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA))
+        half = cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
+        pyramid.append(half.astype(np.float32, copy=False))
     return pyramid
 
 

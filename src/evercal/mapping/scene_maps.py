@@ -38,8 +38,8 @@ class SceneRecord:
     """Poses with a smaller inlier ratio are `unknown_scene`; fitted on held-out training frames."""
     covariance_scale: float = 1.0
     """What covariances are multiplied with to match the errors on held-out training frames."""
-    min_coverage: float = 0.0
-    """Poses whose landmarks cover a smaller share of the image are `unknown_scene`."""
+    min_support: float = 0.0
+    """Poses of the map with less support are `unknown_scene` (`localization.acceptance`)."""
     common: SE3 = field(default_factory=SE3.identity)
     """What the map's poses were multiplied with to become consistent: answers are taken back."""
     map_sigma: tuple[float, float] = (0.0, 0.0)

@@ -91,7 +91,7 @@ def write_record(folder: Path, record: SceneRecord) -> None:
         "refined_camera": record.refined_camera.to_dict() if record.refined_camera else None,
         "inlier_threshold": record.inlier_threshold,
         "covariance_scale": record.covariance_scale,
-        "min_coverage": record.min_coverage,
+        "min_support": record.min_support,
         "common": record.common.matrix().tolist(),
         "map_sigma": list(record.map_sigma),
     }
@@ -112,7 +112,7 @@ def read_record(folder: Path) -> SceneRecord:
         Camera.from_dict(refined) if refined else None,
         content["inlier_threshold"],
         content["covariance_scale"],
-        content["min_coverage"],
+        content["min_support"],
         SE3.from_matrix(content["common"]),
         (content["map_sigma"][0], content["map_sigma"][1]),
     )
