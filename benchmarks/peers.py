@@ -181,7 +181,7 @@ def peer_entries(
     few = select_sars(
         poses.translation_m,
         poses.rotation_wxyz,
-        max(1, int(options.share * len(every) + 1e-9)),  # as many frames as evercal would keep
+        max(1, int(options.share * len(every) + 1e-9)),  # rounded as evercal does
         SarsOptions(fill=True),
     )
     for title, kept in ((f"{name} all", every), (_titled(name, options), few)):
