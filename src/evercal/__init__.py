@@ -7,13 +7,16 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from evercal.continual.learn_into_store import learn as learn
     from evercal.continual.learn_scene import LearnOptions as LearnOptions
     from evercal.continual.learn_scene import LearnReport as LearnReport
     from evercal.continual.learn_scene import learn_scene as learn_scene
     from evercal.datasets import Frame as Frame
     from evercal.datasets import Scene as Scene
     from evercal.datasets import load_scene as load_scene
+    from evercal.datasets import read_image as read_image
     from evercal.errors import InputError as InputError
+    from evercal.evaluation.score_scenes import evaluate as evaluate
     from evercal.geometry import SE3 as SE3
     from evercal.geometry import Camera as Camera
     from evercal.localization.estimate import PoseEstimate as PoseEstimate
@@ -32,8 +35,11 @@ _PUBLIC = {
     "PoseEstimate": "evercal.localization.estimate",
     "SE3": "evercal.geometry",
     "Scene": "evercal.datasets",
+    "evaluate": "evercal.evaluation.score_scenes",
+    "learn": "evercal.continual.learn_into_store",
     "learn_scene": "evercal.continual.learn_scene",
     "load_scene": "evercal.datasets",
+    "read_image": "evercal.datasets",
 }
 
 

@@ -86,11 +86,14 @@ def test_the_mean_over_scenes_does_not_weigh_them_by_frames() -> None:
 def test_json_has_the_agreed_fields_and_null_for_infinite() -> None:
     text = json.dumps(scores([result("a"), lost("b", "failed", None)]).to_dict(), allow_nan=False)
     data = json.loads(text)
-    assert set(data) == {"scenes", "mean_accuracy_5cm_5deg", "ms_per_image"}
+    means = {"mean_accuracy_5cm_5deg", "mean_accuracy_1cm_1deg"}
+    assert set(data) == {"scenes", *means, "ms_per_image"}
     assert list(data["scenes"]["b"]) == [
         "frames",
         "accuracy_5cm_5deg",
+        "accuracy_2cm_2deg",
         "accuracy_1cm_1deg",
+        "accuracy_5mm_05deg",
         "median_translation_cm",
         "median_rotation_deg",
         "wrong_scene",

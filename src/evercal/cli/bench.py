@@ -136,11 +136,10 @@ class Bench:
         return load_suite(self.suite, self.data, _words(self.scenes), self.poses)
 
     def _stage(self, seed: int) -> "StageOptions":
-        from evercal.cli.learn import parse_memory
+        from evercal.continual.memory_budget import with_memory
         from evercal.continual.presets import on_paper_backbone, preset
 
-        share, count = parse_memory(self.memory)
-        stage = preset(self.preset, seed)
+        stage = with_memory(preset(self.preset, seed), self.memory)
         if self.backbone == "paper":
             stage = on_paper_backbone(stage)
         steps = stage.fit.iterations if self.steps is None else self.steps
@@ -150,8 +149,6 @@ class Bench:
             stage,
             head=dataclasses.replace(stage.head, offsets=self.offsets),
             fit=dataclasses.replace(stage.fit, iterations=steps),
-            memory_share=stage.memory_share if share is None else share,
-            memory_bytes=count,
         )
 
 

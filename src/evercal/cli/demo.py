@@ -3,46 +3,48 @@
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from evercal.cli.console import print_json, print_next
+from evercal.cli.console import print_json, print_next, progress_bar, size
 from evercal.errors import InputError
-from evercal.reports.demo_outcome import METHODS, DemoOutcome, FixedCamera
 
 if TYPE_CHECKING:
     from evercal.continual.learn import StageOptions
+    from evercal.continual.learn_scene import LearnReport
     from evercal.datasets import Scene
     from evercal.localization.localizer import Localizer
+    from evercal.reports.demo_outcome import DemoOutcome
     from evercal.simulation.mini import CellRoom
 
 STORE = "store"
 QUERY = "query.png"
 
+Say = Callable[[str], None]
+
 
 @dataclass(frozen=True)
 class Demo:
-    """Learn three rendered rooms one by one, with evercal and with plain fine-tuning."""
+    """Learn three rendered rooms, locate cameras in them to the millimetre, and write a report."""
 
     out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-demo")
-    """Folder for report.html, overview.png, a store and an image to try it with."""
+    """Folder for report.html, overview.png, the store and an image to try it with."""
+    compare: bool = False
+    """Train two networks on the same rooms as well, and compare what they remember; this takes some
+    minutes more."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Takes some minutes on two cores."""
-        say = _quiet if self.json else print
-        outcome = run_demo(self.out, DemoOptions(), say)
+        """Takes about a minute on two cores, and some minutes more with --compare."""
+        outcome = run_demo(self.out, DemoOptions(self.compare), _quiet if self.json else _say)
         if self.json:
             print_json(outcome.to_dict())
             return 0
-        print(outcome.table())
-        if outcome.fixed:
-            print(outcome.fixed_table())
         print(f"wrote {self.out / 'report.html'} and {self.out / 'overview.png'}")
         print_next("evercal", "localize", self.out / STORE, self.out / QUERY)
         return 0
@@ -52,34 +54,39 @@ class Demo:
 class DemoOptions:
     """How much the demo does."""
 
+    compare: bool = False
+    """Train the networks of fine-tuning and of SARS + SPDD as well."""
     rooms: "tuple[CellRoom, ...] | None" = None
     """Two or more; those that come with the package when None."""
-    stage: "StageOptions | None" = None
-    """How a room is learned; the preset `demo` when None."""
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
 
 
 def _quiet(line: str) -> None:
     """In place of `print` where stdout is for JSON."""
 
 
-def run_demo(out: Path, options: DemoOptions, say: Callable[[str], None] = _quiet) -> DemoOutcome:
-    """Learns the rooms with both methods, evaluates after each, and writes pictures and report.
+def run_demo(out: Path, options: DemoOptions, say: Say = _quiet) -> "DemoOutcome":
+    """Learns the rooms, measures, and writes pictures and report.
 
     Args:
         out: folder for the results; made when missing, results of an earlier demo are replaced.
         options: how much.
-        say: told in a line what comes next.
+        say: told in a line what happens and what came out.
 
     Raises:
         InputError: `out` holds something else under a name that the demo needs.
     """
     from evercal.datasets import write_image
     from evercal.localization.localizer import Localizer
+    from evercal.reports.demo_outcome import MAP, METHODS, DemoOutcome
     from evercal.reports.demo_page import write_pictures
     from evercal.simulation.mini import mini_rooms
     from evercal.storage import MANIFEST, replace_folder
 
-    store = out / STORE
+    began, store = time.perf_counter(), out / STORE
     if store.exists() and not (store / MANIFEST).is_file():
         raise InputError(f"{store}: exists and is not an evercal store; give another --out")
     out.mkdir(parents=True, exist_ok=True)
@@ -88,72 +95,79 @@ def run_demo(out: Path, options: DemoOptions, say: Callable[[str], None] = _quie
     outcome = DemoOutcome([scene.name for scene in scenes])
     work = Path(tempfile.mkdtemp(prefix=".demo-", dir=out))
     try:
-        # Stage 1 is the same training twice: a store says which strategy it was made with.
-        for method in METHODS:
-            _run_method(work / method, method, scenes, options, outcome, say)
-        replace_folder(work / "evercal", store)
+        for method in METHODS if options.compare else (MAP,):
+            _learn_rooms(work / method, method, scenes, _Teller(outcome, say, options.compare))
+        replace_folder(work / MAP, store)
     finally:
         shutil.rmtree(work, ignore_errors=True)
     localizer = Localizer.open(store)
-    outcome.fixed = [_find_fixed(localizer, room) for room in rooms if room.fixed is not None]
+    _measure(localizer, rooms, outcome, say)
     write_pictures(out, localizer, rooms, outcome)
     middle = scenes[0].test[len(scenes[0].test) // 2]
     write_image(out / QUERY, middle.read_image())
+    outcome.seconds = time.perf_counter() - began
+    say(f"all of this took {outcome.seconds:.0f} s")
     return outcome
 
 
-def _find_fixed(localizer: "Localizer", room: "CellRoom") -> FixedCamera:
-    """One pose from all images of a camera that stands still, compared with the truth."""
-    import numpy as np
+@dataclass(frozen=True)
+class _Teller:
+    """Where results go."""
 
-    from evercal.geometry import SE3, average_poses, pose_distance
-
-    assert room.fixed is not None
-    frames, poses, inliers = room.fixed.test, [], []
-    for frame in frames:
-        estimate = localizer.localize(frame.read_image(), frame.camera)
-        if estimate.scene == room.scene.name and estimate.base_from_camera is not None:
-            poses.append(estimate.base_from_camera)
-            inliers.append(estimate.inliers)
-    truth = frames[0].base_from_camera
-    if not poses or truth is None:
-        return FixedCamera(room.scene.name, len(frames), len(poses), None, None)
-    found = average_poses(SE3.stack(poses), np.array(inliers, float))
-    metres, radians = pose_distance(found, truth)
-    error = float(1000 * metres), float(np.rad2deg(radians))
-    return FixedCamera(room.scene.name, len(frames), len(poses), *error)
+    outcome: "DemoOutcome"
+    say: Say
+    compare: bool
 
 
-def _run_method(
-    store: Path,
-    method: str,
-    scenes: "list[Scene]",
-    options: DemoOptions,
-    outcome: DemoOutcome,
-    say: Callable[[str], None],
-) -> None:
+def _learn_rooms(store: Path, method: str, scenes: "Sequence[Scene]", teller: _Teller) -> None:
+    """Learns the rooms one after the other; where methods are compared, evaluates after each."""
     from evercal.cli.learn_bars import LearnBars
     from evercal.continual.learn_scene import LearnOptions, learn_scene
-    from evercal.continual.presets import preset
     from evercal.localization.localizer import Localizer
+    from evercal.reports.demo_outcome import MAP, METHODS
 
-    how = LearnOptions(options.stage or preset("demo"), method)
-    outcome.accuracy[method], outcome.seconds[method] = [], []
+    outcome, say, seconds = teller.outcome, teller.say, 0.0
     for i, scene in enumerate(scenes):
-        say(f"{METHODS[method]}: learning {scene.name}")
+        say(f"{METHODS[method]}: learning {scene.name} from {len(scene.train)} posed images")
         began = time.perf_counter()
         with LearnBars() as bars:
-            report = learn_scene(store, scene, how, bars)
-        outcome.seconds[method].append(time.perf_counter() - began)
-        if method == "evercal":
-            outcome.memory_bytes = report.memory_bytes
-        row = _accuracies(Localizer.open(store), scenes[: i + 1])
-        outcome.accuracy[method].append(row)
+            report = learn_scene(store, scene, LearnOptions(_stage(method), method), bars)
+        seconds += time.perf_counter() - began
+        if method == MAP:
+            _note_map(report, outcome, say)
+        else:
+            say(f"  {report.iterations} training steps in {report.seconds / 60:.1f} minutes")
+        if teller.compare:
+            row = _accuracies(Localizer.open(store), scenes[: i + 1])
+            outcome.accuracy.setdefault(method, []).append(row)
+    outcome.minutes[method] = seconds / 60
 
 
-def _accuracies(localizer: "Localizer", scenes: "list[Scene]") -> list[float]:
-    """Per cent of test frames within 5 cm and 5 deg, for each scene."""
-    from evercal.cli.console import progress_bar
+def _stage(method: str) -> "StageOptions":
+    from evercal.continual.presets import preset
+    from evercal.reports.demo_outcome import MAP
+
+    return preset("fast" if method == MAP else "demo")
+
+
+def _note_map(report: "LearnReport", outcome: "DemoOutcome", say: Say) -> None:
+    from evercal.reports.demo_outcome import LearnedRoom
+
+    adjusted = report.adjusted
+    residual = adjusted.residual_px if adjusted is not None else float("nan")
+    frames, kept, marks = report.train_frames, report.frames_kept, report.landmarks
+    room = LearnedRoom(report.scene, frames, kept, marks, residual, report.seconds)
+    outcome.learned.append(room)
+    outcome.memory_bytes = report.memory_bytes
+    say(
+        f"  {kept} keyframes with {marks} landmarks in {report.seconds:.0f} s; after bundle"
+        f" adjustment the median reprojection error is {residual:.2f} px; all rooms take"
+        f" {size(report.memory_bytes)}"
+    )
+
+
+def _accuracies(localizer: "Localizer", scenes: "Sequence[Scene]") -> list[float]:
+    """Per cent of test images within 5 cm and 5 deg, for each scene."""
     from evercal.evaluation import evaluate, scores
 
     count = sum(len(scene.test) for scene in scenes)
@@ -166,3 +180,28 @@ def _accuracies(localizer: "Localizer", scenes: "list[Scene]") -> list[float]:
         results = evaluate(localizer, named, on_frame=show)
     rows = scores(results).scenes
     return [rows[scene.name].accuracy_5cm_5deg for scene in scenes]
+
+
+def _measure(
+    localizer: "Localizer", rooms: "Sequence[CellRoom]", outcome: "DemoOutcome", say: Say
+) -> None:
+    """Asks the map everything that the report shows, and says it in sentences."""
+    from evercal.reports import demo_sentences as told
+    from evercal.reports.demo_measurements import Look
+
+    if outcome.accuracy:
+        say(outcome.table())
+    with progress_bar("locating", 0, "image") as bar:
+        look = Look(localizer, rooms, lambda: bar.update() and None)
+        bar.total = look.images()
+        steps = (
+            (look.locate_test_images, told.about_test_images),
+            (look.locate_changed_rooms, told.about_changed_rooms),
+            (look.find_fixed_cameras, told.about_fixed_cameras),
+            (look.show_unknown_room, told.about_unknown_room),
+        )
+        for measure, sentences in steps:
+            measure(outcome)
+            bar.clear()
+            for line in sentences(outcome):
+                say(line)

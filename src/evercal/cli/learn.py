@@ -11,14 +11,12 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, size
 from evercal.cli.learn_bars import LearnBars
+from evercal.continual.memory_budget import parse_memory, with_memory
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
     from evercal.continual.learn_scene import LearnOptions, LearnReport
     from evercal.mapping.build import Adjusted
-
-_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
-_UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
 
 
 @dataclass(frozen=True)
@@ -50,7 +48,7 @@ class Learn:
 
     def run(self) -> int:
         """Learns, shows how it goes, and says what came out."""
-        share, count = parse_memory(self.memory)
+        parse_memory(self.memory)  # refused before anything is read
         if self.centres is not None and self.centres < 1:
             raise InputError(f"--centres {self.centres}: give a number >= 1")
         if self.seed < 0:
@@ -60,7 +58,7 @@ class Learn:
 
         scene = posed_scene(load_scene(self.scene, self.format, self.name))
         check_name(scene.name)
-        options = self._options(share, count)
+        options = self._options()
         held_out = len(validation_split(scene.train)[1])
         start = (
             f"{scene.name}: {len(scene.train)} training frames, {scene.untracked} untracked left"
@@ -86,16 +84,13 @@ class Learn:
     def _scene_word(self, name: str) -> str:
         return str(self.scene) if self.name is None else f"{name}={self.scene}"
 
-    def _options(self, share: float | None, count: int | None) -> "LearnOptions":
+    def _options(self) -> "LearnOptions":
         from evercal.continual.learn_scene import LearnOptions
         from evercal.continual.presets import preset
 
         if self.encoder is not None and not self.encoder.is_file():
             raise InputError(f"--encoder {self.encoder}: no such file")
-        stage = preset(self.preset, self.seed)
-        stage = dataclasses.replace(stage, memory_bytes=count)
-        if share is not None:
-            stage = dataclasses.replace(stage, memory_share=share)
+        stage = with_memory(preset(self.preset, self.seed), self.memory)
         if self.centres is not None:
             head = dataclasses.replace(stage.head, centres_per_scene=self.centres)
             stage = dataclasses.replace(stage, head=head)
@@ -179,24 +174,6 @@ def adjusted_lines(adjusted: "Adjusted") -> list[str]:
 def _few(names: tuple[str, ...], most: int = 8) -> str:
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
-
-
-def parse_memory(text: str) -> tuple[float | None, int | None]:
-    """(share of the frames, None) of `10%`, or (None, bytes) of `5MB`, `512KiB`, `100000`.
-
-    Raises:
-        InputError: Neither, or nothing at all to remember in.
-    """
-    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(%|[kmg]?i?b?)\s*", text, re.IGNORECASE)
-    unit = match[2].upper() if match else ""
-    if match and unit == "%" and 0 < float(match[1]) <= 100:
-        return float(match[1]) / 100, None
-    if match and unit in _UNITS and float(match[1]) * _UNITS[unit] >= 1:
-        return None, int(float(match[1]) * _UNITS[unit])
-    raise InputError(
-        f"--memory {text}: give a share of the frames above 0% and up to 100%, or bytes such as"
-        f" 500kB, 5MB or 5MiB"
-    )
 
 
 def check_name(name: str) -> None:

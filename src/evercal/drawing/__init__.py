@@ -2,6 +2,7 @@
 
 from evercal.drawing.charts import accuracy_against_size as accuracy_against_size
 from evercal.drawing.charts import error_curve as error_curve
+from evercal.drawing.charts import error_histogram as error_histogram
 from evercal.drawing.charts import forgetting_curves as forgetting_curves
 from evercal.drawing.charts import kept_places as kept_places
 from evercal.drawing.charts import scene_bars as scene_bars

@@ -103,6 +103,47 @@ def error_curve(
     return _png(figure)
 
 
+def error_histogram(
+    groups: Mapping[str, ArrayLike], limit_mm: float = 5.0, bins: int = 20
+) -> bytes:
+    """How many frames have which translation error, one panel per group.
+
+    Args:
+        groups: Per group (frames,) errors in metres; infinite without a pose.
+        limit_mm: Right end of the axis; what lies beyond, or has no pose, is one bar of its own.
+        bins: Bars up to there.
+
+    Raises:
+        ValueError: No group, or one with an error that is not a number.
+    """
+    if not groups:
+        raise ValueError("a histogram takes at least one group of errors")
+    figure = _figure(2.6 * len(groups) + 0.6, 2.6)
+    panels = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]
+    width = limit_mm / bins
+    for index, (panel, (name, values)) in enumerate(zip(panels, groups.items(), strict=True)):
+        errors = 1000.0 * np.asarray(values, dtype=np.float64).ravel()
+        if np.isnan(errors).any():
+            raise ValueError(f"{name}: errors are numbers (inf allowed), got nan")
+        counts, edges = np.histogram(errors[errors < limit_mm], bins, (0, limit_mm))
+        colour = _COLOURS[index % len(_COLOURS)]
+        panel.bar(edges[:-1], counts, 0.9 * width, align="edge", color=colour)
+        beyond = int((errors >= limit_mm).sum())
+        if beyond:
+            panel.bar(limit_mm + width, beyond, 0.9 * width, align="edge", color="0.6")
+            words = f"{beyond} beyond\nor no pose"
+            panel.annotate(words, (limit_mm + 2 * width, beyond), fontsize=7, ha="right")
+        panel.set_title(f"{name} ({len(errors)})", fontsize=9)
+        panel.set_xlim(0, limit_mm + 2.2 * width)
+        panel.grid(color="0.9", linewidth=0.6)
+        panel.set_axisbelow(True)
+        panel.tick_params(labelsize=8)
+        panel.spines[["top", "right"]].set_visible(False)
+    figure.supxlabel("translation error (mm)", fontsize=9)
+    panels[0].set_ylabel("frames", fontsize=9)
+    return _png(figure)
+
+
 def scene_bars(
     methods: Mapping[str, ArrayLike], scenes: Sequence[str], quantity: str = "accuracy (%)"
 ) -> bytes:

@@ -18,8 +18,12 @@ Status = Literal["ok", "unknown_scene", "failed"]
 
 COARSE = (0.05, math.radians(5.0))
 """5 cm and 5 deg, the threshold of the indoor benchmarks, in metres and radians."""
+MIDDLE = (0.02, math.radians(2.0))
+"""2 cm and 2 deg, in metres and radians."""
 FINE = (0.01, math.radians(1.0))
 """1 cm and 1 deg, in metres and radians."""
+FINEST = (0.005, math.radians(0.5))
+"""5 mm and 0.5 deg, in metres and radians."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +65,12 @@ class SceneScores:
     """How many test frames were scored."""
     accuracy_5cm_5deg: float
     """Per cent."""
+    accuracy_2cm_2deg: float
+    """Per cent."""
     accuracy_1cm_1deg: float
     """Per cent."""
+    accuracy_5mm_05deg: float
+    """Per cent, within 5 mm and 0.5 deg."""
     median_translation_cm: float
     """Over all frames, those without a pose as infinite."""
     median_rotation_deg: float
@@ -83,6 +91,8 @@ class Scores:
     """By name, in the order of the results."""
     mean_accuracy_5cm_5deg: float
     """Per cent, unweighted mean over scenes."""
+    mean_accuracy_1cm_1deg: float
+    """Per cent, unweighted mean over scenes."""
     ms_per_image: float
     """Mean milliseconds of one image at a time, decoding included."""
 
@@ -91,6 +101,7 @@ class Scores:
         return {
             "scenes": {name: _plain(row) for name, row in self.scenes.items()},
             "mean_accuracy_5cm_5deg": self.mean_accuracy_5cm_5deg,
+            "mean_accuracy_1cm_1deg": self.mean_accuracy_1cm_1deg,
             "ms_per_image": self.ms_per_image,
         }
 
@@ -147,6 +158,7 @@ def scores(results: Sequence[FrameResult]) -> Scores:
     return Scores(
         scenes,
         float(np.mean([row.accuracy_5cm_5deg for row in scenes.values()])),
+        float(np.mean([row.accuracy_1cm_1deg for row in scenes.values()])),
         float(np.mean([result.milliseconds for result in results])),
     )
 
@@ -198,11 +210,13 @@ def _by_scene(results: Iterable[FrameResult]) -> dict[str, list[FrameResult]]:
 
 def _scene_scores(rows: list[FrameResult]) -> SceneScores:
     middle = len(rows) // 2
-    (coarse,), (fine,) = correct(rows, COARSE).values(), correct(rows, FINE).values()
+    within = [_percent(*correct(rows, t).values()) for t in (COARSE, MIDDLE, FINE, FINEST)]
     return SceneScores(
         frames=len(rows),
-        accuracy_5cm_5deg=_percent(coarse),
-        accuracy_1cm_1deg=_percent(fine),
+        accuracy_5cm_5deg=within[0],
+        accuracy_2cm_2deg=within[1],
+        accuracy_1cm_1deg=within[2],
+        accuracy_5mm_05deg=within[3],
         median_translation_cm=100.0 * sorted(row.translation_error_m for row in rows)[middle],
         median_rotation_deg=math.degrees(sorted(row.rotation_error_rad for row in rows)[middle]),
         wrong_scene=_percent([row.wrong_scene for row in rows]),

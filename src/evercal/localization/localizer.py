@@ -5,6 +5,7 @@ where a scene has one), PnP, align landmarks, refine the pose, accept. Whatever 
 source gives 2D-3D correspondences and one solver takes them all.
 """
 
+import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -32,6 +33,7 @@ from evercal.mapping.patches import image_pyramid
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 
 ASPECT_TOLERANCE = 0.01
+DEVICES = ("auto", "cpu")
 
 
 @dataclass(frozen=True)
@@ -145,9 +147,10 @@ class Localizer:
     @classmethod
     def open(
         cls,
-        store: Path | str,
+        store: str | os.PathLike[str],
         options: LocalizeOptions | None = None,
         encoder: torch.nn.Module | None = None,
+        device: str = "auto",
     ) -> Self:
         """A localizer for a store on disk.
 
@@ -155,10 +158,13 @@ class Localizer:
             store: its folder.
             options: how to locate.
             encoder: only for a store made with a module of one's own: that module.
+            device: "cpu", or "auto", which is the CPU today.
 
         Raises:
-            InputError: not a store, an empty one, or a damaged file.
+            InputError: not a store, an empty one, or a damaged file; another device.
         """
+        if device not in DEVICES:
+            raise InputError(f"device {device!r}: images are located on the CPU; use auto or cpu")
         from evercal.mapping.store import Store
 
         opened = Store.open(Path(store), encoder)

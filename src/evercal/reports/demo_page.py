@@ -1,26 +1,43 @@
 """The pictures and the report of `evercal demo`."""
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evercal.reports.demo_outcome import FIXED_HEADER, METHODS, DemoOutcome
-from evercal.reports.pictures import draw_estimate
+from evercal.benchmark.tables import SCENE_HEADER, scene_rows
+from evercal.drawing import (
+    Picture,
+    Section,
+    Table,
+    contact_sheet,
+    encode_image,
+    error_histogram,
+    forgetting_curves,
+    html_page,
+)
+from evercal.reports import demo_sentences as told
+from evercal.reports.demo_outcome import (
+    BUMP_HEADER,
+    FIXED_HEADER,
+    LEARNED_HEADER,
+    METHODS,
+    DemoOutcome,
+)
+from evercal.reports.pictures import draw_landmarks
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from evercal.datasets import Frame, Scene
-    from evercal.drawing import Section
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import Localizer
     from evercal.simulation.mini import CellRoom
 
-_COLOURS = ("#0072B2", "#D55E00")
+_COLOURS = ("#0072B2", "#D55E00", "#009E73")
 _OVERLAYS_PER_ROOM = 3
+_HISTOGRAM_MM = 5.0
 
 
 def write_pictures(
@@ -30,54 +47,57 @@ def write_pictures(
 
     Args:
         out: folder, there already.
-        localizer: evercal's after the last room.
+        localizer: that knows all rooms.
         places: the rooms.
         outcome: what was measured.
     """
-    from evercal.drawing import html_page
     from evercal.storage import write_bytes
 
     overlays = [_overlays(localizer, place.scene) for place in places]
     overview = _overview([max(found, key=lambda o: o.inliers) for found in overlays[:2]], outcome)
     write_bytes(out / "overview.png", overview)
     sections = [
-        *_results(overview, len(places[0].scene.train), outcome),
-        *_points(places, overlays),
+        *_learning(overview, outcome),
+        *_test_images(places, overlays, outcome),
+        *_changed_rooms(localizer, places, outcome),
         *_fixed_cameras(outcome),
+        *_unknown_room(outcome),
+        *_compared(outcome),
     ]
     write_bytes(out / "report.html", html_page("evercal demo", sections).encode())
 
 
-def _results(overview: bytes, images: int, outcome: DemoOutcome) -> "list[Section]":
-    """What happened, and how accurate each method was after each room."""
-    from evercal.drawing import Picture, Section, Table, forgetting_curves
-
-    rooms = outcome.rooms
-    curves = {METHODS[key]: _square(rows, len(rooms)) for key, rows in outcome.accuracy.items()}
-    header = ["method", "after", *(f"{room} %" for room in rooms)]
-    seconds = [second for times in outcome.seconds.values() for second in times]
+def _learning(overview: bytes, outcome: DemoOutcome) -> list[Section]:
+    """What happened, and what the map is."""
     intro = (
-        f"{len(rooms)} virtual rooms were learned one after the other, from {images}"
-        f" posed images each, by one small network. Fine-tuning is the same network and the same"
-        f" number of steps without anything to remember by. A room took {np.mean(seconds):.0f} s on"
-        f" average; evercal keeps {outcome.memory_bytes / 1e6:.1f} MB of the rooms in memory. At"
-        f" test time nothing says which room an image is from."
+        f"{len(outcome.rooms)} virtual rooms were learned one after the other from posed images"
+        f" alone. Nothing was trained: a map holds keyframes, and landmarks with their depths, all"
+        f" adjusted together with the camera. The maps of all rooms take"
+        f" {outcome.memory_bytes / 1e6:.1f} MB."
     )
-    table = Table(header, outcome.rows(), "Test frames within 5 cm and 5 deg, per cent")
-    picture = Picture(forgetting_curves(curves, rooms), "What became of each room")
-    return [
-        Section("", [intro, Picture(overview, "Left: two test images; right: the first room")]),
-        Section("Accuracy after each room", [table, picture]),
+    said = "Left: landmarks that were found in two test images. Right: errors of all test images."
+    table = Table(LEARNED_HEADER, outcome.learned_rows(), "What learning took and left")
+    return [Section("", [intro, Picture(overview, said), table])]
+
+
+def _test_images(
+    places: "Sequence[CellRoom]", overlays: "list[list[_Overlay]]", outcome: DemoOutcome
+) -> list[Section]:
+    """How well the test images were located, and with which landmarks."""
+    assert outcome.test is not None, "test images are located before a report is made"
+    table = Table(SCENE_HEADER, scene_rows(outcome.test), "Test images after the last room")
+    histogram = error_histogram(outcome.errors_m, _HISTOGRAM_MM)
+    sections = [
+        Section(
+            "Test images",
+            [
+                _paragraph(told.about_test_images(outcome)),
+                table,
+                Picture(histogram, "How many test images have which error"),
+                Picture(_sheet(overlays), "Landmarks that were found, and how far off they were"),
+            ],
+        )
     ]
-
-
-def _points(places: "Sequence[CellRoom]", overlays: "list[list[_Overlay]]") -> "list[Section]":
-    """Test images with the points that agree, and with the room's bare shapes over them."""
-    from evercal.drawing import Picture, Section, contact_sheet, encode_image
-
-    said = "Test images with the scene points that agree"
-    sheet = encode_image(_sheet(overlays), "jpg")
-    sections = [Section("Predicted points", [Picture(sheet, said)])]
     pairs = zip(places, overlays, strict=True)
     rendered = [image for place, found in pairs for image in _untextured_overlays(place, found)]
     if rendered:
@@ -87,18 +107,63 @@ def _points(places: "Sequence[CellRoom]", overlays: "list[list[_Overlay]]") -> "
     return sections
 
 
-def _fixed_cameras(outcome: DemoOutcome) -> "list[Section]":
-    """Where the cameras that stand still were found."""
-    from evercal.drawing import Section, Table
-
-    if not outcome.fixed:
+def _changed_rooms(
+    localizer: "Localizer", places: "Sequence[CellRoom]", outcome: DemoOutcome
+) -> list[Section]:
+    """How well images were located after the rooms had changed."""
+    if outcome.changed is None:
         return []
+    overlays = [_overlays(localizer, place.changed) for place in places if place.changed]
+    table = Table(SCENE_HEADER, scene_rows(outcome.changed), "Images after the change")
+    words = "Landmarks that were found again after the change"
+    said = _paragraph(told.about_changed_rooms(outcome))
+    return [Section("After a change in the rooms", [said, table, Picture(_sheet(overlays), words)])]
+
+
+def _fixed_cameras(outcome: DemoOutcome) -> list[Section]:
+    """Where the cameras that stand still were found, and how far they were bumped."""
+    sections = []
+    if outcome.fixed:
+        said = (
+            "A camera stands still while the arm moves. Its pose in the robot's base frame is the"
+            " robust mean over its images; no marker, no motion of the camera."
+        )
+        table = Table(FIXED_HEADER, outcome.fixed_rows(), "base_from_camera against the truth")
+        sections.append(Section("Calibration of a fixed camera", [said, table]))
+    if outcome.bumps:
+        said = (
+            "Then somebody bumped into the camera. The images before and after tell by how much it"
+            " moved. The last column is the distance between two halves of the images before the"
+            " bump: what a camera at rest looks like."
+        )
+        table = Table(BUMP_HEADER, outcome.bump_rows(), "Found and true motion of the camera")
+        sections.append(Section("A bump", [said, table]))
+    return sections
+
+
+def _unknown_room(outcome: DemoOutcome) -> list[Section]:
+    lines = told.about_unknown_room(outcome)
+    return [Section("A room that nobody learned", [_paragraph(lines)])] if lines else []
+
+
+def _compared(outcome: DemoOutcome) -> list[Section]:
+    """What the networks remember of the same rooms."""
+    if not outcome.accuracy:
+        return []
+    rooms = outcome.rooms
+    curves = {METHODS[key]: _square(rows, len(rooms)) for key, rows in outcome.accuracy.items()}
     said = (
-        "A camera stands still while the arm moves. Its pose in the robot's base frame is the"
-        " robust mean over its images; no marker, no motion of the camera."
+        "Two networks were trained on the same rooms. Fine-tuning has nothing to remember by;"
+        " SARS + SPDD replays keyframes with a distillation loss (arXiv 2604.15814)."
     )
-    table = Table(FIXED_HEADER, outcome.fixed_rows(), "evercal after the last room")
-    return [Section("Calibration of a fixed camera", [said, table])]
+    caption = "Test images within 5 cm and 5 deg after each room, per cent"
+    table = Table(outcome.compared_header(), outcome.compared_rows(), caption)
+    picture = Picture(forgetting_curves(curves, rooms), "What became of each room")
+    return [Section("Compared with networks", [said, table, picture])]
+
+
+def _paragraph(lines: Sequence[str]) -> str:
+    return "\n".join(f"{line[:1].upper()}{line[1:]}." for line in lines)
 
 
 def _square(rows: list[list[float]], count: int) -> np.ndarray:
@@ -110,21 +175,22 @@ def _square(rows: list[list[float]], count: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Overlay:
-    """A test image and what was said about it."""
+    """An image and what was said about it."""
 
     frame: "Frame"
-    """The test image."""
+    """The image."""
     estimate: "PoseEstimate"
     """The answer for it."""
     image: np.ndarray
-    """(H, W, 3) uint8 RGB, scene points drawn in."""
+    """(H, W, 3) uint8 RGB, landmarks drawn in."""
 
     @property
     def caption(self) -> str:
         """The answer in words."""
         found = self.estimate
-        said = f"in {found.scene}" if found.scene else found.status.replace("_", " ")
-        return f"{said}, {100 * found.inlier_ratio:.0f} % inliers"
+        if found.scene is None:
+            return found.status.replace("_", " ")
+        return f"{found.scene}: {found.inliers} landmarks, {100 * found.inlier_ratio:.0f} %"
 
     @property
     def inliers(self) -> int:
@@ -138,7 +204,7 @@ def _overlays(localizer: "Localizer", scene: "Scene") -> list[_Overlay]:
     for frame in _spread(scene):
         image = frame.read_image()
         estimate = localizer.localize(image, frame.camera)
-        found.append(_Overlay(frame, estimate, draw_estimate(image, estimate, frame.camera)))
+        found.append(_Overlay(frame, estimate, draw_landmarks(image, estimate, localizer)))
     return found
 
 
@@ -168,17 +234,16 @@ def _spread(scene: "Scene") -> "list[Frame]":
     return [scene.test[int(place + half)] for place in places]
 
 
-def _sheet(overlays: list[list[_Overlay]]) -> np.ndarray:
-    """All of them, a row for each room."""
-    from evercal.drawing import contact_sheet
-
+def _sheet(overlays: list[list[_Overlay]]) -> bytes:
+    """All of them as a JPEG file, a row for each room."""
     flat = [overlay for found in overlays for overlay in found]
     captions = [overlay.caption for overlay in flat]
-    return contact_sheet([overlay.image for overlay in flat], _OVERLAYS_PER_ROOM, captions)
+    images = [overlay.image for overlay in flat]
+    return encode_image(contact_sheet(images, _OVERLAYS_PER_ROOM, captions), "jpg")
 
 
 def _overview(shown: list[_Overlay], outcome: DemoOutcome) -> bytes:
-    """Two images with points, and what became of the first room with both methods, as a PNG."""
+    """Two images with landmarks, and the errors of all test images, as a PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 3.1), dpi=130, layout="constrained", facecolor="white")
@@ -188,18 +253,19 @@ def _overview(shown: list[_Overlay], outcome: DemoOutcome) -> bytes:
         panel.set_title(overlay.caption, fontsize=9)
         panel.set_axis_off()
     bars = panels[2]
-    first, last = outcome.rooms[0], outcome.rooms[-1]
-    for i, (method, rows) in enumerate(outcome.accuracy.items()):
-        heights = [rows[0][0], rows[-1][0]]
-        places = np.arange(2) + 0.4 * (i - 0.5)
-        drawn = bars.bar(places, heights, 0.38, color=_COLOURS[i], label=METHODS[method])
-        bars.bar_label(drawn, fmt="%.0f", fontsize=9)
-    bars.set_xticks([0, 1], [f"after learning\n{first}", f"after learning\n{last}"], fontsize=9)
-    bars.set_ylim(0, 135)  # room for the legend
-    bars.set_yticks([0, 50, 100])
-    bars.set_title(f"{first}: % within 5 cm, 5 deg", fontsize=9, loc="left")
+    errors = [
+        np.minimum(1000 * np.array(values), 1.02 * _HISTOGRAM_MM)
+        for values in outcome.errors_m.values()
+    ]
+    bins = [*np.linspace(0, _HISTOGRAM_MM, 21).tolist(), 1.05 * _HISTOGRAM_MM]
+    colours = [_COLOURS[i % len(_COLOURS)] for i in range(len(errors))]
+    bars.hist(errors, bins, stacked=True, color=colours, label=list(outcome.errors_m))
+    bars.set_xlim(0, 1.05 * _HISTOGRAM_MM)
+    bars.set_xlabel("translation error (mm)", fontsize=9)
+    bars.set_title(f"{sum(map(len, errors))} test images", fontsize=9, loc="left")
+    bars.tick_params(labelsize=8)
     bars.spines[["top", "right"]].set_visible(False)
-    bars.legend(frameon=False, fontsize=9, loc="upper right", bbox_to_anchor=(1, 0.97))
+    bars.legend(frameon=False, fontsize=9, loc="upper right")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()

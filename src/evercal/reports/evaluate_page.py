@@ -12,13 +12,14 @@ from evercal.reports.pictures import draw_estimate
 
 if TYPE_CHECKING:
     from evercal.datasets import Frame, Scene
-    from evercal.drawing import Section
+    from evercal.drawing import Section, Table
     from evercal.evaluation import FrameResult, Scores
     from evercal.geometry import SE3, Camera
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import Localizer
 
 _WORST = 12
+_AXES_CM = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 
 
 class Watch:
@@ -70,14 +71,14 @@ def evaluation_page(
         summary: of the results.
         store: its path, for the title.
     """
-    from evercal.drawing import Picture, Section, error_curve, html_page
+    from evercal.drawing import Picture, Section, html_page
 
     errors: dict[str, list[float]] = {}
     for result in results:
         errors.setdefault(result.scene, []).append(result.translation_error_m)
     sections = [
         Section("", [_summary(summary), _table(summary)]),
-        Section("Errors", [Picture(error_curve(errors), "Share of frames within an error")]),
+        Section("Errors", [Picture(_curve(errors), "Share of frames within an error")]),
     ]
     for name in errors:
         rows = [result for result in results if result.scene == name]
@@ -86,36 +87,32 @@ def evaluation_page(
     return html_page(f"{store}: evaluation", sections)
 
 
+def _curve(errors: "Mapping[str, Sequence[float]]") -> bytes:
+    """The error curve, with an axis that shows 95 % of the errors."""
+    from evercal.drawing import error_curve
+
+    finite = [100 * e for values in errors.values() for e in values if math.isfinite(e)]
+    most = float(np.quantile(finite, 0.95)) if finite else math.inf
+    limit = next((cm for cm in _AXES_CM if cm >= most), _AXES_CM[-1])
+    return error_curve(errors, limit, 5.0 if limit > 5 else None)
+
+
 def _summary(summary: "Scores") -> str:
     frames = sum(row.frames for row in summary.scenes.values())
     return (
         f"{frames} test frames of {len(summary.scenes)} scenes, mixed; the localizer saw images"
-        f" and cameras only. Mean accuracy at 5 cm, 5 deg: {summary.mean_accuracy_5cm_5deg:.1f} %."
+        f" and cameras only. Mean accuracy at 5 cm, 5 deg: {summary.mean_accuracy_5cm_5deg:.1f} %,"
+        f" at 1 cm, 1 deg: {summary.mean_accuracy_1cm_1deg:.1f} %."
         f" {summary.ms_per_image:.0f} ms per image, decoding included. A frame without a pose, or"
         f" in another scene, counts as wrong."
     )
 
 
-def _table(summary: "Scores"):
+def _table(summary: "Scores") -> "Table":
+    from evercal.benchmark.tables import SCENE_HEADER, scene_rows
     from evercal.drawing import Table
 
-    header = ["scene", "frames", "5 cm 5 deg %", "1 cm 1 deg %", "median cm", "median deg"]
-    header += ["wrong scene %", "unknown %", "near training %"]
-    rows = [
-        [
-            name,
-            row.frames,
-            f"{row.accuracy_5cm_5deg:.1f}",
-            f"{row.accuracy_1cm_1deg:.1f}",
-            f"{row.median_translation_cm:.1f}",
-            f"{row.median_rotation_deg:.2f}",
-            f"{row.wrong_scene:.1f}",
-            f"{row.unknown:.1f}",
-            f"{row.near_training_frame:.1f}",
-        ]
-        for name, row in summary.scenes.items()
-    ]
-    return Table(header, rows)
+    return Table(SCENE_HEADER, scene_rows(summary))
 
 
 def _trajectory(watch: Watch, name: str, rows: "list[FrameResult]") -> "Section":
@@ -155,9 +152,11 @@ def _worst(watch: Watch, results: "Sequence[FrameResult]") -> "Section":
 
 
 def _verdict(result: "FrameResult") -> str:
+    from evercal.benchmark.tables import distance
+
     if math.isfinite(result.translation_error_m):
         degrees = math.degrees(result.rotation_error_rad)
-        return f"{100 * result.translation_error_m:.1f} cm, {degrees:.1f} deg"
+        return f"{distance(result.translation_error_m)}, {degrees:.2f} deg"
     if result.wrong_scene:
         return f"taken for {result.found_scene}"
     return result.status.replace("_", " ")

@@ -1,0 +1,53 @@
+"""`evercal.learn`: a recording into a store, with the defaults of `evercal learn`."""
+
+import os
+from pathlib import Path
+
+from evercal.continual.learn_scene import LearnOptions, LearnReport, OnEvent, learn_scene
+from evercal.continual.memory_budget import with_memory
+from evercal.continual.presets import PRESETS, Preset, stage_options
+from evercal.datasets import Scene, load_scene
+from evercal.errors import InputError
+from evercal.storage import MANIFEST, read_manifest
+
+
+def learn(
+    store: str | os.PathLike[str],
+    scene: str | os.PathLike[str] | Scene,
+    *,
+    preset: Preset = "fast",
+    memory: str | int = "10%",
+    strategy: str | None = None,
+    on_event: OnEvent | None = None,
+) -> LearnReport:
+    """Learns a scene into a store, or goes on where an interrupted call of the same kind stopped.
+
+    Args:
+        store: folder of the store; made when missing.
+        scene: folder of a recorded scene, or the scene itself. Its training frames are learned, its
+            test frames are not looked at.
+        preset: work of strategies that train a network; a map takes no notice of it.
+        memory: keyframes to keep of the scene: a share of its frames ("10%") or bytes ("5MB").
+        strategy: "evercal" builds a map, other names train a network; that of the store when left
+            out, and "evercal" for a new store.
+        on_event: called with everything that happens, for progress bars.
+
+    Returns:
+        What came out: keyframes, landmarks, what bundle adjustment changed.
+
+    Raises:
+        InputError: a recording or store that cannot be used, or an argument that is none of those
+            above.
+    """
+    if preset not in PRESETS:
+        raise InputError(f"preset {preset!r}: unknown; use one of {', '.join(PRESETS)}")
+    stage = with_memory(stage_options(preset), memory)
+    root = Path(store)
+    recorded = scene if isinstance(scene, Scene) else load_scene(scene)
+    return learn_scene(root, recorded, LearnOptions(stage, strategy or _made_with(root)), on_event)
+
+
+def _made_with(root: Path) -> str:
+    """The strategy of a store, or the default one where there is no store yet."""
+    default = LearnOptions.strategy
+    return str(read_manifest(root)["strategy"]) if (root / MANIFEST).exists() else default

@@ -1,0 +1,52 @@
+"""`evercal.evaluate`: the scores that `evercal evaluate` prints."""
+
+import os
+from collections.abc import Mapping, Sequence
+
+from evercal.datasets import Scene, load_scene
+from evercal.errors import InputError
+from evercal.evaluation.metrics import Scores, scores
+from evercal.evaluation.protocol import SceneLocalizer
+from evercal.evaluation.protocol import evaluate as frame_results
+
+Recorded = str | os.PathLike[str] | Scene
+"""The folder of a recorded scene, or the scene itself."""
+
+
+def evaluate(
+    localizer: SceneLocalizer, scenes: Recorded | Sequence[Recorded] | Mapping[str, Recorded]
+) -> Scores:
+    """Accuracy on the test frames of scenes, mixed, without telling which is from where.
+
+    Args:
+        localizer: that was taught these scenes, and maybe others.
+        scenes: one or more, as folders or as scenes; by name where the localizer knows them by
+            another name than their own.
+
+    Returns:
+        Scores of each scene and their means.
+
+    Raises:
+        InputError: no scene, one name twice, or as `evaluation.protocol.evaluate`.
+    """
+    return scores(frame_results(localizer, _named(scenes)))
+
+
+def _named(scenes: Recorded | Sequence[Recorded] | Mapping[str, Recorded]) -> dict[str, Scene]:
+    if isinstance(scenes, Mapping):
+        return {name: _loaded(scene) for name, scene in scenes.items()}
+    given = [scenes] if isinstance(scenes, str | os.PathLike | Scene) else scenes
+    named: dict[str, Scene] = {}
+    for recorded in given:
+        scene = _loaded(recorded)
+        if scene.name in named:
+            raise InputError(
+                f"scene {scene.name!r}: given twice; tell them apart by name, as in"
+                f" {{'name under which it was learned': scene}}"
+            )
+        named[scene.name] = scene
+    return named
+
+
+def _loaded(scene: Recorded) -> Scene:
+    return scene if isinstance(scene, Scene) else load_scene(scene)
