@@ -8,7 +8,7 @@ training locate their images to some centimetres. torch is imported inside the f
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -80,7 +80,28 @@ def quick() -> StageOptions:
 
 
 @pytest.fixture(scope="session")
-def blank(one_thread: None) -> Callable[[str], SceneMaps]:
+def quick_vlad() -> Iterator[None]:
+    """Tiny encoders get random centroids at once; rooms for better ones take seconds to draw."""
+    import torch
+
+    from evercal.features import vlad
+    from evercal.features.encoder import Encoder
+
+    whole = vlad.fit_centroids
+
+    def quick(encoder: Encoder) -> torch.Tensor:
+        if encoder.width > 8:
+            return whole(encoder)
+        drawn = torch.randn(4, encoder.width, generator=torch.Generator().manual_seed(0))
+        return torch.nn.functional.normalize(drawn, dim=1)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(vlad, "fit_centroids", quick)
+        yield
+
+
+@pytest.fixture(scope="session")
+def blank(one_thread: None, quick_vlad: None) -> Callable[[str], SceneMaps]:
     """Makes a robot that knows nothing, with tiny random networks, given its strategy."""
     import torch
 
@@ -105,7 +126,7 @@ def taught(
     from evercal.mapping.scene_maps import with_fit
 
     found: dict[str, list[SceneMaps]] = {}
-    for strategy in ("evercal", "isolation"):
+    for strategy in ("evercal_network", "isolation"):
         maps, after = blank(strategy), []
         for scene in rooms:
             *_, stage = learn(maps, scene, quick)
@@ -137,7 +158,7 @@ def make() -> Callable[[Path, list[SceneMaps]], Store]:
 
 
 @pytest.fixture(scope="session")
-def answers(rooms: tuple[Scene, Scene, Scene]) -> Callable[[SceneMaps], list[bytes]]:
+def answers(rooms: tuple[Scene, Scene, Scene]) -> Callable[..., list[bytes]]:
     """Tells what a robot says to an image of each room, to the last bit."""
     from evercal.localization.localizer import LocalizeOptions, Localizer
     from evercal.localization.pnp import PnpOptions
@@ -145,14 +166,14 @@ def answers(rooms: tuple[Scene, Scene, Scene]) -> Callable[[SceneMaps], list[byt
     # Networks this small are wide of the mark: only generous bounds give poses to compare.
     wide = PnpOptions(threshold_px=20.0)
 
-    def ask(maps: SceneMaps) -> list[bytes]:
-        localizer, said = Localizer(maps, LocalizeOptions(pnp=wide, refine=wide)), []
+    def ask(maps: SceneMaps, sure: bool = True) -> list[bytes]:
+        localizer, said = Localizer(maps, LocalizeOptions(pnp=wide)), []
         for scene in rooms:
             frame = scene.train[0]
             found = localizer.localize(frame.read_image(), frame.camera)
             pose = found.base_from_camera
             numbers = b"" if pose is None else pose.matrix().tobytes()
-            assert found.inliers > 0, "an answer without a pose would be like any other"
+            assert found.inliers > 0 or not sure, "an answer without a pose would be like any other"
             said.append(repr((found.status, found.scene, found.inliers)).encode() + numbers)
         return said
 
@@ -190,7 +211,7 @@ def arc_maps(arcs: tuple[Scene, Scene], arc_stage: StageOptions) -> tuple[SceneM
     from evercal.features.encoder import load_encoder
     from evercal.mapping.scene_maps import SceneMaps
 
-    maps = [SceneMaps(load_encoder(), load_descriptor(), "evercal", 120)]
+    maps = [SceneMaps(load_encoder(), load_descriptor(), "evercal_network", 120)]
     for arc in arcs:
         *_, stage = learn(maps[-1], arc, arc_stage)
         assert isinstance(stage, Stage)
