@@ -368,7 +368,8 @@ class Localizer:
             self.options.alignment,
         )
         if found is None:
-            return _Hypothesis(candidate.scene, rough.world_from_camera, rough.covariance)
+            pose, covariance = rough.world_from_camera, rough.covariance
+            return _Hypothesis(candidate.scene, pose, covariance, aligned=True)
         scale = self.maps.short_side / min(height, width)
         return _Hypothesis(
             candidate.scene,
@@ -442,7 +443,7 @@ class Localizer:
     def _accepted(self, best: _Hypothesis) -> bool:
         record = self.maps.scenes[best.scene]
         if best.aligned:
-            return best.support >= record.min_support
+            return best.inliers > 0 and best.support >= record.min_support
         return best.ratio >= record.inlier_threshold
 
     def _answer(self, best: _Hypothesis, began: float) -> PoseEstimate:
