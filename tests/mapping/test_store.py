@@ -104,7 +104,9 @@ def test_poses_survive_the_disk(
     assert sure >= 6
 
 
-@pytest.mark.parametrize(("strategy", "heads"), [("evercal_network", [3]), ("isolation", [1, 2, 3])])
+@pytest.mark.parametrize(
+    ("strategy", "heads"), [("evercal_network", [3]), ("isolation", [1, 2, 3])]
+)
 def test_only_heads_that_count_are_kept(
     strategy: str, heads: list[int], taught: Stages, tmp_path: Path, make: Make
 ) -> None:

@@ -121,9 +121,7 @@ class _Hypothesis:
 
     @property
     def support(self) -> float:
-        """Share of the landmarks that should be visible, times the share of the patches that were
-        found near their place and lie exactly there, times the square root of their number.
-        """
+        """What the scene's threshold is compared with, see `localization.acceptance`."""
         exact = self.inliers / self.matched if self.aligned else 1.0
         return self.ratio * exact * self.inliers**0.5
 
@@ -449,7 +447,17 @@ class Localizer:
     def _answer(self, best: _Hypothesis, began: float) -> PoseEstimate:
         def refused(status, reason: str) -> PoseEstimate:
             ms = 1000 * (time.perf_counter() - began)
-            return PoseEstimate(status, reason, None, None, None, best.inliers, best.ratio, ms)
+            return PoseEstimate(
+                status,
+                reason,
+                None,
+                None,
+                None,
+                best.inliers,
+                best.ratio,
+                ms,
+                support=best.support,
+            )
 
         record = self.maps.scenes[best.scene]
         if best.pose is None:
@@ -470,6 +478,7 @@ class Localizer:
             1000 * (time.perf_counter() - began),
             best.pixels,
             best.points_m,
+            best.support,
         )
 
     def _outside(self, best: _Hypothesis, record: SceneRecord) -> bool:
@@ -483,7 +492,7 @@ def _why(best: _Hypothesis, record: SceneRecord) -> str:
     if best.aligned:
         return (
             f"{best.inliers} landmarks, {100 * best.ratio:.0f} % of those that should be visible,"
-            f" were found: support {best.support:.1f}, {record.name} needs {record.min_support:.1f}"
+            f" were found: support {best.support:.2f}, {record.name} needs {record.min_support:.2f}"
         )
     need = f"{100 * record.inlier_threshold:.0f} %"
     return f"{100 * best.ratio:.0f} % of the patches agree, {record.name} needs {need}"
