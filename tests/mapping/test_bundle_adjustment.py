@@ -19,7 +19,7 @@ from evercal.mapping.bundle_adjustment import (
     BundleAdjustment,
     BundleOptions,
     BundleTracks,
-    _camera_jacobian,
+    camera_jacobian,
     _State,
 )
 from evercal.simulation.box_room import look_at
@@ -284,7 +284,7 @@ def test_derivatives_are_finite_differences(camera: Camera) -> None:
         return problem._linearised(tracks, at).residual.ravel()
 
     lin = problem._linearised(tracks, state())
-    jacobian = _camera_jacobian(lin, tracks.host[tracks.landmark], tracks.frame, FRAMES).toarray()
+    jacobian = camera_jacobian(lin, tracks.host[tracks.landmark], tracks.frame, FRAMES).toarray()
     rng = np.random.default_rng(0)
     poses = rng.choice(6 * FRAMES, 30, replace=False)
     lens = 6 * FRAMES + COMMON + SHIFT + np.arange(LENS)

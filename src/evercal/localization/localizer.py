@@ -9,121 +9,28 @@ import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from evercal.errors import InputError
 from evercal.features.encode import ENCODE_BATCH, encode_features
-from evercal.features.precision import autocast
-from evercal.features.views import View, ViewOptions, ideal_cell_pixels, plain_view, working_image
+from evercal.features.views import View, ViewOptions, plain_view
 from evercal.geometry.camera import Camera
-from evercal.geometry.se3 import SE3
-from evercal.localization.alignment import Alignment, AlignmentOptions, align_pose
+from evercal.localization.alignment import Alignment, align_pose
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.keyframe_bank import KeyframeBank
-from evercal.localization.pnp import PnpOptions, PnpResult, solve_pnp
-from evercal.mapping.patches import image_pyramid
+from evercal.localization.matching import Matcher
+from evercal.localization.pnp import PnpResult, solve_pnp
+from evercal.localization.query import Attempt, Candidate, Hypothesis, LocalizeOptions, Query
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 
 ASPECT_TOLERANCE = 0.01
 DEVICES = ("auto", "cpu")
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """How much work an image gets."""
-
-    retrieved: int
-    """Keyframes that the global descriptor proposes."""
-    match_stride: int
-    """Every so many-th row and column of patches is matched to the keyframes."""
-
-
-@dataclass(frozen=True)
-class LocalizeOptions:
-    """How an image is located."""
-
-    candidates: int = 3
-    """At most this many scenes are tried for an image."""
-    attempts: tuple[Attempt, ...] = (Attempt(12, 2), Attempt(48, 1))
-    """Where no pose is accepted, the next attempt follows."""
-    keyframes: int = 6
-    """Keyframes of a scene that an image is matched to and aligned with."""
-    retrieval_stride: int = 16
-    """Every so many-th patch of the image votes for the proposed keyframes."""
-    votes: float = 0.2
-    """Scenes with a smaller share of the best scene's votes are not tried."""
-    margin: float = 0.15
-    """Without keyframes: scenes whose best prototype is less similar than the best scene's by more
-    are not tried."""
-    pnp: PnpOptions = field(default_factory=PnpOptions)
-    """RANSAC settings of the first pose."""
-    align: bool = True
-    """Refine the first pose by the landmarks of the map; else it is the answer."""
-    alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
-    """How landmarks are looked for."""
-    patches_short_side: int = 480
-    """Landmarks are looked for in the image at this short side at most, pixels."""
-    loaded_keyframes: int = 256
-    """Keyframes that stay decoded in memory."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Query:
-    """An image on its way."""
-
-    image: np.ndarray
-    features: Tensor
-    short_side: int
-
-    @cached_property
-    def grey(self) -> np.ndarray:
-        """The image that landmarks are looked for in."""
-        height, width = self.image.shape[:2]
-        plain = Camera(width, height, 1, 1, 0, 0)
-        return working_image(self.image, plain, min(self.short_side, height, width))[0]
-
-    @cached_property
-    def pyramid(self) -> list[np.ndarray]:
-        return image_pyramid(self.grey, 2)
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    """A scene to try, with its keyframes that look like the image, best first."""
-
-    scene: int
-    keyframes: NDArray[np.int64]
-    match_stride: int = 1
-
-
-@dataclass(frozen=True, eq=False)
-class _Hypothesis:
-    """A pose for one image under the assumption that it shows one scene."""
-
-    scene: int
-    pose: SE3 | None = None
-    """base_from_camera, as the map has it."""
-    covariance: np.ndarray | None = None
-    inliers: int = 0
-    ratio: float = 0.0
-    pixels: np.ndarray | None = None
-    points_m: np.ndarray | None = None
-    aligned: bool = False
-    matched: int = 0
-
-    @property
-    def support(self) -> float:
-        """What the scene's threshold is compared with, see `localization.acceptance`."""
-        exact = self.inliers / self.matched if self.aligned else 1.0
-        return self.ratio * exact * self.inliers**0.5
 
 
 class Localizer:
@@ -137,8 +44,8 @@ class Localizer:
     def __init__(self, maps: SceneMaps, options: LocalizeOptions | None = None):
         self.maps, self.options = maps, options or LocalizeOptions()
         self._view = ViewOptions(short_side=maps.short_side)
-        self._prototypes = [record.prototypes.float() for record in maps.scenes]
         self._bank = KeyframeBank(maps, self.options.loaded_keyframes)
+        self._matcher = Matcher(maps, self._bank, self.options)
         for head in maps.heads:
             head.eval()
 
@@ -234,12 +141,12 @@ class Localizer:
     def _locate(
         self, image: np.ndarray, features: Tensor, camera: Camera | None, began: float
     ) -> PoseEstimate:
-        query = _Query(image, features, self.options.patches_short_side)
+        query = Query(image, features, self.options.patches_short_side)
         cameras = self._cameras(camera, image.shape)
         usable = [i for i, c in enumerate(cameras) if c is not None]
-        best: _Hypothesis | None = None
+        best: Hypothesis | None = None
         for attempt in self.options.attempts if len(self._bank) else (Attempt(0, 1),):
-            for candidate in self._candidates(query, usable, attempt):
+            for candidate in self._matcher.candidates(query, usable, attempt, self._one_answer()):
                 trial = self._hypothesis(query, candidate, cameras)
                 if best is None or trial.support > best.support:
                     best = trial
@@ -266,73 +173,23 @@ class Localizer:
             )
         return found
 
-    def _candidates(self, query: _Query, usable: list[int], attempt: Attempt) -> list[_Candidate]:
-        """Scenes to try, the likeliest first."""
-        features = query.features.flatten(1).T
-        ranked = self._bank.retrieve(features, usable)
-        if len(ranked):
-            return self._voted(features, ranked, attempt)
-        none = np.zeros(0, np.int64)
-        if self._one_answer():
-            return [_Candidate(usable[0], none)]
-        descriptor = self._descriptor(query)
-        likeness = {i: float((self._prototypes[i] @ descriptor).max()) for i in usable}
-        usable.sort(key=lambda i: -likeness[i])
-        floor = likeness[usable[0]] - self.options.margin
-        likely = [i for i in usable if likeness[i] >= floor][: self.options.candidates]
-        return [_Candidate(i, none) for i in likely]
-
-    @torch.inference_mode()
-    def _voted(
-        self, features: Tensor, ranked: NDArray[np.int64], attempt: Attempt
-    ) -> list[_Candidate]:
-        """Patches of the image vote for the keyframes that rank first, and so for scenes.
-
-        A scene is tried with the keyframes that got most votes, and where these are too few, with
-        those of its others whose descriptors are most alike.
-        """
-        proposed, rest = ranked[: attempt.retrieved], ranked[attempt.retrieved :]
-        some = features[:: self.options.retrieval_stride]
-        best = []
-        for index in proposed:
-            keys = self._bank.load(int(index)).features
-            best.append((some.to(keys.dtype) @ keys.T).max(1).values.float())
-        votes = np.bincount(torch.stack(best).argmax(0).numpy(), minlength=len(proposed))
-        order = np.argsort(-votes, kind="stable")
-        scene = self._bank.scene[proposed]
-        total = {int(s): int(votes[scene == s].sum()) for s in np.unique(scene)}
-        likely = sorted(total, key=lambda s: -total[s])[: self.options.candidates]
-        enough = self.options.votes * total[likely[0]]
-        found = []
-        for s in likely:
-            voted = proposed[order[scene[order] == s]]
-            others = rest[self._bank.scene[rest] == s]
-            if total[s] >= enough:
-                both = np.concatenate([voted, others])[: self.options.keyframes]
-                found.append(_Candidate(s, both, attempt.match_stride))
-        return found
-
     def _one_answer(self) -> bool:
         """Whether the network itself decides which scene answers (condition `descriptor`)."""
         heads = self.maps.heads
         return len(heads) == 1 and heads[0].options.condition == "descriptor"
 
-    @torch.inference_mode()
-    def _descriptor(self, query: _Query) -> Tensor:
-        return self.maps.descriptor(query.features[None])[0]
-
     def _hypothesis(
-        self, query: _Query, candidate: _Candidate, cameras: list[Camera | None]
-    ) -> _Hypothesis:
+        self, query: Query, candidate: Candidate, cameras: list[Camera | None]
+    ) -> Hypothesis:
         """A pose in one scene: match, PnP, align."""
         scene, camera = candidate.scene, cameras[candidate.scene]
         assert camera is not None, "only scenes whose camera fits are tried"
-        pixels, points, cells = self._correspondences(query, candidate, camera)
+        pixels, points, cells = self._matcher.correspondences(query, candidate, camera)
         small = camera.short_side_resized(self.maps.short_side)
         intrinsics = np.array([small.fx, small.fy, small.cx, small.cy])
         rough = solve_pnp(pixels, points, intrinsics, self.options.pnp)
         if rough is None:
-            return _Hypothesis(scene)
+            return Hypothesis(scene)
         if self._one_answer():
             scene = self._scene_of(rough, scene)
             own = cameras[scene]
@@ -343,7 +200,7 @@ class Localizer:
         agree = rough.inliers
         sources = max(1, len(pixels) // cells)
         voices = agree[: sources * cells].reshape(sources, cells).any(0).sum()
-        return _Hypothesis(
+        return Hypothesis(
             scene,
             rough.world_from_camera,
             rough.covariance,
@@ -354,8 +211,8 @@ class Localizer:
         )
 
     def _aligned(
-        self, query: _Query, candidate: _Candidate, camera: Camera, rough: PnpResult
-    ) -> _Hypothesis:
+        self, query: Query, candidate: Candidate, camera: Camera, rough: PnpResult
+    ) -> Hypothesis:
         height, width = query.grey.shape
         keyframes = [self._bank.load(int(index)) for index in candidate.keyframes]
         found: Alignment | None = align_pose(
@@ -367,9 +224,9 @@ class Localizer:
         )
         if found is None:
             pose, covariance = rough.world_from_camera, rough.covariance
-            return _Hypothesis(candidate.scene, pose, covariance, aligned=True)
+            return Hypothesis(candidate.scene, pose, covariance, aligned=True)
         scale = self.maps.short_side / min(height, width)
-        return _Hypothesis(
+        return Hypothesis(
             candidate.scene,
             found.pose.base_from_camera,
             found.pose.covariance,
@@ -381,56 +238,6 @@ class Localizer:
             matched=found.matched,
         )
 
-    @torch.inference_mode()
-    def _correspondences(
-        self, query: _Query, candidate: _Candidate, camera: Camera
-    ) -> tuple[np.ndarray, np.ndarray, int]:
-        """What is matched to points of a scene.
-
-        Returns:
-            Pixels (m, 2) at the encoder's working size, points (m, 3) in the scene's base frame,
-            and how many patches of the image they stand for.
-        """
-        small = camera.short_side_resized(self.maps.short_side)
-        pixels = ideal_cell_pixels(small, self.maps.encoder.stride).astype(np.float64)
-        features = query.features.flatten(1).T
-        sources, cells = [], len(pixels)
-        if len(candidate.keyframes):
-            some = self._strided(query, candidate)
-            cells = len(some)
-            sources.append((pixels[some], self._matched(features[some], candidate.keyframes)))
-        if self.maps.heads:
-            points = self._predicted(query, candidate.scene)
-            take = self._strided(query, candidate) if sources else slice(None)
-            sources.append((pixels[take], points[take]))
-        return (
-            np.concatenate([source[0] for source in sources]),
-            np.concatenate([source[1] for source in sources]),
-            cells,
-        )
-
-    def _strided(self, query: _Query, candidate: _Candidate) -> NDArray[np.int64]:
-        """The patches of the image that are matched to keyframes."""
-        rows, columns = query.features.shape[1:]
-        step = candidate.match_stride if self.options.align else 1
-        return np.arange(rows * columns).reshape(rows, columns)[::step, ::step].ravel()
-
-    def _matched(self, features: Tensor, keyframes: NDArray[np.int64]) -> np.ndarray:
-        """(n, 3) points of the keyframes' patches that are most similar to (n, channels)."""
-        loaded = [self._bank.load(int(index)) for index in keyframes]
-        keys = torch.cat([keyframe.features for keyframe in loaded])
-        best = _largest(features.to(keys.dtype) @ keys.T)
-        return np.concatenate([keyframe.points_m for keyframe in loaded])[best]
-
-    def _predicted(self, query: _Query, scene: int) -> np.ndarray:
-        """(cells, 3) points that the network predicts, in the scene's base frame."""
-        head, local = self.maps.head_for(scene)
-        features = query.features.flatten(1).T
-        with autocast():
-            output = head(features, local, self._descriptor(query).expand(len(features), -1))
-        points = output.points.double().numpy()
-        return self.maps.scenes[scene].cell.atlas_from_base.inverse().apply(points)
-
     def _scene_of(self, rough: PnpResult, scene: int) -> int:
         """The scene in whose cell of the atlas a pose lies."""
         atlas_from_base = self.maps.scenes[scene].cell.atlas_from_base
@@ -438,13 +245,13 @@ class Localizer:
         found = self.maps.atlas().scene_at(place)
         return scene if found is None else found
 
-    def _accepted(self, best: _Hypothesis) -> bool:
+    def _accepted(self, best: Hypothesis) -> bool:
         record = self.maps.scenes[best.scene]
         if best.aligned:
             return best.inliers > 0 and best.support >= record.min_support
         return best.ratio >= record.inlier_threshold
 
-    def _answer(self, best: _Hypothesis, began: float) -> PoseEstimate:
+    def _answer(self, best: Hypothesis, began: float) -> PoseEstimate:
         def refused(status, reason: str) -> PoseEstimate:
             ms = 1000 * (time.perf_counter() - began)
             return PoseEstimate(
@@ -481,14 +288,14 @@ class Localizer:
             best.support,
         )
 
-    def _outside(self, best: _Hypothesis, record: SceneRecord) -> bool:
+    def _outside(self, best: Hypothesis, record: SceneRecord) -> bool:
         """Whether a pose lies where the scene has nothing; the atlas tells for networks."""
         assert best.pose is not None
         place = record.cell.atlas_from_base.apply(best.pose.translation_m)
         return self.maps.atlas().scene_at(place) != best.scene
 
 
-def _why(best: _Hypothesis, record: SceneRecord) -> str:
+def _why(best: Hypothesis, record: SceneRecord) -> str:
     if best.aligned:
         return (
             f"{best.inliers} landmarks, {100 * best.ratio:.0f} % of those that should be visible,"
@@ -496,16 +303,6 @@ def _why(best: _Hypothesis, record: SceneRecord) -> str:
         )
     need = f"{100 * record.inlier_threshold:.0f} %"
     return f"{100 * best.ratio:.0f} % of the patches agree, {record.name} needs {need}"
-
-
-def _largest(value: Tensor) -> np.ndarray:
-    """(n,) the column of the largest value of each row.
-
-    The bits of a positive float are ordered as it is; numpy finds the largest of them in a
-    hundredth of the time that torch takes for bfloat16.
-    """
-    kind = torch.int16 if value.dtype == torch.bfloat16 else torch.int32
-    return value.contiguous().view(kind).numpy().argmax(1)
 
 
 def _same_shape(camera: Camera, width: int, height: int) -> bool:

@@ -20,26 +20,20 @@ from evercal.mapping.bundle_adjustment import (
     Adjustment,
     BundleAdjustment,
     BundleOptions,
-    BundleTracks,
 )
+from evercal.mapping.bundle_tracks import bundle_tracks
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.pose_check import PoseCheckOptions, contradicting_frames
 from evercal.mapping.recording import Recording, WorkingSize
 from evercal.mapping.selection import SarsOptions, select_sars
 from evercal.mapping.tracks import (
     KeyframeTracks,
-    Observations,
     TrackOptions,
-    joined,
-    observe,
     open_keyframe,
     refine_depths,
 )
 
 Result = TypeVar("Result")
-
-_WIDE_STEPS = ((2, 4), (1, 4), (0, 4))
-_PROBES = 64
 
 
 @dataclass(frozen=True)
@@ -56,8 +50,6 @@ class MapOptions:
     """When a stated pose is wrong."""
     support_frames: int = 250
     """Frames that take part beside the keyframes, spread evenly; more add time and no precision."""
-    bundle_landmarks: int = 6000
-    """Landmarks in bundle adjustment over all keyframes, at most."""
     adjust: bool = True
     """Adjust poses and lens; else they are taken as stated."""
     rounds: int = 2
@@ -243,7 +235,7 @@ def _adjust(
     adjustment = None
     for number in range(options.rounds):
         yield Mapping("adjusting", number, options.rounds)
-        tracks = _bundle_tracks(recording, keyframes, options)
+        tracks = bundle_tracks(recording, keyframes, options.tracks)
         problem = BundleAdjustment(recording.stated, stated_cameras, velocity, options.bundle)
         adjustment = problem.solve(tracks)
         recording.adjust(adjustment.poses, adjustment.camera)
@@ -275,82 +267,6 @@ def _bent(camera: Camera | None, stated: Camera) -> bool:
         return False
     now, before = ((*c.distortion, 0.0, 0.0)[:2] for c in (camera, stated))
     return float(np.abs(np.subtract(now, before)).max()) > 1e-3
-
-
-def _bundle_tracks(
-    recording: Recording, keyframes: list[KeyframeTracks], options: MapOptions
-) -> BundleTracks:
-    """A spread subset of the landmarks, in all frames that see enough of their keyframe."""
-    o = options.tracks
-    most = max(30, min(o.landmarks_per_keyframe, options.bundle_landmarks // len(keyframes)))
-    tied = _tied_frames(recording, keyframes, o)
-    parts: list[Observations] = []
-    host, pixels, inverse, start = [], [], [], 0
-    for keyframe, frames in zip(keyframes, tied, strict=True):
-        which = np.flatnonzero(keyframe.kept)
-        if len(which) < most // 2:
-            which = np.arange(len(keyframe.landmarks))
-        if len(which) > most:
-            which = which[np.linspace(0, len(which) - 1, most).astype(int)]
-        if not len(which):
-            continue
-        number = np.full(len(keyframe.landmarks), -1)
-        number[which] = start + np.arange(len(which))
-        for j in frames:
-            seen = observe(recording, keyframe, j, which, _WIDE_STEPS, o.wide_reach_px, o)
-            parts.append(
-                Observations(number[seen.landmark], seen.frame, seen.pixels, seen.whitening)
-            )
-        host.append(np.full(len(which), keyframe.frame))
-        pixels.append(keyframe.landmarks.pixels[which])
-        inverse.append(keyframe.landmarks.inverse_depth[which])
-        start += len(which)
-    seen = joined(parts)
-    often = np.bincount(seen.landmark, minlength=start)[seen.landmark] >= 2
-    return BundleTracks(
-        np.concatenate(host),
-        np.concatenate(pixels),
-        np.concatenate(inverse),
-        seen.landmark[often],
-        seen.frame[often],
-        seen.pixels[often],
-        seen.whitening[often],
-    )
-
-
-def _tied_frames(
-    recording: Recording, keyframes: list[KeyframeTracks], options: TrackOptions
-) -> list[list[int]]:
-    """Frames in which each keyframe's landmarks are looked for."""
-    shared = np.stack([_shared(recording, keyframe) for keyframe in keyframes])
-    best = np.argsort(-shared, axis=0, kind="stable")[: options.frames_per_keyframe]
-    tied = np.zeros(shared.shape, bool)
-    np.put_along_axis(tied, best, True, axis=0)
-    tied &= shared > options.min_shared
-    return [
-        sorted({*np.flatnonzero(row).tolist(), *keyframe.sources} - {keyframe.frame})
-        for row, keyframe in zip(tied, keyframes, strict=True)
-    ]
-
-
-def _shared(recording: Recording, keyframe: KeyframeTracks) -> np.ndarray:
-    """(n,) how much of a keyframe's view every frame sees from a similar direction, 0 to 1."""
-    cells = recording.posed_cells(keyframe.frame)
-    some = np.linspace(0, len(keyframe.cell_inverse_depth) - 1, _PROBES).astype(int)
-    local = cells.rays()[some] / keyframe.cell_inverse_depth[some, None]
-    points = cells.base_from_camera.apply(local)
-    towards = points[None] - recording.translation_m[:, None]
-    unit = towards / (np.linalg.norm(towards, axis=-1, keepdims=True) + 1e-9)
-    within = np.einsum("nji,npj->npi", recording.rotation, towards)
-    shared = np.zeros(len(recording))
-    for i in range(len(recording)):
-        camera, front = recording.cameras[i], within[i, :, 2] > 0.1
-        at = camera.project(np.where(front[:, None], within[i], [0, 0, 1]))
-        inside = front & (at > 0).all(1) & (at < [camera.width, camera.height]).all(1)
-        like = ((unit[i] * unit[keyframe.frame]).sum(1) - 0.7).clip(0, 1) / 0.3
-        shared[i] = (inside * like).mean()
-    shared[keyframe.frame] = 0
-    return shared
 
 
 def _finished(

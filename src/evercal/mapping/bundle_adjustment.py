@@ -18,11 +18,20 @@ from scipy.spatial.transform import Rotation
 
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
+from evercal.mapping.jacobians import (
+    COMMON,
+    GLOBALS,
+    LENS,
+    SHIFT,
+    Linearised,
+    camera_jacobian,
+    cross,
+    projection_slopes,
+    ray_slopes,
+)
 
 Array = NDArray[np.floating]
 
-COMMON, SHIFT, LENS = 6, 1, 5
-GLOBALS = COMMON + SHIFT + LENS
 _GROUPS = ((0, 3), (3, 6), (6, 7), (7, 8), (8, 10), (10, 12))
 """Common translation, common rotation, time shift, focal length, principal point, distortion: what
 is judged relevant or not together."""
@@ -200,7 +209,7 @@ class BundleAdjustment:
             groups.setdefault(camera, []).append(i)
         return [(c, np.flatnonzero(np.isin(frames, which))) for c, which in groups.items()]
 
-    def _linearised(self, tracks: BundleTracks, state: _State) -> "_Linearised":
+    def _linearised(self, tracks: BundleTracks, state: _State) -> Linearised:
         turn, place = self._poses(state)
         k, j = tracks.host[tracks.landmark], tracks.frame
         ray = np.zeros((len(tracks.host), 3))
@@ -217,19 +226,19 @@ class BundleAdjustment:
         at, slope, bent = np.zeros_like(plane), np.zeros((len(j), 2, 2)), np.zeros((len(j), 2, 5))
         for camera, rows in self._lenses(state, j):
             at[rows] = camera.project(seen[rows])
-            slope[rows], bent[rows] = _projection_slopes(plane[rows], camera)
+            slope[rows], bent[rows] = projection_slopes(plane[rows], camera)
         to_plane = np.zeros((len(j), 2, 3))
         to_plane[:, 0, 0] = to_plane[:, 1, 1] = 1 / seen[:, 2]
         to_plane[:, :, 2] = -plane / seen[:, 2:]
         by_point = slope @ to_plane
         by_host = by_point @ across
         by_ray = by_host[:, :, :2] / rho[..., None]
-        lens = bent + _ray_slopes(by_ray, ray, self._cameras[0])
+        lens = bent + ray_slopes(by_ray, ray, self._cameras[0])
         white = tracks.whitening
-        return _Linearised(
+        return Linearised(
             np.einsum("nij,nj->ni", white, at - tracks.observed),
-            white @ np.concatenate([by_host, -by_host @ _cross(ray / rho)], 2),
-            white @ np.concatenate([-by_point, by_point @ _cross(seen)], 2),
+            white @ np.concatenate([by_host, -by_host @ cross(ray / rho)], 2),
+            white @ np.concatenate([-by_point, by_point @ cross(seen)], 2),
             np.einsum("nij,njk,nk->ni", white, -by_host, ray) / rho**2,
             white @ lens,
         )
@@ -243,7 +252,7 @@ class BundleAdjustment:
         k, j, p = tracks.host[tracks.landmark], tracks.frame, len(tracks.host)
         hold = np.bincount(tracks.landmark, weight * (lin.depth**2).sum(1), p) + 1e-6
         pull = np.bincount(tracks.landmark, weight * (lin.depth * lin.residual).sum(1), p)
-        jacobian = _camera_jacobian(lin, k, j, n)
+        jacobian = camera_jacobian(lin, k, j, n)
         root = np.repeat(np.sqrt(weight), 2)
         scaled = sparse.diags_array(root) @ jacobian
         rows = np.arange(2 * len(j))
@@ -351,77 +360,7 @@ class BundleAdjustment:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Linearised:
-    """Whitened residuals (m, 2) and their derivatives by host pose, pose, depth and lens."""
-
-    residual: Array
-    host: Array
-    own: Array
-    depth: Array
-    lens: Array
-
-
 def _small_motion(six: Array) -> SE3:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = Rotation.from_rotvec(six[3:]).as_matrix(), six[:3]
     return SE3.from_matrix(matrix)
-
-
-def _cross(v: Array) -> Array:
-    """(n, 3, 3) matrices of the cross product with (n, 3) vectors."""
-    matrix = np.zeros((len(v), 3, 3))
-    matrix[:, 0, 1], matrix[:, 0, 2], matrix[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    return matrix - matrix.transpose(0, 2, 1)
-
-
-def _radial(camera: Camera) -> tuple[float, float]:
-    k1, k2 = (*camera.distortion[:2], 0.0, 0.0)[:2]
-    return k1, k2
-
-
-def _projection_slopes(plane: Array, camera: Camera) -> tuple[Array, Array]:
-    """Derivatives of pixels by points of the plane z = 1 (n, 2, 2) and by the lens (n, 2, 5)."""
-    (k1, k2), focal = _radial(camera), np.array([camera.fx, camera.fy])
-    r2 = (plane**2).sum(1)
-    radial = 1 + r2 * (k1 + r2 * k2)
-    outer = plane[:, :, None] * plane[:, None, :] * (2 * k1 + 4 * k2 * r2)[:, None, None]
-    by_plane = (np.eye(2) * radial[:, None, None] + outer) * focal[:, None]
-    lens = np.zeros((len(plane), 2, LENS))
-    lens[:, :, 0] = plane * radial[:, None] * focal
-    lens[:, 0, 1] = lens[:, 1, 2] = 1
-    lens[:, :, 3] = plane * r2[:, None] * focal
-    lens[:, :, 4] = plane * (r2**2)[:, None] * focal
-    return by_plane, lens
-
-
-def _ray_slopes(by_ray: Array, ray: Array, camera: Camera) -> Array:
-    """(n, 2, 5) derivatives of pixels by the lens through the ray of the host, to first order."""
-    plane, focal = ray[:, :2], np.array([camera.fx, camera.fy])
-    r2 = (plane**2).sum(1)[:, None]
-    slopes = np.zeros((len(ray), 2, LENS))
-    slopes[:, :, 0] = -np.einsum("nij,nj->ni", by_ray, plane)
-    slopes[:, :, 1:3] = -by_ray / focal
-    slopes[:, :, 3] = -np.einsum("nij,nj->ni", by_ray, plane * r2)
-    slopes[:, :, 4] = -np.einsum("nij,nj->ni", by_ray, plane * r2**2)
-    return slopes
-
-
-def _camera_jacobian(
-    lin: _Linearised, host: NDArray[np.int64], frame: NDArray[np.int64], n: int
-) -> sparse.csr_array:
-    """(2 m, 6 n + 12) derivatives of the residuals by poses and shared parameters."""
-    m, six = len(frame), np.arange(6)
-    start = 6 * n + COMMON + SHIFT
-    columns = np.concatenate(
-        [
-            6 * host[:, None] + six,
-            6 * frame[:, None] + six,
-            np.broadcast_to(start + np.arange(LENS), (m, LENS)),
-        ],
-        1,
-    )
-    values = np.concatenate([lin.host, lin.own, lin.lens], 2)
-    rows = np.repeat(np.arange(2 * m), columns.shape[1])
-    where = np.repeat(columns[:, None], 2, 1).ravel()
-    return sparse.csr_array((values.ravel(), (rows, where)), shape=(2 * m, 6 * n + GLOBALS))

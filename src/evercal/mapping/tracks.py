@@ -30,6 +30,8 @@ class TrackOptions:
     """Every frame is tied to this many keyframes that see the same, in bundle adjustment."""
     landmarks_per_keyframe: int = 200
     """Landmarks of a keyframe that take part in bundle adjustment, at most."""
+    bundle_landmarks: int = 6000
+    """Landmarks in bundle adjustment over all keyframes, at most."""
     min_shared: float = 0.15
     """Smallest share of a keyframe's view that a frame tied to it must see."""
     floor_px: float = 0.1
