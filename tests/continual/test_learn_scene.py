@@ -24,6 +24,7 @@ from evercal.errors import InputError
 from evercal.geometry.se3 import SE3
 from evercal.localization import acceptance
 from evercal.localization.localizer import Localizer
+from evercal.mapping.build import Mapping
 from evercal.mapping.stage_files import head_bytes
 from evercal.mapping.store import Checkpoint, Store
 from evercal.networks.trainer import Progress
@@ -281,6 +282,134 @@ def linger(event):
 scene = generic.load(Path(sys.argv[2]))
 learn_scene(Path(sys.argv[1]), scene, LearnOptions(stage, "evercal_network", short_side=48), linger)
 """
+
+
+MAP_CHILD = """
+import sys, time
+from pathlib import Path
+from evercal.continual.learn_scene import LearnOptions, learn_scene
+from evercal.datasets import generic
+from evercal.mapping.build import Mapping
+def linger(event):
+    if isinstance(event, Mapping) and event.what == sys.argv[3]:
+        print("now", flush=True)
+        time.sleep(600)
+learn_scene(Path(sys.argv[1]), generic.load(Path(sys.argv[2])), LearnOptions(short_side=48), linger)
+"""
+
+
+@pytest.fixture(scope="module")
+def mapped(
+    rooms: Rooms, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, list[LearnReport], list[object]]:
+    """A store of maps after two scenes, with the reports and the events."""
+    root, events = tmp_path_factory.mktemp("mapped") / "store", []
+    for room in rooms[:2]:
+        generic.write(root.parent / room.name, room)
+    scenes = [generic.load(root.parent / room.name) for room in rooms[:2]]
+    options = LearnOptions(short_side=48)
+    reports = []
+    for scene in scenes:
+        reports.append(learn_scene(root, scene, options, events.append))
+        shutil.copytree(root, root.parent / f"after-{scene.name}")
+    return root, reports, events
+
+
+def test_a_map_is_learned_without_a_step(
+    mapped: tuple[Path, list[LearnReport], list[object]],
+) -> None:
+    root, reports, events = mapped
+    maps = Store.open(root).maps
+    assert maps.strategy == "evercal"
+    assert maps.heads == []
+    for i, report in enumerate(reports):
+        keyframes, record = maps.keyframes[i], maps.scenes[i]
+        assert keyframes is not None
+        assert (report.iterations, report.head_bytes, report.resumed) == (0, 0, False)
+        assert report.landmarks == sum(map(len, keyframes.landmarks)) > 30
+        assert report.frames_kept == len(keyframes) == 2
+        assert report.adjusted is not None
+        assert report.adjusted.residual_px < 0.5
+        assert report.adjusted.wrong_poses == ()
+        assert 0.5 <= record.min_support <= 1.5
+        assert record.refined_camera is not None
+    whats = {event.what for event in events if isinstance(event, Mapping)}
+    assert whats == {"encoding", "mapping", "adjusting"}
+    assert {type(event) for event in events} == {Mapping}
+
+
+@pytest.mark.parametrize("what", ["encoding", "mapping", "adjusting"])
+def test_kill_nine_while_a_map_is_built(
+    what: str,
+    mapped: tuple[Path, list[LearnReport], list[object]],
+    rooms: Rooms,
+    tmp_path: Path,
+    tree: Tree,
+    learned: Tree,
+) -> None:
+    whole, store = mapped[0], tmp_path / "store"
+    shutil.copytree(whole.parent / "after-alpha", store)
+    image = rooms[0].train[0].read_image()
+    before, expected = tree(store), Localizer.open(store).localize(image)
+    command = [sys.executable, "-c", MAP_CHILD, str(store), str(whole.parent / "beta"), what]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "now\n"
+        child.send_signal(signal.SIGKILL)
+        assert child.wait(60) == -signal.SIGKILL
+    # The store is at its last complete scene and says the same.
+    now = tree(store)
+    assert {name: now.get(name) for name in before} == before
+    assert all(name.startswith("learning/") for name in now.keys() - before.keys())
+    found = Localizer.open(store)
+    assert found.scenes == ("alpha",)
+    again = found.localize(image)
+    assert (again.status, again.inliers) == (expected.status, expected.inliers)
+    assert again.status == "ok"
+    # And the same command succeeds, with the same outcome as without the kill.
+    learn_scene(store, generic.load(whole.parent / "beta"), LearnOptions(short_side=48))
+    assert learned(store).keys() == learned(whole).keys()
+    one, two = (Store.open(root).maps.keyframes[1] for root in (store, whole))
+    assert one is not None
+    assert two is not None
+    assert list(map(len, one.landmarks)) == list(map(len, two.landmarks))
+    for a, b in zip(one.landmarks, two.landmarks, strict=True):
+        np.testing.assert_allclose(a.inverse_depth, b.inverse_depth, rtol=1e-6)
+
+
+def test_a_stop_while_a_map_is_built_leaves_nothing_that_counts(
+    mapped: tuple[Path, list[LearnReport], list[object]], tmp_path: Path, learned: Tree
+) -> None:
+    whole, store = mapped[0], tmp_path / "store"
+    alpha = generic.load(whole.parent / "alpha")
+
+    def stop(event: object) -> None:
+        if isinstance(event, Mapping) and event.what == "mapping":
+            raise Stop
+
+    with pytest.raises(Stop):
+        learn_scene(store, alpha, LearnOptions(short_side=48), stop)
+    with pytest.raises(InputError):
+        Store.open(store)  # nothing was learned yet
+    report = learn_scene(store, alpha, LearnOptions(short_side=48))
+    assert learned(store) == learned(whole.parent / "after-alpha")
+    assert not report.resumed
+
+
+def test_frames_without_parallax_are_refused_and_leave_nothing(
+    rooms: Rooms, tmp_path: Path
+) -> None:
+    spot = np.array([0.0, 0, 1.3])
+    frames = tuple(
+        replace(f, base_from_camera=SE3(f.base_from_camera.rotation_wxyz, spot))
+        for f in rooms[0].train
+        if f.base_from_camera
+    )
+    with pytest.raises(InputError, match="under parallax"):
+        learn_scene(
+            tmp_path / "s", replace(rooms[0], train=frames), LearnOptions(short_side=48)
+        )
+    assert not (tmp_path / "s").exists()
 
 
 def test_kill_nine(

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from safetensors.torch import load, save
 
 from evercal.datasets.frame import Frame, Scene
@@ -11,6 +12,7 @@ from evercal.features.views import working_image
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.mapping.keyframes import Keyframes, store_keyframes
+from evercal.mapping.landmarks import Landmarks
 
 DISTORTIONS = ((), (0.1, -0.05, 0.001, 0.002), (0.1, -0.05, 0.001, 0.002, 0.01),
                (0.1, -0.05, 0.001, 0.002, 0.01, 0.02, -0.03, 0.004))  # fmt: skip
@@ -95,3 +97,51 @@ def test_large_images_are_kept_at_working_size(size: tuple[int, int]) -> None:
     np.testing.assert_allclose(columns[middle], ramp[0, 4 * middle + 1, 0], atol=2.5)
     small = replace(frame, image=kept.read_image(), camera=kept.camera)
     assert store_keyframes([small], 120).bytes < store_keyframes([frame], 480).bytes / 4
+
+
+def mapped(frames: tuple[Frame, ...], counts: tuple[int, ...]) -> Keyframes:
+    """Keyframes with depths, descriptors and so many landmarks each."""
+    rng = np.random.default_rng(0)
+    marks = tuple(
+        Landmarks(
+            rng.integers(0, 640, (n, 2)).astype(float),
+            rng.uniform(0.1, 4, n).astype(np.float32).astype(float),
+            rng.normal(0, 0.01, (n, 2)).astype(np.float32).astype(float),
+            rng.uniform(0.001, 0.1, n).astype(np.float32).astype(float),
+        )
+        for n in counts
+    )
+    depths = tuple(torch.rand(48, dtype=torch.float32).half() + 0.1 for _ in counts)
+    descriptors = torch.randn(len(counts), 16).half()
+    plain = store_keyframes(frames[: len(counts)], 48)
+    return replace(plain, inverse_depth=depths, landmarks=marks, descriptors=descriptors)
+
+
+@pytest.mark.parametrize("counts", [(7, 0, 12), (0, 0), (5,)])
+def test_a_map_comes_back_exactly_and_counts(
+    counts: tuple[int, ...], rooms: tuple[Scene, ...]
+) -> None:
+    keyframes = mapped(rooms[0].train, counts)
+    back = through_a_file(keyframes)
+    assert len(back) == len(back.landmarks) == len(back.inverse_depth) == len(counts)
+    for a, b in zip(back.landmarks, keyframes.landmarks, strict=True):
+        for name in ("pixels", "inverse_depth", "slope", "sigma"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+            assert getattr(a, name).dtype == np.float64
+    for one, two in zip(back.inverse_depth, keyframes.inverse_depth, strict=True):
+        assert torch.equal(one, two)
+    assert keyframes.descriptors is not None
+    assert torch.equal(torch.as_tensor(back.descriptors), keyframes.descriptors)
+    # 16 bytes of floats and 4 of pixels a landmark.
+    plain = replace(keyframes, landmarks=(), descriptors=None, inverse_depth=())
+    extra = 20 * sum(counts) + 8 * len(counts) + (2 * 48 + 8) * len(counts) + 32 * len(counts)
+    assert keyframes.bytes == plain.bytes + extra
+    nothing = through_a_file(plain)
+    assert (nothing.landmarks, nothing.descriptors, nothing.inverse_depth) == ((), None, ())
+
+
+def test_pixels_beyond_single_bytes_survive(rooms: tuple[Scene, ...]) -> None:
+    keyframes = mapped(rooms[0].train, (2,))
+    far = replace(keyframes.landmarks[0], pixels=np.array([[32767.0, 0], [1919, 1079]]))
+    back = through_a_file(replace(keyframes, landmarks=(far,)))
+    np.testing.assert_array_equal(back.landmarks[0].pixels, far.pixels)

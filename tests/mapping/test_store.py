@@ -37,7 +37,7 @@ def stored(head: Head) -> dict[str, Tensor]:
     }
 
 
-@pytest.mark.parametrize("strategy", ["evercal_network", "isolation"])
+@pytest.mark.parametrize("strategy", ["evercal", "evercal_network", "isolation"])
 def test_what_is_committed_is_what_opens(
     strategy: str, taught: Stages, tmp_path: Path, make: Make
 ) -> None:
@@ -65,6 +65,12 @@ def test_what_is_committed_is_what_opens(
             assert (a.images, a.cameras) == (b.images, b.cameras)
             poses = a.base_from_camera, b.base_from_camera
             np.testing.assert_allclose(poses[0].matrix(), poses[1].matrix(), atol=1e-15)
+            one, two = a.to_tensors(), b.to_tensors()
+            assert one.keys() == two.keys()
+            assert bool(a.landmarks) == (strategy == "evercal")
+            for name, value in one.items():
+                if name != "poses":
+                    assert torch.equal(value, two[name])
     grey = torch.rand(1, 1, 48, 64, generator=torch.Generator().manual_seed(0))
     for name in ("encoder", "descriptor"):
         a, b = getattr(again, name), getattr(maps, name)
@@ -72,10 +78,11 @@ def test_what_is_committed_is_what_opens(
         torch.testing.assert_close(a(x), b(x), rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("strategy", ["evercal", "evercal_network"])
 def test_everything_can_be_opened_and_written_again_without_a_change(
-    taught: Stages, tmp_path: Path, make: Make, tree: Tree
+    strategy: str, taught: Stages, tmp_path: Path, make: Make, tree: Tree
 ) -> None:
-    make(tmp_path / "a", taught["evercal_network"][:1])
+    make(tmp_path / "a", taught[strategy][:1])
     make(tmp_path / "b", [Store.open(tmp_path / "a").maps])
     a, b = tree(tmp_path / "a"), tree(tmp_path / "b")
     assert a.keys() == b.keys()
@@ -105,7 +112,7 @@ def test_poses_survive_the_disk(
 
 
 @pytest.mark.parametrize(
-    ("strategy", "heads"), [("evercal_network", [3]), ("isolation", [1, 2, 3])]
+    ("strategy", "heads"), [("evercal", []), ("evercal_network", [3]), ("isolation", [1, 2, 3])]
 )
 def test_only_heads_that_count_are_kept(
     strategy: str, heads: list[int], taught: Stages, tmp_path: Path, make: Make
@@ -146,14 +153,15 @@ def test_any_name_of_a_scene_will_do(taught: Stages, tmp_path: Path, make: Make)
         shutil.rmtree(root)
 
 
+@pytest.mark.parametrize(("strategy", "heads"), [("evercal", 0), ("evercal_network", 1)])
 def test_every_flipped_byte_is_refused_by_name(
-    taught: Stages, tmp_path: Path, make: Make, tree: Tree
+    strategy: str, heads: int, taught: Stages, tmp_path: Path, make: Make, tree: Tree
 ) -> None:
     root = tmp_path / "store"
-    make(root, taught["evercal_network"][:2])
+    make(root, taught[strategy][:2])
     names = list(tree(root))
-    # Two networks; camera, prototypes and report twice, memory twice, one head, the manifest.
-    assert len(names) == 2 + 2 * 4 + 1 + 1
+    # Two networks; camera, prototypes and report twice, memory twice, heads, the manifest.
+    assert len(names) == 2 + 2 * 4 + heads + 1
     rng = np.random.default_rng(0)
     for name in names:
         file = root / name
@@ -217,7 +225,9 @@ def test_a_store_of_an_earlier_version_is_to_be_learned_again(
     assert tree(tmp_path) == before
 
 
-@pytest.mark.parametrize(("strategy", "heads"), [("evercal_network", 1), ("isolation", 3)])
+@pytest.mark.parametrize(
+    ("strategy", "heads"), [("evercal", 0), ("evercal_network", 1), ("isolation", 3)]
+)
 def test_a_store_opens_whatever_its_strategy_is_called(
     strategy: str,
     heads: int,

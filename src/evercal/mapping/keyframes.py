@@ -26,7 +26,7 @@ _LANDMARK_FIELDS = {
     "slope": torch.float32,
     "sigma": torch.float32,
 }
-"""Fields of `Landmarks`, in order, and how they are stored: 22 bytes a landmark."""
+"""Fields of `Landmarks`, in order, and how they are stored: 20 bytes a landmark."""
 
 
 @dataclass(frozen=True)
