@@ -427,7 +427,7 @@ class Localizer:
 
     def _accepted(self, best: _Hypothesis) -> bool:
         record = self.maps.scenes[best.scene]
-        if best.aligned:
+        if best.aligned or (self.options.align and record.min_support > 0):
             return best.support >= record.min_support
         return best.ratio >= record.inlier_threshold
 
@@ -470,6 +470,8 @@ def _why(best: _Hypothesis, record: SceneRecord) -> str:
             f"{best.inliers} landmarks, {100 * best.ratio:.0f} % of those that should be visible,"
             f" were found: support {best.support:.1f}, {record.name} needs {record.min_support:.1f}"
         )
+    if record.min_support > 0:
+        return f"too few landmarks of {record.name} were found where the pose puts them"
     need = f"{100 * record.inlier_threshold:.0f} %"
     return f"{100 * best.ratio:.0f} % of the patches agree, {record.name} needs {need}"
 
