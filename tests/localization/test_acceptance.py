@@ -55,7 +55,7 @@ def fit(
     with monkeypatch.context() as patch:
         patch.setattr(acceptance, "Localizer", Fake)
         patch.setattr(acceptance, "_negative_images", lambda *_: unknown)
-        return acceptance.fit_threshold(blank("evercal"), frames)
+        return acceptance.fit_threshold(blank("evercal_network"), frames)
 
 
 def test_the_threshold_lies_a_sixth_of_the_way_up(

@@ -25,7 +25,7 @@ def unlearned(arcs: tuple[Scene, Scene], arc_stage: StageOptions) -> SceneMaps:
     """The first arc after a dozen steps; half of its frames are remembered."""
     fit = replace(arc_stage.fit, iterations=12)
     options = replace(arc_stage, fit=fit, memory_share=0.5)
-    blank = SceneMaps(load_encoder(), load_descriptor(), "evercal", 120)
+    blank = SceneMaps(load_encoder(), load_descriptor(), "evercal_hybrid", 120)
     *_, stage = learn(blank, arcs[0], options)
     assert isinstance(stage, Stage)
     return stage.maps

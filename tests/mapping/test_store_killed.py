@@ -17,7 +17,7 @@ from evercal.storage.manifest import MANIFEST
 Stages = dict[str, list[SceneMaps]]
 Make = Callable[[Path, list[SceneMaps]], Store]
 Tree = Callable[[Path], dict[str, str]]
-Answers = Callable[[SceneMaps], list[bytes]]
+Answers = Callable[..., list[bytes]]
 Snapshots = list[Path]
 
 
@@ -74,7 +74,7 @@ def test_killed_anywhere_in_a_second_stage(
     tree: Tree,
     answers: Answers,
 ) -> None:
-    stages, root = taught["evercal"], tmp_path / "store"
+    stages, root = taught["evercal_network"], tmp_path / "store"
     make(root, stages[:1])
     expected = [answers(Store.open(root).maps)]
     identity = {"scene": "beta"}
@@ -126,7 +126,7 @@ def test_killed_anywhere_in_the_first_stage(
     tree: Tree,
     answers: Answers,
 ) -> None:
-    stages, root = taught["evercal"], tmp_path / "store"
+    stages, root = taught["evercal_network"], tmp_path / "store"
     snapshots = every_step(root, lambda: make(root, stages[:1]))
     expected = answers(Store.open(root).maps)
     opened = 0
@@ -139,7 +139,7 @@ def test_killed_anywhere_in_the_first_stage(
         where = tmp_path / f"again-{i}"
         if snapshot.exists():
             unlinked(snapshot, where)
-        store = Store.create(where, "evercal")
+        store = Store.create(where, "evercal_network")
         resume = store.begin({"scene": "alpha"})
         assert (resume is not None) == any(where.glob("learning/rows-*.safetensors"))
         store.commit(stages[0], {"scene": "alpha", "seconds": 1.5})
@@ -155,7 +155,7 @@ def test_killed_while_giving_up_an_older_stage(
 ) -> None:
     # Half of the rows of a stage must never be taken for that stage again.
     root = tmp_path / "store"
-    store = make(root, taught["evercal"][:1])
+    store = make(root, taught["evercal_network"][:1])
     store.begin({"scene": "beta"})
     for i in range(4):
         store.checkpoint(Checkpoint({"x": torch.tensor([i])}, {}))
@@ -174,7 +174,7 @@ def test_a_full_disk_leaves_the_store_as_it_was(
     make: Make,
     answers: Answers,
 ) -> None:
-    stages, root = taught["evercal"], tmp_path / "store"
+    stages, root = taught["evercal_network"], tmp_path / "store"
     make(root, stages[:1])
     expected = answers(Store.open(root).maps)
     whole, failures = os.fsync, 0

@@ -13,7 +13,7 @@ from evercal.simulation.cell_paths import changed_shots, is_clear, sweep_shots
 from evercal.simulation.changed_room import SMALL, changed_room
 from evercal.simulation.furnished.furniture import Item
 from evercal.simulation.furnished.rooms import Room, room
-from evercal.simulation.shapes import box
+from evercal.simulation.furnished.shapes import box
 
 Placed = dict[tuple[str, bytes], Item]
 

@@ -92,6 +92,7 @@ class Learn:
     def _options(self) -> "LearnOptions":
         from evercal.continual.learn_scene import LearnOptions
         from evercal.continual.presets import preset
+        from evercal.continual.strategies import STRATEGIES
 
         if self.encoder is not None and not self.encoder.is_file():
             raise InputError(f"--encoder {self.encoder}: no such file")
@@ -99,7 +100,13 @@ class Learn:
         if self.centres is not None:
             head = dataclasses.replace(stage.head, centres_per_scene=self.centres)
             stage = dataclasses.replace(stage, head=head)
-        return LearnOptions(stage, self._strategy(), self.encoder)
+        strategy = self._strategy()
+        if self.centres is not None and not STRATEGIES[strategy].network:
+            raise InputError(
+                f"--centres {self.centres}: strategy {strategy} trains no network; leave the option"
+                " out"
+            )
+        return LearnOptions(stage, strategy, self.encoder)
 
     def _strategy(self) -> str:
         """The strategy asked for, else the store's; refuses what a store cannot change later."""

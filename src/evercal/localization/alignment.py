@@ -61,6 +61,8 @@ class Alignment:
     """In the base frame of the scene."""
     expected: int
     """Landmarks that should be visible and were looked for."""
+    matched: int
+    """Landmarks whose patch was found near where it was expected."""
     pixels: Array
     """(n, 2) landmarks that agree, pixels of the image."""
     points_m: Array
@@ -123,6 +125,7 @@ def align_pose(
     return Alignment(
         refined,
         found.expected,
+        len(found.pixels),
         found.pixels[agree],
         found.points_m[agree],
     )

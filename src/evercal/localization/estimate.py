@@ -32,8 +32,5 @@ class PoseEstimate:
     """(n, 2) what agrees, in pixels of the working image, for overlays."""
     points_m: np.ndarray | None = None
     """(n, 3) their scene points in the base frame, metres."""
-
-    @property
-    def support(self) -> float:
-        """`inlier_ratio` times the square root of `inliers`."""
-        return self.inlier_ratio * self.inliers**0.5
+    support: float = 0.0
+    """What the scene's threshold is compared with, see `localization.acceptance`."""

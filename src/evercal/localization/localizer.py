@@ -37,21 +37,29 @@ DEVICES = ("auto", "cpu")
 
 
 @dataclass(frozen=True)
+class Attempt:
+    """How much work an image gets."""
+
+    retrieved: int
+    """Keyframes that the global descriptor proposes."""
+    match_stride: int
+    """Every so many-th row and column of patches is matched to the keyframes."""
+
+
+@dataclass(frozen=True)
 class LocalizeOptions:
     """How an image is located."""
 
     candidates: int = 3
     """At most this many scenes are tried for an image."""
-    retrieved: tuple[int, ...] = (12, 48)
-    """Keyframes that the global descriptor proposes; more of them where no pose is accepted."""
+    attempts: tuple[Attempt, ...] = (Attempt(12, 2), Attempt(48, 1))
+    """Where no pose is accepted, the next attempt follows."""
     keyframes: int = 6
     """Keyframes of a scene that an image is matched to and aligned with."""
     retrieval_stride: int = 16
     """Every so many-th patch of the image votes for the proposed keyframes."""
     votes: float = 0.2
     """Scenes with a smaller share of the best scene's votes are not tried."""
-    match_stride: int = 2
-    """Every so many-th row and column of patches is matched to the keyframes."""
     margin: float = 0.15
     """Without keyframes: scenes whose best prototype is less similar than the best scene's by more
     are not tried."""
@@ -93,6 +101,7 @@ class _Candidate:
 
     scene: int
     keyframes: NDArray[np.int64]
+    match_stride: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +117,13 @@ class _Hypothesis:
     pixels: np.ndarray | None = None
     points_m: np.ndarray | None = None
     aligned: bool = False
+    matched: int = 0
 
     @property
     def support(self) -> float:
-        """See `PoseEstimate.support`."""
-        return self.ratio * self.inliers**0.5
+        """What the scene's threshold is compared with, see `localization.acceptance`."""
+        exact = self.inliers / max(1, self.matched) if self.aligned else 1.0
+        return self.ratio * exact * self.inliers**0.5
 
 
 class Localizer:
@@ -227,15 +238,13 @@ class Localizer:
         cameras = self._cameras(camera, image.shape)
         usable = [i for i, c in enumerate(cameras) if c is not None]
         best: _Hypothesis | None = None
-        for count in self.options.retrieved if len(self._bank) else (0,):
-            for candidate in self._candidates(query, usable, count):
+        for attempt in self.options.attempts if len(self._bank) else (Attempt(0, 1),):
+            for candidate in self._candidates(query, usable, attempt):
                 trial = self._hypothesis(query, candidate, cameras)
                 if best is None or trial.support > best.support:
                     best = trial
                 if trial.aligned and self._accepted(trial):
                     return self._answer(trial, began)
-            if count >= len(self._bank):
-                break
         assert best is not None, "at least one scene is tried"
         return self._answer(best, began)
 
@@ -257,12 +266,12 @@ class Localizer:
             )
         return found
 
-    def _candidates(self, query: _Query, usable: list[int], count: int) -> list[_Candidate]:
-        """Scenes to try, the likeliest first; `count` keyframes are compared by their patches."""
+    def _candidates(self, query: _Query, usable: list[int], attempt: Attempt) -> list[_Candidate]:
+        """Scenes to try, the likeliest first."""
         features = query.features.flatten(1).T
         ranked = self._bank.retrieve(features, usable)
         if len(ranked):
-            return self._voted(features, ranked, count)
+            return self._voted(features, ranked, attempt)
         none = np.zeros(0, np.int64)
         if self._one_answer():
             return [_Candidate(usable[0], none)]
@@ -274,13 +283,15 @@ class Localizer:
         return [_Candidate(i, none) for i in likely]
 
     @torch.inference_mode()
-    def _voted(self, features: Tensor, ranked: NDArray[np.int64], count: int) -> list[_Candidate]:
+    def _voted(
+        self, features: Tensor, ranked: NDArray[np.int64], attempt: Attempt
+    ) -> list[_Candidate]:
         """Patches of the image vote for the keyframes that rank first, and so for scenes.
 
         A scene is tried with the keyframes that got most votes, and where these are too few, with
         those of its others whose descriptors are most alike.
         """
-        proposed, rest = ranked[:count], ranked[count:]
+        proposed, rest = ranked[: attempt.retrieved], ranked[attempt.retrieved :]
         some = features[:: self.options.retrieval_stride]
         best = []
         for index in proposed:
@@ -298,7 +309,7 @@ class Localizer:
             others = rest[self._bank.scene[rest] == s]
             if total[s] >= enough:
                 both = np.concatenate([voted, others])[: self.options.keyframes]
-                found.append(_Candidate(s, both))
+                found.append(_Candidate(s, both, attempt.match_stride))
         return found
 
     def _one_answer(self) -> bool:
@@ -355,7 +366,8 @@ class Localizer:
             self.options.alignment,
         )
         if found is None:
-            return _Hypothesis(candidate.scene, rough.world_from_camera, rough.covariance)
+            pose, covariance = rough.world_from_camera, rough.covariance
+            return _Hypothesis(candidate.scene, pose, covariance, aligned=True)
         scale = self.maps.short_side / min(height, width)
         return _Hypothesis(
             candidate.scene,
@@ -366,6 +378,7 @@ class Localizer:
             (found.pixels + 0.5) * scale - 0.5,
             found.points_m,
             aligned=True,
+            matched=found.matched,
         )
 
     @torch.inference_mode()
@@ -383,12 +396,12 @@ class Localizer:
         features = query.features.flatten(1).T
         sources, cells = [], len(pixels)
         if len(candidate.keyframes):
-            some = self._strided(query)
+            some = self._strided(query, candidate)
             cells = len(some)
             sources.append((pixels[some], self._matched(features[some], candidate.keyframes)))
         if self.maps.heads:
             points = self._predicted(query, candidate.scene)
-            take = slice(None) if not sources else self._strided(query)
+            take = self._strided(query, candidate) if sources else slice(None)
             sources.append((pixels[take], points[take]))
         return (
             np.concatenate([source[0] for source in sources]),
@@ -396,10 +409,10 @@ class Localizer:
             cells,
         )
 
-    def _strided(self, query: _Query) -> NDArray[np.int64]:
+    def _strided(self, query: _Query, candidate: _Candidate) -> NDArray[np.int64]:
         """The patches of the image that are matched to keyframes."""
         rows, columns = query.features.shape[1:]
-        step = self.options.match_stride if self.options.align else 1
+        step = candidate.match_stride if self.options.align else 1
         return np.arange(rows * columns).reshape(rows, columns)[::step, ::step].ravel()
 
     def _matched(self, features: Tensor, keyframes: NDArray[np.int64]) -> np.ndarray:
@@ -427,14 +440,24 @@ class Localizer:
 
     def _accepted(self, best: _Hypothesis) -> bool:
         record = self.maps.scenes[best.scene]
-        if best.aligned or (self.options.align and record.min_support > 0):
-            return best.support >= record.min_support
+        if best.aligned:
+            return best.inliers > 0 and best.support >= record.min_support
         return best.ratio >= record.inlier_threshold
 
     def _answer(self, best: _Hypothesis, began: float) -> PoseEstimate:
         def refused(status, reason: str) -> PoseEstimate:
             ms = 1000 * (time.perf_counter() - began)
-            return PoseEstimate(status, reason, None, None, None, best.inliers, best.ratio, ms)
+            return PoseEstimate(
+                status,
+                reason,
+                None,
+                None,
+                None,
+                best.inliers,
+                best.ratio,
+                ms,
+                support=best.support,
+            )
 
         record = self.maps.scenes[best.scene]
         if best.pose is None:
@@ -455,6 +478,7 @@ class Localizer:
             1000 * (time.perf_counter() - began),
             best.pixels,
             best.points_m,
+            best.support,
         )
 
     def _outside(self, best: _Hypothesis, record: SceneRecord) -> bool:
@@ -468,10 +492,8 @@ def _why(best: _Hypothesis, record: SceneRecord) -> str:
     if best.aligned:
         return (
             f"{best.inliers} landmarks, {100 * best.ratio:.0f} % of those that should be visible,"
-            f" were found: support {best.support:.1f}, {record.name} needs {record.min_support:.1f}"
+            f" were found: support {best.support:.2f}, {record.name} needs {record.min_support:.2f}"
         )
-    if record.min_support > 0:
-        return f"too few landmarks of {record.name} were found where the pose puts them"
     need = f"{100 * record.inlier_threshold:.0f} %"
     return f"{100 * best.ratio:.0f} % of the patches agree, {record.name} needs {need}"
 

@@ -1,7 +1,9 @@
 """`build_map`: a recording in, keyframes with adjusted poses and sub-pixel landmarks out."""
 
 from collections.abc import Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -158,11 +160,16 @@ def map_steps(
     """
     recording, numbers, wrong = yield from _open(frames, encoder, chosen, options)
     keyframes = []
-    for done, frame in enumerate(numbers):
+
+    def opened(frame: int) -> KeyframeTracks:
         keyframe = open_keyframe(recording, frame, options.tracks)
         refine_depths(recording, keyframe, options.tracks)
-        keyframes.append(keyframe)
-        yield Mapping("mapping", done + 1, len(numbers))
+        return keyframe
+
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        for keyframe in pool.map(opened, numbers):
+            keyframes.append(keyframe)
+            yield Mapping("mapping", len(keyframes), len(numbers))
     if not any(keyframe.kept.any() for keyframe in keyframes):
         raise InputError(
             "no two training frames see the same surfaces under parallax: record views from at"
@@ -242,11 +249,15 @@ def _adjust(
         recording.adjust(adjustment.poses, adjustment.camera)
         if not _moved(adjustment, stated_cameras[0]):
             break
-        for keyframe in keyframes:
-            refine_depths(recording, keyframe, options.tracks)
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+            list(pool.map(partial(_refined_again, recording, options.tracks), keyframes))
     yield Mapping("adjusting", options.rounds, options.rounds)
     assert adjustment is not None
     return adjustment
+
+
+def _refined_again(recording: Recording, options: TrackOptions, keyframe: KeyframeTracks) -> None:
+    refine_depths(recording, keyframe, options, again=True)
 
 
 def _moved(adjustment: Adjustment, stated: Camera) -> bool:

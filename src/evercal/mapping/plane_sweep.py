@@ -109,18 +109,20 @@ def select_source_views(
     points = view.base_from_camera.apply(view.rays()[some] * depth_m[some, None])
     own = points - view.base_from_camera.translation_m
     own /= np.linalg.norm(own, axis=-1, keepdims=True)
-    worth = np.zeros(len(poses))
     few, enough, many = PARALLAX_RAD
-    for i, (pose, camera) in enumerate(zip(poses, cameras, strict=True)):
-        within = pose.inverse().apply(points)
-        pixels = camera.project(np.where(within[:, 2:] > 0.1, within, [0, 0, 1]))
-        seen = (within[:, 2] > 0.1) & (pixels > 0).all(-1)
-        seen &= (pixels < [camera.width, camera.height]).all(-1)
-        other = points - pose.translation_m
-        other /= np.linalg.norm(other, axis=-1, keepdims=True) + 1e-9
-        parallax = np.arccos(np.clip((own * other).sum(-1), -1, 1))
-        useful = np.clip(parallax / few, 0, 1) * np.clip((many - parallax) / (many - enough), 0, 1)
-        worth[i] = (seen * useful).mean()
+    other = points - poses.translation_m[:, None]
+    within = other @ poses.rotation_matrix()
+    front = within[..., 2:] > 0.1
+    within = np.where(front, within, [0, 0, 1])
+    seen = front[..., 0]
+    for camera in set(cameras):
+        rows = [i for i, own_camera in enumerate(cameras) if own_camera == camera]
+        pixels = camera.project(within[rows])
+        seen[rows] &= ((pixels > 0) & (pixels < [camera.width, camera.height])).all(-1)
+    other /= np.linalg.norm(other, axis=-1, keepdims=True) + 1e-9
+    parallax = np.arccos(np.clip((own * other).sum(-1), -1, 1))
+    useful = np.clip(parallax / few, 0, 1) * np.clip((many - parallax) / (many - enough), 0, 1)
+    worth = (seen * useful).mean(-1)
     best = np.argsort(-worth, kind="stable")[:count]
     return [int(i) for i in best if worth[i] > MIN_SHARED]
 

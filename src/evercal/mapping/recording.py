@@ -3,6 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +56,7 @@ class Recording:
             self.cameras.append(camera)
         self._features: dict[int, Tensor] = {}
         self._pyramids: OrderedDict[int, list[np.ndarray]] = OrderedDict()
+        self._lock = Lock()
 
     def without(self, left_out: NDArray[np.int64]) -> "Recording":
         """The recording less some frames; what was computed for the others stays."""
@@ -69,7 +71,7 @@ class Recording:
         rest.translation_m = self.translation_m[keep]
         rest.grey, rest.cameras = [self.grey[i] for i in keep], [self.cameras[i] for i in keep]
         rest._features = {new: self._features[i] for new, i in enumerate(keep)}
-        rest._pyramids = OrderedDict()
+        rest._pyramids, rest._lock = OrderedDict(), Lock()
         return rest
 
     def __len__(self) -> int:
@@ -109,12 +111,16 @@ class Recording:
 
     def pyramid(self, i: int) -> list[np.ndarray]:
         """Image pyramid of a frame; the last ones used stay in memory."""
-        if i not in self._pyramids:
-            self._pyramids[i] = image_pyramid(self.grey[i], PYRAMID_LEVELS)
+        with self._lock:
+            if i in self._pyramids:
+                self._pyramids.move_to_end(i)
+                return self._pyramids[i]
+        pyramid = image_pyramid(self.grey[i], PYRAMID_LEVELS)
+        with self._lock:
+            self._pyramids[i] = pyramid
             if len(self._pyramids) > _PYRAMIDS:
                 self._pyramids.popitem(last=False)
-        self._pyramids.move_to_end(i)
-        return self._pyramids[i]
+        return pyramid
 
     def relative(self, j: int, k: int) -> tuple[np.ndarray, np.ndarray]:
         """Rotation (3, 3) and translation (3,) of camera j from camera k."""

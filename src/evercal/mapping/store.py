@@ -54,7 +54,7 @@ from evercal.storage.manifest import (
     write_manifest,
 )
 
-SCHEMA = 1
+SCHEMA = 2
 LEARNING = "learning"
 STAGES = "stages"
 MEMORY_FILES = ("memory.safetensors", "notes.safetensors")
@@ -144,8 +144,14 @@ class Store:
         problems = verify(root)
         if problems:
             raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
-        if payload.get("schema") != SCHEMA:
-            raise InputError(f"store {root}: schema {payload.get('schema')!r} is not {SCHEMA}")
+        schema = payload.get("schema")
+        if schema == 1:
+            raise InputError(
+                f"store {root}: schema 1 is of an earlier evercal; learn the scenes again into a"
+                " new store"
+            )
+        if schema != SCHEMA:
+            raise InputError(f"store {root}: schema {schema!r} is not {SCHEMA}; update evercal")
         networks = payload["networks"]
         local, descriptor = (str(name) for name in networks)  # type: ignore[attr-defined]
         maps = SceneMaps(

@@ -136,22 +136,31 @@ _DEPTH_ROUNDS = ((((1, 6),), 1), (((1, 3), (0, 5)), 2), (((0, 4),), 2))
 
 
 def refine_depths(
-    recording: Recording, keyframe: KeyframeTracks, options: TrackOptions
+    recording: Recording, keyframe: KeyframeTracks, options: TrackOptions, again: bool = False
 ) -> Observations | None:
     """Gauss-Newton on the inverse depths of a keyframe's landmarks; poses stay.
+
+    Args:
+        recording: the frames.
+        keyframe: whose landmarks are refined.
+        options: how.
+        again: depths are nearly right already, so the coarse round is left out.
 
     Returns:
         The observations of the last round, None where no other frame sees the same.
     """
     if not keyframe.sources or not len(keyframe.landmarks):
         return None
-    seen, every = None, np.arange(len(keyframe.landmarks))
-    for steps, updates in _DEPTH_ROUNDS:
+    seen, which = None, np.arange(len(keyframe.landmarks))
+    for steps, updates in _DEPTH_ROUNDS[again:]:
         found = [
-            observe(recording, keyframe, j, every, steps, options.reach_px, options)
+            observe(recording, keyframe, j, which, steps, options.reach_px, options)
             for j in keyframe.sources
         ]
         seen = joined(found)
+        # What hardly any frame sees now will not be seen by enough of them later.
+        count = np.bincount(seen.landmark, minlength=len(keyframe.landmarks))
+        which = np.flatnonzero(count >= options.min_views - 1)
         for _ in range(updates):
             _depth_step(recording, keyframe, seen)
     assert seen is not None
