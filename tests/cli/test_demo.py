@@ -16,7 +16,9 @@ from evercal.cli.demo import DemoOptions
 from evercal.datasets import Frame, Scene, read_image
 from evercal.geometry import SE3
 from evercal.reports import demo_page
+from evercal.reports.demo_measurements import Look
 from evercal.reports.demo_outcome import DemoOutcome, FixedCamera
+from evercal.reports.demo_sentences import about_fixed_cameras
 from evercal.simulation import mini
 from evercal.simulation.box_room import box_room_scene
 from evercal.simulation.mini import CellRoom
@@ -24,10 +26,11 @@ from evercal.simulation.mini import CellRoom
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    scenes = [box_room_scene(seed, 16, 4) for seed in (41, 42)]
+    scenes = [box_room_scene(seed, 24, 4) for seed in (41, 42)]
     still = replace(scenes[1].test[0], name="again")
     fixed = Scene("still", (), (scenes[1].test[0], still))
-    rooms = CellRoom(scenes[0]), CellRoom(scenes[1], fixed)
+    changed = replace(scenes[1], name="later", train=())
+    rooms = CellRoom(scenes[0]), CellRoom(scenes[1], fixed, None, fixed, changed)
     monkeypatch.setattr(demo, "DemoOptions", functools.partial(DemoOptions, rooms=rooms))
 
 
@@ -36,25 +39,41 @@ def test_demo_leaves_a_report_a_picture_and_a_store(run: Any, tmp_path: Path) ->
     out = tmp_path / "demo"
     outcome = json.loads(run("demo", "--out", out, "--json").out)
     assert outcome["rooms"] == ["box-room-41", "box-room-42"]
-    for method in ("evercal", "finetune"):
-        first, second = outcome["accuracy_5cm_5deg"][method]
-        assert (len(first), len(second)) == (1, 2)
-        assert all(0 <= value <= 100 for value in first + second)
+    assert [room["room"] for room in outcome["learned"]] == outcome["rooms"]
+    assert all(room["landmarks"] > 0 for room in outcome["learned"])
+    assert outcome["test"]["scenes"].keys() == set(outcome["rooms"])
+    assert outcome["changed"]["scenes"].keys() == {"box-room-42"}
     assert outcome["memory_bytes"] > 0
+    assert outcome["accuracy_5cm_5deg"] == {}
     (camera,) = outcome["fixed_cameras"]
     assert (camera["room"], camera["images"]) == ("box-room-42", 2)
+    assert outcome["unknown_room"] == {"images": 20, "refused": 20}
     names = sorted(path.name for path in out.iterdir())
     assert names == ["overview.png", "query.png", "report.html", "store"]
     height, width, _ = read_image(out / "overview.png").shape
     assert width > 2 * height > 400
     page = (out / "report.html").read_text()
-    assert page.count('<img src="data:image/') == 3
+    assert page.count('<img src="data:image/') == 4  # overview, histogram, two sheets of images
     assert not re.search(r"(?:src|href)=\"(?!data:)", page)
-    assert "fine-tuning" in page
-    assert "Calibration of a fixed camera" in page
+    for heading in ("Test images", "After a change", "Calibration of a fixed camera"):
+        assert heading in page
+    assert "Fine-tuning" not in page
     assert run("localize", out / "store", out / "query.png").code in (0, 1)
     scenes = json.loads(run("info", out / "store", "--json").out)["scenes"]
     assert [scene["name"] for scene in scenes] == outcome["rooms"]
+
+
+@pytest.mark.usefixtures("small")
+def test_networks_are_compared_on_request(run: Any, tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    ran = run("demo", "--out", out, "--compare")
+    assert ran.code == 0
+    assert "SARS + SPDD" in ran.out
+    assert "wrote" in ran.out.splitlines()[-2]
+    page = (out / "report.html").read_text()
+    assert "Fine-tuning" in page
+    assert "minutes" in page
+    assert not [path for path in out.iterdir() if path.name.startswith(".")]
 
 
 def test_bare_shapes_lie_over_located_images(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -69,6 +88,7 @@ def test_bare_shapes_lie_over_located_images(monkeypatch: pytest.MonkeyPatch) ->
     pose = SE3.identity()
     answers = [(scene.name, pose), ("elsewhere", pose), (scene.name, None)]
     room = CellRoom(scene, model=("living", 3))
+    monkeypatch.setattr(demo_page, "draw_landmarks", lambda image, *_: image)
     overlays = demo_page._overlays(Answers(answers), scene)  # pyright: ignore[reportArgumentType]
     (drawn,) = demo_page._untextured_overlays(room, overlays)
     ((model, frames, poses),) = asked
@@ -89,10 +109,10 @@ def test_what_is_in_the_way_stays(run: Any, tmp_path: Path, snapshot: Any) -> No
 
 
 def test_rows_leave_rooms_not_yet_learned_blank() -> None:
-    outcome = DemoOutcome(["a", "b"], {"finetune": [[90.0], [0.0, 92.5]]})
-    assert outcome.rows() == [
-        ["fine-tuning", "+ a", "90.0", ""],
-        ["fine-tuning", "+ b", "0.0", "92.5"],
+    outcome = DemoOutcome(["a", "b"], {"finetune": [[90.0], [0.0, 92.5]]}, {"finetune": 2.04})
+    assert outcome.compared_rows() == [
+        ["fine-tuning", "+ a", "90.0", "", ""],
+        ["fine-tuning", "+ b", "0.0", "92.5", "2.0"],
     ]
     assert "92.5" in outcome.table()
 
@@ -108,29 +128,64 @@ class Answers:
         return SimpleNamespace(scene=scene, base_from_camera=pose, inliers=9, points_m=None)
 
 
-def test_a_fixed_camera_is_the_robust_mean_of_its_own_room() -> None:
+def still_camera() -> tuple[CellRoom, SE3]:
+    """A room with a camera that takes five images before and five after a bump of 3 mm."""
     scene = box_room_scene(7, 1, 1)
     frame = scene.test[0]
     truth = frame.base_from_camera
     assert truth is not None
-    room = CellRoom(scene, Scene("still", (), (frame,) * 5))
+    moved = replace(frame, base_from_camera=truth @ SE3.exp([0.003, 0, 0, 0, 0, 0]))
+    room = CellRoom(
+        scene, Scene("still", (), (frame,) * 5), None, Scene("bumped", (), (moved,) * 5)
+    )
+    return room, truth
+
+
+def looked(room: CellRoom, answers: list[tuple[str, SE3 | None]]) -> DemoOutcome:
+    outcome = DemoOutcome([room.scene.name])
+    localizer: Any = Answers(answers)
+    Look(localizer, [room]).find_fixed_cameras(outcome)
+    return outcome
+
+
+def test_a_fixed_camera_is_the_robust_mean_of_its_own_room() -> None:
+    room, truth = still_camera()
 
     def off(metres: float) -> SE3:
         return truth @ SE3.exp([metres, 0, 0, 0, 0, 0])
 
-    here = scene.name
-    far = [
+    here = room.scene.name
+    before = [
         (here, off(0.004)),
         (here, off(0.004)),
         ("elsewhere", off(3)),
         (here, off(9)),
         (here, None),
     ]
-    found = demo._find_fixed(Answers(far), room)  # pyright: ignore[reportArgumentType]
+    outcome = looked(room, [*before, *[(here, None)] * 5])
+    (found,) = outcome.fixed
     assert (found.room, found.images, found.located) == (here, 5, 3)
     assert found.error_mm == pytest.approx(4.0, abs=1e-6)
     assert found.error_deg == pytest.approx(0.0, abs=1e-6)
-    none = demo._find_fixed(Answers([(here, None)] * 5), room)  # pyright: ignore[reportArgumentType]
+    assert outcome.bumps == []  # nothing was found afterwards
+    (none,) = looked(room, [(here, None)] * 10).fixed
     assert none == FixedCamera(here, 5, 0, None, None)
     shown = DemoOutcome([here], fixed=[found, none])
-    assert shown.fixed_rows() == [[here, "3 of 5", "4.0", "0.00"], [here, "0 of 5", "", ""]]
+    assert shown.fixed_rows() == [[here, "3 of 5", "4.00", "0.000"], [here, "0 of 5", "", ""]]
+    first, second = about_fixed_cameras(shown)
+    assert "3 of 5 images: 4.00 mm" in first
+    assert "not found in any of 5" in second
+
+
+@pytest.mark.parametrize(("shift", "noticed"), [(0.0035, True), (0.0005, False)])
+def test_a_bump_is_the_motion_between_the_means(shift: float, noticed: bool) -> None:
+    room, truth = still_camera()
+    here = room.scene.name
+    # Half of the images before are off by 0.2 mm, those after by the shift on top of it.
+    before = [truth @ SE3.exp([0, 0.0002 * (i % 2), 0, 0, 0, 0]) for i in range(5)]
+    after = [pose @ SE3.exp([shift, 0, 0, 0, 0, 0]) for pose in before]
+    (bump,) = looked(room, [(here, pose) for pose in [*before, *after]]).bumps
+    assert bump.shift_mm == pytest.approx(1000 * shift, abs=1e-6)
+    assert (bump.true_mm, bump.true_deg) == pytest.approx((3.0, 0.0), abs=1e-6)
+    assert bump.still_mm == pytest.approx(0.2, abs=1e-6)
+    assert bump.noticed is noticed

@@ -22,12 +22,15 @@ def test_json_is_the_contract(run: Any, store: Path, rooms: Any) -> None:
     scores = json.loads(ran.out)
     assert ran.code == 0
     assert ran.err == []
-    assert scores.keys() == {"scenes", "mean_accuracy_5cm_5deg", "ms_per_image"}
+    means = {"mean_accuracy_5cm_5deg", "mean_accuracy_1cm_1deg"}
+    assert scores.keys() == {"scenes", *means, "ms_per_image"}
     assert scores["scenes"].keys() == {"box-room-41"}
     assert scores["scenes"]["box-room-41"].keys() == {
         "frames",
         "accuracy_5cm_5deg",
+        "accuracy_2cm_2deg",
         "accuracy_1cm_1deg",
+        "accuracy_5mm_05deg",
         "median_translation_cm",
         "median_rotation_deg",
         "wrong_scene",

@@ -19,9 +19,9 @@ from evercal.mapping.bundle_adjustment import (
     BundleAdjustment,
     BundleOptions,
     BundleTracks,
-    camera_jacobian,
     _State,
 )
+from evercal.mapping.jacobians import camera_jacobian
 from evercal.simulation.box_room import look_at
 
 Array = NDArray[np.floating]

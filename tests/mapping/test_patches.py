@@ -118,7 +118,7 @@ def test_the_step_of_one_patch_is_that_of_least_squares() -> None:
     patches, affine = cut_patches(plain, at), AFFINES["sheared"]
     other, truth = image(picture(3), affine, np.array([10.3, 14.2])), None
     truth = at @ affine.T + [10.3, 14.2]
-    start = truth + [0.4, -0.3]
+    start = truth + np.array([0.4, -0.3])
     found, _ = align_patches(patches, other, start, affine[None], 1)
 
     def standardised(values: Array) -> Array:
@@ -128,7 +128,10 @@ def test_the_step_of_one_patch_is_that_of_least_squares() -> None:
     template = [plain[50 + y, 60 + x] for x, y in steps]
     slope = np.array(
         [
-            (plain[50 + y, 61 + x] - plain[50 + y, 59 + x], plain[51 + y, 60 + x] - plain[49 + y, 60 + x])
+            (
+                plain[50 + y, 61 + x] - plain[50 + y, 59 + x],
+                plain[51 + y, 60 + x] - plain[49 + y, 60 + x],
+            )
             for x, y in steps
         ]
     ) / 2  # fmt: skip
@@ -150,7 +153,7 @@ def test_coarse_to_fine_reaches_farther() -> None:
     at = spots(margin=45)
     plain = image(picture(5), np.eye(2), np.zeros(2))
     other = image(picture(5), np.eye(2), np.array([8.3, -6.6]))
-    truth = at + [8.3, -6.6]
+    truth = at + np.array([8.3, -6.6])
     pyramid = image_pyramid(plain, 3)
     levels = [cut_patches(pyramid[i], to_level(at, i)) for i in range(3)]
     affines, others = np.broadcast_to(np.eye(2), (len(at), 2, 2)), image_pyramid(other, 3)

@@ -23,41 +23,42 @@ if TYPE_CHECKING:
 class Bench:
     """Compare strategies on a sequence of scenes; what is done is kept, what is missing is run.
 
-    Under torchrun several processes share every training.
+    Under torchrun, several processes share every training.
     """
 
     suite: Annotated[Positional[str], arg(metavar="SUITE")]
-    """sim-mini (in the package), sim, sim-7, sim-12, real2, i7s, i12s, custom, or regions."""
+    """One of sim-mini (in the package), sim, sim-7, sim-12, real2, i7s, i12s, custom, regions."""
     recordings: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="")
     ] = ()
-    """Scene folders of the suite custom, in order of learning; one for the suite regions."""
+    """Scene folders of the suite custom, in order of learning; a single one for regions."""
     strategies: Annotated[str, arg(metavar="A,B")] = "evercal,joint,finetune,er,sars_spdd"
-    """Names with commas between, or SELECTOR+PENALTY; the first is compared with the others."""
+    """Strategies (or SELECTOR+PENALTY) with commas between; the others are compared with the first.
+    """
     seeds: Annotated[str, arg(metavar="0,1")] = "0,1,2"
-    """One run each."""
+    """Seeds with commas between; every strategy is run once with each."""
     order: Literal["given", "reversed", "shuffled"] = "given"
-    """In which the scenes come."""
+    """Order in which the scenes are learned."""
     scenes: Annotated[str, arg(metavar="A,B", help_behavior_hint="")] = ""
-    """Only these scenes of the suite; all when left out."""
+    """Scenes of the suite to use, with commas between; all when left out."""
     data: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Folder of the suite's recordings, a folder per scene."""
+    """Folder of the suite's recordings, with a folder for each scene."""
     poses: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Structure-from-motion poses for i7s and i12s (Brachmann et al., ICCV 2021); the original ones
     when left out."""
     parts: int = 4
-    """Stages that the suite regions makes of one scene."""
+    """How many stages the suite regions makes of one scene."""
     preset: Literal["fast", "demo", "bench", "paper"] = "bench"
-    """How much work a stage is."""
+    """How much a network is trained in a stage."""
     backbone: Literal["evercal", "paper"] = "evercal"
     """The network: ours, or the paper's with all centres known in advance and every stage at the
     full rate."""
     offsets: Literal["per_centre", "shared"] = "per_centre"
     """An offset and scale for each centre (the paper), or one for all (GLACE)."""
     steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Optimiser steps of a stage; the preset's when left out."""
+    """Optimiser steps of a stage; the preset's number when left out."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
-    """What is remembered of a scene: a share of its frames (10%) or bytes (5MB)."""
+    """How many keyframes are kept of a scene: a share of its frames (10%) or bytes (5MB)."""
     held_out: bool = False
     """Judge on a fifth of the training frames instead of the test frames, to choose settings."""
     plugin: Annotated[Path | None, arg(metavar="FILE.py", help_behavior_hint="")] = None
@@ -136,9 +137,11 @@ class Bench:
         return load_suite(self.suite, self.data, _words(self.scenes), self.poses)
 
     def _stage(self, seed: int) -> "StageOptions":
+        from evercal.cli.learn import parse_memory
         from evercal.continual.memory_budget import with_memory
         from evercal.continual.presets import on_paper_backbone, preset
 
+        parse_memory(self.memory)
         stage = with_memory(preset(self.preset, seed), self.memory)
         if self.backbone == "paper":
             stage = on_paper_backbone(stage)

@@ -18,7 +18,7 @@ class BenchReport:
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder of results."""
     reference: Annotated[str, arg(metavar="NAME")] = "evercal"
-    """The strategy that the others are compared with."""
+    """Name of the strategy that the others are compared with."""
     compare_with: Annotated[tuple[Path, ...], arg(metavar="DIR...", help_behavior_hint="")] = ()
     """Other folders of results to show beside it, of the same scenes under other settings, such as
     another --memory."""

@@ -192,7 +192,7 @@ def _measure(
     if outcome.accuracy:
         say(outcome.table())
     with progress_bar("locating", 0, "image") as bar:
-        look = Look(localizer, rooms, lambda: bar.update() and None)
+        look = Look(localizer, rooms, bar.update)
         bar.total = look.images()
         steps = (
             (look.locate_test_images, told.about_test_images),

@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure accuracy on the test frames of scenes, mixed, without telling which is from where."""
+    """Measure accuracy on the test frames of scenes; nothing tells which scene an image shows."""
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the store."""
     scenes: Annotated[
         Positional[tuple[str, ...]], arg(metavar="[NAME=]SCENE...", help_behavior_hint="")
     ]
-    """Folders of recorded scenes; NAME=SCENE where the store knows one by another name."""
+    """Folders of recorded scenes; write NAME=SCENE where the store knows one by another name."""
     report: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
-    """HTML file for error curves, trajectories and the worst frames."""
+    """HTML file to write error curves, trajectories and the worst frames to."""
     json: bool = False
     """Print one JSON object."""
 

@@ -11,12 +11,12 @@ from evercal.cli.console import print_json, print_next
 
 @dataclass(frozen=True)
 class Inspect:
-    """Describe a recorded scene and point out what looks wrong, before time is spent on it."""
+    """Describe a recorded scene and point out what looks wrong, before it is learned."""
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
     """Folder of the recorded scene."""
     format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """Format of the folder, generic, 7scenes or 12scenes; recognised when left out."""
+    """Format of the folder: generic, 7scenes or 12scenes; it is recognised when left out."""
     json: bool = False
     """Print one JSON object."""
 

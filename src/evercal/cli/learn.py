@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, size
 from evercal.cli.learn_bars import LearnBars
-from evercal.continual.memory_budget import parse_memory, with_memory
+from evercal.continual import memory_budget
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Learn:
-    """Learn a scene into a store; the scenes it knows stay as they are. Goes on after a stop."""
+    """Learn a scene into a store; the scenes it knows stay as they are.
+
+    The same command goes on where it was stopped.
+    """
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the store; made when it is missing."""
@@ -30,19 +33,21 @@ class Learn:
     name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """What the scene is called in the store; its own name when left out."""
     strategy: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """evercal builds a map, other names train a network; a store keeps the one it was made with."""
+    """The strategy evercal builds a map of keyframes and landmarks; all others train a network. A
+    store keeps the strategy it was made with."""
     preset: Literal["fast", "demo", "bench", "paper"] = "fast"
-    """Work of strategies that train a network: fast takes minutes on two cores, paper a GPU."""
+    """How much a network is trained: fast takes minutes on two cores, paper needs a GPU. A map
+    takes no notice of it."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
-    """Keyframes to keep of the scene: a share of its frames (10%) or bytes (5MB)."""
+    """How many keyframes are kept of the scene: a share of its frames (10%) or bytes (5MB)."""
     centres: Annotated[int | None, arg(metavar="M", help_behavior_hint="")] = None
-    """Cluster centres that a scene adds to the network; the preset's number when left out."""
+    """How many cluster centres a scene adds to a network; the preset's number when left out."""
     encoder: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Encoder weights from 'evercal pretrain', for a new store; else the shipped ones."""
+    """File of encoder weights from 'evercal pretrain', for a new store; else the shipped ones."""
     format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """Format of the scene folder, generic, 7scenes or 12scenes; recognised when left out."""
+    """Format of the folder: generic, 7scenes or 12scenes; it is recognised when left out."""
     seed: int = 0
-    """Random seed."""
+    """Seed of all that is drawn at random."""
     json: bool = False
     """Print one JSON object."""
 
@@ -62,7 +67,7 @@ class Learn:
         held_out = len(validation_split(scene.train)[1])
         start = (
             f"{scene.name}: {len(scene.train)} training frames, {scene.untracked} untracked left"
-            f" out, {held_out} held out to calibrate the unknown-scene threshold"
+            f" out, {held_out} held out to set the unknown_scene threshold"
         )
         try:
             with LearnBars(start, sys.stderr if self.json else sys.stdout) as bars:
@@ -91,7 +96,7 @@ class Learn:
 
         if self.encoder is not None and not self.encoder.is_file():
             raise InputError(f"--encoder {self.encoder}: no such file")
-        stage = with_memory(preset(self.preset, self.seed), self.memory)
+        stage = memory_budget.with_memory(preset(self.preset, self.seed), self.memory)
         if self.centres is not None:
             head = dataclasses.replace(stage.head, centres_per_scene=self.centres)
             stage = dataclasses.replace(stage, head=head)
@@ -181,6 +186,18 @@ def adjusted_lines(adjusted: "Adjusted") -> list[str]:
 def _few(names: tuple[str, ...], most: int = 8) -> str:
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
+
+
+def parse_memory(text: str) -> tuple[float | None, int | None]:
+    """The share or the bytes that --memory names; see `memory_budget.parse_memory`.
+
+    Raises:
+        InputError: Neither, or nothing at all to keep keyframes in.
+    """
+    try:
+        return memory_budget.parse_memory(text)
+    except InputError as error:
+        raise InputError(f"--{error}") from None
 
 
 def check_name(name: str) -> None:

@@ -27,9 +27,10 @@ class Localize:
     images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
     """Image files, one or more."""
     camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Intrinsics: a 3x3 matrix as text, our JSON, ROS camera_info YAML; else the found scene's."""
+    """File of the intrinsics: a 3x3 matrix as text, our JSON, or a ROS camera_info YAML. Without it
+    they are those of the scene that is found."""
     overlay: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Folder for the images with the scene points that agree drawn in."""
+    """Folder for copies of the images with the landmarks that were found drawn in."""
     json: bool = False
     """Print one JSON object."""
 

@@ -14,26 +14,26 @@ from evercal.errors import InputError
 
 @dataclass(frozen=True)
 class Simulate:
-    """Render photorealistic rooms with a robot arm, exact poses and depth; needs evercal[sim]."""
+    """Render photorealistic rooms with a robot arm, poses and depth; this needs evercal[sim]."""
 
     suite: Annotated[Positional[Literal["sim", "sim-7", "sim-12", "sim-mini"]], arg(name="SUITE")]
-    """Three rooms, seven, twelve, or the three small as shipped."""
+    """Three rooms (sim), seven, twelve, or the three small ones that are shipped (sim-mini)."""
     out: Annotated[Path, arg(metavar="DIR")]
     """New folder for the scenes; the same command continues a run that was cut off."""
     frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Frames per room, train and test together; the suite's own number when left out."""
+    """Frames of each room, training and test together; the suite's own number when left out."""
     size: Annotated[str | None, arg(metavar="WxH", help_behavior_hint="")] = None
     """Image size in pixels, such as 640x480; the suite's own when left out."""
     seed: int = 0
-    """Of the paths and the noise; the rooms of a suite stay the same."""
+    """Seed of the camera paths and the noise; the rooms of a suite stay the same."""
     samples: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Paths per pixel: more is slower and truer in fine detail; the suite's own when left out."""
     exposure_ev: float = 0.0
-    """Brighter or darker, in stops."""
+    """Exposure in stops: above 0 is brighter, below 0 is darker."""
     noise: float = 0.0
-    """Sensor noise in parts of full scale; 0.01 is a good camera."""
+    """Sensor noise as a share of full scale; a good camera has 0.01."""
     blur_steps: int = 1
-    """Poses per frame while the shutter is open; 1 is no motion blur."""
+    """How many poses a frame has while the shutter is open; with 1 there is no motion blur."""
     json: bool = False
     """Print one JSON object."""
 

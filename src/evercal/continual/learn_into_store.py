@@ -5,7 +5,8 @@ from pathlib import Path
 
 from evercal.continual.learn_scene import LearnOptions, LearnReport, OnEvent, learn_scene
 from evercal.continual.memory_budget import with_memory
-from evercal.continual.presets import PRESETS, Preset, stage_options
+from evercal.continual.presets import PRESETS, Preset
+from evercal.continual.presets import preset as stage_options
 from evercal.datasets import Scene, load_scene
 from evercal.errors import InputError
 from evercal.storage import MANIFEST, read_manifest

@@ -28,8 +28,8 @@ def parse_memory(memory: str | int) -> tuple[float | None, int | None]:
     if match and unit in _UNITS and float(match[1]) * _UNITS[unit] >= 1:
         return None, int(float(match[1]) * _UNITS[unit])
     raise InputError(
-        f"memory {memory!r}: give a share of the frames above 0% and up to 100%, or bytes such as"
-        f" 500kB, 5MB or 5MiB (on the command line: --memory 10%)"
+        f"memory {memory}: give a share of the frames above 0% and up to 100%, or bytes such as"
+        f" 500kB, 5MB or 5MiB"
     )
 
 

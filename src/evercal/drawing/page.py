@@ -52,7 +52,8 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size
 caption, figcaption { color: var(--quiet); font-size: .9rem; text-align: left; }
 caption { padding-bottom: .4rem; }
 th, td { padding: .3rem .8rem; border-bottom: 1px solid var(--line); text-align: left; }
-th { font-weight: 600; } .n { text-align: right; white-space: nowrap; }
+th { font-weight: 600; vertical-align: bottom; } .n { text-align: right; }
+td.n { white-space: nowrap; }
 figure { margin: 1.2rem 0; }
 img { max-width: 100%; height: auto; border-radius: 4px; background: #fff; }
 """.strip()
@@ -139,7 +140,7 @@ def _is_number(cell: str | int | float) -> bool:
     if not isinstance(cell, str) or cell.strip() in ("", "-"):
         return True
     try:
-        float(cell.strip().removesuffix("%"))
+        float(cell.strip().removesuffix("%").removesuffix(" mm").removesuffix(" cm"))
     except ValueError:
         return False
     return True

@@ -287,7 +287,12 @@ class Store:
 
     def report(self) -> dict[str, Any]:
         """What `commit` was told about the newest stage."""
-        return json.loads((self.root / STAGES / self.stages[-1] / "report.json").read_text())
+        return self.reports()[-1]
+
+    def reports(self) -> list[dict[str, Any]]:
+        """The same about every stage, in order."""
+        folders = [self.root / STAGES / name for name in self.stages]
+        return [json.loads((folder / "report.json").read_text()) for folder in folders]
 
     def bytes(self) -> dict[str, int]:
         """Size on disk: `memory` (what replay keeps) and `rest` (all else in the manifest)."""

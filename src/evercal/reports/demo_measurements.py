@@ -28,7 +28,7 @@ class Look:
     """Answers."""
     rooms: "Sequence[CellRoom]"
     """In order of learning."""
-    on_image: Callable[[], None] = lambda: None
+    on_image: Callable[[], object] = lambda: None
     """Called after every image."""
 
     def images(self) -> int:

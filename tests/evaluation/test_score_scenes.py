@@ -1,0 +1,51 @@
+"""`evercal.evaluate` takes scenes however they come."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import evercal
+from evercal.datasets import generic
+from evercal.errors import InputError
+from evercal.evaluation.score_scenes import evaluate
+from evercal.geometry import SE3
+from evercal.simulation.box_room import box_room_scene
+
+
+class Shifted:
+    """Knows one scene under two names, and is 3 mm off in it."""
+
+    scenes = ("box-room-7", "other")
+
+    def __init__(self, name: str = "box-room-7"):
+        self.scene, self.name = box_room_scene(7, 2, 3), name
+
+    def localize(self, image: object, camera: object, /) -> SimpleNamespace:
+        frame = next(f for f in self.scene.test if (f.read_image() == image).all())
+        assert frame.base_from_camera is not None
+        pose = frame.base_from_camera @ SE3.exp([0.003, 0, 0, 0, 0, 0])
+        found = {"status": "ok", "scene": self.name, "inliers": 9, "inlier_ratio": 0.5}
+        return SimpleNamespace(base_from_camera=pose, **found)
+
+
+def test_scenes_folders_and_names(tmp_path: Path) -> None:
+    localizer = Shifted()
+    generic.write(tmp_path / "room", localizer.scene)
+    folder = tmp_path / "room"
+    for scenes in (localizer.scene, [localizer.scene], folder, str(folder), (folder,)):
+        row = evaluate(localizer, scenes).scenes["box-room-7"]
+        assert (row.frames, row.accuracy_5mm_05deg) == (3, 100.0)
+        assert row.median_translation_cm == pytest.approx(0.3)
+    named = evaluate(Shifted("other"), {"other": folder})
+    assert list(named.scenes) == ["other"]
+    assert named.mean_accuracy_1cm_1deg == 100.0
+    assert evercal.evaluate is evaluate
+
+
+def test_one_name_twice_is_refused() -> None:
+    localizer = Shifted()
+    with pytest.raises(InputError, match="given twice"):
+        evaluate(localizer, [localizer.scene, localizer.scene])
+    with pytest.raises(InputError, match="no scene"):
+        evaluate(localizer, [])
