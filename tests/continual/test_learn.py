@@ -132,7 +132,9 @@ def test_memory_may_be_given_in_bytes(blank: Blank, rooms: Rooms, quick: StageOp
     )
     sizes = []
     for budget in (4_000, 12_000, 10**9):
-        maps = outcome(learn(blank("evercal_network"), rooms[0], replace(least, memory_bytes=budget)))
+        maps = outcome(
+            learn(blank("evercal_network"), rooms[0], replace(least, memory_bytes=budget))
+        )
         keyframes = maps.keyframes[0]
         assert keyframes is not None
         assert keyframes.bytes <= 1.25 * budget  # frames are counted at the size of the first
@@ -215,7 +217,9 @@ def test_replayed_rows_are_the_old_scenes_and_their_teacher_stays_as_it_was(
         seen.append((teacher, rows, progress))
         return student.points.square().mean()
 
-    monkeypatch.setitem(STRATEGIES, "evercal_network", replace(STRATEGIES["evercal_network"], penalty=spy))
+    monkeypatch.setitem(
+        STRATEGIES, "evercal_network", replace(STRATEGIES["evercal_network"], penalty=spy)
+    )
     list(learn(maps, rooms[1], quick))
     assert [progress for *_, progress in seen] == [i / 8 for i in range(8)]
     centres = maps.scenes[0].cell.atlas_from_base.apply(keyframes.base_from_camera.translation_m)

@@ -406,9 +406,7 @@ def test_frames_without_parallax_are_refused_and_leave_nothing(
         if f.base_from_camera
     )
     with pytest.raises(InputError, match="under parallax"):
-        learn_scene(
-            tmp_path / "s", replace(rooms[0], train=frames), LearnOptions(short_side=48)
-        )
+        learn_scene(tmp_path / "s", replace(rooms[0], train=frames), LearnOptions(short_side=48))
     assert not (tmp_path / "s").exists()
 
 

@@ -157,7 +157,9 @@ def world(
         record = SceneRecord(f"scene-{i}", camera, cell, prototypes, 100)
         scenes.append(replace(record, inlier_threshold=threshold))
     descriptor = cast(GlobalDescriptor, LevelDescriptor())
-    maps = SceneMaps(LevelEncoder(), descriptor, "evercal_network", SHORT, [oracle], scenes, [None] * 9)
+    maps = SceneMaps(
+        LevelEncoder(), descriptor, "evercal_network", SHORT, [oracle], scenes, [None] * 9
+    )
     return World(maps, oracle)
 
 

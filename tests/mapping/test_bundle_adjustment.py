@@ -62,7 +62,9 @@ def world(
     inverse = 1 / rng.uniform(1.5, 4.0, len(host))
     rays = camera.unproject(pixels)
     landmark, frame, observed = [], [], []
-    points = np.stack([poses[int(k)].apply(r / d) for k, r, d in zip(host, rays, inverse, strict=True)])
+    points = np.stack(
+        [poses[int(k)].apply(r / d) for k, r, d in zip(host, rays, inverse, strict=True)]
+    )
     for j in range(n):
         local = poses[j].inverse().apply(points)
         ahead = local[:, 2] > 0.3
@@ -267,7 +269,9 @@ def test_few_wrong_tracks_change_little() -> None:
 @pytest.mark.parametrize("camera", [CAMERA, replace(CAMERA, distortion=(-0.1, 0.05, 0.0, 0.0))])
 def test_derivatives_are_finite_differences(camera: Camera) -> None:
     made = world(camera)
-    problem = BundleAdjustment(made.truth, [camera] * FRAMES, np.zeros((FRAMES, 6)), BundleOptions())
+    problem = BundleAdjustment(
+        made.truth, [camera] * FRAMES, np.zeros((FRAMES, 6)), BundleOptions()
+    )
     tracks = made.tracks
 
     def state(change: Array | None = None, depth: Array | None = None) -> _State:

@@ -8,8 +8,8 @@ from evercal.geometry import SE3, pose_distance
 from evercal.simulation.cell import SUITES
 from evercal.simulation.cell_paths import changed_shots
 from evercal.simulation.changed_room import changed_room
-from evercal.simulation.mini import FOLDER, CellRoom, untextured_renders, mini_rooms
 from evercal.simulation.furnished.rooms import room as simulated
+from evercal.simulation.mini import FOLDER, CellRoom, mini_rooms, untextured_renders
 
 
 @pytest.fixture(scope="module")
