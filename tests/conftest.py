@@ -2,8 +2,8 @@
 
 Three sizes. `rooms` are 64x48 pixels with random networks, for all that does not depend on what was
 learned. `arcs` are short camera arcs at 160x120 with the shipped networks: a few hundred steps of
-training locate their images to some centimetres. `hall` is an arc at 320x240 with fine textures: its
-map locates images to a millimetre. torch is imported inside the fixtures only.
+training locate their images to some centimetres. `hall` is an arc at 320x240 with fine textures:
+its map locates images to a millimetre. torch is imported inside the fixtures only.
 """
 
 from __future__ import annotations

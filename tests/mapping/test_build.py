@@ -153,7 +153,7 @@ def test_frames_from_one_spot_are_refused(arcs: tuple[Scene, Scene]) -> None:
         for f in arcs[0].train[:16]
         if f.base_from_camera
     )
-    with pytest.raises(InputError, match="no two training frames see the same .* parallax"):
+    with pytest.raises(InputError, match=r"no two training frames see the same .* parallax"):
         build_map(frames, load_encoder(), [0, 8], SMALL)
 
 
