@@ -12,6 +12,7 @@ from evercal.continual.learn import Stage, learn
 from evercal.features.descriptor import load_descriptor
 from evercal.features.encoder import load_encoder
 from evercal.localization.localizer import LocalizeOptions, Localizer
+from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.scene_maps import SceneMaps
 
 if TYPE_CHECKING:
@@ -29,6 +30,11 @@ def unlearned(arcs: tuple[Scene, Scene], arc_stage: StageOptions) -> SceneMaps:
     *_, stage = learn(blank, arcs[0], options)
     assert isinstance(stage, Stage)
     return stage.maps
+
+
+def without_map(keyframes: Keyframes) -> Keyframes:
+    """The images alone."""
+    return replace(keyframes, inverse_depth=(), landmarks=(), descriptors=None)
 
 
 def located(maps: SceneMaps, scene: Scene) -> tuple[list[PoseEstimate], float]:
@@ -60,8 +66,8 @@ def test_remembered_frames_answer_where_the_network_cannot(
             assert len(found.pixels) == len(found.points_m) >= found.inliers
     alone = replace(unlearned, keyframes=[None])
     assert located(alone, arcs[0])[1] > 0.2
-    # Without depths, as older stores and other strategies have it, nothing is recalled.
-    plain = replace(unlearned, keyframes=[replace(keyframes, inverse_depth=())])
+    # Without a map, as other strategies have it, nothing is recalled.
+    plain = replace(unlearned, keyframes=[without_map(keyframes)])
     assert located(plain, arcs[0])[1] == located(alone, arcs[0])[1]
 
 
@@ -103,6 +109,6 @@ def test_remembered_cells_vote_for_the_scene(
         )
 
     assert right(maps) >= 11  # of 12
-    # Without depths nothing is recalled, and the descriptors decide.
-    maps.keyframes = [m and replace(m, inverse_depth=()) for m in maps.keyframes]
+    # Without a map nothing is recalled, and the descriptors decide.
+    maps.keyframes = [m and without_map(m) for m in maps.keyframes]
     assert right(maps) == 0

@@ -53,7 +53,7 @@ def test_too_few_cells_of_an_image(world: Any) -> None:
     where.maps.short_side = 16  # 2 cells of 16 x 21 pixels: no pose has 6 inliers
     found = Localizer(where.maps).localize(where.view(0))
     assert found.status == "failed"
-    assert "6 cells" in found.reason
+    assert "6 patches" in found.reason
     assert found.inliers == 0
     assert found.inlier_ratio == 0.0
 

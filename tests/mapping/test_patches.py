@@ -116,7 +116,7 @@ def test_the_step_of_one_patch_is_that_of_least_squares() -> None:
     # The slow twin: the templates' gradients by hand, one patch, one step.
     plain, at = image(picture(3), np.eye(2), np.zeros(2)), np.array([[60.0, 50.0]])
     patches, affine = cut_patches(plain, at), AFFINES["sheared"]
-    other, truth = image(picture(3), affine, np.array([10.3, 14.2])), None
+    other = image(picture(3), affine, np.array([10.3, 14.2]))
     truth = at @ affine.T + [10.3, 14.2]
     start = truth + np.array([0.4, -0.3])
     found, _ = align_patches(patches, other, start, affine[None], 1)
@@ -126,15 +126,9 @@ def test_the_step_of_one_patch_is_that_of_least_squares() -> None:
 
     steps = [(x, y) for y in range(-5, 6) for x in range(-5, 6)]
     template = [plain[50 + y, 60 + x] for x, y in steps]
-    slope = np.array(
-        [
-            (
-                plain[50 + y, 61 + x] - plain[50 + y, 59 + x],
-                plain[51 + y, 60 + x] - plain[49 + y, 60 + x],
-            )
-            for x, y in steps
-        ]
-    ) / 2  # fmt: skip
+    right = [plain[50 + y, 61 + x] - plain[50 + y, 59 + x] for x, y in steps]
+    down = [plain[51 + y, 60 + x] - plain[49 + y, 60 + x] for x, y in steps]
+    slope = np.stack([right, down], -1) / 2
     slope /= np.std(template) + 1e-3
 
     def bilinear(u: float, v: float) -> float:

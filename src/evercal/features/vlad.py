@@ -71,7 +71,9 @@ def fit_centroids(encoder: Encoder) -> Tensor:
     for _ in range(_ROUNDS):
         nearest = (features @ centroids.T).argmax(1)
         sums = torch.zeros_like(centroids).index_add_(0, nearest, features)
-        centroids = F.normalize(sums, dim=1)
+        # One that nothing is nearest to stays where it is.
+        some = sums.norm(dim=1, keepdim=True) > 0
+        centroids = torch.where(some, F.normalize(sums, dim=1), centroids)
     return centroids
 
 

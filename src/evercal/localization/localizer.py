@@ -195,6 +195,11 @@ class Localizer:
             own = cameras[scene]
             if scene != candidate.scene and own is not None and own != camera:
                 return self._hypothesis(query, replace(candidate, scene=scene), cameras)
+            # Said in the frame of the scene that was asked, meant in that of the scene it found.
+            asked, meant = (self.maps.scenes[i].cell for i in (candidate.scene, scene))
+            across = meant.atlas_from_base.inverse() @ asked.atlas_from_base
+            rough = replace(rough, world_from_camera=across @ rough.world_from_camera)
+            points = across.apply(points)
         if len(candidate.keyframes) and self.options.align:
             return self._aligned(query, candidate, camera, rough)
         agree = rough.inliers

@@ -1,0 +1,174 @@
+"""`build_map` in a room whose surfaces are known in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from evercal.datasets.frame import Frame, Scene
+from evercal.errors import InputError
+from evercal.features.encoder import load_encoder
+from evercal.geometry.se3 import SE3, pose_distance
+from evercal.mapping.build import MapOptions, Mapping, SceneMap, build_map, map_steps, spread_frames
+from evercal.mapping.recording import WorkingSize
+from evercal.simulation.box_room import BoxRoom
+
+if TYPE_CHECKING:
+    from evercal.continual.learn import Stage
+
+SMALL = MapOptions(size=WorkingSize(cells=120, patches=120))
+
+
+@pytest.fixture(scope="module")
+def found(hall_stage: Stage) -> SceneMap:
+    assert hall_stage.scene_map is not None
+    return hall_stage.scene_map
+
+
+def moved(frames: tuple[Frame, ...], change: SE3) -> tuple[Frame, ...]:
+    """The frames with `change` multiplied to all poses on the right."""
+    return tuple(
+        replace(frame, base_from_camera=frame.base_from_camera @ change)
+        for frame in frames
+        if frame.base_from_camera is not None
+    )
+
+
+def test_landmarks_are_where_the_room_is(found: SceneMap) -> None:
+    room, off, sure = BoxRoom(34, texture_px=256), [], []
+    keyframes = found.keyframes
+    for i, marks in enumerate(keyframes.landmarks):
+        assert len(marks) > 100
+        pose, camera = keyframes.base_from_camera[i], keyframes.cameras[i]
+        rays = camera.unproject(marks.pixels)
+        _, depth = room.intersect(pose.translation_m, rays @ pose.rotation_matrix().T)
+        error = 1 / marks.inverse_depth / depth - 1
+        off.append(np.abs(error))
+        sure.append(np.abs(marks.inverse_depth - 1 / depth) / marks.sigma)
+    every, claimed = np.concatenate(off), np.concatenate(sure)
+    assert np.median(every) < 0.003
+    assert np.quantile(every, 0.9) < 0.02
+    # A standard deviation is claimed: half of all errors should lie below 0.67 of it.
+    assert 0.1 < np.median(claimed) < 3
+
+
+def test_slants_are_those_of_the_surfaces(found: SceneMap) -> None:
+    room, keyframes = BoxRoom(34, texture_px=256), found.keyframes
+    steps = np.array([[8.0, 0], [-8, 0], [0, 8], [0, -8], [0, 0]])
+    slopes, truths = [], []
+    for i, marks in enumerate(keyframes.landmarks):
+        pose, camera = keyframes.base_from_camera[i], keyframes.cameras[i]
+        rays = camera.unproject(marks.pixels[None] + steps[:, None])
+        turned = rays @ pose.rotation_matrix().T
+        near = np.stack([1 / room.intersect(pose.translation_m, ray)[1] for ray in turned])
+        truth = np.stack([near[0] - near[1], near[2] - near[3]], -1) / 16
+        # On a plane, inverse depth is linear in the image; elsewhere there is no one slant.
+        flat = np.abs(near[:2].mean(0) - near[4]) + np.abs(near[2:4].mean(0) - near[4]) < 1e-6
+        slopes.append(marks.slope[flat])
+        truths.append(truth[flat])
+    slope, truth = np.concatenate(slopes), np.concatenate(truths)
+    assert len(slope) > 300
+    # Coarse, but better than none.
+    assert np.corrcoef(slope.ravel(), truth.ravel())[0, 1] > 0.5
+    error = np.linalg.norm(slope - truth, axis=1)
+    assert np.median(error) < np.median(np.linalg.norm(truth, axis=1))
+
+
+def test_right_poses_and_a_right_lens_stay(found: SceneMap, hall: Scene) -> None:
+    truth = {f.name: f.base_from_camera for f in hall.train}
+    keyframes, stated = found.keyframes, [f for f in hall.train if f.base_from_camera]
+    assert len(keyframes) == 7
+    for i in range(7):
+        pose = keyframes.base_from_camera[i]
+        nearest = min(pose_distance(pose, p)[0] for p in truth.values() if p is not None)
+        assert nearest < 0.003
+    assert found.camera.fx == pytest.approx(stated[0].camera.fx, rel=2e-3)
+    adjusted = found.adjusted
+    assert adjusted.residual_px < 0.2
+    assert adjusted.pose_sigma_mm < 1
+    assert adjusted.pose_sigma_deg < 0.05
+    assert abs(adjusted.time_shift_frames) < 0.02
+    assert (adjusted.wrong_poses, adjusted.doubtful_poses) == ((), ())
+    assert 0 < found.pose_sigma[0] < 0.003
+    assert 0 < found.pose_sigma[1] < 0.003
+
+
+def test_steps_are_told_in_order(arcs: tuple[Scene, Scene]) -> None:
+    steps = []
+    chosen = spread_frames(arcs[0].train, 3)
+    work = map_steps(arcs[0].train[:16], load_encoder(), chosen[chosen < 16], SMALL)
+    for step in work:
+        assert isinstance(step, Mapping)
+        assert 0 <= step.done <= step.total
+        steps.append(step)
+    order = list(dict.fromkeys(step.what for step in steps))
+    assert order == ["encoding", "mapping", "adjusting"]
+    assert [s.done for s in steps if s.what == "encoding"] == list(range(1, 17))
+    assert steps[-1].done == steps[-1].total
+
+
+def test_a_transform_common_to_all_poses_is_found(arcs: tuple[Scene, Scene]) -> None:
+    frames, encoder = arcs[0].train[:18], load_encoder()
+    off = SE3.exp(np.array([0, 0, 0, 0.012, -0.02, 0.015]))
+    chosen = spread_frames(frames, 4)
+    found = build_map(moved(frames, off.inverse()), encoder, chosen, SMALL)
+    # Adjusted = stated @ common, and stated = true @ off^-1.
+    _, radians = pose_distance(found.common, off)
+    assert radians < 0.004
+    turn = np.deg2rad(found.adjusted.common_rotation_deg)
+    np.testing.assert_allclose(turn, off.log()[3:], atol=4e-3)
+
+
+def test_poses_and_lens_may_be_taken_as_stated(arcs: tuple[Scene, Scene]) -> None:
+    frames = arcs[0].train[:10]
+    found = build_map(frames, load_encoder(), [2, 7], replace(SMALL, adjust=False))
+    assert np.abs(found.common.log()).max() == 0
+    assert found.pose_sigma == (0.0, 0.0)
+    assert found.camera == frames[0].camera
+    for i, frame in ((0, frames[2]), (1, frames[7])):
+        assert frame.base_from_camera is not None
+        pose = found.keyframes.base_from_camera[i]
+        assert pose_distance(pose, frame.base_from_camera)[0] < 1e-9
+
+
+def test_a_frame_in_the_wrong_place_is_named_and_left_out(hall: Scene) -> None:
+    frames = list(hall.train[::2])
+    (frames[6],) = moved((frames[6],), SE3.exp(np.array([0, 0.3, 0, 0, 0, 0])))
+    chosen = [0, 6, 12]
+    found = build_map(frames, load_encoder(), chosen)
+    assert found.adjusted.wrong_poses == (frames[6].name,)
+    assert len(found.keyframes) == 3  # another one stands in for it
+    wrong = frames[6].base_from_camera
+    assert wrong is not None
+    places = found.keyframes.base_from_camera
+    assert min(pose_distance(places[i], wrong)[0] for i in range(3)) > 0.05
+
+
+def test_frames_from_one_spot_are_refused(arcs: tuple[Scene, Scene]) -> None:
+    frames = tuple(
+        replace(f, base_from_camera=SE3(f.base_from_camera.rotation_wxyz, np.ones(3)))
+        for f in arcs[0].train[:16]
+        if f.base_from_camera
+    )
+    with pytest.raises(InputError, match=r"no two training frames see the same .* parallax"):
+        build_map(frames, load_encoder(), [0, 8], SMALL)
+
+
+def test_the_same_frames_give_the_same_map(arcs: tuple[Scene, Scene]) -> None:
+    frames, encoder = arcs[1].train[:10], load_encoder()
+    one, two = (build_map(frames, encoder, [2, 7], SMALL) for _ in range(2))
+    a, b = one.keyframes.to_tensors(), two.keyframes.to_tensors()
+    assert a.keys() == b.keys()
+    for name, value in a.items():
+        np.testing.assert_array_equal(value, b[name])
+    assert one.adjusted == two.adjusted
+
+
+@pytest.mark.parametrize("capacity", [1, 5, 24, 100])
+def test_frames_are_spread(capacity: int, arcs: tuple[Scene, Scene]) -> None:
+    chosen = spread_frames(arcs[0].train, capacity).tolist()
+    assert len(chosen) == min(capacity, 24)
+    assert chosen == sorted(set(chosen))

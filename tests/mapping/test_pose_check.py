@@ -1,0 +1,80 @@
+"""A stated pose that contradicts the images is named, and no other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evercal.datasets.frame import Scene
+from evercal.features.encoder import load_encoder
+from evercal.features.vlad import vlad_for
+from evercal.geometry.se3 import SE3
+from evercal.mapping.pose_check import PoseCheckOptions, _segment_distance, contradicting_frames
+from evercal.mapping.recording import Recording, WorkingSize
+
+
+@pytest.fixture(scope="module")
+def recording(hall: Scene) -> Recording:
+    """Every second training frame of the hall."""
+    return Recording(hall.train[::2], load_encoder(), WorkingSize())
+
+
+def moved(recording: Recording, changes: dict[int, SE3]) -> Recording:
+    """The same images with other stated poses."""
+    changed = recording.without(np.zeros(0, np.int64))
+    poses = [recording.poses[i] for i in range(len(recording))]
+    for i, change in changes.items():
+        poses[i] = poses[i] @ change
+    changed.adjust(SE3.stack(poses), None)
+    return changed
+
+
+def named(recording: Recording) -> list[int]:
+    return contradicting_frames(recording, vlad_for(recording.encoder), PoseCheckOptions()).tolist()
+
+
+def test_right_poses_contradict_nothing(recording: Recording) -> None:
+    assert named(recording) == []
+
+
+# At the end of the walk, a step along it keeps all patches on their rays: that cannot be told.
+@pytest.mark.parametrize(
+    ("frame", "direction"), [(0, (0, 1, 0)), (6, (0, 1, 0)), (14, (0, 1, 0)), (6, (1, 0, 0))]
+)
+def test_one_frame_30_cm_away_is_named(
+    frame: int, direction: tuple[float, ...], recording: Recording
+) -> None:
+    shift = SE3.exp(np.array([*(0.3 * np.array(direction)), 0, 0, 0]))
+    assert named(moved(recording, {frame: shift})) == [frame]
+
+
+def test_two_wrong_frames_and_a_turned_one_are_named(recording: Recording) -> None:
+    up, turned = SE3.exp(np.array([0, 0.3, 0, 0, 0, 0])), SE3.exp(np.array([0, 0, 0, 0, 0.2, 0]))
+    assert named(moved(recording, {3: up, 10: turned})) == [3, 10]
+
+
+def test_errors_that_bundle_adjustment_corrects_are_left_to_it(recording: Recording) -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=(len(recording), 6)) * ([0.005] * 3 + [0.004] * 3)
+    assert named(moved(recording, {i: SE3.exp(n) for i, n in enumerate(noise)})) == []
+
+
+def test_a_recording_less_some_frames_keeps_the_others_as_they_are(recording: Recording) -> None:
+    rest = recording.without(np.array([0, 5]))
+    keep = [i for i in range(len(recording)) if i not in (0, 5)]
+    assert [f.name for f in rest.frames] == [recording.frames[i].name for i in keep]
+    for new, old in enumerate(keep):
+        np.testing.assert_array_equal(rest.grey[new], recording.grey[old])
+        np.testing.assert_allclose(rest.poses[new].matrix(), recording.poses[old].matrix())
+        np.testing.assert_array_equal(rest.features(new), recording.features(old))
+    turn, shift = rest.relative(1, 0)
+    one, two = rest.poses[1], rest.poses[0]
+    np.testing.assert_allclose(turn, (one.inverse() @ two).rotation_matrix(), atol=1e-12)
+    np.testing.assert_allclose(shift, (one.inverse() @ two).translation_m, atol=1e-12)
+    assert rest.one_camera()
+
+
+def test_distances_from_segments() -> None:
+    start, end = np.array([[0.0, 0], [0, 0], [0, 0], [1, 1]]), np.array([[4.0, 0]] * 3 + [[1, 1]])
+    points = np.array([[2.0, 3], [-3, 4], [7, -4], [4, 5]])
+    np.testing.assert_allclose(_segment_distance(points, start, end), [3, 5, 5, 5], atol=1e-6)
