@@ -183,7 +183,7 @@ def test_support_decides(hall: Scene, hall_maps: SceneMaps, answers: list[PoseEs
         found = Localizer(strict).localize(frame.read_image(), frame.camera)
         assert found.status == status
         if status != "ok":
-            assert f"hall needs {need:.1f}" in found.reason
+            assert f"hall needs {need:.2f}" in found.reason
             assert found.base_from_camera is None
 
 

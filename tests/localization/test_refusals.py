@@ -9,7 +9,8 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.localization.localizer import LocalizeOptions, Localizer, _Hypothesis
+from evercal.localization.localizer import LocalizeOptions, Localizer
+from evercal.localization.query import Hypothesis
 
 
 @pytest.mark.parametrize("device", ["cuda", "mps", ""])
@@ -31,6 +32,6 @@ class Record:
 def test_a_pose_without_landmarks_is_no_answer_of_a_map(record: Record) -> None:
     localizer: Any = Localizer.__new__(Localizer)
     localizer.maps, localizer.options = SimpleNamespace(scenes=[record]), LocalizeOptions()
-    found = _Hypothesis(0, SE3.identity(), aligned=True)
+    found = Hypothesis(0, SE3.identity(), aligned=True)
     assert found.support == 0
     assert localizer._accepted(found) is False
