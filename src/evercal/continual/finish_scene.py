@@ -59,6 +59,7 @@ def mapped_record(record: SceneRecord, scene_map: SceneMap | None) -> SceneRecor
         refined_camera=scene_map.camera,
         common=scene_map.common,
         map_sigma=scene_map.pose_sigma,
+        bend=scene_map.bend,
     )
 
 

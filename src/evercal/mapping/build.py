@@ -22,6 +22,7 @@ from evercal.mapping.bundle_adjustment import (
     BundleOptions,
 )
 from evercal.mapping.bundle_tracks import bundle_tracks
+from evercal.mapping.frame_correction import FrameCorrection, fit_correction
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.pose_check import PoseCheckOptions, contradicting_frames
 from evercal.mapping.recording import Recording, WorkingSize
@@ -94,6 +95,8 @@ class SceneMap:
     """Uncertainty of the map itself against the stated frame: metres and radians per axis."""
     adjusted: Adjusted
     """What was changed."""
+    bend: FrameCorrection | None = None
+    """Corrections of stated poses that answers take back; None where none go together."""
 
 
 @dataclass(frozen=True)
@@ -301,9 +304,11 @@ def _finished(
             float(np.sqrt(variance[:, :3].mean())),
             float(np.sqrt(variance[:, 3:].mean())),
         )
-    return SceneMap(
-        complete, camera, common, spread, _adjusted(recording, adjustment, camera, wrong)
-    )
+    bend = None
+    if adjustment is not None:
+        bend = fit_correction(recording.stated, adjustment.poses, common)
+    told = _adjusted(recording, adjustment, camera, wrong)
+    return SceneMap(complete, camera, common, spread, told, bend)
 
 
 def _adjusted(

@@ -12,6 +12,7 @@ from evercal.features.encoder import Encoder
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.mapping.atlas import Atlas, Cell
+from evercal.mapping.frame_correction import FrameCorrection
 from evercal.mapping.keyframes import Keyframes
 from evercal.networks.head import Head
 
@@ -45,6 +46,9 @@ class SceneRecord:
     map_sigma: tuple[float, float] = (0.0, 0.0)
     """Standard deviation of the map's own poses per axis: metres and radians."""
 
+    bend: FrameCorrection | None = None
+    """Corrections of stated poses that go together in places; answers take them back too."""
+
     def stated(self, pose: SE3, covariance: np.ndarray | None) -> tuple[SE3, np.ndarray | None]:
         """A pose of the map in the frame that the recording states, and its covariance.
 
@@ -56,7 +60,11 @@ class SceneRecord:
         if covariance is not None:
             own = np.repeat(np.square(self.map_sigma), 3)
             covariance = covariance * self.covariance_scale + np.diag(own)
-        return pose @ self.common.inverse(), covariance
+        found = pose @ self.common.inverse()
+        if self.bend is not None:
+            back = SE3.exp(-self.bend.at(found))
+            found = pose @ back @ self.common.inverse()
+        return found, covariance
 
     def query_camera(self, camera: Camera | None) -> Camera:
         """Intrinsics for a query: refined if the nominal ones or none are given, else as given."""

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -13,6 +14,7 @@ from evercal.features.encoder import Encoder, checked_encoder
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.mapping.atlas import Cell
+from evercal.mapping.frame_correction import FrameCorrection
 from evercal.mapping.scene_maps import SceneRecord
 from evercal.networks.head import Head, HeadOptions
 from evercal.storage.atomic import write_bytes, write_json
@@ -96,18 +98,26 @@ def write_record(folder: Path, record: SceneRecord) -> None:
         "map_sigma": list(record.map_sigma),
     }
     write_json(folder / "scene.json", content)
-    save_tensors(folder / "prototypes.safetensors", {"prototypes": record.prototypes})
+    tensors = {"prototypes": record.prototypes}
+    if record.bend is not None:
+        stated = record.bend.stated
+        poses = np.concatenate([stated.rotation_wxyz, stated.translation_m], -1)
+        tensors["bend_poses"] = torch.from_numpy(poses)
+        tensors["bend"] = torch.from_numpy(record.bend.correction)
+        tensors["bend_radius"] = torch.tensor(record.bend.radius, dtype=torch.float64)
+    save_tensors(folder / "prototypes.safetensors", tensors)
 
 
 def read_record(folder: Path) -> SceneRecord:
     """From a stage's folder."""
     content = json.loads((folder / "scene.json").read_text())
     cell, refined = content["cell"], content["refined_camera"]
+    tensors = load_tensors(folder / "prototypes.safetensors")
     return SceneRecord(
         content["name"],
         Camera.from_dict(content["camera"]),
         Cell(tuple(cell["centre_m"]), cell["side_m"], tuple(cell["origin_m"])),
-        load_tensors(folder / "prototypes.safetensors")["prototypes"],
+        tensors["prototypes"],
         content["train_frames"],
         Camera.from_dict(refined) if refined else None,
         content["inlier_threshold"],
@@ -115,7 +125,16 @@ def read_record(folder: Path) -> SceneRecord:
         content["min_support"],
         SE3.from_matrix(content["common"]),
         (content["map_sigma"][0], content["map_sigma"][1]),
+        _bend_of(tensors),
     )
+
+
+def _bend_of(tensors: Mapping[str, Tensor]) -> FrameCorrection | None:
+    if "bend" not in tensors:
+        return None
+    poses, radius = tensors["bend_poses"].numpy(), tensors["bend_radius"].tolist()
+    stated = SE3(poses[:, :4], poses[:, 4:])
+    return FrameCorrection(stated, tensors["bend"].numpy(), (radius[0], radius[1]))
 
 
 def save_tensors(
