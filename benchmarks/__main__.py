@@ -91,12 +91,33 @@ def gate(update: bool = False) -> int:
     return run(update)
 
 
+def maps(
+    what: Literal["mini", "fixed", "badposes", "sequence", "ablation", "strangers"],
+    scenes: tuple[Path, ...] = (),
+    out: Path = Path("runs/maps"),
+    memory: float = 0.1,
+) -> None:
+    """Measures the default strategy, and prints tables.
+
+    Args:
+        what: the packaged rooms with spoiled images and changes; their fixed cameras; spoiled
+            training poses; scenes learned in turn; what alignment gives; images that the first
+            scene's map must refuse.
+        scenes: folders of scenes, for sequence, ablation and strangers.
+        out: where stores and results are kept; must not exist yet.
+        memory: keyframes as a share of the frames.
+    """
+    from benchmarks.maps import run
+
+    run(what, scenes, out / what, memory)
+
+
 def main() -> int:
     """Runs one benchmark; `--gate` is short for `gate`."""
     from evercal.errors import InputError
 
     args = ["gate", *sys.argv[2:]] if sys.argv[1:2] == ["--gate"] else sys.argv[1:]
-    verbs = {"real": real, "speed": speed, "rooms": rooms, "peers": peers, "gate": gate}
+    verbs = {"real": real, "speed": speed, "rooms": rooms, "peers": peers, "gate": gate, "maps": maps}
     try:
         code = tyro.extras.subcommand_cli_from_dict(verbs, args=args)
     except InputError as error:

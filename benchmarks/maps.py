@@ -15,6 +15,7 @@ from tqdm import tqdm
 from evercal.continual.learn_scene import LearnOptions, LearnReport, learn_scene
 from evercal.continual.presets import preset
 from evercal.datasets import Frame, Scene, load_scene, posed
+from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, average_poses, pose_distance
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import LocalizeOptions, Localizer
@@ -349,3 +350,22 @@ def settings() -> dict[str, object]:
 def _write(path: Path, rows: Sequence[dict[str, object]]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({"rows": list(rows), "settings": settings()}, indent=1))
+
+
+def run(what: str, folders: Sequence[Path], out: Path, memory: float) -> None:
+    """Measures one thing and prints its table."""
+    if out.exists():
+        raise InputError(f"{out}: exists; remove it or give another --out")
+    if what in ("sequence", "ablation", "strangers") and not folders:
+        raise InputError(f"{what}: give scenes with --scenes DIR...")
+    scenes = [load_scene(folder) for folder in folders]
+    if what == "strangers":
+        learned(out / "store.evercal", scenes[:1], memory)
+        rows = strangers(out / "store.evercal", folders[1:])
+    elif what == "sequence":
+        rows = sequence(scenes, out, memory)
+    elif what == "ablation":
+        rows = ablation(out, scenes)
+    else:
+        rows = {"mini": mini, "fixed": fixed, "badposes": bad_poses}[what](out)
+    print_rows(rows)
