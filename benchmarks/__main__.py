@@ -117,7 +117,14 @@ def main() -> int:
     from evercal.errors import InputError
 
     args = ["gate", *sys.argv[2:]] if sys.argv[1:2] == ["--gate"] else sys.argv[1:]
-    verbs = {"real": real, "speed": speed, "rooms": rooms, "peers": peers, "gate": gate, "maps": maps}
+    verbs = {
+        "real": real,
+        "speed": speed,
+        "rooms": rooms,
+        "peers": peers,
+        "gate": gate,
+        "maps": maps,
+    }
     try:
         code = tyro.extras.subcommand_cli_from_dict(verbs, args=args)
     except InputError as error:

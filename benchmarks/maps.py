@@ -126,7 +126,7 @@ def sequence(scenes: Sequence[Scene], out: Path, memory: float) -> list[dict[str
 def _mean(name: str, rows: Sequence[dict[str, object]]) -> dict[str, object]:
     keys = [key for key in rows[0] if key != "scene"]
     means = {key: float(np.nanmean([float(str(row[key])) for row in rows])) for key in keys}
-    return {"scene": name} | means
+    return {"scene": name, **means}
 
 
 DEGRADED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
