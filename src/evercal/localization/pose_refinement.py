@@ -10,7 +10,7 @@ from evercal.geometry.se3 import SE3
 
 Array = NDArray[np.floating]
 
-_SMALL = 1e-7
+_SMALL = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
