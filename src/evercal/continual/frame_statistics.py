@@ -10,7 +10,7 @@ from torch import Tensor
 from evercal.datasets.frame import Frame, known_poses
 from evercal.networks.buffer import FeatureBuffer, Rows
 from evercal.networks.head import Head
-from evercal.networks.loss import fixed_clamp_loss, reprojection_error
+from evercal.networks.loss import fixed_clamp_loss
 
 RELIABLE_PX = 10.0
 PARTS = 625
@@ -59,18 +59,6 @@ class FrameStatistics:
     def _of(self, frame: int) -> Rows:
         start, end = self._first_rows[frame : frame + 2].tolist()
         return self._buffer.rows(torch.arange(start, end))
-
-    def local_features(self, frame: int) -> Tensor:
-        """(cells, channels) feature rows of a frame as it is."""
-        return self._of(frame).features.float()
-
-    @torch.no_grad()
-    def depths_m(self, frame: int) -> np.ndarray:
-        """(cells,) depths of a frame's cells along its optical axis, as the head believes them."""
-        rows = self._of(frame)
-        points = self._head.decode(self._hidden(rows).float(), self._buffer.scene).points
-        _, in_camera = reprojection_error(points, rows.target)
-        return in_camera[:, 2].double().numpy()
 
     def _hidden(self, rows: Rows) -> Tensor:
         return self._head.hidden(rows.features.float(), self._buffer.scene, rows.descriptor)

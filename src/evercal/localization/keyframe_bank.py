@@ -12,9 +12,10 @@ from torch import Tensor
 
 from evercal.features.encode import encode_features
 from evercal.features.precision import fast_bfloat16
-from evercal.features.views import ViewOptions, ideal_cell_pixels, plain_view
+from evercal.features.views import ViewOptions, plain_view
 from evercal.features.vlad import vlad_for
 from evercal.mapping.patches import Patches, cut_patches, image_pyramid, to_level
+from evercal.mapping.plane_sweep import PosedCells
 from evercal.mapping.scene_maps import SceneMaps
 
 ALIGNED_LEVELS = 2
@@ -97,9 +98,7 @@ class KeyframeBank:
         view = plain_view(grey, camera, stride, ViewOptions(short_side=maps.short_side))
         features = encode_features([view], maps.encoder)[0].flatten(1).T
         small = camera.short_side_resized(maps.short_side)
-        pixels = ideal_cell_pixels(small, stride).astype(np.float64)
-        plane = (pixels - [small.cx, small.cy]) / [small.fx, small.fy]
-        rays = np.concatenate([plane, np.ones((len(plane), 1))], 1)
+        rays = PosedCells(features, small, pose, stride).rays()
         depth = 1 / keyframes.inverse_depth[number].double().numpy()
         pyramid = image_pyramid(grey, ALIGNED_LEVELS)
         return LoadedKeyframe(

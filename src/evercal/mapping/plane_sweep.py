@@ -5,7 +5,7 @@ cell right to no more than some percent. Other views that show the same surface 
 cell's ray, features agree best where the surface is (Collins, A space-sweep approach, CVPR 1996).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from evercal.datasets.frame import Frame, known_poses
 from evercal.features.views import ideal_cell_pixels
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
@@ -28,8 +27,6 @@ GUESS_WEIGHT, GUESS_SPREAD = 0.2, 0.15
 """What nearness to the guess is worth, as likeness; spread in parts of the depth."""
 PARALLAX_RAD = np.deg2rad([4.0, 20.0, 35.0])
 """Parallax of a good view: at least the first, at most the second, useless from the third on."""
-SOURCE_VIEWS = 12
-"""Views that a keyframe's depths are swept through, at most."""
 MIN_SHARED = 0.1
 PROBES = 64
 ALIKE = 0.4
@@ -59,38 +56,6 @@ class PosedCells:
         c, pixels = self.camera, ideal_cell_pixels(self.camera, self.stride).astype(float)
         plane = (pixels - [c.cx, c.cy]) / [c.fx, c.fy]
         return np.concatenate([plane, np.ones((len(plane), 1))], 1)
-
-
-def keyframe_depths(
-    chosen: np.ndarray,
-    frames: Sequence[Frame],
-    short_side: int,
-    stride: int,
-    features: Callable[[int], Tensor],
-    guess_m: Callable[[int], np.ndarray],
-) -> tuple[Tensor, ...]:
-    """Inverse depths (cells,) of each keyframe, half floats, swept through its scene's frames.
-
-    Args:
-        chosen: which of the frames are keyframes.
-        frames: all training frames of a scene.
-        short_side: working size of images, pixels.
-        stride: of the encoder.
-        features: (cells, channels) of a frame, given its number.
-        guess_m: (cells,) depths of a frame, roughly.
-    """
-    cameras = [frame.camera.short_side_resized(short_side) for frame in frames]
-    poses = known_poses(frames)
-
-    def cells(i: int) -> PosedCells:
-        return PosedCells(features(i), cameras[i], poses[i], stride)
-
-    depths = []
-    for i in chosen.tolist():
-        view, guess = cells(i), guess_m(i)
-        others = select_source_views(guess, view, poses, cameras, SOURCE_VIEWS)
-        depths.append(inverse_depths(view, [cells(j) for j in others], guess).half())
-    return tuple(depths)
 
 
 def select_source_views(
