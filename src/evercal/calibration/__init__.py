@@ -1,0 +1,1 @@
+"""Hand-eye calibration: from images and robot poses to one transform that a robot can rely on."""
