@@ -44,7 +44,7 @@ class BagFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            from rosbags.highlevel import AnyReader, AnyReaderError
+            from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
         except ImportError:
             raise InputError(
@@ -55,7 +55,9 @@ class BagFile:
         try:
             self._reader = AnyReader(_parts(path), default_typestore=types)
             self._reader.open()
-        except (AnyReaderError, OSError, ValueError, AssertionError, KeyError) as error:
+        except InputError:
+            raise
+        except Exception as error:  # damaged bags make rosbags raise many kinds
             raise InputError(f"{path}: rosbags cannot read it: {_hint(error)}") from None
         weakref.finalize(self, self._reader.close)
         self._lock = threading.Lock()

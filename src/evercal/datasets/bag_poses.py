@@ -56,10 +56,7 @@ def place_images(
     stamps = (stamps_ns - stamps_ns[0]).astype(np.float64) * 1e-9
     base = _frame(bag, tree, options.base_frame, _BASES, "--base-frame")
     gripper = _frame(bag, tree, options.gripper_frame, _GRIPPERS, "--gripper-frame")
-    try:
-        poses, known = tree.a_from_b(base, gripper, stamps)
-    except InputError as error:
-        raise InputError(f"{bag.path}: {error}") from None
+    poses, known = tree.a_from_b(base, gripper, stamps)
     if not known.any():
         _refuse_apart(bag, stamps, times, "tf")
     of_camera = gripper == camera_frame
@@ -83,7 +80,7 @@ def _tf(bag: BagFile, zero_ns: int) -> tuple[TfTree, NDArray[np.float64]]:
             f"{bag.path}: no tf in it, so nothing says where the gripper was; record /tf and"
             f" /tf_static{instead}. It holds {bag.contents()}"
         )
-    tree, times = TfTree(), []
+    tree, times = TfTree(str(bag.path)), []
     for message in bag.messages(topics):
         for entry in message.content.transforms:
             stamp = None

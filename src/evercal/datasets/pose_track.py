@@ -47,8 +47,8 @@ class PoseTrack:
             max_gap_s: longest gap in the track that a moving frame is interpolated over.
 
         Returns:
-            (m,) poses and (m,) whether each is known. It is not outside the track's ends and in a
-            gap over which the frame moved; the pose there is the nearest known one.
+            (m,) poses and (m,) whether each is known. Beyond the ends none is, the nearest one
+            stands there; nor is any in a long gap over which the frame moved.
         """
         stamps = np.asarray(stamps_s, dtype=np.float64)
         held = np.clip(stamps, self.stamps_s[0], self.stamps_s[-1])

@@ -11,27 +11,27 @@ from numpy.typing import NDArray
 
 from evercal.datasets.images import decode_image
 
-# Encoding: bytes of a channel, channels, what OpenCV's constant COLOR_..2RGB is called.
+# Encoding: bytes of a channel, channels, OpenCV's constant COLOR_... that makes it RGB.
 _ENCODINGS: dict[str, tuple[int, int, str | None]] = {
     "rgb8": (1, 3, None),
-    "bgr8": (1, 3, "BGR"),
-    "8UC3": (1, 3, "BGR"),
-    "rgba8": (1, 4, "RGBA"),
-    "bgra8": (1, 4, "BGRA"),
-    "8UC4": (1, 4, "BGRA"),
-    "mono8": (1, 1, "GRAY"),
-    "8UC1": (1, 1, "GRAY"),
+    "bgr8": (1, 3, "BGR2RGB"),
+    "8UC3": (1, 3, "BGR2RGB"),
+    "rgba8": (1, 4, "RGBA2RGB"),
+    "bgra8": (1, 4, "BGRA2RGB"),
+    "8UC4": (1, 4, "BGRA2RGB"),
+    "mono8": (1, 1, "GRAY2RGB"),
+    "8UC1": (1, 1, "GRAY2RGB"),
     "rgb16": (2, 3, None),
-    "bgr16": (2, 3, "BGR"),
-    "mono16": (2, 1, "GRAY"),
-    "bayer_rggb8": (1, 1, "BayerBG"),
-    "bayer_bggr8": (1, 1, "BayerRG"),
-    "bayer_gbrg8": (1, 1, "BayerGR"),
-    "bayer_grbg8": (1, 1, "BayerGB"),
-    "yuv422": (1, 2, "YUV_UYVY"),
-    "uyvy": (1, 2, "YUV_UYVY"),
-    "yuv422_yuy2": (1, 2, "YUV_YUY2"),
-    "yuyv": (1, 2, "YUV_YUY2"),
+    "bgr16": (2, 3, "BGR2RGB"),
+    "mono16": (2, 1, "GRAY2RGB"),
+    "bayer_rggb8": (1, 1, "BayerBG2RGB"),
+    "bayer_bggr8": (1, 1, "BayerRG2RGB"),
+    "bayer_gbrg8": (1, 1, "BayerGR2RGB"),
+    "bayer_grbg8": (1, 1, "BayerGB2RGB"),
+    "yuv422": (1, 2, "YUV2RGB_UYVY"),
+    "uyvy": (1, 2, "YUV2RGB_UYVY"),
+    "yuv422_yuy2": (1, 2, "YUV2RGB_YUY2"),
+    "yuyv": (1, 2, "YUV2RGB_YUY2"),
 }
 _FILES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}
 
@@ -76,7 +76,7 @@ def image_of(message: Any) -> NDArray[np.uint8]:
         rows = (rows.astype(np.float64) / 257).round().astype(np.uint8)
     pixels = rows.reshape(height, width, channels) if channels > 1 else rows
     if colour is not None:
-        pixels = cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{colour}2RGB"))
+        pixels = cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{colour}"))
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 
 

@@ -22,9 +22,14 @@ class _Edge:
 
 
 class TfTree:
-    """What was said about frames, in any order."""
+    """What was said about frames, in any order.
 
-    def __init__(self) -> None:
+    Args:
+        where: The recording, for the messages.
+    """
+
+    def __init__(self, where: str) -> None:
+        self._where = where
         self._edges: dict[str, _Edge] = {}
         self._two_parents: dict[str, set[str]] = {}
 
@@ -52,7 +57,7 @@ class TfTree:
         length = float(np.linalg.norm(rotation_wxyz))
         if not (abs(length - 1) < 1e-2 and np.isfinite(translation_m).all()):
             raise InputError(
-                f"tf {parent} -> {child}: quaternion (w x y z) {tuple(rotation_wxyz)}, translation"
+                f"{self._where}: tf {parent} -> {child}: quaternion (w x y z) {tuple(rotation_wxyz)}, translation"
                 f" {tuple(translation_m)}: no rigid transform; mend what publishes it"
             )
         edge = self._edges.get(child)
@@ -98,12 +103,14 @@ class TfTree:
         """
         for frame in (a, b):
             if frame not in self:
-                raise InputError(f"no frame {frame!r} in tf; it has {', '.join(self.frames())}")
+                raise InputError(
+                    f"{self._where}: no frame {frame!r} in tf; it has {', '.join(self.frames())}"
+                )
         up, down = self._chain(a), self._chain(b)
         if up[-1] != down[-1]:
             raise InputError(
-                f"tf has no chain between {a!r} and {b!r}: one hangs on {up[-1]!r}, the other on"
-                f" {down[-1]!r}; record the transform that joins them"
+                f"{self._where}: tf has no chain between {a!r} and {b!r}: one hangs on {up[-1]!r}, the"
+                f" other on {down[-1]!r}; record the transform that joins them"
             )
         shared = set(up) & set(down)
         known = np.ones(len(stamps_s), dtype=bool)
@@ -121,8 +128,8 @@ class TfTree:
         if child in self._two_parents:
             parents = ", ".join(sorted(self._two_parents[child]))
             raise InputError(
-                f"tf frame {child!r} has several parents, {parents}: two programs publish it;"
-                f" record with one of them"
+                f"{self._where}: tf frame {child!r} has several parents, {parents}: two programs"
+                f" publish it; record with one of them"
             )
         edge = self._edges[child]
         poses = SE3(np.array(edge.quaternions), np.array(edge.translations))
@@ -136,7 +143,8 @@ class TfTree:
         while chain[-1] in self._edges:
             parent = self._edges[chain[-1]].parent
             if parent in chain:
-                raise InputError(f"tf goes in a circle: {' -> '.join([*chain, parent])}")
+                circle = " -> ".join([*chain, parent])
+                raise InputError(f"{self._where}: tf goes in a circle: {circle}")
             chain.append(parent)
         return chain
 
