@@ -75,6 +75,7 @@ def _verbs(first: str) -> dict[str, Any]:
     """All verbs by name."""
     from evercal.cli.bench import Bench
     from evercal.cli.bench_report import BenchReport
+    from evercal.cli.convert import Convert
     from evercal.cli.demo import Demo
     from evercal.cli.evaluate import Evaluate
     from evercal.cli.info import Info
@@ -93,6 +94,7 @@ def _verbs(first: str) -> dict[str, Any]:
         "info": Info,
         "verify": Verify,
         "inspect": Inspect,
+        "convert": Convert,
         "simulate": Simulate,
         "bench": Bench,
         "bench-report": BenchReport,
