@@ -127,6 +127,11 @@ def test_a_folder_with_joints_and_a_urdf_is_a_recording(tmp_path: Path, urdf: Pa
     for frame, pose in zip(scene.train, expected, strict=True):
         assert frame.base_from_gripper is not None
         assert max(pose_distance(frame.base_from_gripper, pose)) < 1e-9
+    degrees = ReadOptions(urdf=urdf, pose_convention="deg")  # of the column that does not say
+    turned = load_scene(tmp_path, options=degrees).train[0].base_from_gripper
+    assert turned is not None
+    expected = planar(np.deg2rad(0.25), np.deg2rad(-30), 0.2)
+    assert max(pose_distance(turned, expected)) < 1e-7
     assert scene.notes[0] == "gripper poses are those of tip in base, from planar.urdf"
     with pytest.raises(InputError, match="has no link 'hand'; its links are base, upper"):
         load_scene(tmp_path, options=ReadOptions(urdf=urdf, gripper_frame="hand"))

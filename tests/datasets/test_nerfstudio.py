@@ -118,8 +118,9 @@ def test_an_applied_transform_is_undone(
 
 
 def test_named_test_files_are_test_frames(tmp_path: Path) -> None:
-    write(tmp_path, entries(ring()), **LENS, train_filenames=["images/frame_00000.png"],
-          test_filenames=["./images/frame_00003.png"], val_filenames=["images/frame_00001.png"])  # fmt: skip
+    names = [f"images/frame_{i:05d}.png" for i in range(4)]
+    splits: dict[str, Any] = {"train_filenames": names[:1], "val_filenames": names[1:2]}
+    write(tmp_path, entries(ring()), **LENS, **splits, test_filenames=[f"./{names[3]}"])
     scene = load_scene(tmp_path)
     assert [f.name[-6:-4] for f in scene.train] == ["00", "02", "04"]
     assert [f.name[-6:-4] for f in scene.test] == ["01", "03"]

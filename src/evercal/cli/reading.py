@@ -29,7 +29,8 @@ class Reading:
     urdf: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """URDF of the robot, where the recording has joint angles and no poses."""
     pose_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """How a file of gripper poses is written, where its header does not say."""
+    """How a file of gripper poses is written, where its header does not say; of joint angles rad or
+    deg."""
     every: Annotated[int, arg(metavar="N", help_behavior_hint="")] = 1
     """Take every N-th image only."""
 

@@ -72,6 +72,13 @@ def decode_image(data: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
     return np.ascontiguousarray(image[:, :, ::-1]).astype(np.uint8, copy=False)
 
 
+def image_file(data: bytes) -> tuple[str, bytes] | None:
+    """The ending that goes with the bytes of a PNG or JPEG file, and the bytes; None for others."""
+    starts = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}
+    ending = next((e for start, e in starts.items() if data.startswith(start)), None)
+    return None if ending is None else (ending, data)
+
+
 def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
     """Writes (H, W, 3) uint8 RGB in the format that the file's ending names.
 

@@ -176,8 +176,8 @@ def _warn_motion(poses: SE3, extent: np.ndarray, step: float, of_camera: bool) -
         found += _warn_reach(poses)
     if extent.max() < SAME_M:
         found.append(
-            f"all training frames stand at one point, turning by {np.rad2deg(turned.max()):.0f} deg;"
-            f" a map takes views from several. Are the translations there, and in metres?"
+            f"all training frames stand at one point, turning by {np.rad2deg(turned.max()):.0f}"
+            f" deg; a map takes views from several. Are the translations there, and in metres?"
         )
     elif extent.max() < SMALLEST_EXTENT_M:
         found.append(

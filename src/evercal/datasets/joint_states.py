@@ -11,6 +11,7 @@ belongs to; without either they go in order.
 """
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,12 +23,17 @@ from evercal.datasets.robot_poses import RobotPoses
 from evercal.datasets.row_files import Rows, read_rows
 from evercal.errors import InputError
 
+_UNITS = ("deg", "rad", "m")
 _STILL_RAD = 0.001
 _JSON = "an object with 'joint_names', 'positions' and, if known, 'images' or 'stamps_s'"
 
 
 def read_joint_poses(
-    path: Path, model: RobotModel, base: str | None = None, gripper: str | None = None
+    path: Path,
+    model: RobotModel,
+    base: str | None = None,
+    gripper: str | None = None,
+    unit: str | None = None,
 ) -> tuple[RobotPoses, list[str]]:
     """Reads joint angles and makes gripper poses of them.
 
@@ -36,6 +42,7 @@ def read_joint_poses(
         model: the arm.
         base: link; the root of the URDF if None.
         gripper: link; the only end of the URDF if None.
+        unit: "rad" or "deg", of angles whose column does not say; radians if None.
 
     Returns:
         The poses with names or times of the rows, and notes: the frames taken, doubtful angles.
@@ -49,7 +56,7 @@ def read_joint_poses(
     needed = model.joints_between(base, gripper)
     if not needed:
         raise InputError(f"{model.path}: no joint moves {gripper} against {base}; name other links")
-    names, values = in_radians(rows, needed)
+    names, values = _plain_columns(rows, model, unit)
     try:
         poses = model.base_from_gripper(names, values, base, gripper)
     except InputError as error:
@@ -60,17 +67,41 @@ def read_joint_poses(
     return RobotPoses(rows.names, rows.stamps_s, poses), notes
 
 
-def in_radians(rows: Rows, joints: tuple[str, ...]) -> tuple[list[str], NDArray[np.float64]]:
-    """Column names without their units, and (n, columns) values in radians."""
-    names, values = [], rows.values.copy()
-    for i, column in enumerate(rows.columns):
-        plain, _, unit = column.rpartition("_")
-        if column not in joints and unit in ("deg", "rad", "m") and plain in joints:
-            column = plain
-            if unit == "deg":
-                values[:, i] = np.deg2rad(values[:, i])
-        names.append(column)
-    return names, values
+def _plain_columns(
+    rows: Rows, model: RobotModel, unit: str | None
+) -> tuple[list[str], NDArray[np.float64]]:
+    """Joint names without their units, and (n, columns) values in radians and metres."""
+    names, stated = [], []
+    for column in rows.columns:
+        plain, _, ending = column.rpartition("_")
+        says = ending in _UNITS and not model.has_joint(column) and model.has_joint(plain)
+        names.append(plain if says else column)
+        stated.append(ending if says else None)
+    return names, in_radians(model, names, rows.values, [s or unit for s in stated])
+
+
+def in_radians(
+    model: RobotModel,
+    names: Sequence[str],
+    values: NDArray[np.float64],
+    units: Sequence[str | None],
+) -> NDArray[np.float64]:
+    """Angles that are stated in degrees in radians; other values as they are.
+
+    Args:
+        model: tells which joints turn.
+        names: of the joints.
+        values: (n, joints).
+        units: of each joint: "deg", "rad", "m" or None.
+
+    Raises:
+        InputError: another unit.
+    """
+    strange = next((unit for unit in units if unit not in (None, *_UNITS)), None)
+    if strange is not None:
+        raise InputError(f"--pose-convention {strange}: joint angles are rad or deg")
+    turned = [u == "deg" and t for u, t in zip(units, model.turning(names), strict=True)]
+    return np.where(turned, np.deg2rad(values), values)
 
 
 def interpolate(

@@ -52,6 +52,10 @@ class RobotModel:
         self.links = tuple(self._urdf.link_map)
         self._joint_above = {joint.child: joint for joint in self._urdf.robot.joints}
 
+    def has_joint(self, name: str) -> bool:
+        """Whether the URDF has a joint of this name."""
+        return name in self._urdf.joint_map
+
     def end_link(self) -> str:
         """The last link of an arm that has one end only.
 
@@ -114,6 +118,11 @@ class RobotModel:
             self._urdf.update_cfg(dict(zip(needed, row.tolist(), strict=True)))
             matrix[...] = self._urdf.get_transform(gripper, base)
         return SE3.from_matrix(found)
+
+    def turning(self, names: Sequence[str]) -> list[bool]:
+        """Whether each joint turns, so that its values are angles."""
+        kinds = {name: joint.type for name, joint in self._urdf.joint_map.items()}
+        return [kinds.get(name) in ("revolute", "continuous") for name in names]
 
     def beyond_limits(self, names: Sequence[str], values: NDArray[np.float64]) -> list[str]:
         """One sentence for each joint whose values leave what the URDF allows by over 0.1."""

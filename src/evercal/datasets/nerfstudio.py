@@ -5,12 +5,12 @@
      "frames": [{"file_path": "images/frame_00001.png", "transform_matrix": [4][4]}, ...],
      "test_filenames": [...]}
 
-`transform_matrix` is the camera in the world with OpenGL's axes (y up, looking along -z). Intrinsics
-stand at the top or in each frame; pixels count from the image's corner, as in COLMAP, so that the
-centre of the top-left pixel is (0.5, 0.5). `applied_transform` and `applied_scale` are undone: the
-base frame is that of the program that made the poses, and its scale is that program's. Files that
-`val_filenames` and `test_filenames` name are test frames. (Tancik et al., Nerfstudio, SIGGRAPH
-2023; its documentation, Data conventions.)
+`transform_matrix` is the camera in the world with OpenGL's axes (y up, looking along -z).
+Intrinsics stand at the top or in each frame; pixels count from the image's corner, as in COLMAP, so
+that the centre of the top-left pixel is (0.5, 0.5). `applied_transform` and `applied_scale` are
+undone: the base frame is that of the program that made the poses, and its scale is that program's.
+Files that `val_filenames` and `test_filenames` name are test frames. (Tancik et al., Nerfstudio,
+SIGGRAPH 2023; its documentation, Data conventions.)
 """
 
 import json

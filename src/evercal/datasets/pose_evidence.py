@@ -30,6 +30,7 @@ LEAST_MATCHES = 40
 LONG_SIDE = 640
 AGREE_DEG = 2.0
 """Turns that differ by no more agree."""
+STILL_DEG = 1.0
 BETTER, CLOSE_DEG = 3.0, 0.5
 """Another reading of the poses has to fit so many times better to be named; with it those that fit
 as well within so much."""
@@ -172,7 +173,10 @@ def _camera_doubts(turns: Turns) -> list[str]:
 
 def _gripper_doubts(turns: Turns) -> list[str]:
     if _still(turns):
-        return ["the gripper turns and the images do not; does the camera stand still?"]
+        return [
+            "the gripper turns and the images hardly do; does the camera stand still, or are the"
+            " angles in another unit than was said?"
+        ]
     as_said = _fitted(turns.seen, turns.stated)
     fits = {
         "gripper_from_base, the inverse": _fitted(turns.seen, turns.inverse),
@@ -186,8 +190,7 @@ def _gripper_doubts(turns: Turns) -> list[str]:
 
 def _still(turns: Turns) -> bool:
     """Whether the images hardly turn although the gripper does."""
-    seen, stated = (np.rad2deg(np.linalg.norm(t, axis=1)) for t in (turns.seen, turns.stated))
-    return float(np.median(seen)) < 0.1 * float(np.median(stated))
+    return float(np.rad2deg(np.median(np.linalg.norm(turns.seen, axis=1)))) < STILL_DEG
 
 
 def _told(what: str, as_said: float, fits: dict[str, float], pairs: int, better: float) -> str:

@@ -22,8 +22,8 @@ class ReadOptions:
     urdf: Path | None = None
     """The robot's URDF, where the recording has joint angles; None for the one beside them."""
     pose_convention: str | None = None
-    """How a pose file is written, a name that `read_robot_poses` knows; None where its header says
-    so."""
+    """How a pose file is written, a name that `read_robot_poses` knows; of joint angles rad or deg.
+    None where the file says so."""
     every: int = 1
     """Every how manyeth image is taken, 1 for all; of use for video."""
 

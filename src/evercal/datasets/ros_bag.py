@@ -20,7 +20,7 @@ from evercal.datasets.bag_file import BagFile
 from evercal.datasets.bag_poses import Placed, place_images
 from evercal.datasets.camera_file import read_camera
 from evercal.datasets.frame import Frame, Scene
-from evercal.datasets.images import StoredImage
+from evercal.datasets.images import StoredImage, image_file
 from evercal.datasets.pose_track import MAX_GAP_S
 from evercal.datasets.read_options import ReadOptions
 from evercal.datasets.tf_tree import plain
@@ -92,7 +92,7 @@ class BagImage(StoredImage):
         if self.bag.kinds[self.topic] != bag_file.COMPRESSED:
             return None
         message = self.bag.message(self.topic, self.logged_ns, self.repeat)
-        return ros_images.file_of(message.content)
+        return image_file(bytes(message.content.data))
 
 
 _decompress = ros_images.compressed_image_of

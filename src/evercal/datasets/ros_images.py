@@ -33,7 +33,6 @@ _ENCODINGS: dict[str, tuple[int, int, str | None]] = {
     "yuv422_yuy2": (1, 2, "YUV2RGB_YUY2"),
     "yuyv": (1, 2, "YUV2RGB_YUY2"),
 }
-_FILES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}
 
 
 def refused(encoding: str) -> str | None:
@@ -96,10 +95,3 @@ def compressed_image_of(message: Any) -> NDArray[np.uint8]:
     if image is None:
         raise ValueError(f"format {message.format!r} is not supported or broken; use jpeg or png")
     return image
-
-
-def file_of(message: Any) -> tuple[str, bytes] | None:
-    """The ending and bytes of the image file in a CompressedImage; None if it holds none."""
-    data = bytes(message.data)
-    ending = next((e for start, e in _FILES.items() if data.startswith(start)), None)
-    return None if ending is None else (ending, data)

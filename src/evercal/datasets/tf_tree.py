@@ -57,8 +57,9 @@ class TfTree:
         length = float(np.linalg.norm(rotation_wxyz))
         if not (abs(length - 1) < 1e-2 and np.isfinite(translation_m).all()):
             raise InputError(
-                f"{self._where}: tf {parent} -> {child}: quaternion (w x y z) {tuple(rotation_wxyz)}, translation"
-                f" {tuple(translation_m)}: no rigid transform; mend what publishes it"
+                f"{self._where}: tf {parent} -> {child}: quaternion (w x y z)"
+                f" {tuple(rotation_wxyz)}, translation {tuple(translation_m)}: no rigid transform;"
+                f" mend what publishes it"
             )
         edge = self._edges.get(child)
         if edge is not None and edge.parent != parent:
@@ -109,8 +110,8 @@ class TfTree:
         up, down = self._chain(a), self._chain(b)
         if up[-1] != down[-1]:
             raise InputError(
-                f"{self._where}: tf has no chain between {a!r} and {b!r}: one hangs on {up[-1]!r}, the"
-                f" other on {down[-1]!r}; record the transform that joins them"
+                f"{self._where}: tf has no chain between {a!r} and {b!r}: one hangs on"
+                f" {up[-1]!r}, the other on {down[-1]!r}; record the transform that joins them"
             )
         shared = set(up) & set(down)
         known = np.ones(len(stamps_s), dtype=bool)

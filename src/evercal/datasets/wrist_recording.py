@@ -66,12 +66,9 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Sc
 
 def _rows(root: Path, file: Path, options: ReadOptions) -> tuple[RobotPoses, list[str]]:
     if file.name in _JOINTS:
-        if options.pose_convention is not None:
-            raise InputError(
-                f"--pose-convention: {file} holds joint angles, not poses; leave it out"
-            )
         model = RobotModel(options.urdf or _urdf(root, file))
-        return read_joint_poses(file, model, options.base_frame, options.gripper_frame)
+        frames = options.base_frame, options.gripper_frame
+        return read_joint_poses(file, model, *frames, options.pose_convention)
     for name in ("urdf", "base_frame", "gripper_frame"):
         if getattr(options, name) is not None:
             raise InputError(
