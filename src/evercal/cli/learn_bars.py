@@ -15,7 +15,13 @@ if TYPE_CHECKING:
     from evercal.networks.trainer import Progress
 
 
-_UNITS = {"encoding": "image", "mapping": "keyframe", "adjusting": "round", "training": "step"}
+_UNITS = {
+    "encoding": "image",
+    "mapping": "keyframe",
+    "matching": "pair",
+    "adjusting": "round",
+    "training": "step",
+}
 _FRESH = {"encoding": 8}
 
 

@@ -48,6 +48,9 @@ class SceneRecord:
 
     bend: FrameCorrection | None = None
     """Corrections of stated poses that go together in places; answers take them back too."""
+    frame_covariance: np.ndarray | None = None
+    """(6, 6) uncertainty of the base frame itself: a small motion of it, base frame, metres and
+    radians, that all answers share. None where poses were stated in it."""
 
     def stated(self, pose: SE3, covariance: np.ndarray | None) -> tuple[SE3, np.ndarray | None]:
         """A pose of the map in the frame that the recording states, and its covariance.
@@ -64,6 +67,8 @@ class SceneRecord:
         if self.bend is not None:
             back = SE3.exp(-self.bend.at(found))
             found = pose @ back @ self.common.inverse()
+        if covariance is not None and self.frame_covariance is not None:
+            covariance = covariance + moved_by_frame(found, self.frame_covariance)
         return found, covariance
 
     def query_camera(self, camera: Camera | None) -> Camera:
@@ -75,6 +80,40 @@ class SceneRecord:
         ):
             return self.refined_camera or own
         return camera
+
+
+def moved_by_frame(base_from_camera: SE3, frame_covariance: np.ndarray) -> np.ndarray:
+    """(6, 6) covariance of a camera pose that an uncertain base frame gives it.
+
+    Args:
+        base_from_camera: single pose.
+        frame_covariance: (6, 6) of a small motion (v, w) of the base frame, which moves the
+            position t by v + w x t and turns the camera by w.
+    """
+    x, y, z = base_from_camera.translation_m
+    slope = np.eye(6)
+    slope[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+    slope[3:, 3:] = base_from_camera.rotation_matrix().T
+    return slope @ frame_covariance @ slope.T
+
+
+def frame_moved_by_cameras(base_from_camera: SE3, covariance: np.ndarray) -> np.ndarray:
+    """(6, 6) covariance of the base frame that a motion common to all cameras gives it.
+
+    The reverse of `moved_by_frame` for an error of `gripper_from_camera`: landmarks move with the
+    cameras that saw them, so the frame moves by the mean over them.
+
+    Args:
+        base_from_camera: (n,) poses that a map was built from.
+        covariance: (6, 6) of the common motion, camera frame.
+    """
+    turn = base_from_camera.rotation_matrix()
+    slope = np.zeros((len(turn), 6, 6))
+    slope[:, :3, :3] = slope[:, 3:, 3:] = turn
+    for axis in range(3):  # the position moves by R v, less what turning about the base moves it
+        slope[:, :3, 3 + axis] = np.cross(base_from_camera.translation_m, turn[:, :, axis])
+    mean = slope.mean(0)
+    return mean @ covariance @ mean.T
 
 
 def _proportions(camera: Camera) -> tuple[float, float, float, float]:

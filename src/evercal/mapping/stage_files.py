@@ -105,6 +105,8 @@ def write_record(folder: Path, record: SceneRecord) -> None:
         tensors["bend_poses"] = torch.from_numpy(poses)
         tensors["bend"] = torch.from_numpy(record.bend.correction)
         tensors["bend_radius"] = torch.tensor(record.bend.radius, dtype=torch.float64)
+    if record.frame_covariance is not None:
+        tensors["frame_covariance"] = torch.from_numpy(record.frame_covariance)
     save_tensors(folder / "prototypes.safetensors", tensors)
 
 
@@ -126,6 +128,7 @@ def read_record(folder: Path) -> SceneRecord:
         SE3.from_matrix(content["common"]),
         (content["map_sigma"][0], content["map_sigma"][1]),
         _bend_of(tensors),
+        tensors["frame_covariance"].numpy() if "frame_covariance" in tensors else None,
     )
 
 
