@@ -284,7 +284,7 @@ def _pair_motions(
     return motions
 
 
-def _sift(image: NDArray[np.uint8], options: HandEyeOptions) -> tuple[Array, Array]:
+def _sift(image: NDArray[np.uint8], options: HandEyeOptions) -> tuple[Array, NDArray[np.float32]]:
     """Pixels (n, 2) and descriptors (n, 128) of unit length, RootSIFT (Arandjelovic, CVPR 2012)."""
     import cv2
 
@@ -303,7 +303,7 @@ def _ideal(camera: Camera) -> dict[str, object]:
 
 def _motion(
     pair: tuple[int, int],
-    features: list[tuple[Array, Array]],
+    features: list[tuple[Array, NDArray[np.float32]]],
     cameras: list[Camera],
     options: HandEyeOptions,
 ) -> PairMotion | None:
