@@ -37,7 +37,7 @@ def table(header: str, numbers: NDArray[np.float64], separator: str = ",") -> st
 
 
 def same(found: SE3, poses: SE3, tolerance: float = 1e-12) -> bool:
-    return found.shape == poses.shape and np.max(pose_distance(found, poses)) < tolerance
+    return found.shape == poses.shape and bool(np.max(pose_distance(found, poses)) < tolerance)
 
 
 HEADERS = [
@@ -216,6 +216,7 @@ REFUSED = [
     ("a1,a2,a3,a4,a5,a6,a7\n" + Q, None, "names no pose that is known"),
     ("x,y,z,u,v\n0,0,0,0,0", "kuka", "its 5 columns are not the 6 of kuka"),
     ("x,y,z,qw,qx,qy,qz\n" + Q, "kuka", "no columns for kuka"),
+    ("x,y,z,rx,ry,rz\n500,0,0,10,20,30", "kuka", "no columns for kuka .X Y Z A B C"),
     (Q, None, "7 columns without a header"),
     (Q + ",3,4", "wxyz", "row 1 has 9 columns; wxyz takes 7"),
     (Q + "\n1,2", "wxyz", "row 2 has 2 columns"),

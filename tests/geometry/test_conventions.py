@@ -43,7 +43,7 @@ def of_quaternion(w: float, x: float, y: float, z: float) -> Array:
 
 
 def of_vector(x: float, y: float, z: float) -> Array:
-    return expm(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
+    return np.asarray(expm(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])), dtype=np.float64)
 
 
 def fixed_xyz(unit: float) -> Callable[..., Array]:

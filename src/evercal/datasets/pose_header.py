@@ -206,7 +206,10 @@ def _columns(header: PoseHeader, group: str, convention: PoseConvention) -> list
     ):
         found = [*columns]
     elif group in ("angles", "roll_pitch_yaw") and layout == "euler":
-        # By their axes: rx and roll turn about x.
+        # By their axes: rx and roll turn about x. KUKA's A turns about z, but who wrote its angles
+        # under rx ry rz may have meant either.
+        if (group, base) == ("angles", "kuka"):
+            return None
         found = [columns["xyz".index(axis)] for axis in convention.euler.lower()]
     return None if found is None else [*header.groups.get("position", ()), *found]
 

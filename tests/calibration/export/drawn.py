@@ -2,7 +2,7 @@
 
 import numpy as np
 from hypothesis import strategies as st
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from evercal.calibration.calibration import Calibration, ImageUse, Mount
 from evercal.geometry import SE3, Camera
@@ -47,7 +47,7 @@ def arm(count: int = 5, seed: int = 3) -> SE3:
 
 
 def quaternion_matrix(
-    x: float, y: float, z: float, w: float, translation: object
+    x: float, y: float, z: float, w: float, translation: ArrayLike
 ) -> NDArray[np.float64]:
     """4x4 from the textbook's formula."""
     matrix = np.eye(4)
@@ -56,5 +56,5 @@ def quaternion_matrix(
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    matrix[:3, 3] = translation  # pyright: ignore[reportArgumentType]
+    matrix[:3, 3] = np.asarray(translation)
     return matrix

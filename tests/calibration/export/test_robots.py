@@ -45,7 +45,7 @@ def test_ur(pose: SE3) -> None:
     assert comment.startswith("# pose of cam/optical-frame in base_link")
     assert re.fullmatch(rf"p\[{NUMBER}(, {NUMBER}){{5}}\]", line)
     numbers = [float(word) for word in re.findall(NUMBER, line)]
-    check(cv2.Rodrigues(np.array(numbers[3:]))[0], numbers[:3], pose)
+    check(np.asarray(cv2.Rodrigues(np.array(numbers[3:]))[0], dtype=np.float64), numbers[:3], pose)
 
 
 @given(poses())
