@@ -80,6 +80,7 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.check import Check
     from evercal.cli.demo import Demo
     from evercal.cli.evaluate import Evaluate
+    from evercal.cli.export import ExportCalibration
     from evercal.cli.info import Info
     from evercal.cli.inspect import Inspect
     from evercal.cli.learn import Learn
@@ -102,6 +103,7 @@ def _verbs(first: str) -> dict[str, Any]:
         "verify": Verify,
         "inspect": Inspect,
         "simulate": Simulate,
+        "export": ExportCalibration,
         "bench": Bench,
         "bench-report": BenchReport,
         "pretrain": pretrain_with_options() if first == "pretrain" else Pretrain,
