@@ -38,7 +38,7 @@ class HandEyeOptions:
 
     frames: int = 120
     """Frames that take part, at most, spread over the gripper's poses."""
-    partners: int = 10
+    partners: int = 6
     """Every frame is matched to this many frames that look most alike."""
     features: int = 1500
     """SIFT features of an image, at most."""
