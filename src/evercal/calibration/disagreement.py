@@ -97,9 +97,7 @@ def _readings(pairs: PosePairs, mount: Mount, scale_known: bool) -> Iterator[_Re
     for shift in (1, -1):
         rows = slice(max(shift, 0), len(pairs) + min(shift, 0))
         others = slice(max(-shift, 0), len(pairs) + min(-shift, 0))
-        moved = replace(
-            pairs[np.arange(len(pairs))[rows]], camera_from_board=camera[others]
-        )
+        moved = replace(pairs[np.arange(len(pairs))[rows]], camera_from_board=camera[others])
         late = "robot" if shift > 0 else "camera"
         if len(moved) >= MIN_POSES:
             yield _Reading(
@@ -145,7 +143,13 @@ def _rotation_readings(pairs: PosePairs) -> Iterator[_Reading]:
         other = pairs.camera_from_board if name == "robot" else pairs.base_from_gripper
         for sentence, rotation in _misread(poses):
             turned = SE3(rotation.as_quat(scalar_first=True), poses.translation_m)
-            found.append((_angle_mismatch(turned, other)[0], f"the {name} {sentence}", replace(pairs, **{part: turned})))
+            found.append(
+                (
+                    _angle_mismatch(turned, other)[0],
+                    f"the {name} {sentence}",
+                    replace(pairs, **{part: turned}),
+                )
+            )
     found.sort(key=lambda entry: entry[0])
     for _, sentence, turned in found[:_FITTED]:
         yield _Reading(sentence, turned)
@@ -198,9 +202,13 @@ def _require_unit(pairs: PosePairs, mount: Mount, found: Agreement) -> None:
     powers = {0.001: "millimetres", 0.01: "centimetres", 0.0254: "inches"}
     for unit, name in powers.items():
         if abs(np.log(scale / unit)) < 0.1:
-            raise InputError(f"the camera poses look like {name}, the robot's are metres; convert them")
+            raise InputError(
+                f"the camera poses look like {name}, the robot's are metres; convert them"
+            )
         if abs(np.log(scale * unit)) < 0.1:
-            raise InputError(f"the robot poses look like {name}, the camera's are metres; convert them")
+            raise InputError(
+                f"the robot poses look like {name}, the camera's are metres; convert them"
+            )
     raise InputError(
         f"the camera's lengths fit the robot's only if multiplied by {scale:.4g}; check the board's"
         f" square or tag size and both units, or say --scale unknown"

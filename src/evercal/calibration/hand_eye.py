@@ -7,7 +7,12 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
 from evercal.calibration.consensus import consensus_start
-from evercal.calibration.noise_levels import NoiseLevels, ellipsoid_factor, estimate_levels, widened_covariance
+from evercal.calibration.noise_levels import (
+    NoiseLevels,
+    ellipsoid_factor,
+    estimate_levels,
+    widened_covariance,
+)
 from evercal.calibration.pose_equation import PoseEquation, Unknowns
 
 _TAILS = 3.0

@@ -107,7 +107,9 @@ def widened_covariance(
     unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     covariance = np.outer(unit, unit) * np.linalg.pinv(normal * np.outer(unit, unit), 1e-13)
     # Per kind J' W S and, with the noise taken out, how much of it reaches the unknowns.
-    reached = [weighted.transpose(0, 2, 1) @ part @ part.transpose(0, 2, 1) for part in directions.values()]
+    reached = [
+        weighted.transpose(0, 2, 1) @ part @ part.transpose(0, 2, 1) for part in directions.values()
+    ]
     reached = np.stack(reached)
     slopes = np.einsum("knpi,niq->kpq", reached, weighted, optimize=True)
     loss = np.einsum("kl,knpi,nij,lnqj->pq", uncertainty, reached, inverse, reached, optimize=True)

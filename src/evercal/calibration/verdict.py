@@ -47,7 +47,9 @@ def verdict(calibration: Calibration) -> str:
     found = tier(calibration)
     mm, deg = _expected(calibration)
     if found is None:
-        first = f"Unusable: even tabletop tasks ask for {TIERS[-1].mm:g} mm and {TIERS[-1].deg:g} deg."
+        first = (
+            f"Unusable: even tabletop tasks ask for {TIERS[-1].mm:g} mm and {TIERS[-1].deg:g} deg."
+        )
     else:
         first = f"Good for {found.name} (within {found.mm:g} mm and {found.deg:g} deg)."
     known = f"The camera's place is known to {_length(mm)} and {deg:.2f} deg"
@@ -58,9 +60,7 @@ def verdict(calibration: Calibration) -> str:
     return f"{first} {known} {held_out[1]:.2f} deg. {_advice(found, (mm, deg), held_out)}"
 
 
-def _advice(
-    found: Tier | None, known: tuple[float, float], held_out: tuple[float, float]
-) -> str:
+def _advice(found: Tier | None, known: tuple[float, float], held_out: tuple[float, float]) -> str:
     if found is TIERS[0]:
         return "Check it on the robot before use: touch a point that the camera sees."
     wanted = TIERS[-1] if found is None else TIERS[TIERS.index(found) - 1]

@@ -41,8 +41,9 @@ class Learn:
     preset: Literal["fast", "demo", "bench", "paper"] = "fast"
     """How much a network is trained: fast takes minutes on two cores, paper needs a GPU. A map
     takes no notice of it."""
-    memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
-    """How many keyframes are kept of the scene: a share of its frames (10%) or bytes (5MB)."""
+    memory: Annotated[str, arg(metavar="SHARE|BYTES|auto")] = "10%"
+    """How many keyframes are kept of the scene: a share of its frames (10%), bytes (5MB), or auto:
+    the fewest with which its other frames are located well."""
     centres: Annotated[int | None, arg(metavar="M", help_behavior_hint="")] = None
     """How many cluster centres a scene adds to a network; the preset's number when left out."""
     encoder: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -61,7 +62,8 @@ class Learn:
 
     def run(self) -> int:
         """Learns, shows how it goes, and says what came out."""
-        parse_memory(self.memory)  # refused before anything is read
+        if self.memory.strip().lower() != memory_budget.AUTO:
+            parse_memory(self.memory)  # refused before anything is read
         if self.centres is not None and self.centres < 1:
             raise InputError(f"--centres {self.centres}: give a number >= 1")
         if self.seed < 0:

@@ -19,6 +19,7 @@ _UNITS = {
     "encoding": "image",
     "mapping": "keyframe",
     "matching": "pair",
+    "choosing keyframes": "try",
     "adjusting": "round",
     "training": "step",
 }

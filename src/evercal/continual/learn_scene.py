@@ -234,6 +234,13 @@ def _check(opened: Store, scene: Scene, options: LearnOptions) -> None:
             f" {opened.maps.strategy!r} builds no map that could find the camera on the gripper;"
             " use strategy evercal"
         )
+    if options.stage.memory_auto and (
+        strategy_of(opened).network or not strategy_of(opened).build_map
+    ):
+        raise InputError(
+            f"memory auto: strategy {opened.maps.strategy!r} trains a network; give a share or"
+            " bytes"
+        )
     if len(scene.train) < MIN_TRAIN_FRAMES:
         raise InputError(
             f"scene {scene.name!r}: {len(scene.train)} training frames are too few; "
