@@ -125,15 +125,17 @@ def shift_between(
     same = reference.source.get("map") == map_digest(localizer, fused.scene)
     off = deviations(SE3.stack([fused.pose]), reference.parent_from_child)[0]
     count = int(fused.used.sum())
-    covariance = _scatter(fused.scatter, count, options) / count
     floor = [(options.floor_mm / 1000) ** 2] * 3 + [np.deg2rad(options.floor_deg) ** 2] * 3
-    covariance = covariance + np.diag(floor)
+    seen = [(fused.scatter, count)]
     if same:
+        # One camera in one map: its images scatter alike before and now.
         before = int(reference.checks.get("images_used", 1))
-        scatter = np.array(reference.checks.get("image_scatter", np.zeros((6, 6))))
-        covariance = covariance + _scatter(scatter, before, options) / before
+        seen.append((np.array(reference.checks.get("image_scatter", np.zeros((6, 6)))), before))
+        scatter = _scatter(seen, options)
+        covariance = scatter / count + scatter / before + np.diag(floor)
     else:
         kept = [item.covariance for item, used in zip(located, fused.used, strict=True) if used]
+        covariance = _scatter(seen, options) / count + np.diag(floor)
         covariance = covariance + reference.covariance + np.mean(kept, axis=0)
     confidence = float(stats.chi2.cdf(off @ np.linalg.solve(covariance, off), 6))
     millimetres = 1000 * float(np.linalg.norm(off[:3]))
@@ -151,9 +153,16 @@ def shift_between(
     )
 
 
-def _scatter(measured: Array, count: int, options: DriftOptions) -> Array:
-    """Scatter of one image: as measured, drawn to the usual one where few images measured it."""
+def _scatter(seen: Sequence[tuple[Array, int]], options: DriftOptions) -> Array:
+    """Scatter of one image: as measured, drawn to the usual one where few images measured it.
+
+    Args:
+        seen: scatters (6, 6) with the number of images that each was measured on.
+        options: with the usual scatter.
+    """
     usual = [(options.usual_scatter_mm / 1000) ** 2] * 3
     usual += [np.deg2rad(options.usual_scatter_deg) ** 2] * 3
-    weight = options.usual_weight
-    return (weight * np.diag(usual) + (count - 1) * measured) / (weight + count - 1)
+    total, weight = options.usual_weight * np.diag(usual), options.usual_weight
+    for scatter, count in seen:
+        total, weight = total + (count - 1) * scatter, weight + count - 1
+    return total / weight

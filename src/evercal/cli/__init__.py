@@ -73,6 +73,7 @@ def _complain(message: str, as_json: bool) -> int:
 
 def _verbs(first: str) -> dict[str, Any]:
     """All verbs by name."""
+    from evercal.cli.align import Align
     from evercal.cli.audit import Audit
     from evercal.cli.bench import Bench
     from evercal.cli.bench_report import BenchReport
@@ -98,6 +99,7 @@ def _verbs(first: str) -> dict[str, Any]:
         "check": Check,
         "watch": Watch,
         "audit": Audit,
+        "align": Align,
         "evaluate": Evaluate,
         "info": Info,
         "verify": Verify,

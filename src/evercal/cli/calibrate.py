@@ -33,6 +33,8 @@ class Calibrate:
     rig."""
     robot_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """The gripper's pose in the base at every image, in the order of the images."""
+    convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """How the numbers of the robot poses are meant, where the file does not say it."""
     mount: Literal["eye_to_hand", "eye_in_hand"] | None = None
     """Whether the camera stands still (eye_to_hand) or the gripper carries it (eye_in_hand); found
     out when left out."""
@@ -83,9 +85,9 @@ class Calibrate:
 
         poses = None
         if self.robot_poses is not None:
-            from evercal.datasets.robot_poses import poses_for_images
+            from evercal.datasets.robot_poses import poses_of_images
 
-            poses = poses_for_images(self.robot_poses, files)
+            poses = poses_of_images(self.robot_poses, files, self.convention)
         return Images(read_images(files), camera_for(self.camera, files), poses)
 
     def _calibrated(self, localizer: "Localizer", given: "Images") -> "Calibration":
