@@ -22,6 +22,7 @@ VERBS = (
     "info",
     "verify",
     "inspect",
+    "convert",
     "simulate",
     "export",
     "bench",
@@ -83,7 +84,7 @@ def test_arguments_have_names_and_explanations(run: Any) -> None:
     for option in ("name", "strategy", "preset", "memory", "centres", "encoder", "format", "seed"):
         assert f"--{option} " in text
     assert "STORE SCENE" in text
-    assert "Folder of the recorded scene." in text
+    assert "Folder of the recorded scene," in text
     assert "--no-json" not in text
 
 

@@ -79,6 +79,7 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.bench_report import BenchReport
     from evercal.cli.calibrate import Calibrate
     from evercal.cli.check import Check
+    from evercal.cli.convert import Convert
     from evercal.cli.demo import Demo
     from evercal.cli.evaluate import Evaluate
     from evercal.cli.export import ExportCalibration
@@ -104,6 +105,7 @@ def _verbs(first: str) -> dict[str, Any]:
         "info": Info,
         "verify": Verify,
         "inspect": Inspect,
+        "convert": Convert,
         "simulate": Simulate,
         "export": ExportCalibration,
         "bench": Bench,

@@ -68,7 +68,7 @@ class Align:
 
     def _by_gripper(self, localizer: "Localizer") -> "MapAlignment":
         from evercal.calibration.align import align_by_gripper
-        from evercal.datasets.robot_poses import poses_of_images
+        from evercal.datasets.pairing import poses_of_images
 
         files = image_files(self.images)
         assert self.robot_poses is not None

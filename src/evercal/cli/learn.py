@@ -3,7 +3,7 @@
 import dataclasses
 import re
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, size
 from evercal.cli.learn_bars import LearnBars
+from evercal.cli.reading import Reading
 from evercal.continual import memory_budget
 from evercal.errors import InputError
 
@@ -32,7 +33,7 @@ class Learn:
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the store; made when it is missing."""
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
-    """Folder of the recorded scene."""
+    """Folder of the recorded scene, or file of a bag."""
     name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """What the scene is called in the store; its own name when left out."""
     strategy: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
@@ -48,8 +49,8 @@ class Learn:
     """How many cluster centres a scene adds to a network; the preset's number when left out."""
     encoder: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """File of encoder weights from 'evercal pretrain', for a new store; else the shipped ones."""
-    format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """Format of the folder: generic, 7scenes or 12scenes; it is recognised when left out."""
+    reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
+    """How the recording is read."""
     gripper_from_camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Where the camera roughly sits on the gripper, a 4x4 matrix or a calibration file, for a
     recording that states gripper poses only: what is found from the images is compared with it."""
@@ -70,9 +71,9 @@ class Learn:
             raise InputError(f"--seed {self.seed}: give a number >= 0")
         from evercal.continual.learn_scene import learn_scene, validation_split
         from evercal.continual.wrist_camera import lacks_camera_poses
-        from evercal.datasets import load_scene, posed_scene
+        from evercal.datasets import posed_scene
 
-        scene = load_scene(self.scene, self.format, self.name)
+        scene = self.reading.scene(self.scene, self.name)
         wrist = lacks_camera_poses(scene)
         if not wrist:
             self._refuse_hand_eye(scene.name)
