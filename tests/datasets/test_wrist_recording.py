@@ -188,19 +188,35 @@ def test_what_is_missing_or_twice_is_named(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("", "empty"),
-        ("x_m,y_m\n", "no rows"),
+        ("image,stamp_s\n", "no rows"),
         ("1,2,3\n4,5,6\n", "names no columns"),
-        ("x_m,y_m,z_m,rotvec_x,rotvec_y,rotvec_z\n1,2,3\n", "row 1 has 3 cells"),
-        ("x_m,y_m,z_m,rotvec_x,rotvec_y,rotvec_z\n1,2,3,4,nan,6\n", "'nan' is not a number"),
+        ("image,stamp_s\na.png\n", "row 1 has 1 cells"),
+        ("image,stamp_s\na.png,nan\n", "'nan' is not a number"),
+        ("image,x\na.png,1\n", "needs the columns image and stamp_s"),
     ],
 )
 def test_broken_tables_are_named(tmp_path: Path, text: str, message: str) -> None:
-    make_folder(tmp_path, ["1.png"], None)
-    (tmp_path / "base_from_gripper.csv").write_text(text)
+    make_folder(tmp_path, ["1.png"], some_poses(1))
+    (tmp_path / "stamps.csv").write_text(text)
     with pytest.raises(InputError, match=message) as caught:
         load_scene(tmp_path)
     assert "\n" not in str(caught.value)
-    assert "base_from_gripper.csv" in str(caught.value)
+    assert "stamps.csv" in str(caught.value)
+
+
+def test_the_formats_of_pose_files_are_read(tmp_path: Path) -> None:
+    names, poses = ["1.png", "2.png"], some_poses(2)
+    make_folder(tmp_path, names, None)
+    np.save(tmp_path / "base_from_gripper.npy", poses.matrix())
+    assert_paired(load_scene(tmp_path), names, poses)
+    (tmp_path / "base_from_gripper.npy").unlink()
+    rows = np.hstack([1000 * poses.translation_m, poses.log()[:, 3:]])
+    numbers = "\n".join(" ".join(f"{v:.12g}" for v in row) for row in rows)
+    (tmp_path / "base_from_gripper.txt").write_text(numbers)
+    with pytest.raises(InputError, match=r"base_from_gripper\.txt"):
+        load_scene(tmp_path)  # nothing says how the numbers are meant
+    scene = load_scene(tmp_path, options=ReadOptions(pose_convention="ur:mm"))
+    assert_paired(scene, names, poses)
 
 
 REAL = os.environ.get("EVERCAL_REAL_DATA", "")

@@ -27,6 +27,8 @@ from evercal.datasets.images import read_image as read_image
 from evercal.datasets.images import write_image as write_image
 from evercal.datasets.read_options import ReadOptions as ReadOptions
 from evercal.datasets.read_options import flag
+from evercal.datasets.robot_poses import RobotPoses as RobotPoses
+from evercal.datasets.robot_poses import read_robot_poses as read_robot_poses
 from evercal.datasets.sfm_poses import with_sfm_poses as with_sfm_poses
 from evercal.errors import InputError
 

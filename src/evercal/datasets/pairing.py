@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.datasets.pose_track import MAX_GAP_S, PoseTrack
-from evercal.datasets.robot_poses import RobotPoses
+from evercal.datasets.robot_poses import RobotPoses, read_robot_poses
 from evercal.datasets.row_files import in_seconds
 from evercal.errors import InputError
 from evercal.geometry import SE3
@@ -49,6 +49,26 @@ def pair_images(
         )
     first, last = images[0].name, images[-1].name
     return list(rows.poses), [f"images and poses were paired in order, {first} to {last}"]
+
+
+def poses_of_images(file: Path, images: Sequence[Path], convention: str | None = None) -> SE3:
+    """(n,) base_from_gripper of images, paired with the rows of a file as `pair_images` does.
+
+    Args:
+        file: as `read_robot_poses` takes it.
+        images: in the order of the rows, where neither names nor times pair them.
+        convention: how the file is written, where it does not say it.
+
+    Raises:
+        InputError: they cannot be paired, or an image has no pose.
+    """
+    poses, _ = pair_images(images, read_robot_poses(file, convention), None, file)
+    missing = [image.name for image, pose in zip(images, poses, strict=True) if pose is None]
+    if missing:
+        raise InputError(
+            f"{file}: has no pose for {_few(missing)}; give every image one, or leave the image out"
+        )
+    return SE3.stack([pose for pose in poses if pose is not None])
 
 
 def _by_name(

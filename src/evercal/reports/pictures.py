@@ -71,7 +71,7 @@ def draw_landmarks(
         return large
     record = next(r for r in localizer.maps.scenes if r.name == estimate.scene)
     camera = record.query_camera(None).short_side_resized(localizer.maps.short_side)
-    adjusted = estimate.base_from_camera @ record.common  # landmarks are in the map's own frame
+    adjusted = record.camera_among_landmarks(estimate.base_from_camera)
     expected = camera.project(adjusted.inverse().apply(estimate.points_m))
     residual = np.linalg.norm(estimate.pixels - expected, axis=1)
     at = (estimate.pixels + 0.5) * (height / camera.height) - 0.5

@@ -1,0 +1,229 @@
+"""Robust joint refinement of both unknown transforms, with a covariance that can be believed."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, f
+
+from evercal.calibration.consensus import consensus_start
+from evercal.calibration.noise_levels import (
+    NoiseLevels,
+    ellipsoid_factor,
+    estimate_levels,
+    widened_covariance,
+)
+from evercal.calibration.pose_equation import PoseEquation, Unknowns
+
+_TAILS = 3.0
+"""Degrees of freedom of the tails in the first refinement."""
+_GROSS = 40.0
+"""Squared distance beyond which a pose is left out of the first noise levels."""
+MIN_POSES = 4
+"""Different poses; of three, a wrong one cannot be told from the others."""
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """What decides the refinement."""
+
+    rejection: float = 0.01
+    """Probability that any pose of a recording without outliers is rejected."""
+    rounds: int = 12
+    """Passes of refinement, noise levels and rejection, at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandEyeFit:
+    """The refined answer."""
+
+    at: Unknowns
+    """Both transforms and the scale."""
+    covariance: Array
+    """(p, p) of all unknowns in the order of `PoseEquation.jacobian`, before `factor`."""
+    factor: float
+    """On the covariance, since the noise was judged from few poses, see `ellipsoid_factor`."""
+    inliers: Mask
+    """(n,) the poses that it rests on."""
+    residual: Array
+    """(n, 6) of all poses, metres and radians in the axes of `fixed`."""
+    distance2: Array
+    """(n,) squared distance of each residual in units of its covariance."""
+    levels: NoiseLevels
+    """What noise the poses show."""
+    contributions: Array
+    """(k, 6, 6) what each kind of noise adds to the covariance of `parent_from_camera`."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well poses fit together, robustly and quickly judged."""
+
+    at: Unknowns
+    """The answer of most of them."""
+    metres: float
+    """Standard deviation of the board's place per axis."""
+    radians: float
+    """The same of its rotation."""
+    inliers: Mask
+    """(n,) which poses lie within some of these."""
+
+
+def agreement(equation: PoseEquation) -> Agreement:
+    """How well poses fit together.
+
+    Args:
+        equation: four poses or more.
+    """
+    n, at = len(equation), consensus_start(equation)
+    # Medians of the length of a 3-D normal; the fit follows part of the noise.
+    to_sigma = np.sqrt(n / max(n - 2.0, 1.0)) / np.sqrt(chi2.ppf(0.5, 3))
+    sigma, distance2 = np.zeros(2), np.zeros(n)
+    for _ in range(30):
+        lengths = np.linalg.norm(equation.residuals(at).reshape(n, 2, 3), axis=2)
+        sigma = np.maximum(np.median(lengths, 0) * to_sigma, 1e-8)
+        distance2 = ((lengths / sigma) ** 2).sum(1)
+        trust = (_TAILS + 6) / (_TAILS + distance2)
+        step, gain = _step(equation, at, trust[:, None, None] * np.diag(np.repeat(sigma**-2.0, 3)))
+        at = at.moved(step, equation.scale_known)
+        if gain < 1e-2:
+            break
+    return Agreement(at, float(sigma[0]), float(sigma[1]), distance2 < _GROSS)
+
+
+def robust_fit(
+    equation: PoseEquation, found: Agreement | None = None, options: SolveOptions | None = None
+) -> HandEyeFit:
+    """Refines the answer of most poses; gross outliers are found and left out.
+
+    Args:
+        equation: the poses, sorted so that equal recordings come in equal order; four or more, with
+            rotations about two axes.
+        found: `agreement(equation)`, where it was computed already.
+        options: of the rejection.
+    """
+    options = options or SolveOptions()
+    found = found or agreement(equation)
+    at, inliers = found.at, found.inliers
+    covariance = np.broadcast_to(
+        np.diag(np.repeat([found.metres**2, found.radians**2], 3)), (len(equation), 6, 6)
+    )
+    levels: NoiseLevels | None = None
+    seen: list[bytes] = []
+    for _ in range(options.rounds):
+        at = refine(equation, at, covariance, inliers)
+        before, levels = levels, _levels(equation, at, inliers, levels)
+        covariance = _noise(equation, at, levels)
+        residual = equation.residuals(at)
+        jacobian = equation.jacobian(at, residual)
+        distance2 = _distances(residual, jacobian, covariance, inliers)
+        keep = _agreeing(distance2, inliers, equation.unknowns, options.rejection)
+        if keep.sum() < max(MIN_POSES, len(keep) // 2):
+            break
+        same, settled = bool((keep == inliers).all()), _settled(before, levels)
+        # A pose at the threshold may come and go for ever; the second visit decides.
+        if (same and settled) or (not same and keep.tobytes() in seen):
+            break
+        seen.append(inliers.tobytes())
+        inliers = keep
+    assert levels is not None
+    at = refine(equation, at, covariance, inliers)
+    return _result(equation, at, covariance, inliers, levels)
+
+
+def refine(equation: PoseEquation, at: Unknowns, covariance: Array, use: Mask) -> Unknowns:
+    """Weighted least squares by Gauss and Newton.
+
+    Args:
+        equation: n poses.
+        at: a start within some degrees and centimetres.
+        covariance: (n, 6, 6) of the residuals.
+        use: (n,) the poses that count.
+    """
+    chosen, weight = equation[use], np.linalg.inv(covariance[use])
+    for _ in range(30):
+        step, gain = _step(chosen, at, weight)
+        at = at.moved(step, equation.scale_known)
+        if gain < 1e-4:
+            break
+    return at
+
+
+def _step(equation: PoseEquation, at: Unknowns, weight: Array) -> tuple[Array, float]:
+    """One step of Gauss and Newton, and its squared length in units of the covariance."""
+    p = equation.unknowns
+    residual = equation.residuals(at)
+    jacobian = equation.jacobian(at, residual)
+    weighted = (weight @ jacobian).reshape(-1, p)
+    normal = weighted.T @ jacobian.reshape(-1, p)
+    # Metres and radians per unit of every unknown, so that the solution keeps its digits.
+    unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    right = unit * (weighted.T @ residual.ravel())
+    step = -unit * np.linalg.lstsq(normal * np.outer(unit, unit), right, rcond=1e-13)[0]
+    return step, float(step @ normal @ step)
+
+
+def _levels(
+    equation: PoseEquation, at: Unknowns, use: Mask, start: NoiseLevels | None
+) -> NoiseLevels:
+    chosen = equation[use]
+    residual = chosen.residuals(at)
+    jacobian = chosen.jacobian(at, residual)
+    directions, known = chosen.noise_directions(at), chosen.known_noise(at)
+    return estimate_levels(residual, jacobian, directions, known, start)
+
+
+def residual_noise(equation: PoseEquation, fit: HandEyeFit) -> Array:
+    """(n, 6, 6) covariance of the residuals of all poses by the noise that they show."""
+    return _noise(equation, fit.at, fit.levels)
+
+
+def _noise(equation: PoseEquation, at: Unknowns, levels: NoiseLevels) -> Array:
+    return levels.covariances(equation.noise_directions(at), equation.known_noise(at))
+
+
+def _settled(before: NoiseLevels | None, now: NoiseLevels) -> bool:
+    if before is None:
+        return False
+    return bool(np.abs(now.variance - before.variance).max() <= 0.05 * now.variance.max())
+
+
+def _result(
+    equation: PoseEquation, at: Unknowns, noise: Array, use: Mask, levels: NoiseLevels
+) -> HandEyeFit:
+    """The covariance of the unknowns and how far the truth may lie."""
+    residual = equation.residuals(at)
+    jacobian = equation.jacobian(at, residual)
+    covariance, slopes = widened_covariance(
+        jacobian[use], noise[use], equation[use].noise_directions(at), levels.uncertainty
+    )
+    factor = ellipsoid_factor(covariance[:6, :6], slopes[:, :6, :6], levels.uncertainty)
+    distance2 = _distances(residual, jacobian, noise, use)
+    parts = slopes[:, :6, :6] * levels.variance[:, None, None]
+    return HandEyeFit(at, covariance, factor, use, residual, distance2, levels, parts)
+
+
+def _covariance(jacobian: Array, noise: Array) -> Array:
+    """(p, p) of the unknowns by weighted least squares."""
+    p = jacobian.shape[-1]
+    normal = (np.linalg.inv(noise) @ jacobian).reshape(-1, p).T @ jacobian.reshape(-1, p)
+    unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    return np.outer(unit, unit) * np.linalg.pinv(normal * np.outer(unit, unit), 1e-13)
+
+
+def _distances(residual: Array, jacobian: Array, noise: Array, use: Mask) -> Array:
+    """(n,) squared distance of each residual in units of its covariance."""
+    covariance = _covariance(jacobian[use], noise[use])
+    followed = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
+    # A pose that the answer rests on has pulled it along, another one has not. One that fixes an
+    # unknown alone has no spread left along some axis.
+    spread = np.where(use[:, None, None], noise - followed, noise + followed) + 1e-3 * noise
+    return (residual * np.linalg.solve(spread, residual[..., None])[..., 0]).sum(1)
+
+
+def _agreeing(distance2: Array, use: Mask, unknowns: int, rejection: float) -> Mask:
+    """(n,) which poses lie as close as noise allows, judged from the noise that they show."""
+    freedom = max(6 * int(use.sum()) - unknowns, 2)
+    return distance2 < 6 * f.ppf(1 - rejection / len(use), 6, freedom)
