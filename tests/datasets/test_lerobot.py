@@ -165,7 +165,7 @@ def test_a_dataset_comes_back(version: str, kind: str, codec: str, tmp_path: Pat
         assert off.max() < (5 if kind == "video" else 1e-9)  # frames differ by 10
         assert frame.base_from_gripper is not None
         assert max(pose_distance(frame.base_from_gripper, pose(episode, number))) < 1e-6
-    assert scene.notes == ("gripper poses are observation.ee, in metres, with a quaternion",)
+    assert scene.notes[0].startswith("gripper poses are observation.ee: ")
 
 
 def test_joints_and_a_urdf_in_radians_or_degrees(tmp_path: Path) -> None:
@@ -183,8 +183,27 @@ def test_joints_and_a_urdf_in_radians_or_degrees(tmp_path: Path) -> None:
             assert max(pose_distance(frame.base_from_gripper, expected)) < 1e-6
     with pytest.raises(InputError, match="--pose-convention grad: joint angles are rad or deg"):
         load_scene(root, options=options(root, urdf=root / "arm.urdf", pose_convention="grad"))
-    with pytest.raises(InputError, match="--base-frame: goes with joint angles"):
+    with pytest.raises(InputError, match="--base-frame goes with --urdf only"):
         load_scene(root, options=options(root, base_frame="base"))
+
+
+def test_poses_in_a_given_convention(tmp_path: Path) -> None:
+    root = make(tmp_path / "wave", "v2.1", "image")
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"]["observation.ee"]["names"] = None
+    change(root, features=info["features"])
+    read = options(root, pose_convention="xyzw", gripper_frame="observation.ee")
+    for i, frame in enumerate(load_scene(root, options=read).train):
+        assert frame.base_from_gripper is not None
+        assert max(pose_distance(frame.base_from_gripper, pose(*divmod(i, LENGTH)))) < 1e-6
+    for convention, feature, message in (
+        ("xyzw", None, r"observation\.state: "),
+        ("martian", "observation.ee", "martian"),
+        ("xyzw", "observation.hand", r"no feature 'observation\.hand'; --gripper-frame names one"),
+    ):
+        read = options(root, pose_convention=convention, gripper_frame=feature)
+        with pytest.raises(InputError, match=message):
+            load_scene(root, options=read)
 
 
 def test_embedded_images_are_written_out(tmp_path: Path) -> None:

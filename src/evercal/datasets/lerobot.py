@@ -7,9 +7,11 @@
     ROOT/meta/episodes/chunk-000/file-000.parquet, ROOT/videos/KEY/chunk-000/file-000.mp4
 
 Poses come from a feature whose names hold x, y, z and qx, qy, qz, qw, or wx, wy, wz for a rotation
-vector (`ee.x` and `x` alike); with a URDF from the joints of observation.state (`elbow.pos` is the
-joint elbow), in radians unless the convention deg is said. The format has no place for intrinsics:
-a camera file has to be given. Frames of all episodes are training frames with base_from_gripper.
+vector (`ee.x` and `x` alike), in metres and radians; or from the first numbers of observation.state
+in a convention that is given; or with a URDF from the joints of observation.state (`elbow.pos` is
+the joint elbow), in radians unless the convention deg is given. The format has no place for
+intrinsics: a camera file has to be given. Frames of all episodes are training frames with
+base_from_gripper.
 """
 
 import json
@@ -20,22 +22,23 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from evercal.datasets.camera_file import read_camera
 from evercal.datasets.frame import Frame, Scene
 from evercal.datasets.images import StoredImage, decode_image, image_file
 from evercal.datasets.joint_states import in_radians
 from evercal.datasets.kinematics import RobotModel
-from evercal.datasets.read_options import ReadOptions, flag
+from evercal.datasets.read_options import ReadOptions
 from evercal.datasets.video_file import VideoFrame, Videos
 from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.geometry.conventions import doubt, pose_convention, poses_from_numbers
 
 USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")
 INFO = Path("meta") / "info.json"
 _STATE = "observation.state"
-_TURNS = {"quaternion": ("qx", "qy", "qz", "qw"), "rotation vector": ("wx", "wy", "wz")}
+# By convention: how the numbers of a pose are called.
+_CALLED = {"xyzw": ("x", "y", "z", "qx", "qy", "qz", "qw"), "ur": ("x", "y", "z", "wx", "wy", "wz")}
 
 
 def detect(root: Path) -> bool:
@@ -124,7 +127,14 @@ def _pose_column(root: Path, info: Mapping[str, Any], options: ReadOptions) -> s
     """The feature that says where the arm was."""
     if options.urdf is not None:
         return _STATE
-    found = [k for k in info["features"] if k.startswith("observation") and _turn(_names(info, k))]
+    if options.pose_convention is not None:
+        column = options.gripper_frame or _STATE
+        if column not in info["features"]:
+            has = ", ".join(info["features"])
+            raise InputError(f"{root}: no feature {column!r}; --gripper-frame names one of {has}")
+        return column
+    keys = [key for key in info["features"] if key.startswith("observation")]
+    found = [key for key in keys if _called(_names(info, key))]
     if options.gripper_frame is not None:
         found = [key for key in found if key == options.gripper_frame]
     if _STATE in found or len(found) == 1:
@@ -140,16 +150,15 @@ def _pose_column(root: Path, info: Mapping[str, Any], options: ReadOptions) -> s
     )
     raise InputError(
         f"{root}: no feature holds a pose (x, y, z and qx, qy, qz, qw or wx, wy, wz), there are"
-        f" {has or 'no named numbers'}; for joint angles give --urdf"
+        f" {has or 'no named numbers'}; for joint angles give --urdf, for a pose in another form"
+        f" --pose-convention and --gripper-frame FEATURE"
     )
 
 
-def _turn(names: list[str]) -> str | None:
-    """How a feature states a rotation, if it states a pose."""
+def _called(names: list[str]) -> str | None:
+    """The convention that a feature's names speak of, if it is a pose."""
     last = [name.rpartition(".")[2] for name in names]
-    if not all(axis in last for axis in "xyz"):
-        return None
-    return next((what for what, parts in _TURNS.items() if all(p in last for p in parts)), None)
+    return next((c for c, parts in _CALLED.items() if all(p in last for p in parts)), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,37 +218,46 @@ def _poses(
 ) -> tuple[SE3, list[str]]:
     """(n,) base_from_gripper and what was taken."""
     names = _names(info, column)
-    if len(names) != table.values.shape[1]:
-        raise InputError(
-            f"{root}: {column} has {table.values.shape[1]} numbers and {len(names)} names"
-        )
     if options.urdf is not None:
-        model = RobotModel(options.urdf)
-        base = options.base_frame or model.base_link
-        gripper = options.gripper_frame or model.end_link()
-        values = in_radians(model, names, table.values, [options.pose_convention] * len(names))
-        try:
-            poses = model.base_from_gripper(names, values, base, gripper)
-        except InputError as error:
-            raise InputError(f"{root}: {column}: {error} (or say --pose-convention deg)") from None
-        notes = [f"gripper poses are those of {gripper} in {base}, from {options.urdf.name}"]
-        return poses, notes + model.beyond_limits(names, values)
-    for name in ("base_frame", "pose_convention"):
-        if getattr(options, name) is not None:
-            raise InputError(f"{flag(name)}: goes with joint angles and --urdf only; leave it out")
-    last = [name.rpartition(".")[2] for name in names]
-    turn = _turn(names)
-    assert turn is not None
-    numbers = table.values[:, [last.index(part) for part in _TURNS[turn]]]
-    if turn == "quaternion":
-        if np.abs(np.linalg.norm(numbers, axis=1) - 1).max() > 0.01:
-            raise InputError(f"{root}: {column}: qx, qy, qz, qw are not of length one")
-        rotation = Rotation.from_quat(numbers)
-    else:
-        rotation = Rotation.from_rotvec(numbers)
-    moved = table.values[:, [last.index(axis) for axis in "xyz"]]
-    poses = SE3(rotation.as_quat(scalar_first=True), moved)
-    return poses, [f"gripper poses are {column}, in metres, with a {turn}"]
+        return _joint_poses(root, names, table, options)
+    if options.base_frame is not None:
+        raise InputError(f"{root}: --base-frame goes with --urdf only; leave it out")
+    try:
+        if options.pose_convention is not None:
+            convention = pose_convention(options.pose_convention)
+            numbers = table.values[:, : convention.count]
+        else:
+            called = _called(names)
+            assert called is not None
+            convention = pose_convention(called)
+            last = [name.rpartition(".")[2] for name in names]
+            numbers = table.values[:, [last.index(part) for part in _CALLED[called]]]
+        poses, why = poses_from_numbers(numbers, convention), doubt(numbers, convention)
+    except ValueError as error:
+        raise InputError(f"{root}: {column}: {error}") from None
+    if why is not None:
+        raise InputError(f"{root}: {column}: {why}")
+    return poses, [f"gripper poses are {column}: {convention.meaning}"]
+
+
+def _joint_poses(
+    root: Path, names: list[str], table: _Table, options: ReadOptions
+) -> tuple[SE3, list[str]]:
+    """Forward kinematics of observation.state."""
+    assert options.urdf is not None
+    if len(names) != table.values.shape[1]:
+        count = table.values.shape[1]
+        raise InputError(f"{root}: {_STATE} has {count} numbers and {len(names)} names")
+    model = RobotModel(options.urdf)
+    base = options.base_frame or model.base_link
+    gripper = options.gripper_frame or model.end_link()
+    values = in_radians(model, names, table.values, [options.pose_convention] * len(names))
+    try:
+        poses = model.base_from_gripper(names, values, base, gripper)
+    except InputError as error:
+        raise InputError(f"{root}: {_STATE}: {error} (or say --pose-convention deg)") from None
+    notes = [f"gripper poses are those of {gripper} in {base}, from {options.urdf.name}"]
+    return poses, notes + model.beyond_limits(names, values)
 
 
 def _images(
