@@ -86,6 +86,7 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.learn import Learn
     from evercal.cli.localize import Localize
     from evercal.cli.pretrain import Pretrain, pretrain_with_options
+    from evercal.cli.report import Report
     from evercal.cli.simulate import Simulate
     from evercal.cli.verify import Verify
     from evercal.cli.watch import Watch
@@ -98,6 +99,7 @@ def _verbs(first: str) -> dict[str, Any]:
         "check": Check,
         "watch": Watch,
         "audit": Audit,
+        "report": Report,
         "evaluate": Evaluate,
         "info": Info,
         "verify": Verify,
