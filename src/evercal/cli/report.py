@@ -26,8 +26,7 @@ class Report:
     store: Annotated[Path | None, arg(metavar="STORE", help_behavior_hint="")] = None
     """Folder of the store: landmarks are found in the images and drawn with their residuals."""
     images: Annotated[tuple[Path, ...], arg(metavar="IMAGE...", help_behavior_hint="")] = ()
-    """Images of the camera to draw into, or a folder of them; those it was made from when left
-    out."""
+    """Images of the camera to draw into, or a folder of them; else those it was made from."""
     against: Annotated[Path | None, arg(metavar="OLD_CALIBRATION.json", help_behavior_hint="")] = (
         None
     )
@@ -74,8 +73,10 @@ class Report:
         from evercal.reports.calibration_views import Views, readable_images, views_of
 
         given = image_files(self.images) if self.images else []
+        if found.camera is None:
+            return views_of(found, [])
         files, none = readable_images(found, self.calibration.parent, given)
-        if found.camera is not None and not files:
+        if not files:
             return Views(missing=(none,))
         localizer = None
         if self.store is not None:

@@ -81,8 +81,8 @@ def overlay_lines(
 ) -> Image:
     """Draws lines over an image: the axes of a frame, say.
 
-    Whole lines have a white rim, so that they stand out on any ground. Dashed ones have none and
-    are meant to lie beside or over whole ones.
+    Whole lines have a white rim and dashed ones a black one, so that they stand out on any ground
+    and can be told apart where they lie together.
 
     Args:
         image: (H, W, 3) uint8 RGB; not changed.
@@ -112,8 +112,8 @@ def overlay_lines(
         if dash is not None:
             pieces = [part for piece in pieces for part in _dashes(piece, dash)]
         whole = [np.round(piece * (1 << _FRACTION_BITS)).astype(np.int32) for piece in pieces]
-        rim = [((255, 255, 255), width + 2)] if dash is None else []
-        for ink, thickness in (*rim, (colour, width)):
+        rim = (255, 255, 255) if dash is None else (0, 0, 0)
+        for ink, thickness in ((rim, width + 2), (colour, width)):
             cv2.polylines(drawn, whole, False, ink, thickness, cv2.LINE_AA, _FRACTION_BITS)
     return drawn
 

@@ -67,7 +67,7 @@ def ellipsoid_shadows(covariance_mm2: ArrayLike, frame: str, share: float = 0.95
         panel.set_xlabel(plain(f"{'xyz'[a]} of {_short(frame)} (mm)"), fontsize=9)
         panel.set_ylabel(plain(f"{'xyz'[b]} of {_short(frame)} (mm)"), fontsize=9)
         panel.set_title(f"{'xyz'[a]}{'xyz'[b]}", fontsize=9)
-        panel.locator_params(nbins=5)
+        panel.locator_params(nbins=7)
         _quiet(panel)
     return png_bytes(figure)
 

@@ -47,7 +47,7 @@ def older_sentences(found: Calibration, older: Older, views: Views) -> list[str]
     if views.axes is not None and views.older is not None:
         pixels = float(np.linalg.norm(views.axes.origin_px - views.older.origin_px))
         if np.isfinite(pixels) and not views.axes.where:
-            said += f" In the image the origin of {found.parent_frame} moves by {pixels:.1f} pixels."
+            said += f" In the image {found.parent_frame} moves by {pixels:.1f} pixels."
     blocks = [said]
     if before.parent_frame != found.parent_frame:
         blocks.append(
@@ -74,8 +74,9 @@ def _shared(found: Calibration, older: Calibration) -> str:
     """How the two uncertainties bear on the difference."""
     digest = found.source.get("map")
     if digest is not None and digest == older.source.get("map"):
+        judge = " ('evercal check' judges it)" if found.mount == "eye_to_hand" else ""
         return (
             "Both come from one map, whose errors cancel in the difference: a shift is known better"
-            " than either pose ('evercal check' judges it)."
+            f" than either pose{judge}."
         )
     return "They do not come from one map, so the errors of both are in the difference."

@@ -93,14 +93,17 @@ def _verdict(found: Calibration) -> Section:
         reached = good is not None and TIERS.index(level) >= TIERS.index(good)
         told = "good enough" if reached else "not good enough"
         rows.append((level.name, level.most_mm, level.most_deg, told))
-    rows.append(("unusable", "more", "more", "yes: do not use it" if good is None else "no"))
+    rows.append(("unusable", "-", "-", "yes: do not use it" if good is None else "no"))
     header = (
         "use",
         "error of position, at most mm",
         "of rotation, at most deg",
         "this calibration",
     )
-    blocks: list[Block] = [found.verdict or verdict(found), Table(header, rows, "Tiers of use")]
+    blocks: list[Block] = [
+        found.verdict or verdict(found),
+        Table(header, rows, "Tiers of use; what fits none of them is unusable"),
+    ]
     if _states_uncertainty(found):
         millimetres, degrees = expected_error(found)
         blocks.append(
@@ -176,12 +179,12 @@ def _in_the_images(subject: Subject) -> Section:
         blocks.append(_axes_sentence(subject))
         landmarks = any(view.landmarks is not None for view in views.views)
         if landmarks:
-            told = "where the calibration puts them"
+            puts = "the calibration puts them"
             if found.mount == "eye_in_hand":
-                told = "where the pose of the image puts them, since this camera moves"
+                puts = "the image's own pose puts them (this camera moves)"
             blocks.append(
-                f"Dots are landmarks of {subject.store} that were found in the images, dark where"
-                f" they lie {told}, yellow where they lie further off."
+                f"Dots are landmarks of {subject.store} that were found in the images: dark ones"
+                f" lie where {puts}, yellow ones further off."
             )
         else:
             blocks.append(Missing("No landmarks: give the store with --store to see them."))
@@ -192,6 +195,9 @@ def _in_the_images(subject: Subject) -> Section:
         captions = [f"{_name(view.name)}: {view.use}" for view in views.views]
         sheet = contact_sheet([v.image for v in views.views], 2, captions, cell_width=640)
         blocks.append(Picture(encode_image(sheet, "jpg"), _sheet_caption(subject)))
+        if views.close_up is not None:
+            told = f"The origin of {found.parent_frame} in the first of them, enlarged"
+            blocks.append(Picture(encode_image(views.close_up, "jpg"), told))
         if landmarks:
             blocks.append(_landmark_table(views))
     blocks += [Missing(sentence) for sentence in views.missing]
@@ -214,10 +220,13 @@ def _axes_sentence(subject: Subject) -> str:
 
 
 def _sheet_caption(subject: Subject) -> str:
-    frame = subject.found.parent_frame
-    told = f"The axes of {frame} as the calibration sees them"
-    if subject.older is not None:
-        told += f"; pale and dashed, as {subject.older.file} does"
+    axes, before, frame = subject.views.axes, subject.views.older, subject.found.parent_frame
+    if axes is not None and axes.where:
+        told = f"Which way the axes of {frame} point, as the calibration has it"
+    else:
+        told = f"The axes of {frame} where the calibration sees them"
+    if before is not None and subject.older is not None and not before.where:
+        told += f"; pale and dashed, where {subject.older.file} sees them"
     return told
 
 
@@ -321,9 +330,11 @@ def _checks(found: Calibration) -> Section:
             " the map: their difference says how well images agree, not how right they are."
         )
     if "repeatability" not in names:
-        blocks.append(Missing("No repeatability: two halves of the data were not compared."))
+        blocks.append(
+            Missing("No repeatability: the calibration holds no comparison of two halves.")
+        )
     if "held_out" not in names:
-        blocks.append(Missing("No held-out error: nothing was held out when it was made."))
+        blocks.append(Missing("No held-out error: the calibration holds none."))
     others = other_rows(found)
     if others:
         blocks.append(Table(("what", "value"), others, "Other numbers that were kept"))

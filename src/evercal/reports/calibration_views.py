@@ -1,6 +1,5 @@
 """Images with the axes of a calibration drawn in, and the landmarks that were found in them."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +13,13 @@ from evercal.calibration.from_images import map_digest
 from evercal.datasets.images import read_image
 from evercal.drawing import overlay_points
 from evercal.errors import InputError
-from evercal.reports.frame_axes import AxesInView, axes_in_view, draw_axes, draw_directions
+from evercal.reports.frame_axes import (
+    AxesInView,
+    axes_in_view,
+    close_up,
+    draw_axes,
+    draw_directions,
+)
 from evercal.reports.pictures import landmark_errors
 
 if TYPE_CHECKING:
@@ -25,9 +30,10 @@ Image = NDArray[np.uint8]
 
 MOST_IMAGES = 4
 _CELL_PX = 640
+_CLOSE_UP_PX = 480
 _ASPECT_TOLERANCE = 0.01
 _WORST_PX = 2.0
-"""Reprojection error at the upper end of the colours, pixels of the image as it is."""
+"""Reprojection error at the upper end of the colours, pixels of the working image."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,8 @@ class Views:
     """The axes of the parent frame, the same in every image; None without intrinsics."""
     older: AxesInView | None = None
     """Those of an older calibration."""
+    close_up: Image | None = None
+    """The origin of the parent frame in the first image, enlarged; None where it is not seen."""
     missing: tuple[str, ...] = ()
     """What could not be drawn, in sentences."""
     other_map: bool = False
@@ -97,7 +105,7 @@ def views_of(
         return Views(missing=(f"No pictures: {reason}",))
     axes = axes_in_view(camera, found.parent_from_child.inverse())
     before = None if older is None else axes_in_view(camera, older.parent_from_child.inverse())
-    drawn, missing = [], []
+    drawn, missing, near = [], [], None
     for file in images:
         path = file.path
         try:
@@ -114,10 +122,12 @@ def views_of(
             continue
         view = _view(found, file, image, localizer)
         with_axes = _with_axes(view.image, camera, found.parent_frame, axes, before)
+        if not drawn:
+            near = close_up(image, camera, axes, before, _CLOSE_UP_PX)
         drawn.append(replace(view, image=with_axes))
         on_image()
     changed = localizer is not None and _is_other_map(found, localizer)
-    return Views(tuple(drawn), axes, before, tuple(missing), changed)
+    return Views(tuple(drawn), axes, before, near, tuple(missing), changed)
 
 
 def readable_images(
@@ -175,6 +185,9 @@ def _view(found: Calibration, file: ImageFile, image: Image, localizer: "Localiz
     if localizer is None:
         return View(name, large, told)
     estimate = localizer.localize(image, found.camera)
+    scene = found.source.get("scene")
+    if scene is not None and estimate.scene not in (None, scene):
+        return View(name, large, told, 0, None, f"it shows {estimate.scene}, not {scene}")
     # A camera on the gripper moves: its images are judged by their own poses.
     pose = found.parent_from_child if found.mount == "eye_to_hand" else None
     errors = landmark_errors(estimate, localizer, found.camera, pose)
@@ -187,7 +200,7 @@ def _view(found: Calibration, file: ImageFile, image: Image, localizer: "Localiz
     legend = "residual (px)"
     marked = overlay_points(large, at, residual, 3.5, (0.0, _WORST_PX * own), legend)
     finite = residual[np.isfinite(residual)]
-    median = float(np.median(finite)) if len(finite) else math.nan
+    median = float(np.median(finite)) if len(finite) else None
     return View(name, marked, told, len(residual), median)
 
 
@@ -195,9 +208,9 @@ def _with_axes(
     image: Image, camera: "Camera", frame: str, axes: AxesInView, older: AxesInView | None
 ) -> Image:
     scale = image.shape[1] / camera.width
-    drawn = draw_axes(image, axes, scale, frame)
+    drawn = draw_axes(image, axes.placed(scale), frame)
     if older is not None:
-        drawn = draw_axes(drawn, older, scale, older=True)
+        drawn = draw_axes(drawn, older.placed(scale), older=True)
     return draw_directions(drawn, axes, frame) if axes.where else drawn
 
 
