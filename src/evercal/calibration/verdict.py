@@ -34,12 +34,18 @@ def tier(calibration: Calibration) -> Tier | None:
     poses that were left out was made, its error as well: a small uncertainty beside a large error
     means that the model of rigid motion does not hold.
     """
-    errors = [_expected(calibration)]
-    held_out = _held_out(calibration)
-    if held_out is not None:
-        errors.append(held_out)
-    mm, deg = np.max(errors, 0)
+    mm, deg = expected_error(calibration)
     return next((t for t in TIERS if mm < t.mm and deg < t.deg), None)
+
+
+def expected_error(calibration: Calibration) -> tuple[float, float]:
+    """Millimetres and degrees: the largest of the uncertainty and of what the checks found."""
+    errors = [_expected(calibration)]
+    for mm, deg in (("held_out_mm", "held_out_deg"), ("repeatability_mm", "repeatability_deg")):
+        if calibration.checks.get(mm) is not None and calibration.checks.get(deg) is not None:
+            errors.append((float(calibration.checks[mm]), float(calibration.checks[deg])))
+    largest = np.max(errors, axis=0)
+    return float(largest[0]), float(largest[1])
 
 
 def verdict(calibration: Calibration) -> str:

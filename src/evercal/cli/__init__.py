@@ -88,6 +88,7 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.learn import Learn
     from evercal.cli.localize import Localize
     from evercal.cli.pretrain import Pretrain, pretrain_with_options
+    from evercal.cli.report import Report
     from evercal.cli.simulate import Simulate
     from evercal.cli.verify import Verify
     from evercal.cli.watch import Watch
@@ -101,6 +102,7 @@ def _verbs(first: str) -> dict[str, Any]:
         "watch": Watch,
         "audit": Audit,
         "align": Align,
+        "report": Report,
         "evaluate": Evaluate,
         "info": Info,
         "verify": Verify,

@@ -1,6 +1,6 @@
 """`evercal calibrate`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -94,7 +94,8 @@ class Calibrate:
         from evercal.calibration.from_images import calibrate
 
         with progress_bar("localizing", len(given.images), "image") as bar:
-            return calibrate(localizer, given, self.mount, on_image=bar.update)
+            found = calibrate(localizer, given, self.mount, on_image=bar.update)
+        return replace(found, source={**found.source, "store": str(self.store)})
 
     def _rig(self, localizer: "Localizer", folders: dict[str, Path]) -> int:
         from evercal.calibration.rig import rig_of

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, size
@@ -197,6 +196,8 @@ def _told(report: "LearnReport") -> list[str]:
 
 def hand_eye_lines(found: "HandEyeReport") -> list[str]:
     """Where the camera was found on the gripper, in sentences."""
+    import numpy as np
+
     covariance = np.array(found.covariance)
     sigma = 1000 * np.sqrt(np.trace(covariance[:3, :3]) / 3)
     turn = np.rad2deg(np.sqrt(np.trace(covariance[3:, 3:]) / 3))
@@ -217,6 +218,8 @@ def hand_eye_lines(found: "HandEyeReport") -> list[str]:
 def write_hand_eye(report: "LearnReport", camera: "Camera", path: Path) -> None:
     """Writes the `gripper_from_camera` of a learned recording as a calibration file."""
     from datetime import UTC, datetime
+
+    import numpy as np
 
     from evercal.calibration.calibration import Calibration
 

@@ -33,6 +33,11 @@ class Alignment:
         scaled = SE3(map_from_camera.rotation_wxyz, self.scale * map_from_camera.translation_m)
         return self.base_from_map @ scaled
 
+    def map_pose(self, base_from_camera: SE3) -> SE3:
+        """A camera pose in the map's own frame: the reverse of `pose`."""
+        scaled = self.base_from_map.inverse() @ base_from_camera
+        return SE3(scaled.rotation_wxyz, scaled.translation_m / self.scale)
+
     def points(self, points: np.ndarray) -> np.ndarray:
         """Points (..., 3) in the base frame."""
         return self.base_from_map.apply(self.scale * points)
@@ -109,11 +114,20 @@ class SceneRecord:
         return self.alignment.points(points_m)
 
     def camera_among_landmarks(self, base_from_camera: SE3) -> SE3:
-        """The pose at which a camera that was located sees the landmarks in the base frame."""
-        common = self.common
+        """The pose at which a camera that was located sees the landmarks in the base frame.
+
+        The reverse of `stated`, for landmarks from `stated_points`.
+        """
+        stated = base_from_camera
         if self.alignment is not None:
-            common = SE3(common.rotation_wxyz, self.alignment.scale * common.translation_m)
-        return base_from_camera @ common
+            stated = self.alignment.map_pose(base_from_camera)
+        pose = stated @ self.common
+        if self.bend is not None:
+            # The bend is told by the pose that is sought; it changes little over its own size.
+            for _ in range(3):
+                bend = SE3.exp(self.bend.at(pose @ self.common.inverse()))
+                pose = stated @ self.common @ bend
+        return pose if self.alignment is None else self.alignment.pose(pose)
 
     def query_camera(self, camera: Camera | None) -> Camera:
         """Intrinsics for a query: refined if the nominal ones or none are given, else as given."""
