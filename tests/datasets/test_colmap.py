@@ -126,3 +126,14 @@ def test_without_the_extra_the_install_line_is_named(
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(InputError, match=r"pip install 'evercal\[colmap\]'"):
         load_scene(tmp_path)
+
+
+def test_models_of_older_versions_have_no_rigs(tmp_path: Path) -> None:
+    make(tmp_path)
+    for name in ("rigs.bin", "frames.bin"):
+        (tmp_path / "sparse/0" / name).unlink()
+    frames = load_scene(tmp_path).train
+    assert len(frames) == 4
+    for i, frame in enumerate(frames):
+        assert frame.base_from_camera is not None
+        assert max(pose_distance(frame.base_from_camera.inverse(), camera_from_world(i))) < 1e-7
