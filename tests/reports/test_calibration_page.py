@@ -133,12 +133,12 @@ def test_the_verdict_comes_first_with_its_tiers() -> None:
     assert reached == {
         "precision assembly": "not good enough",
         "bin picking": "good enough",
-        "tabletop manipulation": "good enough",
+        "tabletop tasks": "good enough",
         "unusable": "no",
     }
     bad, _ = read(Subject("c.json", full(checks={"held_out_mm": 50.0}, verdict="")))
     assert bad.row("unusable")[3] == "yes: do not use it"
-    assert bad.row("tabletop manipulation")[3] == "not good enough"
+    assert bad.row("tabletop tasks")[3] == "not good enough"
     assert "Not usable: expected error 50.0 mm" in bad.text("p")
 
 
@@ -196,7 +196,7 @@ def test_what_is_missing_is_said_and_not_made_up() -> None:
         "No intrinsics",
     }
     assert len(reader.pictures) == 1  # the ellipsoid
-    assert "Good enough for bin picking (expected error 1.7 mm" in told  # made from its numbers
+    assert "Good for bin picking (within 3 mm" in told  # made from its numbers
     without = replace(solved(), covariance=np.zeros((6, 6)), source={})
     reader, page = read(Subject("s.json", without, nothing))
     assert reader.pictures == []

@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from evercal.calibration.calibration import Calibration
 
 
@@ -40,12 +38,11 @@ def tier(calibration: Calibration) -> Tier | None:
 
 def expected_error(calibration: Calibration) -> tuple[float, float]:
     """Millimetres and degrees: the largest of the uncertainty and of what the checks found."""
-    errors = [_expected(calibration)]
-    for mm, deg in (("held_out_mm", "held_out_deg"), ("repeatability_mm", "repeatability_deg")):
-        if calibration.checks.get(mm) is not None and calibration.checks.get(deg) is not None:
-            errors.append((float(calibration.checks[mm]), float(calibration.checks[deg])))
-    largest = np.max(errors, axis=0)
-    return float(largest[0]), float(largest[1])
+    mm, deg = _expected(calibration)
+    for check in ("held_out", "repeatability"):
+        mm = max(mm, float(calibration.checks.get(f"{check}_mm") or 0.0))
+        deg = max(deg, float(calibration.checks.get(f"{check}_deg") or 0.0))
+    return mm, deg
 
 
 def verdict(calibration: Calibration) -> str:
@@ -88,7 +85,7 @@ def _advice(found: Tier | None, known: tuple[float, float], held_out: tuple[floa
 
 def _expected(calibration: Calibration) -> tuple[float, float]:
     """Root mean square error in space, millimetres and degrees."""
-    return np.sqrt(3) * calibration.sigma_mm, np.sqrt(3) * calibration.sigma_deg
+    return 3**0.5 * calibration.sigma_mm, 3**0.5 * calibration.sigma_deg
 
 
 def _held_out(calibration: Calibration) -> tuple[float, float] | None:
