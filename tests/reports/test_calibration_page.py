@@ -139,7 +139,7 @@ def test_the_verdict_comes_first_with_its_tiers() -> None:
     bad, _ = read(Subject("c.json", full(checks={"held_out_mm": 50.0}, verdict="")))
     assert bad.row("unusable")[3] == "yes: do not use it"
     assert bad.row("tabletop tasks")[3] == "not good enough"
-    assert "Not usable: expected error 50.0 mm" in bad.text("p")
+    assert "Unusable: even tabletop tasks ask" in bad.text("p")
 
 
 @pytest.mark.usefixtures("quick")

@@ -7,10 +7,12 @@ from many spots; there the errors average over the spots.
 """
 
 import hashlib
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +29,7 @@ from evercal.calibration.located import (
     locate,
 )
 from evercal.calibration.verdict import verdict
+from evercal.datasets import read_image
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 
@@ -48,6 +51,26 @@ class Images:
     """Intrinsics; None takes those of the scene that is found, scaled."""
     base_from_gripper: SE3 | None = None
     """(n,) where the gripper was at each image."""
+
+    @classmethod
+    def read(
+        cls,
+        paths: Sequence[str | os.PathLike[str]],
+        camera: Camera | None = None,
+        base_from_gripper: SE3 | None = None,
+    ) -> Self:
+        """Reads image files.
+
+        Args:
+            paths: of the images.
+            camera: see `camera`.
+            base_from_gripper: see `base_from_gripper`.
+
+        Raises:
+            InputError: a file is missing or no image.
+        """
+        read = [(os.fspath(path), read_image(Path(path))) for path in paths]
+        return cls(read, camera, base_from_gripper)
 
 
 def calibrate(
