@@ -52,6 +52,10 @@ class HandEyeOptions:
     """Pairs with fewer matches on their epipolar lines say nothing."""
     angle_tolerance_deg: float = 3.0
     """Gripper and camera turn by the same angle; pairs that differ by more are left out."""
+    most_rotation_deg: float = 5.0
+    """A pair agrees when its rotation differs by less than this, degrees."""
+    most_direction_deg: float = 10.0
+    """And when the direction of its translation differs by less than this, degrees."""
     least_rotation_deg: float = 4.0
     """The gripper must turn by at least this much about a second axis, standard deviation."""
     least_pairs: int = 12
@@ -198,11 +202,19 @@ def solve_motions(
     rotation, distance = _robust_rotation(gripper_turn[same_angle], camera_turn[same_angle])
     agree = np.zeros(len(motions), bool)
     limit = 4 * max(1.48 * float(np.median(distance)), 1e-3)
+    limit = min(limit, np.deg2rad(options.most_rotation_deg))
     agree[np.flatnonzero(same_angle)[distance < limit]] = True
+    _refuse_disagreement(agree, options)
     towards = rotation.apply(np.array([m.direction for m in motions]))
     place, apart = _robust_translation(moved, towards, agree)
-    agree &= apart < np.deg2rad(10)
-    _refuse_disagreement(agree, options)
+    # Where a camera hardly moves sideways, its direction is noise: few pairs may be enough.
+    agree &= apart < np.deg2rad(options.most_direction_deg)
+    if agree.sum() < options.least_pairs:
+        raise InputError(
+            f"the directions in which gripper and images moved agree in only {agree.sum()} of"
+            f" {len(agree)} pairs of frames: move the camera sideways by 10 cm or more as well as"
+            " turning it, and check that the poses are in metres"
+        )
     start = SE3(rotation.as_quat(canonical=True, scalar_first=True), place)
     return HandEyeStart(
         start,
