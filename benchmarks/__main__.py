@@ -92,7 +92,9 @@ def gate(update: bool = False) -> int:
 
 
 def maps(
-    what: Literal["mini", "fixed", "badposes", "sequence", "ablation", "strangers"],
+    what: tyro.conf.Positional[
+        Literal["mini", "fixed", "badposes", "sequence", "ablation", "strangers"]
+    ],
     scenes: tuple[Path, ...] = (),
     out: Path = Path("runs/maps"),
     memory: float = 0.1,
@@ -112,6 +114,28 @@ def maps(
     run(what, scenes, out / what, memory)
 
 
+def calibration(
+    what: tyro.conf.Positional[Literal["wrist", "fixed", "bump"]],
+    rooms: tuple[Path, ...] = (),
+    out: Path = Path("runs/calibration"),
+    draws: int = 10,
+    store: Path | None = None,
+) -> None:
+    """Calibrates cameras from images alone and compares with the simulator's truth.
+
+    Args:
+        what: a camera on the arm, gripper_from_camera from nothing; a camera that stands still; the
+            alarm after bumps.
+        rooms: folders of rendered rooms; the packaged ones when left out.
+        out: where stores and results are kept.
+        draws: trials of each room.
+        store: a store that knows the rooms; one is learned when left out.
+    """
+    from benchmarks.calibration import run
+
+    run(what, rooms, out, draws, store)
+
+
 def main() -> int:
     """Runs one benchmark; `--gate` is short for `gate`."""
     from evercal.errors import InputError
@@ -124,6 +148,7 @@ def main() -> int:
         "peers": peers,
         "gate": gate,
         "maps": maps,
+        "calibration": calibration,
     }
     try:
         code = tyro.extras.subcommand_cli_from_dict(verbs, args=args)

@@ -43,3 +43,13 @@ def test_the_first_example_finds_the_camera(tmp_path: Path) -> None:
     assert millimetres is not None
     assert float(millimetres[1]) < 5
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_the_second_example_calibrates_and_notices_the_bump(tmp_path: Path) -> None:
+    said = python([str(ROOT / "examples" / "02_calibrate.py"), str(tmp_path)], tmp_path)
+    assert "pose of camera in base" in said
+    shift = re.search(r"moved: True, ([\d.]+) mm", said)
+    assert shift is not None
+    assert 4 < float(shift[1]) < 6  # the simulator moved it by 5 mm
+    assert (tmp_path / "tripod.calib").read_text().count(":") > 10

@@ -7,6 +7,13 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from evercal.calibration.calibration import Calibration as Calibration
+    from evercal.calibration.calibration import read_calibration as read_calibration
+    from evercal.calibration.drift import check as check
+    from evercal.calibration.from_images import Images as Images
+    from evercal.calibration.from_images import calibrate as calibrate
+    from evercal.calibration.pairs import PosePairs as PosePairs
+    from evercal.calibration.solve import solve as solve
     from evercal.continual.learn_into_store import learn as learn
     from evercal.continual.learn_scene import LearnOptions as LearnOptions
     from evercal.continual.learn_scene import LearnReport as LearnReport
@@ -26,20 +33,27 @@ __version__ = "0.1.0"
 
 # The public names and the module that holds each. A name enters here together with its module.
 _PUBLIC = {
+    "Calibration": "evercal.calibration.calibration",
     "Camera": "evercal.geometry",
     "Frame": "evercal.datasets",
+    "Images": "evercal.calibration.from_images",
     "InputError": "evercal.errors",
     "LearnOptions": "evercal.continual.learn_scene",
     "LearnReport": "evercal.continual.learn_scene",
     "Localizer": "evercal.localization.localizer",
+    "PosePairs": "evercal.calibration.pairs",
     "PoseEstimate": "evercal.localization.estimate",
     "SE3": "evercal.geometry",
     "Scene": "evercal.datasets",
+    "calibrate": "evercal.calibration.from_images",
+    "check": "evercal.calibration.drift",
     "evaluate": "evercal.evaluation.score_scenes",
     "learn": "evercal.continual.learn_into_store",
     "learn_scene": "evercal.continual.learn_scene",
     "load_scene": "evercal.datasets",
+    "read_calibration": "evercal.calibration.calibration",
     "read_image": "evercal.datasets",
+    "solve": "evercal.calibration.solve",
 }
 
 

@@ -18,11 +18,19 @@ VERBS = (
     "demo",
     "learn",
     "localize",
+    "calibrate",
+    "check",
+    "watch",
+    "audit",
+    "align",
+    "report",
     "evaluate",
     "info",
     "verify",
     "inspect",
+    "convert",
     "simulate",
+    "export",
     "bench",
     "bench-report",
     "pretrain",
@@ -65,6 +73,8 @@ def test_help_lists_every_verb_at_once() -> None:
         (["localize", "store", "missing.png"], 2),
         (["evaluate", "store"], 2),
         (["evaluate", "store", "missing"], 2),
+        (["export", "--help"], 0),
+        (["export", "missing.json", "--format", "urdf"], 2),
         (["lern"], 2),
         ([], 2),
     ],
@@ -80,7 +90,7 @@ def test_arguments_have_names_and_explanations(run: Any) -> None:
     for option in ("name", "strategy", "preset", "memory", "centres", "encoder", "format", "seed"):
         assert f"--{option} " in text
     assert "STORE SCENE" in text
-    assert "Folder of the recorded scene." in text
+    assert "Folder of the recorded scene," in text
     assert "--no-json" not in text
 
 

@@ -24,6 +24,7 @@ from evercal.datasets.frame import Frame, Scene
 from evercal.errors import InputError
 from evercal.features.precision import autocast
 from evercal.geometry.se3 import SE3, pose_distance
+from evercal.localization.acceptance import fitted_record
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.networks.buffer import Rows
@@ -342,3 +343,21 @@ def test_strength_weighs_penalty_and_regularizer(
             for now in (learned(name), learned(name, strength=1000.0))
         ]
         assert 0 < moved[0] < moved[1]
+
+
+def test_memory_auto_keeps_few_keyframes_that_locate_the_other_frames(
+    hall: Scene, hall_maps: SceneMaps
+) -> None:
+    nothing = replace(hall_maps, heads=[], scenes=[], keyframes=[], method_states=[])
+    *_, stage = learn(nothing, hall, StageOptions(memory_auto=True))
+    assert isinstance(stage, Stage)
+    kept = stage.maps.keyframes[0]
+    assert kept is not None
+    assert len(kept) == stage.frames_kept < int(0.3 * len(hall.train))
+    stage.maps.scenes[0] = fitted_record(stage.maps, hall.test[::10])
+    localizer = Localizer(stage.maps)
+    for frame in hall.train[1::7]:
+        found = localizer.localize(frame.read_image(), frame.camera).base_from_camera
+        assert found is not None
+        assert frame.base_from_camera is not None
+        assert pose_distance(found, frame.base_from_camera)[0] < 0.01

@@ -168,7 +168,7 @@ def test_formats_are_named_and_recognised(tmp_path: Path) -> None:
     generic.write(tmp_path / "a", make_scene())
     assert load_scene(tmp_path / "a", format="generic", name="lab").name == "lab"
     with pytest.raises(InputError, match="use one of generic, 7scenes"):
-        load_scene(tmp_path / "a", format="colmap")
+        load_scene(tmp_path / "a", format="gopro")
     with pytest.raises(InputError, match="no such folder"):
         load_scene(tmp_path / "b")
     with pytest.raises(InputError, match="a file, not a folder"):

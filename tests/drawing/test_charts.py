@@ -25,13 +25,13 @@ from evercal.drawing import (
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     """The figures drawn, so that their lines can be read."""
     made: list[Figure] = []
-    original = charts._figure
+    original = charts.new_figure
 
     def keep(width: float, height: float) -> Figure:
         made.append(original(width, height))
         return made[-1]
 
-    monkeypatch.setattr(charts, "_figure", keep)
+    monkeypatch.setattr(charts, "new_figure", keep)
     return made
 
 

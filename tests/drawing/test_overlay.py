@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from evercal.drawing import contact_sheet, encode_image, overlay_points
+from evercal.drawing import contact_sheet, encode_image, overlay_lines, overlay_points
 
 GREY = np.full((60, 80, 3), 128, np.uint8)
 
@@ -142,3 +142,29 @@ def test_encoded_images_read_back() -> None:
     lossy = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert lossy is not None
     assert np.abs(lossy[..., ::-1].astype(int) - flat).max() < 6
+
+
+def test_a_line_has_its_colour_its_rim_and_its_gaps() -> None:
+    line = [[10, 30], [40, 30], [np.nan, 30], [60, 30], [70, 30]]
+    drawn = overlay_lines(GREY, [line], [(200, 10, 20)], width=3)
+    assert drawn[30, 25].tolist() == [200, 10, 20]
+    assert drawn[30, 65].tolist() == [200, 10, 20]
+    assert drawn[30, 50].tolist() == [128, 128, 128]
+    assert (drawn[27:29, 25] > 128).any()  # the white rim
+    assert (GREY == 128).all()
+
+
+def test_half_of_a_dashed_line_is_drawn() -> None:
+    drawn = overlay_lines(GREY, [[[0, 30], [80, 30]]], [(255, 0, 0)], width=1, dash=8)
+    red = (drawn[30, :, 0] > 200) & (drawn[30, :, 1] < 60)
+    assert 33 <= red.sum() <= 47
+    switches = np.abs(np.diff(red.astype(int))).sum()
+    assert switches == 10  # five dashes
+
+
+def test_lines_that_are_nowhere_leave_the_image_alone() -> None:
+    for line in ([[np.nan, 1], [np.inf, 2]], [[3, 3]], np.zeros((0, 2)), [[1e9, 1], [1e12, 5]]):
+        assert len(changed(overlay_lines(GREY, [line], [(0, 0, 0)]))) == 0
+        assert len(changed(overlay_lines(GREY, [line], [(0, 0, 0)], dash=3))) == 0
+    with pytest.raises(ValueError, match=r"\(n, 2\)"):
+        overlay_lines(GREY, [[1, 2, 3]], [(0, 0, 0)])

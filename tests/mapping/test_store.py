@@ -15,9 +15,9 @@ from torch import Tensor
 
 from evercal.datasets.frame import Scene
 from evercal.errors import InputError
-from evercal.geometry.se3 import pose_distance
+from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.localizer import Localizer
-from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.scene_maps import Alignment, SceneMaps
 from evercal.mapping.stage_files import head_bytes
 from evercal.mapping.store import Checkpoint, Store
 from evercal.networks.head import Head
@@ -307,3 +307,33 @@ def test_checkpoints_come_back_to_the_same_stage_only(
         assert int(found.trainer["step"]) == 7
     assert store.begin({**asked, "scene": "gamma"}) is None
     assert store.begin(asked) is None
+
+
+@pytest.mark.parametrize("index", [0, 2])
+def test_a_record_is_replaced_and_nothing_else(
+    index: int, taught: Stages, tmp_path: Path, make: Make
+) -> None:
+    root = tmp_path / "store"
+    before = make(root, taught["evercal"])
+    record = before.maps.scenes[index]
+    moved = replace(
+        record,
+        alignment=Alignment(SE3.exp([1.0, 2, 3, 0.1, 0.2, 0.3]), 1.5),
+        frame_covariance=np.diag(np.arange(1.0, 7.0)) * 1e-6,
+    )
+    for _ in range(2):  # a second time too: nothing of the first is left
+        Store.open(root).replace_record(record.name, moved)
+    assert verify(root) == []
+    opened = Store.open(root)
+    assert [scene.name for scene in opened.maps.scenes] == [s.name for s in before.maps.scenes]
+    found = opened.maps.scenes[index]
+    assert found.alignment is not None
+    assert found.alignment.scale == 1.5
+    assert found.frame_covariance == pytest.approx(moved.frame_covariance)
+    assert opened.maps.scenes[1].alignment is None
+    assert len(list((root / "stages").iterdir())) == 3
+    kept = opened.maps.keyframes[index]
+    original = before.maps.keyframes[index]
+    assert kept is not None
+    assert original is not None
+    assert kept.images == original.images

@@ -208,3 +208,29 @@ def read_calibration(path: str | os.PathLike[str]) -> Calibration:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except ValueError as error:
         raise InputError(f"{path}: {error}; give the JSON that evercal wrote") from None
+
+
+def read_transform(path: str | os.PathLike[str]) -> SE3:
+    """A rigid transform from a calibration file or from a 4x4 matrix as text.
+
+    Raises:
+        InputError: Missing, or neither of the two.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: file is missing; check the path") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text ({error})") from None
+    if text.lstrip().startswith("{"):
+        return read_calibration(path).parent_from_child
+    try:
+        numbers = [float(word) for word in text.replace(",", " ").split()]
+        if len(numbers) != 16:
+            raise ValueError(f"{len(numbers)} numbers, a 4x4 matrix has 16")
+        return SE3.from_matrix(np.reshape(numbers, (4, 4)))
+    except ValueError as error:
+        raise InputError(
+            f"{path}: {error}; give a 4x4 matrix as text, metres, or evercal's calibration JSON"
+        ) from None

@@ -151,9 +151,7 @@ def _sine_axes(pose: SE3) -> Array:
     return 2.0 * quaternion[..., :1] * quaternion[..., 1:]
 
 
-def _with_translation(
-    rotation: Rotation, a: SE3, b: SE3, scale_known: bool
-) -> tuple[SE3, float]:
+def _with_translation(rotation: Rotation, a: SE3, b: SE3, scale_known: bool) -> tuple[SE3, float]:
     """The translation (and scale) of A X = X B where the rotation of X is known."""
     moved = rotation.apply(b.translation_m)
     system = a.rotation_matrix() - np.eye(3)

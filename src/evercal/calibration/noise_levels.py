@@ -145,9 +145,7 @@ def loss_by_weights(
     best = Gain.of(jacobian, noise, noise)
     inverse = np.linalg.inv(noise)
     # (k, n, p, 6): how noise of one kind in each residual reaches the unknowns.
-    reached = np.stack(
-        [best.gain @ part @ part.transpose(0, 2, 1) for part in directions.values()]
-    )
+    reached = np.stack([best.gain @ part @ part.transpose(0, 2, 1) for part in directions.values()])
     whitened = reached @ inverse
     products = np.einsum("knpi,lnqi->klpq", whitened, reached, optimize=True)
     slopes = best.slopes(directions)

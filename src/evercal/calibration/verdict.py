@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from evercal.calibration.calibration import Calibration
 
 
@@ -34,12 +32,17 @@ def tier(calibration: Calibration) -> Tier | None:
     poses that were left out was made, its error as well: a small uncertainty beside a large error
     means that the model of rigid motion does not hold.
     """
-    errors = [_expected(calibration)]
-    held_out = _held_out(calibration)
-    if held_out is not None:
-        errors.append(held_out)
-    mm, deg = np.max(errors, 0)
+    mm, deg = expected_error(calibration)
     return next((t for t in TIERS if mm < t.mm and deg < t.deg), None)
+
+
+def expected_error(calibration: Calibration) -> tuple[float, float]:
+    """Millimetres and degrees: the largest of the uncertainty and of what the checks found."""
+    mm, deg = _expected(calibration)
+    for check in ("held_out", "repeatability"):
+        mm = max(mm, float(calibration.checks.get(f"{check}_mm") or 0.0))
+        deg = max(deg, float(calibration.checks.get(f"{check}_deg") or 0.0))
+    return mm, deg
 
 
 def verdict(calibration: Calibration) -> str:
@@ -47,7 +50,9 @@ def verdict(calibration: Calibration) -> str:
     found = tier(calibration)
     mm, deg = _expected(calibration)
     if found is None:
-        first = f"Unusable: even tabletop tasks ask for {TIERS[-1].mm:g} mm and {TIERS[-1].deg:g} deg."
+        first = (
+            f"Unusable: even tabletop tasks ask for {TIERS[-1].mm:g} mm and {TIERS[-1].deg:g} deg."
+        )
     else:
         first = f"Good for {found.name} (within {found.mm:g} mm and {found.deg:g} deg)."
     known = f"The camera's place is known to {_length(mm)} and {deg:.2f} deg"
@@ -58,9 +63,7 @@ def verdict(calibration: Calibration) -> str:
     return f"{first} {known} {held_out[1]:.2f} deg. {_advice(found, (mm, deg), held_out)}"
 
 
-def _advice(
-    found: Tier | None, known: tuple[float, float], held_out: tuple[float, float]
-) -> str:
+def _advice(found: Tier | None, known: tuple[float, float], held_out: tuple[float, float]) -> str:
     if found is TIERS[0]:
         return "Check it on the robot before use: touch a point that the camera sees."
     wanted = TIERS[-1] if found is None else TIERS[TIERS.index(found) - 1]
@@ -82,7 +85,7 @@ def _advice(
 
 def _expected(calibration: Calibration) -> tuple[float, float]:
     """Root mean square error in space, millimetres and degrees."""
-    return np.sqrt(3) * calibration.sigma_mm, np.sqrt(3) * calibration.sigma_deg
+    return 3**0.5 * calibration.sigma_mm, 3**0.5 * calibration.sigma_deg
 
 
 def _held_out(calibration: Calibration) -> tuple[float, float] | None:

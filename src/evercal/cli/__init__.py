@@ -73,27 +73,43 @@ def _complain(message: str, as_json: bool) -> int:
 
 def _verbs(first: str) -> dict[str, Any]:
     """All verbs by name."""
+    from evercal.cli.align import Align
+    from evercal.cli.audit import Audit
     from evercal.cli.bench import Bench
     from evercal.cli.bench_report import BenchReport
+    from evercal.cli.calibrate import Calibrate
+    from evercal.cli.check import Check
+    from evercal.cli.convert import Convert
     from evercal.cli.demo import Demo
     from evercal.cli.evaluate import Evaluate
+    from evercal.cli.export import ExportCalibration
     from evercal.cli.info import Info
     from evercal.cli.inspect import Inspect
     from evercal.cli.learn import Learn
     from evercal.cli.localize import Localize
     from evercal.cli.pretrain import Pretrain, pretrain_with_options
+    from evercal.cli.report import Report
     from evercal.cli.simulate import Simulate
     from evercal.cli.verify import Verify
+    from evercal.cli.watch import Watch
 
     return {
         "demo": Demo,
         "learn": Learn,
         "localize": Localize,
+        "calibrate": Calibrate,
+        "check": Check,
+        "watch": Watch,
+        "audit": Audit,
+        "align": Align,
+        "report": Report,
         "evaluate": Evaluate,
         "info": Info,
         "verify": Verify,
         "inspect": Inspect,
+        "convert": Convert,
         "simulate": Simulate,
+        "export": ExportCalibration,
         "bench": Bench,
         "bench-report": BenchReport,
         "pretrain": pretrain_with_options() if first == "pretrain" else Pretrain,

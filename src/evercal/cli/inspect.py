@@ -1,12 +1,13 @@
 """`evercal inspect`."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next
+from evercal.cli.reading import Reading
 
 
 @dataclass(frozen=True)
@@ -14,28 +15,28 @@ class Inspect:
     """Describe a recorded scene and point out what looks wrong, before it is learned."""
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
-    """Folder of the recorded scene."""
-    format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """Format of the folder: generic, 7scenes or 12scenes; it is recognised when left out."""
+    """Folder of the recorded scene, or file of a bag."""
+    reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
+    """How it is read."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Reads the scene and the first image of every camera."""
-        from evercal.datasets import load_scene
+        """Reads the scene and some of its images."""
         from evercal.datasets.inspection import inspect_scene
 
-        scene = load_scene(self.scene, self.format)
-        found = inspect_scene(scene)
+        found = inspect_scene(self.reading.scene(self.scene))
         if self.json:
             print_json(asdict(found))
             return 0
         extent = " x ".join(f"{side:.2f}" for side in found.extent_m)
-        print(f"{found.name}: {found.train} training and {found.test} test frames")
+        whose = {"camera": "", "gripper": " with the gripper's pose"}.get(found.poses, "")
+        print(f"{found.name}: {found.train} training and {found.test} test frames{whose}")
         print(f"  without a pose  {found.untracked}")
         for lens in found.cameras:
             print(f"  camera          {lens}")
-        print(f"  camera moved in {extent} m (training frames)")
+        mover = "gripper" if found.poses == "gripper" else "camera"
+        print(f"  {mover} moved in {extent} m (training frames)")
         if found.step_median_m is not None and found.step_largest_m is not None:
             print(
                 f"  frame to frame  {100 * found.step_median_m:.1f} cm"
@@ -47,7 +48,9 @@ class Inspect:
                 f"  near training   {found.near_training:.1f} % of the test frames lie within 5 cm"
                 f" and 5 deg of a training frame"
             )
+        for note in found.notes:
+            print(f"note: {note}")
         for warning in found.warnings:
             print(f"warning: {warning}")
-        print_next("evercal", "learn", "STORE", self.scene)
+        print_next("evercal", "learn", "STORE", self.scene, *self.reading.words())
         return 0

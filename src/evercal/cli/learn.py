@@ -3,7 +3,7 @@
 import dataclasses
 import re
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,11 +11,14 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, size
 from evercal.cli.learn_bars import LearnBars
+from evercal.cli.reading import Reading
 from evercal.continual import memory_budget
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
     from evercal.continual.learn_scene import LearnOptions, LearnReport
+    from evercal.continual.wrist_camera import HandEyeReport
+    from evercal.geometry import Camera
     from evercal.mapping.build import Adjusted
 
 
@@ -29,7 +32,7 @@ class Learn:
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the store; made when it is missing."""
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
-    """Folder of the recorded scene."""
+    """Folder of the recorded scene, or file of a bag."""
     name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """What the scene is called in the store; its own name when left out."""
     strategy: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
@@ -38,14 +41,20 @@ class Learn:
     preset: Literal["fast", "demo", "bench", "paper"] = "fast"
     """How much a network is trained: fast takes minutes on two cores, paper needs a GPU. A map
     takes no notice of it."""
-    memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
-    """How many keyframes are kept of the scene: a share of its frames (10%) or bytes (5MB)."""
+    memory: Annotated[str, arg(metavar="SHARE|BYTES|auto")] = "10%"
+    """How many keyframes are kept of the scene: a share of its frames (10%), bytes (5MB), or auto:
+    the fewest with which its other frames are located well."""
     centres: Annotated[int | None, arg(metavar="M", help_behavior_hint="")] = None
     """How many cluster centres a scene adds to a network; the preset's number when left out."""
     encoder: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """File of encoder weights from 'evercal pretrain', for a new store; else the shipped ones."""
-    format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """Format of the folder: generic, 7scenes or 12scenes; it is recognised when left out."""
+    reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
+    """How the recording is read."""
+    gripper_from_camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Where the camera roughly sits on the gripper, a 4x4 matrix or a calibration file, for a
+    recording that states gripper poses only: what is found from the images is compared with it."""
+    calibration: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Where to write the gripper_from_camera that was found, for 'evercal export'."""
     seed: int = 0
     """Seed of all that is drawn at random."""
     json: bool = False
@@ -53,15 +62,21 @@ class Learn:
 
     def run(self) -> int:
         """Learns, shows how it goes, and says what came out."""
-        parse_memory(self.memory)  # refused before anything is read
+        if self.memory.strip().lower() != memory_budget.AUTO:
+            parse_memory(self.memory)  # refused before anything is read
         if self.centres is not None and self.centres < 1:
             raise InputError(f"--centres {self.centres}: give a number >= 1")
         if self.seed < 0:
             raise InputError(f"--seed {self.seed}: give a number >= 0")
         from evercal.continual.learn_scene import learn_scene, validation_split
-        from evercal.datasets import load_scene, posed_scene
+        from evercal.continual.wrist_camera import lacks_camera_poses
+        from evercal.datasets import posed_scene
 
-        scene = posed_scene(load_scene(self.scene, self.format, self.name))
+        scene = self.reading.scene(self.scene, self.name)
+        wrist = lacks_camera_poses(scene)
+        if not wrist:
+            self._refuse_hand_eye(scene.name)
+            scene = posed_scene(scene)
         check_name(scene.name)
         options = self._options()
         held_out = len(validation_split(scene.train)[1])
@@ -75,6 +90,8 @@ class Learn:
         except KeyboardInterrupt:
             print("stopped; the same command continues where it stopped", file=sys.stderr)
             return 130
+        if self.calibration is not None and report.hand_eye is not None:
+            write_hand_eye(report, scene.train[0].camera, self.calibration)
         if self.json:
             print_json(dataclasses.asdict(report))
             return 0
@@ -85,6 +102,17 @@ class Learn:
         else:
             print_next("evercal", "localize", self.store, "IMAGE")
         return 0
+
+    def _refuse_hand_eye(self, scene: str) -> None:
+        for option, value in (
+            ("--gripper-from-camera", self.gripper_from_camera),
+            ("--calibration", self.calibration),
+        ):
+            if value is not None:
+                raise InputError(
+                    f"{option} {value}: {scene} states camera poses, so there is no camera to find"
+                    " on a gripper; leave the option out"
+                )
 
     def _scene_word(self, name: str) -> str:
         return str(self.scene) if self.name is None else f"{name}={self.scene}"
@@ -106,7 +134,12 @@ class Learn:
                 f"--centres {self.centres}: strategy {strategy} trains no network; leave the option"
                 " out"
             )
-        return LearnOptions(stage, strategy, self.encoder)
+        rough = None
+        if self.gripper_from_camera is not None:
+            from evercal.calibration.calibration import read_transform
+
+            rough = read_transform(self.gripper_from_camera)
+        return LearnOptions(stage, strategy, self.encoder, gripper_from_camera=rough)
 
     def _strategy(self) -> str:
         """The strategy asked for, else the store's; refuses what a store cannot change later."""
@@ -151,12 +184,56 @@ def _told(report: "LearnReport") -> list[str]:
         f" with {report.landmarks} landmarks; all scenes take {size(report.memory_bytes)}"
         + (f", the network {size(report.head_bytes)}" if report.head_bytes else "")
     ]
+    if report.hand_eye is not None:
+        lines += hand_eye_lines(report.hand_eye)
     if report.adjusted is not None:
         lines += adjusted_lines(report.adjusted)
     else:
         share = f"{100 * report.inlier_threshold:.0f} %"
         lines.append(f"poses with fewer than {share} inliers are reported as unknown_scene")
     return lines
+
+
+def hand_eye_lines(found: "HandEyeReport") -> list[str]:
+    """Where the camera was found on the gripper, in sentences."""
+    import numpy as np
+
+    covariance = np.array(found.covariance)
+    sigma = 1000 * np.sqrt(np.trace(covariance[:3, :3]) / 3)
+    turn = np.rad2deg(np.sqrt(np.trace(covariance[3:, 3:]) / 3))
+    x, y, z = (1000 * value for value in found.translation_m)
+    lines = [
+        f"gripper_from_camera: ({x:.1f}, {y:.1f}, {z:.1f}) mm, quaternion wxyz"
+        f" ({', '.join(f'{value:.5f}' for value in found.quaternion_wxyz)}); standard deviation"
+        f" {sigma:.2f} mm and {turn:.3f} deg per axis; {found.pairs} of {found.of_pairs} pairs of"
+        " images agree with it"
+    ]
+    if found.given_mm is not None:
+        lines.append(
+            f"it lies {found.given_mm:.1f} mm and {found.given_deg:.1f} deg from the one given"
+        )
+    return lines
+
+
+def write_hand_eye(report: "LearnReport", camera: "Camera", path: Path) -> None:
+    """Writes the `gripper_from_camera` of a learned recording as a calibration file."""
+    from datetime import UTC, datetime
+
+    import numpy as np
+
+    from evercal.calibration.calibration import Calibration
+
+    found = report.hand_eye
+    assert found is not None, "the recording states gripper poses only"
+    Calibration(
+        "eye_in_hand",
+        found.gripper_from_camera,
+        np.array(found.covariance),
+        parent_frame="gripper",
+        camera=camera,
+        source={"command": "learn", "scene": report.scene, "frames": report.train_frames},
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+    ).write(path)
 
 
 def adjusted_lines(adjusted: "Adjusted") -> list[str]:

@@ -15,7 +15,14 @@ if TYPE_CHECKING:
     from evercal.networks.trainer import Progress
 
 
-_UNITS = {"encoding": "image", "mapping": "keyframe", "adjusting": "round", "training": "step"}
+_UNITS = {
+    "encoding": "image",
+    "mapping": "keyframe",
+    "matching": "pair",
+    "choosing keyframes": "try",
+    "adjusting": "round",
+    "training": "step",
+}
 _FRESH = {"encoding": 8}
 
 

@@ -60,6 +60,7 @@ def mapped_record(record: SceneRecord, scene_map: SceneMap | None) -> SceneRecor
         common=scene_map.common,
         map_sigma=scene_map.pose_sigma,
         bend=scene_map.bend,
+        frame_covariance=scene_map.frame_covariance,
     )
 
 

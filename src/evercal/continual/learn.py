@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from evercal.continual.fewest_keyframes import AutoMemoryOptions, fewest_keyframes
 from evercal.continual.finish_scene import (
     mapped_record,
     method_state_of,
@@ -50,6 +51,8 @@ class StageOptions:
     """Views of every remembered frame."""
     memory_share: float = 0.10
     """N_b as a share of the scene's training frames."""
+    memory_auto: bool = False
+    """Keep the fewest keyframes with which other frames are located well; maps only."""
     memory_bytes: int | None = None
     """N_b as a size instead; frames are counted at the size of the first one."""
     fixed_centres_m: tuple[tuple[float, float, float], ...] = ()
@@ -348,6 +351,8 @@ def _learn_map(maps: SceneMaps, scene: Scene, options: StageOptions) -> Iterator
     after, frames = maps.copy_for_training(), scene.train
     positions = np.stack([_pose(frame).translation_m for frame in frames])
     cell = after.atlas(options.grid_scenes).place(positions)
+    if options.memory_auto:
+        options = replace(options, memory_share=AutoMemoryOptions().most, memory_bytes=None)
     chosen = spread_frames(frames, options.capacity(frames, options.map.size.patches))
     scene_map = yield from map_steps(frames, maps.encoder, chosen, sized(options.map, maps))
     nothing = torch.zeros(0, after.descriptor.width).half()
@@ -355,6 +360,9 @@ def _learn_map(maps: SceneMaps, scene: Scene, options: StageOptions) -> Iterator
     after.scenes.append(mapped_record(record, scene_map))
     after.keyframes.append(scene_map.keyframes)
     after.method_states.append({})
+    if options.memory_auto:
+        kept = scene_map.keyframes.take((yield from fewest_keyframes(after, frames)))
+        after.keyframes[-1], scene_map = kept, replace(scene_map, keyframes=kept)
     yield Stage(after, 0, len(scene_map.keyframes), scene_map)
 
 

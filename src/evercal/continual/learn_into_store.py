@@ -28,7 +28,8 @@ def learn(
         scene: folder of a recorded scene, or the scene itself. Its training frames are learned, its
             test frames are not looked at.
         preset: work of strategies that train a network; a map takes no notice of it.
-        memory: keyframes to keep of the scene: a share of its frames ("10%") or bytes ("5MB").
+        memory: keyframes to keep of the scene: a share of its frames ("10%"), bytes ("5MB"), or
+            "auto": the fewest with which its other frames are located well.
         strategy: "evercal" builds a map, other names train a network; that of the store when left
             out, and "evercal" for a new store.
         on_event: called with everything that happens, for progress bars.

@@ -13,10 +13,17 @@ from filelock import FileLock, Timeout
 
 from evercal.continual.learn import Encoding, Stage, StageOptions, learn
 from evercal.continual.strategies import STRATEGIES, Strategy
+from evercal.continual.wrist_camera import (
+    HandEyeReport,
+    hand_eye_report,
+    lacks_camera_poses,
+    posed_by_gripper,
+)
 from evercal.datasets.frame import MIN_TRAIN_FRAMES, Frame, Scene, posed_scene
 from evercal.errors import InputError
 from evercal.features.feature_cache import cache_features
 from evercal.features.weights_file import network_bytes
+from evercal.geometry.se3 import SE3
 from evercal.localization.acceptance import fitted_record
 from evercal.mapping.build import Adjusted, Mapping
 from evercal.mapping.stage_files import head_bytes
@@ -40,6 +47,9 @@ class LearnOptions:
     """Another encoder than the shipped one: a file for a new store, or a module of one's own."""
     short_side: int = 240
     """Working size of images in a new store, pixels."""
+    gripper_from_camera: SE3 | None = None
+    """Where the camera roughly sits on the gripper (CAD), for recordings of gripper poses alone:
+    what is found is compared with it."""
     cache: Path | None = None
     """Folder for features of views, for many runs over the same frames (`cache_features`)."""
 
@@ -72,6 +82,8 @@ class LearnReport:
     """Landmarks of this scene's map."""
     adjusted: Adjusted | None = None
     """What bundle adjustment changed about the recording; None where no map was built."""
+    hand_eye: HandEyeReport | None = None
+    """Where the camera was found on the gripper; None where the recording states camera poses."""
 
 
 OnEvent = Callable[[Encoding | Mapping | Progress | Checkpoint], None]
@@ -122,16 +134,21 @@ def _learn_scene(
     store: Path, scene: Scene, options: LearnOptions, on_event: OnEvent | None
 ) -> LearnReport:
     began = time.perf_counter()
-    scene = posed_scene(scene)
+    wrist = lacks_camera_poses(scene)
+    scene = scene if wrist else posed_scene(scene)
     opened = open_or_create(store, options)
     _check(opened, scene, options)
+    stage_options, start = options.stage, None
+    if wrist:
+        scene, start = posed_by_gripper(scene, opened.maps.encoder, on_event or (lambda _: None))
+        stage_options = replace(stage_options, map=stage_options.map.for_hand_eye())
     if options.cache is not None and isinstance(opened.maps.encoder, torch.nn.Module):
         cache_features(opened.maps.encoder, options.cache)
     train, held_out = validation_split(scene.train)
     train_split = replace(scene, train=train)
     resume = opened.begin(_identity(opened, scene, options))
     try:
-        stage = run_stage(opened, train_split, options.stage, resume, on_event)
+        stage = run_stage(opened, train_split, stage_options, resume, on_event)
     except InputError:
         opened.abandon()  # bad input: no interrupted stage worth going on with
         raise
@@ -151,6 +168,9 @@ def _learn_scene(
         resume is not None,
         sum(map(len, kept.landmarks)) if kept else 0,
         scene_map.adjusted if scene_map else None,
+        hand_eye_report(start, scene_map, options.gripper_from_camera)
+        if start and scene_map
+        else None,
     )
     opened.commit(maps, asdict(report))
     return report
@@ -207,6 +227,19 @@ def _check(opened: Store, scene: Scene, options: LearnOptions) -> None:
         raise InputError(
             f"strategy {opened.maps.strategy!r}: learns all scenes at once, so a scene cannot be "
             "added to a store; start a new store with another strategy"
+        )
+    if lacks_camera_poses(scene) and not strategy_of(opened).build_map:
+        raise InputError(
+            f"scene {scene.name!r}: only gripper poses are known, and strategy"
+            f" {opened.maps.strategy!r} builds no map that could find the camera on the gripper;"
+            " use strategy evercal"
+        )
+    if options.stage.memory_auto and (
+        strategy_of(opened).network or not strategy_of(opened).build_map
+    ):
+        raise InputError(
+            f"memory auto: strategy {opened.maps.strategy!r} trains a network; give a share or"
+            " bytes"
         )
     if len(scene.train) < MIN_TRAIN_FRAMES:
         raise InputError(

@@ -9,6 +9,8 @@ from evercal.errors import InputError
 if TYPE_CHECKING:
     from evercal.continual.learn import StageOptions
 
+AUTO = "auto"
+"""As few keyframes as locate the recording's other frames well."""
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
 _UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
 
@@ -29,7 +31,7 @@ def parse_memory(memory: str | int) -> tuple[float | None, int | None]:
         return None, int(float(match[1]) * _UNITS[unit])
     raise InputError(
         f"memory {memory}: give a share of the frames above 0% and up to 100%, or bytes such as"
-        f" 500kB, 5MB or 5MiB"
+        f" 500kB, 5MB or 5MiB, or auto"
     )
 
 
@@ -38,11 +40,13 @@ def with_memory(stage: "StageOptions", memory: str | int) -> "StageOptions":
 
     Args:
         stage: how a scene is learned.
-        memory: see `parse_memory`.
+        memory: see `parse_memory`, or `auto`.
 
     Raises:
         InputError: as `parse_memory`.
     """
+    if str(memory).strip().lower() == AUTO:
+        return dataclasses.replace(stage, memory_auto=True, memory_bytes=None)
     share, count = parse_memory(memory)
     kept = stage.memory_share if share is None else share
-    return dataclasses.replace(stage, memory_share=kept, memory_bytes=count)
+    return dataclasses.replace(stage, memory_share=kept, memory_bytes=count, memory_auto=False)

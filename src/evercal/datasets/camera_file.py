@@ -49,7 +49,7 @@ def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = Non
         numbers = _plain_numbers(text)
         if numbers is not None:
             return _from_matrix(numbers, size)
-        return _from_ros(_yaml_mapping(text))
+        return camera_from_ros(_yaml_mapping(text))
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -95,7 +95,16 @@ def _yaml_mapping(text: str) -> Mapping[str, object]:
     return data
 
 
-def _from_ros(data: Mapping[str, object]) -> Camera:
+def camera_from_ros(data: Mapping[str, object]) -> Camera:
+    """The raw image's camera of a camera_info message, by the names of its fields.
+
+    Args:
+        data: `width`, `height`, `k`, `d`, `distortion_model` and `roi` of a message, or the names
+            of a calibration file.
+
+    Raises:
+        ValueError: A field is missing or unusable; a lens that is not supported; a cut-out image.
+    """
     width = _first(data, "image_width", "width")
     height = _first(data, "image_height", "height")
     matrix = _list(_first(data, "camera_matrix", "K", "k"), "camera_matrix")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.datasets.images import read_image
+from evercal.datasets.images import StoredImage, read_image
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 
@@ -21,8 +21,8 @@ class Frame:
 
     name: str
     """Unique within its scene."""
-    image: Path | NDArray[np.uint8]
-    """A file, or (H, W, 3) uint8 RGB."""
+    image: Path | NDArray[np.uint8] | StoredImage
+    """A file, (H, W, 3) uint8 RGB, or one inside a bag or video."""
     camera: Camera
     """Intrinsics at the size of `image`."""
     base_from_camera: SE3 | None
@@ -43,7 +43,11 @@ class Frame:
         Raises:
             InputError: The file is missing or broken, or its size is not the camera's.
         """
-        image = read_image(self.image) if isinstance(self.image, Path) else self.image
+        image = self.image
+        if isinstance(image, Path):
+            image = read_image(image)
+        elif isinstance(image, StoredImage):
+            image = image.read()
         if image.shape[:2] != (self.camera.height, self.camera.width):
             where = self.image if isinstance(self.image, Path) else self.name
             raise InputError(
@@ -77,6 +81,8 @@ class Scene:
     """How many recorded frames were left out because they have no valid pose."""
     base: str | None = None
     """What its base frame is called, where scenes share one; None if it is the scene's own."""
+    notes: tuple[str, ...] = ()
+    """What its reader chose, left out or could not know, one sentence each."""
 
 
 def posed_scene(scene: Scene) -> Scene:

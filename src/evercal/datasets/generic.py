@@ -6,26 +6,27 @@
                  "base_from_camera": {"translation_m": [3], "quaternion_wxyz": [4]},
                  "base_from_gripper": null, "depth": "depth/000000.png",
                  "joints_rad": [7]}, ...],
-     "untracked": 0, "render": {}}
+     "untracked": 0, "notes": [], "render": {}}
 
 Metres, quaternions in the order w, x, y, z, OpenCV camera axes, pixel (0, 0) at the centre of the
 top-left pixel, distortion k1 k2 p1 p2 k3 k4 k5 k6 as in OpenCV. Image paths are relative to the
 folder, with forward slashes. Both poses may be null or missing, as may `name` and `untracked`.
 Depth is a 16-bit PNG in millimetres along the optical axis, 0 where unknown; it and the arm's joint
-angles are there only if known. `render` tells how a simulated scene was made.
+angles are there only if known. `notes` are sentences about how the recording was read. `render`
+tells how a simulated scene was made.
 Frames stand in the order they were recorded. Keys not listed here are passed over.
 """
 
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import Any, Literal, Self
 
 from evercal.datasets.frame import Frame, Scene
-from evercal.datasets.images import write_image
+from evercal.datasets.images import StoredImage, write_image
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.storage import write_json
@@ -74,21 +75,34 @@ def load(root: str | os.PathLike[str]) -> Scene:
         tuple(frames["train"]),
         tuple(frames["test"]),
         untracked,
+        notes=_notes(file, data.get("notes", [])),
     )
 
 
-def write(root: str | os.PathLike[str], scene: Scene) -> None:
+def write(
+    root: str | os.PathLike[str],
+    scene: Scene,
+    *,
+    link: bool = False,
+    on_frame: Callable[[], object] | None = None,
+) -> None:
     """Writes a scene with its images; images that are files are copied byte for byte.
+
+    Args:
+        root: Folder to write to; made when missing.
+        scene: What to write.
+        link: Whether image files are hard links where the disk allows them, which take no room.
+        on_frame: Called after every frame, for progress bars.
 
     Raises:
         InputError: `root` already holds a scene, or an image cannot be read.
     """
-    with SceneWriter(root, scene.name) as writer:
-        writer.untracked = scene.untracked
-        for frame in scene.train:
-            writer.add(frame, "train")
-        for frame in scene.test:
-            writer.add(frame, "test")
+    with SceneWriter(root, scene.name, link) as writer:
+        writer.untracked, writer.notes = scene.untracked, scene.notes
+        for i, frame in enumerate((*scene.train, *scene.test)):
+            writer.add(frame, "train" if i < len(scene.train) else "test")
+            if on_frame is not None:
+                on_frame()
 
 
 class SceneWriter:
@@ -96,15 +110,22 @@ class SceneWriter:
 
     A folder without scene.json is therefore a recording that was cut off, not a short scene.
 
+    Args:
+        root: Folder to write to; made when missing.
+        name: What the scene is called.
+        link: Whether image files are hard links where the disk allows them.
+
     Raises:
         InputError: `root` already holds a scene.
     """
 
-    def __init__(self, root: str | os.PathLike[str], name: str) -> None:
+    def __init__(self, root: str | os.PathLike[str], name: str, link: bool = False) -> None:
         self.untracked = 0
+        self.notes: tuple[str, ...] = ()
         self.render: dict[str, object] | None = None
         self._root = Path(root)
         self._name = name
+        self._link = link
         self._cameras: dict[Camera, str] = {}
         self._frames: list[dict[str, object]] = []
         self._names: set[str] = set()
@@ -136,12 +157,7 @@ class SceneWriter:
             raise InputError(f"frame {frame.name!r}: already written; frame names are unique")
         # The counter keeps names like 'a/b' and 'a_b' apart and the folder in recorded order.
         stem = f"{len(self._frames):06d}"
-        suffix = frame.image.suffix.lower() if isinstance(frame.image, Path) else ".png"
-        relative = f"images/{stem}{suffix}"
-        if isinstance(frame.image, Path):
-            self._copy(frame.image, relative)
-        else:
-            write_image(self._root / relative, frame.read_image())
+        relative = self._write_image(frame, f"images/{stem}")
         self._names.add(frame.name)
         entry: dict[str, object] = {
             "name": frame.name,
@@ -159,15 +175,41 @@ class SceneWriter:
             entry["joints_rad"] = list(frame.joints_rad)
         self._frames.append(entry)
 
+    def _write_image(self, frame: Frame, stem: str) -> str:
+        """Writes an image as it is stored, else as a PNG, and gives its path in the folder."""
+        if isinstance(frame.image, Path):
+            relative = stem + frame.image.suffix.lower()
+            self._copy(frame.image, relative)
+            return relative
+        stored = frame.image.file() if isinstance(frame.image, StoredImage) else None
+        if stored is None:
+            write_image(self._root / f"{stem}.png", frame.read_image())
+            return f"{stem}.png"
+        ending, content = stored
+        (self._root / f"{stem}{ending}").write_bytes(content)
+        return f"{stem}{ending}"
+
     def _copy(self, source: Path, relative: str) -> None:
-        """Copies a file to its place; one that already lies there stays as it is."""
+        """Copies or links a file to its place; one that already lies there stays as it is."""
         target = self._root / relative
         if target.exists() and target.samefile(source):
             return
         try:
+            # A link through a link would point to nothing once the folder moves.
+            if self._link and not target.exists() and self._linked(source.resolve(), target):
+                return
             shutil.copyfile(source, target)
         except OSError as error:
             raise InputError(f"{source}: cannot be copied ({error.strerror})") from None
+
+    @staticmethod
+    def _linked(source: Path, target: Path) -> bool:
+        """Whether a hard link could be made; not from one disk to another."""
+        try:
+            target.hardlink_to(source)
+        except OSError:
+            return False
+        return True
 
     def close(self) -> None:
         """Writes scene.json."""
@@ -179,6 +221,8 @@ class SceneWriter:
             "frames": self._frames,
             "untracked": self.untracked,
         }
+        if self.notes:
+            data["notes"] = list(self.notes)
         if self.render is not None:
             data["render"] = self.render
         write_json(self._root / FILE, data)
@@ -268,6 +312,12 @@ def _frame(
             raise ValueError(f"frame {i}: '{key}': {error}") from None
     name = entry.get("name", image)
     return split, Frame(str(name), root / image, cameras[camera], **poses)
+
+
+def _notes(file: Path, notes: object) -> tuple[str, ...]:
+    if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
+        raise InputError(f"{file}: 'notes' is a list of sentences, got {notes!r}")
+    return tuple(notes)
 
 
 def _inside(path: object, what: str) -> str:

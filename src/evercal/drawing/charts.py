@@ -4,7 +4,6 @@ Colours are those of Okabe and Ito, which the colour-blind can tell apart; line 
 differ as well. Nothing global is touched: no pyplot, no style, no backend setting.
 """
 
-import io
 import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -12,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evercal.drawing.canvas import COLOURS, new_figure, png_bytes
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 _MARKERS = "os^Dv<>P"
 _LINES = ("-", "--", "-.", ":")
 
@@ -42,7 +41,7 @@ def forgetting_curves(
             raise ValueError(f"{name}: {count} scenes need ({count}, {count}), got {matrix.shape}")
     columns = min(4, count + 1)
     rows = -(-(count + 1) // columns)
-    figure = _figure(2.6 * columns + 0.4, 2.1 * rows + 0.7)
+    figure = new_figure(2.6 * columns + 0.4, 2.1 * rows + 0.7)
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     stages = np.arange(1, count + 1)
     panels = grid.ravel()
@@ -65,7 +64,7 @@ def forgetting_curves(
     figure.supylabel(quantity, fontsize=9)
     handles, labels = panels[count].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=5, frameon=False, fontsize=9)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def error_curve(
@@ -82,7 +81,7 @@ def error_curve(
     Raises:
         ValueError: A method without errors, or with one that is not a number.
     """
-    figure = _figure(5.4, 3.4)
+    figure = new_figure(5.4, 3.4)
     axes = figure.subplots()
     for index, (name, values) in enumerate(methods.items()):
         errors = np.sort(100.0 * np.asarray(values, dtype=np.float64).ravel())
@@ -100,7 +99,7 @@ def error_curve(
     axes.set_ylabel("share of frames (%)", fontsize=9)
     _finish(axes)
     axes.legend(loc="lower right", fontsize=9, frameon=False)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def error_histogram(
@@ -118,7 +117,7 @@ def error_histogram(
     """
     if not groups:
         raise ValueError("a histogram takes at least one group of errors")
-    figure = _figure(2.6 * len(groups) + 0.6, 2.6)
+    figure = new_figure(2.6 * len(groups) + 0.6, 2.6)
     panels = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]
     width = limit_mm / bins
     for index, (panel, (name, values)) in enumerate(zip(panels, groups.items(), strict=True)):
@@ -126,7 +125,7 @@ def error_histogram(
         if np.isnan(errors).any():
             raise ValueError(f"{name}: errors are numbers (inf allowed), got nan")
         counts, edges = np.histogram(errors[errors < limit_mm], bins, (0, limit_mm))
-        colour = _COLOURS[index % len(_COLOURS)]
+        colour = COLOURS[index % len(COLOURS)]
         panel.bar(edges[:-1], counts, 0.9 * width, align="edge", color=colour)
         beyond = int((errors >= limit_mm).sum())
         if beyond:
@@ -141,7 +140,7 @@ def error_histogram(
         panel.spines[["top", "right"]].set_visible(False)
     figure.supxlabel("translation error (mm)", fontsize=9)
     panels[0].set_ylabel("frames", fontsize=9)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def scene_bars(
@@ -157,7 +156,7 @@ def scene_bars(
     Raises:
         ValueError: Not as many numbers as scenes, or no scene.
     """
-    figure = _figure(1.6 + 0.22 * len(scenes) * (len(methods) + 1), 3.2)
+    figure = new_figure(1.6 + 0.22 * len(scenes) * (len(methods) + 1), 3.2)
     axes = figure.subplots()
     width = 1.0 / (len(methods) + 1)
     for index, (name, values) in enumerate(methods.items()):
@@ -165,15 +164,15 @@ def scene_bars(
         if heights.shape != (len(scenes),) or not len(scenes):
             raise ValueError(f"{name}: {len(scenes)} scenes need as many numbers, got {heights}")
         left = np.arange(len(scenes)) + index * width
-        colour = _COLOURS[index % len(_COLOURS)]
-        hatch = ("", "//", "..", "xx")[index // len(_COLOURS) % 4]
+        colour = COLOURS[index % len(COLOURS)]
+        hatch = ("", "//", "..", "xx")[index // len(COLOURS) % 4]
         axes.bar(left, heights, 0.9 * width, align="edge", color=colour, hatch=hatch, label=name)
     middle = np.arange(len(scenes)) + 0.5 * len(methods) * width
     axes.set_xticks(middle, scenes, rotation=30 if len(scenes) > 4 else 0)
     axes.set_ylabel(quantity, fontsize=9)
     _finish(axes)
     figure.legend(loc="outside upper center", ncols=5, frameon=False, fontsize=9)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def accuracy_against_size(methods: Mapping[str, tuple[float, float]], quantity: str) -> bytes:
@@ -184,7 +183,7 @@ def accuracy_against_size(methods: Mapping[str, tuple[float, float]], quantity: 
             NaN.
         quantity: What takes the megabytes.
     """
-    figure = _figure(5.4, 3.4)
+    figure = new_figure(5.4, 3.4)
     axes = figure.subplots()
     lowest = -math.inf
     drawn = [i for i, (size, _) in enumerate(methods.values()) if not math.isnan(size)]
@@ -206,7 +205,7 @@ def accuracy_against_size(methods: Mapping[str, tuple[float, float]], quantity: 
     axes.set_xlabel(f"{quantity} (MB)", fontsize=9)
     axes.set_ylabel("accuracy (%)", fontsize=9)
     _finish(axes)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def trajectory(
@@ -237,17 +236,17 @@ def trajectory(
     margin = max(0.15 * float((high - low).max()), 0.05)
     inside = found.copy()
     inside[found] = ((guess[found] >= low - margin) & (guess[found] <= high + margin)).all(axis=1)
-    figure = _figure(5.4, 4.6)
+    figure = new_figure(5.4, 4.6)
     panel = figure.subplots()
     panel.plot(*_without_leaps(true).T, color="0.6", linewidth=1, label=f"true ({len(true)})")
     links = np.stack([true, guess], axis=1)[found]
-    panel.plot(*_with_gaps(links).T, color=_COLOURS[1], linewidth=0.8, alpha=0.6)
-    panel.plot(*guess[inside].T, ".", color=_COLOURS[0], label=f"found ({int(found.sum())})")
+    panel.plot(*_with_gaps(links).T, color=COLOURS[1], linewidth=0.8, alpha=0.6)
+    panel.plot(*guess[inside].T, ".", color=COLOURS[0], label=f"found ({int(found.sum())})")
     if not found.all():
         label = f"not found ({int((~found).sum())})"
-        panel.plot(*true[~found].T, "x", color=_COLOURS[6], markersize=5, label=label)
+        panel.plot(*true[~found].T, "x", color=COLOURS[6], markersize=5, label=label)
     if (outside := int((found & ~inside).sum())) > 0:
-        panel.plot([], [], color=_COLOURS[1], label=f"found outside this view ({outside})")
+        panel.plot([], [], color=COLOURS[1], label=f"found outside this view ({outside})")
     panel.set_xlim(low[0] - margin, high[0] + margin)
     panel.set_ylim(low[1] - margin, high[1] + margin)
     panel.set_aspect("equal")
@@ -256,7 +255,7 @@ def trajectory(
     panel.grid(color="0.9", linewidth=0.6)
     panel.tick_params(labelsize=8)
     figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=9)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def kept_places(methods: Mapping[str, ArrayLike]) -> bytes:
@@ -276,16 +275,16 @@ def kept_places(methods: Mapping[str, ArrayLike]) -> bytes:
     middle, reach = (every.max(0) + every.min(0)) / 2, max(float(np.ptp(every, axis=0).max()), 0.1)
     columns = min(4, len(places))
     rows = -(-len(places) // columns)
-    figure = _figure(2.6 * columns, 2.3 * rows)
+    figure = new_figure(2.6 * columns, 2.3 * rows)
     for index, (name, where) in enumerate(places.items()):
         panel = figure.add_subplot(rows, columns, index + 1, projection="3d")
-        panel.scatter(*where.T, s=12, color=_COLOURS[0])  # pyright: ignore[reportArgumentType]
+        panel.scatter(*where.T, s=12, color=COLOURS[0])  # pyright: ignore[reportArgumentType]
         for axis, centre in zip("xyz", middle, strict=True):
             getattr(panel, f"set_{axis}lim")(centre - reach / 2, centre + reach / 2)
             getattr(panel, f"set_{axis}label")(f"{axis} (m)", fontsize=7, labelpad=-8)
         panel.tick_params(labelsize=6, pad=-3)
         panel.set_title(f"{name} ({len(where)})", fontsize=9)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def _without_leaps(path: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -301,16 +300,9 @@ def _with_gaps(links: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([links, gap], axis=1).reshape(-1, 2)
 
 
-def _figure(width: float, height: float) -> "Figure":
-    from matplotlib.figure import Figure
-
-    # A figure made without pyplot draws itself with Agg and belongs to no global state.
-    return Figure(figsize=(width, height), dpi=150, layout="constrained", facecolor="white")
-
-
 def _style(index: int, name: str) -> dict[str, Any]:
     return {
-        "color": _COLOURS[index % len(_COLOURS)],
+        "color": COLOURS[index % len(COLOURS)],
         "marker": _MARKERS[index % len(_MARKERS)],
         "linestyle": _LINES[index % len(_LINES)],
         "label": name,
@@ -324,10 +316,3 @@ def _finish(axes: "Axes") -> None:
     axes.grid(color="0.9", linewidth=0.6)
     axes.tick_params(labelsize=8)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def _png(figure: "Figure") -> bytes:
-    buffer = io.BytesIO()
-    # Without the program's name and version the same chart gives the same bytes.
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""Points drawn onto photographs, and photographs side by side; images are (H, W, 3) uint8 RGB."""
+"""Points and lines on photographs, and photographs side by side; images are (H, W, 3) uint8 RGB."""
 
 import math
 from collections.abc import Sequence
@@ -70,6 +70,70 @@ def overlay_points(
     if legend and limits is not None:
         _draw_legend(drawn, legend, limits)
     return drawn
+
+
+def overlay_lines(
+    image: Image,
+    lines: Sequence[ArrayLike],
+    colours: Sequence[tuple[int, int, int]],
+    width: int = 2,
+    dash: float | None = None,
+) -> Image:
+    """Draws lines over an image: the axes of a frame, say.
+
+    Whole lines have a white rim and dashed ones a black one, so that they stand out on any ground
+    and can be told apart where they lie together.
+
+    Args:
+        image: (H, W, 3) uint8 RGB; not changed.
+        lines: (n, 2) x and y of each, where 0 is the centre of the first pixel; a line has a gap
+            where a point is not finite.
+        colours: RGB, one for each line.
+        width: Pixels.
+        dash: Length of dashes and of the gaps between them, pixels; None for whole lines.
+
+    Returns:
+        A new image of the same size.
+
+    Raises:
+        ValueError: Shapes that do not belong together.
+    """
+    import cv2
+
+    _check_image(image)
+    drawn = np.ascontiguousarray(image).copy()
+    for line, colour in zip(lines, colours, strict=True):
+        points = np.asarray(line, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 2:
+            raise ValueError(f"a line is (n, 2) pixels, got {points.shape}")
+        # OpenCV counts in 32-bit integers: what is further off than this is not on any screen.
+        points = np.where(np.abs(points) < 1e6, points, np.nan)
+        pieces = [piece for piece in _unbroken(points) if len(piece) > 1]
+        if dash is not None:
+            pieces = [part for piece in pieces for part in _dashes(piece, dash)]
+        whole = [np.round(piece * (1 << _FRACTION_BITS)).astype(np.int32) for piece in pieces]
+        rim = (255, 255, 255) if dash is None else (0, 0, 0)
+        for ink, thickness in ((rim, width + 2), (colour, width)):
+            cv2.polylines(drawn, whole, False, ink, thickness, cv2.LINE_AA, _FRACTION_BITS)
+    return drawn
+
+
+def _unbroken(points: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """The stretches of a line (n, 2) in which every point is finite."""
+    finite = np.isfinite(points).all(axis=1)
+    starts = np.flatnonzero(np.diff(finite.astype(int), prepend=0)) if len(points) else []
+    return [part for part in np.split(points, starts) if len(part) and np.isfinite(part[0]).all()]
+
+
+def _dashes(points: NDArray[np.float64], length: float) -> list[NDArray[np.float64]]:
+    """Every other stretch of a length along a line (n, 2), pixels."""
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    found = []
+    for start in np.arange(0, along[-1], 2 * length):
+        end = min(start + length, along[-1])
+        at = np.unique([start, *along[(along > start) & (along < end)], end])
+        found.append(np.stack([np.interp(at, along, points[:, i]) for i in (0, 1)], axis=1))
+    return found
 
 
 def contact_sheet(

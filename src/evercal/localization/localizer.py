@@ -289,7 +289,7 @@ class Localizer:
             best.ratio,
             1000 * (time.perf_counter() - began),
             best.pixels,
-            best.points_m,
+            record.stated_points(best.points_m),
             best.support,
         )
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
 
@@ -26,6 +26,7 @@ from evercal.mapping.frame_correction import FrameCorrection, fit_correction
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.pose_check import PoseCheckOptions, contradicting_frames
 from evercal.mapping.recording import Recording, WorkingSize
+from evercal.mapping.scene_maps import frame_moved_by_cameras
 from evercal.mapping.selection import SarsOptions, select_sars
 from evercal.mapping.tracks import (
     KeyframeTracks,
@@ -35,6 +36,12 @@ from evercal.mapping.tracks import (
 )
 
 Result = TypeVar("Result")
+
+
+HAND_EYE_COVARIANCE_SCALE = 4.0
+"""Alignment errors of a landmark go together over many frames, which the residuals cannot tell: the
+squared error of `gripper_from_camera` in trials was three to four times what they say
+(docs/experiments/handeye.md)."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +62,21 @@ class MapOptions:
     """Adjust poses and lens; else they are taken as stated."""
     rounds: int = 2
     """Rounds of tracking and adjusting; the second only where the first moved something."""
+
+    def for_hand_eye(self) -> "MapOptions":
+        """The same where stated poses come from a `gripper_from_camera` that is only a start.
+
+        Arms place their gripper to some tenths of a millimetre, less than the images of one frame
+        can tell: to take their poses for exact would make the answer surer than it is.
+        """
+        free = {
+            "common_known": False,
+            "common_sigma_m": 0.2,
+            "common_sigma_deg": 10.0,
+            "least_sigma_m": 2e-4,
+            "least_sigma_deg": 0.015,
+        }
+        return replace(self, bundle=replace(self.bundle, **free))
 
 
 @dataclass(frozen=True)
@@ -82,6 +104,16 @@ class Adjusted:
 
 
 @dataclass(frozen=True, eq=False)
+class HandEyeCorrection:
+    """What bundle adjustment found about where the camera sits on its gripper."""
+
+    start_camera_from_camera: SE3
+    """gripper_from_camera is its start times this."""
+    covariance: NDArray[np.float64]
+    """(6, 6), camera frame, translation in metres and rotation in radians."""
+
+
+@dataclass(frozen=True, eq=False)
 class SceneMap:
     """The map of one scene."""
 
@@ -97,6 +129,10 @@ class SceneMap:
     """What was changed."""
     bend: FrameCorrection | None = None
     """Corrections of stated poses that answers take back; None where none go together."""
+    hand_eye: HandEyeCorrection | None = None
+    """What the start of `gripper_from_camera` is corrected by; None where it was stated."""
+    frame_covariance: NDArray[np.float64] | None = None
+    """(6, 6) see `SceneRecord`."""
 
 
 @dataclass(frozen=True)
@@ -296,6 +332,13 @@ def _finished(
     first = recording.frames[0].camera
     camera = recording.cameras[0].resized(first.width, first.height)
     common = adjustment.common if adjustment else SE3.identity()
+    stated, hand_eye, loose = recording.stated, None, None
+    if adjustment is not None and not options.bundle.common_known:
+        # Nobody stated this transform: what was found is the answer, and nothing is taken back.
+        spread_of_common = HAND_EYE_COVARIANCE_SCALE * adjustment.common_covariance
+        hand_eye = HandEyeCorrection(common, spread_of_common)
+        stated, common = stated @ common, SE3.identity()
+        loose = frame_moved_by_cameras(stated, spread_of_common)
     spread = (0.0, 0.0)
     if adjustment is not None:
         block = adjustment.covariance[numbers]
@@ -306,9 +349,9 @@ def _finished(
         )
     bend = None
     if adjustment is not None:
-        bend = fit_correction(recording.stated, adjustment.poses, common)
+        bend = fit_correction(stated, adjustment.poses, common)
     told = _adjusted(recording, adjustment, camera, wrong)
-    return SceneMap(complete, camera, common, spread, told, bend)
+    return SceneMap(complete, camera, common, spread, told, bend, hand_eye, loose)
 
 
 def _adjusted(

@@ -35,7 +35,6 @@ Array = NDArray[np.floating]
 _GROUPS = ((0, 3), (3, 6), (6, 7), (7, 8), (8, 10), (10, 12))
 """Common translation, common rotation, time shift, focal length, principal point, distortion: what
 is judged relevant or not together."""
-_LEAST_M, _LEAST_RAD = 5e-5, 5e-6
 
 
 @dataclass(frozen=True)
@@ -48,10 +47,17 @@ class BundleOptions:
     """Standard deviation of stated positions per axis, metres, before it is estimated."""
     start_sigma_deg: float = 0.4
     """The same of stated rotations, degrees."""
+    least_sigma_m: float = 5e-5
+    """Stated positions are never taken to be better than this per axis, metres."""
+    least_sigma_deg: float = 3e-4
+    """The same of stated rotations, degrees."""
     common_sigma_m: float = 0.02
     """Prior standard deviation of the common translation per axis, metres."""
     common_sigma_deg: float = 2.0
     """The same of the common rotation, degrees."""
+    common_known: bool = True
+    """Keep the common transform at zero unless the images say otherwise. False where nobody stated
+    it (a `gripper_from_camera` from nothing): it is then found with its full uncertainty."""
     shift_sigma_frames: float = 2.0
     """Prior standard deviation of the time shift, in frames of the recording."""
     focal_sigma: float = 0.02
@@ -108,6 +114,8 @@ class Adjustment:
     """The same of stated rotations."""
     residual_px: float
     """Median reprojection error."""
+    common_covariance: NDArray[np.float64]
+    """(6, 6) of the common transform, camera frame, metres and radians."""
     correction: Array
     """(n, 6) of each pose beside the common transform and the shift, camera frame, m and rad."""
     weight: Array
@@ -322,7 +330,8 @@ class BundleAdjustment:
                 continue
             total = (weight * (off[:, part] ** 2 - own[:, part] * k)).sum()
             sigma[part] = np.sqrt(max(total, 0.0) / (k**2).sum()).clip(old / 3, old * 2)
-        state.sigma = sigma.clip([_LEAST_M] * 3 + [_LEAST_RAD] * 3, 0.1)
+        least = [self.options.least_sigma_m] * 3 + [np.deg2rad(self.options.least_sigma_deg)] * 3
+        state.sigma = sigma.clip(least, 0.1)
         tail = self.options.tail
         state.weight = (tail + 6) / (tail + ((off / state.sigma) ** 2).sum(1))
         if widest is not None:
@@ -331,7 +340,7 @@ class BundleAdjustment:
     def _relevance(self, state: _State, variance: Array, widest: Array) -> None:
         share = np.maximum(1 - np.minimum(variance / state.prior, 1), 1e-3)
         squares, noise = (state.shared / share) ** 2, variance / share
-        for low, high in _GROUPS:
+        for low, high in _GROUPS if self.options.common_known else _GROUPS[2:]:
             part = slice(low, high)
             clear = (squares[part] / noise[part]).mean() > self.options.relevance
             wanted = (squares[part] - noise[part]).mean() if clear else 0.0
@@ -353,6 +362,7 @@ class BundleAdjustment:
             float(state.sigma[0]),
             float(state.sigma[3]),
             float(np.median(np.linalg.norm(unwhitened, axis=1))),
+            state.covariance[6 * n : 6 * n + COMMON, 6 * n : 6 * n + COMMON],
             self._deviation(state),
             np.minimum(state.weight, 1.0),
             blocks[np.arange(n), :, np.arange(n), :],

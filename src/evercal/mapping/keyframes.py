@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from evercal.datasets.frame import Frame
@@ -55,6 +56,18 @@ class Keyframes:
 
     def __len__(self) -> int:
         return len(self.images)
+
+    def take(self, index: NDArray[np.int64]) -> "Keyframes":
+        """Some of them."""
+        rows = index.tolist()
+        return Keyframes(
+            tuple(self.images[i] for i in rows),
+            tuple(self.cameras[i] for i in rows),
+            self.base_from_camera[index],
+            tuple(self.inverse_depth[i] for i in rows) if self.inverse_depth else (),
+            tuple(self.landmarks[i] for i in rows) if self.landmarks else (),
+            None if self.descriptors is None else self.descriptors[index],
+        )
 
     def grey(self, i: int) -> np.ndarray:
         """(h, w) uint8 image of a keyframe, decoded."""

@@ -70,7 +70,8 @@ class Recording:
         rest.stated, rest.rotation = self.stated[np.array(keep)], self.rotation[keep]
         rest.translation_m = self.translation_m[keep]
         rest.grey, rest.cameras = [self.grey[i] for i in keep], [self.cameras[i] for i in keep]
-        rest._features = {new: self._features[i] for new, i in enumerate(keep)}
+        known = self._features
+        rest._features = {new: known[i] for new, i in enumerate(keep) if i in known}
         rest._pyramids, rest._lock = OrderedDict(), Lock()
         return rest
 

@@ -19,6 +19,36 @@ from evercal.networks.head import Head
 MAX_PROTOTYPES = 256
 
 
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Where a map that was made in a frame of its own lies in the robot's base frame."""
+
+    base_from_map: SE3
+    """Applied after scaling."""
+    scale: float = 1.0
+    """Metres for every unit of length of the map."""
+
+    def pose(self, map_from_camera: SE3) -> SE3:
+        """A camera pose in the base frame."""
+        scaled = SE3(map_from_camera.rotation_wxyz, self.scale * map_from_camera.translation_m)
+        return self.base_from_map @ scaled
+
+    def map_pose(self, base_from_camera: SE3) -> SE3:
+        """A camera pose in the map's own frame: the reverse of `pose`."""
+        scaled = self.base_from_map.inverse() @ base_from_camera
+        return SE3(scaled.rotation_wxyz, scaled.translation_m / self.scale)
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3) in the base frame."""
+        return self.base_from_map.apply(self.scale * points)
+
+    def covariance(self, covariance: np.ndarray) -> np.ndarray:
+        """(6, 6) of translation in the base frame and rotation about camera axes."""
+        axes = np.eye(6)
+        axes[:3, :3] = self.scale * self.base_from_map.rotation_matrix()
+        return axes @ covariance @ axes.T
+
+
 @dataclass(frozen=True)
 class SceneRecord:
     """What stays known of a learned scene beside the head's weights."""
@@ -48,6 +78,11 @@ class SceneRecord:
 
     bend: FrameCorrection | None = None
     """Corrections of stated poses that go together in places; answers take them back too."""
+    frame_covariance: np.ndarray | None = None
+    """(6, 6) uncertainty of the base frame itself: a small motion of it, base frame, metres and
+    radians, that all answers share. None where poses were stated in it."""
+    alignment: Alignment | None = None
+    """From the frame that the recording states to the robot's base frame; None if it is that."""
 
     def stated(self, pose: SE3, covariance: np.ndarray | None) -> tuple[SE3, np.ndarray | None]:
         """A pose of the map in the frame that the recording states, and its covariance.
@@ -64,7 +99,35 @@ class SceneRecord:
         if self.bend is not None:
             back = SE3.exp(-self.bend.at(found))
             found = pose @ back @ self.common.inverse()
+        if self.alignment is not None:
+            found = self.alignment.pose(found)
+            if covariance is not None:
+                covariance = self.alignment.covariance(covariance)
+        if covariance is not None and self.frame_covariance is not None:
+            covariance = covariance + moved_by_frame(found, self.frame_covariance)
         return found, covariance
+
+    def stated_points(self, points_m: np.ndarray | None) -> np.ndarray | None:
+        """Landmarks (n, 3) of the map in the base frame."""
+        if points_m is None or self.alignment is None:
+            return points_m
+        return self.alignment.points(points_m)
+
+    def camera_among_landmarks(self, base_from_camera: SE3) -> SE3:
+        """The pose at which a camera that was located sees the landmarks in the base frame.
+
+        The reverse of `stated`, for landmarks from `stated_points`.
+        """
+        stated = base_from_camera
+        if self.alignment is not None:
+            stated = self.alignment.map_pose(base_from_camera)
+        pose = stated @ self.common
+        if self.bend is not None:
+            # The bend is told by the pose that is sought; it changes little over its own size.
+            for _ in range(3):
+                bend = SE3.exp(self.bend.at(pose @ self.common.inverse()))
+                pose = stated @ self.common @ bend
+        return pose if self.alignment is None else self.alignment.pose(pose)
 
     def query_camera(self, camera: Camera | None) -> Camera:
         """Intrinsics for a query: refined if the nominal ones or none are given, else as given."""
@@ -75,6 +138,40 @@ class SceneRecord:
         ):
             return self.refined_camera or own
         return camera
+
+
+def moved_by_frame(base_from_camera: SE3, frame_covariance: np.ndarray) -> np.ndarray:
+    """(6, 6) covariance of a camera pose that an uncertain base frame gives it.
+
+    Args:
+        base_from_camera: single pose.
+        frame_covariance: (6, 6) of a small motion (v, w) of the base frame, which moves the
+            position t by v + w x t and turns the camera by w.
+    """
+    x, y, z = base_from_camera.translation_m
+    slope = np.eye(6)
+    slope[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+    slope[3:, 3:] = base_from_camera.rotation_matrix().T
+    return slope @ frame_covariance @ slope.T
+
+
+def frame_moved_by_cameras(base_from_camera: SE3, covariance: np.ndarray) -> np.ndarray:
+    """(6, 6) covariance of the base frame that a motion common to all cameras gives it.
+
+    The reverse of `moved_by_frame` for an error of `gripper_from_camera`: landmarks move with the
+    cameras that saw them, so the frame moves by the mean over them.
+
+    Args:
+        base_from_camera: (n,) poses that a map was built from.
+        covariance: (6, 6) of the common motion, camera frame.
+    """
+    turn = base_from_camera.rotation_matrix()
+    slope = np.zeros((len(turn), 6, 6))
+    slope[:, :3, :3] = slope[:, 3:, 3:] = turn
+    for axis in range(3):  # the position moves by R v, less what turning about the base moves it
+        slope[:, :3, 3 + axis] = np.cross(base_from_camera.translation_m, turn[:, :, axis])
+    mean = slope.mean(0)
+    return mean @ covariance @ mean.T
 
 
 def _proportions(camera: Camera) -> tuple[float, float, float, float]:

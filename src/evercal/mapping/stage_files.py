@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.mapping.atlas import Cell
 from evercal.mapping.frame_correction import FrameCorrection
-from evercal.mapping.scene_maps import SceneRecord
+from evercal.mapping.scene_maps import Alignment, SceneRecord
 from evercal.networks.head import Head, HeadOptions
 from evercal.storage.atomic import write_bytes, write_json
 
@@ -97,6 +98,10 @@ def write_record(folder: Path, record: SceneRecord) -> None:
         "common": record.common.matrix().tolist(),
         "map_sigma": list(record.map_sigma),
     }
+    if record.alignment is not None:
+        placed = record.alignment
+        content["base_from_map"] = placed.base_from_map.matrix().tolist()
+        content["map_scale"] = placed.scale
     write_json(folder / "scene.json", content)
     tensors = {"prototypes": record.prototypes}
     if record.bend is not None:
@@ -105,6 +110,8 @@ def write_record(folder: Path, record: SceneRecord) -> None:
         tensors["bend_poses"] = torch.from_numpy(poses)
         tensors["bend"] = torch.from_numpy(record.bend.correction)
         tensors["bend_radius"] = torch.tensor(record.bend.radius, dtype=torch.float64)
+    if record.frame_covariance is not None:
+        tensors["frame_covariance"] = torch.from_numpy(record.frame_covariance)
     save_tensors(folder / "prototypes.safetensors", tensors)
 
 
@@ -126,7 +133,15 @@ def read_record(folder: Path) -> SceneRecord:
         SE3.from_matrix(content["common"]),
         (content["map_sigma"][0], content["map_sigma"][1]),
         _bend_of(tensors),
+        tensors["frame_covariance"].numpy() if "frame_covariance" in tensors else None,
+        _alignment_of(content),
     )
+
+
+def _alignment_of(content: Mapping[str, Any]) -> Alignment | None:
+    if "base_from_map" not in content:
+        return None
+    return Alignment(SE3.from_matrix(content["base_from_map"]), float(content["map_scale"]))
 
 
 def _bend_of(tensors: Mapping[str, Tensor]) -> FrameCorrection | None:

@@ -33,7 +33,7 @@ from evercal.features.descriptor import PooledDescriptor, descriptor_for, load_d
 from evercal.features.encoder import checked_encoder, load_encoder
 from evercal.features.weights_file import network_bytes
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 from evercal.mapping.stage_files import (
     HEAD,
     load_tensors,
@@ -199,12 +199,38 @@ class Store:
             save_tensors(folder / "notes.safetensors", maps.method_states[-1])
         write_json(folder / "report.json", report)
         replace_folder(folder, self.root / STAGES / name)
-        stages = [*self.stages, name]
-        shared = len(maps.heads) == 1
+        self._publish(maps, [*self.stages, name])
+
+    def replace_record(self, scene: str, record: SceneRecord) -> None:
+        """Puts another record in the place of a scene's: whole, or not at all.
+
+        Args:
+            scene: name of the scene.
+            record: its new record.
+        """
+        index = [known.name for known in self.maps.scenes].index(scene)
+        old = self.stages[index]
+        number, _, name = old.partition("-")
+        plain, _, version = name.partition("~")
+        new = f"{number}-{plain}~{int(version or 1) + 1}"
+        folder = self.root / STAGES / f".{new}"
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(self.root / STAGES / old, folder)
+        write_record(folder, record)
+        replace_folder(folder, self.root / STAGES / new)
+        self.maps.scenes[index] = record
+        stages = list(self.stages)
+        stages[index] = new
+        self._publish(self.maps, stages)
+
+    def _publish(self, maps: SceneMaps, stages: list[str]) -> None:
+        """Writes the manifest of these stages; from then on they are the store."""
+        assert self.networks is not None, "a store with stages has its networks"
+        newest, shared = stages[-1], len(maps.heads) == 1
         files = [*self.networks]
         for stage in stages:
             for file in STAGE_FILES:
-                superseded = shared and stage != name and file == HEAD
+                superseded = shared and stage != newest and file == HEAD
                 if not superseded and (self.root / STAGES / stage / file).exists():
                     files.append(f"{STAGES}/{stage}/{file}")
         payload = {
@@ -215,7 +241,6 @@ class Store:
             "stages": stages,
         }
         write_manifest(self.root, payload, files)
-        # From here on the new stage counts.
         self.maps, self.stages = maps, stages
         self._tidy(shared)
 

@@ -1,12 +1,13 @@
 """An answer drawn into its image."""
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from evercal.geometry import Camera
+    from evercal.geometry import SE3, Camera
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import Localizer
 
@@ -67,13 +68,47 @@ def draw_landmarks(
 
     height, width = 2 * image.shape[0], 2 * image.shape[1]
     large = cv2.resize(image, (width, height), interpolation=cv2.INTER_CUBIC).astype(np.uint8)
-    if estimate.pixels is None or estimate.base_from_camera is None or estimate.points_m is None:
+    found = landmark_errors(estimate, localizer)
+    if found is None:
         return large
-    record = next(r for r in localizer.maps.scenes if r.name == estimate.scene)
-    camera = record.query_camera(None).short_side_resized(localizer.maps.short_side)
-    adjusted = estimate.base_from_camera @ record.common  # landmarks are in the map's own frame
-    expected = camera.project(adjusted.inverse().apply(estimate.points_m))
-    residual = np.linalg.norm(estimate.pixels - expected, axis=1)
-    at = (estimate.pixels + 0.5) * (height / camera.height) - 0.5
+    at = (found.pixels + 0.5) * (height / found.height) - 0.5
     words = "reprojection error (px)" if legend else None
-    return overlay_points(large, at, residual, 3.0, (0.0, 1.0), words)
+    return overlay_points(large, at, found.errors_px, 3.0, (0.0, 1.0), words)
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkErrors:
+    """How far the landmarks of an image lie from where a camera pose puts them."""
+
+    pixels: NDArray[np.float64]
+    """(n, 2) where they were found in the working image."""
+    errors_px: NDArray[np.float64]
+    """(n,) pixels of the working image; nan where the pose puts one behind the camera."""
+    height: int
+    """Of the working image."""
+
+
+def landmark_errors(
+    estimate: "PoseEstimate",
+    localizer: "Localizer",
+    camera: "Camera | None" = None,
+    base_from_camera: "SE3 | None" = None,
+) -> LandmarkErrors | None:
+    """Reprojection errors of the landmarks that were found in an image.
+
+    Args:
+        estimate: the answer for the image; None is returned without a pose.
+        localizer: that gave it.
+        camera: the intrinsics that it was located with; None for the scene's own.
+        base_from_camera: the pose to judge by; that of the answer when None.
+    """
+    pose = base_from_camera or estimate.base_from_camera
+    if estimate.pixels is None or estimate.points_m is None or estimate.base_from_camera is None:
+        return None
+    assert pose is not None, "the answer has one"
+    record = next(r for r in localizer.maps.scenes if r.name == estimate.scene)
+    lens = record.query_camera(camera).short_side_resized(localizer.maps.short_side)
+    among = record.camera_among_landmarks(pose)
+    expected = lens.project(among.inverse().apply(estimate.points_m))
+    errors = np.linalg.norm(estimate.pixels - expected, axis=1)
+    return LandmarkErrors(estimate.pixels, errors, lens.height)

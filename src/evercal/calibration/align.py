@@ -1,0 +1,223 @@
+"""`align`: brings a scene that was learned in a frame of its own into the robot's base frame.
+
+A phone video with poses of structure from motion or SLAM gives a map whose frame, and perhaps
+scale, means nothing to a robot. A few images from a camera on the gripper tell where the base is:
+with gripper poses A, map poses B of the camera and X = gripper_from_camera, A X = Z B holds for
+Z = base_from_map, and both are found together. Or points that the tool has touched are picked in
+images. The error of Z stays with the scene: it is a part of every later answer.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.calibration.align_points import Picks, PointAlignment, align_by_points
+from evercal.calibration.disagreement import require_agreement
+from evercal.calibration.hand_eye import HandEyeFit, agreement, robust_fit
+from evercal.calibration.located import Located, locate
+from evercal.calibration.observability import require_observable
+from evercal.calibration.pairs import PosePairs
+from evercal.errors import InputError
+from evercal.geometry import SE3, Camera
+from evercal.mapping.scene_maps import Alignment, SceneRecord
+
+if TYPE_CHECKING:
+    from evercal.localization.localizer import Localizer
+
+Array = NDArray[np.float64]
+LEAST_IMAGES = 5
+
+
+@dataclass(frozen=True, eq=False)
+class MapAlignment:
+    """Where a map lies in the base frame."""
+
+    alignment: Alignment
+    """From the map to the base frame."""
+    frame_covariance: Array
+    """(6, 6), see `SceneRecord.frame_covariance`."""
+    used: int
+    """Images or points that it rests on."""
+    of: int
+    """Images or points that were given."""
+    residual: str
+    """How well they agree, for people."""
+    gripper_from_camera: SE3 | None = None
+    """Found with it, where the images came from a camera on the gripper."""
+
+    sigma: tuple[float, float] = (0.0, 0.0)
+    """Standard deviation per axis in the middle of the scene, millimetres and degrees."""
+
+
+def in_own_frame(localizer: "Localizer", scene: str) -> SceneRecord:
+    """Makes a localizer answer in the frame that the scene was learned in; gives its record.
+
+    Raises:
+        InputError: no such scene.
+    """
+    if scene not in localizer.scenes:
+        known = ", ".join(localizer.scenes)
+        raise InputError(f"scene {scene!r}: the store does not know it; it has {known}")
+    index = localizer.scenes.index(scene)
+    record = replace(localizer.maps.scenes[index], alignment=None, frame_covariance=None)
+    localizer.maps.scenes[index] = record
+    return record
+
+
+def align_by_gripper(
+    localizer: "Localizer",
+    scene: str,
+    images: Sequence[tuple[str, NDArray[np.uint8]]],
+    base_from_gripper: SE3,
+    scale_known: bool = True,
+) -> MapAlignment:
+    """Finds the base frame from images of a camera on the gripper.
+
+    Args:
+        localizer: of the store.
+        scene: which of its scenes; its alignment so far is not looked at.
+        images: (name, (h, w, 3) uint8 RGB), five or more from places that turn about two axes.
+        base_from_gripper: (n,) where the gripper was.
+        scale_known: whether the scene was learned in metres.
+
+    Raises:
+        InputError: too few images were located in the scene, or the motions leave the answer open.
+    """
+    in_own_frame(localizer, scene)
+    located = [item for item in locate(localizer, images) if item.found]
+    index = {name: i for i, (name, _) in enumerate(images)}
+    located = [item for item in located if item.estimate.scene == scene]
+    if len(located) < LEAST_IMAGES:
+        raise InputError(
+            f"{len(located)} of {len(images)} images were located in {scene}; give at least"
+            f" {LEAST_IMAGES} that show it from places that turn about two axes"
+        )
+    rows = np.array([index[item.name] for item in located])
+    return _solved(located, base_from_gripper[rows], scale_known, len(images))
+
+
+def _solved(
+    located: Sequence[Located], base_from_gripper: SE3, scale_known: bool, given: int
+) -> MapAlignment:
+    map_from_camera = SE3.stack([item.pose for item in located])
+    names = tuple(item.name for item in located)
+    pairs = PosePairs(names, base_from_gripper, map_from_camera.inverse())
+    require_observable(pairs, scale_known)
+    equation = pairs.equation("eye_in_hand", scale_known)
+    found = agreement(equation)
+    require_agreement(pairs, "eye_in_hand", scale_known, found)
+    fit = robust_fit(equation, found)
+    placed = Alignment(fit.at.fixed_from_board, fit.at.scale)
+    covariance, sigma = _frame_covariance(fit, placed, map_from_camera, scale_known)
+    rms = np.sqrt((fit.residual[fit.inliers].reshape(-1, 2, 3) ** 2).sum(2).mean(0))
+    return MapAlignment(
+        placed,
+        covariance,
+        int(fit.inliers.sum()),
+        given,
+        f"{1000 * rms[0]:.1f} mm and {np.rad2deg(rms[1]):.2f} deg root mean square",
+        fit.at.parent_from_camera,
+        sigma,
+    )
+
+
+def _frame_covariance(
+    fit: HandEyeFit, placed: Alignment, map_from_camera: SE3, scale_known: bool
+) -> tuple[Array, tuple[float, float]]:
+    """Covariance of the base frame as one motion of it, and sigmas in the middle of the cameras."""
+    whole = fit.factor * fit.covariance
+    picked = np.arange(6, 12 if scale_known else 13)
+    own = whole[np.ix_(picked, picked)]
+    turn = placed.base_from_map.rotation_matrix()
+    centre = map_from_camera.translation_m.mean(0)
+    arm = placed.scale * turn @ centre
+    slope = np.zeros((6, len(picked)))
+    slope[:3, :3] = np.eye(3)
+    slope[:3, 3:6] = -_cross(arm) @ turn
+    slope[3:, 3:6] = turn
+    if not scale_known:
+        slope[:3, 6] = arm
+    middle = slope @ own @ slope.T
+    if not scale_known:
+        # Away from the middle of the cameras, a wrong scale is a wrong place.
+        radius = np.sqrt(((map_from_camera.translation_m - centre) ** 2).sum(1).mean() / 3)
+        middle[:3, :3] += np.eye(3) * own[6, 6] * (placed.scale * radius) ** 2
+    return _about_origin(middle, arm + placed.base_from_map.translation_m), _sigma(middle)
+
+
+def aligned_by_points(
+    localizer: "Localizer",
+    scene: str,
+    points: Mapping[str, Array],
+    picks: Sequence[tuple[str, NDArray[np.uint8], Mapping[str, Array]]],
+    scale_known: bool = True,
+) -> MapAlignment:
+    """Finds the base frame from touched points.
+
+    Args:
+        localizer: of the store.
+        scene: which of its scenes.
+        points: (3,) by name, base frame, metres.
+        picks: (name, (h, w, 3) uint8 RGB, pixels (2,) by name of the point) of each image.
+        scale_known: whether the scene was learned in metres.
+
+    Raises:
+        InputError: fewer than two images located, or too few points.
+    """
+    record, images = in_own_frame(localizer, scene), []
+    for name, image, pixels in picks:
+        [item] = locate(localizer, [(name, image)])
+        if not item.found or item.estimate.scene != scene:
+            continue
+        lens: Camera = record.query_camera(None).resized(image.shape[1], image.shape[0])
+        seen = tuple(pixels)
+        known = np.stack([points[key] for key in seen])
+        pixel = np.stack([pixels[key] for key in seen])
+        # Landmarks are seen from where the camera is among them, which is what picks belong to.
+        images.append(Picks(record.camera_among_landmarks(item.pose), lens, known, seen, pixel))
+    if len(images) < 2:
+        raise InputError(
+            f"{len(images)} of {len(picks)} images with picks were located in {scene}; at least"
+            " two are needed"
+        )
+    found = align_by_points(images, scale_known)
+    middle = np.mean([points[name] for name in points], axis=0)
+    radius = np.sqrt(np.mean([((p - middle) ** 2).sum() for p in points.values()]) / 3)
+    covariance = found.covariance[:6, :6].copy()
+    covariance[:3, :3] += np.eye(3) * found.covariance[6, 6] * radius**2
+    return MapAlignment(
+        found.alignment,
+        covariance,
+        len(points),
+        len(points),
+        f"{found.residual_px:.1f} px root mean square",
+        None,
+        _sigma(_about(found, middle)),
+    )
+
+
+def _about(found: PointAlignment, middle: Array) -> Array:
+    """Covariance of the motion about a point instead of the base's origin."""
+    slope = np.eye(6)
+    slope[:3, 3:] = -_cross(middle)
+    return slope @ found.covariance[:6, :6] @ slope.T
+
+
+def _about_origin(covariance: Array, middle: Array) -> Array:
+    """From a motion about a point (3,) to one about the base's origin."""
+    slope = np.eye(6)
+    slope[:3, 3:] = _cross(middle)
+    return slope @ covariance @ slope.T
+
+
+def _cross(v: Array) -> Array:
+    x, y, z = v
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def _sigma(covariance: Array) -> tuple[float, float]:
+    metres, radians = (np.sqrt(np.trace(covariance[a:b, a:b]) / 3) for a, b in ((0, 3), (3, 6)))
+    return 1000 * float(metres), float(np.rad2deg(radians))

@@ -1,0 +1,58 @@
+"""`evercal audit`."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from evercal.cli.console import print_json, progress_bar
+from evercal.errors import InputError
+
+
+@dataclass(frozen=True)
+class Audit:
+    """List the recorded episodes whose stated camera pose disagrees with their images.
+
+    Exit code 1 when there are some.
+    """
+
+    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    """Folder of the store."""
+    folder: Annotated[Positional[Path], arg(metavar="DIR")]
+    """Folder whose folders are the episodes: recorded scenes, or images beside a calibration.json
+    or a 4x4 matrix base_from_camera.txt."""
+    calibration: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Pose of the camera in episodes that state none themselves."""
+    images: Annotated[int, arg(metavar="N")] = 5
+    """Images of an episode that are looked at."""
+    most_mm: Annotated[float, arg(metavar="MM")] = 5.0
+    """Largest difference of position that is still right."""
+    most_deg: Annotated[float, arg(metavar="DEG")] = 0.5
+    """Largest difference of rotation that is still right."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Looks at every episode and prints the table."""
+        if self.images < 1 or self.most_mm <= 0 or self.most_deg <= 0:
+            raise InputError("--images is at least 1, --most-mm and --most-deg are above 0")
+        from evercal.calibration.audit import AuditOptions, audit, episode_folders
+        from evercal.calibration.calibration import read_transform
+        from evercal.localization.localizer import Localizer
+
+        stated = None if self.calibration is None else read_transform(self.calibration)
+        total = len(episode_folders(self.folder))
+        localizer = Localizer.open(self.store)
+        options = AuditOptions(self.images, self.most_mm, self.most_deg)
+        with progress_bar("episodes", total, "episode") as bar:
+            found = audit(localizer, self.folder, stated, options, on_episode=bar.update)
+        wrong = [episode for episode in found if episode.verdict == "wrong"]
+        if self.json:
+            print_json({"episodes": [dataclasses.asdict(episode) for episode in found]})
+        else:
+            for episode in found:
+                print(f"{episode.verdict:8s} {episode.name}: {episode.reason}")
+            print(f"{len(wrong)} of {len(found)} episodes state a wrong camera pose")
+        return 1 if wrong else 0

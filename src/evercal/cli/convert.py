@@ -1,0 +1,65 @@
+"""`evercal convert`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.reading import Reading
+from evercal.errors import InputError
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Write a recording of any format as evercal's own folder: one scene.json and the images."""
+
+    scene: Annotated[Positional[Path], arg(metavar="IN")]
+    """Folder of the recording, or file of a bag."""
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Folder to write; made when it is missing."""
+    reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
+    """How it is read."""
+    name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """What the scene is called; its own name when left out."""
+    hard_link: bool = False
+    """Link image files instead of copying them: no room is taken, a change shows in both."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Reads, writes, and says what came along."""
+        from evercal.datasets import generic
+
+        if self.out.exists() and not self.out.is_dir():
+            raise InputError(f"{self.out}: is a file; give a folder to write to")
+        scene = self.reading.scene(self.scene, self.name)
+        frames = (*scene.train, *scene.test)
+        if not frames:
+            raise InputError(f"{self.scene}: no frame to write; see 'evercal inspect {self.scene}'")
+        with progress_bar("writing", len(frames), "image") as bar:
+            generic.write(self.out, scene, link=self.hard_link, on_frame=bar.update)
+        record = {
+            "out": str(self.out),
+            "name": scene.name,
+            "train": len(scene.train),
+            "test": len(scene.test),
+            "untracked": scene.untracked,
+            "with_base_from_camera": sum(f.base_from_camera is not None for f in frames),
+            "with_base_from_gripper": sum(f.base_from_gripper is not None for f in frames),
+            "notes": list(scene.notes),
+        }
+        if self.json:
+            print_json(record)
+            return 0
+        print(
+            f"{self.out}: {scene.name}, {len(scene.train)} training and {len(scene.test)} test"
+            f" frames; {record['with_base_from_camera']} with the camera's pose,"
+            f" {record['with_base_from_gripper']} with the gripper's; {scene.untracked} images"
+            f" without a pose left out"
+        )
+        for note in scene.notes:
+            print(f"note: {note}")
+        print_next("evercal", "inspect", self.out)
+        return 0

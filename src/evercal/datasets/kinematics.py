@@ -1,0 +1,162 @@
+"""Forward kinematics of an arm from its URDF, by yourdfpy (extra `urdf`)."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.errors import InputError
+from evercal.geometry import SE3
+
+_MOVING = ("revolute", "continuous", "prismatic")
+# Two whole turns: no arm's joint goes further, and 12.6 as degrees is next to nothing.
+_LARGEST_RAD = 4 * np.pi
+
+
+class RobotModel:
+    """The links and joints of a URDF.
+
+    Args:
+        path: The URDF. Meshes that it names are not read.
+
+    Raises:
+        InputError: The extra `urdf` is not installed, or the file is missing or no URDF.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        try:
+            import yourdfpy  # pyright: ignore[reportMissingImports]
+        except ImportError:
+            raise InputError(
+                f"{path}: reading a URDF needs yourdfpy; run: pip install 'evercal[urdf]'"
+            ) from None
+        if not self.path.is_file():
+            raise InputError(f"{path}: no such URDF file")
+        if self.path.suffix == ".xacro":
+            raise InputError(f"{path}: is a macro file; make a URDF of it with 'xacro' first")
+        try:
+            self._urdf: Any = yourdfpy.URDF.load(
+                str(self.path),
+                load_meshes=False,
+                load_collision_meshes=False,
+                build_collision_scene_graph=False,
+            )
+            self.base_link = str(self._urdf.base_link)
+        except Exception as error:  # whatever lxml, yourdfpy and numpy raise for broken files
+            text = " ".join(str(error).split())[:200]
+            raise InputError(f"{path}: no usable URDF ({type(error).__name__}: {text})") from None
+        self.links = tuple(self._urdf.link_map)
+        self._joint_above = {joint.child: joint for joint in self._urdf.robot.joints}
+
+    def has_joint(self, name: str) -> bool:
+        """Whether the URDF has a joint of this name."""
+        return name in self._urdf.joint_map
+
+    def end_link(self) -> str:
+        """The last link of an arm that has one end only.
+
+        Raises:
+            InputError: The links end in several places, as those of a gripper with fingers do.
+        """
+        parents = {joint.parent for joint in self._joint_above.values()}
+        ends = [link for link in self.links if link not in parents]
+        if len(ends) != 1:
+            raise InputError(
+                f"{self.path}: has {len(ends)} ends; name the link with --gripper-frame, one of"
+                f" {', '.join(self.links)}"
+            )
+        return ends[0]
+
+    def joints_between(self, base: str, gripper: str) -> tuple[str, ...]:
+        """The moving joints whose values `base_from_gripper` depends on, from the base outwards.
+
+        Raises:
+            InputError: A link that the URDF has not, or a joint of a kind with several values.
+        """
+        up, down = self._ancestors(base), self._ancestors(gripper)
+        joints = [j for j in down if j not in up] + [j for j in up if j not in down]
+        names = []
+        for joint in reversed(joints):
+            if joint.type in ("floating", "planar"):
+                raise InputError(f"{self.path}: joint {joint.name} is {joint.type}; not supported")
+            if joint.type in _MOVING:
+                names.append(joint.name if joint.mimic is None else joint.mimic.joint)
+        return tuple(dict.fromkeys(names))
+
+    def base_from_gripper(
+        self, names: Sequence[str], values: NDArray[np.float64], base: str, gripper: str
+    ) -> SE3:
+        """Poses of one link in another.
+
+        Args:
+            names: of the joints, at least those of `joints_between`.
+            values: (n, joints) radians, metres for joints that slide.
+            base: link.
+            gripper: link.
+
+        Returns:
+            (n,).
+
+        Raises:
+            InputError: A joint without values, or values that are no radians.
+        """
+        needed = self.joints_between(base, gripper)
+        missing = [name for name in needed if name not in names]
+        if missing:
+            raise InputError(
+                f"no values for joint {', '.join(missing)}, which {gripper} depends on; given are"
+                f" {', '.join(names) or 'none'}"
+            )
+        columns = [list(names).index(name) for name in needed]
+        self._refuse_degrees(needed, values[:, columns])
+        found = np.empty((len(values), 4, 4))
+        for row, matrix in zip(values[:, columns], found, strict=True):
+            self._urdf.update_cfg(dict(zip(needed, row.tolist(), strict=True)))
+            matrix[...] = self._urdf.get_transform(gripper, base)
+        return SE3.from_matrix(found)
+
+    def turning(self, names: Sequence[str]) -> list[bool]:
+        """Whether each joint turns, so that its values are angles."""
+        kinds = {name: joint.type for name, joint in self._urdf.joint_map.items()}
+        return [kinds.get(name) in ("revolute", "continuous") for name in names]
+
+    def beyond_limits(self, names: Sequence[str], values: NDArray[np.float64]) -> list[str]:
+        """One sentence for each joint whose values leave what the URDF allows by over 0.1."""
+        found = []
+        for name, column in zip(names, values.T, strict=True):
+            joint = self._urdf.joint_map.get(name)
+            limit = None if joint is None or joint.type == "continuous" else joint.limit
+            if limit is None or limit.lower is None or limit.upper is None:
+                continue
+            if column.min() < limit.lower - 0.1 or column.max() > limit.upper + 0.1:
+                found.append(
+                    f"joint {name} goes from {column.min():.2f} to {column.max():.2f}, the URDF"
+                    f" allows {limit.lower:.2f} to {limit.upper:.2f}; are the joints in the right"
+                    f" order and in radians?"
+                )
+        return found
+
+    def _ancestors(self, link: str) -> list[Any]:
+        """The joints from a link up to the root."""
+        if link not in self.links:
+            raise InputError(
+                f"{self.path}: has no link {link!r}; its links are {', '.join(self.links)}"
+            )
+        joints = []
+        while link in self._joint_above:
+            joints.append(self._joint_above[link])
+            link = joints[-1].parent
+        return joints
+
+    def _refuse_degrees(self, names: Sequence[str], values: NDArray[np.float64]) -> None:
+        for name, column in zip(names, values.T, strict=True):
+            turns = self._urdf.joint_map[name].type == "revolute"
+            if turns and column.size and np.abs(column).max() > _LARGEST_RAD:
+                raise InputError(
+                    f"joint {name} is at {column[np.abs(column).argmax()]:.1f}, no joint turns so"
+                    f" far in radians; if these are degrees, write the column as {name}_deg"
+                )

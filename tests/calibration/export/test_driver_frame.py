@@ -1,0 +1,158 @@
+"""The driver's root frame: ROS's axes, files of tf, and a covariance that moves along."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+
+from evercal.calibration.export.driver_frame import (
+    published_at,
+    read_link_from_optical,
+    standard_link_from_optical,
+)
+from evercal.calibration.export.request import Export, renamed
+from evercal.calibration.export.ros import transform_stamped
+from evercal.errors import InputError
+from evercal.geometry import SE3, pose_distance
+
+from .drawn import made, poses
+
+few = settings(deadline=None, max_examples=40)
+
+
+def test_the_usual_axes() -> None:
+    """Forward, left, up of the link are z, -x, -y of the optical frame."""
+    link_from_optical = standard_link_from_optical((0.01, 0.02, 0.03))
+    seen = link_from_optical.apply([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    offset = np.array([0.01, 0.02, 0.03])
+    np.testing.assert_allclose(seen - offset, [[1, 0, 0], [0, -1, 0], [0, 0, -1]], atol=1e-12)
+
+
+@given(poses(), poses())
+@few
+def test_the_chain_through_the_link_is_the_calibration(pose: SE3, link_from_optical: SE3) -> None:
+    moved = published_at(made(pose), "camera_link", link_from_optical)
+    assert (moved.parent_frame, moved.child_frame) == ("base_link", "camera_link")
+    again = moved.parent_from_child @ link_from_optical
+    assert np.max(pose_distance(again, pose)) < 1e-9
+
+
+def test_the_covariance_moves_along() -> None:
+    pose, arm = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4]), SE3.exp([0.1, 0.2, -0.3, 1, -2, 0.5])
+    moved = published_at(made(pose), "camera_link", arm.inverse())
+
+    def link(shift: np.ndarray) -> SE3:
+        turned = pose @ SE3.exp(np.concatenate([np.zeros(3), shift[3:]]))
+        return SE3(turned.rotation_wxyz, pose.translation_m + shift[:3]) @ arm
+
+    step, jacobian = 1e-6, np.zeros((6, 6))
+    for i in range(6):
+        there, back = (link(sign * step * np.eye(6)[i]) for sign in (1, -1))
+        jacobian[:3, i] = (there.translation_m - back.translation_m) / (2 * step)
+        jacobian[3:, i] = (back.inverse() @ there).log()[3:] / (2 * step)
+    expected = jacobian @ made(pose).covariance @ jacobian.T
+    np.testing.assert_allclose(moved.covariance, expected, rtol=1e-6, atol=1e-14)
+    # A lever arm of 0.4 m and 0.01 deg: the translation must become less certain.
+    assert moved.sigma_mm > made(pose).sigma_mm
+
+
+def entry(parent: str, child: str, pose: SE3) -> dict:
+    (w, x, y, z), t = pose.rotation_wxyz.tolist(), pose.translation_m.tolist()
+    return {
+        "header": {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": parent},
+        "child_frame_id": child,
+        "transform": {
+            "translation": dict(zip("xyz", t, strict=True)),
+            "rotation": {"x": x, "y": y, "z": z, "w": w},
+        },
+    }
+
+
+LINK_FROM_COLOR = SE3.exp([0.0, 0.015, 1e-5, 0.004, 0.001, -0.002])
+COLOR_FROM_OPTICAL = standard_link_from_optical()
+
+
+@pytest.mark.parametrize("kind", ["echo", "list", "reversed", "slash"])
+def test_transforms_are_chained(tmp_path: Path, kind: str) -> None:
+    tf = [
+        entry("camera_link", "camera_depth_frame", SE3.exp([1, 2, 3, 0, 0, 0])),
+        entry("camera_link", "camera_color_frame", LINK_FROM_COLOR),
+        entry("camera_color_frame", "camera_color_optical_frame", COLOR_FROM_OPTICAL),
+    ]
+    if kind == "reversed":
+        tf[1] = entry("camera_color_frame", "camera_link", LINK_FROM_COLOR.inverse())
+    if kind == "slash":
+        tf[2]["header"]["frame_id"] = "/camera_color_frame"
+    data = yaml.safe_dump(tf if kind == "list" else {"transforms": tf})
+    (tmp_path / "tf.yaml").write_text(data + ("---\n" if kind == "echo" else ""))
+    found = read_link_from_optical(
+        tmp_path / "tf.yaml", "camera_link", "camera_color_optical_frame"
+    )
+    expected = LINK_FROM_COLOR @ COLOR_FROM_OPTICAL
+    assert np.max(pose_distance(found, expected)) < 1e-9
+
+
+def test_one_transform_either_way_round(tmp_path: Path) -> None:
+    file = tmp_path / "t.yaml"
+    for pair, pose in (
+        (("camera_link", "optical"), LINK_FROM_COLOR),
+        (("optical", "camera_link"), LINK_FROM_COLOR.inverse()),
+    ):
+        file.write_text(transform_stamped(Export(renamed(made(pose), *pair))))
+        found = read_link_from_optical(file, "camera_link", "optical")
+        assert np.max(pose_distance(found, LINK_FROM_COLOR)) < 1e-9
+    made(LINK_FROM_COLOR).write(file)  # a calibration names its frames too
+    found = read_link_from_optical(file, "base_link", "cam/optical-frame")
+    assert np.max(pose_distance(found, LINK_FROM_COLOR)) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (yaml.safe_dump(entry("camera_link", "other", SE3.identity())), "leads from 'camera_link'"),
+        ("a: [", "neither YAML nor JSON"),
+        ("hello", "no transform in it"),
+        ("", "no transform in it"),
+        ("transform: {translation: {x: 1, y: 2, z: 3}}", "incomplete"),
+        (
+            yaml.safe_dump(entry("camera_link", "optical", SE3.identity())).replace(
+                "w: 1.0", "w: 2.0"
+            ),
+            "not of length 1",
+        ),
+    ],
+)
+def test_files_that_do_not_tell(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "t.yaml").write_text(text)
+    with pytest.raises(InputError, match=said):
+        read_link_from_optical(tmp_path / "t.yaml", "camera_link", "optical")
+
+
+def test_no_file_and_no_second_parent(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="missing"):
+        read_link_from_optical(tmp_path / "no.yaml", "camera_link", "optical")
+    with pytest.raises(InputError, match="both called 'base_link'"):
+        published_at(made(SE3.identity()), "base_link", SE3.identity())
+
+
+@pytest.mark.parametrize("name", ["", "/camera", "my camera", "a\nb", "a/", "a//b", '"', "-x", "<"])
+def test_names_that_tf_or_a_file_does_not_take(name: str) -> None:
+    with pytest.raises(InputError, match="no name of a tf frame"):
+        Export(renamed(made(SE3.identity()), child=name) if name else _nameless())
+
+
+def _nameless():
+    calibration = made(SE3.identity())
+    return type(calibration)("eye_to_hand", SE3.identity(), calibration.covariance, "", "camera")
+
+
+@pytest.mark.parametrize("name", ["camera", "robot1/camera_link", "panda_link0", "0", "a.b-c"])
+def test_names_of_frames(name: str) -> None:
+    assert Export(renamed(made(SE3.identity()), child=name)).child == name
+
+
+def test_one_name_for_both() -> None:
+    with pytest.raises(InputError, match="both called 'tool'"):
+        renamed(made(SE3.identity()), "tool", "tool")

@@ -1,0 +1,111 @@
+"""`evercal convert`, and the reading flags that it shares with `inspect` and `learn`."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evercal.cli.reading import Reading
+from evercal.datasets import FORMATS, ReadOptions, generic, load_scene, write_image
+from evercal.geometry import SE3, pose_distance
+
+
+@pytest.fixture
+def wave(tmp_path: Path) -> Path:
+    """A wrist recording of four images; its camera file lies elsewhere."""
+    root = tmp_path / "wave"
+    root.mkdir()
+    rows = ["x_m,y_m,z_m,rotvec_x,rotvec_y,rotvec_z"]
+    for i in range(4):
+        write_image(root / f"{i}.png", np.full((24, 32, 3), 10 * i, np.uint8))
+        rows.append(f"0.{i},0.2,0.3,0.0,0.{i},0.0")
+    (root / "base_from_gripper.csv").write_text("\n".join(rows))
+    (tmp_path / "lens.txt").write_text("30 0 15.5\n0 30 11.5\n0 0 1\n")
+    return root
+
+
+@pytest.mark.parametrize("flags", [[], ["--hard-link"]])
+def test_a_recording_becomes_a_scene_folder(
+    run: Any, wave: Path, tmp_path: Path, flags: list[str]
+) -> None:
+    out = tmp_path / "out"
+    words = ["convert", wave, out, "--camera", tmp_path / "lens.txt", "--name", "cell", *flags]
+    ran = run(*words, "--json")
+    assert (ran.code, ran.err) == (0, [])
+    told = json.loads(ran.out)
+    assert (told["name"], told["train"], told["test"], told["untracked"]) == ("cell", 4, 0, 0)
+    assert (told["with_base_from_camera"], told["with_base_from_gripper"]) == (0, 4)
+    scene = load_scene(out)
+    assert scene.name == "cell"
+    assert scene.notes == tuple(told["notes"])
+    assert "in order" in scene.notes[0]
+    for i, frame in enumerate(scene.train):
+        assert frame.base_from_gripper is not None
+        expected = SE3.exp([0, 0, 0, 0, i / 10, 0]).rotation_wxyz
+        placed = SE3(expected, np.array([i / 10, 0.2, 0.3]))
+        assert max(pose_distance(frame.base_from_gripper, placed)) < 1e-12
+        assert int(frame.read_image().mean()) == 10 * i
+        assert isinstance(frame.image, Path)
+        assert frame.image.samefile(wave / f"{i}.png") == bool(flags)
+    # The scene is there now: it is not written over.
+    ran = run(*words)
+    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
+    assert "already there" in ran.err[0]
+
+
+def test_every_second_image_and_the_words_of_the_next_command(run: Any, wave: Path) -> None:
+    lens = wave.parent / "lens.txt"
+    ran = run("inspect", wave, "--every", 2, "--camera", lens)
+    assert "2 training and 0 test frames with the gripper's pose" in ran.out
+    assert "gripper moved in 0.20 x 0.00 x 0.00 m" in ran.out
+    assert "note: images and poses were paired in order" in ran.out
+    last = ran.out.splitlines()[-1]
+    assert last == f"next: evercal learn STORE {wave} --camera {lens} --every 2"
+
+
+def test_flags_are_those_of_the_reader(run: Any) -> None:
+    names = {field.name: field.default for field in dataclasses.fields(Reading)}
+    assert names.pop("format") is None
+    assert names == {field.name: field.default for field in dataclasses.fields(ReadOptions)}
+    text = run("inspect", "--help").out.replace("│", "")
+    listed = " ".join(text.split())
+    for name in FORMATS:
+        assert f" {name}" in listed[listed.index("Format of the recording") :]
+    for verb in ("learn", "convert", "inspect"):
+        shown = run(verb, "--help").out
+        for name in names:
+            assert "--" + name.replace("_", "-") in shown
+
+
+@pytest.mark.parametrize("verb", ["convert", "inspect", "learn"])
+def test_misuse_is_one_line(run: Any, wave: Path, tmp_path: Path, verb: str) -> None:
+    lens = tmp_path / "lens.txt"
+    (tmp_path / "file").write_text("x")
+    room = tmp_path / "room"
+    generic.write(room, load_scene(wave, options=ReadOptions(camera=lens)))
+    before, after = {
+        "convert": ([], [tmp_path / "new"]),
+        "inspect": ([], []),
+        "learn": ([tmp_path / "store"], []),
+    }[verb]
+    for scene, words, message in (
+        (wave, [], "no camera file in it"),
+        (wave, ["--camera", tmp_path / "no"], "camera file is missing"),
+        (wave, ["--camera", lens, "--image-topic", "/a"], "--image-topic: means nothing to"),
+        (room, ["--camera", lens], "--camera: means nothing to a recording of format generic"),
+        (room, ["--every", 0], "--every 0: give a number >= 1"),
+        (tmp_path / "file", [], "a file, not a folder"),
+        (tmp_path / "no", [], "no such folder"),
+    ):
+        ran = run(verb, *before, scene, *after, *words)
+        assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
+        assert message in ran.err[0]
+        assert not (tmp_path / "new").exists()
+        assert not (tmp_path / "store").exists()
+    if verb == "convert":
+        ran = run(verb, room, tmp_path / "file")
+        assert (ran.code, len(ran.err)) == (2, 1)
+        assert "is a file; give a folder" in ran.err[0]

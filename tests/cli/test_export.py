@@ -1,0 +1,195 @@
+"""`evercal export`: prints or writes every format, renames frames, refuses what is half told."""
+
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from evercal.calibration.calibration import Calibration, ImageUse, Mount
+from evercal.calibration.export.driver_frame import standard_link_from_optical
+from evercal.calibration.export.formats import FORMATS
+from evercal.datasets.robot_poses import read_robot_poses
+from evercal.geometry import SE3, Camera, pose_distance
+
+POSE = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
+PRINTED = sorted(set(FORMATS) - {"npy", "colmap", "moveit_samples"})
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Any:
+    def calibration(mount: Mount = "eye_to_hand", child: str = "camera") -> Path:
+        parent = "base" if mount == "eye_to_hand" else "gripper"
+        camera = Camera(640, 480, 600, 601, 320, 240)
+        images = (ImageUse("1.png", True),)
+        made = Calibration(
+            mount, POSE, 1e-8 * np.eye(6), parent, child, camera, images, verdict="good"
+        )
+        made.write(tmp_path / "calibration.json")
+        return tmp_path / "calibration.json"
+
+    return calibration
+
+
+@pytest.fixture
+def gripper(tmp_path: Path) -> Path:
+    lines = [f"{i}.png,{0.5 + i / 10},0.1,0.2,1,0,0,0" for i in range(3)]
+    file = tmp_path / "gripper.csv"
+    file.write_text("\n".join(["image,x,y,z,qw,qx,qy,qz", *lines]))
+    return file
+
+
+def test_the_list_has_a_line_for_every_format(run: Any) -> None:
+    lines = run("export", "--format", "list").out.splitlines()
+    assert [line.split()[0] for line in lines] == [*FORMATS, "next:"]
+    listed = json.loads(run("export", "--format", "list", "--json").out)["formats"]
+    assert listed == {name: form.description for name, form in FORMATS.items()}
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_what_is_printed_is_what_is_written(run: Any, make: Any, tmp_path: Path, name: str) -> None:
+    file = make()
+    printed = run("export", file, "--format", name)
+    assert (printed.code, printed.err) == (0, [])
+    out = tmp_path / f"evercal{FORMATS[name].ending}"
+    written = run("export", file, "--format", name.replace("_", "-"), "--out", out)
+    assert written.code == 0
+    assert out.read_text() == printed.out
+    wrote, meaning, verdict, following = written.out.splitlines()
+    assert wrote == f"wrote {out}"
+    assert meaning.strip() == "pose of camera in base: takes points from camera to base"
+    assert verdict.strip() == "good"
+    assert following.startswith("next: evercal check STORE IMAGE --reference")
+    record = json.loads(run("export", file, "--format", name, "--json").out)
+    assert record["text"] == printed.out
+    assert record["translation_m"] == POSE.translation_m.tolist()
+
+
+def test_files_that_cannot_be_printed(run: Any, make: Any, tmp_path: Path) -> None:
+    file = make()
+    for name in ("npy", "colmap"):
+        refused = run("export", file, "--format", name)
+        assert (refused.code, refused.out) == (2, "")
+        assert "cannot be printed; give --out" in refused.err[0]
+    assert run("export", file, "--format", "npy", "--out", tmp_path / "m.npy").code == 0
+    np.testing.assert_allclose(np.load(tmp_path / "m.npy"), POSE.matrix())
+    written = run("export", file, "--format", "colmap", "--out", tmp_path / "m", "--json")
+    names = {Path(path).name for path in json.loads(written.out)["files"]}
+    assert names == {path.name for path in (tmp_path / "m").iterdir()}
+    assert names == {"cameras.txt", "images.txt", "points3D.txt"}
+    assert "already there" in run(
+        "export", file, "--format", "colmap", "--out", tmp_path / "m"
+    ).err[0]  # fmt: skip
+
+
+def test_frames_are_renamed_and_the_file_names_easy_handeyes_calibration(
+    run: Any, make: Any, tmp_path: Path
+) -> None:
+    words = ("--format", "easy_handeye2", "--parent", "panda_link0", "--child", "cam_link")
+    out = tmp_path / "cell_left.calib"
+    run("export", make(), *words, "--robot-frame", "panda_hand", "--out", out)
+    said = yaml.safe_load(out.read_text())["parameters"]
+    assert said["name"] == "cell_left"
+    frames = ("robot_base_frame", "robot_effector_frame", "tracking_base_frame")
+    assert [said[key] for key in frames] == ["panda_link0", "panda_hand", "cam_link"]
+    ran = run("export", make("eye_in_hand"), *words, "--robot-frame", "panda_link0")
+    said = yaml.safe_load(ran.out)["parameters"]
+    assert said["calibration_type"] == "eye_in_hand"
+    assert [said[key] for key in frames] == ["panda_link0", "panda_link0", "cam_link"]
+
+
+def flags(line: str) -> dict[str, str]:
+    words = shlex.split(line)[4:]
+    return dict(zip(words[::2], words[1::2], strict=True))
+
+
+def published(line: str) -> SE3:
+    f = flags(line)
+    quaternion = [float(f[f"--q{axis}"]) for axis in "wxyz"]
+    return SE3(np.array(quaternion), np.array([float(f[f"--{axis}"]) for axis in "xyz"]))
+
+
+def test_the_drivers_root_frame(run: Any, make: Any, tmp_path: Path) -> None:
+    file = make(child="camera_color_optical_frame")
+    words = ("export", file, "--format", "static_transform_publisher")
+    plain = run(*words)
+    assert "note: camera drivers publish camera_color_optical_frame themselves" in plain.err[0]
+    ways = {
+        (0.0, 0.0, 0.0): ("--via-optical",),
+        (0.01, -0.02, 0.03): ("--via-offset", "0.01", "-0.02", "0.03"),
+    }
+    for offset, way in ways.items():
+        ran = run(*words, "--via", "camera_link", *way)
+        assert (ran.code, ran.err) == (0, [])
+        assert flags(ran.out)["--child-frame-id"] == "camera_link"
+        again = published(ran.out) @ standard_link_from_optical(offset)
+        assert np.max(pose_distance(again, POSE)) < 1e-9
+    (tmp_path / "tf.yaml").write_text(
+        "transforms:\n- header: {frame_id: camera_link}\n"
+        "  child_frame_id: camera_color_optical_frame\n"
+        "  transform: {translation: {x: 0.1, y: 0.2, z: 0.3},"
+        " rotation: {x: 0.0, y: 0.6, z: 0.0, w: 0.8}}\n"
+    )
+    ran = run(*words, "--via", "camera_link", "--via-transform", tmp_path / "tf.yaml")
+    again = published(ran.out) @ SE3(np.array([0.8, 0, 0.6, 0]), np.array([0.1, 0.2, 0.3]))
+    assert np.max(pose_distance(again, POSE)) < 1e-9
+
+
+def test_a_camera_on_the_arm_along_its_poses(
+    run: Any, make: Any, gripper: Path, tmp_path: Path
+) -> None:
+    words = ("export", make("eye_in_hand"), "--format", "tum", "--out", tmp_path / "c.tum")
+    assert run(*words, "--robot-poses", gripper).code == 0
+    found = read_robot_poses(tmp_path / "c.tum").poses
+    expected = read_robot_poses(gripper).poses @ POSE
+    assert np.max(pose_distance(found, expected)) < 1e-12
+    gripper.write_text("0.png 500 100 200 0 0 0 1\n1.png 600 100 200 0 0 0 1")
+    assert run(*words, "--robot-poses", gripper, "--convention", "xyzw:mm").code == 0
+    assert len(read_robot_poses(tmp_path / "c.tum")) == 2
+    refused = run(*words, "--robot-poses", gripper, "--convention", "xyzw")
+    assert "look like millimetres; give --convention xyzw:mm" in refused.err[0]
+
+
+def test_pose_pairs_for_moveit(run: Any, make: Any, gripper: Path) -> None:
+    words = ("export", make("eye_in_hand"), "--format", "moveit_samples")
+    ran = run(*words, "--robot-poses", gripper, "--target-poses", gripper)
+    assert [len(sample["effector_wrt_world"]) for sample in yaml.safe_load(ran.out)] == [16] * 3
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "no format given; add --format NAME, one of easy_handeye2"),
+        (("--format", "xml"), "'xml' is not known; use one of easy_handeye2"),
+        (("--format", "urdf", "--parent", "my base"), "'my base' is no name of a tf frame"),
+        (("--format", "urdf", "--child", "/camera"), "'/camera' is no name of a tf frame"),
+        (("--format", "urdf", "--child", "base"), "both called 'base'"),
+        (("--format", "urdf", "--via", "camera_link"), "--via-optical if their origins are"),
+        (("--format", "urdf", "--via-optical"), "name the driver's root frame with --via"),
+        (
+            ("--format", "urdf", "--via", "l", "--via-optical", "--via-offset", "1", "0", "0"),
+            "give one of --via-transform FILE",
+        ),
+        (("--format", "urdf", "--via", "l", "--via-transform", "no.yaml"), "no.yaml: "),
+        (("--format", "urdf", "--via", "base", "--via-optical"), "both called 'base'"),
+        (("--format", "colmap", "--via", "l", "--via-optical"), "leave --via out"),
+        (("--format", "urdf", "--robot-frame", "a b", "--via-optical"), "--via"),
+        (("--format", "tum", "--robot-poses", "no.csv"), "no.csv: file of robot poses is missing"),
+        (("--format", "moveit_samples"), "--target-poses"),
+    ],
+)
+def test_misuse_is_one_line(run: Any, make: Any, words: tuple[str, ...], said: str) -> None:
+    ran = run("export", make(), *words)
+    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
+    assert said in ran.err[0]
+    assert json.loads(run("export", make(), *words, "--json").out).keys() == {"error"}
+
+
+def test_no_calibration(run: Any, make: Any, tmp_path: Path) -> None:
+    assert "no calibration given" in run("export", "--format", "urdf").err[0]
+    assert "missing" in run("export", tmp_path / "no.json", "--format", "urdf").err[0]
+    refused = run("export", make("eye_in_hand"), "--format", "nerfstudio")
+    assert "give the gripper's poses with --robot-poses" in refused.err[0]
