@@ -118,7 +118,7 @@ def _pairs_at(
             f" {times.max():.3f} s, robot poses at {robot.stamps_s[0]:.3f} to"
             f" {robot.stamps_s[-1]:.3f} s; are the clocks the same?"
         )
-    seen, poses, times = camera[known], poses[known], times[known]
+    seen, poses, times = camera[known], poses[known], np.asarray(times[known], dtype=np.float64)
     before, after = (robot.at(times + side * _HALF_S)[0] for side in (-1, 1))
     # At the ends of the stream a neighbour is the end itself.
     span = np.clip(times + _HALF_S, None, robot.stamps_s[-1]) - np.clip(
