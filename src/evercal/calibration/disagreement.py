@@ -8,7 +8,6 @@ these is tried; one that makes the pairs agree is named.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +27,11 @@ HOPELESS_M, HOPELESS_RAD = 0.05, np.deg2rad(3.0)
 """Disagreement from which no answer is given."""
 _BETTER = 3.0
 """How many times better another reading must agree, in metres and in radians."""
-_FITTED = 4
+_FITTED = 24
 """Readings of Euler angles that are fitted, those whose angles agree best."""
-_ORDERS = tuple("".join(order) for order in permutations("xyz"))
+_FIXED = ("xyz", "zyx", "xzy", "yxz", "yzx", "zxy")
+_USUAL = ("xyz", "ZYX", "XYZ", "zyx")
+_ORDERS = (*_USUAL, *_FIXED[2:], *(order.upper() for order in _FIXED[2:]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +98,9 @@ def _readings(pairs: PosePairs, mount: Mount, scale_known: bool) -> Iterator[_Re
     for shift in (1, -1):
         rows = slice(max(shift, 0), len(pairs) + min(shift, 0))
         others = slice(max(-shift, 0), len(pairs) + min(-shift, 0))
-        moved = replace(pairs[np.arange(len(pairs))[rows]], camera_from_board=camera[others])
+        moved = replace(
+            pairs[np.arange(len(pairs))[rows]], camera_from_board=camera[others]
+        )
         late = "robot" if shift > 0 else "camera"
         if len(moved) >= MIN_POSES:
             yield _Reading(
@@ -136,22 +139,19 @@ def _inversion(inverted: PosePairs, mount: Mount, scale_known: bool) -> str:
 
 def _rotation_readings(pairs: PosePairs) -> Iterator[_Reading]:
     """Numbers of rotations that were taken for others; those whose angles agree best."""
-    found: list[tuple[float, str, PosePairs]] = []
+    found: list[tuple[float, int, str, PosePairs]] = []
     parts = {"base_from_gripper": "robot", "camera_from_board": "camera"}
     for part, name in parts.items():
         poses: SE3 = getattr(pairs, part)
         other = pairs.camera_from_board if name == "robot" else pairs.base_from_gripper
-        for sentence, rotation in _misread(poses):
+        for rank, (sentence, rotation) in enumerate(_misread(poses)):
             turned = SE3(rotation.as_quat(scalar_first=True), poses.translation_m)
-            found.append(
-                (
-                    _angle_mismatch(turned, other)[0],
-                    f"the {name} {sentence}",
-                    replace(pairs, **{part: turned}),
-                )
-            )
-    found.sort(key=lambda entry: entry[0])
-    for _, sentence, turned in found[:_FITTED]:
+            mismatch = _angle_mismatch(turned, other)[0]
+            reading = replace(pairs, **{part: turned})
+            found.append((mismatch, rank, f"the {name} {sentence}", reading))
+    # Of orders whose angles agree alike, and cyclic ones do, the usual ones come first.
+    found.sort(key=lambda entry: (round(np.rad2deg(entry[0])), entry[1]))
+    for _, _, sentence, turned in found[:_FITTED]:
         yield _Reading(sentence, turned)
 
 
@@ -167,16 +167,15 @@ def _misread(poses: SE3) -> Iterator[tuple[str, Rotation]]:
         "quaternions look read in the order x y z w where w x y z is meant; name their order",
         Rotation.from_quat(wxyz[:, [1, 2, 3, 0]], scalar_first=True),
     )
-    orders = [*_ORDERS, *(order.upper() for order in _ORDERS)]
-    for used in orders:
-        angles = given.as_euler(used, suppress_warnings=True)
-        for meant in orders:
-            if meant != used:
-                yield (
-                    f"angles look read as Euler {used} where {meant} is meant (small letters:"
-                    f" fixed axes, capitals: moving axes); name their order",
-                    Rotation.from_euler(meant, angles),
-                )
+    # Of two orders one may be taken as one about fixed axes: moving axes reverse both.
+    pairs = [(used, meant) for used in _FIXED for meant in _ORDERS if used != meant]
+    pairs.sort(key=lambda pair: _ORDERS.index(pair[0]) + _ORDERS.index(pair[1]))
+    for used, meant in pairs:
+        yield (
+            f"angles look read in a wrong Euler order: {used} and {meant} seem mixed up (small"
+            f" letters: fixed axes; capitals: moving axes); name their order",
+            Rotation.from_euler(meant, given.as_euler(used, suppress_warnings=True)),
+        )
 
 
 def _angle_mismatch(a: SE3, b: SE3) -> tuple[float, Array, Array]:
@@ -202,13 +201,9 @@ def _require_unit(pairs: PosePairs, mount: Mount, found: Agreement) -> None:
     powers = {0.001: "millimetres", 0.01: "centimetres", 0.0254: "inches"}
     for unit, name in powers.items():
         if abs(np.log(scale / unit)) < 0.1:
-            raise InputError(
-                f"the camera poses look like {name}, the robot's are metres; convert them"
-            )
+            raise InputError(f"the camera poses look like {name}, the robot's like metres; convert")
         if abs(np.log(scale * unit)) < 0.1:
-            raise InputError(
-                f"the robot poses look like {name}, the camera's are metres; convert them"
-            )
+            raise InputError(f"the robot poses look like {name}, the camera's like metres; convert")
     raise InputError(
         f"the camera's lengths fit the robot's only if multiplied by {scale:.4g}; check the board's"
         f" square or tag size and both units, or say --scale unknown"

@@ -8,10 +8,11 @@ from scipy.stats import chi2, f
 
 from evercal.calibration.consensus import consensus_start
 from evercal.calibration.noise_levels import (
+    Gain,
     NoiseLevels,
     ellipsoid_factor,
     estimate_levels,
-    widened_covariance,
+    working_noise,
 )
 from evercal.calibration.pose_equation import PoseEquation, Unknowns
 
@@ -19,6 +20,8 @@ _TAILS = 3.0
 """Degrees of freedom of the tails in the first refinement."""
 _GROSS = 40.0
 """Squared distance beyond which a pose is left out of the first noise levels."""
+_PLAIN_BELOW = 12
+"""Poses below which not all kinds of noise are told apart: they would be confused."""
 MIN_POSES = 4
 """Different poses; of three, a wrong one cannot be told from the others."""
 Array = NDArray[np.float64]
@@ -29,7 +32,7 @@ Mask = NDArray[np.bool_]
 class SolveOptions:
     """What decides the refinement."""
 
-    rejection: float = 0.01
+    rejection: float = 0.001
     """Probability that any pose of a recording without outliers is rejected."""
     rounds: int = 12
     """Passes of refinement, noise levels and rejection, at most."""
@@ -115,10 +118,9 @@ def robust_fit(
     for _ in range(options.rounds):
         at = refine(equation, at, covariance, inliers)
         before, levels = levels, _levels(equation, at, inliers, levels)
-        covariance = _noise(equation, at, levels)
-        residual = equation.residuals(at)
-        jacobian = equation.jacobian(at, residual)
-        distance2 = _distances(residual, jacobian, covariance, inliers)
+        noise = _noise(equation, at, levels)
+        covariance = working_noise(noise, inliers)
+        distance2 = _distances(equation, at, noise, inliers)
         keep = _agreeing(distance2, inliers, equation.unknowns, options.rejection)
         if keep.sum() < max(MIN_POSES, len(keep) // 2):
             break
@@ -130,7 +132,7 @@ def robust_fit(
         inliers = keep
     assert levels is not None
     at = refine(equation, at, covariance, inliers)
-    return _result(equation, at, covariance, inliers, levels)
+    return _result(equation, at, inliers, levels)
 
 
 def refine(equation: PoseEquation, at: Unknowns, covariance: Array, use: Mask) -> Unknowns:
@@ -171,7 +173,8 @@ def _levels(
     chosen = equation[use]
     residual = chosen.residuals(at)
     jacobian = chosen.jacobian(at, residual)
-    directions, known = chosen.noise_directions(at), chosen.known_noise(at)
+    directions = chosen.noise_directions(at, plain=len(equation) < _PLAIN_BELOW)
+    known = chosen.known_noise(at)
     return estimate_levels(residual, jacobian, directions, known, start)
 
 
@@ -190,36 +193,31 @@ def _settled(before: NoiseLevels | None, now: NoiseLevels) -> bool:
     return bool(np.abs(now.variance - before.variance).max() <= 0.05 * now.variance.max())
 
 
-def _result(
-    equation: PoseEquation, at: Unknowns, noise: Array, use: Mask, levels: NoiseLevels
-) -> HandEyeFit:
+def _result(equation: PoseEquation, at: Unknowns, use: Mask, levels: NoiseLevels) -> HandEyeFit:
     """The covariance of the unknowns and how far the truth may lie."""
+    noise = _noise(equation, at, levels)
+    chosen, residual = equation[use], equation.residuals(at)
+    jacobian = chosen.jacobian(at, residual[use])
+    gain = Gain.of(jacobian, working_noise(noise, use)[use], noise[use])
+    directions = chosen.noise_directions(at)
+    slopes = gain.slopes({kind: directions[kind] for kind in levels.kinds})[:, :6, :6]
+    factor = ellipsoid_factor(gain.covariance[:6, :6], slopes, levels.uncertainty)
+    distance2 = _distances(equation, at, noise, use)
+    parts = slopes * levels.variance[:, None, None]
+    return HandEyeFit(at, gain.covariance, factor, use, residual, distance2, levels, parts)
+
+
+def _distances(equation: PoseEquation, at: Unknowns, noise: Array, use: Mask) -> Array:
+    """(n,) squared distance of each residual in units of its covariance."""
     residual = equation.residuals(at)
     jacobian = equation.jacobian(at, residual)
-    covariance, slopes = widened_covariance(
-        jacobian[use], noise[use], equation[use].noise_directions(at), levels.uncertainty
-    )
-    factor = ellipsoid_factor(covariance[:6, :6], slopes[:, :6, :6], levels.uncertainty)
-    distance2 = _distances(residual, jacobian, noise, use)
-    parts = slopes[:, :6, :6] * levels.variance[:, None, None]
-    return HandEyeFit(at, covariance, factor, use, residual, distance2, levels, parts)
-
-
-def _covariance(jacobian: Array, noise: Array) -> Array:
-    """(p, p) of the unknowns by weighted least squares."""
-    p = jacobian.shape[-1]
-    normal = (np.linalg.inv(noise) @ jacobian).reshape(-1, p).T @ jacobian.reshape(-1, p)
-    unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    return np.outer(unit, unit) * np.linalg.pinv(normal * np.outer(unit, unit), 1e-13)
-
-
-def _distances(residual: Array, jacobian: Array, noise: Array, use: Mask) -> Array:
-    """(n,) squared distance of each residual in units of its covariance."""
-    covariance = _covariance(jacobian[use], noise[use])
-    followed = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
-    # A pose that the answer rests on has pulled it along, another one has not. One that fixes an
-    # unknown alone has no spread left along some axis.
-    spread = np.where(use[:, None, None], noise - followed, noise + followed) + 1e-3 * noise
+    gain = Gain.of(jacobian[use], working_noise(noise, use)[use], noise[use])
+    spread = noise + jacobian @ gain.covariance @ jacobian.transpose(0, 2, 1)
+    # A pose that the answer rests on has pulled it along. One that fixes an unknown alone has no
+    # spread left along some axis.
+    pulled = jacobian[use] @ gain.gain @ noise[use]
+    spread[use] -= pulled + pulled.transpose(0, 2, 1)
+    spread = spread + 1e-3 * noise
     return (residual * np.linalg.solve(spread, residual[..., None])[..., 0]).sum(1)
 
 

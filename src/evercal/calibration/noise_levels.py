@@ -7,6 +7,7 @@ inter-block information, 1971; C. R. Rao, Estimation of variance and covariance 
 """
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,8 @@ MAX_POSES = 50
 """Poses that the levels are judged from; more take longer and hardly change them."""
 _FLOOR = np.diag([1e-14] * 6)
 """Metres^2 and radians^2 that no pose is better than, so that exact poses can be weighted."""
+_PLAIN_SHARE = 0.25
+"""Of plain noise in what a fit is weighted by."""
 _ROUNDS, _HALVINGS = 30, 8
 
 
@@ -82,39 +85,47 @@ def estimate_levels(
     return NoiseLevels(tuple(directions), variance, _level_uncertainty(forms.gram, variance))
 
 
-def widened_covariance(
-    jacobian: Array, noise: Array, directions: dict[str, Array], uncertainty: Array
-) -> tuple[Array, Array]:
-    """Covariance of a weighted fit whose weights were estimated, and its slopes by the levels.
+def working_noise(noise: Array, use: NDArray[np.bool_]) -> Array:
+    """The covariance that a fit is weighted by: the estimated one, made more even.
 
-    Weights that are somewhat wrong make a fit somewhat worse than its own covariance says
-    (M. Kenward and J. Roger, Small sample inference for fixed effects from restricted maximum
-    likelihood, 1997).
+    Estimated levels can claim that a certain mixture of shift and turn has hardly any noise, and a
+    fit would then rest on that claim. A share of plain noise, equal in all directions and poses,
+    costs little where the claim is right and keeps the fit sound where it is not.
 
     Args:
-        jacobian: (n, 6, p).
-        noise: (n, 6, 6) covariance of the residuals.
-        directions: by kind (n, 6, c).
-        uncertainty: (k, k) covariance of the variances.
-
-    Returns:
-        (p, p) and (k, p, p).
+        noise: (n, 6, 6) as estimated.
+        use: (n,) poses that count.
     """
-    p = jacobian.shape[-1]
-    inverse = np.linalg.inv(noise)
-    weighted = inverse @ jacobian
-    normal = weighted.reshape(-1, p).T @ jacobian.reshape(-1, p)
-    unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    covariance = np.outer(unit, unit) * np.linalg.pinv(normal * np.outer(unit, unit), 1e-13)
-    # Per kind J' W S and, with the noise taken out, how much of it reaches the unknowns.
-    reached = [
-        weighted.transpose(0, 2, 1) @ part @ part.transpose(0, 2, 1) for part in directions.values()
-    ]
-    reached = np.stack(reached)
-    slopes = np.einsum("knpi,niq->kpq", reached, weighted, optimize=True)
-    loss = np.einsum("kl,knpi,nij,lnqj->pq", uncertainty, reached, inverse, reached, optimize=True)
-    loss -= np.einsum("kl,kpq,qr,lrs->ps", uncertainty, slopes, covariance, slopes, optimize=True)
-    return covariance + 2 * covariance @ loss @ covariance, covariance @ slopes @ covariance
+    mean = noise[use].mean(0)
+    metres2, radians2 = np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3
+    plain = np.diag(np.repeat([metres2, radians2], 3))
+    return (1 - _PLAIN_SHARE) * noise + _PLAIN_SHARE * plain
+
+
+@dataclass(frozen=True, eq=False)
+class Gain:
+    """How residuals of n poses move the p unknowns of a weighted fit, and what noise does there."""
+
+    gain: Array
+    """(n, p, 6) step of the unknowns by each residual, up to the sign."""
+    covariance: Array
+    """(p, p) of the unknowns under the noise, which need not be what the fit was weighted by."""
+
+    @classmethod
+    def of(cls, jacobian: Array, working: Array, noise: Array) -> Self:
+        """From (n, 6, p) derivatives and (n, 6, 6) covariances, assumed and actual."""
+        p = jacobian.shape[-1]
+        weighted = np.linalg.inv(working) @ jacobian
+        normal = weighted.reshape(-1, p).T @ jacobian.reshape(-1, p)
+        unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        inverse = np.outer(unit, unit) * np.linalg.pinv(normal * np.outer(unit, unit), 1e-13)
+        gain = inverse @ weighted.transpose(0, 2, 1)
+        return cls(gain, (gain @ noise @ gain.transpose(0, 2, 1)).sum(0))
+
+    def slopes(self, directions: dict[str, Array]) -> Array:
+        """(k, p, p) how the covariance grows with the variance of each kind of noise."""
+        moves = [self.gain @ columns for columns in directions.values()]
+        return np.stack([(move @ move.transpose(0, 2, 1)).sum(0) for move in moves])
 
 
 def ellipsoid_factor(
@@ -206,9 +217,11 @@ class _Problem:
 def _solve_nonnegative(gram: Array, forms: Array) -> Array:
     """Variances that are not negative, nearest in the metric of their uncertainty."""
     unit = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    scaled = gram / np.outer(unit, unit) + 1e-9 * np.eye(len(gram))
-    root = np.linalg.cholesky(scaled)
-    return nnls(root.T, np.linalg.solve(root, forms / unit))[0] / unit
+    # Kinds that look alike in these poses leave the matrix next to singular.
+    values, axes = np.linalg.eigh(gram / np.outer(unit, unit))
+    root = axes * np.sqrt(np.maximum(values, 1e-9))
+    right = (axes.T @ (forms / unit)) / np.sqrt(np.maximum(values, 1e-9))
+    return nnls(root.T, right)[0] / unit
 
 
 def _level_uncertainty(gram: Array, variance: Array) -> Array:

@@ -110,11 +110,11 @@ def _require_metres(poses: SE3, names: Sequence[str], whose: str) -> None:
     beyond = far > _FAR_M
     if not beyond.any():
         return
-    unit = "millimetres" if float(np.median(far[beyond])) > 10 * _FAR_M else "no metres"
+    unit = "millimetres" if float(np.median(far[beyond])) > 10 * _FAR_M else "another unit"
     if beyond.all() or beyond.mean() > 0.9:
         raise InputError(
-            f"the {whose} poses look like {unit}: they lie {float(np.median(far)):.0f} from the"
-            f" origin; give metres, or name the file's unit"
+            f"the {whose} poses look like {unit}, not metres: they lie {float(np.median(far)):.0f}"
+            f" from the origin; convert them, or name the file's unit"
         )
     rows = listed([name for name, out in zip(names, beyond, strict=True) if out])
     raise InputError(

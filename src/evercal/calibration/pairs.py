@@ -98,6 +98,7 @@ class PosePairs:
             self.camera_from_board,
             self.camera_covariance,
             scale_known,
+            base_is_fixed=mount == "eye_in_hand",
         )
 
 

@@ -84,6 +84,8 @@ class PoseEquation:
     rotation in the board's); zeros where nothing is known."""
     scale_known: bool = True
     """Whether the camera's translations are in metres."""
+    base_is_fixed: bool = True
+    """Whether `fixed` is the robot's base and `parent` its gripper, or the other way round."""
     velocity: Array | None = None
     """(n, 6) how the robot moves: translation of the parent's origin and rotation, m/s and rad/s in
     the axes of `fixed`; given where a time offset is unknown as well."""
@@ -95,6 +97,7 @@ class PoseEquation:
         camera_from_board: SE3,
         camera_covariance: Array | None = None,
         scale_known: bool = True,
+        base_is_fixed: bool = True,
     ) -> Self:
         """From (n,) poses of both."""
         n = len(fixed_from_parent)
@@ -105,6 +108,7 @@ class PoseEquation:
             camera_from_board.translation_m,
             np.zeros((n, 6, 6)) if camera_covariance is None else camera_covariance,
             scale_known,
+            base_is_fixed,
         )
 
     def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Self:
@@ -122,6 +126,10 @@ class PoseEquation:
     def __len__(self) -> int:
         """The number of poses."""
         return len(self.robot_translation)
+
+    def freed(self) -> Self:
+        """With the scale unknown."""
+        return replace(self, scale_known=False)
 
     @property
     def unknowns(self) -> int:
@@ -176,22 +184,30 @@ class PoseEquation:
         turn[:, 3:, 3:] = turned @ self.camera_rotation
         return turn @ self.camera_covariance @ turn.transpose(0, 2, 1)
 
-    def noise_directions(self, at: Unknowns) -> dict[str, Array]:
+    def noise_directions(self, at: Unknowns, plain: bool = False) -> dict[str, Array]:
         """Per kind of noise (n, 6, c): the residuals by c errors of one metre or one radian each.
 
         A rotation about a point that lies far from the board moves the board.
+
+        Args:
+            at: where.
+            plain: without the kinds that many poses are needed to tell apart from the others.
         """
         n = len(self)
         board, parent = at.translations[1], self.robot_translation
         camera = self.robot_rotation @ at.translations[0] + parent
-        ray = board - camera
-        depth = np.zeros((n, 6, 1))
-        depth[:, :3, 0] = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
-        about = {"board": np.broadcast_to(board, (n, 3)), "camera": camera, "parent": parent}
-        about["fixed"] = np.zeros((n, 3))
-        turns = {f"turn about {name}": _turn(board - point) for name, point in about.items()}
-        shift = np.broadcast_to(np.eye(6, 3), (n, 6, 3))
-        return {"translation": shift, "depth": depth, **turns}
+        gripper, base = (parent, np.zeros((n, 3)))[:: 1 if self.base_is_fixed else -1]
+        about = {"board": np.broadcast_to(board, (n, 3)), "camera": camera, "gripper": gripper}
+        if not plain:
+            about["base"] = base
+        kinds = {f"turn about {name}": _turn(board - point) for name, point in about.items()}
+        kinds["translation"] = np.broadcast_to(np.eye(6, 3), (n, 6, 3))
+        if not plain:
+            ray = board - camera
+            depth = np.zeros((n, 6, 1))
+            depth[:, :3, 0] = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
+            kinds["depth"] = depth
+        return kinds
 
 
 def cross(v: Array) -> Array:

@@ -21,6 +21,7 @@ from evercal.calibration.hand_eye import (
 )
 from evercal.calibration.observability import require_observable, require_turns
 from evercal.calibration.pairs import PosePairs
+from evercal.calibration.plausibility import warnings_of
 from evercal.calibration.pose_equation import PoseEquation
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
@@ -131,6 +132,7 @@ class _Result:
             "translation_m": at.translation_m.tolist(),
             "quaternion_wxyz": at.rotation_wxyz.tolist(),
         }
+        checks["warnings"] = warnings_of(self.equation, fit, noise, self.mount)
         if not self.equation.scale_known:
             checks["scale"] = fit.at.scale
             checks["scale_sigma"] = fit.at.scale * _log_scale_sigma(fit)
@@ -156,8 +158,8 @@ class _Result:
         fit = self.fit
         answer = fit.covariance[:6, :6]
         terms = [
-            _term(kind, fit.contributions[i])
-            for i, kind in enumerate(_in_words(fit.levels.kinds, self.mount))
+            _term(_IN_WORDS[kind], fit.contributions[i])
+            for i, kind in enumerate(fit.levels.kinds)
             if fit.levels.variance[i] > 0
         ]
         rest = answer - fit.contributions.sum(0)
@@ -273,14 +275,11 @@ def _term(name: str, covariance: Array) -> ErrorTerm:
     )
 
 
-def _in_words(kinds: tuple[str, ...], mount: Mount) -> list[str]:
-    parent, fixed = ("gripper", "base") if mount == "eye_in_hand" else ("base", "gripper")
-    words = {
-        "translation": "translation of robot and camera poses",
-        "depth": "distance from camera to board",
-        "turn about board": "rotation of the board as seen",
-        "turn about camera": "direction in which the board is seen",
-        "turn about parent": f"rotation of the robot about its {parent}",
-        "turn about fixed": f"rotation of the robot about its {fixed}",
-    }
-    return [words[kind] for kind in kinds]
+_IN_WORDS = {
+    "translation": "translation of robot and camera poses",
+    "depth": "distance from camera to board",
+    "turn about board": "rotation of the board as seen",
+    "turn about camera": "direction in which the board is seen",
+    "turn about gripper": "rotation of the robot's gripper",
+    "turn about base": "rotation of the robot about its base",
+}

@@ -81,6 +81,7 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.check import Check
     from evercal.cli.convert import Convert
     from evercal.cli.demo import Demo
+    from evercal.cli.detect import Detect
     from evercal.cli.evaluate import Evaluate
     from evercal.cli.export import ExportCalibration
     from evercal.cli.info import Info
@@ -90,6 +91,7 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.pretrain import Pretrain, pretrain_with_options
     from evercal.cli.report import Report
     from evercal.cli.simulate import Simulate
+    from evercal.cli.solve import Solve
     from evercal.cli.verify import Verify
     from evercal.cli.watch import Watch
 
@@ -102,6 +104,9 @@ def _verbs(first: str) -> dict[str, Any]:
         "watch": Watch,
         "audit": Audit,
         "align": Align,
+        "detect": Detect,
+        "solve": Solve,
+        "export": ExportCalibration,
         "report": Report,
         "evaluate": Evaluate,
         "info": Info,
@@ -109,7 +114,6 @@ def _verbs(first: str) -> dict[str, Any]:
         "inspect": Inspect,
         "convert": Convert,
         "simulate": Simulate,
-        "export": ExportCalibration,
         "bench": Bench,
         "bench-report": BenchReport,
         "pretrain": pretrain_with_options() if first == "pretrain" else Pretrain,

@@ -1,0 +1,91 @@
+"""Intrinsics of a camera from views of a board, with as much of a lens model as they support."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from evercal.calibration.corners import BoardView
+from evercal.errors import InputError
+from evercal.geometry import Camera
+
+MIN_VIEWS = 5
+"""Views of a flat board from which five parameters and more are found."""
+_FOCAL_SIGMA = 0.01
+"""Share of the focal length that it must be sure to."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A camera and how well the corners fit it."""
+
+    camera: Camera
+    """At the size of the images."""
+    rms_px: float
+    """Root mean square distance of corners from where they should be."""
+    focal_sigma_px: float
+    """Standard deviation of the focal length, the larger of both."""
+
+
+def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Intrinsics:
+    """Finds focal lengths, principal point and distortion.
+
+    Lens models of growing size are fitted, none, k1, k1 k2, those with p1 p2, with k3; the one with
+    the lowest Bayesian information criterion is kept, so that few views get no wild lens.
+
+    Args:
+        views: of a flat board, five or more, tilted.
+        width: of the images, pixels.
+        height: of the images, pixels.
+
+    Raises:
+        InputError: Too few views, or views that leave the focal length open.
+    """
+    import cv2
+
+    if len(views) < MIN_VIEWS:
+        raise InputError(
+            f"the board was found in {len(views)} images, intrinsics take at least {MIN_VIEWS};"
+            f" take 15 with the board tilted by 20 to 45 deg, or give --camera"
+        )
+    points = [view.points_m.astype(np.float32) for view in views]
+    pixels = [view.pixels.astype(np.float32) for view in views]
+    free = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    models = {0: free, 1: free & ~cv2.CALIB_FIX_K1}
+    models[2] = models[1] & ~cv2.CALIB_FIX_K2
+    models[4] = models[2] & ~cv2.CALIB_ZERO_TANGENT_DIST
+    models[5] = 0
+    count = 2 * sum(len(p) for p in points)
+    best: tuple[float, Intrinsics] | None = None
+    matrix, lens = _start(points, pixels, (width, height)), np.zeros(5)
+    for extra, flags in models.items():
+        rms, matrix, lens, _, _, deviations = cv2.calibrateCameraExtended(
+            points,
+            pixels,
+            (width, height),
+            matrix.copy(),
+            lens.copy(),
+            flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS,
+        )[:6]
+        squared = rms**2 * count / 2
+        criterion = count * np.log(max(squared, 1e-12) / count) + extra * np.log(count)
+        if best is None or criterion < best[0] - 2:
+            distortion = tuple(float(v) for v in np.ravel(lens)[:5]) if extra else ()
+            camera = Camera.from_matrix(matrix, width, height, distortion)
+            focal = float(np.ravel(deviations)[:2].max())
+            best = (criterion, Intrinsics(camera, float(rms), focal))
+    assert best is not None
+    found = best[1]
+    if not found.focal_sigma_px < _FOCAL_SIGMA * min(found.camera.fx, found.camera.fy):
+        raise InputError(
+            f"the images leave the focal length open ({found.camera.fx:.0f} +- "
+            f"{found.focal_sigma_px:.0f} px); tilt the board by 20 to 45 deg in several directions,"
+            f" or give --camera"
+        )
+    return found
+
+
+def _start(points: list[np.ndarray], pixels: list[np.ndarray], size: tuple[int, int]) -> np.ndarray:
+    import cv2
+
+    return cv2.initCameraMatrix2D(points, pixels, size)
