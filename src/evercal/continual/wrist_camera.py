@@ -104,12 +104,12 @@ def hand_eye_report(
 
 
 def _doubts(adjusted: Adjusted) -> tuple[str, ...]:
-    """What the covariance does not know: a wrong lens or poses of another camera bend the answer."""
+    """What the covariance does not know: a wrong lens or wrong poses bend the answer."""
     found = []
     if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
         found.append(
-            f"the images ask for a focal length {adjusted.focal_percent:+.1f} % from the stated one:"
-            " calibrate the lens first ('evercal detect' on images of a board)"
+            f"the images ask for a focal length {adjusted.focal_percent:+.1f} % from the stated"
+            " one: calibrate the lens first ('evercal detect' on images of a board)"
         )
     if adjusted.pose_sigma_mm > MOST_POSE_SIGMA_MM:
         found.append(
