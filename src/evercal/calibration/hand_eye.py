@@ -12,6 +12,7 @@ from evercal.calibration.noise_levels import (
     NoiseLevels,
     ellipsoid_factor,
     estimate_levels,
+    loss_by_weights,
     working_noise,
 )
 from evercal.calibration.pose_equation import PoseEquation, Unknowns
@@ -199,12 +200,14 @@ def _result(equation: PoseEquation, at: Unknowns, use: Mask, levels: NoiseLevels
     chosen, residual = equation[use], equation.residuals(at)
     jacobian = chosen.jacobian(at, residual[use])
     gain = Gain.of(jacobian, working_noise(noise, use)[use], noise[use])
-    directions = chosen.noise_directions(at)
-    slopes = gain.slopes({kind: directions[kind] for kind in levels.kinds})[:, :6, :6]
-    factor = ellipsoid_factor(gain.covariance[:6, :6], slopes, levels.uncertainty)
+    all_kinds = chosen.noise_directions(at)
+    kinds = {kind: all_kinds[kind] for kind in levels.kinds}
+    covariance = gain.covariance + loss_by_weights(jacobian, noise[use], kinds, levels.uncertainty)
+    slopes = gain.slopes(kinds)[:, :6, :6]
+    factor = ellipsoid_factor(covariance[:6, :6], slopes, levels.uncertainty)
     distance2 = _distances(equation, at, noise, use)
     parts = slopes * levels.variance[:, None, None]
-    return HandEyeFit(at, gain.covariance, factor, use, residual, distance2, levels, parts)
+    return HandEyeFit(at, covariance, factor, use, residual, distance2, levels, parts)
 
 
 def _distances(equation: PoseEquation, at: Unknowns, noise: Array, use: Mask) -> Array:

@@ -128,6 +128,33 @@ class Gain:
         return np.stack([(move @ move.transpose(0, 2, 1)).sum(0) for move in moves])
 
 
+def loss_by_weights(
+    jacobian: Array, noise: Array, directions: dict[str, Array], uncertainty: Array
+) -> Array:
+    """(p, p) what a fit loses because its weights were estimated from the same residuals.
+
+    M. Kenward and J. Roger, Small sample inference for fixed effects from restricted maximum
+    likelihood, 1997.
+
+    Args:
+        jacobian: (n, 6, p).
+        noise: (n, 6, 6) covariance of the residuals.
+        directions: by kind (n, 6, c).
+        uncertainty: (k, k) covariance of the variances.
+    """
+    best = Gain.of(jacobian, noise, noise)
+    inverse = np.linalg.inv(noise)
+    # (k, n, p, 6): how noise of one kind in each residual reaches the unknowns.
+    reached = np.stack([best.gain @ part @ part.transpose(0, 2, 1) for part in directions.values()])
+    whitened = reached @ inverse
+    products = np.einsum("knpi,lnqi->klpq", whitened, reached, optimize=True)
+    slopes = best.slopes(directions)
+    precision = np.linalg.pinv(best.covariance, 1e-13, hermitian=True)
+    products -= np.einsum("kpq,qr,lrs->klps", slopes, precision, slopes, optimize=True)
+    loss = 2 * np.einsum("kl,klpq->pq", uncertainty, products)
+    return (loss + loss.T) / 2
+
+
 def ellipsoid_factor(
     covariance: Array, slopes: Array, uncertainty: Array, share: float = 0.95
 ) -> float:
