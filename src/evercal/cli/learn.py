@@ -208,6 +208,7 @@ def hand_eye_lines(found: "HandEyeReport") -> list[str]:
         f" {sigma:.2f} mm and {turn:.3f} deg per axis; {found.pairs} of {found.of_pairs} pairs of"
         " images agree with it"
     ]
+    lines += [f"do not rely on it: {doubt}" for doubt in found.doubts]
     if found.given_mm is not None:
         lines.append(
             f"it lies {found.given_mm:.1f} mm and {found.given_deg:.1f} deg from the one given"
@@ -222,10 +223,11 @@ def write_hand_eye(report: "LearnReport", camera: "Camera", path: Path) -> None:
     import numpy as np
 
     from evercal.calibration.calibration import Calibration
+    from evercal.calibration.verdict import verdict
 
     found = report.hand_eye
     assert found is not None, "the recording states gripper poses only"
-    Calibration(
+    made = Calibration(
         "eye_in_hand",
         found.gripper_from_camera,
         np.array(found.covariance),
@@ -233,7 +235,9 @@ def write_hand_eye(report: "LearnReport", camera: "Camera", path: Path) -> None:
         camera=camera,
         source={"command": "learn", "scene": report.scene, "frames": report.train_frames},
         created=datetime.now(UTC).isoformat(timespec="seconds"),
-    ).write(path)
+    )
+    told = [f"Do not rely on it: {doubt}." for doubt in found.doubts] or [verdict(made)]
+    dataclasses.replace(made, verdict=" ".join(told)).write(path)
 
 
 def adjusted_lines(adjusted: "Adjusted") -> list[str]:

@@ -10,8 +10,11 @@ from evercal.datasets.frame import Scene
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.geometry.se3 import SE3, pose_distance
-from evercal.mapping.build import Mapping, SceneMap
+from evercal.mapping.build import Adjusted, Mapping, SceneMap
 from evercal.mapping.hand_eye import HandEyeStart, hand_eye_start, with_gripper
+
+MOST_FOCAL_PERCENT, MOST_POSE_SIGMA_MM = 1.0, 5.0
+"""Beyond these, errors are systematic and the covariance says nothing about them."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,8 @@ class HandEyeReport:
     """How far it lies from a `gripper_from_camera` that was given."""
     given_deg: float | None = None
     """The same for the rotation."""
+    doubts: tuple[str, ...] = ()
+    """Why it should not be relied on; empty if nothing speaks against it."""
 
     @property
     def gripper_from_camera(self) -> SE3:
@@ -83,6 +88,7 @@ def hand_eye_report(
     axes = np.eye(6)
     axes[:3, :3] = start.gripper_from_camera.rotation_matrix()
     covariance = axes @ correction.covariance @ axes.T
+    doubts = _doubts(scene_map.adjusted)
     moved = _apart(found, start.gripper_from_camera)
     off = (None, None) if given is None else _apart(found, given)
     return HandEyeReport(
@@ -93,7 +99,24 @@ def hand_eye_report(
         start.of_pairs,
         *moved,
         *off,
+        doubts,
     )
+
+
+def _doubts(adjusted: Adjusted) -> tuple[str, ...]:
+    """What the covariance does not know: a wrong lens or wrong poses bend the answer."""
+    found = []
+    if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
+        found.append(
+            f"the images ask for a focal length {adjusted.focal_percent:+.1f} % from the stated"
+            " one: calibrate the lens first ('evercal detect' on images of a board)"
+        )
+    if adjusted.pose_sigma_mm > MOST_POSE_SIGMA_MM:
+        found.append(
+            f"the gripper poses fit the images to {adjusted.pose_sigma_mm:.0f} mm only: let the arm"
+            " stand still at every image, and check the clocks"
+        )
+    return tuple(found)
 
 
 def _apart(a: SE3, b: SE3) -> tuple[float, float]:
