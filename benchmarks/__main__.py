@@ -136,6 +136,18 @@ def calibration(
     run(what, rooms, out, draws, store)
 
 
+def handeye(trials: int = 1000, thorough: bool = False) -> None:
+    """Solves simulated pose pairs: errors, 95 % ellipsoids, outliers, scale, time.
+
+    Args:
+        trials: of each setting.
+        thorough: also noise on robot poses and on both, about near and far points.
+    """
+    from benchmarks.hand_eye import run
+
+    run(trials, thorough)
+
+
 def main() -> int:
     """Runs one benchmark; `--gate` is short for `gate`."""
     from evercal.errors import InputError
@@ -148,6 +160,7 @@ def main() -> int:
         "peers": peers,
         "gate": gate,
         "maps": maps,
+        "handeye": handeye,
         "calibration": calibration,
     }
     try:
