@@ -12,8 +12,8 @@ from evercal.calibration.noise_levels import (
     NoiseLevels,
     ellipsoid_factor,
     estimate_levels,
-    normal_inverse,
     loss_by_weights,
+    normal_inverse,
     working_noise,
 )
 from evercal.calibration.pose_equation import PoseEquation, Unknowns
