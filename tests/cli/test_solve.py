@@ -184,3 +184,27 @@ def test_detect_refuses_what_it_cannot_use(run: Any, tmp_path: Path) -> None:
         ran = run("detect", *words, "--out", tmp_path / "board.json")
         assert ran.code == 2, words
         assert reason in ran.err[-1], ran.err
+
+
+def test_matrices_that_are_no_poses_are_refused(run: Any, tmp_path: Path) -> None:
+    drawn = recording(Setting(), 6)
+    words = files(tmp_path, drawn)
+    matrices = drawn.pairs.base_from_gripper.matrix()
+    (tmp_path / "robot.json").write_text(json.dumps(matrices.tolist()))
+    words[2] = tmp_path / "robot.json"
+    assert run(*words, "--mount", "eye_in_hand").code == 0
+    matrices[3, :3, :3] *= 1.1
+    (tmp_path / "robot.json").write_text(json.dumps(matrices.tolist()))
+    ran = run(*words, "--mount", "eye_in_hand")
+    assert (ran.code, len(ran.err)) == (2, 1)
+    assert "rotation" in ran.err[0]
+    # Millimetres in both files: nothing is guessed.
+    for name in ("robot", "camera"):
+        rows = np.loadtxt(tmp_path / f"{name}.csv", delimiter=",", skiprows=1)
+        rows[:, :3] *= 1000
+        header = "x_m,y_m,z_m,rotvec_x,rotvec_y,rotvec_z"
+        np.savetxt(tmp_path / f"{name}.csv", rows, delimiter=",", header=header, comments="")
+    words[2] = tmp_path / "robot.csv"
+    ran = run(*words, "--mount", "eye_in_hand")
+    assert (ran.code, len(ran.err)) == (2, 1)
+    assert "millimetre" in ran.err[0]
