@@ -136,6 +136,20 @@ def calibration(
     run(what, rooms, out, draws, store)
 
 
+def crowd(store: Path, scenes: tuple[Path, ...], keyframes: int = 10_000, rooms: int = 10) -> None:
+    """Locates test frames of a store's scenes among thousands of keyframes of other rooms.
+
+    Args:
+        store: that knows the scenes.
+        scenes: their folders.
+        keyframes: of the crowd.
+        rooms: that they are shared out over.
+    """
+    from benchmarks.crowd import run
+
+    run(store, scenes, keyframes, rooms)
+
+
 def main() -> int:
     """Runs one benchmark; `--gate` is short for `gate`."""
     from evercal.errors import InputError
@@ -149,6 +163,7 @@ def main() -> int:
         "gate": gate,
         "maps": maps,
         "calibration": calibration,
+        "crowd": crowd,
     }
     try:
         code = tyro.extras.subcommand_cli_from_dict(verbs, args=args)
