@@ -26,7 +26,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.storage import write_json
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 FORMAT, VERSION = "evercal-board-poses", 1
 

@@ -6,12 +6,12 @@ Frames of the boards, in which their points are given in metres:
   into the board, away from the camera. Where columns + rows is odd, the origin is the end at which
   the first square between inner corners is bright, and no roll of the camera changes it.
 - charuco: as OpenCV's `CharucoBoard`: origin at an outer corner, z into the board.
-- apriltag: origin in the middle of the black square, x right and y up as OpenCV draws the tag, z out
-  of it, towards the camera.
+- apriltag: origin in the middle of the black square, x right and y up as OpenCV draws the tag, z
+  out of it, towards the camera.
 """
 
 from dataclasses import dataclass
-from typing import Literal, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from evercal.calibration.corners import BoardView
 from evercal.errors import InputError
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 Image = NDArray[np.uint8]
 BoardKind = Literal["chessboard", "charuco", "apriltag"]
 
@@ -170,9 +170,11 @@ def _find_charuco(grey: NDArray, board: Board) -> BoardView | str:
     pixels, ids = None, None
     for legacy in (False, True):  # boards with an even number of rows, printed before OpenCV 4.6
         printed.setLegacyPattern(legacy)
-        pixels, ids, _, markers = cv2.aruco.CharucoDetector(printed).detectBoard(grey)
+        pixels, ids, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(grey)
         if ids is not None and len(ids) >= _LEAST_CORNERS:
-            points = np.asarray(printed.getChessboardCorners(), dtype=np.float64)[np.ravel(ids)]
+            points = np.asarray(printed.getChessboardCorners(), dtype=np.float64)[
+                np.asarray(ids, dtype=np.int64).ravel()
+            ]
             corners = np.reshape(pixels, (-1, 2)).astype(np.float64)
             flat = np.linalg.svd(points - points.mean(0), compute_uv=False)
             if flat[1] > 0.5 * board.size_m:
@@ -242,7 +244,7 @@ def _square_by_its_sides(grey: NDArray, square: Array) -> Array:
     return refined if np.isfinite(moved).all() and moved.max() < 3.0 else square
 
 
-def _dictionary(name: str):  # noqa: ANN202
+def _dictionary(name: str) -> Any:
     import cv2
 
     code = getattr(cv2.aruco, f"DICT_{name}", None)

@@ -7,7 +7,7 @@ from evercal.calibration.pose_equation import PoseEquation
 from evercal.geometry import pose_distance
 
 FOLDS = 5
-_HALVED = 8
+_HALVED = 12
 """Poses from which two halves can be solved."""
 
 
@@ -20,11 +20,11 @@ def held_out_error(equation: PoseEquation, fit: HandEyeFit, noise: np.ndarray) -
     Args:
         equation: the poses that `fit` was made from.
         fit: the answer.
-        noise: (n, 6, 6) covariance of the residuals.
+        noise: (n, 6, 6) covariance that residuals are weighted by, `fit_weights`.
 
     Returns:
-        `held_out_mm`, `held_out_deg` (root mean squares) and `held_out_median_mm`,
-        `held_out_median_deg`; empty with fewer than six poses.
+        `held_out_mm`, `held_out_deg` (medians) and `held_out_rms_mm`, `held_out_rms_deg` (root mean
+        squares); empty with fewer than six poses.
     """
     rows = np.flatnonzero(fit.inliers)
     if len(rows) <= FOLDS:
@@ -40,10 +40,10 @@ def held_out_error(equation: PoseEquation, fit: HandEyeFit, noise: np.ndarray) -
     error = np.concatenate(lengths) * (1000.0, 180 / np.pi)
     rms, median = np.sqrt((error**2).mean(0)), np.median(error, 0)
     return {
-        "held_out_mm": float(rms[0]),
-        "held_out_deg": float(rms[1]),
-        "held_out_median_mm": float(median[0]),
-        "held_out_median_deg": float(median[1]),
+        "held_out_mm": float(median[0]),
+        "held_out_deg": float(median[1]),
+        "held_out_rms_mm": float(rms[0]),
+        "held_out_rms_deg": float(rms[1]),
     }
 
 
@@ -53,10 +53,10 @@ def repeatability(equation: PoseEquation, fit: HandEyeFit, noise: np.ndarray) ->
     Args:
         equation: the poses that `fit` was made from, sorted, so that the halves cover the same.
         fit: the answer.
-        noise: (n, 6, 6) covariance of the residuals.
+        noise: (n, 6, 6) covariance that residuals are weighted by, `fit_weights`.
 
     Returns:
-        `repeatability_mm` and `repeatability_deg`; empty with fewer than eight poses.
+        `repeatability_mm` and `repeatability_deg`; empty with fewer than twelve poses.
     """
     rows = np.flatnonzero(fit.inliers)
     if len(rows) < _HALVED:

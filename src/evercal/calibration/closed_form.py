@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 
 def motions(fixed_from_parent: SE3, camera_from_board: SE3) -> tuple[SE3, SE3]:
@@ -50,7 +50,7 @@ def park(a: SE3, b: SE3, scale_known: bool = True) -> tuple[SE3, float]:
         ValueError: fewer than two motions, or numbers of motions that differ.
     """
     _require(a, b)
-    rotation, _ = Rotation.align_vectors(_sine_axes(a), _sine_axes(b))
+    rotation = Rotation.align_vectors(_sine_axes(a), _sine_axes(b))[0]
     return _with_translation(rotation, a, b, scale_known)
 
 
@@ -172,7 +172,10 @@ def _nearest_rotation(matrix: Array) -> Rotation:
 
 
 def _se3(rotation: Rotation, translation: Array) -> SE3:
-    return SE3(rotation.as_quat(canonical=True, scalar_first=True), translation)
+    return SE3(
+        rotation.as_quat(canonical=True, scalar_first=True),
+        np.asarray(translation, dtype=np.float64),
+    )
 
 
 def _dual_quaternion(pose: SE3) -> tuple[Array, Array]:

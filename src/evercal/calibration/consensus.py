@@ -13,7 +13,7 @@ from evercal.calibration.closed_form import motions, park, shah
 from evercal.calibration.pose_equation import PoseEquation, Unknowns, se3
 from evercal.geometry import SE3
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 SAMPLES = 150
 """Sets of three poses; even with half of the poses wrong some 20 of them are sound."""
@@ -111,20 +111,27 @@ def _spread(rotations: Array, translations: Array) -> tuple[Array, Array, Array]
     """(h,) how far the better half of the boards is spread, and the board in its middle."""
     h, n = translations.shape[:2]
     half = min(n, (n + 4) // 2)
+    rows = np.arange(h)[:, None]
     middle, turn = np.median(translations, 1), _nearest(np.median(rotations, 1))
+    kept = _closest(rotations, translations, turn, middle)[:, :half]
     for _ in range(2):
-        metres2 = ((translations - middle[:, None]) ** 2).sum(-1)
-        radians2 = ((rotations - turn[:, None]) ** 2).sum((-1, -2)) / 2
-        # Both kinds in the unit of their own median, so that they may be added.
-        both = metres2 / (np.median(metres2, 1, keepdims=True) + _FLOOR**2)
-        both = both + radians2 / (np.median(radians2, 1, keepdims=True) + _FLOOR**2)
-        kept = np.argsort(both, 1)[:, :half]
-        rows = np.arange(h)[:, None]
         middle = translations[rows, kept].mean(1)
         turn = _nearest(rotations[rows, kept].mean(1))
+        kept = _closest(rotations, translations, turn, middle)[:, :half]
     metres2 = ((translations[rows, kept] - middle[:, None]) ** 2).sum(-1).mean(1)
     radians2 = ((rotations[rows, kept] - turn[:, None]) ** 2).sum((-1, -2)).mean(1)
     return np.log(metres2 + _FLOOR**2) + np.log(radians2 + _FLOOR**2), turn, middle
+
+
+def _closest(
+    rotations: Array, translations: Array, turn: Array, middle: Array
+) -> NDArray[np.int64]:
+    """(h, n) the boards from the one closest to the middle to the farthest."""
+    metres2 = ((translations - middle[:, None]) ** 2).sum(-1)
+    radians2 = ((rotations - turn[:, None]) ** 2).sum((-1, -2)) / 2
+    # Both kinds in the unit of their own median, so that they may be added.
+    both = metres2 / (np.median(metres2, 1, keepdims=True) + _FLOOR**2)
+    return np.argsort(both + radians2 / (np.median(radians2, 1, keepdims=True) + _FLOOR**2), 1)
 
 
 def _nearest(matrices: Array) -> Array:

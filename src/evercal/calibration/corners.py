@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from evercal.calibration.pose_equation import cross
 from evercal.geometry import SE3, Camera
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 _LEAST_PX = 0.02
 """Corners are never taken to be better than this: lens model and board are not."""
@@ -102,7 +102,7 @@ def board_pose(view: BoardView, camera: Camera, start: SE3 | None = None) -> Boa
     unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     covariance = np.outer(unit, unit) * np.linalg.pinv(normal * np.outer(unit, unit), 1e-12)
     quaternion = rotation.as_quat(canonical=True, scalar_first=True)
-    pose = SE3(quaternion, np.ravel(translation))
+    pose = SE3(quaternion, np.asarray(translation, dtype=np.float64).ravel())
     return BoardPose(pose, (covariance + covariance.T) / 2, squared, len(view.points_m))
 
 
@@ -120,7 +120,7 @@ def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:
     for rotvec, translation in zip(found[1], found[2], strict=True):
         if np.isfinite(rotvec).all() and np.isfinite(translation).all() and translation[2] > 0:
             quaternion = Rotation.from_rotvec(np.ravel(rotvec)).as_quat(scalar_first=True)
-            poses.append(SE3(quaternion, np.ravel(translation)))
+            poses.append(SE3(quaternion, np.asarray(translation, dtype=np.float64).ravel()))
     return poses
 
 

@@ -19,7 +19,7 @@ from evercal.calibration.pairs import PosePairs
 from evercal.errors import InputError
 from evercal.geometry import SE3
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 SUSPECT_M, SUSPECT_RAD = 0.01, np.deg2rad(1.0)
 """Disagreement from which other readings are tried."""
@@ -112,8 +112,11 @@ def _readings(pairs: PosePairs, mount: Mount, scale_known: bool) -> Iterator[_Re
 
 
 def _inversion(inverted: PosePairs, mount: Mount, scale_known: bool) -> str:
-    """Inverted robot poses, inverted camera poses and the other mount obey one equation; the
-    distances tell which of them it is."""
+    """What to say of poses that agree once the robot's are inverted.
+
+    Inverted robot poses, inverted camera poses and the other mount obey one equation; the distances
+    tell which of them it is.
+    """
     at = agreement(inverted.equation(mount, scale_known)).at
     near = float(np.linalg.norm(at.parent_from_camera.translation_m))
     far = float(np.linalg.norm(at.fixed_from_board.translation_m))
@@ -219,7 +222,7 @@ def _mismatch(pairs: PosePairs) -> str:
     first, second = pairs.names[i[worst]], pairs.names[j[worst]]
     return (
         f"robot and camera agree in no rotation: from {first} to {second} the robot turned by"
-        f" {np.rad2deg(robot[worst]):.1f} deg and the camera by {np.rad2deg(camera[worst]):.1f} deg,"
+        f" {np.rad2deg(robot[worst]):.1f} deg, the camera by {np.rad2deg(camera[worst]):.1f} deg,"
         f" and so it is for most pairs"
     )
 

@@ -1,6 +1,6 @@
 """Robust joint refinement of both unknown transforms, with a covariance that can be believed."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ _PLAIN_BELOW = 12
 """Poses below which not all kinds of noise are told apart: they would be confused."""
 MIN_POSES = 4
 """Different poses; of three, a wrong one cannot be told from the others."""
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
 
@@ -179,9 +179,9 @@ def _levels(
     return estimate_levels(residual, jacobian, directions, known, start)
 
 
-def residual_noise(equation: PoseEquation, fit: HandEyeFit) -> Array:
-    """(n, 6, 6) covariance of the residuals of all poses by the noise that they show."""
-    return _noise(equation, fit.at, fit.levels)
+def fit_weights(equation: PoseEquation, fit: HandEyeFit) -> Array:
+    """(n, 6, 6) covariance that the residuals of a fit were weighted by."""
+    return working_noise(_noise(equation, fit.at, fit.levels), fit.inliers)
 
 
 def _noise(equation: PoseEquation, at: Unknowns, levels: NoiseLevels) -> Array:

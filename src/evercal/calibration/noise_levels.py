@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.stats import chi2, f
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 MAX_POSES = 50
 """Poses that the levels are judged from; more take longer and hardly change them."""
@@ -76,11 +76,12 @@ def estimate_levels(
         change = problem.sizes * np.abs(wanted - variance)
         if change.max() <= 0.02 * (problem.sizes * wanted).max():
             break
+        tried = problem.at(wanted)
         for _ in range(_HALVINGS):
-            tried = problem.at(wanted)
             if tried.log_likelihood >= forms.log_likelihood:
                 break
             wanted = (wanted + variance) / 2
+            tried = problem.at(wanted)
         variance, forms = wanted, tried
     return NoiseLevels(tuple(directions), variance, _level_uncertainty(forms.gram, variance))
 
@@ -179,7 +180,7 @@ def ellipsoid_factor(
     expected = float(np.sum(np.where(freedom > 2, freedom / np.maximum(freedom - 2, 1e-9), 0.0)))
     freedom_all = 2 * expected / (expected - d) if expected > d else 2.0
     freedom_all = float(np.clip(freedom_all, 2.0, 1e6))
-    return max(1.0, d * f.ppf(share, d, freedom_all) / chi2.ppf(share, d))
+    return max(1.0, float(d * f.ppf(share, d, freedom_all) / chi2.ppf(share, d)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from evercal.calibration.pairs import PosePairs, listed
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 _FAR_M = 20.0
 _TURN_RAD, _SECOND_RAD = np.deg2rad(2.0), np.deg2rad(1.0)
@@ -55,8 +55,8 @@ def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
     if spread < _MOVE_M:
         raise InputError(
             f"pure rotation: the gripper only turned on the spot (its positions spread by"
-            f" {1000 * spread:.1f} mm); nothing then ties the camera's lengths to the robot's, and a"
-            f" wrong board size or unit would pass unseen; move the gripper by 10 cm or more"
+            f" {1000 * spread:.1f} mm); nothing then ties the camera's lengths to the robot's, and"
+            f" a wrong board size or unit would pass unseen; move the gripper by 10 cm or more"
             f" between poses as well"
         )
 

@@ -6,13 +6,13 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_equation import PoseEquation
 from evercal.geometry import SE3, pose_distance
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
 _SAME_ROBOT_M, _SAME_ROBOT_RAD = 1e-4, np.deg2rad(0.01)
@@ -36,6 +36,9 @@ class PosePairs:
     camera_covariance: Array | None = None
     """(n, 6, 6) of `camera_from_board`: (translation in the camera's axes, metres; rotation about
     the board's axes, radians). Without it the noise is judged from the pairs alone."""
+    velocity: Array | None = None
+    """(n, 6) of the gripper: metres and radians per second in the axes of the base; given where the
+    clocks of robot and camera may differ."""
 
     def __post_init__(self) -> None:
         counts = {len(self.names), len(self.base_from_gripper), len(self.camera_from_board)}
@@ -58,6 +61,7 @@ class PosePairs:
             base_from_gripper=self.base_from_gripper[rows],
             camera_from_board=self.camera_from_board[rows],
             camera_covariance=None if covariance is None else covariance[rows],
+            velocity=None if self.velocity is None else self.velocity[rows],
         )
 
     def order(self) -> NDArray[np.int64]:
@@ -74,7 +78,7 @@ class PosePairs:
         """
         first = np.arange(len(self))
         positions = self.base_from_gripper.translation_m
-        close = cKDTree(positions).query_pairs(_SAME_ROBOT_M, output_type="ndarray")
+        close = KDTree(positions).query_pairs(_SAME_ROBOT_M, output_type="ndarray")
         if len(close) == 0:
             return first
         i, j = np.sort(close, 1).T
@@ -90,22 +94,36 @@ class PosePairs:
         return first
 
     def equation(self, mount: Mount, scale_known: bool = True) -> PoseEquation:
-        """The equation to solve: with the camera on the arm the board is fixed in the base, else in
-        the gripper."""
-        robot = self.base_from_gripper
-        return PoseEquation.of(
-            robot if mount == "eye_in_hand" else robot.inverse(),
+        """The equation to solve.
+
+        With the camera on the arm the board is fixed in the base, else in the gripper.
+        """
+        on_arm, robot = mount == "eye_in_hand", self.base_from_gripper
+        equation = PoseEquation.of(
+            robot if on_arm else robot.inverse(),
             self.camera_from_board,
             self.camera_covariance,
             scale_known,
-            base_is_fixed=mount == "eye_in_hand",
+            base_is_fixed=on_arm,
         )
+        if self.velocity is None:
+            return equation
+        return replace(equation, velocity=self.velocity if on_arm else _inverse_velocity(self))
 
 
 def listed(names: Sequence[str], limit: int = 5) -> str:
     """Names for a sentence, the first few of many."""
     shown = ", ".join(names[:limit])
     return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"
+
+
+def _inverse_velocity(pairs: PosePairs) -> Array:
+    """(n, 6) of the base in the axes of the gripper: how `gripper_from_base` changes."""
+    assert pairs.velocity is not None
+    shift, spin = np.split(pairs.velocity, 2, 1)
+    back = np.swapaxes(pairs.base_from_gripper.rotation_matrix(), 1, 2)
+    moved = np.cross(spin, pairs.base_from_gripper.translation_m) - shift
+    return np.concatenate([(back @ moved[..., None])[..., 0], -(back @ spin[..., None])[..., 0]], 1)
 
 
 def _canonical(pose: SE3) -> Array:

@@ -61,8 +61,8 @@ def _scale(equation: PoseEquation, fit: HandEyeFit, noise: Array) -> list[str]:
     chosen = free[fit.inliers]
     residual = chosen.residuals(at)
     jacobian = chosen.jacobian(at, residual)
-    normal = (np.linalg.inv(noise[fit.inliers]) @ jacobian).reshape(-1, 13).T
-    normal = normal @ jacobian.reshape(-1, 13)
+    normal = (np.linalg.inv(noise[fit.inliers]) @ jacobian).reshape(-1, free.unknowns).T
+    normal = normal @ jacobian.reshape(-1, free.unknowns)
     unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     sigma = unit[12] * np.sqrt(np.linalg.pinv(normal * np.outer(unit, unit), 1e-13)[12, 12])
     off = np.log(at.scale)

@@ -1,10 +1,10 @@
 """The equation of hand-eye calibration, its derivatives, and how noise enters it.
 
-For every pose, `fixed_from_parent @ parent_from_camera @ camera_from_board = fixed_from_board`. With
-the camera on the arm the parent is the gripper and `fixed` the robot's base; with the camera beside
-the robot and the board in its hand the parent is the base and `fixed` the gripper. The noise of a
-robot turns its gripper about the gripper's origin or about the base's, and both are the origins of
-`parent` and `fixed`, so one model serves both mounts.
+For every pose, `fixed_from_parent @ parent_from_camera @ camera_from_board = fixed_from_board`.
+With the camera on the arm the parent is the gripper and `fixed` the robot's base; with the camera
+beside the robot and the board in its hand the parent is the base and `fixed` the gripper. The noise
+of a robot turns its gripper about the gripper's origin or about the base's, and both are the
+origins of `parent` and `fixed`, so one model serves both mounts.
 
 Residuals are (translation, rotation vector) in the axes of `fixed`, metres and radians.
 """
@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,12 +220,15 @@ def cross(v: Array) -> Array:
 def se3(rotation: Array, translation: Array) -> SE3:
     """From rotation matrices (..., 3, 3) and translations (..., 3)."""
     quaternion = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
-    return SE3(quaternion, translation)
+    return SE3(quaternion, np.asarray(translation, dtype=np.float64))
 
 
 def _log_slope(rotvec: Array) -> Array:
-    """(n, 3, 3) derivative of a rotation vector by a small rotation on the left; transposed for one
-    on the right. Series of the inverse Jacobian of SO(3); within 1e-4 up to a radian."""
+    """(n, 3, 3) derivative of a rotation vector by a small rotation on the left.
+
+    Transposed, by one on the right. Series of the inverse Jacobian of SO(3), within 1e-4 up to a
+    radian.
+    """
     matrix = cross(rotvec)
     square = matrix @ matrix
     angle2 = (rotvec**2).sum(1)[:, None, None]
@@ -233,5 +236,5 @@ def _log_slope(rotvec: Array) -> Array:
 
 
 def _turn(lever: Array) -> Array:
-    """(n, 6, 3) turns of one radian about each axis through points `lever` (n, 3) from the board."""
+    """(n, 6, 3) turns of one radian about axes through points `lever` (n, 3) off the board."""
     return np.concatenate([-cross(lever), np.broadcast_to(np.eye(3), (len(lever), 3, 3))], 1)

@@ -16,7 +16,7 @@ from evercal.calibration.hand_eye import (
     HandEyeFit,
     SolveOptions,
     agreement,
-    residual_noise,
+    fit_weights,
     robust_fit,
 )
 from evercal.calibration.observability import require_observable, require_turns
@@ -27,7 +27,7 @@ from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 _SCALE_SIGMA = 0.1
 """Share of the scale that it must be sure to."""
@@ -115,7 +115,7 @@ class _Result:
     mount: Mount
 
     def checks(self) -> dict[str, Any]:
-        fit, noise = self.fit, residual_noise(self.equation, self.fit)
+        fit, noise = self.fit, fit_weights(self.equation, self.fit)
         used = fit.residual[fit.inliers].reshape(-1, 2, 3)
         rms = np.sqrt((used**2).sum(2).mean(0))
         checks: dict[str, Any] = {
@@ -133,6 +133,9 @@ class _Result:
             "quaternion_wxyz": at.rotation_wxyz.tolist(),
         }
         checks["warnings"] = warnings_of(self.equation, fit, noise, self.mount)
+        if self.equation.velocity is not None:
+            checks["time_offset_s"] = fit.at.offset_s
+            checks["time_offset_sigma_s"] = float(np.sqrt(fit.factor * fit.covariance[-1, -1]))
         if not self.equation.scale_known:
             checks["scale"] = fit.at.scale
             checks["scale_sigma"] = fit.at.scale * _log_scale_sigma(fit)
@@ -219,8 +222,11 @@ def _seen_again(
     found: Agreement,
     mount: Mount,
 ) -> tuple[PosePairs, list[BoardPose]]:
-    """Second look at images that disagree: a flat board has two poses that look nearly alike, and a
-    board that is its own mirror image may have been counted from the wrong end."""
+    """Second look at images that disagree.
+
+    A flat board has two poses that look nearly alike, and one that looks the same turned by half a
+    turn may have been counted from the wrong end.
+    """
     at, again = found.at, list(measured)
     robot = pairs[kept].base_from_gripper
     robot = robot if mount == "eye_in_hand" else robot.inverse()
