@@ -98,9 +98,7 @@ def _readings(pairs: PosePairs, mount: Mount, scale_known: bool) -> Iterator[_Re
     for shift in (1, -1):
         rows = slice(max(shift, 0), len(pairs) + min(shift, 0))
         others = slice(max(-shift, 0), len(pairs) + min(-shift, 0))
-        moved = replace(
-            pairs[np.arange(len(pairs))[rows]], camera_from_board=camera[others]
-        )
+        moved = replace(pairs[np.arange(len(pairs))[rows]], camera_from_board=camera[others])
         late = "robot" if shift > 0 else "camera"
         if len(moved) >= MIN_POSES:
             yield _Reading(
