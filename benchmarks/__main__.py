@@ -150,6 +150,18 @@ def crowd(store: Path, scenes: tuple[Path, ...], keyframes: int = 10_000, rooms:
     run(store, scenes, keyframes, rooms)
 
 
+def handeye(trials: int = 1000, thorough: bool = False) -> None:
+    """Solves simulated pose pairs: errors, 95 % ellipsoids, outliers, scale, time.
+
+    Args:
+        trials: of each setting.
+        thorough: also noise on robot poses and on both, about near and far points.
+    """
+    from benchmarks.hand_eye import run
+
+    run(trials, thorough)
+
+
 def main() -> int:
     """Runs one benchmark; `--gate` is short for `gate`."""
     from evercal.errors import InputError
@@ -162,6 +174,7 @@ def main() -> int:
         "peers": peers,
         "gate": gate,
         "maps": maps,
+        "handeye": handeye,
         "calibration": calibration,
         "crowd": crowd,
     }

@@ -176,7 +176,7 @@ def ellipsoid_factor(
     variances, axes = np.linalg.eigh(covariance)
     gradient = np.einsum("dm,kde,em->mk", axes, slopes, axes)
     spread = np.einsum("mk,kl,ml->m", gradient, uncertainty, gradient)
-    freedom = 2 * variances**2 / np.maximum(spread, 1e-300)
+    freedom = np.minimum(2 * variances**2 / np.maximum(spread, 1e-300), 1e6)
     expected = float(np.sum(np.where(freedom > 2, freedom / np.maximum(freedom - 2, 1e-9), 0.0)))
     freedom_all = 2 * expected / (expected - d) if expected > d else 2.0
     freedom_all = float(np.clip(freedom_all, 2.0, 1e6))

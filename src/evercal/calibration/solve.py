@@ -189,7 +189,7 @@ class _Result:
     def _why(self, row: int, mm: float, deg: float) -> str:
         times = float(np.sqrt(self.fit.distance2[row] / 6))
         return (
-            f"disagrees with the others by {mm:.1f} mm and {deg:.1f} deg, {times:.0f} times what"
+            f"disagrees with the others by {mm:.1f} mm and {deg:.2f} deg, {times:.1f} times what"
             f" their noise explains"
         )
 

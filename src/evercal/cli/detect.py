@@ -54,6 +54,10 @@ class Detect:
         from evercal.datasets import image_size, read_image
         from evercal.datasets.camera_file import read_camera
 
+        names = [path.name for path in files]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise InputError(f"{twice[0]}: two images of this name; give every image its own name")
         width, height = image_size(files[0])
         views: dict[str, BoardView | str] = {}
         with progress_bar("detecting", len(files), "image") as bar:
@@ -71,10 +75,16 @@ class Detect:
             first = next(iter(views.items()))
             raise InputError(f"no board in any of {len(files)} images ({first[0]}: {first[1]})")
         if self.camera is not None:
-            found = board_poses(board, read_camera(self.camera, (width, height)), views)
+            lens = read_camera(self.camera, (width, height))
+            if (lens.width, lens.height) != (width, height):
+                raise InputError(
+                    f"{self.camera}: is for images of {lens.width}x{lens.height}, these are"
+                    f" {width}x{height}; give the intrinsics of this image size"
+                )
+            found = board_poses(board, lens, views)
         else:
-            lens = calibrate_camera(seen, width, height)
-            found = board_poses(board, lens.camera, views, "board")
+            found_lens = calibrate_camera(seen, width, height)
+            found = board_poses(board, found_lens.camera, views, "board")
         found.write(self.out)
         self._tell(found)
         return 0
