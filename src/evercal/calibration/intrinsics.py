@@ -59,14 +59,17 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
     best: tuple[float, Intrinsics] | None = None
     matrix, lens = _start(points, pixels, (width, height)), np.zeros(5)
     for extra, flags in models.items():
-        rms, matrix, lens, _, _, deviations = cv2.calibrateCameraExtended(
-            points,
-            pixels,
-            (width, height),
-            matrix.copy(),
-            lens.copy(),
-            flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS,
-        )[:6]
+        try:
+            rms, matrix, lens, _, _, deviations = cv2.calibrateCameraExtended(
+                points,
+                pixels,
+                (width, height),
+                matrix.copy(),
+                lens.copy(),
+                flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS,
+            )[:6]
+        except cv2.error:  # it ran away, as it does where the views leave the camera open
+            break
         squared = rms**2 * count / 2
         criterion = count * np.log(max(squared, 1e-12) / count) + extra * np.log(count)
         if best is None or criterion < best[0] - 2:
@@ -74,13 +77,12 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
             camera = Camera.from_matrix(matrix, width, height, distortion)
             focal = float(np.ravel(deviations)[:2].max())
             best = (criterion, Intrinsics(camera, float(rms), focal))
-    assert best is not None
-    found = best[1]
-    if not found.focal_sigma_px < _FOCAL_SIGMA * min(found.camera.fx, found.camera.fy):
+    found = None if best is None else best[1]
+    if found is None or not found.focal_sigma_px < _FOCAL_SIGMA * found.camera.fx:
+        size = "" if found is None else f" ({found.camera.fx:.0f} +- {found.focal_sigma_px:.0f} px)"
         raise InputError(
-            f"the images leave the focal length open ({found.camera.fx:.0f} +- "
-            f"{found.focal_sigma_px:.0f} px); tilt the board by 20 to 45 deg in several directions,"
-            f" or give --camera"
+            f"the images leave the focal length open{size}; tilt the board by 20 to 45 deg in"
+            f" several directions, or give --camera"
         )
     return found
 

@@ -103,6 +103,13 @@ def working_noise(noise: Array, use: NDArray[np.bool_]) -> Array:
     return (1 - _PLAIN_SHARE) * noise + _PLAIN_SHARE * plain
 
 
+def normal_inverse(normal: Array) -> Array:
+    """Inverse of (p, p) normal equations; what they leave open comes out huge, not zero."""
+    unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    values, axes = np.linalg.eigh(normal * np.outer(unit, unit))
+    return np.outer(unit, unit) * ((axes / np.maximum(values, 1e-14)) @ axes.T)
+
+
 @dataclass(frozen=True, eq=False)
 class Gain:
     """How residuals of n poses move the p unknowns of a weighted fit, and what noise does there."""
@@ -118,9 +125,7 @@ class Gain:
         p = jacobian.shape[-1]
         weighted = np.linalg.inv(working) @ jacobian
         normal = weighted.reshape(-1, p).T @ jacobian.reshape(-1, p)
-        unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        inverse = np.outer(unit, unit) * np.linalg.pinv(normal * np.outer(unit, unit), 1e-13)
-        gain = inverse @ weighted.transpose(0, 2, 1)
+        gain = normal_inverse(normal) @ weighted.transpose(0, 2, 1)
         return cls(gain, (gain @ noise @ gain.transpose(0, 2, 1)).sum(0))
 
     def slopes(self, directions: dict[str, Array]) -> Array:
@@ -150,7 +155,7 @@ def loss_by_weights(
     whitened = reached @ inverse
     products = np.einsum("knpi,lnqi->klpq", whitened, reached, optimize=True)
     slopes = best.slopes(directions)
-    precision = np.linalg.pinv(best.covariance, 1e-13, hermitian=True)
+    precision = normal_inverse(best.covariance)
     products -= np.einsum("kpq,qr,lrs->klps", slopes, precision, slopes, optimize=True)
     loss = 2 * np.einsum("kl,klpq->pq", uncertainty, products)
     return (loss + loss.T) / 2

@@ -4,6 +4,7 @@ import numpy as np
 
 from evercal.calibration.calibration import Mount
 from evercal.calibration.hand_eye import HandEyeFit, refine
+from evercal.calibration.noise_levels import normal_inverse
 from evercal.calibration.pose_equation import PoseEquation
 from evercal.errors import InputError
 
@@ -63,8 +64,7 @@ def _scale(equation: PoseEquation, fit: HandEyeFit, noise: Array) -> list[str]:
     jacobian = chosen.jacobian(at, residual)
     normal = (np.linalg.inv(noise[fit.inliers]) @ jacobian).reshape(-1, free.unknowns).T
     normal = normal @ jacobian.reshape(-1, free.unknowns)
-    unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    sigma = unit[12] * np.sqrt(np.linalg.pinv(normal * np.outer(unit, unit), 1e-13)[12, 12])
+    sigma = np.sqrt(normal_inverse(normal)[12, 12])
     off = np.log(at.scale)
     if abs(off) < _SURE * sigma or abs(off) < _SCALE_ODD:
         return []

@@ -17,6 +17,7 @@ from evercal.calibration.hand_eye import (
     SolveOptions,
     agreement,
     fit_weights,
+    least_sigma,
     robust_fit,
 )
 from evercal.calibration.observability import require_observable, require_turns
@@ -258,12 +259,14 @@ def _require_answer(used: PosePairs, fit: HandEyeFit, equation: PoseEquation) ->
         InputError: They turn about one axis only, or leave the scale open.
     """
     require_turns(used.base_from_gripper)
-    if not equation.scale_known and not _log_scale_sigma(fit) < _SCALE_SIGMA:
+    least = least_sigma(equation, fit)
+    if not equation.scale_known and not max(_log_scale_sigma(fit), least[12]) < _SCALE_SIGMA:
         raise InputError(
             "pure rotation: the poses turn about one point and leave the camera's scale open; move"
             " the gripper by 10 cm or more between poses as well"
         )
-    if not np.isfinite(fit.covariance).all() or np.sqrt(fit.covariance[:3, :3].trace()) > 1.0:
+    spread = np.sqrt(np.abs(fit.covariance[:3, :3].trace()))
+    if not (np.isfinite(fit.covariance).all() and spread < 1.0 and least[:3].max() < 0.1):
         raise InputError(
             "the poses leave the answer open by more than a metre; record 15 to 25 poses that turn"
             " by 20 to 60 deg about two axes"
