@@ -1,0 +1,186 @@
+"""`evercal solve` and `evercal detect`: files in, files out, exit codes."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.hand_eye import Recording, Setting, error, recording, rotations
+from evercal.calibration.calibration import read_calibration
+from evercal.datasets import write_image
+from evercal.geometry import SE3
+
+from ..calibration.printed import CAMERA, CHESSBOARD, photographed, view_of
+
+
+@pytest.fixture(autouse=True)
+def tiny() -> None:
+    """Nothing here is trained."""
+
+
+def write_poses(path: Path, poses: SE3, names: list[str] | None = None) -> None:
+    rows = np.concatenate([poses.translation_m, rotations(poses).as_rotvec()], 1)
+    lines = ["x_m,y_m,z_m,rotvec_x,rotvec_y,rotvec_z" + (",image" if names else "")]
+    for i, row in enumerate(rows):
+        words = [f"{value:.12g}" for value in row] + ([names[i]] if names else [])
+        lines.append(",".join(words))
+    path.write_text("\n".join(lines) + "\n")
+
+
+def files(folder: Path, drawn: Recording, names: list[str] | None = None) -> list[Any]:
+    write_poses(folder / "robot.csv", drawn.pairs.base_from_gripper, names)
+    write_poses(folder / "camera.csv", drawn.pairs.camera_from_board, names)
+    found = ["--robot-poses", folder / "robot.csv", "--camera-poses", folder / "camera.csv"]
+    return ["solve", *found, "--out", folder / "out.json"]
+
+
+def test_an_answer_is_written_and_told(run: Any, tmp_path: Path) -> None:
+    drawn = recording(Setting(noise_mm=0.5, noise_deg=0.05, outliers=2), 0)
+    words = [*files(tmp_path, drawn), "--mount", "eye_in_hand"]
+    ran = run(*words)
+    assert ran.code == 0
+    assert ran.out.startswith("gripper_from_camera: the pose of camera in gripper")
+    assert "23 of 25 used" in ran.out
+    assert f"left out   row {drawn.spoiled[0] + 1}: disagrees with the others" in ran.out
+    assert ran.out.splitlines()[-1].startswith("next: evercal export")
+    found = read_calibration(tmp_path / "out.json")
+    assert np.linalg.norm(error(found.parent_from_child, drawn.parent_from_camera)[:3]) < 0.001
+    assert found.source["command"] == "solve"
+    told = json.loads(run(*words, "--json").out)
+    assert told["matrix"] == found.to_dict()["matrix"]
+    assert told["checks"]["poses_used"] == 23
+
+
+def test_what_is_not_good_enough_exits_with_1(run: Any, tmp_path: Path) -> None:
+    drawn = recording(Setting("eye_to_hand", noise_mm=12, noise_deg=1.0, path="table"), 1)
+    ran = run(*files(tmp_path, drawn), "--mount", "eye_to_hand")
+    assert ran.code == 1
+    assert "Unusable" in ran.out
+
+
+def test_mistakes_are_one_line_and_exit_with_2(run: Any, tmp_path: Path) -> None:
+    drawn = recording(Setting(), 2)
+    words = files(tmp_path, drawn)
+    inverted = drawn.pairs.base_from_gripper.inverse()
+    write_poses(tmp_path / "robot.csv", inverted)
+    ran = run(*words, "--mount", "eye_in_hand")
+    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
+    assert "--invert robot" in ran.err[0]
+    assert not (tmp_path / "out.json").exists()
+    assert json.loads(run(*words, "--mount", "eye_in_hand", "--json").out).keys() == {"error"}
+    # What the message says puts it right.
+    assert run(*words, "--mount", "eye_in_hand", "--invert", "robot").code == 0
+    write_poses(tmp_path / "robot.csv", inverted[:20])
+    ran = run(*words, "--mount", "eye_in_hand")
+    assert ran.code == 2
+    assert "20 poses for 25 images" in ran.err[0]
+    assert run(*words, "--mount", "beside").code == 2
+    ran = run(*words[:3], "--camera-poses", tmp_path / "no.csv", "--mount", "eye_in_hand")
+    assert (ran.code, len(ran.err)) == (2, 1)
+
+
+def test_unknown_scale_is_asked_for(run: Any, tmp_path: Path) -> None:
+    drawn = recording(Setting(scale=0.37), 3)
+    words = [*files(tmp_path, drawn), "--mount", "eye_in_hand"]
+    assert run(*words).code == 2
+    ran = run(*words, "--scale", "unknown", "--json")
+    assert ran.code == 0
+    assert json.loads(ran.out)["checks"]["scale"] == pytest.approx(0.37, rel=0.005)
+
+
+def test_rows_go_by_name_where_there_are_names(run: Any, tmp_path: Path) -> None:
+    drawn = recording(Setting(noise_mm=0.1, noise_deg=0.01), 4)
+    names = [f"shot-{i}.png" for i in range(25)]
+    words = files(tmp_path, drawn, names)
+    order = np.random.default_rng(0).permutation(25)
+    write_poses(
+        tmp_path / "robot.csv", drawn.pairs.base_from_gripper[order], [names[i] for i in order]
+    )
+    assert run(*words, "--mount", "eye_in_hand").code == 0
+    found = read_calibration(tmp_path / "out.json")
+    assert np.linalg.norm(error(found.parent_from_child, drawn.parent_from_camera)[:3]) < 0.001
+
+
+def test_time_offset_takes_times(run: Any, tmp_path: Path) -> None:
+    words = files(tmp_path, recording(Setting(), 5))
+    ran = run(*words, "--mount", "eye_in_hand", "--time-offset")
+    assert ran.code == 2
+    assert "column stamp_s" in ran.err[0]
+
+
+def photographs(folder: Path, count: int) -> tuple[list[Path], SE3, SE3]:
+    """Images of a board, their gripper poses in robot.csv, and where the camera is."""
+    views = SE3.stack([view_of(CHESSBOARD, seed) for seed in range(count)])
+    gripper_from_camera = SE3.exp([0.05, -0.02, 0.08, 0.1, 0.3, 1.5])
+    base_from_board = SE3.exp([0.5, 0.1, 0.0, 3.0, 0.2, 0.1])
+    robot = base_from_board @ (gripper_from_camera @ views).inverse()
+    write_poses(folder / "robot.csv", robot)
+    paths = []
+    for i, view in enumerate(views):
+        paths.append(folder / f"image-{i + 1}.png")
+        write_image(paths[-1], photographed(CHESSBOARD, view, i))
+    (folder / "camera.json").write_text(json.dumps(CAMERA.to_dict()))
+    return paths, gripper_from_camera, views
+
+
+def test_from_photographs_to_a_calibration(run: Any, tmp_path: Path) -> None:
+    paths, truth, _ = photographs(tmp_path, 11)
+    board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
+    out = tmp_path / "board.json"
+    # As a shell lists them: image-10 before image-2.
+    ran = run("detect", *sorted(paths), *board, "--camera", tmp_path / "camera.json", "--out", out)
+    assert ran.code == 0
+    assert "11 of 11 images show the board" in ran.out
+    words = ["solve", "--robot-poses", tmp_path / "robot.csv", "--camera-poses", out]
+    solved = run(*words, "--mount", "eye_in_hand", "--out", tmp_path / "out.json")
+    assert solved.code == 0, solved
+    found = read_calibration(tmp_path / "out.json")
+    off = error(found.parent_from_child, truth)
+    assert np.linalg.norm(off[:3]) < 0.0005
+    assert np.linalg.norm(off[3:]) < np.deg2rad(0.1)
+    assert found.camera == CAMERA
+    assert found.checks["corner_sigma_px"] < 0.1
+
+
+def test_detect_tells_which_images_lack_a_board(run: Any, tmp_path: Path) -> None:
+    paths, truth, _ = photographs(tmp_path, 9)
+    write_image(paths[3], np.full((480, 640, 3), 90, np.uint8))
+    board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
+    out = tmp_path / "board.json"
+    ran = run("detect", *paths, *board, "--out", out, "--json")
+    assert ran.code == 0
+    told = json.loads(ran.out)
+    assert told == json.loads(out.read_text())
+    assert told["camera_from"] == "board"
+    assert told["camera"]["fx"] == pytest.approx(600, abs=6)
+    assert [image["camera_from_board"] is None for image in told["images"]] == [
+        i == 3 for i in range(9)
+    ]
+    assert "no chessboard with 9x6 inner corners" in told["images"][3]["reason"]
+    # The robot's row of that image is left alone, the others keep theirs.
+    words = ["solve", "--robot-poses", tmp_path / "robot.csv", "--camera-poses", out]
+    assert run(*words, "--mount", "eye_in_hand", "--out", tmp_path / "out.json").code == 0
+    found = read_calibration(tmp_path / "out.json")
+    assert len(found.images) == 8
+    assert np.linalg.norm(error(found.parent_from_child, truth)[:3]) < 0.005
+
+
+def test_detect_refuses_what_it_cannot_use(run: Any, tmp_path: Path) -> None:
+    paths, _, _ = photographs(tmp_path, 1)
+    board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
+    small = tmp_path / "small.json"
+    small.write_text(json.dumps({**CAMERA.to_dict(), "width": 320, "height": 240}))
+    for words, reason in (
+        ([paths[0], "--board", "chessboard", "--square-mm", "30"], "size of 3x3 or more"),
+        ([paths[0], "--board", "chessboard", "--size", "9x6"], "--square-mm"),
+        ([paths[0], *board[:3], "9 by 6", *board[4:]], "9x6"),
+        ([tmp_path / "no.png", *board], "missing"),
+        ([paths[0], *board], "intrinsics take at least 5"),
+        ([paths[0], *board, "--camera", small], "320x240"),
+        ([paths[0], paths[0], *board], "two images of this name"),
+    ):
+        ran = run("detect", *words, "--out", tmp_path / "board.json")
+        assert ran.code == 2, words
+        assert reason in ran.err[-1], ran.err
