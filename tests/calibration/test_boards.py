@@ -207,6 +207,6 @@ def test_charuco_boards_of_older_opencv_are_read() -> None:
     page = cv2.aruco.CharucoBoard((5, 6), 0.04, 0.03, words)
     page.setLegacyPattern(True)
     image = page.generateImage((600, 720), marginSize=40)
-    view = find_board(np.repeat(image[..., None], 3, 2), old)
+    view = find_board(np.repeat(image[..., None], 3, 2).astype(np.uint8), old)
     assert isinstance(view, BoardView)
     assert len(view.points_m) == 20

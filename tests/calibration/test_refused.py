@@ -121,7 +121,7 @@ def wxyz_as_xyzw(poses: SE3) -> SE3:
 
 
 MISTAKES: dict[str, tuple[Spoil, str]] = {
-    "two poses": (lambda p: p[np.arange(2)], "^2 pose pairs; .* at least 4"),
+    "two poses": (lambda p: p[np.arange(2)], "^2 pose pairs; .* at least 5"),
     "one pose": (lambda p: p[np.arange(1)], "^1 pose pair; "),
     "duplicates": (lambda p: p[np.arange(25) % 3], "25 pose pairs hold only 3 different ones"),
     "robot in mm": (changed_robot(scaled(1000)), "the robot poses look like millimetres"),

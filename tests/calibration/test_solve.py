@@ -185,7 +185,7 @@ def test_a_board_counted_from_the_other_end_is_turned() -> None:
     points = 0.03 * np.stack([x, y, 0 * x], -1).reshape(-1, 3).astype(float)
     flipped = []
     poses = []
-    half = SE3([0.0, 0.0, 0.0, 1.0], points.max(0))
+    half = SE3(np.array([0.0, 0.0, 0.0, 1.0]), points.max(0))
     for i, pose in enumerate(board):
         pixels = camera.project(pose.apply(points))
         turned = i % 4 == 1

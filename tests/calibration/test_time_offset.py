@@ -25,7 +25,9 @@ def robot_at(times: np.ndarray, speed: float = 1.0) -> SE3:
     return pose(turn, sway[:, :3] + np.array([0.5, 0.0, 0.5]))
 
 
-def streams(mount: Mount, offset: float, noise: float, seed: int = 0) -> tuple:
+def streams(
+    mount: Mount, offset: float, noise: float, seed: int = 0
+) -> tuple[PoseTrack, CameraTrack]:
     rng = np.random.default_rng(seed)
     stamps = np.arange(0, 25, 0.01)
     track = PoseTrack(stamps, robot_at(stamps))

@@ -70,7 +70,7 @@ def require_agreement(pairs: PosePairs, mount: Mount, scale_known: bool, found: 
         )
     if scale_known:
         _require_unit(pairs, mount, found)
-    enough = found.inliers.sum() >= max(MIN_POSES, len(pairs) / 2)
+    enough = found.inliers.mean() >= 0.5
     if found.metres < HOPELESS_M and found.radians < HOPELESS_RAD and enough:
         return
     raise InputError(f"{_mismatch(pairs)}; {_CAUSES}")

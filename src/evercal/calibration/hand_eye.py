@@ -21,11 +21,11 @@ from evercal.calibration.pose_equation import PoseEquation, Unknowns
 _TAILS = 3.0
 """Degrees of freedom of the tails in the first refinement."""
 _GROSS = 40.0
-"""Squared distance beyond which a pose is left out of the first noise levels."""
+"""Squared distance beyond which one of many poses is left out of the first noise levels."""
 _PLAIN_BELOW = 12
 """Poses below which not all kinds of noise are told apart: they would be confused."""
-MIN_POSES = 4
-"""Different poses; of three, a wrong one cannot be told from the others."""
+MIN_POSES = 5
+"""Different poses; of fewer, a wrong one cannot be told from the others."""
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
@@ -95,7 +95,9 @@ def agreement(equation: PoseEquation) -> Agreement:
         at = at.moved(step, equation.scale_known)
         if gain < 1e-2:
             break
-    return Agreement(at, float(sigma[0]), float(sigma[1]), distance2 < _GROSS)
+    # The median of few is no sure measure: a sound pose may lie far from the others.
+    gross = _GROSS * (1 + _GROSS / max(n - 3, 1) ** 2)
+    return Agreement(at, float(sigma[0]), float(sigma[1]), distance2 < gross)
 
 
 def robust_fit(
@@ -112,6 +114,8 @@ def robust_fit(
     options = options or SolveOptions()
     found = found or agreement(equation)
     at, inliers = found.at, found.inliers
+    if inliers.sum() < MIN_POSES:  # too few to tell a wrong pose: all count, and widen the answer
+        inliers = np.ones(len(equation), dtype=bool)
     covariance = np.broadcast_to(
         np.diag(np.repeat([found.metres**2, found.radians**2], 3)), (len(equation), 6, 6)
     )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evercal.calibration.corners import BoardView
+from evercal.calibration.noise_levels import normal_inverse
 from evercal.errors import InputError
 from evercal.geometry import Camera
 
@@ -60,14 +61,14 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
     matrix, lens = _start(points, pixels, (width, height)), np.zeros(5)
     for extra, flags in models.items():
         try:
-            rms, matrix, lens, _, _, deviations = cv2.calibrateCameraExtended(
+            rms, matrix, lens, turns, shifts = cv2.calibrateCamera(
                 points,
                 pixels,
                 (width, height),
                 matrix.copy(),
                 lens.copy(),
                 flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS,
-            )[:6]
+            )[:5]
         except cv2.error:  # it ran away, as it does where the views leave the camera open
             break
         squared = rms**2 * count / 2
@@ -75,7 +76,10 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
         if best is None or criterion < best[0] - 2:
             distortion = tuple(float(v) for v in np.ravel(lens)[:5]) if extra else ()
             camera = Camera.from_matrix(matrix, width, height, distortion)
-            focal = float(np.ravel(deviations)[:2].max())
+            sigma = float(np.sqrt(squared / max(count - 4 - extra - 6 * len(views), 1)))
+            focal = sigma * _unit_focal_sigma(
+                points, camera, extra, list(zip(turns, shifts, strict=True))
+            )
             best = (criterion, Intrinsics(camera, float(rms), focal))
     found = None if best is None else best[1]
     if found is None or not found.focal_sigma_px < _FOCAL_SIGMA * found.camera.fx:
@@ -85,6 +89,28 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
             f" several directions, or give --camera"
         )
     return found
+
+
+def _unit_focal_sigma(
+    points: list[np.ndarray], camera: Camera, extra: int, poses: list[tuple[np.ndarray, np.ndarray]]
+) -> float:
+    """Standard deviation of the focal length for corners that are off by a pixel; huge if open.
+
+    OpenCV's own deviations come out zero where the views leave a parameter open.
+    """
+    import cv2
+
+    shared, size = 4 + extra, len(poses)
+    normal = np.zeros((shared + 6 * size, shared + 6 * size))
+    lens = np.zeros(5)
+    lens[: len(camera.distortion)] = camera.distortion
+    for i, (corners, (turn, shift)) in enumerate(zip(points, poses, strict=True)):
+        # Columns: rotation vector, translation, focal lengths, principal point, distortion.
+        slopes = np.asarray(cv2.projectPoints(corners, turn, shift, camera.matrix(), lens)[1])
+        columns = np.concatenate([slopes[:, 6 : 6 + shared], slopes[:, :6]], 1)
+        where = np.r_[:shared, shared + 6 * i : shared + 6 * i + 6]
+        normal[np.ix_(where, where)] += columns.T @ columns
+    return float(np.sqrt(np.diag(normal_inverse(normal))[:2].max()))
 
 
 def _start(points: list[np.ndarray], pixels: list[np.ndarray], size: tuple[int, int]) -> np.ndarray:

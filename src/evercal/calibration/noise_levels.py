@@ -6,6 +6,7 @@ have the values that they are expected to have (H. Patterson and R. Thompson, Re
 inter-block information, 1971; C. R. Rao, Estimation of variance and covariance components, 1971).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self
 
@@ -36,7 +37,7 @@ class NoiseLevels:
     uncertainty: Array
     """(k, k) covariance of `variance`; 0 for kinds that do not show."""
 
-    def covariances(self, directions: dict[str, Array], known: Array) -> Array:
+    def covariances(self, directions: Mapping[str, Array], known: Array) -> Array:
         """(n, 6, 6) of the residuals.
 
         Args:
@@ -52,7 +53,7 @@ class NoiseLevels:
 def estimate_levels(
     residual: Array,
     jacobian: Array,
-    directions: dict[str, Array],
+    directions: Mapping[str, Array],
     known: Array,
     start: NoiseLevels | None = None,
 ) -> NoiseLevels:
@@ -128,14 +129,14 @@ class Gain:
         gain = normal_inverse(normal) @ weighted.transpose(0, 2, 1)
         return cls(gain, (gain @ noise @ gain.transpose(0, 2, 1)).sum(0))
 
-    def slopes(self, directions: dict[str, Array]) -> Array:
+    def slopes(self, directions: Mapping[str, Array]) -> Array:
         """(k, p, p) how the covariance grows with the variance of each kind of noise."""
         moves = [self.gain @ columns for columns in directions.values()]
         return np.stack([(move @ move.transpose(0, 2, 1)).sum(0) for move in moves])
 
 
 def loss_by_weights(
-    jacobian: Array, noise: Array, directions: dict[str, Array], uncertainty: Array
+    jacobian: Array, noise: Array, directions: Mapping[str, Array], uncertainty: Array
 ) -> Array:
     """(p, p) what a fit loses because its weights were estimated from the same residuals.
 
