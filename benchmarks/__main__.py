@@ -136,6 +136,20 @@ def calibration(
     run(what, rooms, out, draws, store)
 
 
+def crowd(store: Path, scenes: tuple[Path, ...], keyframes: int = 10_000, rooms: int = 10) -> None:
+    """Locates test frames of a store's scenes among thousands of keyframes of other rooms.
+
+    Args:
+        store: that knows the scenes.
+        scenes: their folders.
+        keyframes: of the crowd.
+        rooms: that they are shared out over.
+    """
+    from benchmarks.crowd import run
+
+    run(store, scenes, keyframes, rooms)
+
+
 def handeye(trials: int = 1000, thorough: bool = False) -> None:
     """Solves simulated pose pairs: errors, 95 % ellipsoids, outliers, scale, time.
 
@@ -162,6 +176,7 @@ def main() -> int:
         "maps": maps,
         "handeye": handeye,
         "calibration": calibration,
+        "crowd": crowd,
     }
     try:
         code = tyro.extras.subcommand_cli_from_dict(verbs, args=args)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from evercal.datasets.frame import Scene
     from evercal.mapping.scene_maps import SceneMaps
     from evercal.mapping.store import Store
+    from evercal.simulation.box_room import BoxRoom
 
 
 def _room(
@@ -235,6 +236,14 @@ HALL_SEED = 34
 def hall(one_thread: None) -> Scene:
     """A scene of 30 training and 30 test frames in between, 320x240 pixels, fine textures."""
     return _room(HALL_SEED, "hall", (320, 240), 60, 2, 256)
+
+
+@pytest.fixture(scope="session")
+def hall_room() -> BoxRoom:
+    """The room of `hall`, for other views of it."""
+    from evercal.simulation.box_room import BoxRoom
+
+    return BoxRoom(HALL_SEED, texture_px=256)
 
 
 @pytest.fixture(scope="session")

@@ -46,7 +46,7 @@ class MapAlignment:
     residual: str
     """How well they agree, for people."""
     gripper_from_camera: SE3 | None = None
-    """Found with it, where the images came from a camera on the gripper."""
+    """Found with it: of the camera on the gripper, or of the board that it holds."""
 
     sigma: tuple[float, float] = (0.0, 0.0)
     """Standard deviation per axis in the middle of the scene, millimetres and degrees."""
@@ -73,8 +73,9 @@ def align_by_gripper(
     images: Sequence[tuple[str, NDArray[np.uint8]]],
     base_from_gripper: SE3,
     scale_known: bool = True,
+    camera_from_board: Mapping[str, SE3] | None = None,
 ) -> MapAlignment:
-    """Finds the base frame from images of a camera on the gripper.
+    """Finds the base frame from images of a camera on the gripper, or of a board that it holds.
 
     Args:
         localizer: of the store.
@@ -82,14 +83,29 @@ def align_by_gripper(
         images: (name, (h, w, 3) uint8 RGB), five or more from places that turn about two axes.
         base_from_gripper: (n,) where the gripper was.
         scale_known: whether the scene was learned in metres.
+        camera_from_board: by name of the image, where the camera stands anywhere in the scene and
+            the gripper holds a board; images without one are left out.
 
     Raises:
-        InputError: too few images were located in the scene, or the motions leave the answer open.
+        InputError: the scale is unknown and a board is given, too few images were located in the
+            scene, or the motions leave the answer open.
     """
     in_own_frame(localizer, scene)
     located = [item for item in locate(localizer, images) if item.found]
     index = {name: i for i, (name, _) in enumerate(images)}
     located = [item for item in located if item.estimate.scene == scene]
+    if camera_from_board is not None:
+        if not scale_known:
+            raise InputError(
+                "a board in the gripper is seen in metres, the map is not: bring it into the base"
+                " frame by a camera on the gripper or by touched points"
+            )
+        # The board takes the camera's place: it is what the gripper carries through the map.
+        located = [
+            replace(item, pose=item.pose @ camera_from_board[item.name])
+            for item in located
+            if item.name in camera_from_board
+        ]
     if len(located) < LEAST_IMAGES:
         raise InputError(
             f"{len(located)} of {len(images)} images were located in {scene}; give at least"

@@ -35,6 +35,9 @@ class Align:
     """The gripper's pose in the base at every image."""
     convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """How the numbers of the robot poses are meant, where the file does not say it."""
+    board_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """What 'evercal detect' found in the images, where the gripper holds a board and the camera
+    stands anywhere in the scene."""
     points: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Touched points, base frame: lines of name, x, y, z in metres."""
     picks: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -73,8 +76,14 @@ class Align:
         files = image_files(self.images)
         assert self.robot_poses is not None
         poses = poses_of_images(self.robot_poses, files, self.convention)
-        images, known = read_images(files), not self.unknown_scale
-        return align_by_gripper(localizer, self.scene, images, poses, known)
+        images, known, boards = read_images(files), not self.unknown_scale, None
+        if self.board_poses is not None:
+            from evercal.calibration.board_poses import read_board_poses
+
+            found = read_board_poses(self.board_poses).found
+            seen = {image.name: image.camera_from_board for image in found}
+            boards = {str(f): pose for f in files if (pose := seen.get(f.name)) is not None}
+        return align_by_gripper(localizer, self.scene, images, poses, known, boards)
 
     def _by_points(self, localizer: "Localizer") -> "MapAlignment":
         from evercal.calibration.align import aligned_by_points

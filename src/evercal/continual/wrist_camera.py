@@ -11,7 +11,7 @@ from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.mapping.build import Adjusted, Mapping, SceneMap
-from evercal.mapping.hand_eye import HandEyeStart, hand_eye_start, with_gripper
+from evercal.mapping.hand_eye_start import HandEyeStart, hand_eye_start, with_gripper
 
 MOST_FOCAL_PERCENT, MOST_POSE_SIGMA_MM = 1.0, 5.0
 """Beyond these, errors are systematic and the covariance says nothing about them."""

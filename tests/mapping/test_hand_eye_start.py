@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
-from evercal.mapping.hand_eye import (
+from evercal.mapping.hand_eye_start import (
     HandEyeOptions,
     PairMotion,
     refuse_poor_motion,
