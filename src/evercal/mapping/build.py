@@ -335,7 +335,8 @@ def _finished(
     stated, hand_eye, loose = recording.stated, None, None
     if adjustment is not None and not options.bundle.common_known:
         # Nobody stated this transform: what was found is the answer, and nothing is taken back.
-        spread_of_common = HAND_EYE_COVARIANCE_SCALE * adjustment.common_covariance
+        common_covariance = np.asarray(adjustment.common_covariance, np.float64)
+        spread_of_common = HAND_EYE_COVARIANCE_SCALE * common_covariance
         hand_eye = HandEyeCorrection(common, spread_of_common)
         stated, common = stated @ common, SE3.identity()
         loose = frame_moved_by_cameras(stated, spread_of_common)

@@ -114,7 +114,7 @@ class Adjustment:
     """The same of stated rotations."""
     residual_px: float
     """Median reprojection error."""
-    common_covariance: NDArray[np.float64]
+    common_covariance: Array
     """(6, 6) of the common transform, camera frame, metres and radians."""
     correction: Array
     """(n, 6) of each pose beside the common transform and the shift, camera frame, m and rad."""
