@@ -52,13 +52,12 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
     points = [view.points_m.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
     free = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    models = {0: free, 1: free & ~cv2.CALIB_FIX_K1}
-    models[2] = models[1] & ~cv2.CALIB_FIX_K2
-    models[4] = models[2] & ~cv2.CALIB_ZERO_TANGENT_DIST
+    some = free & ~cv2.CALIB_FIX_K1 & ~cv2.CALIB_FIX_K2
+    models = {0: free, 1: some | cv2.CALIB_FIX_K2, 2: some, 4: some & ~cv2.CALIB_ZERO_TANGENT_DIST}
     models[5] = 0
     count = 2 * sum(len(p) for p in points)
     best: tuple[float, Intrinsics] | None = None
-    matrix, lens = _start(points, pixels, (width, height)), np.zeros(5)
+    matrix, lens = cv2.initCameraMatrix2D(points, pixels, (width, height)), np.zeros(5)
     for extra, flags in models.items():
         try:
             rms, matrix, lens, turns, shifts = cv2.calibrateCamera(
@@ -111,9 +110,3 @@ def _unit_focal_sigma(
         where = np.r_[:shared, shared + 6 * i : shared + 6 * i + 6]
         normal[np.ix_(where, where)] += columns.T @ columns
     return float(np.sqrt(np.diag(normal_inverse(normal))[:2].max()))
-
-
-def _start(points: list[np.ndarray], pixels: list[np.ndarray], size: tuple[int, int]) -> np.ndarray:
-    import cv2
-
-    return cv2.initCameraMatrix2D(points, pixels, size)
