@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.align_points import Picks, PointAlignment, align_by_points
+from evercal.calibration.align_points import Picks, align_by_points
 from evercal.calibration.disagreement import require_agreement
 from evercal.calibration.hand_eye import HandEyeFit, agreement, robust_fit
 from evercal.calibration.located import Located, locate
 from evercal.calibration.observability import require_observable
 from evercal.calibration.pairs import PosePairs
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, axis_deviation, cross_matrix
 from evercal.mapping.scene_maps import Alignment, SceneRecord
 
 if TYPE_CHECKING:
@@ -47,7 +47,6 @@ class MapAlignment:
     """How well they agree, for people."""
     gripper_from_camera: SE3 | None = None
     """Found with it: of the camera on the gripper, or of the board that it holds."""
-
     sigma: tuple[float, float] = (0.0, 0.0)
     """Standard deviation per axis in the middle of the scene, millimetres and degrees."""
 
@@ -152,7 +151,7 @@ def _frame_covariance(
     arm = placed.scale * turn @ centre
     slope = np.zeros((6, len(picked)))
     slope[:3, :3] = np.eye(3)
-    slope[:3, 3:6] = -_cross(arm) @ turn
+    slope[:3, 3:6] = -cross_matrix(arm) @ turn
     slope[3:, 3:6] = turn
     if not scale_known:
         slope[:3, 6] = arm
@@ -161,7 +160,8 @@ def _frame_covariance(
         # Away from the middle of the cameras, a wrong scale is a wrong place.
         radius = np.sqrt(((map_from_camera.translation_m - centre) ** 2).sum(1).mean() / 3)
         middle[:3, :3] += np.eye(3) * own[6, 6] * (placed.scale * radius) ** 2
-    return _about_origin(middle, arm + placed.base_from_map.translation_m), _sigma(middle)
+    origin = arm + placed.base_from_map.translation_m
+    return _about(origin, middle), axis_deviation(middle)
 
 
 def aligned_by_points(
@@ -211,29 +211,12 @@ def aligned_by_points(
         len(points),
         f"{found.residual_px:.1f} px root mean square",
         None,
-        _sigma(_about(found, middle)),
+        axis_deviation(_about(-middle, found.covariance[:6, :6])),
     )
 
 
-def _about(found: PointAlignment, middle: Array) -> Array:
-    """Covariance of the motion about a point instead of the base's origin."""
+def _about(point: Array, covariance: Array) -> Array:
+    """Covariance of a small motion about a point instead of the one at `point` (3,) from it."""
     slope = np.eye(6)
-    slope[:3, 3:] = -_cross(middle)
-    return slope @ found.covariance[:6, :6] @ slope.T
-
-
-def _about_origin(covariance: Array, middle: Array) -> Array:
-    """From a motion about a point (3,) to one about the base's origin."""
-    slope = np.eye(6)
-    slope[:3, 3:] = _cross(middle)
+    slope[:3, 3:] = cross_matrix(point)
     return slope @ covariance @ slope.T
-
-
-def _cross(v: Array) -> Array:
-    x, y, z = v
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
-def _sigma(covariance: Array) -> tuple[float, float]:
-    metres, radians = (np.sqrt(np.trace(covariance[a:b, a:b]) / 3) for a, b in ((0, 3), (3, 6)))
-    return 1000 * float(metres), float(np.rad2deg(radians))

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, cross_matrix
 from evercal.mapping.scene_maps import Alignment
 
 Array = NDArray[np.float64]
@@ -63,14 +63,12 @@ def align_by_points(images: Sequence[Picks], scale_known: bool) -> PointAlignmen
         InputError: too few points, or all on one line.
     """
     found = _triangulated(images)
-    names = [name for name in found if found[name] is not None]
-    if len(names) < 3:
+    if len(found) < 3:
         raise InputError(
-            f"{len(names)} points were picked in two or more images; give at least three, each in"
+            f"{len(found)} points were picked in two or more images; give at least three, each in"
             " two images from different places"
         )
-    in_map = np.stack([found[name][0] for name in names])
-    in_base = np.stack([found[name][1] for name in names])
+    in_map, in_base = (np.stack(side) for side in zip(*found.values(), strict=True))
     start = _umeyama(in_map, in_base, scale_known)
     centre = in_base.mean(0)
 
@@ -94,9 +92,8 @@ def align_by_points(images: Sequence[Picks], scale_known: bool) -> PointAlignmen
     covariance = np.zeros((7, 7))
     covariance[: len(fit.x), : len(fit.x)] = small
     # From a motion about the points' centre to one about the base's origin.
-    x, y, z = centre
     slope = np.eye(7)
-    slope[:3, 3:6] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    slope[:3, 3:6] = cross_matrix(centre)
     rms = float(np.sqrt((off.reshape(-1, 2) ** 2).sum(1).mean()))
     return PointAlignment(placed(fit.x), slope @ covariance @ slope.T, rms)
 

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from evercal.calibration.calibration import read_transform
-from evercal.calibration.located import Located, deviations, fuse, locate
+from evercal.calibration.located import Located, deviations, fuse, length_mm_deg, locate
 from evercal.datasets import load_scene, read_image
+from evercal.datasets.images import IMAGE_ENDINGS
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
 
-IMAGE_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 POSE_FILES = ("calibration.json", "base_from_camera.txt")
 """Files of an episode's folder that state the pose of its camera."""
 
@@ -118,8 +118,7 @@ def _audited(
     if not differences:
         return Episode(episode.name, "unknown", f"no image was located: {reason}")
     off = deviations(SE3.stack([fuse(differences).pose]), SE3.identity())[0]
-    millimetres = 1000 * float(np.linalg.norm(off[:3]))
-    degrees = float(np.rad2deg(np.linalg.norm(off[3:])))
+    millimetres, degrees = length_mm_deg(off)
     wrong = millimetres > options.most_mm or degrees > options.most_deg
     told = f"stated pose is {millimetres:.1f} mm and {degrees:.2f} deg from where it was found"
     return Episode(episode.name, "wrong" if wrong else "right", told, millimetres, degrees)

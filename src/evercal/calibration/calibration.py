@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry import SE3, Camera, axis_deviation, pose_distance
 from evercal.storage import write_json
 
 FORMAT, VERSION = "evercal-calibration", 1
@@ -113,12 +113,12 @@ class Calibration:
     @property
     def sigma_mm(self) -> float:
         """One standard deviation of the translation, root mean square of the axes."""
-        return 1000.0 * float(np.sqrt(np.trace(self.covariance[:3, :3]) / 3))
+        return axis_deviation(self.covariance)[0]
 
     @property
     def sigma_deg(self) -> float:
         """The same of the rotation."""
-        return float(np.rad2deg(np.sqrt(np.trace(self.covariance[3:, 3:]) / 3)))
+        return axis_deviation(self.covariance)[1]
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values, see the top of this file."""

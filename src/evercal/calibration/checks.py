@@ -4,7 +4,7 @@ import numpy as np
 
 from evercal.calibration.hand_eye import HandEyeFit, refine
 from evercal.calibration.pose_equation import PoseEquation
-from evercal.geometry import pose_distance
+from evercal.geometry import pose_distance_mm_deg
 
 FOLDS = 5
 _HALVED = 12
@@ -66,8 +66,5 @@ def repeatability(equation: PoseEquation, fit: HandEyeFit, noise: np.ndarray) ->
         use = np.zeros(len(equation), dtype=bool)
         use[rows[half::2]] = True
         answers.append(refine(equation, fit.at, noise, use).parent_from_camera)
-    metres, radians = pose_distance(*answers)
-    return {
-        "repeatability_mm": 1000 * float(metres),
-        "repeatability_deg": float(np.rad2deg(radians)),
-    }
+    millimetres, degrees = pose_distance_mm_deg(*answers)
+    return {"repeatability_mm": millimetres, "repeatability_deg": degrees}

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.pose_equation import cross
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, cross_matrix
 
 Array = NDArray[np.floating]
 
@@ -95,7 +94,7 @@ def board_pose(view: BoardView, camera: Camera, start: SE3 | None = None) -> Boa
     projected, slopes = cv2.projectPoints(view.points_m, rotvec, translation, matrix, lens)[:2]
     by_point = np.asarray(slopes[:, 3:6], dtype=np.float64).reshape(-1, 2, 3)
     rotation = Rotation.from_rotvec(np.ravel(rotvec))
-    turned = -rotation.as_matrix() @ cross(view.points_m)
+    turned = -rotation.as_matrix() @ cross_matrix(view.points_m)
     jacobian = np.concatenate([by_point, by_point @ turned], 2).reshape(-1, 6)
     squared = float(((projected.reshape(-1, 2) - view.pixels) ** 2).sum())
     normal = jacobian.T @ jacobian

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.calibration.from_images import map_digest
-from evercal.calibration.located import Fused, Located, deviations, fuse, locate
+from evercal.calibration.located import Fused, Located, deviations, fuse, length_mm_deg, locate
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, axis_deviation
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
@@ -134,19 +134,17 @@ def shift_between(
         scatter = _scatter(seen, options)
         covariance = scatter / count + scatter / before + np.diag(floor)
     else:
-        kept = [item.covariance for item, used in zip(located, fused.used, strict=True) if used]
+        kept = [item.covariance for item in fused.kept(located)]
         covariance = _scatter(seen, options) / count + np.diag(floor)
         covariance = covariance + reference.covariance + np.mean(kept, axis=0)
     confidence = float(stats.chi2.cdf(off @ np.linalg.solve(covariance, off), 6))
-    millimetres = 1000 * float(np.linalg.norm(off[:3]))
-    degrees = float(np.rad2deg(np.linalg.norm(off[3:])))
+    millimetres, degrees = length_mm_deg(off)
     visible = millimetres > options.least_mm or degrees > options.least_deg
     return Shift(
         reference.parent_from_child.inverse() @ fused.pose,
         millimetres,
         degrees,
-        1000 * float(np.sqrt(np.trace(covariance[:3, :3]) / 3)),
-        float(np.rad2deg(np.sqrt(np.trace(covariance[3:, 3:]) / 3))),
+        *axis_deviation(covariance),
         confidence,
         bool(visible and confidence >= options.confidence),
         same,

@@ -31,7 +31,7 @@ from evercal.calibration.located import (
 from evercal.calibration.verdict import verdict
 from evercal.datasets import read_image
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, axis_deviation
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
@@ -128,7 +128,7 @@ def calibrate(
         lens,
         fused.uses,
         terms,
-        _checks(moved, fused, localizer),
+        _checks(moved, fused),
         "",
         {"command": "calibrate", "scene": fused.scene, "map": map_digest(localizer, fused.scene)},
         datetime.now(UTC).isoformat(timespec="seconds"),
@@ -159,7 +159,7 @@ def _stands_still(located: Sequence[Located]) -> bool:
 
 def _from_one_spot(located: Sequence[Located], fused: Fused) -> tuple[Array, tuple[ErrorTerm, ...]]:
     """Covariance of a camera that stands still: what one image has, plus the scatter's share."""
-    kept = [item for item, used in zip(located, fused.used, strict=True) if used]
+    kept = fused.kept(located)
     shared = np.mean([item.covariance for item in kept], axis=0)
     own = fused.scatter / len(kept)
     terms = (
@@ -173,11 +173,11 @@ def _from_many_spots(
     located: Sequence[Located], moved: Sequence[Located], fused: Fused
 ) -> tuple[Array, tuple[ErrorTerm, ...]]:
     """Covariance of a camera on the gripper: the scatter among spots, and what one spot has."""
-    kept = [i for i, used in enumerate(fused.used) if used]
-    spots = _spots([located[i].pose for i in kept])
+    kept = fused.kept(moved)
+    spots = _spots([item.pose for item in fused.kept(located)])
     count = int(spots.max()) + 1
-    own = np.mean([moved[i].covariance for i in kept], axis=0) / count
-    off = deviations(SE3.stack([moved[i].pose for i in kept]), fused.pose)
+    own = np.mean([item.covariance for item in kept], axis=0) / count
+    off = deviations(SE3.stack([item.pose for item in kept]), fused.pose)
     means = np.stack([off[spots == spot].mean(0) for spot in range(count)])
     # The scatter holds errors of the robot's poses, which the images know nothing of.
     scatter = means.T @ means / max(count - 1, 1) / count
@@ -218,13 +218,12 @@ def _spots(poses: Sequence[SE3]) -> NDArray[np.int64]:
 
 
 def _term(name: str, covariance: Array) -> ErrorTerm:
-    metres, radians = (np.sqrt(np.trace(covariance[a:b, a:b]) / 3) for a, b in ((0, 3), (3, 6)))
-    return ErrorTerm(name, 1000 * float(metres), float(np.rad2deg(radians)))
+    return ErrorTerm(name, *axis_deviation(covariance))
 
 
-def _checks(moved: Sequence[Located], fused: Fused, localizer: "Localizer") -> Mapping[str, Any]:
+def _checks(moved: Sequence[Located], fused: Fused) -> Mapping[str, Any]:
     """Repeatability, and what `check` needs to compare later images."""
-    kept = [item for item, used in zip(moved, fused.used, strict=True) if used]
+    kept = fused.kept(moved)
     halves = halves_apart(SE3.stack([item.pose for item in kept]))
     found: dict[str, Any] = {
         "images_given": len(moved),

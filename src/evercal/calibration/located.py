@@ -3,20 +3,21 @@
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.calibration import ImageUse
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, average_poses, pose_distance
+from evercal.geometry import SE3, Camera, average_poses, pose_distance_mm_deg, with_translation_by
 
 if TYPE_CHECKING:
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import Localizer
 
 Array = NDArray[np.float64]
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,10 @@ class Fused:
     scene: str
     """Name of the scene."""
 
+    def kept(self, items: Sequence[Item]) -> list[Item]:
+        """Those of (n,) things, one for each image, that belong to the images used."""
+        return [item for item, used in zip(items, self.used, strict=True) if used]
+
 
 def locate(
     localizer: "Localizer",
@@ -100,9 +105,7 @@ def in_gripper_frame(located: Sequence[Located], base_from_gripper: SE3) -> list
     """
     moved = []
     for item, gripper in zip(located, base_from_gripper, strict=True):
-        axes = np.eye(6)
-        axes[:3, :3] = gripper.rotation_matrix().T
-        covariance = axes @ item.covariance @ axes.T
+        covariance = with_translation_by(gripper.rotation_matrix().T, item.covariance)
         pose = gripper.inverse() @ item.pose
         moved.append(Located(item.name, item.estimate, pose, covariance))
     return moved
@@ -140,7 +143,7 @@ def fuse(located: Sequence[Located], options: FusionOptions | None = None) -> Fu
     far = _far(off, options)
     for place, i in enumerate(usable):
         if far[place]:
-            millimetres, degrees = _size(off[place])
+            millimetres, degrees = length_mm_deg(off[place])
             reasons[i] = f"lies {millimetres:.1f} mm and {degrees:.2f} deg from the other images"
     keep = ~far
     if keep.sum() >= 2:
@@ -149,7 +152,7 @@ def fuse(located: Sequence[Located], options: FusionOptions | None = None) -> Fu
     scatter = off[keep].T @ off[keep] / max(1, keep.sum() - 1)
     uses, residual = [], dict(zip(usable, off, strict=True))
     for i, item in enumerate(located):
-        size = _size(residual[i]) if i in residual else (None, None)
+        size = length_mm_deg(residual[i]) if i in residual else (None, None)
         uses.append(ImageUse(item.name, not reasons[i], reasons[i], *size))
     used = np.array([not reason for reason in reasons])
     return Fused(middle, scatter, used, tuple(uses), str(scene))
@@ -176,8 +179,8 @@ def _far(off: Array, options: FusionOptions) -> NDArray[np.bool_]:
     return far
 
 
-def _size(off: Array) -> tuple[float, float]:
-    """Millimetres and degrees."""
+def length_mm_deg(off: Array) -> tuple[float, float]:
+    """Millimetres and degrees of one deviation (6,)."""
     return 1000 * float(np.linalg.norm(off[:3])), float(np.rad2deg(np.linalg.norm(off[3:])))
 
 
@@ -190,5 +193,4 @@ def halves_apart(poses: SE3) -> tuple[float, float] | None:
     if len(poses) < 4:
         return None
     first, second = (average_poses(poses[start::2]) for start in (0, 1))
-    metres, radians = pose_distance(first, second)
-    return 1000 * float(metres), float(np.rad2deg(radians))
+    return pose_distance_mm_deg(first, second)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from evercal.geometry import SE3
+from evercal.geometry import SE3, cross_matrix
 
 Array = NDArray[np.floating]
 
@@ -161,7 +161,7 @@ class PoseEquation:
         slope = _log_slope(residual[:, 3:])
         jacobian = np.zeros((len(self), 6, self.unknowns))
         jacobian[:, :3, 0:3] = robot
-        jacobian[:, :3, 3:6] = -turned @ cross(board_in_camera)
+        jacobian[:, :3, 3:6] = -turned @ cross_matrix(board_in_camera)
         jacobian[:, 3:, 3:6] = slope @ turned
         jacobian[:, :3, 6:9] = -np.eye(3)
         jacobian[:, 3:, 9:12] = -slope.transpose(0, 2, 1) @ at.rotations[1]
@@ -210,13 +210,6 @@ class PoseEquation:
         return kinds
 
 
-def cross(v: Array) -> Array:
-    """(n, 3, 3) matrices of the cross product with (n, 3) vectors."""
-    matrix = np.zeros((len(v), 3, 3))
-    matrix[:, 0, 1], matrix[:, 0, 2], matrix[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    return matrix - matrix.transpose(0, 2, 1)
-
-
 def se3(rotation: Array, translation: Array) -> SE3:
     """From rotation matrices (..., 3, 3) and translations (..., 3)."""
     quaternion = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
@@ -229,7 +222,7 @@ def _log_slope(rotvec: Array) -> Array:
     Transposed, by one on the right. Series of the inverse Jacobian of SO(3), within 1e-4 up to a
     radian.
     """
-    matrix = cross(rotvec)
+    matrix = cross_matrix(rotvec)
     square = matrix @ matrix
     angle2 = (rotvec**2).sum(1)[:, None, None]
     return np.eye(3) - 0.5 * matrix + (1 / 12 + angle2 / 720 + angle2**2 / 30240) * square
@@ -237,4 +230,4 @@ def _log_slope(rotvec: Array) -> Array:
 
 def _turn(lever: Array) -> Array:
     """(n, 6, 3) turns of one radian about axes through points `lever` (n, 3) off the board."""
-    return np.concatenate([-cross(lever), np.broadcast_to(np.eye(3), (len(lever), 3, 3))], 1)
+    return np.concatenate([-cross_matrix(lever), np.broadcast_to(np.eye(3), (len(lever), 3, 3))], 1)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
-from evercal.geometry import SE3
+from evercal.geometry import SE3, axis_deviation, cross_matrix
 from evercal.storage import write_json
 
 
@@ -31,12 +31,12 @@ class RigPair:
     @property
     def sigma_mm(self) -> float:
         """One standard deviation per axis."""
-        return 1000 * float(np.sqrt(np.trace(self.covariance[:3, :3]) / 3))
+        return axis_deviation(self.covariance)[0]
 
     @property
     def sigma_deg(self) -> float:
         """The same for the rotation."""
-        return float(np.rad2deg(np.sqrt(np.trace(self.covariance[3:, 3:]) / 3)))
+        return axis_deviation(self.covariance)[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,11 +94,10 @@ def _pair(first: str, second: str, cameras: Mapping[str, Calibration]) -> RigPai
     """Errors of both are taken for independent, which is too much where they share landmarks."""
     a, b = cameras[first], cameras[second]
     first_from_second = a.parent_from_child.inverse() @ b.parent_from_child
-    x, y, z = first_from_second.translation_m
     back = a.parent_from_child.rotation_matrix().T
     of_first = np.eye(6)
     of_first[:3, :3] = -back
-    of_first[:3, 3:] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    of_first[:3, 3:] = cross_matrix(first_from_second.translation_m)
     of_first[3:, 3:] = -first_from_second.rotation_matrix().T
     of_second = np.eye(6)
     of_second[:3, :3] = back

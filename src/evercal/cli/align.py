@@ -58,9 +58,9 @@ class Align:
         from evercal.localization.localizer import Localizer
         from evercal.mapping.store import Store
 
-        localizer = Localizer.open(self.store)
-        found = self._by_points(localizer) if by_points else self._by_gripper(localizer)
         opened = Store.open(self.store)
+        localizer = Localizer(opened.maps)
+        found = self._by_points(localizer) if by_points else self._by_gripper(localizer)
         record = next(known for known in opened.maps.scenes if known.name == self.scene)
         opened.replace_record(
             self.scene,

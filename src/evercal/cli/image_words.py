@@ -11,8 +11,6 @@ if TYPE_CHECKING:
 
     from evercal.geometry import Camera
 
-ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
-
 
 def image_files(words: Sequence[Path]) -> list[Path]:
     """Image files that words name; a folder stands for the images in it, in order of name.
@@ -22,12 +20,14 @@ def image_files(words: Sequence[Path]) -> list[Path]:
     """
     if not words:
         raise InputError("no image given; name one or more image files after the store")
+    from evercal.datasets.images import IMAGE_ENDINGS
+
     files: list[Path] = []
     for word in words:
         if word.is_dir():
-            inside = sorted(p for p in word.iterdir() if p.suffix.lower() in ENDINGS)
+            inside = sorted(p for p in word.iterdir() if p.suffix.lower() in IMAGE_ENDINGS)
             if not inside:
-                raise InputError(f"{word}: no images in this folder ({', '.join(ENDINGS)})")
+                raise InputError(f"{word}: no images in this folder ({', '.join(IMAGE_ENDINGS)})")
             files += inside
         elif word.is_file():
             files.append(word)

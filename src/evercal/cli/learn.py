@@ -198,9 +198,9 @@ def hand_eye_lines(found: "HandEyeReport") -> list[str]:
     """Where the camera was found on the gripper, in sentences."""
     import numpy as np
 
-    covariance = np.array(found.covariance)
-    sigma = 1000 * np.sqrt(np.trace(covariance[:3, :3]) / 3)
-    turn = np.rad2deg(np.sqrt(np.trace(covariance[3:, 3:]) / 3))
+    from evercal.geometry import axis_deviation
+
+    sigma, turn = axis_deviation(np.array(found.covariance))
     x, y, z = (1000 * value for value in found.translation_m)
     lines = [
         f"gripper_from_camera: ({x:.1f}, {y:.1f}, {z:.1f}) mm, quaternion wxyz"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.image_words import camera_for
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ class Localize:
         for path in self.images:
             if not path.is_file():
                 raise InputError(f"{path}: image file is missing; check the path")
-        camera = self._camera()
+        camera = camera_for(self.camera, self.images)
         from evercal.localization.localizer import Localizer
 
         localizer = Localizer.open(self.store)
@@ -56,14 +57,6 @@ class Localize:
                 print(as_text(path, answer, ms))
             self._next(found)
         return 0 if found else 1
-
-    def _camera(self) -> "Camera | None":
-        if self.camera is None:
-            return None
-        from evercal.datasets import image_size
-        from evercal.datasets.camera_file import read_camera
-
-        return read_camera(self.camera, image_size(self.images[0]))
 
     def _answers(
         self, localizer: "Localizer", camera: "Camera | None"

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.check import shift_dict, shift_line
 from evercal.cli.console import print_json
-from evercal.cli.image_words import ENDINGS, camera_for
+from evercal.cli.image_words import camera_for
 from evercal.errors import InputError
 
 
@@ -78,10 +78,12 @@ class Watch:
 
     def _new(self, seen: set[Path]) -> list[Path]:
         """Images that were not looked at yet, oldest first."""
+        from evercal.datasets.images import IMAGE_ENDINGS
+
         found = [
             path
             for path in self.folder.iterdir()
-            if path.suffix.lower() in ENDINGS and path not in seen
+            if path.suffix.lower() in IMAGE_ENDINGS and path not in seen
         ]
         return sorted(found, key=lambda path: (path.stat().st_mtime, path.name))
 

@@ -13,7 +13,7 @@ from evercal.localization.localizer import Localizer
 from evercal.mapping.build import Mapping
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.scene_maps import SceneMaps
-from evercal.mapping.selection import SarsOptions, select_sars
+from evercal.mapping.selection import spread_poses
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def fewest_keyframes(
     sizes = sorted({max(1, int(share * len(frames))) for share in options.shares})
     for step, size in enumerate(size for size in sizes if size < len(whole)):
         yield Mapping("choosing keyframes", step + 1, len(sizes))
-        chosen = _spread(whole, size)
+        chosen = spread_poses(whole.base_from_camera, size)
         found = _located(maps, chosen, [probes[i] for i in seen])
         good = [_close(a, truth[i], options) for a, i in zip(found, seen, strict=True)]
         if sum(good) >= options.least_located * len(seen):
@@ -81,13 +81,6 @@ def _probes(whole: Keyframes, frames: Sequence[Frame], count: int) -> list[Frame
     ]
     spread = np.unique(np.linspace(0, len(others) - 1, count).round().astype(int))
     return [others[i] for i in spread] if others else []
-
-
-def _spread(whole: Keyframes, size: int) -> NDArray[np.int64]:
-    poses = whole.base_from_camera
-    return np.sort(
-        select_sars(poses.translation_m, poses.rotation_wxyz, size, SarsOptions(fill=True))
-    )
 
 
 def _located(

@@ -9,7 +9,8 @@ import numpy as np
 from evercal.datasets.frame import Scene
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
-from evercal.geometry.se3 import SE3, pose_distance
+from evercal.geometry.pose_covariance import with_translation_by
+from evercal.geometry.se3 import SE3, pose_distance_mm_deg
 from evercal.mapping.build import Adjusted, Mapping, SceneMap
 from evercal.mapping.hand_eye_start import HandEyeStart, hand_eye_start, with_gripper
 
@@ -85,12 +86,11 @@ def hand_eye_report(
     correction = scene_map.hand_eye
     assert correction is not None, "the map was built for a hand-eye calibration"
     found = start.gripper_from_camera @ correction.start_camera_from_camera
-    axes = np.eye(6)
-    axes[:3, :3] = start.gripper_from_camera.rotation_matrix()
-    covariance = axes @ correction.covariance @ axes.T
+    axes = start.gripper_from_camera.rotation_matrix()
+    covariance = with_translation_by(axes, correction.covariance)
     doubts = _doubts(scene_map.adjusted)
-    moved = _apart(found, start.gripper_from_camera)
-    off = (None, None) if given is None else _apart(found, given)
+    moved = pose_distance_mm_deg(found, start.gripper_from_camera)
+    off = (None, None) if given is None else pose_distance_mm_deg(found, given)
     return HandEyeReport(
         tuple(found.translation_m.tolist()),
         tuple(found.rotation_wxyz.tolist()),
@@ -117,11 +117,6 @@ def _doubts(adjusted: Adjusted) -> tuple[str, ...]:
             " stand still at every image, and check the clocks"
         )
     return tuple(found)
-
-
-def _apart(a: SE3, b: SE3) -> tuple[float, float]:
-    metres, radians = pose_distance(a, b)
-    return 1000 * float(metres), float(np.rad2deg(radians))
 
 
 def _run(

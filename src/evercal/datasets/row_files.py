@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.datasets.pose_header import is_number
 from evercal.errors import InputError
 
 NAME_COLUMNS = ("name", "image", "image_name", "file", "filename", "file_name", "frame")
@@ -44,7 +45,7 @@ def read_rows(path: Path, what: str) -> Rows:
     keys = [word.lower() for word in header]
     name = next((i for i, key in enumerate(keys) if key in NAME_COLUMNS), None)
     stamp = next((i for i, k in enumerate(keys) if k in STAMP_COLUMNS + STAMP_COLUMNS_NS), None)
-    if all(_is_number(word) for word in header):
+    if all(is_number(word) for word in header):
         raise InputError(f"{path}: the first line names no columns; write a header, then {what}")
     if not lines:
         raise InputError(f"{path}: holds a header and no rows; it is to hold {what}")
@@ -110,16 +111,8 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(p), p) if p.isdigit() else (1, 0, p) for p in parts)
 
 
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
 def _number(path: Path, row: int, column: str, word: str) -> float:
-    value = float(word) if _is_number(word) else np.nan
+    value = float(word) if is_number(word) else np.nan
     if not np.isfinite(value):
         raise InputError(f"{path}: row {row + 1}, column {column!r}: {word!r} is not a number")
     return value

@@ -198,6 +198,12 @@ def pose_distance(a: SE3, b: SE3) -> tuple[Array, Array]:
     return np.asarray(metres), 2.0 * np.arctan2(sine, np.abs(difference[..., 0]))
 
 
+def pose_distance_mm_deg(a: SE3, b: SE3) -> tuple[float, float]:
+    """`pose_distance` of two single transforms for people: millimetres and degrees."""
+    metres, radians = pose_distance(a, b)
+    return 1000 * float(metres), float(np.rad2deg(radians))
+
+
 def average_poses(poses: SE3, weights: ArrayLike | None = None) -> SE3:
     """Robust mean: up to nearly half of the weight may be far off without moving the answer.
 

@@ -27,7 +27,7 @@ from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.pose_check import PoseCheckOptions, contradicting_frames
 from evercal.mapping.recording import Recording, WorkingSize
 from evercal.mapping.scene_maps import frame_moved_by_cameras
-from evercal.mapping.selection import SarsOptions, select_sars
+from evercal.mapping.selection import spread_poses
 from evercal.mapping.tracks import (
     KeyframeTracks,
     TrackOptions,
@@ -238,12 +238,8 @@ def _open(
 
 
 def spread_frames(frames: Sequence[Frame], capacity: int) -> NDArray[np.int64]:
-    """Frames spread over the poses by SARS with the largest radius that fills the capacity."""
-    if len(frames) <= capacity:
-        return np.arange(len(frames))
-    poses = known_poses(frames)
-    fill = SarsOptions(fill=True)
-    return select_sars(poses.translation_m, poses.rotation_wxyz, capacity, fill)
+    """Posed frames spread over their poses, see `spread_poses`."""
+    return spread_poses(known_poses(frames), capacity)
 
 
 def _velocity(frames: Sequence[Frame], recording: Recording) -> np.ndarray:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry.camera import Camera
+from evercal.geometry.pose_covariance import cross_matrix
 from evercal.geometry.se3 import SE3
 from evercal.mapping.jacobians import (
     COMMON,
@@ -25,7 +26,6 @@ from evercal.mapping.jacobians import (
     SHIFT,
     Linearised,
     camera_jacobian,
-    cross,
     projection_slopes,
     ray_slopes,
 )
@@ -245,8 +245,8 @@ class BundleAdjustment:
         white = tracks.whitening
         return Linearised(
             np.einsum("nij,nj->ni", white, at - tracks.observed),
-            white @ np.concatenate([by_host, -by_host @ cross(ray / rho)], 2),
-            white @ np.concatenate([-by_point, by_point @ cross(seen)], 2),
+            white @ np.concatenate([by_host, -by_host @ cross_matrix(ray / rho)], 2),
+            white @ np.concatenate([-by_point, by_point @ cross_matrix(seen)], 2),
             np.einsum("nij,njk,nk->ni", white, -by_host, ray) / rho**2,
             white @ lens,
         )

@@ -27,7 +27,7 @@ from evercal.features.views import ViewOptions, plain_view, working_image
 from evercal.features.vlad import vlad_for
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
-from evercal.mapping.selection import SarsOptions, select_sars
+from evercal.mapping.selection import spread_poses
 
 Array = NDArray[np.float64]
 
@@ -152,8 +152,7 @@ def hand_eye_start(
     poses = gripper_poses(frames)
     refuse_poor_motion(poses, options)
     if len(frames) > options.frames:
-        fill = SarsOptions(fill=True)
-        some = select_sars(poses.translation_m, poses.rotation_wxyz, options.frames, fill)
+        some = spread_poses(poses, options.frames)
         frames, poses = [frames[i] for i in some], poses[some]
     motions = yield from _pair_motions(frames, encoder, options)
     return solve_motions(poses, motions, options)

@@ -27,13 +27,6 @@ class Linearised:
     lens: Array
 
 
-def cross(v: Array) -> Array:
-    """(n, 3, 3) matrices of the cross product with (n, 3) vectors."""
-    matrix = np.zeros((len(v), 3, 3))
-    matrix[:, 0, 1], matrix[:, 0, 2], matrix[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    return matrix - matrix.transpose(0, 2, 1)
-
-
 def _radial(camera: Camera) -> tuple[float, float]:
     k1, k2 = (*camera.distortion[:2], 0.0, 0.0)[:2]
     return k1, k2

@@ -10,6 +10,7 @@ from torch import Tensor
 from evercal.features.descriptor import Descriptor
 from evercal.features.encoder import Encoder
 from evercal.geometry.camera import Camera
+from evercal.geometry.pose_covariance import cross_matrix, with_translation_by
 from evercal.geometry.se3 import SE3
 from evercal.mapping.atlas import Atlas, Cell
 from evercal.mapping.frame_correction import FrameCorrection
@@ -44,9 +45,8 @@ class Alignment:
 
     def covariance(self, covariance: np.ndarray) -> np.ndarray:
         """(6, 6) of translation in the base frame and rotation about camera axes."""
-        axes = np.eye(6)
-        axes[:3, :3] = self.scale * self.base_from_map.rotation_matrix()
-        return axes @ covariance @ axes.T
+        turned = self.scale * self.base_from_map.rotation_matrix()
+        return with_translation_by(turned, covariance)
 
 
 @dataclass(frozen=True)
@@ -148,9 +148,8 @@ def moved_by_frame(base_from_camera: SE3, frame_covariance: np.ndarray) -> np.nd
         frame_covariance: (6, 6) of a small motion (v, w) of the base frame, which moves the
             position t by v + w x t and turns the camera by w.
     """
-    x, y, z = base_from_camera.translation_m
     slope = np.eye(6)
-    slope[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+    slope[:3, 3:] = -cross_matrix(base_from_camera.translation_m)
     slope[3:, 3:] = base_from_camera.rotation_matrix().T
     return slope @ frame_covariance @ slope.T
 

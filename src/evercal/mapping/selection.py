@@ -21,6 +21,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
+from evercal.geometry.se3 import SE3
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,14 @@ def _checked_capacity(capacity: int) -> int:
     if capacity < 0:
         raise ValueError(f"capacity is {capacity}; give a number of frames >= 0")
     return int(capacity)
+
+
+def spread_poses(poses: SE3, capacity: int) -> NDArray[np.int64]:
+    """Which of (n,) poses to take: by SARS with the largest radius that fills the capacity."""
+    if len(poses) <= capacity:
+        return np.arange(len(poses))
+    fill = SarsOptions(fill=True)
+    return select_sars(poses.translation_m, poses.rotation_wxyz, capacity, fill)
 
 
 def select_sars(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evercal.calibration.calibration import Calibration
-from evercal.calibration.located import deviations
+from evercal.calibration.located import deviations, length_mm_deg
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.reports.calibration_views import Views
@@ -27,8 +27,7 @@ def difference(found: Calibration, older: Calibration) -> tuple[float, float]:
     Raises:
         InputError: One camera stands still and the gripper carries the other.
     """
-    off = _off(found, older)
-    return 1000 * float(np.linalg.norm(off[:3])), float(np.rad2deg(np.linalg.norm(off[3:])))
+    return length_mm_deg(_off(found, older))
 
 
 def older_sentences(found: Calibration, older: Older, views: Views) -> list[str]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from evercal.datasets import Frame, Scene
 from evercal.evaluation import FrameResult, evaluate, scores
-from evercal.geometry import SE3, average_poses, pose_distance
+from evercal.geometry import SE3, average_poses, pose_distance_mm_deg
 from evercal.reports.demo_outcome import Bump, DemoOutcome, FixedCamera, UnknownRoom
 from evercal.simulation.box_room import BoxRoom
 
@@ -107,7 +107,9 @@ def _fixed_camera(name: str, recording: Scene, poses: list[SE3]) -> FixedCamera:
     count = len(recording.test)
     if not poses or truth is None:
         return FixedCamera(name, count, len(poses), None, None)
-    return FixedCamera(name, count, len(poses), *_apart(average_poses(SE3.stack(poses)), truth))
+    return FixedCamera(
+        name, count, len(poses), *pose_distance_mm_deg(average_poses(SE3.stack(poses)), truth)
+    )
 
 
 def _bump(name: str, recordings: tuple[Scene, Scene], poses: tuple[list[SE3], list[SE3]]) -> Bump:
@@ -116,15 +118,9 @@ def _bump(name: str, recordings: tuple[Scene, Scene], poses: tuple[list[SE3], li
     true_before, true_after = (_truth(recording.test[0]) for recording in recordings)
     assert true_before is not None, "the simulator knows every pose"
     assert true_after is not None, "the simulator knows every pose"
-    shift, true = _apart(before, after), _apart(true_before, true_after)
-    return Bump(name, *shift, *true, _apart(first, second)[0])
+    shift, true = pose_distance_mm_deg(before, after), pose_distance_mm_deg(true_before, true_after)
+    return Bump(name, *shift, *true, pose_distance_mm_deg(first, second)[0])
 
 
 def _truth(frame: Frame) -> SE3 | None:
     return frame.base_from_camera
-
-
-def _apart(a: SE3, b: SE3) -> tuple[float, float]:
-    """Millimetres and degrees."""
-    metres, radians = pose_distance(a, b)
-    return 1000 * float(metres), float(np.rad2deg(radians))

@@ -1,0 +1,33 @@
+"""Covariances (6, 6) of poses.
+
+Of translation in the parent frame, metres, and rotation about the axes of the child, radians.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def cross_matrix(v: ArrayLike) -> Array:
+    """(..., 3, 3) matrices that multiply like the cross product with vectors (..., 3)."""
+    v = np.asarray(v, dtype=np.float64)
+    matrix = np.zeros((*v.shape, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return matrix - np.swapaxes(matrix, -1, -2)
+
+
+def axis_deviation(covariance: Array) -> tuple[float, float]:
+    """Standard deviation per axis, millimetres and degrees: root mean squares of three axes."""
+    metres, radians = (np.sqrt(np.trace(covariance[a:b, a:b]) / 3) for a, b in ((0, 3), (3, 6)))
+    return 1000 * float(metres), float(np.rad2deg(radians))
+
+
+def with_translation_by(matrix: Array, covariance: Array) -> Array:
+    """(6, 6) covariance after the translation alone was multiplied by a matrix (3, 3).
+
+    A rotation matrix gives it in the axes of another parent frame.
+    """
+    whole = np.eye(6)
+    whole[:3, :3] = matrix
+    return whole @ covariance @ whole.T
