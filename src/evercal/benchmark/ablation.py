@@ -5,18 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from evercal.benchmark.comparison import Run, TableRows, by_strategy, difference
-from evercal.continual.strategies import PENALTIES, SELECTORS, Strategy, compose
-from evercal.errors import InputError
+from evercal.continual.selectors import SELECTORS
 
 ABLATIONS: dict[str, tuple[tuple[str, str], ...]] = {
     "as printed": (
         ("iCaRL", "icarl"),
-        ("+ SARS", "sars+old_output"),
+        ("+ SARS", "sars_old_output"),
         ("+ SARS + SPDD", "sars_spdd"),
     ),
     "one change at a time": (
         ("random, reprojection", "er"),
-        ("SARS, reprojection", "sars+reprojection"),
+        ("SARS, reprojection", "sars_reprojection"),
         ("SARS, SPDD", "sars_spdd"),
     ),
 }
@@ -64,18 +63,18 @@ def ablation_rows(runs: Sequence[Run], suite: str = "") -> TableRows:
 def grid_rows(runs: Sequence[Run]) -> TableRows:
     """Final accuracy, a row per selector and a column per penalty; TFR in brackets.
 
-    Strategies that differ from a composed one in anything else have no place in it.
+    Strategies that are more than the two, or weigh the penalty otherwise, have no place in it.
 
     Returns:
         A header alone unless two selectors were run with two penalties at least.
     """
     cells: dict[tuple[str, str], list[Run]] = {}
-    for name, of in by_strategy(runs).items():
-        place = _place(name)
+    for of in by_strategy(runs).values():
+        place = _place(of[0])
         if place is not None:
             cells.setdefault(place, of)
     selectors = [name for name in SELECTORS if any(s == name for s, _ in cells)]
-    penalties = [name for name in PENALTIES if any(p == name for _, p in cells)]
+    penalties = sorted({penalty for _, penalty in cells})
     rows = [["frames \\ cost", *penalties]]
     if len(selectors) < 2 or len(penalties) < 2:
         return rows
@@ -90,21 +89,11 @@ def grid_rows(runs: Sequence[Run]) -> TableRows:
     return rows
 
 
-def _place(name: str) -> tuple[str, str] | None:
-    """Selector and penalty of a strategy that is nothing but these two."""
-    if "@" in name:
+def _place(run: Run) -> tuple[str, str] | None:
+    """Selector and penalty of a strategy that is replay of nothing but these two."""
+    method = run.description.get("method")
+    if not isinstance(method, dict) or method.get("kind") != "Replay" or run.description["map"]:
         return None
-    try:
-        rule = compose(name)
-    except InputError:  # a plugin's, which is not loaded
-        return None
-    for selector, select in SELECTORS.items():
-        for penalty in PENALTIES:
-            if rule.select is select and _same(rule, compose(f"{selector}+{penalty}")):
-                return selector, penalty
-    return None
-
-
-def _same(rule: Strategy, composed: Strategy) -> bool:
-    """Whether two rules are the same but for where they come from."""
-    return {**vars(rule), "source": ""} == {**vars(composed), "source": ""}
+    penalty = method["penalty"]
+    assert isinstance(penalty, dict)
+    return str(method["selector"]), str(penalty["kind"])

@@ -1,14 +1,13 @@
 """What the outcomes of a benchmark say: one row per method, and whether differences are real."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
 from evercal.benchmark.results import SceneResult
 from evercal.benchmark.tables import Style, table
-from evercal.continual.strategies import STRATEGIES
 from evercal.errors import InputError
 from evercal.evaluation.metrics import COARSE, FINE, ContinualScores, continual_scores
 from evercal.evaluation.statistics import Interval, paired_difference
@@ -33,6 +32,8 @@ class Run:
     """In order of learning."""
     results: dict[tuple[int, str], SceneResult]
     """By stage and scene; of joint training only those of the last stage."""
+    description: Mapping[str, object] = field(default_factory=dict)
+    """What the strategy is (`Strategy.description`); empty in older results."""
 
     @property
     def last(self) -> list[SceneResult]:
@@ -46,8 +47,7 @@ class Run:
     @property
     def memory_mb(self) -> float:
         """Megabytes that stay of the scenes at the end; NaN where all frames are needed again."""
-        rule = STRATEGIES.get(self.last[0].strategy)  # whatever a report calls it
-        if rule is not None and rule.data == "all":
+        if self.description.get("jointly"):
             return math.nan
         return self.last[0].memory_bytes / 1e6
 
@@ -72,8 +72,14 @@ class Run:
         return continual_scores(matrix)
 
 
-def runs_of(results: Sequence[SceneResult]) -> list[Run]:
+def runs_of(
+    results: Sequence[SceneResult], strategies: Mapping[str, Mapping[str, object]] | None = None
+) -> list[Run]:
     """The runs whose last stage is done, in the order of their first lines.
+
+    Args:
+        results: of a folder.
+        strategies: what each strategy is, by name.
 
     Raises:
         InputError: no run is done.
@@ -87,7 +93,7 @@ def runs_of(results: Sequence[SceneResult]) -> list[Run]:
     for (strategy, seed), of in grouped.items():
         order = tuple(scene for stage, scene in of if stage == count - 1)
         if len(order) == count:
-            found.append(Run(strategy, seed, order, of))
+            found.append(Run(strategy, seed, order, of, (strategies or {}).get(strategy, {})))
     if not found:
         raise InputError("no run is done yet; go on with 'evercal bench'")
     return found

@@ -18,7 +18,7 @@ from evercal.benchmark.comparison import (
     selector_rows,
     threshold_rows,
 )
-from evercal.benchmark.results import RESULTS, SETTINGS, read
+from evercal.benchmark.results import RESULTS, SETTINGS, read, read_strategies
 from evercal.errors import InputError
 from evercal.storage import read_settings
 
@@ -117,4 +117,4 @@ def _ranked(runs: Sequence[Run]) -> list[Run]:
 def _results(folder: Path) -> tuple[list[Run], Mapping[str, object]]:
     if not (folder / RESULTS).is_file():
         raise InputError(f"{folder}: no results here; make some with 'evercal bench'")
-    return runs_of(read(folder)), read_settings(folder / SETTINGS)
+    return runs_of(read(folder), read_strategies(folder)), read_settings(folder / SETTINGS)

@@ -14,8 +14,9 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.evaluation.metrics import COARSE, FrameResult
+from evercal.storage import read_settings
 
-RESULTS, SETTINGS = "results.jsonl", "settings.json"
+RESULTS, SETTINGS, STRATEGIES = "results.jsonl", "settings.json", "strategies.json"
 _LATER = {"keyframe_positions_m", "covering_radius", "min_spacing"}
 """Fields that older results lack."""
 _FORMERLY = {
@@ -31,7 +32,7 @@ class SceneResult:
     """How one scene's test frames fared after one stage of one run."""
 
     strategy: str
-    """Key of STRATEGIES."""
+    """Name of the strategy; strategies.json says what it is."""
     seed: int
     """Of the run."""
     stage: int
@@ -112,6 +113,16 @@ def read(folder: Path) -> list[SceneResult]:
         except (ValueError, TypeError, KeyError) as error:
             raise InputError(f"{path}: line {number} is not a result ({error!r})") from error
     return found
+
+
+def read_strategies(folder: Path) -> dict[str, dict[str, object]]:
+    """What each strategy of a folder is (`Strategy.description`); none in older folders.
+
+    Raises:
+        InputError: a file that is none of ours.
+    """
+    path = folder / STRATEGIES
+    return read_settings(path) if path.exists() else {}  # pyright: ignore[reportReturnType]
 
 
 def _plain(result: SceneResult) -> dict[str, object]:

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from evercal.benchmark.bench import BenchOptions, Step
-    from evercal.continual.learn import StageOptions
+    from evercal.continual.stage import StageOptions
+    from evercal.continual.strategies import Strategy
     from evercal.datasets import Scene
 
 
@@ -33,8 +34,10 @@ class Bench:
     ] = ()
     """Scene folders of the suite custom, in order of learning; a single one for regions."""
     strategies: Annotated[str, arg(metavar="A,B")] = "evercal,joint,finetune,er,sars_spdd"
-    """Strategies (or SELECTOR+PENALTY) with commas between; the others are compared with the first.
-    """
+    """Strategies with commas between; the others are compared with the first."""
+    rows: Annotated[str | None, arg(metavar="NAME|FILE.json", help_behavior_hint="")] = None
+    """More strategies, made from others: table4, spdd-sweep, with-map, or a file of one's own (see
+    `evercal.benchmark.rows`)."""
     seeds: Annotated[str, arg(metavar="0,1")] = "0,1,2"
     """Seeds with commas between; every strategy is run once with each."""
     order: Literal["given", "reversed", "shuffled"] = "given"
@@ -84,7 +87,7 @@ class Bench:
         wait_for_all()
         options = BenchOptions(
             self._stage,
-            _words(self.strategies),
+            self._strategies(),
             seeds,
             self.order,
             settings={
@@ -102,7 +105,14 @@ class Bench:
             seconds = f" ({step.results[0].seconds:.0f} s)" if step.results else ""
             line = f"[{step.done}/{step.total}] {step.strategy} seed {step.seed}: "
             print(line + (found or "noted") + seconds, file=said, flush=True)
-        return 0 if rank() else show_report(self.out, _words(self.strategies)[0], self.json)
+        return 0 if rank() else show_report(self.out, options.strategies[0].name, self.json)
+
+    def _strategies(self) -> "tuple[Strategy, ...]":
+        from evercal.benchmark.rows import load_rows
+        from evercal.continual.strategies import strategy_named
+
+        named = [strategy_named(name) for name in _words(self.strategies)]
+        return (*named, *(load_rows(self.rows) if self.rows else ()))
 
     def _steps(self, options: "BenchOptions", out: Path) -> "Iterator[Step]":
         from evercal.benchmark.bench import run_bench

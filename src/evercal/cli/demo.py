@@ -14,8 +14,8 @@ from evercal.cli.console import print_json, print_next, progress_bar, size
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.continual.learn import StageOptions
     from evercal.continual.learn_scene import LearnReport
+    from evercal.continual.stage import StageOptions
     from evercal.datasets import Scene
     from evercal.localization.localizer import Localizer
     from evercal.reports.demo_outcome import DemoOutcome
@@ -123,6 +123,7 @@ def _learn_rooms(store: Path, method: str, scenes: "Sequence[Scene]", teller: _T
     """Learns the rooms one after the other; where methods are compared, evaluates after each."""
     from evercal.cli.learn_bars import LearnBars
     from evercal.continual.learn_scene import LearnOptions, learn_scene
+    from evercal.continual.strategies import STRATEGIES
     from evercal.localization.localizer import Localizer
     from evercal.reports.demo_outcome import MAP, METHODS
 
@@ -130,8 +131,9 @@ def _learn_rooms(store: Path, method: str, scenes: "Sequence[Scene]", teller: _T
     for i, scene in enumerate(scenes):
         say(f"{METHODS[method]}: learning {scene.name} from {len(scene.train)} posed images")
         began = time.perf_counter()
+        options = LearnOptions(_stage(method), STRATEGIES[method])
         with LearnBars() as bars:
-            report = learn_scene(store, scene, LearnOptions(_stage(method), method), bars)
+            report = learn_scene(store, scene, options, bars)
         seconds += time.perf_counter() - began
         if method == MAP:
             _note_map(report, outcome, say)

@@ -120,7 +120,7 @@ class Learn:
     def _options(self) -> "LearnOptions":
         from evercal.continual.learn_scene import LearnOptions
         from evercal.continual.presets import preset
-        from evercal.continual.strategies import STRATEGIES
+        from evercal.continual.strategies import strategy_named
 
         if self.encoder is not None and not self.encoder.is_file():
             raise InputError(f"--encoder {self.encoder}: no such file")
@@ -128,11 +128,11 @@ class Learn:
         if self.centres is not None:
             head = dataclasses.replace(stage.head, centres_per_scene=self.centres)
             stage = dataclasses.replace(stage, head=head)
-        strategy = self._strategy()
-        if self.centres is not None and not STRATEGIES[strategy].network:
+        strategy = strategy_named(self._strategy())
+        if self.centres is not None and strategy.method is None:
             raise InputError(
-                f"--centres {self.centres}: strategy {strategy} trains no network; leave the option"
-                " out"
+                f"--centres {self.centres}: strategy {strategy.name} trains no network; leave the"
+                " option out"
             )
         rough = None
         if self.gripper_from_camera is not None:
@@ -143,13 +143,12 @@ class Learn:
 
     def _strategy(self) -> str:
         """The strategy asked for, else the store's; refuses what a store cannot change later."""
-        from evercal.continual.learn_scene import strategy_of
-        from evercal.continual.strategies import STRATEGIES
+        from evercal.continual.strategies import STRATEGIES, strategy_named
         from evercal.mapping.store import Store
         from evercal.storage import MANIFEST
 
         if self.strategy is not None:
-            usable = [name for name, entry in STRATEGIES.items() if entry.data == "stage"]
+            usable = [name for name, entry in STRATEGIES.items() if not entry.jointly]
             if self.strategy in STRATEGIES and self.strategy not in usable:
                 raise InputError(
                     f"--strategy {self.strategy}: needs the recordings of all scenes at once, so it"
@@ -159,15 +158,15 @@ class Learn:
                 raise InputError(f"--strategy {self.strategy}: unknown; use {', '.join(usable)}")
         if not (self.store / MANIFEST).exists():
             return self.strategy or "evercal"
-        opened = Store.open(self.store)
-        maps, rule = opened.maps, strategy_of(opened)
+        maps = Store.open(self.store).maps
+        method = strategy_named(maps.strategy).method
         if self.encoder is not None:
             raise InputError(
                 f"--encoder {self.encoder}: {self.store} keeps the encoder it was made with; leave"
                 f" the option out or start a new store"
             )
         made_with = maps.heads[-1].options.centres_per_scene if maps.heads else self.centres
-        shared = rule.heads == "one"
+        shared = method is not None and not method.head_per_scene
         if shared and self.centres is not None and self.centres != made_with:
             raise InputError(
                 f"--centres {self.centres}: {self.store} was made with {made_with} for each scene;"

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
     from tqdm import tqdm
 
-    from evercal.continual.learn import Encoding
+    from evercal.continual.stage import Encoding
     from evercal.mapping.build import Mapping
     from evercal.mapping.store import Checkpoint
     from evercal.networks.trainer import Progress
@@ -54,7 +54,7 @@ class LearnBars:
 
     def __call__(self, event: "Encoding | Mapping | Progress | Checkpoint") -> None:
         """Takes one event."""
-        from evercal.continual.learn import Encoding
+        from evercal.continual.stage import Encoding
         from evercal.mapping.build import Mapping
         from evercal.networks.trainer import Progress
 

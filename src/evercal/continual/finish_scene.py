@@ -1,48 +1,94 @@
-"""What stays of a scene that was just learned: keyframes, their depths, the method's state."""
+"""What stays of a scene that was just learned: keyframes, their map, the method's state."""
 
-from collections.abc import Generator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass, replace
 
 from evercal.continual.frame_statistics import FrameStatistics
-from evercal.continual.method_state import FinishedScene, MethodState
-from evercal.continual.strategies import STRATEGIES
+from evercal.continual.methods.method import FinishedScene, Method, MethodState
+from evercal.continual.stage import Event, Stage, StageOptions
+from evercal.continual.stage_rows import replay_plan
+from evercal.continual.strategies import Strategy
 from evercal.datasets.frame import Frame
-from evercal.features.views import ViewOptions
-from evercal.geometry.camera import Camera
-from evercal.mapping.build import MapOptions, Mapping, SceneMap, map_steps
+from evercal.mapping.build import MapOptions, Mapping, SceneMap, map_steps, spread_frames
 from evercal.mapping.keyframes import Keyframes, store_keyframes
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord
-from evercal.networks.buffer import EncodePlan, FeatureBuffer, encode_frames
+from evercal.networks.buffer import FeatureBuffer, encode_frames
+from evercal.networks.hooks import TrainingHooks
 
 
-def select_keyframes(
-    maps: SceneMaps,
-    frames: Sequence[Frame],
-    statistics: FrameStatistics,
-    capacity: int,
-    refined: Camera | None,
-    mapping: MapOptions,
-) -> Generator[Mapping, None, tuple[Keyframes | None, SceneMap | None]]:
-    """The keyframes that a strategy keeps of a scene, and their map if it has one.
+@dataclass(frozen=True)
+class Learned:
+    """A scene that was just learned."""
+
+    frames: Sequence[Frame]
+    """Its training frames in recorded order."""
+    rows: Callable[[], FeatureBuffer]
+    """Their rows; the first views are the frames as they are."""
+    hooks: TrainingHooks | None = None
+    """Those of the training; None where it was plain."""
+
+
+def finished_stage(
+    maps: SceneMaps, strategy: Strategy, scene: Learned, options: StageOptions
+) -> Generator[Event, None, Stage]:
+    """Chooses what stays of the newest scene, maps it where that is wanted, and adds it to `maps`.
 
     Args:
-        maps: whose strategy selects.
-        frames: in recorded order.
-        statistics: the same frames as selectors see them.
-        capacity: N_b, how many at most.
-        refined: the camera as training corrected it; replay takes it as given.
-        mapping: how a map is built.
+        maps: with the scene's record and head, without its keyframes and state.
+        strategy: by which it was learned.
+        scene: what was learned.
+        options: of the stage.
     """
-    strategy = STRATEGIES[maps.strategy]
-    if strategy.select is None:
-        return None, None
-    chosen = strategy.select(statistics, capacity)
-    if strategy.build_map:
-        scene_map = yield from map_steps(frames, maps.encoder, chosen, sized(mapping, maps))
+    number = len(maps.scenes) - 1
+    keyframes, scene_map = yield from _keyframes(maps, strategy, scene, options)
+    maps.scenes[number] = mapped_record(maps.scenes[number], scene_map)
+    maps.keyframes.append(keyframes)
+    assert strategy.method is not None, "maps alone are finished in `learn`"
+    maps.method_states.append(_state(maps, strategy.method, scene, options))
+    kept = len(keyframes) if keyframes else 0
+    return Stage(maps, options.fit.iterations, kept, scene_map)
+
+
+def _keyframes(
+    maps: SceneMaps, strategy: Strategy, scene: Learned, options: StageOptions
+) -> Generator[Mapping, None, tuple[Keyframes | None, SceneMap | None]]:
+    head, _ = maps.head_for(len(maps.scenes) - 1)
+    statistics = FrameStatistics(scene.frames, head, scene.rows, options.seed)
+    capacity = options.capacity(scene.frames, maps.short_side)
+    chosen = strategy.method.select(statistics, capacity) if strategy.method else None
+    if strategy.builds_map:
+        if chosen is None:
+            chosen = spread_frames(scene.frames, capacity)
+        mapping = sized(options.map, maps)
+        scene_map = yield from map_steps(scene.frames, maps.encoder, chosen, mapping)
         return scene_map.keyframes, scene_map
-    if refined is not None:
+    if chosen is None:
+        return None, None
+    frames, refined = scene.frames, maps.scenes[-1].refined_camera
+    if refined is not None:  # replay takes the camera as training corrected it
         frames = [replace(frame, camera=refined) for frame in frames]
     return store_keyframes([frames[i] for i in chosen], maps.short_side), None
+
+
+def _state(maps: SceneMaps, method: Method, scene: Learned, options: StageOptions) -> MethodState:
+    """What the method keeps of the newest scene beside its keyframes."""
+    head, local = maps.head_for(len(maps.scenes) - 1)
+    keyframes = maps.keyframes[-1]
+
+    def remembered() -> FeatureBuffer:
+        assert keyframes is not None, "a method whose state is about keyframes selects some"
+        buffer = FeatureBuffer(local, maps.scenes[-1].cell.atlas_from_base)
+        plan = replay_plan(options, maps.short_side)
+        for _ in encode_frames(buffer, keyframes.frames(), plan, maps.encoder, maps.descriptor):
+            pass
+        return buffer
+
+    kept = len(keyframes) if keyframes else 0
+    return method.after_scene(
+        FinishedScene(
+            head.eval(), local, scene.rows, remembered, kept, maps.method_states, scene.hooks
+        )
+    )
 
 
 def sized(options: MapOptions, maps: SceneMaps) -> MapOptions:
@@ -62,31 +108,3 @@ def mapped_record(record: SceneRecord, scene_map: SceneMap | None) -> SceneRecor
         bend=scene_map.bend,
         frame_covariance=scene_map.frame_covariance,
     )
-
-
-def method_state_of(maps: SceneMaps, buffer: FeatureBuffer) -> MethodState:
-    """What the strategy keeps of the newest scene beside its keyframes, which are chosen already.
-
-    Args:
-        maps: with the scene's record and keyframes.
-        buffer: rows of its training frames.
-    """
-    after_scene = STRATEGIES[maps.strategy].after_scene
-    if after_scene is None:
-        return {}
-
-    def remembered() -> FeatureBuffer:
-        keyframes = maps.keyframes[-1]
-        assert keyframes is not None, "a method whose state is about keyframes selects some"
-        found = FeatureBuffer(buffer.scene, buffer.atlas_from_base)
-        return plain_rows(found, keyframes.frames(), maps)
-
-    return after_scene(FinishedScene(maps.heads[-1].eval(), buffer, remembered, maps.method_states))
-
-
-def plain_rows(buffer: FeatureBuffer, frames: Sequence[Frame], maps: SceneMaps) -> FeatureBuffer:
-    """Encodes frames as they are into a buffer, and gives it back."""
-    plan = EncodePlan(views_per_frame=1, view=ViewOptions(short_side=maps.short_side))
-    for _ in encode_frames(buffer, frames, plan, maps.encoder, maps.descriptor):
-        pass
-    return buffer

@@ -7,6 +7,7 @@ from evercal.continual.learn_scene import LearnOptions, LearnReport, OnEvent, le
 from evercal.continual.memory_budget import with_memory
 from evercal.continual.presets import PRESETS, Preset
 from evercal.continual.presets import preset as stage_options
+from evercal.continual.strategies import strategy_named
 from evercal.datasets import Scene, load_scene
 from evercal.errors import InputError
 from evercal.storage import MANIFEST, read_manifest
@@ -46,10 +47,11 @@ def learn(
     stage = with_memory(stage_options(preset), memory)
     root = Path(store)
     recorded = scene if isinstance(scene, Scene) else load_scene(scene)
-    return learn_scene(root, recorded, LearnOptions(stage, strategy or _made_with(root)), on_event)
+    options = LearnOptions(stage, strategy_named(strategy or _made_with(root)))
+    return learn_scene(root, recorded, options, on_event)
 
 
 def _made_with(root: Path) -> str:
     """The strategy of a store, or the default one where there is no store yet."""
-    default = LearnOptions.strategy
+    default = LearnOptions.strategy.name
     return str(read_manifest(root)["strategy"]) if (root / MANIFEST).exists() else default

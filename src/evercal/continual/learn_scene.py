@@ -11,7 +11,8 @@ from pathlib import Path
 import torch
 from filelock import FileLock, Timeout
 
-from evercal.continual.learn import Encoding, Stage, StageOptions, learn
+from evercal.continual.learn import learn
+from evercal.continual.stage import Encoding, Stage, StageOptions
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.continual.wrist_camera import (
     HandEyeReport,
@@ -41,8 +42,8 @@ class LearnOptions:
 
     stage: StageOptions = field(default_factory=StageOptions)
     """Network and training."""
-    strategy: str = "evercal"
-    """Key of STRATEGIES; a store keeps the strategy it was made with."""
+    strategy: Strategy = STRATEGIES["evercal"]
+    """What is learned; a store keeps the strategy it was made with."""
     encoder: Path | torch.nn.Module | None = None
     """Another encoder than the shipped one: a file for a new store, or a module of one's own."""
     short_side: int = 240
@@ -148,7 +149,9 @@ def _learn_scene(
     train_split = replace(scene, train=train)
     resume = opened.begin(_identity(opened, scene, options))
     try:
-        stage = run_stage(opened, train_split, stage_options, resume, on_event)
+        stage = run_stage(
+            opened, train_split, replace(options, stage=stage_options), resume, on_event
+        )
     except InputError:
         opened.abandon()  # bad input: no interrupted stage worth going on with
         raise
@@ -180,32 +183,13 @@ def open_or_create(store: Path, options: LearnOptions) -> Store:
     """The store at a path, or a new one when there is none yet.
 
     Raises:
-        InputError: as `Store.open` and `Store.create`, or a strategy that is none.
+        InputError: as `Store.open` and `Store.create`.
     """
     if (store / MANIFEST).exists():
         own = options.encoder if isinstance(options.encoder, torch.nn.Module) else None
         opened = Store.open(store, own)
-        strategy_of(opened)
         return opened
-    if options.strategy not in STRATEGIES:
-        names = ", ".join(STRATEGIES)
-        raise InputError(f"strategy {options.strategy!r}: unknown; choose one of {names}")
-    return Store.create(store, options.strategy, options.short_side, options.encoder)
-
-
-def strategy_of(store: Store) -> Strategy:
-    """How scenes are learned into a store.
-
-    Raises:
-        InputError: it was made with a strategy that is not known here.
-    """
-    name = store.maps.strategy
-    if name not in STRATEGIES:
-        raise InputError(
-            f"store {store.root}: made with strategy {name!r}, this evercal has "
-            f"{', '.join(STRATEGIES)}; update evercal"
-        )
-    return STRATEGIES[name]
+    return Store.create(store, options.strategy.name, options.short_side, options.encoder)
 
 
 def _check(opened: Store, scene: Scene, options: LearnOptions) -> None:
@@ -218,28 +202,26 @@ def _check(opened: Store, scene: Scene, options: LearnOptions) -> None:
         raise InputError(
             f"scene name {scene.name!r}: names become folders; give one without slashes (--name)"
         )
-    if opened.maps.strategy != options.strategy:
+    strategy = options.strategy
+    if opened.maps.strategy != strategy.name:
         raise InputError(
-            f"strategy {options.strategy!r}: the store was made with {opened.maps.strategy!r}; "
+            f"strategy {strategy.name!r}: the store was made with {opened.maps.strategy!r}; "
             "go on with that one or start a new store"
         )
-    if strategy_of(opened).data == "all" and names:
+    if strategy.jointly:
         raise InputError(
-            f"strategy {opened.maps.strategy!r}: learns all scenes at once, so a scene cannot be "
-            "added to a store; start a new store with another strategy"
+            f"strategy {strategy.name!r}: learns all scenes at once, so a store cannot grow by it; "
+            "take another strategy, or compare it with 'evercal bench'"
         )
-    if lacks_camera_poses(scene) and not strategy_of(opened).build_map:
+    if lacks_camera_poses(scene) and not strategy.builds_map:
         raise InputError(
             f"scene {scene.name!r}: only gripper poses are known, and strategy"
-            f" {opened.maps.strategy!r} builds no map that could find the camera on the gripper;"
+            f" {strategy.name!r} builds no map that could find the camera on the gripper;"
             " use strategy evercal"
         )
-    if options.stage.memory_auto and (
-        strategy_of(opened).network or not strategy_of(opened).build_map
-    ):
+    if options.stage.memory_auto and strategy.method is not None:
         raise InputError(
-            f"memory auto: strategy {opened.maps.strategy!r} trains a network; give a share or"
-            " bytes"
+            f"memory auto: strategy {strategy.name!r} trains a network; give a share or bytes"
         )
     if len(scene.train) < MIN_TRAIN_FRAMES:
         raise InputError(
@@ -267,7 +249,7 @@ def _identity(opened: Store, scene: Scene, options: LearnOptions) -> dict[str, o
         "frames": poses.hexdigest(),
         "camera": scene.train[0].camera.to_dict(),
         "stage": json.loads(json.dumps(asdict(options.stage))),
-        "strategy": options.strategy,
+        "strategy": options.strategy.description(),
         "stages": stages,
     }
 
@@ -275,12 +257,12 @@ def _identity(opened: Store, scene: Scene, options: LearnOptions) -> dict[str, o
 def run_stage(
     opened: Store,
     train_split: Scene,
-    options: StageOptions,
+    options: LearnOptions,
     resume: Resume | None,
     on_event: OnEvent | None,
 ) -> Stage:
     """Drives `learn` to its end, writing checkpoints to the store."""
-    for event in learn(opened.maps, train_split, options, resume):
+    for event in learn(opened.maps, options.strategy, train_split, options.stage, resume):
         if isinstance(event, Stage):
             return event
         if isinstance(event, Checkpoint):

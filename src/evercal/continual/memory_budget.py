@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.continual.learn import StageOptions
+    from evercal.continual.stage import StageOptions
 
 AUTO = "auto"
 """As few keyframes as locate the recording's other frames well."""

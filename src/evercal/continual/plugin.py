@@ -11,7 +11,8 @@ def load_plugin(path: Path) -> tuple[str, ...]:
     """Runs a Python file and adds the strategies that it names to `STRATEGIES`.
 
     Args:
-        path: a file with a dict `STRATEGIES` of its own, names to `Strategy` records.
+        path: a file with a dict `STRATEGIES` of its own, names to `Strategy` records of these
+            names.
 
     Returns:
         The names added.
@@ -30,10 +31,13 @@ def load_plugin(path: Path) -> tuple[str, ...]:
     except Exception as error:
         raise InputError(f"plugin {path}: {type(error).__name__}: {error}") from error
     found = getattr(module, "STRATEGIES", None)
-    usable = isinstance(found, dict) and all(isinstance(v, Strategy) for v in found.values())
+    usable = isinstance(found, dict) and all(
+        isinstance(v, Strategy) and v.name == name for name, v in found.items()
+    )
     if not usable or not found:
         raise InputError(
-            f"plugin {path}: defines no STRATEGIES; give a dict of names to Strategy records"
+            f"plugin {path}: defines no STRATEGIES; give a dict of names to Strategy records of"
+            " these names"
         )
     taken = [name for name in found if name in STRATEGIES and STRATEGIES[name] is not found[name]]
     if taken:

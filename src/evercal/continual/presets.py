@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Literal
 
-from evercal.continual.learn import StageOptions
+from evercal.continual.stage import StageOptions
 from evercal.networks.buffer import EncodePlan
 from evercal.networks.head import HeadOptions
 from evercal.networks.loss import LossOptions

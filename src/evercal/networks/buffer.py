@@ -33,8 +33,8 @@ class Rows:
     stored: Tensor | None = None
     """(n, 3) points that a head once gave to these rows, NaN where none were kept."""
 
-    def part(self, where: slice) -> "Rows":
-        """The rows of a slice."""
+    def part(self, where: slice | Tensor) -> "Rows":
+        """The rows of a slice, or at an index (m,)."""
         t = self.target
         target = Target(t.pixels[where], t.intrinsics[where], t.camera_from_atlas[where])
         return Rows(

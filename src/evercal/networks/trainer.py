@@ -1,8 +1,7 @@
-"""The loop: one head, rows of one or more scenes, optionally rows that are replayed."""
+"""The loop that fits a head to rows of scenes; whatever else is wanted comes in as hooks."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -12,8 +11,8 @@ from torch.nn import functional as F
 from evercal.features.precision import autocast
 from evercal.networks.buffer import FeatureBuffer, Rows, join
 from evercal.networks.distributed import average, own_share, processes
-from evercal.networks.gradients import Combine, Gradients
-from evercal.networks.head import Head, HeadOutput
+from evercal.networks.head import Head
+from evercal.networks.hooks import ProposedStep, TrainingHooks
 from evercal.networks.loss import LossOptions, clamp_px, reprojection_loss
 
 INLIER_PX = 5.0
@@ -21,8 +20,6 @@ INLIER_PX = 5.0
 MUON_STEPS = 3
 # While points are still far off, their errors say nothing about the lens.
 CORRECTION_FROM_PX = 20.0
-# How often it is chosen anew which views are replayed.
-CHOICE_STEPS = 20
 
 
 @dataclass(frozen=True)
@@ -33,9 +30,8 @@ class FitOptions:
     """Optimiser steps."""
     batch: int = 2048
     """Rows of the scenes being learned in a step."""
-    replay_batch: int = 1024
-    """Replayed rows in a step, drawn evenly from up to two remembered scenes; see
-    `replayed_rows` for more."""
+    replay_batch: int = 2048
+    """Replayed rows in a step, drawn evenly from all remembered scenes."""
     peak_rate: float = 4e-3
     """Peak of the one-cycle learning rate (cosine up and down) of AdamW."""
     muon_rate: float = 0.02
@@ -62,43 +58,21 @@ class Progress:
     """Steps done."""
     total: int
     """Steps of the stage."""
-    loss: float
-    """Mean loss of the rows being learned at the last step."""
-    inlier_share: float
-    """Share of the rows being learned within 5 px at the last step."""
+    costs: Tensor
+    """(n,) loss of each row being learned at the last step."""
+    errors_px: Tensor
+    """(n,) reprojection error of each, pixels."""
 
+    # Computed when asked for: a GPU would have to finish the step first.
+    @property
+    def loss(self) -> float:
+        """Mean loss of the rows being learned at the last step."""
+        return float(self.costs.mean())
 
-ReplayLoss = Callable[[HeadOutput, Rows, float], Tensor]
-"""What replay costs: (head output on replayed rows, those rows, progress in [0, 1]) -> scalar."""
-
-
-Precondition = Callable[
-    [Head, Sequence[FeatureBuffer], int], Callable[[], AbstractContextManager[None]]
-]
-"""(head before the stage, rows of remembered scenes, seed) -> what makes the context of a step."""
-
-ChooseViews = Callable[[Head, Rows, FeatureBuffer, float, torch.Generator], Tensor]
-"""(head, new rows, rows of a remembered scene, learning rate, generator) -> numbers of views."""
-
-
-@dataclass
-class Replay:
-    """Rows of remembered scenes and what they cost."""
-
-    buffers: Sequence[FeatureBuffer]
-    """One per remembered scene."""
-    penalty: ReplayLoss
-    """Loss on a batch of their rows."""
-    per_scene: bool = False
-    """Whether the penalty is one scene's, and counts once for each."""
-    precondition: Precondition | None = None
-    """What every optimiser step is taken in; None takes it as it is."""
-    combine: Combine | None = None
-    """How the gradient of each scene's penalty joins that of the new rows; None adds them up."""
-    references: Tensor | None = None
-    """(scenes,) penalty of each scene when it was just learned, for `combine`."""
-    choose_views: ChooseViews | None = None
-    """Which views' rows are replayed; None draws from all."""
+    @property
+    def inlier_share(self) -> float:
+        """Share of the rows being learned within 5 px at the last step."""
+        return float((self.errors_px < INLIER_PX).float().mean())
 
 
 class HeadTrainer:
@@ -110,54 +84,25 @@ class HeadTrainer:
     Args:
         head: trained in place.
         buffers: rows of the scenes being learned.
-        replay: rows of remembered scenes.
         options: how.
         seed: random seed.
-        regularizer: what the weights themselves cost.
+        hooks: what a continual-learning method adds.
     """
 
     def __init__(
         self,
         head: Head,
         buffers: Sequence[FeatureBuffer],
-        replay: Replay | None,
         options: FitOptions,
         seed: int,
-        regularizer: Callable[[], Tensor] | None = None,
+        hooks: TrainingHooks | None = None,
     ):
-        self.head, self.buffers, self.replay = head, buffers, replay
-        self.regularizer = regularizer
+        self.head, self.buffers = head, buffers
         self.options, self.seed, self.step = options, seed, 0
-        hidden, decay, plain = [], [], []
-        for name, parameter in head.named_parameters():
-            if name.startswith(("code", "logit")):
-                plain.append(parameter)
-            elif options.muon_rate > 0 and parameter.shape == (head.options.width,) * 2:
-                hidden.append(parameter)
-            else:
-                decay.append(parameter)
+        self.hooks = TrainingHooks() if hooks is None else hooks
         self.correction = torch.nn.Parameter(torch.zeros(len(buffers), 5))
         self._correctable = torch.tensor([[buffer.correctable] for buffer in buffers]).float()
-        groups = [
-            {"params": decay, "share": 1.0},
-            {"params": plain, "share": 1.0, "weight_decay": 0.0},
-            {"params": [self.correction], "share": options.intrinsics_rate, "weight_decay": 0.0},
-        ]
-        rate, decay_rate = options.peak_rate, options.weight_decay
-        self._optimisers: list[torch.optim.Optimizer] = [
-            torch.optim.AdamW(groups, lr=rate, weight_decay=decay_rate, fused=True)
-        ]
-        if hidden:
-            matrices = [{"params": hidden, "share": options.muon_rate / rate}]
-            self._optimisers.append(
-                torch.optim.Muon(matrices, weight_decay=decay_rate, ns_steps=MUON_STEPS)
-            )
-
-        self._replayed_views: list[Tensor] = []
-        self._losses: Tensor | None = None  # of remembered scenes in the step before
-        self._spare: Callable[[], AbstractContextManager[None]] = nullcontext
-        if replay is not None and replay.precondition is not None:
-            self._spare = replay.precondition(head, replay.buffers, seed)
+        self._optimisers = _optimisers(head, self.correction, options)
 
     def run(self) -> Iterator[Progress]:
         """Trains to the end, yielding after every step."""
@@ -167,154 +112,148 @@ class HeadTrainer:
         self.head.eval()
 
     def _train_step(self) -> Progress:
-        options, replay = self.options, self.replay
+        options, rate = self.options, one_cycle(self.options, self.step)
+        rows, fresh = self._rows(rate)
+        for optimiser in self._optimisers:
+            for group in optimiser.param_groups:
+                group["lr"] = rate * group["share"]
+            optimiser.zero_grad()
+        # One scene for all rows is a plain bias, a scene per row another product in every layer.
+        alone = len(self.buffers) == 1 and fresh == len(rows.scene)
+        scene = self.buffers[0].scene if alone else rows.scene
+        with autocast():
+            output = self.head(rows.features.float(), scene, rows.descriptor)
+        costs, errors = self._fresh_costs(output.points[:fresh], rows.part(slice(0, fresh)))
+        loss = costs.mean()
+        held, remembered = output.part(slice(fresh, None)), rows.part(slice(fresh, None))
+        progress = self.step / options.iterations
+        more = [self.hooks.regularizer()]
+        if fresh < len(rows.scene):
+            more.append(self.hooks.cost(held, remembered, progress))
+        for cost in more:
+            loss = loss if cost is None else loss + cost
+        losses = self.hooks.constraints(held, remembered, progress)
+        constraints = [self._gradients(one) for one in losses]
+        loss.backward()
+        every = [*self.head.parameters(), self.correction]
+        average([parameter.grad for parameter in every if parameter.grad is not None])
+        average([gradient for constraint in constraints for gradient in constraint.values()])
+        self._take_step(losses, constraints, rate / options.peak_rate)
+        self.step += 1
+        return Progress(self.step, options.iterations, costs.detach(), errors)
+
+    def _rows(self, rate: float) -> tuple[Rows, int]:
+        """The rows of this step that this process trains on, and how many of them are new."""
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
-        share = options.batch // len(self.buffers)
+        share = self.options.batch // len(self.buffers)
         parts = [buffer.draw(share, generator) for buffer in self.buffers]
-        if replay is not None:
-            parts += self._replayed(parts, replay, generator)
+        fresh = len(parts)
+        parts += self.hooks.replayed(join(parts), self.step, rate, generator)
         parts = [own_share(part) for part in parts]
-        share //= processes()
-        fresh = share * len(self.buffers)
         rows = join(parts)
         if self.head.options.condition == "descriptor":
             noise = torch.randn(rows.descriptor.shape, generator=generator)
-            rows.descriptor = F.normalize(rows.descriptor + options.diffusion * noise, dim=-1)
-        for optimiser in self._optimisers:
-            for group in optimiser.param_groups:
-                group["lr"] = one_cycle(options, self.step) * group["share"]
-        # One scene for all rows is a plain bias, a scene per row another product in every layer.
-        scene = rows.scene if len(parts) > 1 else self.buffers[0].scene
-        with autocast():
-            output = self.head(rows.features.float(), scene, rows.descriptor)
-        progress = self.step / options.iterations
-        new = rows.part(slice(0, fresh))
-        tau = clamp_px(options.loss, progress)
+            noise = self.options.diffusion * noise.to(rows.descriptor)
+            rows.descriptor = F.normalize(rows.descriptor + noise, dim=-1)
+        return rows, fresh * (share // processes())
+
+    def _fresh_costs(self, points: Tensor, rows: Rows) -> tuple[Tensor, Tensor]:
+        """Loss and error in pixels of the rows being learned."""
+        options = self.options
+        tau = clamp_px(options.loss, self.step / options.iterations)
         correction = None
         if options.intrinsics_rate > 0 and tau < CORRECTION_FROM_PX:
+            share = len(points) // len(self.buffers)
             correction = (self.correction * self._correctable).repeat_interleave(share, 0)
-        points = output.points[:fresh]
-        cost, error = reprojection_loss(points, new.target, tau, options.loss, correction)
-        loss = cost.mean()
-        if self.regularizer is not None:
-            loss = loss + self.regularizer()
+        return reprojection_loss(points, rows.target, tau, options.loss, correction)
+
+    def _gradients(self, loss: Tensor) -> dict[str, Tensor]:
+        """Gradient of a loss by every weight of the head; the graph stays."""
+        named = dict(self.head.named_parameters())
+        found = torch.autograd.grad(
+            loss, list(named.values()), retain_graph=True, materialize_grads=True
+        )
+        return dict(zip(named, found, strict=True))
+
+    def _take_step(
+        self, losses: Sequence[Tensor], constraints: list[dict[str, Tensor]], schedule: float
+    ) -> None:
+        """Lets the optimisers step, and a hook change what they did."""
+        named = dict(self.head.named_parameters())
+        before = {}
+        if self.hooks.edits_steps:
+            before = {name: value.detach().clone() for name, value in named.items()}
         for optimiser in self._optimisers:
-            optimiser.zero_grad()
-        self._backward(loss, output, rows, fresh)
-        with self._spare():
-            for optimiser in self._optimisers:
-                optimiser.step()
-        self.step += 1
-        inliers = float((error < INLIER_PX).float().mean())
-        return Progress(self.step, options.iterations, float(cost.mean().detach()), inliers)
-
-    def _replayed(
-        self, fresh: Sequence[Rows], replay: Replay, generator: torch.Generator
-    ) -> list[Rows]:
-        """The same number of rows of each remembered scene."""
-        each = replayed_rows(self.options, len(replay.buffers)) // len(replay.buffers)
-        if replay.choose_views is None:
-            return [buffer.draw(each, generator) for buffer in replay.buffers]
-        if self.step % CHOICE_STEPS == 0 or not self._replayed_views:
-            rate = one_cycle(self.options, self.step)
-            self._replayed_views = [
-                replay.choose_views(self.head, join(fresh), buffer, rate, generator)
-                for buffer in replay.buffers
-            ]
-        rows = []
-        for buffer, views in zip(replay.buffers, self._replayed_views, strict=True):
-            where = torch.nonzero(torch.isin(buffer.tensors["view"], views))[:, 0]
-            drawn = torch.randint(len(where), (each,), generator=generator)
-            rows.append(buffer.rows(where[drawn]))
-        return rows
-
-    def _backward(self, loss: Tensor, output: HeadOutput, rows: Rows, fresh: int) -> None:
-        """Leaves in `.grad` the gradients of `loss`, on `fresh` rows, and of replaying the rest."""
-        replay, progress = self.replay, self.step / self.options.iterations
-        if replay is not None and replay.combine is not None:
-            each = (len(rows.scene) - fresh) // len(replay.buffers)
-            slices = [slice(i, i + each) for i in range(fresh, len(rows.scene), each)]
-            old_costs = [replay.penalty(output.part(s), rows.part(s), progress) for s in slices]
-            self._join_gradients(loss, old_costs, replay)
+            optimiser.step()
+        if not before:
             return
-        if replay is not None:
-            old = slice(fresh, None)
-            cost_of_old = replay.penalty(output.part(old), rows.part(old), progress)
-            loss = loss + (len(replay.buffers) if replay.per_scene else 1) * cost_of_old
-        loss.backward()
-        every = [*self.head.parameters(), self.correction]
-        average(parameter.grad for parameter in every if parameter.grad is not None)
-
-    def _join_gradients(self, loss: Tensor, old: Sequence[Tensor], replay: Replay) -> None:
-        """Leaves in `.grad` what the rule makes of the gradients of new and remembered rows."""
-        assert replay.combine is not None
-        parameters = list(self.head.parameters())
-
-        def flat(cost: Tensor, more: Sequence[Tensor] = ()) -> tuple[Tensor, tuple[Tensor, ...]]:
-            found = torch.autograd.grad(
-                cost, [*parameters, *more], retain_graph=True, materialize_grads=True
+        with torch.no_grad():
+            found = torch.stack([loss.detach() for loss in losses]) if losses else torch.zeros(0)
+            average([found])
+            changes = {name: value - before[name] for name, value in named.items()}
+            gradients = {
+                k: torch.zeros_like(v) if v.grad is None else v.grad for k, v in named.items()
+            }
+            self.hooks.edit_step(
+                ProposedStep(changes, gradients, found, constraints, self.step, schedule)
             )
-            own, rest = found[: len(parameters)], found[len(parameters) :]
-            return torch.cat([part.flatten() for part in own]), rest
-
-        new, (correction,) = flat(loss, [self.correction])
-        memory = torch.stack([flat(cost)[0] for cost in old])
-        losses = torch.stack([cost.detach() for cost in old])
-        average([new, correction, memory, losses])  # before they join: rules are not linear
-        references = torch.full_like(losses, torch.nan)
-        if replay.references is not None:
-            references = replay.references
-        before = torch.full_like(losses, torch.nan) if self._losses is None else self._losses
-        joined = replay.combine(Gradients(new, memory, losses, references, before, self.step))
-        self._losses = losses
-        self.correction.grad = correction
-        start = 0
-        for parameter in parameters:
-            end = start + parameter.numel()
-            parameter.grad = joined[start:end].view_as(parameter)
-            start = end
+            for name, value in named.items():
+                value.copy_(before[name] + changes[name])
 
     def state(self) -> dict[str, Tensor]:
         """What `load` needs to go on from here, as named tensors."""
         state = {f"head.{k}": v for k, v in self.head.state_dict().items()}
         state["correction"] = self.correction.detach()
-        state |= {f"replayed_views.{i}": views for i, views in enumerate(self._replayed_views)}
-        if self._losses is not None:
-            state["losses"] = self._losses
+        state |= {f"hooks.{k}": v for k, v in self.hooks.state().items()}
         for which, optimiser in enumerate(self._optimisers):
             for i, slots in optimiser.state_dict()["state"].items():
                 state |= {f"optimiser.{which}.{i}.{name}": v for name, v in slots.items()}
         # Copies: training goes on while someone may be writing them.
         return {k: v.clone() for k, v in state.items()} | {"step": torch.tensor(self.step)}
 
-    def load(self, state: dict[str, Tensor]) -> None:
+    def load(self, state: Mapping[str, Tensor]) -> None:
         """Goes back to where `state()` was taken; the head must have the same shape."""
         self.step = int(state["step"])
-        head = {k.removeprefix("head."): v for k, v in state.items() if k.startswith("head.")}
-        self.head.load_state_dict(head)
+        self.head.load_state_dict(_under("head.", state))
         self.correction.data.copy_(state["correction"])
-        count = sum(key.startswith("replayed_views.") for key in state)
-        self._replayed_views = [state[f"replayed_views.{i}"] for i in range(count)]
-        self._losses = state.get("losses")
+        self.hooks.load(_under("hooks.", state))
         for which, optimiser in enumerate(self._optimisers):
             slots: dict[int, dict[str, Tensor]] = {}
-            prefix = f"optimiser.{which}."
-            for key, value in state.items():
-                if key.startswith(prefix):
-                    i, name = key.removeprefix(prefix).split(".")
-                    slots.setdefault(int(i), {})[name] = value
+            for key, value in _under(f"optimiser.{which}.", state).items():
+                i, name = key.split(".")
+                slots.setdefault(int(i), {})[name] = value
             groups = optimiser.state_dict()["param_groups"]
             optimiser.load_state_dict({"state": slots, "param_groups": groups})
 
 
-def replayed_rows(options: FitOptions, scenes: int) -> int:
-    """Rows that a step replays from all remembered scenes together, at least one of each.
+def _under(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors whose names begin with a prefix, without it."""
+    return {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
 
-    One or two scenes share `replay_batch` and each further one brings half as many, up to four
-    times the batch.
-    """
-    shares = min(max(2, scenes), 8)
-    return max(scenes, shares * options.replay_batch // 2)
+
+def _optimisers(
+    head: Head, correction: torch.nn.Parameter, options: FitOptions
+) -> list[torch.optim.Optimizer]:
+    """AdamW, and Muon for the hidden matrices where it has a rate."""
+    hidden, decay, plain = [], [], []
+    for name, parameter in head.named_parameters():
+        if name.startswith(("code", "logit")):
+            plain.append(parameter)
+        elif options.muon_rate > 0 and parameter.shape == (head.options.width,) * 2:
+            hidden.append(parameter)
+        else:
+            decay.append(parameter)
+    rate, weight_decay = options.peak_rate, options.weight_decay
+    groups = [
+        {"params": decay, "share": 1.0},
+        {"params": plain, "share": 1.0, "weight_decay": 0.0},
+        {"params": [correction], "share": options.intrinsics_rate, "weight_decay": 0.0},
+    ]
+    adamw = torch.optim.AdamW(groups, lr=rate, weight_decay=weight_decay, fused=True)
+    if not hidden:
+        return [adamw]
+    matrices = [{"params": hidden, "share": options.muon_rate / rate}]
+    return [adamw, torch.optim.Muon(matrices, weight_decay=weight_decay, ns_steps=MUON_STEPS)]
 
 
 def one_cycle(options: FitOptions, step: int) -> float:

@@ -1,86 +1,227 @@
-"""How the gradient of new rows joins those of remembered scenes, where they are not just added.
+"""Remembered scenes as constraints: no step may raise their losses.
 
-A rule takes flat gradients and gives the one that the optimiser sees. Their sum (plain replay) is
-no rule here: it is what one backward pass gives.
+The originals project the gradient and let plain SGD take the step. Here AdamW and Muon take it, and
+their momentum, scales and decay could oppose the memory although the gradient does not; so what is
+projected is the change of the weights after the optimisers, the step that is really taken. With
+g_t the gradient of scene t's loss, a change u alters that loss by <g_t, u> to first order.
 """
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from evercal.networks.gradients import Gradients
+from evercal.continual.methods.method import FinishedScene, StageStart
+from evercal.continual.methods.penalties import Reprojection
+from evercal.continual.methods.replay import Replay, ReplayHooks, by_scene
+from evercal.networks.buffer import Rows
+from evercal.networks.head import HeadOutput
+from evercal.networks.hooks import ProposedStep, TrainingHooks
+from evercal.networks.loss import LossOptions, reprojection_loss
+
+REFERENCE_ROWS = 8192
 
 
-def averaged_constraint(g: Gradients) -> Tensor:
-    """A-GEM (Chaudhry et al., ICLR 2019): new rows alone, but not against the mean of the memory.
+@dataclass(frozen=True)
+class ConstrainedStep(Replay):
+    """What GEM, A-GEM and GEC share: losses of remembered scenes that are not minimised."""
 
-    Where both disagree, the part of the new gradient against the memory's is taken out. Remembered
-    rows are never trained on.
+    clamp_px: float = 50.0
+    """Fixed soft clamp of remembered losses, pixels, so that losses of different times compare.
+    It must be wide: beyond it a row that is forgotten has no gradient left."""
+
+    def begin(self, start: StageStart) -> TrainingHooks:
+        """Constrained steps; nothing for the first scene."""
+        return ConstraintHooks(self, start) if start.memories else TrainingHooks()
+
+    def edit(
+        self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
+    ) -> Tensor:
+        """The change that is allowed.
+
+        Args:
+            changes: (p,) what the optimisers would change, all weights one after the other.
+            g: (t, p) gradients of the remembered scenes' losses.
+            proposed: the step.
+            references: (t,) the losses when the scenes were just learned; NaN where not kept.
+        """
+        raise NotImplementedError
+
+    def loss(self, output: HeadOutput, rows: Rows) -> Tensor:
+        """Mean loss of remembered rows at the fixed clamp."""
+        cost, _ = reprojection_loss(output.points, rows.target, self.clamp_px, LossOptions())
+        return cost.mean()
+
+
+class ConstraintHooks(ReplayHooks):
+    """Asks for the gradient of every remembered scene and lets the method edit the step."""
+
+    edits_steps = True
+
+    def __init__(self, method: ConstrainedStep, start: StageStart):
+        super().__init__(method, start)
+        self._rule = method
+        unknown = torch.tensor(torch.nan)
+        kept = [start.states[memory.scene].get("reference", unknown) for memory in self.memories]
+        self._references = torch.stack(kept)
+
+    def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
+        """Nothing: remembered rows are not trained on."""
+        return None
+
+    def constraints(self, output: HeadOutput, rows: Rows, progress: float) -> list[Tensor]:
+        """The loss of each remembered scene."""
+        return [self._rule.loss(o, r) for o, r in by_scene(output, rows, self.memories)]
+
+    def edit_step(self, proposed: ProposedStep) -> None:
+        """Projects the step."""
+        names = list(proposed.changes)
+        g = torch.stack([_flat(constraint, names) for constraint in proposed.constraints])
+        references = self._references.to(g)
+        allowed = self._rule.edit(_flat(proposed.changes, names), g, proposed, references)
+        start = 0
+        for name in names:
+            like = proposed.changes[name]
+            proposed.changes[name] = allowed[start : start + like.numel()].view_as(like)
+            start += like.numel()
+
+
+@dataclass(frozen=True)
+class AveragedGem(ConstrainedStep):
+    """A-GEM: the step may not raise the mean of the remembered losses."""
+
+    citation: ClassVar[str] = "Chaudhry et al., Efficient lifelong learning with A-GEM, ICLR 2019"
+
+    def edit(
+        self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
+    ) -> Tensor:
+        """Takes out of the change what raises the mean loss."""
+        mean = g.mean(0, keepdim=True)
+        return nearest_change(changes, mean, torch.zeros(1))
+
+
+@dataclass(frozen=True)
+class Gem(ConstrainedStep):
+    """GEM: the step may not raise the loss of any remembered scene.
+
+    The original adds a margin to the dual variables, in units of SGD's gradient; steps of AdamW and
+    Muon have no such unit, and there is none here.
     """
-    mean = g.memory.mean(0)
-    against = g.new @ mean
-    if against >= 0:
-        return g.new
-    return g.new - against / (mean @ mean).clamp(min=1e-12) * mean
+
+    citation: ClassVar[str] = "Lopez-Paz and Ranzato, Gradient episodic memory, NeurIPS 2017"
+
+    def edit(
+        self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
+    ) -> Tensor:
+        """The nearest change with <g_t, u> <= 0 for every scene."""
+        return nearest_change(changes, g, torch.zeros(len(g)))
 
 
-def gem(g: Gradients, margin: float = 0.5) -> Tensor:
-    """GEM (Lopez-Paz and Ranzato, NeurIPS 2017): no remembered scene's loss may rise.
+@dataclass(frozen=True)
+class EpisodicConstraint(ConstrainedStep):
+    """GEC, several constraints, with the references of its appendix.
 
-    The nearest gradient v with <v, g_t> >= 0 for every t; `margin` is added to the dual variables
-    as the original does, which favours the memory.
+    With h_t = loss_t - (1 + slack) reference_t, the original asks <v, g_t> >= alpha h_t of a
+    gradient v and steps by -eta v; so a step u has <g_t, u> <= -alpha eta h_t. A remembered scene
+    whose loss has risen by over 5 % since it was learned must get better by that share of what it
+    lost, others may get worse by so much. Both sides are changes of a loss, so nothing has to be
+    normalised. The first steps are plain replay. The original's look-ahead step before each g_t is
+    left out: with one network trained at a rate that changes all the time it has no natural size.
     """
-    if not len(g.memory) or bool((g.memory @ g.new >= 0).all()):
-        return g.new
-    weights = _dual(g.memory, g.memory @ g.new, torch.zeros(len(g.memory)))
-    return g.new + (weights + margin) @ g.memory
+
+    citation: ClassVar[str] = "Lai et al., GEC, NeurIPS 2025, several constraints"
+    alpha: float = 0.5
+    """Share of h_t that a step of unit length makes up for (no unit)."""
+    eta: float = 0.03
+    """The original's learning rate; here it is only the length that alpha is meant for."""
+    slack: float = 0.05
+    """Share by which a remembered loss may rise."""
+    warm_steps: int = 5
+    """Steps of plain replay at the start of a stage."""
+    moving: bool = False
+    """Compare with the losses of the step before, as the original's Algorithm 1 does; then no step
+    may raise a loss by over 5 %, and nothing stops many small ones."""
+
+    def begin(self, start: StageStart) -> TrainingHooks:
+        """Constrained steps after the warm-up."""
+        return _EpisodicHooks(self, start) if start.memories else TrainingHooks()
+
+    def edit(
+        self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
+    ) -> Tensor:
+        """The nearest change with <g_t, u> <= -alpha eta h_t for every scene."""
+        if proposed.step < self.warm_steps:
+            return changes
+        h = proposed.losses - (1 + self.slack) * references
+        # Warmed up and annealed like every other step: at the end nothing moves any more.
+        most = -self.alpha * self.eta * proposed.schedule * h
+        known = torch.isfinite(h)
+        return nearest_change(changes, g[known], most[known])
+
+    def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
+        """`reference`: the loss on remembered rows as they are replayed."""
+        buffer = scene.remembered()
+        rows = buffer.draw(REFERENCE_ROWS, torch.Generator().manual_seed(scene.number))
+        with torch.no_grad():
+            output = scene.head(rows.features.float(), scene.number, rows.descriptor)
+            return {"reference": self.loss(output, rows).cpu()}
 
 
-GEC_ALPHA = 0.5
-GEC_SLACK = 0.05
-GEC_WARM_STEPS = 5
+class _EpisodicHooks(ConstraintHooks):
+    def __init__(self, method: EpisodicConstraint, start: StageStart):
+        super().__init__(method, start)
+        self._steps, self._warm, self._moving = 0, method.warm_steps, method.moving
+        if method.moving:
+            self._references = torch.full_like(self._references, torch.nan)
+
+    def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
+        """Plain replay during the first steps, averaged over the scenes."""
+        if self._steps >= self._warm:
+            return None
+        return Reprojection()(output, None, rows, progress)
+
+    def edit_step(self, proposed: ProposedStep) -> None:
+        super().edit_step(proposed)
+        self._steps = proposed.step + 1
+        if self._moving:
+            self._references = proposed.losses
+
+    def state(self) -> dict[str, Tensor]:
+        return {"steps": torch.tensor(self._steps), "references": self._references}
+
+    def load(self, state: Mapping[str, Tensor]) -> None:
+        self._steps, self._references = int(state["steps"]), state["references"]
 
 
-def episodic_barrier(g: Gradients) -> Tensor:
-    """GEC (Lai et al., NeurIPS 2025), several constraints, references as in its appendix.
+def nearest_change(changes: Tensor, g: Tensor, most: Tensor) -> Tensor:
+    """The change u nearest to a given one with <g_t, u> <= most_t for every t.
 
-    With h_t = loss_t - 1.05 reference_t, the nearest gradient v to the new one with
-    <v, g_t> >= alpha h_t: a remembered scene whose loss has risen by over 5 % since it was learned
-    must get better, others may get worse by so much. The first 5 steps are plain replay. The
-    original's look-ahead step before each g_t is left out: with one network trained at a rate that
-    changes all the time it has no natural size.
+    u = changes - sum_t lambda_t g_t with lambda >= 0. The dual, min 1/2 l'Gl - l'b with G = g g'
+    and b = g changes - most, is a least-squares problem in the root of G.
+
+    Args:
+        changes: (p,).
+        g: (t, p).
+        most: (t,) allowed increase of each loss.
     """
-    if g.step < GEC_WARM_STEPS:
-        return g.new + g.memory.mean(0)
-    bound = GEC_ALPHA * (g.losses - (1 + GEC_SLACK) * g.references.nan_to_num(torch.inf))
-    active = torch.isfinite(bound)
-    if not bool(active.any()):
-        return g.new
-    memory, bound = g.memory[active], bound[active]
-    return g.new + _dual(memory, memory @ g.new, bound) @ memory
-
-
-def moving_barrier(g: Gradients) -> Tensor:
-    """The same with the references of the original's Algorithm 1: the losses of the step before.
-
-    Then no step may raise a remembered loss by over 5 %, and nothing stops many small ones.
-    """
-    return episodic_barrier(replace(g, references=g.before))
-
-
-def _dual(memory: Tensor, along: Tensor, bound: Tensor) -> Tensor:
-    """(t,) lambda >= 0 of min |v - g|^2 with M v >= bound; v = g + lambda M, along = M g.
-
-    The dual min 1/2 l'Gl - l'(bound - along) with G = M M' is a least-squares problem in G's root.
-    """
+    if not len(g):
+        return changes
+    over = (g @ changes - most.to(g)).double().cpu().numpy()
+    if (over <= 0).all():
+        return changes
     from scipy.optimize import nnls
 
-    gram = (memory @ memory.T).double().numpy()
+    gram = (g @ g.T).double().cpu().numpy()
     values, vectors = np.linalg.eigh(gram)
     # Parallel constraints make G singular; this little keeps their answer finite.
     root = np.sqrt(np.maximum(values, 0) + 1e-9 * max(values.max(), 1e-12))
-    wanted = (vectors / root).T @ (bound - along).double().numpy()
-    weights, _ = nnls((vectors * root).T, wanted)
-    return torch.from_numpy(weights).to(memory)
+    weights, _ = nnls((vectors * root).T, (vectors / root).T @ over)
+    return changes - torch.from_numpy(weights).to(g) @ g
+
+
+def _flat(named: Mapping[str, Tensor], names: Sequence[str]) -> Tensor:
+    """(p,) all tensors in the order of the names."""
+    return torch.cat([named[name].flatten() for name in names])

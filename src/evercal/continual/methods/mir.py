@@ -1,45 +1,96 @@
-"""Which remembered views a step on new rows is about to spoil (MIR)."""
+"""Maximally interfered retrieval: replay what a step on new rows is about to spoil."""
 
 import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from evercal.continual.methods.method import StageStart
+from evercal.continual.methods.replay import Replay, ReplayHooks
 from evercal.networks.buffer import FeatureBuffer, Rows
 from evercal.networks.head import Head
+from evercal.networks.hooks import TrainingHooks
 from evercal.networks.loss import fixed_clamp_loss
 
-CANDIDATES = 48
-CHOSEN = 8
-ROWS = 64
-"""Of a view that its loss is judged by."""
 
-
-def mir_views(
-    head: Head, fresh: Rows, buffer: FeatureBuffer, rate: float, generator: torch.Generator
-) -> Tensor:
-    """Maximally interfered retrieval (Aljundi et al., NeurIPS 2019).
+@dataclass(frozen=True)
+class MaximallyInterferedRetrieval(Replay):
+    """Views are replayed whose loss a virtual step on new rows raises most (Aljundi et al., 2019).
 
     A virtual step down the gradient of the new rows is taken; of some views drawn from memory,
     those are replayed whose loss it raises most.
+    """
+
+    citation: ClassVar[str] = "Aljundi et al., Maximally interfered retrieval, NeurIPS 2019"
+    candidates: int = 48
+    """Views of a scene that are looked at."""
+    chosen: int = 8
+    """Views of a scene that are replayed until the next choice."""
+    view_rows: int = 64
+    """Rows by which a view is judged."""
+    every_steps: int = 20
+    """How often views are chosen anew; the original chooses in every step."""
+
+    def begin(self, start: StageStart) -> TrainingHooks:
+        """Replay of chosen views; nothing for the first scene."""
+        return _MirHooks(self, start) if start.memories else TrainingHooks()
+
+
+class _MirHooks(ReplayHooks):
+    def __init__(self, method: MaximallyInterferedRetrieval, start: StageStart):
+        super().__init__(method, start)
+        self._rule, self._head, self._views = method, start.head, list[Tensor]()
+
+    def replayed(
+        self, fresh: Rows, step: int, rate: float, generator: torch.Generator
+    ) -> list[Rows]:
+        if step % self._rule.every_steps == 0 or not self._views:
+            self._views = [
+                interfered_views(self._rule, self._head, fresh, memory, rate, generator)
+                for memory in self.memories
+            ]
+        rows = []
+        for memory, views in zip(self.memories, self._views, strict=True):
+            where = torch.nonzero(torch.isin(memory.tensors["view"], views))[:, 0]
+            drawn = torch.randint(len(where), (self.each,), generator=generator)
+            rows.append(memory.rows(where[drawn]))
+        return rows
+
+    def state(self) -> dict[str, Tensor]:
+        return {f"views.{i}": views for i, views in enumerate(self._views)}
+
+    def load(self, state: Mapping[str, Tensor]) -> None:
+        self._views = [state[f"views.{i}"] for i in range(len(state))]
+
+
+def interfered_views(
+    method: MaximallyInterferedRetrieval,
+    head: Head,
+    fresh: Rows,
+    memory: FeatureBuffer,
+    rate: float,
+    generator: torch.Generator,
+) -> Tensor:
+    """(k,) numbers of the views that a step on new rows would spoil most.
 
     Args:
+        method: how many views and rows.
         head: as it is; not changed.
         fresh: new rows.
-        buffer: of a remembered scene.
+        memory: rows of a remembered scene.
         rate: of the virtual step, whose length is that of an optimiser with unit updates.
         generator: of the draws.
-
-    Returns:
-        (k,) numbers of views, at most 8.
     """
-    drawn = torch.randperm(buffer.views, generator=generator)[:CANDIDATES]
-    view = buffer.tensors["view"]
+    drawn = torch.randperm(memory.views, generator=generator)[: method.candidates]
+    view = memory.tensors["view"]
     starts = torch.searchsorted(view, drawn.to(view.dtype))
     ends = torch.searchsorted(view, drawn.to(view.dtype), right=True)
-    offsets = torch.rand(len(drawn), ROWS, generator=generator)
+    offsets = torch.rand(len(drawn), method.view_rows, generator=generator)
     index = (starts[:, None] + offsets * (ends - starts)[:, None]).long()
-    rows = buffer.rows(index.clamp(max=len(buffer) - 1).flatten())
+    rows = memory.rows(index.clamp(max=len(memory) - 1).flatten())
     moved = copy.deepcopy(head)
     before = _losses(head, rows, len(drawn))
     points = moved(fresh.features.float(), fresh.scene, fresh.descriptor).points
@@ -51,7 +102,7 @@ def mir_views(
             size = gradient.square().mean().sqrt().clamp(min=1e-12)
             parameter.sub_(rate * gradient / size)
     spoiled = _losses(moved, rows, len(drawn)) - before
-    return drawn[spoiled.topk(min(CHOSEN, len(drawn))).indices]
+    return drawn[spoiled.topk(min(method.chosen, len(drawn))).indices]
 
 
 @torch.no_grad()

@@ -1,6 +1,7 @@
-"""Penalties: what replaying remembered rows costs."""
+"""What replaying remembered rows costs: small frozen dataclasses, one a rule."""
 
-from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -10,79 +11,117 @@ from evercal.networks.buffer import Rows
 from evercal.networks.head import HeadOutput
 from evercal.networks.loss import LossOptions, clamp_px, fixed_clamp_loss, reprojection_loss
 
-Penalty = Callable[[HeadOutput, HeadOutput, Rows, float], Tensor]
-"""What replay costs: (student, frozen teacher, replayed rows, progress in [0, 1]) -> scalar."""
-
-REPLAY_CLAMP_PX = 5.0
-TEACHER_LIMIT_PX = 10.0
-OUTPUT_WEIGHT_PX_PER_M = 50.0
-REPLAY_WEIGHT = 0.5
-RELATED_ROWS = 512
-RELATION_TEMPERATURE = 0.2
+PX_PER_M = 50.0
+"""Weight of a distance in scene coordinates, pixels per metre: the parallax of a pixel at 3 m."""
 
 
-def spdd(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
-    """Replay of the paper: its three distillations (see `methods.spdd`), and no truth."""
-    return spdd_loss(student, teacher, SpddOptions()).total
+@dataclass(frozen=True)
+class Penalty:
+    """What a replayed row costs; a subclass says how."""
+
+    needs_teacher: ClassVar[bool] = True
+    """Whether the output of the head before the stage is needed, which costs a forward pass."""
+
+    def __call__(
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+    ) -> Tensor:
+        """Cost of replayed rows, pixels.
+
+        Args:
+            student: what the head says.
+            teacher: what the head said before the stage; None unless `needs_teacher`.
+            rows: the replayed rows.
+            progress: share of the stage's steps done, in [0, 1].
+        """
+        raise NotImplementedError
 
 
-def reprojection(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
-    """Plain experience replay: remembered rows cost what new ones cost, the schedule included."""
-    options = LossOptions()
-    tau = clamp_px(options, progress)
-    cost, _ = reprojection_loss(student.points, rows.target, tau, options)
-    return cost.mean()
+@dataclass(frozen=True)
+class Reprojection(Penalty):
+    """Remembered rows cost what new ones cost, the schedule of the clamp included."""
+
+    needs_teacher: ClassVar[bool] = False
+
+    def __call__(
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+    ) -> Tensor:
+        """Mean reprojection loss."""
+        options = LossOptions()
+        tau = clamp_px(options, progress)
+        cost, _ = reprojection_loss(student.points, rows.target, tau, options)
+        return cost.mean()
 
 
-def old_output(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
-    """Replay of iCaRL for points: what new rows cost, and the distance to the old model's points.
+@dataclass(frozen=True)
+class OldOutput(Penalty):
+    """iCaRL for points: reprojection, and the L1 distance to the old model's points.
 
-    Distillation of class scores becomes L1 in metres, on remembered rows only: what the old model
-    says about rows of a new scene means nothing.
+    Distillation of class scores becomes a distance in metres, on remembered rows only: what the old
+    model says about rows of a new scene means nothing.
     """
-    drift = (student.points - teacher.points.detach()).abs().sum(-1).mean()
-    return reprojection(student, teacher, rows, progress) + OUTPUT_WEIGHT_PX_PER_M * drift
+
+    px_per_m: float = PX_PER_M
+    """Weight of the distance, pixels per metre."""
+
+    def __call__(
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+    ) -> Tensor:
+        """Mean of both."""
+        assert teacher is not None
+        drift = (student.points - teacher.points.detach()).abs().sum(-1).mean()
+        return Reprojection()(student, None, rows, progress) + self.px_per_m * drift
 
 
-def bounded_by_teacher(
-    student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float
-) -> Tensor:
-    """Replay of Buff-CS: half the truth, half the teacher where it is nearer to the truth.
+@dataclass(frozen=True)
+class BoundedByTeacher(Penalty):
+    """Buff-CS: half the truth, half the teacher where the teacher is nearer to the truth.
 
     The teacher is the model before the stage, where the original stores its outputs when a frame
     enters the buffer.
     """
-    _, error = fixed_clamp_loss(student.points, rows.target)
-    _, bound = fixed_clamp_loss(teacher.points, rows.target)
-    drift = (student.points - teacher.points.detach()).abs().sum(-1)
-    pulled = torch.where(error > bound, drift, torch.zeros_like(drift)).mean()
-    truth = reprojection(student, teacher, rows, progress)
-    return 0.5 * truth + 0.5 * OUTPUT_WEIGHT_PX_PER_M * pulled
+
+    px_per_m: float = PX_PER_M
+    """Weight of the distance to the teacher's points, pixels per metre."""
+
+    def __call__(
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+    ) -> Tensor:
+        """Mean of both halves."""
+        assert teacher is not None
+        _, error = fixed_clamp_loss(student.points, rows.target)
+        _, bound = fixed_clamp_loss(teacher.points, rows.target)
+        drift = (student.points - teacher.points.detach()).abs().sum(-1)
+        pulled = torch.where(error > bound, drift, torch.zeros_like(drift)).mean()
+        truth = Reprojection()(student, None, rows, progress)
+        return 0.5 * truth + 0.5 * self.px_per_m * pulled
 
 
-def fixed_clamp_reprojection(
-    student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float
-) -> Tensor:
-    """Reprojection with a fixed clamp, for rules that compare losses of different times."""
-    cost, _ = fixed_clamp_loss(student.points, rows.target)
-    return cost.mean()
-
-
-def stored_output(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
-    """Replay of DER++ for points: half the truth, half what was said when the scene was learned.
+@dataclass(frozen=True)
+class StoredOutput(Penalty):
+    """DER++ for points: half the truth, half what was said when the scene was learned.
 
     The stored points belong to remembered frames as they are; augmented views have the truth alone.
     """
-    assert rows.stored is not None, "strategies with this penalty note their points"
-    kept = ~rows.stored[:, 0].isnan()
-    drift = (student.points[kept] - rows.stored[kept]).abs().sum(-1)
-    held = drift.sum() / max(len(drift), 1)
-    truth = reprojection(student, teacher, rows, progress)
-    return 0.5 * truth + 0.5 * OUTPUT_WEIGHT_PX_PER_M * held
+
+    needs_teacher: ClassVar[bool] = False
+    px_per_m: float = PX_PER_M
+    """Weight of the distance to the stored points, pixels per metre."""
+
+    def __call__(
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+    ) -> Tensor:
+        """Mean of both halves."""
+        assert rows.stored is not None, "the method stores points when a scene is finished"
+        kept = ~rows.stored[:, 0].isnan()
+        drift = (student.points[kept] - rows.stored[kept]).abs().sum(-1)
+        held = drift.sum() / max(len(drift), 1)
+        truth = Reprojection()(student, None, rows, progress)
+        return 0.5 * truth + 0.5 * self.px_per_m * held
 
 
-def relations(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float) -> Tensor:
-    """Replay of Co2L for points: the truth, and how alike rows are to one another.
+@dataclass(frozen=True)
+class Relations(Penalty):
+    """Co2L for points: the truth, and how alike rows are to one another.
 
     The instance-wise relation distillation of Cha et al. (ICCV 2021): the Kullback-Leibler
     divergence between softmaxed similarities of the old model's features and of the new one's, at
@@ -90,31 +129,77 @@ def relations(student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: fl
     counterpart.
     """
 
-    def similarity(hidden: Tensor) -> Tensor:
-        unit = torch.nn.functional.normalize(hidden[:RELATED_ROWS], dim=-1)
-        others = ~torch.eye(len(unit), dtype=torch.bool)
-        logits = (unit @ unit.T / RELATION_TEMPERATURE)[others].view(len(unit), -1)
-        return logits.log_softmax(-1)
+    related_rows: int = 512
+    """Rows that are compared with one another, spread over all remembered scenes."""
+    temperature: float = 0.2
+    """Of the softmax over cosines (no unit)."""
 
-    old, new = similarity(teacher.hidden.detach()), similarity(student.hidden)
-    moved = (old.exp() * (old - new)).sum(-1).mean()
-    return reprojection(student, teacher, rows, progress) + moved
+    def __call__(
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+    ) -> Tensor:
+        """Mean reprojection loss and the divergence, nats."""
+        assert teacher is not None
+        # Rows come scene by scene; the first ones alone would all be of the oldest scene.
+        count = len(student.hidden)
+        chosen = torch.linspace(0, count - 1, min(count, self.related_rows)).round().long()
+
+        def similarity(hidden: Tensor) -> Tensor:
+            unit = torch.nn.functional.normalize(hidden[chosen.to(hidden.device)], dim=-1)
+            others = ~torch.eye(len(unit), dtype=torch.bool, device=unit.device)
+            logits = (unit @ unit.T / self.temperature)[others].view(len(unit), -1)
+            return logits.log_softmax(-1)
+
+        old, new = similarity(teacher.hidden.detach()), similarity(student.hidden)
+        moved = (old.exp() * (old - new)).sum(-1).mean()
+        return Reprojection()(student, None, rows, progress) + moved
 
 
-def anchored_reprojection(
-    student: HeadOutput, teacher: HeadOutput, rows: Rows, progress: float
-) -> Tensor:
-    """Replay of `evercal`: geometric truth, and the teacher's points where they were right.
+@dataclass(frozen=True)
+class AnchoredReprojection(Penalty):
+    """Geometric truth, and the teacher's points where they were right.
 
     Reprojection against the known poses with a tight, fixed clamp corrects itself, so errors do not
-    pile up from stage to stage. The L1 distance to the teacher's point (weight 50 px per metre,
-    about the parallax of a pixel at 3 m) holds the depth, which a single reprojection does not
-    see; it counts only where the teacher reprojects within 10 px (after Buff-CS's teacher-bounded
-    regression, Wang et al., ICCV 2021).
+    pile up from stage to stage. The L1 distance to the teacher's point holds the depth, which a
+    single reprojection does not see; it counts only where the teacher was right (after Buff-CS's
+    teacher-bounded regression, Wang et al., ICCV 2021).
     """
-    options = LossOptions()
-    cost, _ = reprojection_loss(student.points, rows.target, REPLAY_CLAMP_PX, options)
-    _, error = reprojection_loss(teacher.points, rows.target, REPLAY_CLAMP_PX, options)
-    drift = (student.points - teacher.points.detach()).abs().sum(-1)
-    held = torch.where(error < TEACHER_LIMIT_PX, drift, torch.zeros_like(drift))
-    return REPLAY_WEIGHT * (cost.mean() + OUTPUT_WEIGHT_PX_PER_M * held.mean())
+
+    clamp_px: float = 5.0
+    """Soft clamp of the reprojection error, pixels."""
+    px_per_m: float = PX_PER_M
+    """Weight of the distance to the teacher's points, pixels per metre."""
+    teacher_limit_px: float = 10.0
+    """The teacher is right where it reprojects within so many pixels."""
+
+    def __call__(
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+    ) -> Tensor:
+        """Mean of both."""
+        assert teacher is not None
+        options = LossOptions()
+        cost, _ = reprojection_loss(student.points, rows.target, self.clamp_px, options)
+        _, error = reprojection_loss(teacher.points, rows.target, self.clamp_px, options)
+        drift = (student.points - teacher.points.detach()).abs().sum(-1)
+        held = torch.where(error < self.teacher_limit_px, drift, torch.zeros_like(drift))
+        return cost.mean() + self.px_per_m * held.mean()
+
+
+@dataclass(frozen=True)
+class Distillation(Penalty):
+    """SPDD, the whole replay cost of the paper (Algorithm 2): no truth, the teacher alone.
+
+    Its terms are in nats and metres. The paper adds them up as they are; `scale` says how many
+    pixels of the loss on new rows one of them is worth.
+    """
+
+    options: SpddOptions = field(default_factory=SpddOptions)
+    """Weights of the three terms, temperature and active set."""
+    scale: float = 1.0
+    """Pixels per metre and per nat; 1 is the paper's."""
+
+    def __call__(
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+    ) -> Tensor:
+        """The weighted sum of the three terms."""
+        assert teacher is not None
+        return self.scale * spdd_loss(student, teacher, self.options).total

@@ -46,7 +46,7 @@ class SpddOptions:
     temperature: float = 2.0
     """Softmax temperature tau of the prior term (no unit)."""
     active_centres: int = 50
-    """Largest number M_a of active centres per row; never over half of the teacher's centres."""
+    """Largest number M_a of active centres per row; all that are alive in it where it has fewer."""
 
     def __post_init__(self) -> None:
         """Refuse settings that make no loss."""
@@ -73,8 +73,8 @@ class SpddTerms:
 def spdd_loss(student: CentreOutput, teacher: CentreOutput, options: SpddOptions) -> SpddTerms:
     """Return the distillation loss of `student` against `teacher` on the same rows.
 
-    The active set A of a row holds the teacher's M_a highest logits, with
-    ``M_a = max(1, min(options.active_centres, K_teacher // 2))``. The terms are
+    The active set A of a row holds the teacher's M_a highest logits among the centres that are
+    alive in it, or all of those where there are fewer. The terms are
 
     - prior: ``tau^2 KL(p_T || p_S)``. Teacher: ``p_T = softmax(z_T / tau)`` over A. Student:
       softmax over A and, if it has more centres than the teacher, over its new centres N too::
@@ -109,7 +109,7 @@ def spdd_loss(student: CentreOutput, teacher: CentreOutput, options: SpddOptions
     rows, old = teacher.logits.shape
     teacher_logits = teacher.logits.detach()
     masked = torch.isneginf(teacher_logits) | torch.isneginf(student.logits.detach()[:, :old])
-    count = max(1, min(options.active_centres, old // 2))
+    count = min(options.active_centres, old)
     best = teacher_logits.masked_fill(masked, -torch.inf).topk(count, dim=1)
     dead = torch.isneginf(best.values)
 

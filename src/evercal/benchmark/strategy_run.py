@@ -1,0 +1,218 @@
+"""One strategy with one seed over a sequence of scenes, going on where it was interrupted."""
+
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from evercal.benchmark.results import SceneResult, scene_result
+from evercal.benchmark.scene_views import keep_views
+from evercal.continual.finish_scene import Learned, finished_stage
+from evercal.continual.learn_jointly import learn_jointly
+from evercal.continual.learn_scene import (
+    LearnOptions,
+    OnEvent,
+    learn_scene,
+    open_or_create,
+    validation_split,
+)
+from evercal.continual.stage import Stage, StageOptions
+from evercal.continual.stage_rows import encoded, scene_buffer, view_plan
+from evercal.continual.strategies import STRATEGIES, Strategy
+from evercal.datasets import Frame, Scene, known_poses
+from evercal.evaluation.protocol import evaluate
+from evercal.features.feature_cache import cache_features
+from evercal.localization.acceptance import fitted_record
+from evercal.localization.localizer import Localizer
+from evercal.mapping.atlas import combined_centres
+from evercal.mapping.build import finished
+from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.selection import covering_radius, smallest_pair
+from evercal.mapping.stage_files import head_bytes
+from evercal.mapping.store import Store
+from evercal.networks.buffer import FeatureBuffer
+from evercal.storage import MANIFEST
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a run is done."""
+
+    stage: StageOptions
+    """How a scene is learned; its seed is the run's."""
+    short_side: int
+    """Working size of images, pixels."""
+    features: Path
+    """Folder of encoded views, shared by all runs."""
+    out: Path
+    """Folder of results; stores under way are in its folder `runs`."""
+
+
+def run_strategy(
+    strategy: Strategy, scenes: Sequence[Scene], options: RunOptions, on_event: OnEvent | None
+) -> Iterator[tuple[int, tuple[SceneResult, ...]]]:
+    """Learns the scenes in turn and judges all that are known after each.
+
+    Args:
+        strategy: what is learned.
+        scenes: in order of learning.
+        options: how.
+        on_event: called with everything that happens while a scene is learned.
+
+    Yields:
+        (number, results) of the stages that were not done before, a result for each scene known;
+        no results for the stages before the last of joint training.
+    """
+    run = _Run(strategy, scenes, options, on_event)
+    return run.jointly() if strategy.jointly else run.stages()
+
+
+class _Run:
+    def __init__(
+        self,
+        strategy: Strategy,
+        scenes: Sequence[Scene],
+        options: RunOptions,
+        on_event: OnEvent | None,
+    ):
+        self.strategy, self.scenes, self.on_event = strategy, scenes, on_event
+        self.options, self.stage = options, _with_centres(options.stage, scenes)
+        self.store = options.out / "runs" / f"{strategy.name}-{options.stage.seed}"
+
+    def stages(self) -> Iterator[tuple[int, tuple[SceneResult, ...]]]:
+        """See `run_strategy`."""
+        self._begin()
+        for number in range(len(Store.open(self.store).stages) - 1, len(self.scenes)):
+            if number >= len(Store.open(self.store).stages):
+                learn_scene(self.store, self.scenes[number], self._how(), self.on_event)
+            opened = Store.open(self.store)
+            self._cached(opened.maps)
+            seconds = float(opened.report()["seconds"])
+            yield number, self._judge(opened.maps, number, seconds)
+        shutil.rmtree(self.store)
+
+    def _how(self, strategy: Strategy | None = None) -> LearnOptions:
+        return LearnOptions(
+            self.stage,
+            strategy or self.strategy,
+            short_side=self.options.short_side,
+            cache=self.options.features,
+        )
+
+    def _begin(self) -> None:
+        """The first scene, learned once for all strategies that learn it alike.
+
+        What differs between them, the frames that stay, is chosen by each from the same head.
+        """
+        if (self.store / MANIFEST).exists():
+            return
+        shutil.rmtree(self.store, ignore_errors=True)  # left by a commit that was killed
+        scene, method = self.scenes[0], self.strategy.method
+        if method is None or not method.first_scene_alike:
+            learn_scene(self.store, scene, self._how(), self.on_event)
+            return
+        shared = self.store.with_name(f"first-{scene.name}-{self.stage.seed}")
+        if not (shared / MANIFEST).exists():
+            learn_scene(shared, scene, self._how(STRATEGIES["finetune"]), self.on_event)
+        first = Store.open(shared)
+        began = time.perf_counter()
+        maps = first.maps.copy_for_training()
+        maps.strategy, maps.keyframes, maps.method_states = self.strategy.name, [], []
+        self._cached(maps)
+        train, aside = validation_split(scene.train)
+        learned = Learned(train, self._rows(maps, train))
+        stage = finished(finished_stage(maps, self.strategy, learned, self.stage))
+        if self.strategy.builds_map:  # another threshold than the network's alone
+            maps.scenes[0] = fitted_record(maps, aside, 0)
+        report = first.report()
+        report["seconds"] = float(report["seconds"]) + time.perf_counter() - began
+        report["frames_kept"] = stage.frames_kept
+        open_or_create(self.store, self._how()).commit(maps, report)
+
+    def _rows(self, maps: SceneMaps, train: Sequence[Frame]) -> Callable[[], FeatureBuffer]:
+        """Rows of the first scene as it was trained on, encoded when they are first asked for."""
+
+        @cache
+        def rows() -> FeatureBuffer:
+            buffer = scene_buffer(0, maps.scenes[0].cell, train)
+            finished(encoded(buffer, train, view_plan(self.stage, maps.short_side), maps))
+            return buffer
+
+        return rows
+
+    def _cached(self, maps: SceneMaps) -> None:
+        cache_features(maps.encoder, self.options.features)  # pyright: ignore[reportArgumentType]
+
+    def jointly(self) -> Iterator[tuple[int, tuple[SceneResult, ...]]]:
+        """See `run_strategy`; a killed run begins anew."""
+        shutil.rmtree(self.store, ignore_errors=True)
+        maps = open_or_create(self.store, self._how()).maps
+        self._cached(maps)
+        split = [validation_split(scene.train) for scene in self.scenes]
+        train_splits = [replace(s, train=t) for s, (t, _) in zip(self.scenes, split, strict=True)]
+        began = time.perf_counter()
+        for event in learn_jointly(maps, self.strategy, train_splits, self.stage):
+            if isinstance(event, Stage):
+                maps = event.maps
+            elif self.on_event is not None:
+                self.on_event(event)
+        for number, (_, aside) in enumerate(split):
+            maps.scenes[number] = fitted_record(maps, aside, number)
+        seconds = time.perf_counter() - began
+        last = len(self.scenes) - 1
+        for number in range(last):
+            yield number, ()
+        yield last, self._judge(maps, last, seconds)
+        shutil.rmtree(self.store)
+
+    def _judge(self, maps: SceneMaps, number: int, seconds: float) -> tuple[SceneResult, ...]:
+        learned = {scene.name: scene for scene in self.scenes[: number + 1]}
+        localizer = Localizer(maps)
+        found = evaluate(localizer, learned)
+        if number == len(self.scenes) - 1:
+            keep_views(self.options.out, self.strategy.name, localizer, self.scenes)
+        size, keyframes = sum(head_bytes(head) for head in maps.heads), maps.keyframes[number]
+        return tuple(
+            scene_result(
+                [r for r in found if r.scene == name],
+                strategy=self.strategy.name,
+                seed=self.stage.seed,
+                stage=number,
+                seconds=seconds,
+                memory_bytes=maps.memory_bytes,
+                head_bytes=size,
+                frames_kept=len(keyframes.images) if keyframes else 0,
+                **(_spread(maps, number, self.scenes) if name == self.scenes[number].name else {}),
+            )
+            for name in learned
+        )
+
+
+def _with_centres(stage: StageOptions, scenes: Sequence[Scene]) -> StageOptions:
+    """The options with the centres of all scenes, where they are to be known in advance."""
+    if stage.head.centres != "fixed" or stage.fixed_centres_m:
+        return stage
+    places = [known_poses(validation_split(scene.train)[0]).translation_m for scene in scenes]
+    found = combined_centres(places, stage.head.centres_per_scene, stage.seed)
+    return replace(stage, grid_scenes=len(scenes), fixed_centres_m=found)
+
+
+def _spread(maps: SceneMaps, number: int, scenes: Sequence[Scene]) -> dict[str, object]:
+    """How the frames kept of a stage's scene lie among those learned."""
+    keyframes = maps.keyframes[number]
+    if keyframes is None or not keyframes.images:
+        return {}
+    train, _ = validation_split(scenes[number].train)
+    poses = known_poses(train)
+    stood = keyframes.base_from_camera.translation_m
+    gaps = np.linalg.norm(poses.translation_m[:, None] - stood[None], axis=-1)
+    places = poses.translation_m, poses.rotation_wxyz, gaps.argmin(0)
+    return {
+        "keyframe_positions_m": tuple(tuple(round(float(v), 4) for v in row) for row in stood),
+        "covering_radius": covering_radius(*places),
+        "min_spacing": smallest_pair(*places),
+    }

@@ -1,0 +1,63 @@
+"""All frames of all scenes at once: the reference for methods that see them one by one."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+from evercal.continual.finish_scene import Learned, finished_stage
+from evercal.continual.learn import refined_camera
+from evercal.continual.methods.method import Method
+from evercal.continual.stage import Event, Stage, StageOptions
+from evercal.continual.stage_head import head_for_all, whiten
+from evercal.continual.stage_rows import encoded, scene_buffer, view_plan
+from evercal.continual.strategies import Strategy
+from evercal.datasets.frame import Scene, known_poses
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord, prototypes
+from evercal.networks.trainer import HeadTrainer
+
+
+def learn_jointly(
+    maps: SceneMaps, strategy: Strategy, scenes: Sequence[Scene], options: StageOptions
+) -> Iterator[Event]:
+    """Trains one head on several scenes, with the steps and the rows of as many stages.
+
+    A step has as many rows as one that learns a scene and replays others.
+
+    Args:
+        maps: without scenes; not changed.
+        strategy: whether a map is built, too; its method adds nothing.
+        scenes: their training frames are learned.
+        options: of one stage.
+
+    Yields:
+        `Encoding` and `Progress` as it goes, a `Stage` of all scenes at the end.
+    """
+    after = maps.copy_for_training()
+    plan = view_plan(options, maps.short_side)
+    cells, places, buffers = [], [], []
+    atlas = after.atlas(options.grid_scenes)
+    for number, scene in enumerate(scenes):
+        positions = known_poses(scene.train).translation_m
+        cells.append(atlas.place(positions))
+        places.append(cells[-1].atlas_from_base.apply(positions))
+        buffers.append(scene_buffer(number, cells[-1], scene.train))
+        yield from encoded(buffers[-1], scene.train, plan, maps)
+    head = head_for_all(after, options, places)
+    whiten(head, buffers, options.seed)
+    fit = options.fit
+    rows = fit.batch + (fit.replay_batch if len(scenes) > 1 else 0)
+    whole = replace(fit, iterations=fit.iterations * len(scenes), batch=rows)
+    trainer = HeadTrainer(head, buffers, whole, options.seed)
+    yield from trainer.run()
+    kept = 0
+    for number, scene in enumerate(scenes):
+        frames, camera = scene.train, scene.train[0].camera
+        refined = refined_camera(trainer, number, camera)
+        seen = prototypes(buffers[number].tensors["descriptors"][: len(frames)])
+        after.scenes.append(
+            SceneRecord(scene.name, camera, cells[number], seen, len(frames), refined)
+        )
+        done = Learned(frames, lambda number=number: buffers[number])
+        alone = replace(strategy, method=Method())
+        stage = yield from finished_stage(after, alone, done, options)
+        kept = stage.frames_kept
+    yield Stage(after, whole.iterations, kept)

@@ -1,0 +1,121 @@
+"""Experience replay: rows of remembered keyframes join every step and cost something.
+
+Most methods here differ in nothing but which frames stay and what replaying them costs; those two
+are fields.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from evercal.continual.frame_statistics import FrameStatistics
+from evercal.continual.methods.method import FinishedScene, Method, StageStart
+from evercal.continual.methods.penalties import Penalty, Reprojection, StoredOutput
+from evercal.continual.selectors import SELECTORS
+from evercal.features.precision import autocast
+from evercal.networks.buffer import FeatureBuffer, Rows
+from evercal.networks.head import Head, HeadOutput
+from evercal.networks.hooks import TrainingHooks
+
+
+@dataclass(frozen=True)
+class Replay(Method):
+    """Replays keyframes (Chaudhry et al., On tiny episodic memories, 2019)."""
+
+    citation: ClassVar[str] = "Vitter 1985; Chaudhry et al., On tiny episodic memories, 2019"
+    replays: ClassVar[bool] = True
+    selector: str = "reservoir"
+    """Which frames stay: a key of SELECTORS."""
+    penalty: Penalty = field(default_factory=Reprojection)
+    """What a replayed row costs."""
+    weight: float = 1.0
+    """What the penalty of each remembered scene is multiplied by."""
+    every_scene: bool = True
+    """Whether each remembered scene costs that much; False: all of them together."""
+
+    def select(self, frames: FrameStatistics, capacity: int) -> np.ndarray | None:
+        """As the selector says."""
+        return SELECTORS[self.selector](frames, capacity)
+
+    def begin(self, start: StageStart) -> TrainingHooks:
+        """Replay from the stage's memories; nothing for the first scene."""
+        return ReplayHooks(self, start) if start.memories else TrainingHooks()
+
+
+class ReplayHooks(TrainingHooks):
+    """Draws the same number of rows of each remembered scene, and adds their penalty.
+
+    Args:
+        method: what is replayed and at what cost.
+        start: of the stage; it must have memories.
+    """
+
+    def __init__(self, method: Replay, start: StageStart):
+        self.method, self.memories = method, start.memories
+        self.each = rows_each(start)
+        self._teacher = start.teacher if method.penalty.needs_teacher else None
+
+    def replayed(
+        self, fresh: Rows, step: int, rate: float, generator: torch.Generator
+    ) -> list[Rows]:
+        """As many rows of each remembered scene."""
+        return [memory.draw(self.each, generator) for memory in self.memories]
+
+    def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
+        """The weighted penalty."""
+        teacher = None if self._teacher is None else teacher_output(self._teacher, rows)
+        scenes = len(self.memories) if self.method.every_scene else 1
+        penalty = self.method.penalty(output, teacher, rows, progress)
+        return scenes * self.method.weight * penalty
+
+
+def rows_each(start: StageStart) -> int:
+    """Rows that a step replays of each remembered scene, at least one."""
+    return max(1, start.replay_rows // len(start.memories))
+
+
+def teacher_output(teacher: Head, rows: Rows) -> HeadOutput:
+    """What a frozen head says about rows."""
+    with torch.no_grad(), autocast():
+        return teacher(rows.features.float(), rows.scene, rows.descriptor)
+
+
+def by_scene(
+    output: HeadOutput, rows: Rows, memories: Sequence[FeatureBuffer]
+) -> list[tuple[HeadOutput, Rows]]:
+    """The replayed rows of each remembered scene, which come one scene after the other."""
+    each = len(rows.scene) // len(memories)
+    slices = [slice(i * each, (i + 1) * each) for i in range(len(memories))]
+    return [(output.part(where), rows.part(where)) for where in slices]
+
+
+@dataclass(frozen=True)
+class DarkExperienceReplay(Replay):
+    """DER++ for points (Buzzega et al., NeurIPS 2020): keeps what was said about kept frames."""
+
+    citation: ClassVar[str] = "Buzzega et al., Dark experience (DER++), NeurIPS 2020"
+    penalty: Penalty = field(default_factory=StoredOutput)
+
+    def begin(self, start: StageStart) -> TrainingHooks:
+        """Replay with the stored points beside the rows of plain views."""
+        for memory in start.memories:
+            state = start.states[memory.scene]
+            memory.stored = state["points"].float() + state["origin"]
+        return super().begin(start)
+
+    def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
+        """`points` (m, 3) half and `origin` (3,): what the head says now about plain views.
+
+        Half floats are fine enough near the origin, the mean of the points.
+        """
+        buffer = scene.remembered()
+        plain = int((buffer.tensors["view"] < scene.keyframes).sum())
+        rows = buffer.rows(torch.arange(plain))
+        with torch.no_grad():
+            points = scene.head(rows.features.float(), scene.number, rows.descriptor).points
+        origin = points.mean(0)
+        return {"points": (points - origin).half().cpu(), "origin": origin.cpu()}

@@ -1,0 +1,98 @@
+"""The head that a stage trains: a new one, the last one grown by a scene, or a copy of it."""
+
+from collections.abc import Sequence
+from itertools import islice
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from evercal.continual.stage import StageOptions
+from evercal.mapping.atlas import camera_clusters, spiral
+from evercal.mapping.scene_maps import SceneMaps
+from evercal.networks.buffer import FeatureBuffer
+from evercal.networks.head import Head
+
+WHITENING_ROWS = 20_000
+
+
+def head_for_scene(
+    maps: SceneMaps, own: bool, options: StageOptions, positions_m: np.ndarray
+) -> tuple[Head, int]:
+    """The head to train, which is put in its place among those of `maps`.
+
+    Args:
+        maps: with the heads of earlier scenes; changed.
+        own: whether every scene has a head of its own; it starts from the last one's weights.
+        options: of the stage.
+        positions_m: (n, 3) camera positions of the scene in the atlas.
+
+    Returns:
+        The head, grown by this scene, and the scene's index in it.
+    """
+    if not maps.heads:
+        head = fresh_head(maps, options)
+    elif own:
+        head = _without_scenes(maps.heads[-1])
+    else:
+        head = maps.heads.pop()
+    local = head.scenes
+    head.grow(_new_centres(head, options, positions_m), options.seed + len(maps.scenes))
+    maps.heads.append(head)
+    return head, local
+
+
+def head_for_all(maps: SceneMaps, options: StageOptions, positions_m: Sequence[np.ndarray]) -> Head:
+    """A new head with room for several scenes, from the camera positions of each in the atlas."""
+    head = fresh_head(maps, options)
+    for number, places in enumerate(positions_m):
+        head.grow(_new_centres(head, options, places), options.seed + number)
+    maps.heads = [head]
+    return head
+
+
+def fresh_head(maps: SceneMaps, options: StageOptions) -> Head:
+    """A head that knows no scene."""
+    torch.manual_seed(options.seed)
+    return Head(maps.encoder.width, maps.descriptor.width, options.head)
+
+
+def whiten(head: Head, buffers: Sequence[FeatureBuffer], seed: int) -> None:
+    """Fits the whitening of a new head's inputs to rows of all buffers, where it has any."""
+    if not head.options.whiten:
+        return
+    generator = torch.Generator().manual_seed(seed)
+    drawn = [buffer.draw(WHITENING_ROWS // len(buffers), generator) for buffer in buffers]
+    head.whiten(torch.cat([rows.features for rows in drawn]))
+
+
+def _without_scenes(head: Head) -> Head:
+    """A copy with the shared weights alone; centres that belong to no scene stay."""
+    copy = Head(head.features, head.descriptor, head.options)
+    state = head.state_dict()
+    owned = {"code"}
+    if head.options.centres == "grow":
+        owned |= {"logit", "logit_bias", "centres", "centre_scene"}
+        owned |= {"offset", "offset_bias"} if head.options.offsets == "per_centre" else set()
+    for name, value in state.items():
+        if name in owned:
+            continue
+        place, _, last = name.rpartition(".")
+        module = copy.get_submodule(place)
+        if last in dict(module.named_parameters(recurse=False)):
+            setattr(module, last, nn.Parameter(value.clone()))
+        else:
+            module.register_buffer(last, value.clone())
+    return copy
+
+
+def _new_centres(head: Head, options: StageOptions, positions_m: np.ndarray) -> Tensor:
+    """(k, 3) centres that the scene adds, from its camera positions (n, 3) in the atlas."""
+    kind, count = head.options.centres, head.options.centres_per_scene
+    if kind == "grow":
+        return torch.from_numpy(camera_clusters(positions_m, count, options.seed)).float()
+    if len(head.centres):
+        return torch.zeros(0, 3)
+    if kind == "fixed":
+        return torch.tensor(options.fixed_centres_m).reshape(-1, 3)
+    return torch.tensor(np.stack(list(islice(spiral(), count)))).float()
