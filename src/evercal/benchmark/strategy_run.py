@@ -28,14 +28,20 @@ from evercal.evaluation.protocol import evaluate
 from evercal.features.feature_cache import cache_features
 from evercal.localization.acceptance import fitted_record
 from evercal.localization.localizer import Localizer
+from evercal.localization.query import LocalizeOptions
 from evercal.mapping.atlas import combined_centres
 from evercal.mapping.build import finished
+from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.selection import covering_radius, smallest_pair
 from evercal.mapping.stage_files import head_bytes
 from evercal.mapping.store import Store
 from evercal.networks.buffer import FeatureBuffer
 from evercal.storage import MANIFEST
+
+NETWORK, UNALIGNED = ":network", ":unaligned"
+"""Added to a strategy's name where the same run is judged by its network alone, or by the first
+pose from matched keyframes, whose landmarks are not aligned."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +99,7 @@ class _Run:
             self._cached(opened.maps)
             seconds = float(opened.report()["seconds"])
             yield number, self._judge(opened.maps, number, seconds)
-        shutil.rmtree(self.store)
+        shutil.rmtree(self.store, ignore_errors=True)
 
     def _how(self, strategy: Strategy | None = None) -> LearnOptions:
         return LearnOptions(
@@ -167,29 +173,56 @@ class _Run:
         for number in range(last):
             yield number, ()
         yield last, self._judge(maps, last, seconds)
-        shutil.rmtree(self.store)
+        shutil.rmtree(self.store, ignore_errors=True)
 
     def _judge(self, maps: SceneMaps, number: int, seconds: float) -> tuple[SceneResult, ...]:
-        learned = {scene.name: scene for scene in self.scenes[: number + 1]}
-        localizer = Localizer(maps)
-        found = evaluate(localizer, learned)
+        """Results of all scenes known; of what answers alone, too, where several things answer."""
+        name, localizer = self.strategy.name, Localizer(maps)
+        found = self._results(name, localizer, number, seconds)
         if number == len(self.scenes) - 1:
-            keep_views(self.options.out, self.strategy.name, localizer, self.scenes)
+            keep_views(self.options.out, name, localizer, self.scenes)
+        if not self.strategy.builds_map:
+            return found
+        if self.strategy.method is None:
+            localizer = Localizer(maps, LocalizeOptions(align=False))
+            return found + self._results(name + UNALIGNED, localizer, number, seconds)
+        alone = _without_map(maps, self.strategy.method.replays)
+        for i, scene in enumerate(self.scenes[: number + 1]):
+            _, aside = validation_split(scene.train)
+            alone.scenes[i] = fitted_record(alone, aside, i)
+        return found + self._results(name + NETWORK, Localizer(alone), number, seconds)
+
+    def _results(
+        self, name: str, localizer: Localizer, number: int, seconds: float
+    ) -> tuple[SceneResult, ...]:
+        maps = localizer.maps
+        found = evaluate(localizer, {s.name: s for s in self.scenes[: number + 1]})
         size, keyframes = sum(head_bytes(head) for head in maps.heads), maps.keyframes[number]
+        newest = self.scenes[number].name
         return tuple(
             scene_result(
-                [r for r in found if r.scene == name],
-                strategy=self.strategy.name,
+                [r for r in found if r.scene == scene.name],
+                strategy=name,
                 seed=self.stage.seed,
                 stage=number,
                 seconds=seconds,
                 memory_bytes=maps.memory_bytes,
                 head_bytes=size,
                 frames_kept=len(keyframes.images) if keyframes else 0,
-                **(_spread(maps, number, self.scenes) if name == self.scenes[number].name else {}),
+                **(_spread(maps, number, self.scenes) if scene.name == newest else {}),
             )
-            for name in learned
+            for scene in self.scenes[: number + 1]
         )
+
+
+def _without_map(maps: SceneMaps, replays: bool) -> SceneMaps:
+    """What the network of the same training knows; keyframes stay where it replays them."""
+    alone = maps.copy_for_training()
+    for i, keyframes in enumerate(alone.keyframes):
+        assert keyframes is not None, "a map has keyframes"
+        images = Keyframes(keyframes.images, keyframes.cameras, keyframes.base_from_camera)
+        alone.keyframes[i] = images if replays else None
+    return alone
 
 
 def _with_centres(stage: StageOptions, scenes: Sequence[Scene]) -> StageOptions:

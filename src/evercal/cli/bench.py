@@ -78,6 +78,7 @@ class Bench:
         seeds = _numbers(self.seeds)
         from evercal.benchmark.bench import BenchOptions
         from evercal.continual.plugin import load_plugin
+        from evercal.continual.presets import short_side
         from evercal.networks.distributed import join_processes, rank, wait_for_all
 
         if self.plugin is not None:
@@ -90,6 +91,7 @@ class Bench:
             self._strategies(),
             seeds,
             self.order,
+            short_side(self.preset),
             settings={
                 "suite": self.suite,
                 "poses": "sfm" if self.poses else "original",
@@ -149,13 +151,16 @@ class Bench:
     def _stage(self, seed: int) -> "StageOptions":
         from evercal.cli.learn import parse_memory
         from evercal.continual.memory_budget import with_memory
-        from evercal.continual.presets import on_paper_backbone, preset
+        from evercal.continual.presets import PAPER_SIM_STEPS, on_paper_backbone, preset
 
         parse_memory(self.memory)
         stage = with_memory(preset(self.preset, seed), self.memory)
-        if self.backbone == "paper":
+        if "paper" in (self.backbone, self.preset):
             stage = on_paper_backbone(stage)
-        steps = stage.fit.iterations if self.steps is None else self.steps
+        preset_steps = stage.fit.iterations
+        if self.preset == "paper" and self.suite.startswith("sim"):
+            preset_steps = PAPER_SIM_STEPS
+        steps = preset_steps if self.steps is None else self.steps
         if steps < 1:
             raise InputError(f"--steps {steps}: give a number >= 1")
         return dataclasses.replace(

@@ -119,7 +119,7 @@ class Learn:
 
     def _options(self) -> "LearnOptions":
         from evercal.continual.learn_scene import LearnOptions
-        from evercal.continual.presets import preset
+        from evercal.continual.presets import preset, short_side
         from evercal.continual.strategies import strategy_named
 
         if self.encoder is not None and not self.encoder.is_file():
@@ -139,7 +139,8 @@ class Learn:
             from evercal.calibration.calibration import read_transform
 
             rough = read_transform(self.gripper_from_camera)
-        return LearnOptions(stage, strategy, self.encoder, gripper_from_camera=rough)
+        side = short_side(self.preset)
+        return LearnOptions(stage, strategy, self.encoder, side, rough)
 
     def _strategy(self) -> str:
         """The strategy asked for, else the store's; refuses what a store cannot change later."""

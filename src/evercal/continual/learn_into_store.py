@@ -5,7 +5,7 @@ from pathlib import Path
 
 from evercal.continual.learn_scene import LearnOptions, LearnReport, OnEvent, learn_scene
 from evercal.continual.memory_budget import with_memory
-from evercal.continual.presets import PRESETS, Preset
+from evercal.continual.presets import PRESETS, Preset, short_side
 from evercal.continual.presets import preset as stage_options
 from evercal.continual.strategies import strategy_named
 from evercal.datasets import Scene, load_scene
@@ -47,7 +47,9 @@ def learn(
     stage = with_memory(stage_options(preset), memory)
     root = Path(store)
     recorded = scene if isinstance(scene, Scene) else load_scene(scene)
-    options = LearnOptions(stage, strategy_named(strategy or _made_with(root)))
+    options = LearnOptions(
+        stage, strategy_named(strategy or _made_with(root)), short_side=short_side(preset)
+    )
     return learn_scene(root, recorded, options, on_event)
 
 

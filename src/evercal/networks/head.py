@@ -43,7 +43,7 @@ class HeadOptions:
     """Where centres come from: each scene appends its own, all scenes at once in advance (the
     paper; needs the future), or the middles of the atlas cells."""
     centres_per_scene: int = 4
-    """Cluster centres that a scene adds."""
+    """Cluster centres that a scene adds; of all scenes together where they are `fixed`."""
     whiten: bool = True
     """Features are centred, scaled and half decorrelated before the first layer. Without it their
     few strong directions drown the many weak ones, which tell neighbouring points apart."""

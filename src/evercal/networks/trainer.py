@@ -30,7 +30,7 @@ class FitOptions:
     """Optimiser steps."""
     batch: int = 2048
     """Rows of the scenes being learned in a step."""
-    replay_batch: int = 2048
+    replay_batch: int = 1024
     """Replayed rows in a step, drawn evenly from all remembered scenes."""
     peak_rate: float = 4e-3
     """Peak of the one-cycle learning rate (cosine up and down) of AdamW."""
