@@ -1,4 +1,4 @@
-"""`python -m benchmarks real|speed|rooms|peers|gate ...`: makes what docs/results.md reports."""
+"""`python -m benchmarks real|speed|peers|gate ...`: makes what docs/results.md reports."""
 
 import os
 import sys
@@ -38,6 +38,40 @@ def speed(store: Path, image: Path, repeat: int = 50) -> None:
     from benchmarks.speed import run
 
     run(store, image, repeat)
+
+
+def trainer(widths: tuple[int, ...] = (256, 384), batch: int = 2048, repeat: int = 30) -> None:
+    """Times a training step beside its bare matrix products.
+
+    Args:
+        widths: of the head.
+        batch: rows of a step.
+        repeat: steps timed.
+    """
+    from benchmarks.trainer import run
+
+    run(widths, batch, repeat)
+
+
+def tune(
+    suite: tyro.conf.Positional[str],
+    file: Path,
+    data: Path | None = None,
+    scenes: int = 3,
+    out: Path = Path("runs/tune"),
+) -> None:
+    """Three trials of every method's setting on held-out training frames; goes on where it stopped.
+
+    Args:
+        suite: whose first scenes are learned.
+        file: the best rows are written here, for `evercal bench --rows`.
+        data: folder of the suite's recordings.
+        scenes: how many of its scenes.
+        out: where runs and results are kept.
+    """
+    from benchmarks.tuning import run
+
+    run(suite, data, scenes, out / suite, file)
 
 
 def rooms(
@@ -170,6 +204,8 @@ def main() -> int:
     verbs = {
         "real": real,
         "speed": speed,
+        "trainer": trainer,
+        "tune": tune,
         "rooms": rooms,
         "peers": peers,
         "gate": gate,
