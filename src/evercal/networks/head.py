@@ -11,9 +11,9 @@ offset in homogeneous form. Scenes may be told apart in two ways (`HeadOptions.c
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -114,6 +114,33 @@ class Head(nn.Module):
         self.register_buffer("feature_map", torch.eye(features))
         self.register_buffer("centres", torch.zeros(0, 3))
         self.register_buffer("centre_scene", torch.zeros(0, dtype=torch.long))
+
+    @classmethod
+    def from_state(
+        cls, features: int, descriptor: int, options: HeadOptions, state: Mapping[str, Tensor]
+    ) -> Self:
+        """A head with the weights of another one's `state_dict()`, half floats or single."""
+        head = cls(features, descriptor, options)
+        state = {name: v.float() if v.dtype == torch.half else v for name, v in state.items()}
+        # These grow with every scene; whatever their shape is in the state, it is theirs.
+        head.code = nn.Parameter(state["code"].clone())
+        head.logit = nn.Parameter(state["logit"].clone())
+        head.logit_bias = nn.Parameter(state["logit_bias"].clone())
+        head.offset = nn.Parameter(state["offset"].clone())
+        head.offset_bias = nn.Parameter(state["offset_bias"].clone())
+        head.centres, head.centre_scene = state["centres"].clone(), state["centre_scene"].clone()
+        head.load_state_dict(state)
+        return head
+
+    def without_scenes(self) -> "Head":
+        """A copy of what scenes share, which knows none; centres that belong to none stay."""
+        state = dict(self.state_dict())
+        state["code"] = state["code"][:0]
+        if self.options.centres == "grow":
+            owned = ["logit", "logit_bias", "centres", "centre_scene"]
+            owned += ["offset", "offset_bias"] if self.options.offsets == "per_centre" else []
+            state |= {name: state[name][:0] for name in owned}
+        return Head.from_state(self.features, self.descriptor, self.options, state)
 
     @property
     def layers(self) -> int:
