@@ -311,7 +311,8 @@ def _believed(localizer: Localizer, name: str, images: Sequence[np.ndarray]) -> 
     for image in images:
         height, width = image.shape[:2]
         fits = abs(own.width * height / (own.height * width) - 1) < 0.01
-        camera = None if fits else Camera(width, height, width, width, width / 2, height / 2)
+        middle = (width - 1) / 2, (height - 1) / 2
+        camera = None if fits else Camera(width, height, width, width, *middle)
         found.append(localizer.localize(image, camera))
     support = [estimate.support for estimate in found]
     return {
