@@ -162,6 +162,17 @@ def handeye(trials: int = 1000, thorough: bool = False) -> None:
     run(trials, thorough)
 
 
+def intervals(trials: int = 2000) -> None:
+    """Counts how often 95 % bounds of a paired difference hold the truth, before and now.
+
+    Args:
+        trials: of each setting.
+    """
+    from benchmarks.intervals import run
+
+    run(trials)
+
+
 def main() -> int:
     """Runs one benchmark; `--gate` is short for `gate`."""
     from evercal.errors import InputError
@@ -177,6 +188,7 @@ def main() -> int:
         "handeye": handeye,
         "calibration": calibration,
         "crowd": crowd,
+        "intervals": intervals,
     }
     try:
         code = tyro.extras.subcommand_cli_from_dict(verbs, args=args)

@@ -11,9 +11,8 @@ from evercal.benchmark.tables import Style, table
 from evercal.continual.strategies import STRATEGIES
 from evercal.errors import InputError
 from evercal.evaluation.metrics import COARSE, FINE, ContinualScores, continual_scores
-from evercal.evaluation.statistics import Interval, paired_difference
+from evercal.evaluation.statistics import Interval, frame_pieces, paired_difference
 
-BLOCK = 10
 BOUNDS = ((0.10, np.deg2rad(10)), COARSE, (0.02, np.deg2rad(2)), FINE)
 """Metres and radians under which accuracy is asked."""
 
@@ -151,7 +150,7 @@ def scene_rows(runs: Sequence[Run]) -> TableRows:
 def difference_rows(runs: Sequence[Run], reference: str) -> TableRows:
     """How much better `reference` ends than each other strategy, on the seeds that both ran.
 
-    Bounds are those of a paired bootstrap over runs and blocks of 10 frames.
+    Bounds are those of `evaluation.paired_difference` over whole runs of frames and over seeds.
     """
     grouped = by_strategy(runs)
     rows = [["difference in points", "mean", "95 % low", "95 % high"]]
@@ -166,7 +165,11 @@ def difference_rows(runs: Sequence[Run], reference: str) -> TableRows:
 
 
 def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
-    """Final accuracy of one strategy less that of another; None without a common seed."""
+    """Final accuracy of one strategy less that of another, and 95 % bounds, both within -1 to 1.
+
+    None without a common seed, or where a scene has one test frame, of whose choice nobody can say
+    how much it matters.
+    """
     pairs = [(a, b) for a in ours for b in theirs if a.seed == b.seed]
     if not pairs:
         return None
@@ -176,9 +179,12 @@ def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
         ends = [pair[which].end(name) for pair in pairs]
         return np.array([end.correct() for end in ends], float)
 
+    pieces = [frame_pieces(pairs[0][0].end(name).frames) for name in names]
+    if not all(of[-1] > 0 for of in pieces):
+        return None
     first, second = ([flags(which, name) for name in names] for which in (0, 1))
-    block = min(BLOCK, *(rows.shape[1] // 2 for rows in first))
-    return paired_difference(first, second, block)
+    found = paired_difference(first, second, pieces)
+    return Interval(found.mean, max(found.low, -1.0), min(found.high, 1.0))
 
 
 def by_strategy(runs: Sequence[Run]) -> dict[str, list[Run]]:

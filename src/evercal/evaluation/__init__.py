@@ -9,5 +9,6 @@ from evercal.evaluation.metrics import correct as correct
 from evercal.evaluation.metrics import scores as scores
 from evercal.evaluation.protocol import evaluate as evaluate
 from evercal.evaluation.statistics import Interval as Interval
-from evercal.evaluation.statistics import block_bootstrap as block_bootstrap
+from evercal.evaluation.statistics import frame_pieces as frame_pieces
+from evercal.evaluation.statistics import mean_interval as mean_interval
 from evercal.evaluation.statistics import paired_difference as paired_difference
