@@ -6,14 +6,22 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from evercal.benchmark.published import LOOSE, PublishedScene
 from evercal.benchmark.results import SceneResult
 from evercal.benchmark.tables import Style, table
 from evercal.continual.strategies import STRATEGIES
 from evercal.errors import InputError
-from evercal.evaluation.metrics import COARSE, FINE, ContinualScores, continual_scores
+from evercal.evaluation.metrics import (
+    COARSE,
+    FINE,
+    MIDDLE,
+    ContinualScores,
+    continual_scores,
+    share_inside,
+)
 from evercal.evaluation.statistics import Interval, frame_pieces, paired_difference
 
-BOUNDS = ((0.10, np.deg2rad(10)), COARSE, (0.02, np.deg2rad(2)), FINE)
+BOUNDS = (LOOSE, COARSE, MIDDLE, FINE)
 """Metres and radians under which accuracy is asked."""
 
 TableRows = list[list[str]]
@@ -30,8 +38,8 @@ class Run:
     """Which seed."""
     scenes: tuple[str, ...]
     """In order of learning."""
-    results: dict[tuple[int, str], SceneResult]
-    """By stage and scene; of joint training only those of the last stage."""
+    results: dict[tuple[int, str], SceneResult | PublishedScene]
+    """By stage and scene, the last stage frame by frame; joint training has the last alone."""
 
     @property
     def last(self) -> list[SceneResult]:
@@ -40,7 +48,9 @@ class Run:
 
     def end(self, scene: str) -> SceneResult:
         """What is known of one scene at the end."""
-        return self.results[len(self.scenes) - 1, scene]
+        found = self.results[len(self.scenes) - 1, scene]
+        assert isinstance(found, SceneResult)
+        return found
 
     @property
     def memory_mb(self) -> float:
@@ -59,7 +69,7 @@ class Run:
         found = np.full((count, count), math.nan)
         for (stage, scene), result in self.results.items():
             column = self.scenes.index(scene)
-            found[stage, column] = 100 * result.correct(thresholds).mean()
+            found[stage, column] = 100 * result.accuracy(thresholds)
         return found
 
     def scores(self, thresholds: tuple[float, float] = COARSE) -> ContinualScores:
@@ -71,13 +81,13 @@ class Run:
         return continual_scores(matrix)
 
 
-def runs_of(results: Sequence[SceneResult]) -> list[Run]:
+def runs_of(results: Sequence[SceneResult | PublishedScene]) -> list[Run]:
     """The runs whose last stage is done, in the order of their first lines.
 
     Raises:
         InputError: no run is done.
     """
-    grouped: dict[tuple[str, int], dict[tuple[int, str], SceneResult]] = {}
+    grouped: dict[tuple[str, int], dict[tuple[int, str], SceneResult | PublishedScene]] = {}
     for result in results:
         run = grouped.setdefault((result.strategy, result.seed), {})
         run[result.stage, result.scene] = result
@@ -122,7 +132,7 @@ def selector_rows(runs: Sequence[Run]) -> TableRows:
     """One row per strategy that keeps frames: how they lie among those learned, mean of scenes."""
     rows = [["strategy", "frames kept", "covering radius", "smallest pair"]]
     for name, of in by_strategy(runs).items():
-        told = [o for run in of for o in run.results.values() if o.keyframe_positions_m]
+        told = [o for run in of for o in run.results.values() if math.isfinite(o.covering_radius)]
         if told:
             cells = [
                 np.mean([getattr(o, key) for o in told])
@@ -233,6 +243,15 @@ def _wrong_scene(run: Run) -> float:
     return 100 * float(np.mean([np.mean(o.wrong_scene) for o in run.last]))
 
 
+def _refused(run: Run) -> float:
+    return 100 * float(np.mean([np.mean(o.refused) for o in run.last]))
+
+
+def _inside(run: Run) -> float:
+    """Per cent of all poses in the right scene that lie in the ellipsoid stated for them."""
+    return share_inside(np.concatenate([o.squared_mahalanobis for o in run.last]))
+
+
 def _seconds(run: Run) -> float:
     stages = {stage: result.seconds for (stage, _), result in run.results.items()}
     return float(sum(stages.values()))
@@ -247,6 +266,8 @@ _COLUMNS: tuple[tuple[str, Callable[[Run], float]], ...] = (
     ("forgetting", lambda run: run.scores().forgetting),
     ("BWT", lambda run: run.scores().backward_transfer),
     ("wrong scene %", _wrong_scene),
+    ("refused %", _refused),
+    ("in 95 % ellipsoid", _inside),
     ("median cm, right scene", _fine_median_cm),
     ("%, right scene", _fine_accuracy),
     ("memory MB", lambda run: run.memory_mb),

@@ -9,8 +9,9 @@ Camera axes are OpenCV's. Without the intrinsics file the colour camera has the 
 the field uses, 525 pixels at 640x480 and scaled with the size, and its principal point in the
 middle of the image: nobody calibrated it. Code that writes (width / 2, height / 2) for the middle
 counts pixels from the image's corner; here pixel (0, 0) is a centre, so the middle is at ((width -
-1) / 2, (height - 1) / 2). An intrinsics file is taken at its word, with (0, 0) a centre. A pose with inf or nan marks a frame that was not tracked: it is left
-out and counted. Every sequence is taken to come from one camera. Depth files are not read.
+1) / 2, (height - 1) / 2). An intrinsics file is taken at its word, with (0, 0) a centre. A pose
+with inf or nan marks a frame that was not tracked: it is left out and counted. Every sequence is
+taken to come from one camera. Depth files are not read.
 """
 
 import itertools

@@ -79,10 +79,10 @@ def mean_interval(
 
     Two things are drawn by chance: the pieces of recording that a scene is judged by, which are
     the same for all runs, and the runs, which are the same for all scenes. Each adds the variance
-    that its means show. Chance that strikes one run on one piece shows in both and is counted twice,
-    which makes the bounds a little wide (as in Owen, The Pigeonhole Bootstrap, Ann. Appl. Stat.
-    2007). With one run the bounds tell of the choice of frames alone. Values that are all equal
-    have no width, however few they are.
+    that its means show. Chance that strikes one run on one piece shows in both and is counted
+    twice, which makes the bounds a little wide (as in Owen, The Pigeonhole Bootstrap, Ann. Appl.
+    Stat. 2007). With one run the bounds tell of the choice of frames alone. Values that are all
+    equal have no width, however few they are.
 
     Args:
         values: (runs, frames) or (frames,) for one scene, or a list of such arrays, one per scene;
