@@ -18,7 +18,6 @@ from benchmarks.publish import FOLDER
 from evercal.benchmark.comparison import (
     Run,
     TableRows,
-    as_text,
     by_strategy,
     difference_rows,
     method_rows,
@@ -28,7 +27,6 @@ from evercal.benchmark.comparison import (
     threshold_rows,
 )
 from evercal.benchmark.published import Published, Row, read_published
-from evercal.benchmark.tables import distance
 from evercal.errors import InputError
 from evercal.evaluation.metrics import CHI2_6
 
@@ -87,7 +85,7 @@ def _bench(rows_of: Callable[[Sequence[Run]], TableRows]) -> Callable[..., str]:
         counts = {name: len(of) for name, of in by_strategy(runs).items()}
         several = [run for run in runs if counts[run.strategy] > 1]
         alone = [run for run in runs if counts[run.strategy] == 1]
-        parts = [as_text(rows_of(of), "markdown") for of in (several, alone) if of]
+        parts = [_markdown(rows_of(of)) for of in (several, alone) if of]
         return f"\n\n{ONE_RUN}\n\n".join(parts) if len(parts) > 1 else parts[0]
 
     return made
@@ -104,7 +102,7 @@ def _differences(sources: Sequence[Published], reference: str) -> str:
     for wanted in (lambda n: n > 1, lambda n: n == 1):
         of = [run for run in runs if run.strategy == reference or wanted(shared[run.strategy])]
         rows = difference_rows(of, reference)
-        parts += [as_text(rows, "markdown")] if len(rows) > 1 else []
+        parts += [_markdown(rows)] if len(rows) > 1 else []
     return f"\n\n{ONE_RUN}\n\n".join(parts)
 
 
@@ -125,7 +123,7 @@ def _accuracy(sources: Sequence[Published], what: str) -> str:
             counts = [f"{_column(of, key).sum():.0f}" for key in ("wrong_scene", "refused")]
             inside = f"{np.average(_column(of, 'inside_95'), weights=frames):.0f} %"
             table.append([title, f"{frames.sum():.0f}", *shares, _median(of), *counts, inside])
-    return as_text(table, "markdown")
+    return _markdown(table)
 
 
 def _spoiled(sources: Sequence[Published], what: str) -> str:
@@ -144,7 +142,7 @@ def _spoiled(sources: Sequence[Published], what: str) -> str:
         inside = f"{_column(of, 'inside_95').mean():.0f} %"
         cells = [*shares, _median(of), f"{refused:.0f} of {frames:.0f}", inside]
         table.append([title, *cells])
-    return as_text(table, "markdown")
+    return _markdown(table)
 
 
 def _fixed(sources: Sequence[Published], what: str) -> str:
@@ -162,7 +160,7 @@ def _fixed(sources: Sequence[Published], what: str) -> str:
             f"{row[f'{prefix}_mm']:.2f} mm, {row[f'{prefix}_deg']:.3f} deg" for row in source.rows
         ]
         table.append([title, *cells])
-    return as_text(table, "markdown")
+    return _markdown(table)
 
 
 SPOILED_POSES = {
@@ -192,34 +190,43 @@ def _bad_poses(sources: Sequence[Published], what: str) -> str:
         seeds = f" ({len(of)} seeds)" if len(of) > 1 else ""
         share = _share(_column(of, "1 cm/1 deg").mean())
         table.append([title + seeds, share, f"{_range(of, 'median_mm', 2)} mm", found])
-    return as_text(table, "markdown")
+    return _markdown(table)
 
 
 def _trials(sources: Sequence[Published], what: str) -> str:
-    """`calibration`: a row per kind of camera; of `--draws` that use all images alone."""
+    """`calibration`: a row per kind of camera, its title the file's note; 25 images where told."""
     table = [["camera, from images alone", "trials", "median", "worst", "in 95 % ellipsoid"]]
     for source in sources:
-        for prefix, title in source.groups.items():
-            rows = [row for row in source.rows if row.get("images", 25) == 25]
-            rows = [row for row in rows if row.get("camera", "fixed") == "fixed"]
-            key = "" if prefix == "camera" else f"{prefix}_"
+        rows = [row for row in source.rows if row.get("images", 25) == 25]
+        for prefix, title in (("", source.note), ("fixed_", "then a fixed camera in that map")):
+            if f"{prefix}mm" not in rows[0]:
+                continue
             mm, deg, squared = (
-                _column(rows, f"{key}{name}") for name in ("mm", "deg", "squared_mahalanobis")
+                _column(rows, f"{prefix}{name}") for name in ("mm", "deg", "squared_mahalanobis")
             )
             median, worst = (f"{at(mm):.2f} mm, {at(deg):.3f} deg" for at in (np.median, np.max))
             inside = f"{int((squared < CHI2_6).sum())} of {len(rows)}"
-            table.append([",".join(title), str(len(rows)), median, worst, inside])
-    return as_text(table, "markdown")
+            table.append([title, str(len(rows)), median, worst, inside])
+    return _markdown(table)
 
 
 def _bump(sources: Sequence[Published], what: str) -> str:
     """`calibration bump`: how often the alarm calls a camera moved."""
     (source,) = sources
-    table = [["true shift, from 5 images", "trials", "called moved"]]
-    for kind in dict.fromkeys(str(row["kind"]) for row in source.rows):
-        moved = [bool(row["moved"]) for row in source.rows if row["kind"] == kind]
-        table.append([kind, str(len(moved)), f"{100 * np.mean(moved):.1f} %"])
-    return as_text(table, "markdown")
+    moved: dict[str, list[bool]] = {}
+    for row in source.rows:
+        moved.setdefault(str(row["kind"]), []).append(bool(row["moved"]))
+    trials = " and ".join(str(n) for n in sorted({len(of) for of in moved.values()}))
+    title = f"bumped by (5 images, {trials} trials each)"
+    cells = [f"{100 * np.mean(of):.1f} %" for of in moved.values()]
+    return _markdown([[title, *moved], ["called moved", *cells]])
+
+
+def _markdown(rows: TableRows) -> str:
+    """A table without padding: a cell that changes changes one line."""
+    header, *body = [[cell.replace("|", "\\|") for cell in row] for row in rows]
+    lines = [header, ["---", *["---:"] * (len(header) - 1)], *body]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def _column(rows: Sequence[Row], key: str) -> np.ndarray:
@@ -231,8 +238,8 @@ def _share(percent: float) -> str:
 
 
 def _median(rows: Sequence[Row]) -> str:
-    metres = _column(rows, "median_mm").mean() / 1000
-    return f"{distance(metres)}, {_column(rows, 'median_deg').mean():.3f} deg"
+    mm, deg = (_column(rows, key).mean() for key in ("median_mm", "median_deg"))
+    return f"{mm:.{2 if mm < 10 else 1}f} mm, {deg:.3f} deg"
 
 
 def _range(rows: Sequence[Row], key: str, digits: int) -> str:

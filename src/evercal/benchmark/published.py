@@ -1,7 +1,8 @@
 """What a published table rests on: one small file of numbers, from which the table is made again.
 
     results/NAME.jsonl    first line: name, kind, note, settings and their hash
-                          then a line per strategy, seed, stage and scene (kind `bench`),
+                          then a line per strategy, seed, stage and scene (kind `bench`), values
+                          in the order of `fields` of the first line,
                           or any flat rows of a measurement (kind `rows`)
 
 Of the last stage, which methods are compared by, errors are kept frame by frame, cut to 0.1 mm and
@@ -193,6 +194,8 @@ def write_published(folder: Path, published: Published) -> Path:
     for key in ("groups", "frames"):
         if getattr(published, key):
             header[key] = getattr(published, key)
+    if published.kind == "bench":
+        header["fields"] = _FIELDS
     lines = [header, *map(_plain, published.scenes), *map(dict, published.rows)]
     text = "".join(json.dumps(o, allow_nan=False, separators=(",", ":")) + "\n" for o in lines)
     if len(text) > LARGEST_BYTES:
@@ -220,6 +223,8 @@ def read_published(path: Path) -> Published:
     try:
         header = json.loads(lines[0])
         stated = header.pop("settings_sha256")
+        if header.pop("fields", _FIELDS) != _FIELDS:
+            raise ValueError("other fields")
         for key in ("groups", "frames"):
             header[key] = {k: tuple(v) for k, v in header.get(key, {}).items()}
         found: list[PublishedScene] = []
@@ -265,8 +270,8 @@ def _counted(of: SceneResult, frame_by_frame: bool) -> PublishedScene:
         memory_bytes=of.memory_bytes,
         head_bytes=of.head_bytes,
         frames_kept=of.frames_kept,
-        covering_radius=round(of.covering_radius, 4),
-        min_spacing=round(of.min_spacing, 4),
+        covering_radius=_rounded(of.covering_radius, 4),
+        min_spacing=_rounded(of.min_spacing, 4),
         **told,  # pyright: ignore[reportArgumentType]
     )
 
@@ -275,24 +280,31 @@ def _floored(values: np.ndarray) -> tuple[int | None, ...]:
     return tuple(math.floor(v) if math.isfinite(v) else None for v in values.tolist())
 
 
-def _plain(scene: PublishedScene) -> dict[str, object]:
-    """Plain values; what is not known or not kept is left out, None stands for infinite."""
-    record: dict[str, object] = {}
-    for key, value in asdict(scene).items():
-        if isinstance(value, float) and not math.isfinite(value):
-            if key in ("median_mm", "median_deg"):
-                record[key] = None
-        elif value not in ((), ""):
-            record[key] = value
-    return record
+def _rounded(value: float, digits: int) -> float:
+    return math.nan if math.isnan(value) else round(value, digits)
 
 
-def _scene(record: dict[str, object]) -> PublishedScene:
-    known = {of.name for of in fields(PublishedScene)}
-    if not record.keys() <= known:
-        raise KeyError(", ".join(sorted(record.keys() - known)))
-    for key in ("median_mm", "median_deg"):
-        record[key] = math.inf if record[key] is None else record[key]
-    for key in ("within", "tenth_mm", "mdeg"):
-        record[key] = tuple(record.get(key, ()))  # pyright: ignore[reportArgumentType]
+_FIELDS = [of.name for of in fields(PublishedScene)]
+_INFINITE = ("median_mm", "median_deg")
+
+
+def _plain(scene: PublishedScene) -> list[object]:
+    """Values in the order of the fields, those at the end that are not known left out."""
+    values = list(asdict(scene).values())
+    while values[-1] in ((), "") or values[-1] is math.nan:
+        values.pop()
+    return [
+        None if isinstance(value, float) and not math.isfinite(value) else value for value in values
+    ]
+
+
+def _scene(values: list[object]) -> PublishedScene:
+    if not isinstance(values, list) or len(values) > len(_FIELDS):
+        raise ValueError("other fields")
+    record = dict(zip(_FIELDS, values, strict=False))
+    for key, value in record.items():
+        if isinstance(value, list):
+            record[key] = tuple(value)
+        elif value is None:
+            record[key] = math.inf if key in _INFINITE else math.nan
     return PublishedScene(**record)  # pyright: ignore[reportArgumentType]
