@@ -92,7 +92,8 @@ def whole_runs(method: str) -> Callable[[Scenes, Scenes, int], Bounds]:
             (x - y).mean(axis=0).reshape(runs, -1).mean(axis=1) for x, y in zip(a, b, strict=True)
         ]
         if all(np.ptp(of) == 0 for of in pieces):
-            return (float(np.mean(pieces)),) * 2
+            same = float(np.mean(pieces))
+            return same, same
         found = bootstrap(
             pieces,
             lambda *samples, axis: sum(s.mean(axis=axis) for s in samples) / len(samples),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import pickle
 import sys
 import tarfile
@@ -67,16 +68,20 @@ def test_a_worker_of_a_cluster_that_dies_is_replaced(
     arcs: tuple[Scene, Scene], arc_stage: StageOptions, tmp_path: Path
 ) -> None:
     pytest.importorskip("ray", reason="the extra 'ray' is not installed")
-    flag, plugin = tmp_path / "died", tmp_path / "plugin.py"
-    plugin.write_text(
-        f"import os, pathlib\nflag = pathlib.Path({str(flag)!r})\n"
-        "if not flag.exists():\n    flag.touch()\n    os._exit(1)\n"
-    )
+    flag, here = tmp_path / "died", os.getpid()
+
+    def stage(seed: int) -> StageOptions:
+        if os.getpid() != here and not flag.exists():
+            flag.touch()
+            os._exit(1)
+        fit = replace(arc_stage.fit, iterations=4, batch=64, replay_batch=32)
+        return replace(arc_stage, fit=fit, seed=seed)
+
     few = [replace(scene, train=scene.train[:18], test=scene.test[:3]) for scene in arcs]
-    options = BenchOptions(lambda _: arc_stage, ("evercal",), seeds=(0,), short_side=120)
+    options = BenchOptions(stage, ("evercal",), seeds=(0,), short_side=120)
     said: list[str] = []
     out = tmp_path / "out"
-    steps = list(run_on_ray(few, options, out, "local", plugin, said.append))
+    steps = list(run_on_ray(few, options, out, "local", None, said.append))
     assert [step.done for step in steps] == [1, 2]
     (line,) = said
     assert line.startswith("run evercal-0, try 1 of 4: WorkerCrashedError: ")

@@ -161,7 +161,8 @@ def _half_width(scenes: Sequence[Array], labels: Sequence[Labels]) -> float:
 def _shares(values: Array, labels: Labels) -> Array:
     """(pieces,) the sum over a piece of (frames,) values less their mean, by all frames."""
     _, piece = np.unique(labels, return_inverse=True)
-    return np.bincount(piece, (values - values.mean()) / len(values))
+    sums = np.bincount(piece, (values - values.mean()) / len(values))
+    return sums.astype(np.float64)
 
 
 def _scenes(values: ArrayLike | Sequence[ArrayLike]) -> list[Array]:
