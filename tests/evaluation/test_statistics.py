@@ -38,6 +38,7 @@ def test_one_run_is_cut_into_blocks() -> None:
     assert lengths(numbered(0, frames=39, step=7)) == [13, 13, 13]
     assert lengths(numbered(0, frames=1000)) == [50] * 20
     assert lengths([f"view {'abc'[i % 3]}" for i in range(25)]) == [13, 12]
+    assert lengths([f"seq-{i:02d}/frame-000000" for i in range(25)]) == [13, 12]
     assert lengths(numbered(0, frames=5)) == [3, 2]
     assert frame_pieces([]).tolist() == []
     assert (blocks(39) == frame_pieces(numbered(0, frames=39))).all()

@@ -99,14 +99,7 @@ def run_on_ray(
     ray = _ray()
     missing = begin_bench(scenes, options, out)
     tell = on_failure or (lambda line: print(line, file=sys.stderr, flush=True))  # noqa: T201
-    try:
-        ray.init(
-            address=None if address == "local" else address,
-            ignore_reinit_error=True,
-            log_to_driver=False,
-        )
-    except (ConnectionError, ValueError) as error:
-        raise InputError(f"--ray {address}: no cluster there ({error})") from error
+    _join(ray, address)
     try:
         jobs = _jobs(missing, options, plugin, out)
         total = len(options.seeds) * len(options.strategies) * len(scenes)
@@ -118,10 +111,11 @@ def run_on_ray(
                 continue
             _keep(out, outcome)
             shutil.rmtree(job.folder, ignore_errors=True)
+            (strategy,), (seed,) = job.options.strategies, job.options.seeds
             for stage in range(len(scenes)):
                 done += 1
                 these = tuple(o for o in outcome.results if o.stage == stage)
-                yield Step(job.options.strategies[0], job.options.seeds[0], these, done, total)
+                yield Step(strategy, seed, these, done, total)
     finally:
         ray.shutdown()
     if given_up:
@@ -129,6 +123,14 @@ def run_on_ray(
             f"{len(given_up)} of {len(missing)} runs failed: {'; '.join(given_up)}; the others are"
             f" in {out}, the same command tries these again"
         )
+
+
+def _join(ray, address: str) -> None:
+    where = None if address == "local" else address
+    try:
+        ray.init(address=where, ignore_reinit_error=True, log_to_driver=False)
+    except (ConnectionError, ValueError) as error:
+        raise InputError(f"--ray {address}: no cluster there ({error})") from error
 
 
 def _jobs(

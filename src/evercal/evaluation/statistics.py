@@ -40,8 +40,8 @@ def frame_pieces(names: Sequence[str]) -> Labels:
     A run of consecutive frames is a piece. It ends where what stands before the frame number
     changes (`seq-03/frame-000039`, `seq-08/frame-000000`), where the number falls, and where it
     steps over ten frames or more; the usual step of the recording counts as one, so that every
-    fifth frame of a path is still one run. A scene with a single run, or whose names hold no
-    numbers, is cut into blocks of neighbouring frames of equal length, at least ten frames each
+    fifth frame of a path is still one run. A scene with a single run, whose frames all stand
+    alone or whose names hold no numbers is cut into blocks of neighbouring frames of equal length, at least ten frames each
     and at most twenty of them.
 
     Args:
@@ -58,7 +58,7 @@ def frame_pieces(names: Sequence[str]) -> Labels:
         forward = steps[together & (steps > 0)]
         usual = float(np.median(forward)) if len(forward) else 1.0
         ends = ~together | (steps <= 0) | (steps > LARGEST_STEP * usual)
-        if ends.any():
+        if ends.any() and not ends.all():
             return np.concatenate([[0], np.cumsum(ends)]).astype(np.int64)
     return blocks(len(names))
 

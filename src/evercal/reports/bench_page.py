@@ -77,7 +77,7 @@ def _parts(tables: Tables) -> list[Section]:
     parts = [
         _table(rows, said)
         for rows, said in (
-            (tables.ablation, "After the paper's Table 4; 95 % bounds over runs and pieces of recording"),
+            (tables.ablation, "After the paper's Table 4; 95 % bounds as below"),
             (tables.grid, "Final accuracy (TFR) by which frames stay and what replay costs"),
         )
         if len(rows) > 1
