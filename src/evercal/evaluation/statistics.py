@@ -41,8 +41,8 @@ def frame_pieces(names: Sequence[str]) -> Labels:
     changes (`seq-03/frame-000039`, `seq-08/frame-000000`), where the number falls, and where it
     steps over ten frames or more; the usual step of the recording counts as one, so that every
     fifth frame of a path is still one run. A scene with a single run, whose frames all stand
-    alone or whose names hold no numbers is cut into blocks of neighbouring frames of equal length, at least ten frames each
-    and at most twenty of them.
+    alone or whose names hold no numbers is cut into blocks of neighbouring frames of equal length,
+    at least ten frames each and at most twenty of them.
 
     Args:
         names: of one scene's frames, in recorded order.
