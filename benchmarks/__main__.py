@@ -196,6 +196,48 @@ def handeye(trials: int = 1000, thorough: bool = False) -> None:
     run(trials, thorough)
 
 
+def intervals(trials: int = 2000) -> None:
+    """Counts how often 95 % bounds of a paired difference hold the truth, before and now.
+
+    Args:
+        trials: of each setting.
+    """
+    from benchmarks.intervals import run
+
+    run(trials)
+
+
+def publish(
+    source: tyro.conf.Positional[Path],
+    name: tyro.conf.Positional[str],
+    groups: tuple[str, ...] = (),
+    note: str = "",
+) -> None:
+    """Puts the numbers of a measurement into results/NAME.jsonl, for `tables`.
+
+    Args:
+        source: a folder of `evercal bench`, or rows in JSON from maps, calibration or peers.
+        name: of the file.
+        groups: rows that a table takes together, each TITLE=ROW,ROW.
+        note: what a reader must know besides.
+    """
+    from benchmarks.publish import groups_of
+    from benchmarks.publish import publish as write
+
+    print(write(source, name, groups_of(groups), note))
+
+
+def tables(check: bool = False) -> int:
+    """Makes the tables of the docs anew from results/.
+
+    Args:
+        check: write nothing; fail where a page does not agree with its data.
+    """
+    from benchmarks.tables import run
+
+    return run(check)
+
+
 def main() -> int:
     """Runs one benchmark; `--gate` is short for `gate`."""
     from evercal.errors import InputError
@@ -213,6 +255,9 @@ def main() -> int:
         "handeye": handeye,
         "calibration": calibration,
         "crowd": crowd,
+        "intervals": intervals,
+        "publish": publish,
+        "tables": tables,
     }
     try:
         code = tyro.extras.subcommand_cli_from_dict(verbs, args=args)

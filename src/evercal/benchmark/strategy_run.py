@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evercal.benchmark.results import SceneResult, scene_result
+from evercal.benchmark.results import NETWORK, UNALIGNED, SceneResult, scene_result
 from evercal.benchmark.scene_views import keep_views
 from evercal.continual.finish_scene import Learned, finished_stage
 from evercal.continual.learn_jointly import learn_jointly
@@ -38,10 +38,6 @@ from evercal.mapping.stage_files import head_bytes
 from evercal.mapping.store import Store
 from evercal.networks.buffer import FeatureBuffer
 from evercal.storage import MANIFEST
-
-NETWORK, UNALIGNED = ":network", ":unaligned"
-"""Added to a strategy's name where the same run is judged by its network alone, or by the first
-pose from matched keyframes, whose landmarks are not aligned."""
 
 
 @dataclass(frozen=True)
