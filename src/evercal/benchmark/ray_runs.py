@@ -9,6 +9,7 @@ A worker that dies without a word on a disk of its own starts its run anew.
 """
 
 import io
+import pickle
 import shutil
 import sys
 import tarfile
@@ -23,6 +24,7 @@ from evercal.benchmark.bench import BenchOptions, Step, begin_bench, run_bench
 from evercal.benchmark.results import SceneResult
 from evercal.benchmark.scene_views import VIEWS
 from evercal.continual.plugin import load_plugin
+from evercal.continual.strategies import Strategy
 from evercal.datasets import Scene
 from evercal.errors import InputError
 from evercal.storage import write_bytes
@@ -35,8 +37,12 @@ TRIES = 4
 class Job:
     """What a task needs besides the scenes."""
 
+    strategy: str
+    """Name of the strategy."""
+    pickled: bytes
+    """The strategy, to be read when the plugin is there: its class may be the plugin's."""
     options: BenchOptions
-    """With one strategy and one seed."""
+    """With one seed, without strategies."""
     plugin: Path | None
     """File of strategies."""
     folder: Path
@@ -49,7 +55,7 @@ class Job:
     @property
     def name(self) -> str:
         """STRATEGY-SEED."""
-        return f"{self.options.strategies[0]}-{self.options.seeds[0]}"
+        return f"{self.strategy}-{self.options.seeds[0]}"
 
 
 @dataclass(frozen=True)
@@ -111,11 +117,11 @@ def run_on_ray(
                 continue
             _keep(out, outcome)
             shutil.rmtree(job.folder, ignore_errors=True)
-            (strategy,), (seed,) = job.options.strategies, job.options.seeds
+            (seed,) = job.options.seeds
             for stage in range(len(scenes)):
                 done += 1
                 these = tuple(o for o in outcome.results if o.stage == stage)
-                yield Step(strategy, seed, these, done, total)
+                yield Step(job.strategy, seed, these, done, total)
     finally:
         ray.shutdown()
     if given_up:
@@ -134,7 +140,7 @@ def _join(ray, address: str) -> None:
 
 
 def _jobs(
-    missing: Sequence[tuple[int, str]], options: BenchOptions, plugin: Path | None, out: Path
+    missing: Sequence[tuple[int, Strategy]], options: BenchOptions, plugin: Path | None, out: Path
 ) -> list[Job]:
     around = out.absolute() / "runs" / "ray"
     around.mkdir(parents=True, exist_ok=True)
@@ -142,9 +148,11 @@ def _jobs(
     write_bytes(around / "shared", token.encode())
     return [
         Job(
-            replace(options, strategies=(strategy,), seeds=(seed,)),
+            strategy.name,
+            pickle.dumps(strategy),
+            replace(options, strategies=(), seeds=(seed,)),
             plugin,
-            around / f"{strategy}-{seed}",
+            around / f"{strategy.name}-{seed}",
             token,
         )
         for seed, strategy in missing
@@ -188,7 +196,8 @@ def _one_run(scenes: list[Scene], job: Job) -> Outcome:
                     archive.extractall(folder, filter="data")
             if job.plugin is not None:
                 load_plugin(job.plugin)
-            for _ in run_bench(scenes, job.options, folder):
+            options = replace(job.options, strategies=(pickle.loads(job.pickled),))
+            for _ in run_bench(scenes, options, folder):
                 pass
             views = {path.name: path.read_bytes() for path in (folder / VIEWS).iterdir()}
             return Outcome(tuple(results.read(folder)), views)
