@@ -92,8 +92,7 @@ class FeatureBuffer:
         self.scene, self.atlas_from_base = scene, atlas_from_base
         self.correctable, self.device = correctable, torch.device(device)
         self.views = 0
-        self.stored: Tensor | None = None
-        """(m, 3) points that a head once gave to the first m rows; on any device."""
+        self._stored: Tensor | None = None
         self._parts: list[dict[str, Tensor]] = []
         self._taken = 0
         self._merged: dict[str, Tensor] | None = None
@@ -145,6 +144,15 @@ class FeatureBuffer:
         self._taken = len(self._parts)
 
     @property
+    def stored(self) -> Tensor | None:
+        """(m, 3) points that a head once gave to the first m rows, on the buffer's device."""
+        return self._stored
+
+    @stored.setter
+    def stored(self, points: Tensor | None) -> None:
+        self._stored = None if points is None else points.to(self.device)
+
+    @property
     def tensors(self) -> dict[str, Tensor]:
         """Everything in the buffer, by name: on its device, or the CPU where that has no room."""
         if self._merged is None:
@@ -181,15 +189,16 @@ class FeatureBuffer:
         target = Target(at("pixels", index), at("intrinsics", view), at("camera_from_atlas", view))
         scene = torch.full((len(index),), self.scene, device=held)
         features, descriptors = at("features", index), at("descriptors", view)
-        stored = None if self.stored is None else _points_at(self.stored, index)
-        return Rows(features, scene, descriptors, target, index, stored).to(self.device)
+        rows = Rows(features, scene, descriptors, target, index).to(self.device)
+        if self._stored is not None:
+            rows.stored = _points_at(self._stored, rows.index)
+        return rows
 
 
 def _points_at(stored: Tensor, index: Tensor) -> Tensor:
     """(n, 3) points at `index` (n,), NaN beyond the last."""
-    where = index.to(stored.device)
-    points = stored[where.clamp(max=len(stored) - 1)].float()
-    return torch.where((where < len(stored))[:, None], points, torch.nan).to(index.device)
+    points = stored[index.clamp(max=len(stored) - 1)].float()
+    return torch.where((index < len(stored))[:, None], points, torch.nan)
 
 
 def _merge(parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
