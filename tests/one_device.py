@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 META = torch.device("meta")
-_COPIES = (torch.ops.aten._to_copy.default, torch.ops.aten.copy_.default)
+_COPIES = (torch.ops.aten._to_copy, torch.ops.aten.to, torch.ops.aten.copy_)
 
 
 class OneDevice(TorchDispatchMode):
@@ -29,7 +29,7 @@ class OneDevice(TorchDispatchMode):
     ) -> Any:
         tensors = [t for t in tree_leaves((args, kwargs)) if isinstance(t, Tensor)]
         devices = {t.device for t in tensors if t.dim() or t.device.type != "cpu"}
-        if len(devices) > 1 and func not in _COPIES:
+        if len(devices) > 1 and func.overloadpacket not in _COPIES:
             raise AssertionError(f"{func}: tensors on {sorted(map(str, devices))}")
         return func(*args, **(kwargs or {}))
 

@@ -185,7 +185,7 @@ def test_the_guard_finds_what_it_is_for() -> None:
     with pytest.raises(AssertionError, match="meta"), made_where_inputs_lie():
         torch.nn.functional.linear(ones[None], torch.zeros(2, 3))
     with pytest.raises(AssertionError, match="meta"), OneDevice():
-        torch.zeros(3, 3, device=META) @ ones[:, None]
+        torch.mm(torch.zeros(3, 3, device=META), ones[:, None])
     with OneDevice():
         assert torch.zeros(3, device=META).mul(torch.tensor(2.0)).device == META
 

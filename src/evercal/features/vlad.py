@@ -78,7 +78,9 @@ def fit_centroids(encoder: Encoder) -> Tensor:
     """(k, channels) centroids of the features of procedural rooms, by spherical k-means."""
     features = torch.cat([_room_features(encoder, seed) for seed in _ROOMS])
     generator = torch.Generator().manual_seed(0)
-    centroids = features[torch.randperm(len(features), generator=generator)[:CENTROIDS]]
+    centroids = features[
+        torch.randperm(len(features), generator=generator, device="cpu")[:CENTROIDS]
+    ]
     for _ in range(_ROUNDS):
         nearest = (features @ centroids.T).argmax(1)
         sums = torch.zeros_like(centroids).index_add_(0, nearest, features)
@@ -99,7 +101,8 @@ def save_centroids(encoder: nn.Module, path: Path) -> None:
 def _projected(centroids: Tensor) -> Vlad:
     # A fixed random projection keeps angles well enough and a quarter of the numbers.
     shape = (centroids.numel(), WIDTH)
-    projection = torch.randn(shape, generator=torch.Generator().manual_seed(1))
+    drawn = torch.Generator().manual_seed(1)
+    projection = torch.randn(shape, generator=drawn, device="cpu")
     return Vlad(centroids, projection / shape[0] ** 0.5)
 
 
