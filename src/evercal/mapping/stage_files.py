@@ -152,7 +152,9 @@ def save_tensors(
     """Writes named tensors, whole or not at all."""
     from safetensors.torch import save
 
-    write_bytes(path, save({k: v.detach().contiguous() for k, v in tensors.items()}, metadata))
+    write_bytes(
+        path, save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, metadata)
+    )
 
 
 def load_tensors(path: Path) -> dict[str, Tensor]:

@@ -148,6 +148,11 @@ class Head(nn.Module):
         return 3 + 3 * self.options.blocks + 2
 
     @property
+    def device(self) -> torch.device:
+        """Where the weights lie."""
+        return self.feature_mean.device
+
+    @property
     def scenes(self) -> int:
         """How many scenes this head knows."""
         return self.code.shape[0]
@@ -159,7 +164,8 @@ class Head(nn.Module):
         a such that the variance over all rows and channels is 1.
 
         Args:
-            features: (n, features) rows of the first scene, n well above the number of channels.
+            features: (n, features) rows of the first scene, n well above the number of channels;
+                on any device.
         """
         features = features.double()
         mean = features.mean(0)
@@ -176,6 +182,8 @@ class Head(nn.Module):
     def grow(self, centres: Tensor, seed: int) -> None:
         """Makes room for one more scene; what the head says about others does not change.
 
+        The new rows are drawn on the CPU, so that they are the same on every device.
+
         Args:
             centres: (k, 3) atlas coordinates of the new scene's centres, metres; k may be 0.
             seed: of the new rows.
@@ -184,17 +192,17 @@ class Head(nn.Module):
         width, count = self.options.width, len(centres)
 
         def draw(*shape: int, scale: float) -> Tensor:
-            return (torch.rand(*shape, generator=generator) * 2 - 1) * scale
+            return (torch.rand(*shape, generator=generator, device="cpu") * 2 - 1) * scale
 
         bound = 1 / math.sqrt(width)
         self.code = _append(self.code, draw(1, self.layers, width, scale=0.2))
         self.logit = _append(self.logit, draw(count, width, scale=bound))
-        self.logit_bias = _append(self.logit_bias, torch.zeros(count))
+        self.logit_bias = _append(self.logit_bias, self.logit_bias.new_zeros(count))
         if self.options.offsets == "per_centre":
             self.offset = _append(self.offset, draw(count, 4, width, scale=bound))
-            self.offset_bias = _append(self.offset_bias, torch.zeros(count, 4))
-        scene = torch.full((count,), self.scenes - 1)
-        self.centres = torch.cat([self.centres, centres.float()])
+            self.offset_bias = _append(self.offset_bias, self.offset_bias.new_zeros(count, 4))
+        scene = torch.full((count,), self.scenes - 1, device=self.device)
+        self.centres = torch.cat([self.centres, centres.to(self.centres)])
         self.centre_scene = torch.cat([self.centre_scene, scene])
 
     def forward(
@@ -211,7 +219,7 @@ class Head(nn.Module):
             What the head says, in fp32, whatever autocast does inside.
         """
         hidden = self.hidden(features, scene, descriptor)
-        with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+        with torch.autocast(hidden.device.type, enabled=False):
             return self.decode(hidden.float(), scene)
 
     def hidden(self, features: Tensor, scene: Tensor | int, descriptor: Tensor | None) -> Tensor:
