@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from evercal.benchmark.results import NETWORK, UNALIGNED, SceneResult, scene_result
 from evercal.benchmark.scene_views import keep_views
@@ -50,6 +51,8 @@ class RunOptions:
     """Working size of images, pixels."""
     features: Path
     """Folder of encoded views, shared by all runs."""
+    device: torch.device
+    """What the networks run on."""
     out: Path
     """Folder of results; stores under way are in its folder `runs`."""
 
@@ -92,6 +95,7 @@ class _Run:
             if number >= len(Store.open(self.store).stages):
                 learn_scene(self.store, self.scenes[number], self._how(), self.on_event)
             opened = Store.open(self.store)
+            opened.maps.to(self.options.device)
             self._cached(opened.maps)
             seconds = float(opened.report()["seconds"])
             yield number, self._judge(opened.maps, number, seconds)
@@ -102,6 +106,7 @@ class _Run:
             self.stage,
             strategy or self.strategy,
             short_side=self.options.short_side,
+            device=self.options.device,
             cache=self.options.features,
         )
 
@@ -122,7 +127,7 @@ class _Run:
             learn_scene(shared, scene, self._how(STRATEGIES["finetune"]), self.on_event)
         first = Store.open(shared)
         began = time.perf_counter()
-        maps = first.maps.copy_for_training()
+        maps = first.maps.copy_for_training().to(self.options.device)
         maps.strategy, maps.keyframes, maps.method_states = self.strategy.name, [], []
         self._cached(maps)
         train, aside = validation_split(scene.train)
@@ -140,7 +145,7 @@ class _Run:
 
         @cache
         def rows() -> FeatureBuffer:
-            buffer = scene_buffer(0, maps.scenes[0].cell, train)
+            buffer = scene_buffer(0, maps.scenes[0].cell, train, maps.device)
             finished(encoded(buffer, train, view_plan(self.stage, maps.short_side), maps))
             return buffer
 
@@ -152,7 +157,7 @@ class _Run:
     def jointly(self) -> Iterator[tuple[int, tuple[SceneResult, ...]]]:
         """See `run_strategy`; a killed run begins anew."""
         shutil.rmtree(self.store, ignore_errors=True)
-        maps = open_or_create(self.store, self._how()).maps
+        maps = open_or_create(self.store, self._how()).maps.to(self.options.device)
         self._cached(maps)
         split = [validation_split(scene.train) for scene in self.scenes]
         train_splits = [replace(s, train=t) for s, (t, _) in zip(self.scenes, split, strict=True)]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli.bench_report import show_report
+from evercal.cli.device import Device
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -64,6 +65,7 @@ class Bench:
     """How many keyframes are kept of a scene: a share of its frames (10%) or bytes (5MB)."""
     held_out: bool = False
     """Judge on a fifth of the training frames instead of the test frames, to choose settings."""
+    device: Device = "auto"
     plugin: Annotated[Path | None, arg(metavar="FILE.py", help_behavior_hint="")] = None
     """File with strategies of one's own (see examples/my_strategy.py)."""
     ray: Annotated[str | None, arg(metavar="ADDRESS", help_behavior_hint="")] = None
@@ -83,7 +85,7 @@ class Bench:
 
         if self.plugin is not None:
             load_plugin(self.plugin)
-        join_processes()
+        device = join_processes(self.device)
         out = self.out if rank() == 0 else _mirror(self.out)
         wait_for_all()
         options = BenchOptions(
@@ -97,6 +99,7 @@ class Bench:
                 "poses": "sfm" if self.poses else "original",
                 "judged": "held-out training frames" if self.held_out else "test frames",
             },
+            device=str(device),
             features=self.out.absolute() / "features",
         )
         said = sys.stderr if self.json else sys.stdout

@@ -138,7 +138,7 @@ def _learn_rooms(store: Path, method: str, scenes: "Sequence[Scene]", teller: _T
     for i, scene in enumerate(scenes):
         say(f"{METHODS[method]}: learning {scene.name} from {len(scene.train)} posed images")
         began = time.perf_counter()
-        options = LearnOptions(_stage(method), STRATEGIES[method])
+        options = LearnOptions(_stage(method), STRATEGIES[method], device=teller.options.device)
         with LearnBars() as bars:
             report = learn_scene(store, scene, options, bars)
         seconds += time.perf_counter() - began

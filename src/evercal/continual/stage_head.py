@@ -54,7 +54,7 @@ def head_for_all(maps: SceneMaps, options: StageOptions, positions_m: Sequence[n
 def fresh_head(maps: SceneMaps, options: StageOptions) -> Head:
     """A head that knows no scene."""
     torch.manual_seed(options.seed)
-    return Head(maps.encoder.width, maps.descriptor.width, options.head)
+    return Head(maps.encoder.width, maps.descriptor.width, options.head).to(maps.device)
 
 
 def whiten(head: Head, buffers: Sequence[FeatureBuffer], seed: int) -> None:

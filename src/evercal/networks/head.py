@@ -120,7 +120,7 @@ class Head(nn.Module):
         cls, features: int, descriptor: int, options: HeadOptions, state: Mapping[str, Tensor]
     ) -> Self:
         """A head with the weights of another one's `state_dict()`, half floats or single."""
-        head = cls(features, descriptor, options)
+        head = cls(features, descriptor, options).to(state["code"].device)
         state = {name: v.float() if v.dtype == torch.half else v for name, v in state.items()}
         # These grow with every scene; whatever their shape is in the state, it is theirs.
         head.code = nn.Parameter(state["code"].clone())
