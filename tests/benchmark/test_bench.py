@@ -22,7 +22,7 @@ from evercal.geometry import SE3, Camera
 from evercal.mapping.store import Store
 
 if TYPE_CHECKING:
-    from evercal.continual.learn import StageOptions
+    from evercal.continual.stage import StageOptions
 
 Arcs = tuple[Scene, Scene]
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)

@@ -16,7 +16,7 @@ from evercal.benchmark.results import SceneResult, read
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.continual.learn import StageOptions
+    from evercal.continual.stage import StageOptions
     from evercal.datasets import Scene
 
 

@@ -14,7 +14,7 @@ from evercal.cli import bench as verb
 from evercal.datasets import generic
 
 if TYPE_CHECKING:
-    from evercal.continual.learn import StageOptions
+    from evercal.continual.stage import StageOptions
     from evercal.datasets import Scene
 
 

@@ -9,15 +9,11 @@ import pytest
 import torch
 from safetensors.torch import load, save
 
-from evercal.continual import learn as learn_module
-from evercal.continual.learn import (
-    Checkpoint,
-    Encoding,
-    Event,
-    Resume,
-    StageOptions,
-)
+from evercal.continual import stage_rows
+from evercal.continual.stage import Encoding, Event, StageOptions
+from evercal.continual.strategies import STRATEGIES
 from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.store import Checkpoint, Resume
 from evercal.networks.trainer import Progress
 
 from .stages import Rooms, assert_same, continued, outcome, weights
@@ -55,7 +51,7 @@ STOPS: dict[str, Callable[[Sequence[Checkpoint]], bool]] = {
 
 
 @pytest.mark.parametrize("where", STOPS)
-@pytest.mark.parametrize("name", ["evercal_network", "sars_spdd", "joint"])
+@pytest.mark.parametrize("name", ["evercal_network", "sars_spdd", "isolation"])
 def test_an_interruption_does_not_show(
     name: str,
     where: str,
@@ -66,7 +62,7 @@ def test_an_interruption_does_not_show(
 ) -> None:
     maps = first[name]
     whole = outcome(continued(maps, rooms, quick))
-    monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
     resume = interrupted(continued(maps, rooms, quick), STOPS[where])
     assert resume is not None
     again = list(continued(maps, rooms, quick, resume))
@@ -91,7 +87,7 @@ def test_interrupted_twice(
 ) -> None:
     maps = first["evercal_network"]
     whole = outcome(continued(maps, rooms, quick))
-    monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
     once = interrupted(continued(maps, rooms, quick), STOPS["halfway through encoding"])
     assert once is not None
     twice = interrupted(continued(maps, rooms, quick, once), STOPS["fifth step"])
@@ -108,7 +104,7 @@ def test_a_checkpoint_keeps_its_value(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # A consumer may write it while training goes on.
-    monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
     kept: list[tuple[Checkpoint, Checkpoint]] = []
     for event in continued(first["evercal_network"], rooms, quick):
         if isinstance(event, Checkpoint):
