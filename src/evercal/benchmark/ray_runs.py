@@ -70,7 +70,7 @@ def run_on_ray(
             for stage in range(len(scenes)):
                 done += 1
                 these = tuple(o for o in found if o.stage == stage)
-                yield Step(strategy, seed, these, done, total)
+                yield Step(strategy.name, seed, these, done, total)
     finally:
         ray.shutdown()
 
