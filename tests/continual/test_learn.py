@@ -280,7 +280,9 @@ def test_a_camera_that_stands_still(
         if frame.base_from_camera
         for spot in [float(i % places)]
     )
-    head = outcome(learn(blank(NETWORK.name), NETWORK, replace(rooms[0], train=frames), quick)).heads[0]
+    head = outcome(
+        learn(blank(NETWORK.name), NETWORK, replace(rooms[0], train=frames), quick)
+    ).heads[0]
     assert len(head.centres) == places
     assert all(bool(torch.isfinite(value).all()) for value in head.state_dict().values())
 

@@ -71,9 +71,7 @@ def test_only_chosen_views_are_replayed_and_a_stop_does_not_show(learnable: Lear
         hooks = MIR.begin(stage_start(head, [old], replay_rows=60))
         replayed = hooks.replayed
 
-        def watched(
-            fresh: Rows, step: int, rate: float, generator: torch.Generator
-        ) -> list[Rows]:
+        def watched(fresh: Rows, step: int, rate: float, generator: torch.Generator) -> list[Rows]:
             parts = replayed(fresh, step, rate, generator)
             seen.append(set(old.tensors["view"][parts[0].index].tolist()))
             assert len(parts[0].scene) == 60

@@ -51,8 +51,9 @@ def test_a_new_basis_has_as_many_columns_as_it_takes(share: float, count: int) -
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_grown_basis_keeps_the_old_columns_and_holds_the_share(seed: int) -> None:
-    first, second = moment_of([9.0, 5, 1, 0.1, 0.1, 0.1, 0.01, 0.01], seed), moment_of(
-        [4.0, 4, 4, 1, 0.2, 0.1, 0.01, 0.01], seed + 50
+    first, second = (
+        moment_of([9.0, 5, 1, 0.1, 0.1, 0.1, 0.01, 0.01], seed),
+        moment_of([4.0, 4, 4, 1, 0.2, 0.1, 0.01, 0.01], seed + 50),
     )
     old = grown_basis(torch.zeros(8, 0, dtype=torch.float64), first, 0.9)
     grown = grown_basis(old, second, 0.9)
@@ -114,7 +115,11 @@ def trained(hooks: TrainingHooks | None, head: Head) -> float:
 
 def two_scenes(options: HeadOptions) -> Head:
     head = wave_head(1, options)
-    centres = torch.zeros(0, 3) if options.centres == "fixed" else torch.tensor([[0.1, 0, 4.0], [0, 0.1, 5.0]])
+    centres = (
+        torch.zeros(0, 3)
+        if options.centres == "fixed"
+        else torch.tensor([[0.1, 0, 4.0], [0, 0.1, 5.0]])
+    )
     head.grow(centres, seed=7)
     return head
 
@@ -180,7 +185,9 @@ def test_bases_of_later_scenes_hold_those_of_earlier_ones() -> None:
     method, states = GradientProjectionMemory(kept_share=0.9), []
     for scene in range(2):
         buffer = wave_buffer(scene)
-        finished = FinishedScene(head, scene, lambda b=buffer: b, lambda b=buffer: b, 2, states, None)
+        finished = FinishedScene(
+            head, scene, lambda b=buffer: b, lambda b=buffer: b, 2, states, None
+        )
         states = [*states, method.after_scene(finished)]
     for name, first in states[0].items():
         second = states[1][name]
@@ -197,7 +204,9 @@ def test_the_moment_of_the_last_hidden_layer(monkeypatch: pytest.MonkeyPatch) ->
     with torch.no_grad():
         hidden = head.hidden(rows.features.float(), rows.scene, rows.descriptor).double()
     monkeypatch.setattr("evercal.continual.methods.projection.ROWS", 10)
-    torch.testing.assert_close(hidden_moment(head, buffer), 10 * hidden.T @ hidden, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(
+        hidden_moment(head, buffer), 10 * hidden.T @ hidden, rtol=1e-5, atol=1e-6
+    )
 
 
 def test_the_first_scene_is_learned_freely() -> None:

@@ -76,7 +76,9 @@ def two_rows():
 
 def test_two_rows_by_hand():
     student, teacher = two_rows()
-    terms = spdd_loss(student, teacher, SpddOptions(2.0, 3.0, 5.0, temperature=2.0, active_centres=2))
+    terms = spdd_loss(
+        student, teacher, SpddOptions(2.0, 3.0, 5.0, temperature=2.0, active_centres=2)
+    )
     # Row 1: teacher logits 2, 1 over 2 -> sigmoid(0.5); student 1, 1 -> one half each.
     p = 1 / (1 + math.exp(-0.5))
     first = p * math.log(p / 0.5) + (1 - p) * math.log((1 - p) / 0.5)

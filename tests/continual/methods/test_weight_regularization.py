@@ -161,7 +161,9 @@ def test_a_running_sum_takes_rows_that_were_appended_as_they_are(finished: Finis
     alone = importances(method.after_scene(finished))
     half = len(alone["logit"]) // 2
     gained = found["logit"] - alone["logit"]
-    torch.testing.assert_close(gained[:half], torch.full_like(gained[:half], 0.9), atol=0.02, rtol=0)
+    torch.testing.assert_close(
+        gained[:half], torch.full_like(gained[:half], 0.9), atol=0.02, rtol=0
+    )
     torch.testing.assert_close(gained[half:], torch.zeros_like(gained[half:]), atol=0.02, rtol=0)
 
 
