@@ -13,6 +13,7 @@ from evercal.benchmark import ray_runs as cluster
 from evercal.benchmark.bench import BenchOptions, run_bench
 from evercal.benchmark.ray_runs import run_on_ray
 from evercal.benchmark.results import SceneResult, read
+from evercal.continual.strategies import strategy_named
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -37,15 +38,19 @@ def test_a_cluster_gives_what_a_loop_gives(
         return replace(arc_stage, fit=fit, encode=encode, replay_views_per_frame=1, seed=seed)
 
     few = [replace(scene, train=scene.train[:18], test=scene.test[:3]) for scene in arcs]
-    options = BenchOptions(stage, ("evercal", "joint"), seeds=(0,), short_side=120)
+    options = BenchOptions(
+        stage, tuple(map(strategy_named, ("evercal", "joint"))), seeds=(0,), short_side=120
+    )
     plain, spread = tmp_path / "plain", tmp_path / "spread"
-    list(run_bench(few, replace(options, strategies=("joint",)), spread))
+    list(run_bench(few, replace(options, strategies=options.strategies[1:]), spread))
     steps = list(run_on_ray(few, options, spread, "local"))
     assert [(s.strategy, s.done, s.total) for s in steps] == [("evercal", 3, 4), ("evercal", 4, 4)]
     list(run_bench(few, options, plain))
     names = [sorted(path.name for path in (at / "views").iterdir()) for at in (plain, spread)]
     assert (
-        names[0] == names[1] == [f"{s}-{r}.npz" for s in options.strategies for r in ("one", "two")]
+        names[0]
+        == names[1]
+        == [f"{s.name}-{r}.npz" for s in options.strategies for r in ("one", "two")]
     )
     for a, b in zip(told(plain), told(spread), strict=True):
         assert (a.strategy, a.stage, a.scene, a.frames) == (b.strategy, b.stage, b.scene, b.frames)

@@ -112,3 +112,31 @@ def test_a_checkpoint_keeps_its_value(
     for event, then in kept:
         assert_same(dict(event.rows), dict(then.rows))
         assert_same(dict(event.trainer), dict(then.trainer))
+
+
+TRAINED = [name for name, s in STRATEGIES.items() if s.method is not None and not s.jointly]
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_no_method_forgets_where_it_stood(
+    name: str,
+    first: dict[str, SceneMaps],
+    rooms: Rooms,
+    quick: StageOptions,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """After five of eight steps of the second scene; what is kept of the scene is the same, too."""
+    maps = first[name]
+    whole = outcome(continued(maps, rooms, quick))
+    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
+    resume = interrupted(continued(maps, rooms, quick), STOPS["fifth step"])
+    assert resume is not None
+    events = list(continued(maps, rooms, quick, resume))
+    assert [event.step for event in events if isinstance(event, Progress)] == [6, 7, 8]
+    again = outcome(events)
+    assert_same(weights(again.heads[-1]), weights(whole.heads[-1]))
+    state, expected = again.method_states[-1], whole.method_states[-1]
+    assert state.keys() == expected.keys()
+    for key, value in expected.items():
+        # Importances are divided by one another: the last digit may differ.
+        torch.testing.assert_close(state[key].float(), value.float(), rtol=1e-2, atol=1e-3)
