@@ -19,7 +19,7 @@ import pytest
 if TYPE_CHECKING:
     import torch
 
-    from evercal.continual.learn import Stage, StageOptions
+    from evercal.continual.stage import Stage, StageOptions
     from evercal.datasets.frame import Scene
     from evercal.mapping.scene_maps import SceneMaps
     from evercal.mapping.store import Store
@@ -83,7 +83,7 @@ def rooms(one_thread: None) -> tuple[Scene, Scene, Scene]:
 @pytest.fixture(scope="session")
 def quick() -> StageOptions:
     """A stage of eight steps for `rooms`."""
-    from evercal.continual.learn import StageOptions
+    from evercal.continual.stage import StageOptions
     from evercal.features.views import ViewOptions
     from evercal.networks.buffer import EncodePlan
     from evercal.networks.head import HeadOptions
@@ -140,14 +140,16 @@ def taught(
     blank: Callable[[str], SceneMaps], rooms: tuple[Scene, Scene, Scene], quick: StageOptions
 ) -> dict[str, list[SceneMaps]]:
     """By strategy: what is known after one, two and three rooms."""
-    from evercal.continual.learn import Stage, learn
+    from evercal.continual.learn import learn
+    from evercal.continual.stage import Stage
+    from evercal.continual.strategies import STRATEGIES
     from evercal.mapping.scene_maps import with_fit
 
     found: dict[str, list[SceneMaps]] = {}
     for strategy in ("evercal", "evercal_network", "isolation"):
         maps, after = blank(strategy), []
         for scene in rooms:
-            *_, stage = learn(maps, scene, quick)
+            *_, stage = learn(maps, STRATEGIES[strategy], scene, quick)
             assert isinstance(stage, Stage)
             maps = stage.maps
             maps.scenes[-1] = with_fit(maps.scenes[-1], 0.01 * len(maps.scenes), 1.5)
@@ -214,7 +216,7 @@ def arcs(one_thread: None) -> tuple[Scene, Scene]:
 @pytest.fixture(scope="session")
 def arc_stage() -> StageOptions:
     """Enough training for `arcs`."""
-    from evercal.continual.learn import StageOptions
+    from evercal.continual.stage import StageOptions
     from evercal.features.views import ViewOptions
     from evercal.networks.buffer import EncodePlan
     from evercal.networks.head import HeadOptions
@@ -230,14 +232,16 @@ def arc_stage() -> StageOptions:
 @pytest.fixture(scope="session")
 def arc_maps(arcs: tuple[Scene, Scene], arc_stage: StageOptions) -> tuple[SceneMaps, SceneMaps]:
     """What is known after the first arc, and after both."""
-    from evercal.continual.learn import Stage, learn
+    from evercal.continual.learn import learn
+    from evercal.continual.stage import Stage
+    from evercal.continual.strategies import STRATEGIES
     from evercal.features.descriptor import load_descriptor
     from evercal.features.encoder import load_encoder
     from evercal.mapping.scene_maps import SceneMaps
 
     maps = [SceneMaps(load_encoder(), load_descriptor(), "evercal_network", 120)]
     for arc in arcs:
-        *_, stage = learn(maps[-1], arc, arc_stage)
+        *_, stage = learn(maps[-1], STRATEGIES["evercal_network"], arc, arc_stage)
         assert isinstance(stage, Stage)
         maps.append(stage.maps)
     return maps[1], maps[2]
@@ -263,14 +267,17 @@ def hall_room() -> BoxRoom:
 @pytest.fixture(scope="session")
 def hall_stage(hall: Scene) -> Stage:
     """The map of `hall` with 7 keyframes; the thresholds of its record are fitted."""
-    from evercal.continual.learn import Stage, StageOptions, learn
+    from evercal.continual.learn import learn
+    from evercal.continual.stage import Stage, StageOptions
+    from evercal.continual.strategies import STRATEGIES
     from evercal.features.descriptor import load_descriptor
     from evercal.features.encoder import load_encoder
     from evercal.localization.acceptance import fitted_record
     from evercal.mapping.scene_maps import SceneMaps
 
     nothing = SceneMaps(load_encoder(), load_descriptor(), "evercal", 240)
-    *_, stage = learn(nothing, hall, StageOptions(memory_share=0.25))
+    options = StageOptions(memory_share=0.25)
+    *_, stage = learn(nothing, STRATEGIES["evercal"], hall, options)
     assert isinstance(stage, Stage)
     stage.maps.scenes[0] = fitted_record(stage.maps, hall.test[::10])
     return stage

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,22 +11,29 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from evercal.benchmark import bench
+from evercal.benchmark import bench, strategy_run
 from evercal.benchmark.bench import BenchOptions, begin_bench, in_order, run_bench
 from evercal.benchmark.comparison import runs_of
-from evercal.benchmark.results import RESULTS, SceneResult, read
+from evercal.benchmark.results import RESULTS, STRATEGIES, SceneResult, read, read_strategies
+from evercal.benchmark.strategy_run import RunOptions
 from evercal.benchmark.suites import SUITES, load_suite, regions, tuning_split
+from evercal.continual.methods.replay import Replay
 from evercal.continual.presets import PRESETS, on_paper_backbone
+from evercal.continual.strategies import Strategy, strategy_named
 from evercal.datasets import Frame, Scene
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.mapping.store import Store
 
 if TYPE_CHECKING:
-    from evercal.continual.learn import StageOptions
+    from evercal.continual.stage import StageOptions
 
 Arcs = tuple[Scene, Scene]
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
+
+
+def named(*names: str) -> tuple[Strategy, ...]:
+    return tuple(strategy_named(name) for name in names)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +43,7 @@ def options(arc_stage: StageOptions) -> BenchOptions:
         encode = replace(arc_stage.encode, views_per_frame=1, seed=seed)
         return replace(arc_stage, fit=fit, encode=encode, replay_views_per_frame=1, seed=seed)
 
-    return BenchOptions(stage, ("er", "finetune", "joint"), seeds=(0,), short_side=120)
+    return BenchOptions(stage, named("er", "finetune", "joint"), seeds=(0,), short_side=120)
 
 
 def told(results: list[SceneResult]) -> list[SceneResult]:
@@ -92,8 +100,8 @@ def test_what_is_done_is_not_run_again(
 ) -> None:
     out, _ = done
     before = (out / RESULTS).read_bytes()
-    monkeypatch.setattr(bench, "learn_scene", None)
-    monkeypatch.setattr(bench, "learn", None)
+    monkeypatch.setattr(strategy_run, "learn_scene", None)
+    monkeypatch.setattr(strategy_run, "learn_jointly", None)
     assert list(run_bench(arcs, options, out)) == []
     assert (out / RESULTS).read_bytes() == before
 
@@ -106,7 +114,7 @@ def test_a_stop_between_stages_does_not_show(
     tmp_path: Path,
     stop: int,
 ) -> None:
-    alone = replace(options, strategies=("er",))
+    alone = replace(options, strategies=named("er"))
     steps = run_bench(arcs, alone, tmp_path)
     for _ in range(stop):
         next(steps)
@@ -119,9 +127,9 @@ def test_a_stop_between_stages_does_not_show(
 def test_a_stop_inside_a_stage_resumes_it(
     arcs: Arcs, options: BenchOptions, done: tuple[Path, list[bench.Step]], tmp_path: Path
 ) -> None:
-    alone = replace(options, strategies=("er",))
+    alone = replace(options, strategies=named("er"))
     # What a kill inside the first commit leaves behind.
-    (tmp_path / "runs" / "evercal-0" / "stages" / ".0001-one").mkdir(parents=True)
+    (tmp_path / "runs" / "er-0" / "stages" / ".0001-one").mkdir(parents=True)
 
     def stop(event: object) -> None:
         raise KeyboardInterrupt
@@ -144,26 +152,41 @@ def test_results_make_runs(done: tuple[Path, list[bench.Step]]) -> None:
     ("change", "message"),
     [
         ({"order": "reversed"}, "order 'given', now it is 'reversed'"),
-        ({"strategies": ("er", "magic")}, "strategy 'magic': unknown; choose from evercal"),
+        (
+            {"strategies": (replace(strategy_named("er"), method=Replay("sars", weight=0.3)),)},
+            "strategy 'er' was .*reservoir.*now it is .*sars.*give it another name",
+        ),
         ({"settings": {"suite": "other"}}, "suite None, now it is 'other'"),
     ],
 )
-def test_other_settings_and_unknown_strategies_are_refused(
+def test_other_settings_and_names_that_change_their_meaning_are_refused(
     arcs: Arcs,
     options: BenchOptions,
     done: tuple[Path, list[bench.Step]],
     change: dict[str, object],
     message: str,
 ) -> None:
+    before = (done[0] / STRATEGIES).read_bytes()
     with pytest.raises(InputError, match=message):
         next(run_bench(arcs, replace(options, **change), done[0]))  # pyright: ignore[reportArgumentType]
+    assert (done[0] / STRATEGIES).read_bytes() == before
 
 
-def test_made_up_strategies_join_what_is_there(
-    arcs: Arcs, options: BenchOptions, done: tuple[Path, list[bench.Step]]
+def test_what_each_strategy_is_stands_beside_the_results(
+    arcs: Arcs, options: BenchOptions, done: tuple[Path, list[bench.Step]], tmp_path: Path
 ) -> None:
-    more = replace(options, strategies=("er", "reservoir+old_output", "er@3"))
-    assert begin_bench(arcs, more, done[0]) == [(0, "reservoir+old_output"), (0, "er@3")]
+    told = read_strategies(done[0])
+    assert told == {s.name: s.description() for s in options.strategies}
+    runs = {run.strategy: run for run in runs_of(read(done[0]), told)}
+    assert runs["er"].description == strategy_named("er").description()
+    assert np.isfinite(runs["er"].memory_mb)
+    assert np.isnan(runs["joint"].memory_mb)  # it needs every frame again
+    # More may join, and what is there stays.
+    row = Strategy("er_3", Replay(weight=0.9))
+    asked = replace(options, strategies=(*named("er"), row))
+    shutil.copytree(done[0], tmp_path / "out", ignore=shutil.ignore_patterns("features"))
+    assert begin_bench(arcs, asked, tmp_path / "out") == [(0, row)]
+    assert list(read_strategies(tmp_path / "out")) == ["er", "finetune", "joint", "er_3"]
 
 
 def test_one_scene_cannot_be_forgotten(arcs: Arcs, options: BenchOptions, tmp_path: Path) -> None:
@@ -226,15 +249,16 @@ def test_the_paper_knows_all_centres_from_the_start(
         made = on_paper_backbone(replace(few, head=replace(few.head, width=24)))
         return replace(made, head=replace(made.head, centres_per_scene=5))
 
-    asked = replace(options, stage=stage, strategies=("sars_spdd", "joint", "evercal"))
-    run = bench._Run(list(arcs), asked, tmp_path, "evercal", 0)
+    asked = replace(options, stage=stage, strategies=named("sars_spdd", "joint", "evercal"))
+    how = RunOptions(stage(0), 120, tmp_path / "features", tmp_path)
+    run = strategy_run._Run(asked.strategies[0], list(arcs), how, None)
     assert (run.stage.grid_scenes, len(run.stage.fixed_centres_m)) == (2, 10)
     assert run.stage.head.width == 24
     assert run.stage.head.condition == "descriptor"
     assert run.stage.fit.iterations == options.stage(0).fit.iterations
     assert run.stage.fit.peak_rate == PRESETS["paper"].fit.peak_rate
     steps = list(run_bench(arcs, asked, tmp_path))
-    assert [s.strategy for s in steps] == [n for n in asked.strategies for _ in arcs]
+    assert [s.strategy for s in steps] == [s.name for s in asked.strategies for _ in arcs]
     first = Store.open(tmp_path / "runs" / "first-one-0").maps
     # No scene brings any of its own.
     assert len(first.heads[0].centres) == 10
@@ -247,16 +271,16 @@ def test_the_paper_knows_all_centres_from_the_start(
 def test_a_running_note_begins_with_the_first_scene(
     arcs: Arcs, options: BenchOptions, tmp_path: Path
 ) -> None:
-    steps = list(run_bench(arcs, replace(options, strategies=("ewc_online",)), tmp_path))
+    steps = list(run_bench(arcs, replace(options, strategies=named("ewc_online")), tmp_path))
     sizes = [step.results[0].memory_bytes for step in steps]
     # One anchor and one Fisher matrix a scene, both of the whole head.
     assert 0 < sizes[0] < sizes[1]
 
 
-def test_joint_training_may_remember_too(
+def test_joint_training_may_build_maps_too(
     arcs: Arcs, options: BenchOptions, done: tuple[Path, list[bench.Step]], tmp_path: Path
 ) -> None:
-    list(run_bench(arcs, replace(options, strategies=("joint_recall",)), tmp_path))
+    list(run_bench(arcs, replace(options, strategies=named("joint_map")), tmp_path))
     ours = {o.scene: o for o in read(tmp_path)}
     plain = {o.scene: o for o in read(done[0]) if o.strategy == "joint"}
     assert ours.keys() == plain.keys() == {"one", "two"}

@@ -20,11 +20,12 @@ from evercal.benchmark import ray_runs as cluster
 from evercal.benchmark.bench import BenchOptions, run_bench
 from evercal.benchmark.ray_runs import run_on_ray
 from evercal.benchmark.results import SceneResult, append, read
+from evercal.continual.strategies import Strategy, strategy_named
 from evercal.errors import InputError
 from tests.benchmark.test_comparison import lines
 
 if TYPE_CHECKING:
-    from evercal.continual.learn import StageOptions
+    from evercal.continual.stage import StageOptions
     from evercal.datasets import Scene
 
 
@@ -45,15 +46,19 @@ def test_a_cluster_gives_what_a_loop_gives(
         return replace(arc_stage, fit=fit, encode=encode, replay_views_per_frame=1, seed=seed)
 
     few = [replace(scene, train=scene.train[:18], test=scene.test[:3]) for scene in arcs]
-    options = BenchOptions(stage, ("evercal", "joint"), seeds=(0,), short_side=120)
+    options = BenchOptions(
+        stage, tuple(map(strategy_named, ("evercal", "joint"))), seeds=(0,), short_side=120
+    )
     plain, spread = tmp_path / "plain", tmp_path / "spread"
-    list(run_bench(few, replace(options, strategies=("joint",)), spread))
+    list(run_bench(few, replace(options, strategies=options.strategies[1:]), spread))
     steps = list(run_on_ray(few, options, spread, "local"))
     assert [(s.strategy, s.done, s.total) for s in steps] == [("evercal", 3, 4), ("evercal", 4, 4)]
     list(run_bench(few, options, plain))
     names = [sorted(path.name for path in (at / "views").iterdir()) for at in (plain, spread)]
     assert (
-        names[0] == names[1] == [f"{s}-{r}.npz" for s in options.strategies for r in ("one", "two")]
+        names[0]
+        == names[1]
+        == [f"{s.name}-{r}.npz" for s in options.strategies for r in ("one", "two")]
     )
     for a, b in zip(told(plain), told(spread), strict=True):
         assert (a.strategy, a.stage, a.scene, a.frames) == (b.strategy, b.stage, b.scene, b.frames)
@@ -78,7 +83,7 @@ def test_a_worker_of_a_cluster_that_dies_is_replaced(
         return replace(arc_stage, fit=fit, seed=seed)
 
     few = [replace(scene, train=scene.train[:18], test=scene.test[:3]) for scene in arcs]
-    options = BenchOptions(stage, ("evercal",), seeds=(0,), short_side=120)
+    options = BenchOptions(stage, (strategy_named("evercal"),), seeds=(0,), short_side=120)
     said: list[str] = []
     out = tmp_path / "out"
     steps = list(run_on_ray(few, options, out, "local", None, said.append))
@@ -166,7 +171,7 @@ def start(
         monkeypatch.setattr(cluster, "_reads", lambda _: None)
 
     def run(out: Path) -> tuple[list[str], list[str], str]:
-        options = BenchOptions(lambda _: None, ("ours", "theirs"), (0,))  # pyright: ignore[reportArgumentType]
+        options = BenchOptions(lambda _: None, (Strategy("ours"), Strategy("theirs")), (0,))  # pyright: ignore[reportArgumentType]
         said: list[str] = []
         steps, error = [], ""
         try:
@@ -260,7 +265,7 @@ def test_failures_go_to_stderr(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     start(monkeypatch, FakeRay(), Bench({"ours": [1]}), shared=True)
-    options = BenchOptions(lambda _: None, ("ours",), (0,))  # pyright: ignore[reportArgumentType]
+    options = BenchOptions(lambda _: None, (Strategy("ours"),), (0,))  # pyright: ignore[reportArgumentType]
     list(run_on_ray(SCENES, options, tmp_path, "local"))
     told = capsys.readouterr()
     assert told.out == ""

@@ -6,7 +6,8 @@ import pytest
 
 from evercal.benchmark import results
 from evercal.benchmark.report_data import read_report
-from evercal.benchmark.results import SETTINGS
+from evercal.benchmark.results import SETTINGS, STRATEGIES
+from evercal.continual.strategies import strategy_named
 from evercal.errors import InputError
 from evercal.storage import write_json
 
@@ -19,6 +20,8 @@ def folder(root: Path, name: str, right: int, **settings: object) -> Path:
     out.mkdir()
     held = {"suite": "custom", "scenes": [["a", 9, 20], ["b", 9, 20]], "judged": "test frames"}
     write_json(out / SETTINGS, held | settings)
+    known = {name: strategy_named(name).description() for name in ("evercal", "joint")}
+    write_json(out / STRATEGIES, known)
     results.append(out, lines("evercal", 0, [[16], [right, right]]))
     results.append(out, lines("joint", 0, [[10], [10, 10]]))
     return out

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from evercal.benchmark.results import RESULTS
+from evercal.benchmark.results import RESULTS, STRATEGIES
 from evercal.cli import bench as verb
 from evercal.datasets import generic
 
 if TYPE_CHECKING:
-    from evercal.continual.learn import StageOptions
+    from evercal.continual.stage import StageOptions
     from evercal.datasets import Scene
 
 
@@ -57,10 +57,12 @@ def test_bench_and_its_report(
         (["attic"], "suite 'attic': unknown; choose one of sim-mini"),
         (["custom"], "suite custom: scene folders are for the suites custom and regions"),
         (["sim-mini", "somewhere"], "suite sim-mini: scene folders are for the suites custom"),
-        (["sim-mini", "--strategies", "evercal,magic"], "strategy 'magic': unknown; choose from"),
+        (["sim-mini", "--strategies", "evercal,magic"], "strategy 'magic': unknown; choose one of"),
         (["sim-mini", "--seeds", "0,one"], "--seeds 0,one: give numbers"),
         (["sim-mini", "--seeds", ","], "--seeds ,: give numbers"),
-        (["sim-mini", "--strategies", "er@fast"], "strategy 'er@fast': unknown; choose from"),
+        (["sim-mini", "--strategies", "er@3"], "strategy 'er@3': unknown; choose one of"),
+        (["sim-mini", "--rows", "table5"], "rows table5: give spdd-sweep, table4, with-map"),
+        (["sim-mini", "--rows", "nowhere.json"], "rows nowhere.json: no such file"),
         (["sim-mini", "--steps", "0"], "--steps 0: give a number >= 1"),
         (["sim-mini", "--memory", "all"], "--memory all: give a share"),
         (["sim-mini", "--scenes", "bedroom"], "two or more"),
@@ -87,11 +89,20 @@ def test_settings_are_chosen_on_training_frames(
     for scene in arcs:
         folders.append(tmp_path / scene.name)
         generic.write(folders[-1], replace(scene, train=scene.train[:30], test=scene.test[:2]))
-    words = ["custom", *folders, "--strategies", "er,er@3", "--seeds", "0", "--held-out"]
+    rows = tmp_path / "rows.json"
+    # What is named twice and means the same is run once.
+    rows.write_text(
+        '[{"name": "er", "of": "er"}, {"name": "er_3", "of": "er", "with": {"weight": 0.9}}]'
+    )
+    words = ["custom", *folders, "--strategies", "er", "--rows", rows, "--seeds", "0", "--held-out"]
     assert run("bench", *words, "--out", tmp_path / "out").code == 0
     lines = [json.loads(line) for line in (tmp_path / "out" / RESULTS).read_text().splitlines()]
     learned = {frame.name for scene in arcs for frame in scene.train}
-    assert {line["strategy"] for line in lines} == {"er", "er@3"}
+    done = [(line["strategy"], line["stage"], line["scene"]) for line in lines]
+    stages = [(0, "one"), (1, "one"), (1, "two")]
+    assert done == [(name, *stage) for name in ("er", "er_3") for stage in stages]
+    told = json.loads((tmp_path / "out" / STRATEGIES).read_text())
+    assert [told[name]["method"]["weight"] for name in ("er", "er_3")] == [0.3, 0.9]
     assert {len(line["frames"]) for line in lines} == {6}
     assert {name for line in lines for name in line["frames"]} <= learned
     # Results on test frames do not mix with these.

@@ -67,7 +67,7 @@ def test_after_a_stop_the_same_command_goes_on(
 
 BAD_OPTIONS = [
     (["--strategy", "joint"], "for the benchmark only"),
-    (["--strategy", "nonsense"], "evercal, evercal_hybrid, finetune"),
+    (["--strategy", "nonsense"], "evercal, evercal_network, evercal_hybrid, finetune"),
     (["--strategy", "finetune"], "'evercal'"),
     (["--memory", "lots"], "--memory lots"),
     (["--memory", "0%"], "--memory 0%"),

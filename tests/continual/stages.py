@@ -5,9 +5,12 @@ from collections.abc import Callable, Iterable, Iterator
 import torch
 from torch import Tensor
 
-from evercal.continual.learn import Event, Resume, Stage, StageOptions, learn
+from evercal.continual.learn import learn
+from evercal.continual.stage import Event, Stage, StageOptions
+from evercal.continual.strategies import STRATEGIES
 from evercal.datasets.frame import Scene
 from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.store import Resume
 from evercal.networks.head import Head
 
 Blank = Callable[[str], SceneMaps]
@@ -36,5 +39,5 @@ def assert_same(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
 def continued(
     maps: SceneMaps, rooms: Rooms, options: StageOptions, resume: Resume | None = None
 ) -> Iterator[Event]:
-    """The events of the second stage, `beta`, for any strategy."""
-    return learn(maps, rooms[1], options, resume, earlier=rooms[:1])
+    """The events of the second stage, `beta`, with the strategy of the first."""
+    return learn(maps, STRATEGIES[maps.strategy], rooms[1], options, resume)

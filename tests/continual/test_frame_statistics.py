@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from evercal.continual.frame_statistics import PARTS, FrameStatistics
-from evercal.continual.learn import Stage, StageOptions, learn
+from evercal.continual.learn import learn
+from evercal.continual.stage import Stage, StageOptions
+from evercal.continual.strategies import STRATEGIES
 from evercal.geometry import SE3
 from evercal.networks.buffer import FeatureBuffer, encode_frames
 from evercal.networks.head import Head, HeadOptions
@@ -22,7 +24,7 @@ def seen(
 ) -> tuple[FrameStatistics, Head, FeatureBuffer]:
     """Frames of `alpha` after some learning, with two views of each in the buffer."""
     options = replace(quick, fit=replace(quick.fit, iterations=60))
-    *_, stage = learn(blank("finetune"), rooms[0], options)
+    *_, stage = learn(blank("finetune"), STRATEGIES["finetune"], rooms[0], options)
     assert isinstance(stage, Stage)
     maps = stage.maps
     buffer = FeatureBuffer(0, maps.scenes[0].cell.atlas_from_base)

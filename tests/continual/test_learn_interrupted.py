@@ -9,15 +9,11 @@ import pytest
 import torch
 from safetensors.torch import load, save
 
-from evercal.continual import learn as learn_module
-from evercal.continual.learn import (
-    Checkpoint,
-    Encoding,
-    Event,
-    Resume,
-    StageOptions,
-)
+from evercal.continual import stage_rows
+from evercal.continual.stage import Encoding, Event, StageOptions
+from evercal.continual.strategies import STRATEGIES
 from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.store import Checkpoint, Resume
 from evercal.networks.trainer import Progress
 
 from .stages import Rooms, assert_same, continued, outcome, weights
@@ -55,7 +51,7 @@ STOPS: dict[str, Callable[[Sequence[Checkpoint]], bool]] = {
 
 
 @pytest.mark.parametrize("where", STOPS)
-@pytest.mark.parametrize("name", ["evercal_network", "sars_spdd", "joint"])
+@pytest.mark.parametrize("name", ["evercal_network", "sars_spdd", "isolation"])
 def test_an_interruption_does_not_show(
     name: str,
     where: str,
@@ -66,7 +62,7 @@ def test_an_interruption_does_not_show(
 ) -> None:
     maps = first[name]
     whole = outcome(continued(maps, rooms, quick))
-    monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
     resume = interrupted(continued(maps, rooms, quick), STOPS[where])
     assert resume is not None
     again = list(continued(maps, rooms, quick, resume))
@@ -91,7 +87,7 @@ def test_interrupted_twice(
 ) -> None:
     maps = first["evercal_network"]
     whole = outcome(continued(maps, rooms, quick))
-    monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
     once = interrupted(continued(maps, rooms, quick), STOPS["halfway through encoding"])
     assert once is not None
     twice = interrupted(continued(maps, rooms, quick, once), STOPS["fifth step"])
@@ -108,7 +104,7 @@ def test_a_checkpoint_keeps_its_value(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # A consumer may write it while training goes on.
-    monkeypatch.setattr(learn_module, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
     kept: list[tuple[Checkpoint, Checkpoint]] = []
     for event in continued(first["evercal_network"], rooms, quick):
         if isinstance(event, Checkpoint):
@@ -116,3 +112,31 @@ def test_a_checkpoint_keeps_its_value(
     for event, then in kept:
         assert_same(dict(event.rows), dict(then.rows))
         assert_same(dict(event.trainer), dict(then.trainer))
+
+
+TRAINED = [name for name, s in STRATEGIES.items() if s.method is not None and not s.jointly]
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_no_method_forgets_where_it_stood(
+    name: str,
+    first: dict[str, SceneMaps],
+    rooms: Rooms,
+    quick: StageOptions,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """After five of eight steps of the second scene; what is kept of the scene is the same, too."""
+    maps = first[name]
+    whole = outcome(continued(maps, rooms, quick))
+    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
+    resume = interrupted(continued(maps, rooms, quick), STOPS["fifth step"])
+    assert resume is not None
+    events = list(continued(maps, rooms, quick, resume))
+    assert [event.step for event in events if isinstance(event, Progress)] == [6, 7, 8]
+    again = outcome(events)
+    assert_same(weights(again.heads[-1]), weights(whole.heads[-1]))
+    state, expected = again.method_states[-1], whole.method_states[-1]
+    assert state.keys() == expected.keys()
+    for key, value in expected.items():
+        # Importances are divided by one another: the last digit may differ.
+        torch.testing.assert_close(state[key].float(), value.float(), rtol=1e-2, atol=1e-3)

@@ -42,7 +42,7 @@ def test_folders_and_scenes_strings_and_paths(asked: Any, tmp_path: Path) -> Non
         assert root == tmp_path / "store"
         assert taken.name == scene.name
         assert options.stage.memory_bytes == 5_000_000
-        assert options.strategy == "evercal"
+        assert options.strategy.name == "evercal"
 
 
 def test_memory_is_a_share_bytes_or_a_number(asked: Any, tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_memory_is_a_share_bytes_or_a_number(asked: Any, tmp_path: Path) -> None
 def test_a_store_keeps_its_strategy(asked: Any, tmp_path: Path) -> None:
     write_manifest(tmp_path, {"strategy": "finetune"}, [])
     learn(tmp_path, box_room_scene(3, 2, 1))
-    assert asked[0][2].strategy == "finetune"
+    assert asked[0][2].strategy.name == "finetune"
 
 
 @pytest.mark.parametrize(

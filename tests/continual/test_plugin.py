@@ -1,13 +1,21 @@
 """Strategies from a user's file."""
 
+from __future__ import annotations
+
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from evercal.continual.learn import learn
+from evercal.continual.methods.penalties import OldOutput
 from evercal.continual.plugin import load_plugin
-from evercal.continual.strategies import STRATEGIES
+from evercal.continual.stage import StageOptions
+from evercal.continual.strategies import STRATEGIES, strategy_named
 from evercal.errors import InputError
+
+from .stages import Blank, Rooms, outcome, weights
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "my_strategy.py"
 
@@ -23,14 +31,20 @@ def _restored() -> object:
 def test_the_example_is_short_and_can_be_loaded_twice() -> None:
     assert len(EXAMPLE.read_text().splitlines()) <= 40
     assert load_plugin(EXAMPLE) == ("spread",)
-    select = STRATEGIES["spread"].select
-    assert select is not None
+    method = STRATEGIES["spread"].method
+    assert method is not None
 
     class Line:
         positions_m = np.linspace(0, 1, 11)[:, None] * [1.0, 0, 0]
         quaternions_wxyz = np.tile([1.0, 0, 0, 0], (11, 1))
 
-    assert select(Line(), 3).tolist() == [0, 5, 10]  # pyright: ignore[reportArgumentType]
+    kept = method.select(Line(), 3)  # pyright: ignore[reportArgumentType]
+    assert kept is not None
+    assert kept.tolist() == [0, 5, 10]
+    # What it is made of is recorded like ours.
+    told = STRATEGIES["spread"].description()["method"]
+    assert isinstance(told, dict)
+    assert (told["kind"], told["penalty"]) == ("Spread", {"kind": "OldOutput", "px_per_m": 25.0})
     with pytest.raises(InputError, match="'spread' is evercal's own"):
         load_plugin(EXAMPLE)
 
@@ -42,6 +56,11 @@ def test_the_example_is_short_and_can_be_loaded_twice() -> None:
         ("x = 1", "defines no STRATEGIES"),
         ("STRATEGIES = {}", "defines no STRATEGIES"),
         ("STRATEGIES = {'a': 1}", "defines no STRATEGIES"),
+        (
+            "from evercal.continual.strategies import Strategy\n"
+            "STRATEGIES = {'mine': Strategy('other')}",
+            "defines no STRATEGIES",
+        ),
         ("1 / 0", "ZeroDivisionError: division by zero"),
         ("def :", "SyntaxError"),
     ],
@@ -59,7 +78,7 @@ def test_names_of_ours_are_taken(tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
     path.write_text(
         "from evercal.continual.strategies import Strategy\n"
-        "STRATEGIES = {'finetune': Strategy(source='mine')}"
+        "STRATEGIES = {'finetune': Strategy('finetune', source='mine')}"
     )
     with pytest.raises(InputError, match="'finetune' is evercal's own"):
         load_plugin(path)
@@ -68,3 +87,20 @@ def test_names_of_ours_are_taken(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("")
     with pytest.raises(InputError, match=r"ends in \.py"):
         load_plugin(tmp_path / "mine.txt")
+
+
+def test_the_example_learns_two_scenes(blank: Blank, rooms: Rooms, quick: StageOptions) -> None:
+    """Its frames are replayed, with its penalty: without a weight it ends elsewhere."""
+    (name,) = load_plugin(EXAMPLE)
+    strategy = strategy_named(name)
+    maps = blank(name)
+    for scene in rooms[:2]:
+        before, maps = maps, outcome(learn(maps, strategy, scene, quick))
+    assert [len(kept) for kept in maps.keyframes if kept is not None] == [3, 3]
+    method = strategy.method
+    assert method is not None
+    assert method.penalty == OldOutput(25.0)  # pyright: ignore[reportAttributeAccessIssue]
+    free = replace(strategy, method=replace(method, weight=0.0))  # pyright: ignore[reportCallIssue]
+    other = outcome(learn(before, free, rooms[1], quick))
+    name = "first.1.weight"
+    assert not np.allclose(weights(maps.heads[0])[name], weights(other.heads[0])[name], atol=1e-4)

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evercal.continual.learn import StageOptions
 from evercal.continual.learn_scene import LearnOptions, LearnReport, learn_scene
+from evercal.continual.stage import StageOptions
+from evercal.continual.strategies import STRATEGIES
 from evercal.continual.wrist_camera import lacks_camera_poses
 from evercal.datasets import Scene, load_scene
 from evercal.errors import InputError
@@ -103,6 +104,6 @@ def test_rotation_about_one_axis_is_refused_before_any_work(hand: Scene, tmp_pat
 
 
 def test_a_network_cannot_find_it(hand: Scene, tmp_path: Path) -> None:
-    options = LearnOptions(strategy="evercal_network")
+    options = LearnOptions(strategy=STRATEGIES["evercal_network"])
     with pytest.raises(InputError, match="only gripper poses are known"):
         learn_scene(tmp_path / "store", blind(hand), options)

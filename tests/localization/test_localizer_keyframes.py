@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from evercal.continual.learn import Stage, learn
+from evercal.continual.learn import learn
+from evercal.continual.stage import Stage
+from evercal.continual.strategies import STRATEGIES
 from evercal.features.descriptor import load_descriptor
 from evercal.features.encoder import load_encoder
 from evercal.localization.localizer import LocalizeOptions, Localizer
@@ -16,7 +18,7 @@ from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.scene_maps import SceneMaps
 
 if TYPE_CHECKING:
-    from evercal.continual.learn import StageOptions
+    from evercal.continual.stage import StageOptions
     from evercal.datasets import Scene
     from evercal.localization.estimate import PoseEstimate
 
@@ -27,7 +29,7 @@ def unlearned(arcs: tuple[Scene, Scene], arc_stage: StageOptions) -> SceneMaps:
     fit = replace(arc_stage.fit, iterations=12)
     options = replace(arc_stage, fit=fit, memory_share=0.5)
     blank = SceneMaps(load_encoder(), load_descriptor(), "evercal_hybrid", 120)
-    *_, stage = learn(blank, arcs[0], options)
+    *_, stage = learn(blank, STRATEGIES["evercal_hybrid"], arcs[0], options)
     assert isinstance(stage, Stage)
     return stage.maps
 
@@ -89,7 +91,7 @@ def test_remembered_cells_vote_for_the_scene(
         memory_share=0.5,
         replay_views_per_frame=1,
     )
-    *_, stage = learn(unlearned, arcs[1], options)
+    *_, stage = learn(unlearned, STRATEGIES["evercal_hybrid"], arcs[1], options)
     assert isinstance(stage, Stage)
     maps = stage.maps
     # Descriptors that say the opposite of the truth.

@@ -17,7 +17,7 @@ from evercal.mapping.recording import WorkingSize
 from evercal.simulation.box_room import BoxRoom
 
 if TYPE_CHECKING:
-    from evercal.continual.learn import Stage
+    from evercal.continual.stage import Stage
 
 SMALL = MapOptions(size=WorkingSize(cells=120, patches=120))
 

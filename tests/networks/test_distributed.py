@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from torch import Tensor, distributed
 from torch.multiprocessing import spawn  # pyright: ignore[reportPrivateImportUsage]
 
-from evercal.continual.methods.gradient_constraints import gem
 from evercal.datasets.frame import Frame
 from evercal.errors import InputError
 from evercal.features.descriptor import GlobalDescriptor
@@ -40,14 +39,14 @@ from evercal.networks.distributed import (
     shared_out,
     wait_for_all,
 )
-from evercal.networks.gradients import Combine
 from evercal.networks.head import Head, HeadOptions, HeadOutput
+from evercal.networks.hooks import ProposedStep, TrainingHooks
 from evercal.networks.loss import Target
-from evercal.networks.trainer import FitOptions, HeadTrainer, Replay
+from evercal.networks.trainer import FitOptions, HeadTrainer
 from evercal.simulation.box_room import default_camera
 
-OPTIONS = FitOptions(iterations=4, batch=64, replay_batch=32)
-RULES: dict[str, Combine | None] = {"sum": None, "gem": gem}
+OPTIONS = FitOptions(iterations=4, batch=64)
+RULES = ("cost", "constraints")
 STOPS = (0, 2)
 """Rounds of encoding after which a run is interrupted."""
 Made = list[dict[str, dict[str, Tensor]]]
@@ -72,25 +71,51 @@ def buffer_of(scene: int) -> FeatureBuffer:
     return buffer
 
 
-def cost(output: HeadOutput, rows: Rows, progress: float) -> Tensor:
-    return (output.points - rows.features[:, 6:].float()).abs().mean()
+class Both(TrainingHooks):
+    """Remembered scenes cost something, or constrain the step; keeps what it was shown."""
+
+    def __init__(self, rule: str, memories: list[FeatureBuffer]):
+        self.rule, self.memories, self.seen = rule, memories, dict[str, Tensor]()
+        self.edits_steps = rule == "constraints"
+
+    def replayed(
+        self, fresh: Rows, step: int, rate: float, generator: torch.Generator
+    ) -> list[Rows]:
+        return [memory.draw(16, generator) for memory in self.memories]
+
+    def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
+        if self.rule == "constraints":
+            return None
+        return (output.points - rows.features[:, 6:].float()).abs().mean()
+
+    def constraints(self, output: HeadOutput, rows: Rows, progress: float) -> list[Tensor]:
+        if self.rule == "cost":
+            return []
+        each = len(rows.scene) // 2
+        off = (output.points - rows.features[:, 6:].float()).abs().mean(1)
+        return [off[:each].mean(), off[each:].mean()]
+
+    def edit_step(self, proposed: ProposedStep) -> None:
+        self.seen = {"losses": proposed.losses}
+        for i, constraint in enumerate(proposed.constraints):
+            self.seen |= {f"{i}.{name}": value.clone() for name, value in constraint.items()}
 
 
 def gradients(rule: str, steps: int = 1) -> dict[str, Tensor]:
-    """What is in `.grad` after some steps of training."""
+    """What is in `.grad` after some steps of training, and what the hooks were shown."""
     torch.manual_seed(0)
     torch.set_num_threads(1)
     buffers = [buffer_of(scene) for scene in range(3)]
     head = Head(9, 4, HeadOptions(width=16, blocks=1, whiten=False))
     for scene in range(3):
         head.grow(torch.randn(2, 3), seed=scene)
-    replay = Replay(buffers[:2], cost, combine=RULES[rule])
-    trainer = HeadTrainer(head, buffers[2:], replay, OPTIONS, seed=1)
+    hooks = Both(rule, buffers[:2])
+    trainer = HeadTrainer(head, buffers[2:], OPTIONS, 1, hooks)
     run = trainer.run()
     for _ in range(steps):
         next(run)
     found = {name: value.grad for name, value in head.named_parameters()}
-    return {name: value for name, value in found.items() if value is not None}
+    return {name: value for name, value in found.items() if value is not None} | hooks.seen
 
 
 def _worker(number: int, folder: str) -> None:
@@ -118,6 +143,7 @@ def test_two_processes_leave_the_gradients_of_one(rule: str, by_two: Made) -> No
     found = [made[f"gradients {rule}"] for made in by_two]
     alone = gradients(rule)
     assert found[0].keys() == found[1].keys() == alone.keys()
+    assert ("losses" in alone) == (rule == "constraints")
     for name, value in alone.items():
         assert torch.equal(found[0][name], found[1][name]), name
         # Products in half precision differ with the shape of the batch.

@@ -1,7 +1,7 @@
 """The training loop: its schedule, its seeds, stopping and going on, and that it learns."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import islice
 
@@ -13,15 +13,9 @@ from evercal.features.views import cell_centres
 from evercal.geometry import SE3, Camera
 from evercal.networks.buffer import FeatureBuffer, Rows
 from evercal.networks.head import Head, HeadOptions, HeadOutput
+from evercal.networks.hooks import ProposedStep, TrainingHooks
 from evercal.networks.loss import LossOptions, reprojection_error
-from evercal.networks.trainer import (
-    FitOptions,
-    HeadTrainer,
-    Progress,
-    Replay,
-    one_cycle,
-    replayed_rows,
-)
+from evercal.networks.trainer import FitOptions, HeadTrainer, Progress, one_cycle
 
 CAMERA = Camera(160, 120, 131.0, 128.0, 79.5, 59.5)
 CHANNELS, DESCRIPTOR = 48, 6
@@ -35,6 +29,48 @@ OPTIONS = FitOptions(
 )
 
 Learnable = Callable[..., tuple[FeatureBuffer, Tensor]]
+Cost = Callable[[HeadOutput, Rows, float], Tensor]
+
+
+class Replayed(TrainingHooks):
+    """Thirty rows of each buffer join every step and cost what a function says."""
+
+    def __init__(self, memories: list[FeatureBuffer], penalty: Cost):
+        self.memories, self.penalty = memories, penalty
+
+    def replayed(
+        self, fresh: Rows, step: int, rate: float, generator: torch.Generator
+    ) -> list[Rows]:
+        return [memory.draw(30, generator) for memory in self.memories]
+
+    def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
+        return self.penalty(output, rows, progress)
+
+
+class Counted(Replayed):
+    """Replay that counts its steps and edits them by the count."""
+
+    edits_steps = True
+
+    def __init__(self, memories: list[FeatureBuffer], penalty: Cost):
+        super().__init__(memories, penalty)
+        self.count = 0
+
+    def edit_step(self, proposed: ProposedStep) -> None:
+        self.count += 1
+        for change in proposed.changes.values():
+            change *= 1 / (1 + self.count)
+
+    def state(self) -> dict[str, Tensor]:
+        return {"count": torch.tensor(self.count)}
+
+    def load(self, state: Mapping[str, Tensor]) -> None:
+        self.count = int(state["count"])
+
+
+def numbers(steps: list[Progress]) -> list[tuple[int, float, float]]:
+    """What progress says, as plain numbers."""
+    return [(step.step, step.loss, step.inlier_share) for step in steps]
 
 
 def head_for(buffers: list[FeatureBuffer], options: HeadOptions | None = None) -> Head:
@@ -84,8 +120,9 @@ def test_the_shortest_schedules_have_a_rate(iterations: int) -> None:
 
 @pytest.mark.parametrize("stop", [3, 10, 17])
 @pytest.mark.parametrize("condition", ["code", "descriptor"])
+@pytest.mark.parametrize("kind", [Replayed, Counted])
 def test_stopping_and_going_on_changes_nothing(
-    learnable: Learnable, stop: int, condition: str
+    learnable: Learnable, stop: int, condition: str, kind: type[Replayed]
 ) -> None:
     """Twenty steps in one go, and in two goes by two fitters that share only the saved state."""
     fresh, _ = learnable(1, correctable=True)
@@ -93,19 +130,21 @@ def test_stopping_and_going_on_changes_nothing(
     shape = HeadOptions(width=32, condition=condition)  # pyright: ignore[reportArgumentType]
     head = head_for([past, fresh], shape)
     twin, third = copy.deepcopy(head), copy.deepcopy(head)
-    replay = Replay([past], lambda output, rows, progress: output.points.abs().mean())
 
-    whole = HeadTrainer(head, [fresh], replay, OPTIONS, seed=3)
+    def hooks() -> Replayed:
+        return kind([past], lambda output, rows, progress: output.points.abs().mean())
+
+    whole = HeadTrainer(head, [fresh], OPTIONS, 3, hooks())
     expected = list(whole.run())
-    first = HeadTrainer(twin, [fresh], replay, OPTIONS, seed=3)
+    first = HeadTrainer(twin, [fresh], OPTIONS, 3, hooks())
     found = list(islice(first.run(), stop))
     saved = snapshot(first)
-    second = HeadTrainer(third, [fresh], replay, OPTIONS, seed=3)
+    second = HeadTrainer(third, [fresh], OPTIONS, 3, hooks())
     second.load(saved)
     found += list(second.run())
 
     assert [p.step for p in found] == list(range(1, 21))
-    assert found == expected
+    assert numbers(found) == numbers(expected)
     for (name, value), other in zip(
         head.state_dict().items(), third.state_dict().values(), strict=True
     ):
@@ -117,10 +156,10 @@ def test_stopping_and_going_on_changes_nothing(
 
 def test_loading_does_not_tie_two_fitters_together(learnable: Learnable) -> None:
     buffer, _ = learnable()
-    first = HeadTrainer(head_for([buffer]), [buffer], None, OPTIONS, seed=0)
+    first = HeadTrainer(head_for([buffer]), [buffer], OPTIONS, seed=0)
     list(islice(first.run(), 4))
     saved = snapshot(first)
-    second = HeadTrainer(head_for([buffer]), [buffer], None, OPTIONS, seed=0)
+    second = HeadTrainer(head_for([buffer]), [buffer], OPTIONS, seed=0)
     second.load({key: value.clone() for key, value in saved.items()})
     list(islice(second.run(), 4))
     for key, value in first.state().items():
@@ -129,7 +168,7 @@ def test_loading_does_not_tie_two_fitters_together(learnable: Learnable) -> None
 
 def test_a_state_stays_what_it_was_when_training_goes_on(learnable: Learnable) -> None:
     buffer, _ = learnable()
-    trainer = HeadTrainer(head_for([buffer]), [buffer], None, OPTIONS, seed=0)
+    trainer = HeadTrainer(head_for([buffer]), [buffer], OPTIONS, seed=0)
     list(islice(trainer.run(), 4))
     state = trainer.state()
     before = {key: value.clone() for key, value in state.items()}
@@ -155,7 +194,7 @@ def test_rows_depend_on_seed_and_step_alone(learnable: Learnable) -> None:
         buffer = Spied(0, ATLAS_FROM_BASE)
         buffer.restore(plain.tensors)
         buffer.drawn = []
-        trainer = HeadTrainer(head_for([plain]), [buffer], None, options, seed)
+        trainer = HeadTrainer(head_for([plain]), [buffer], options, seed)
         trainer.step = start
         list(trainer.run())
         return buffer.drawn
@@ -187,52 +226,18 @@ def test_replay_gets_remembered_rows_evenly_and_its_cost_is_trained(learnable: L
 
     before = mean_logit()
     options = replace(OPTIONS, iterations=60, peak_rate=1e-2)
-    list(HeadTrainer(head, buffers[2:], Replay(buffers[:2], penalty), options, 0).run())
+    list(HeadTrainer(head, buffers[2:], options, 0, Replayed(buffers[:2], penalty)).run())
     assert abs(mean_logit() + 3) < 0.3 < abs(before + 3)
     for scene, _ in seen:
         assert torch.bincount(scene, minlength=3).tolist() == [30, 30, 0]
     assert [progress for _, progress in seen] == pytest.approx([i / 60 for i in range(60)])
 
 
-@pytest.mark.parametrize(
-    ("scenes", "rows"), [(1, 60), (2, 60), (3, 90), (7, 210), (8, 240), (12, 240), (500, 500)]
-)
-def test_replayed_rows_grow_with_the_scenes(scenes: int, rows: int) -> None:
-    assert replayed_rows(OPTIONS, scenes) == rows
-
-
-@pytest.mark.parametrize(
-    ("remembered", "per_scene", "expected"),
-    [(1, False, 1), (2, False, 1), (1, True, 1), (2, True, 2), (3, True, 3)],
-)
-def test_remembered_scenes_cost_each_or_together(
-    remembered: int, per_scene: bool, expected: float, learnable: Learnable
-) -> None:
-    """The penalty alone moves the head here; plain gradient steps show how much it counts."""
-    buffers = [learnable(scene)[0] for scene in range(remembered + 1)]
-    moved = []
-    for scale in (1.0, 2.0):
-        head = head_for(buffers)
-
-        def penalty(
-            output: HeadOutput, rows: Rows, progress: float, scale=scale, bias=head.logit_bias
-        ) -> Tensor:
-            return scale * bias.sum() + 0 * output.points.sum()
-
-        replay = Replay(buffers[:-1], penalty, per_scene)
-        trainer = HeadTrainer(head, buffers[-1:], replay, replace(OPTIONS, iterations=1), 0)
-        next(trainer.run())
-        gradient = head.logit_bias.grad
-        assert gradient is not None
-        moved.append(float(gradient[head.centre_scene == 0].mean()))
-    assert moved == pytest.approx([expected, 2 * expected])
-
-
 def test_several_scenes_share_a_batch_evenly(learnable: Learnable) -> None:
     buffers = [learnable(scene)[0] for scene in range(3)]
     head, seen = head_for(buffers), []
     head.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[1]))
-    list(HeadTrainer(head, buffers, None, replace(OPTIONS, iterations=2), 0).run())
+    list(HeadTrainer(head, buffers, replace(OPTIONS, iterations=2), 0).run())
     for scene in seen:
         assert torch.bincount(scene).tolist() == [32, 32, 32]
 
@@ -243,7 +248,7 @@ def test_descriptors_are_shaken_and_stay_unit_vectors(learnable: Learnable) -> N
     head, seen = head_for([buffer], HeadOptions(width=16, condition="descriptor")), []
     head.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[2]))
     options = replace(OPTIONS, iterations=1, batch=4000, diffusion=0.5)
-    list(HeadTrainer(head, [buffer], None, options, 0).run())
+    list(HeadTrainer(head, [buffer], options, 0).run())
     (shaken,) = seen
     assert torch.equal(buffer.tensors["descriptors"], kept)
     torch.testing.assert_close(shaken.norm(dim=-1), torch.ones(4000))
@@ -269,7 +274,7 @@ def test_a_small_head_learns_where_things_are(learnable: Learnable) -> None:
 
     pixels_before, metres_before = judge()
     options = FitOptions(iterations=200, batch=512, peak_rate=5e-3, loss=OPTIONS.loss)
-    progress = list(HeadTrainer(head, [buffer], None, options, 0).run())
+    progress = list(HeadTrainer(head, [buffer], options, 0).run())
     pixels, metres = judge()
     assert pixels < 3.0 < 30.0 < pixels_before
     assert metres < 0.15 < 1.5 < metres_before
@@ -287,7 +292,7 @@ def test_a_wrong_lens_is_corrected_where_it_may_be(learnable: Learnable) -> None
     for correctable, steps in ((True, 400), (False, 30)):
         buffer, _ = learnable(views=20, lens=true, correctable=correctable)
         head = head_for([buffer], HeadOptions(width=64))
-        trainer = HeadTrainer(head, [buffer], None, replace(options, iterations=steps), 0)
+        trainer = HeadTrainer(head, [buffer], replace(options, iterations=steps), 0)
         list(trainer.run())
         # How far off the lens is on its own, with the pose out of the question.
         where = buffer.rows(torch.arange(300)).target
@@ -303,7 +308,7 @@ def test_a_wrong_lens_is_corrected_where_it_may_be(learnable: Learnable) -> None
 
 def test_progress_says_what_the_last_step_saw(learnable: Learnable) -> None:
     buffer, _ = learnable()
-    trainer = HeadTrainer(head_for([buffer]), [buffer], None, replace(OPTIONS, iterations=2), 0)
+    trainer = HeadTrainer(head_for([buffer]), [buffer], replace(OPTIONS, iterations=2), 0)
     first, second = trainer.run()
     assert (first.step, second.step, first.total) == (1, 2, 2)
     assert isinstance(first, Progress)
@@ -316,35 +321,150 @@ def test_progress_says_what_the_last_step_saw(learnable: Learnable) -> None:
     assert first.inlier_share == pytest.approx(float(inside.float().mean()), abs=0.05)
 
 
-def test_a_rule_that_adds_gradients_up_is_plain_replay(learnable: Learnable) -> None:
-    buffers = [learnable(scene)[0] for scene in range(3)]
-    heads = []
+def test_progress_looks_at_the_numbers_only_when_asked(
+    learnable: Learnable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A GPU would have to finish every step first."""
+    buffer, _ = learnable()
+    trainer = HeadTrainer(head_for([buffer]), [buffer], replace(OPTIONS, iterations=1), 0)
+    looked: list[int] = []
+    plain = Tensor.__float__
+    monkeypatch.setattr(Tensor, "__float__", lambda self: looked.append(1) or plain(self))
+    (progress,) = trainer.run()
+    assert looked == []
+    assert isinstance(progress.loss, float)
+    assert isinstance(progress.inlier_share, float)
+    assert len(looked) == 2
+    assert progress.loss == pytest.approx(progress.costs.mean().item())
+    assert progress.inlier_share == (progress.errors_px < 5).float().mean().item()
+    assert not progress.costs.requires_grad
 
-    def penalty(output: HeadOutput, rows: Rows, progress: float) -> Tensor:
-        return output.points.abs().mean()
 
-    for combine in (None, lambda g: g.new + g.memory.mean(0)):
-        head = head_for(buffers)
-        replay = Replay(buffers[:2], penalty, combine=combine)
-        # Plain descent, which tells sums of gradients apart where Adam and Muon would not.
-        trainer = HeadTrainer(head, buffers[2:], replay, OPTIONS, 0)
-        next(trainer.run())
-        heads.append({name: value.grad for name, value in head.named_parameters()})
-    for name, gradient in heads[0].items():
-        assert gradient is not None
-        torch.testing.assert_close(heads[1][name], gradient, atol=2e-3, rtol=2e-2)
+class Regularized(TrainingHooks):
+    """Pulls the logits back to where they were."""
+
+    def __init__(self, head: Head, strength: float):
+        self.head, self.strength, self.anchor = head, strength, head.logit.detach().clone()
+
+    def regularizer(self) -> Tensor | None:
+        return self.strength * (self.head.logit - self.anchor).square().sum()
 
 
-def test_a_restraint_pulls_the_weights(learnable: Learnable) -> None:
+def test_a_regularizer_pulls_the_weights(learnable: Learnable) -> None:
     buffer, _ = learnable()
     norms = []
     for strength in (0.0, 1e3):
         head = head_for([buffer])
-        anchor = head.logit.detach().clone()
-
-        def regularizer(head: Head = head, anchor: Tensor = anchor, s: float = strength) -> Tensor:
-            return s * (head.logit - anchor).square().sum()
-
-        list(HeadTrainer(head, [buffer], None, OPTIONS, 0, regularizer).run())
-        norms.append(float((head.logit.detach() - anchor).norm()))
+        hooks = Regularized(head, strength)
+        list(HeadTrainer(head, [buffer], OPTIONS, 0, hooks).run())
+        norms.append(float((head.logit.detach() - hooks.anchor).norm()))
     assert norms[1] < 0.3 * norms[0]
+
+
+class Watching(Replayed):
+    """Adds up proposed steps and keeps the last one."""
+
+    edits_steps = True
+
+    def __init__(self, memories: list[FeatureBuffer], penalty: Cost):
+        super().__init__(memories, penalty)
+        self.way: dict[str, Tensor] = {}
+        self.last: ProposedStep | None = None
+        self.schedules: list[float] = []
+
+    def constraints(self, output: HeadOutput, rows: Rows, progress: float) -> list[Tensor]:
+        return [output.points[:30].square().mean(), output.points[30:].square().mean()]
+
+    def edit_step(self, proposed: ProposedStep) -> None:
+        for name, change in proposed.changes.items():
+            self.way[name] = self.way.get(name, 0) + change.double()
+        self.schedules.append(proposed.schedule)
+        self.last = copy.deepcopy(proposed)
+
+
+def test_proposed_changes_sum_up_to_the_way_of_the_weights(learnable: Learnable) -> None:
+    """Also where AdamW decays weights and Muon has momentum: nothing else moves them."""
+    buffers = [learnable(scene)[0] for scene in range(3)]
+    head = head_for(buffers)
+    first = {name: value.detach().clone() for name, value in head.named_parameters()}
+    hooks = Watching(buffers[:2], lambda output, rows, progress: output.points.abs().mean())
+    list(HeadTrainer(head, buffers[2:], OPTIONS, 0, hooks).run())
+    assert hooks.way.keys() == first.keys()
+    for name, value in head.named_parameters():
+        moved = value.detach().double() - first[name].double()
+        torch.testing.assert_close(hooks.way[name], moved, rtol=0, atol=2e-6)
+    assert any(float(way.abs().max()) > 1e-3 for way in hooks.way.values())
+    shares = [one_cycle(OPTIONS, step) / OPTIONS.peak_rate for step in range(20)]
+    assert hooks.schedules == pytest.approx(shares)
+
+
+def test_an_edited_step_is_the_one_that_is_taken(learnable: Learnable) -> None:
+    """Half of every change, and none of the codes'."""
+    buffer, _ = learnable()
+
+    class Halved(TrainingHooks):
+        edits_steps = True
+
+        def edit_step(self, proposed: ProposedStep) -> None:
+            for name, change in proposed.changes.items():
+                proposed.changes[name] = change / 2 if name != "code" else torch.zeros_like(change)
+
+    plain, edited = head_for([buffer]), head_for([buffer])
+    first = {name: value.detach().clone() for name, value in plain.named_parameters()}
+    next(HeadTrainer(plain, [buffer], OPTIONS, 0).run())
+    next(HeadTrainer(edited, [buffer], OPTIONS, 0, Halved()).run())
+    for name, value in edited.named_parameters():
+        whole = plain.get_parameter(name).detach() - first[name]
+        expected = torch.zeros_like(whole) if name == "code" else whole / 2
+        torch.testing.assert_close(value.detach() - first[name], expected, rtol=1e-3, atol=1e-7)
+    assert not torch.equal(plain.code, first["code"])
+
+
+def test_constraints_are_not_minimised_and_their_gradients_are_their_own(
+    learnable: Learnable,
+) -> None:
+    """With and without them the step is the same, and each gradient is that of one scene's rows."""
+    buffers = [learnable(scene)[0] for scene in range(3)]
+
+    def nothing(output: HeadOutput, rows: Rows, progress: float) -> Tensor:
+        return 0 * output.points.sum()
+
+    watched, plain = head_for(buffers), head_for(buffers)
+    hooks = Watching(buffers[:2], nothing)
+    next(HeadTrainer(watched, buffers[2:], OPTIONS, 0, hooks).run())
+    next(HeadTrainer(plain, buffers[2:], OPTIONS, 0, Replayed(buffers[:2], nothing)).run())
+    for name, value in watched.named_parameters():
+        torch.testing.assert_close(value, plain.get_parameter(name), rtol=0, atol=1e-6)
+    assert hooks.last is not None
+    assert len(hooks.last.constraints) == len(hooks.last.losses) == 2
+    for scene, gradient in enumerate(hooks.last.constraints):
+        used = gradient["code"].abs().sum((1, 2)) > 0
+        assert used.tolist() == [number == scene for number in range(3)]
+        assert float(gradient["first.1.weight"].abs().max()) > 0
+    # What is minimised here is the loss of the new scene alone.
+    assert (hooks.last.gradients["code"].abs().sum((1, 2)) > 0).tolist() == [False, False, True]
+
+
+def test_replayed_rows_cost_nothing_where_the_hook_says_none(learnable: Learnable) -> None:
+    buffers = [learnable(scene)[0] for scene in range(2)]
+
+    class Seen(TrainingHooks):
+        rows = 0
+
+        def replayed(
+            self, fresh: Rows, step: int, rate: float, generator: torch.Generator
+        ) -> list[Rows]:
+            assert len(fresh.scene) == 96
+            assert rate == one_cycle(OPTIONS, step)
+            return [buffers[0].draw(7, generator)]
+
+        def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
+            assert len(output.points) == len(rows.scene) == 7
+            self.rows += 7
+            return None
+
+    head, hooks = head_for(buffers), Seen()
+    before = head.code.detach().clone()
+    list(HeadTrainer(head, buffers[1:], OPTIONS, 0, hooks).run())
+    assert hooks.rows == 7 * OPTIONS.iterations
+    assert torch.equal(head.code[0], before[0])

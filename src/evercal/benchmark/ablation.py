@@ -5,7 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from evercal.benchmark.comparison import Run, TableRows, by_strategy, difference
+from evercal.continual.methods.method import described
+from evercal.continual.methods.replay import Replay
 from evercal.continual.selectors import SELECTORS
+from evercal.continual.strategies import STRATEGIES
 
 ABLATIONS: dict[str, tuple[tuple[str, str], ...]] = {
     "as printed": (
@@ -96,4 +99,11 @@ def _place(run: Run) -> tuple[str, str] | None:
         return None
     penalty = method["penalty"]
     assert isinstance(penalty, dict)
-    return str(method["selector"]), str(penalty["kind"])
+    # The first strategy with a penalty tells how it is weighed; other weights are other rows.
+    for strategy in STRATEGIES.values():
+        if type(strategy.method) is not Replay:
+            continue
+        known = described(strategy.method) | {"selector": method["selector"]}
+        if known["penalty"]["kind"] == penalty["kind"]:  # pyright: ignore[reportIndexIssue]
+            return (str(method["selector"]), str(penalty["kind"])) if known == method else None
+    return None

@@ -11,6 +11,7 @@ A penalty of another kind is told by `kind`, a class of `continual.methods.penal
 """
 
 import json
+import re
 from dataclasses import fields, is_dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -23,6 +24,8 @@ from evercal.continual.strategies import Strategy, strategy_named
 from evercal.errors import InputError
 
 _KEYS = {"name", "of", "with", "map"}
+_NAME = re.compile(r"\w[\w.+-]*")
+"""Names become those of files."""
 
 
 def load_rows(name: str) -> tuple[Strategy, ...]:
@@ -69,7 +72,10 @@ def strategy_from_row(file: str, row: object) -> Strategy:
     """
     if not isinstance(row, dict) or not {"name", "of"} <= row.keys() <= _KEYS:
         raise InputError(f"rows {file}: a row is {row!r}; give name, of, and if need be with, map")
-    of, changes = strategy_named(str(row["of"])), row.get("with", {})
+    name, of = str(row["name"]), strategy_named(str(row["of"]))
+    if not _NAME.fullmatch(name):
+        raise InputError(f"rows {file}: name {name!r}: give letters, digits and any of _.+-")
+    changes, builds_map = row.get("with", {}), row.get("map", of.builds_map)
     if changes and of.method is None:
         raise InputError(f"rows {file}: {of.name} trains nothing, so there is nothing to change")
     method = of.method if of.method is None else _changed(of.method, changes, f"rows {file}")
@@ -77,29 +83,42 @@ def strategy_from_row(file: str, row: object) -> Strategy:
     if selector is not None and selector not in SELECTORS:
         known = ", ".join(SELECTORS)
         raise InputError(f"rows {file}: selector {selector!r}: unknown; use one of {known}")
-    builds_map = bool(row.get("map", of.builds_map))
-    return replace(of, name=str(row["name"]), method=method, builds_map=builds_map)
+    if not isinstance(builds_map, bool) or (method is None and not builds_map):
+        raise InputError(
+            f"rows {file}: {name}: map is {builds_map!r}; give true or false, and true where"
+            " nothing is trained"
+        )
+    return replace(of, name=name, method=method, builds_map=builds_map)
 
 
 def _changed(record: Any, changes: object, where: str) -> Any:
     """A dataclass with some fields changed, those of fields that are dataclasses too."""
     assert is_dataclass(record)
     assert not isinstance(record, type)
-    names = {field.name for field in fields(record)}
-    if not isinstance(changes, dict) or not changes.keys() - {"kind"} <= names:
+    if isinstance(record, Penalty) and isinstance(changes, dict) and "kind" in changes:
+        record = _penalty(str(changes["kind"]), where)
+        changes = {name: value for name, value in changes.items() if name != "kind"}
+    kind, names = type(record).__name__, {field.name for field in fields(record)}
+    if not isinstance(changes, dict) or not changes.keys() <= names:
         raise InputError(
-            f"{where}: {type(record).__name__} cannot change by {changes!r}; its fields are"
+            f"{where}: {kind} cannot change by {changes!r}; its fields are"
             f" {', '.join(sorted(names))}"
         )
     found = {}
     for name, value in changes.items():
-        before = getattr(record, name, None)
-        if name == "kind":
+        before = getattr(record, name)
+        if is_dataclass(before):
+            found[name] = _changed(before, value, where)
             continue
-        if isinstance(before, Penalty) and isinstance(value, dict) and "kind" in value:
-            before = _penalty(str(value["kind"]), where)
-        found[name] = _changed(before, value, where) if is_dataclass(before) else value
-    return replace(record, **found)
+        if isinstance(before, float) and type(value) is int:
+            value = float(value)
+        if type(value) is not type(before):
+            raise InputError(f"{where}: {kind}.{name} is {value!r}; give one like {before!r}")
+        found[name] = value
+    try:
+        return replace(record, **found)
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def _penalty(kind: str, where: str) -> Penalty:

@@ -174,7 +174,7 @@ class _Run:
         for number in range(last):
             yield number, ()
         yield last, self._judge(maps, last, seconds)
-        shutil.rmtree(self.store, ignore_errors=True)
+        shutil.rmtree(self.store, ignore_errors=True)  # nothing was committed to it
 
     def _judge(self, maps: SceneMaps, number: int, seconds: float) -> tuple[SceneResult, ...]:
         """Results of all scenes known; of what answers alone, too, where several things answer."""

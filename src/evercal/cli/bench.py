@@ -117,7 +117,8 @@ class Bench:
         from evercal.continual.strategies import strategy_named
 
         named = [strategy_named(name) for name in _words(self.strategies)]
-        return (*named, *(load_rows(self.rows) if self.rows else ()))
+        # Rows may repeat what is named: it is run once. Two of one name are refused later.
+        return tuple(dict.fromkeys((*named, *(load_rows(self.rows) if self.rows else ()))))
 
     def _steps(self, options: "BenchOptions", out: Path) -> "Iterator[Step]":
         from evercal.benchmark.bench import run_bench

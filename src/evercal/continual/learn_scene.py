@@ -106,8 +106,9 @@ def learn_scene(
         on_event: called with everything that happens, for progress bars.
 
     Raises:
-        InputError: no such device, too few frames, a name that the store knows already, another strategy than the
-            store's, a store that is none or that another process is learning into.
+        InputError: no such device, too few frames, a name that the store knows already, another
+            strategy than the store's, a store that is none or that another process is learning
+            into.
     """
     with _store_lock(store):
         return _learn_scene(store, scene, options, on_event)

@@ -8,17 +8,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.methods.mir import CHOSEN, mir_views
+from evercal.continual.methods.mir import MaximallyInterferedRetrieval, interfered_views
 from evercal.networks.buffer import FeatureBuffer, Rows
-from evercal.networks.head import Head, HeadOptions, HeadOutput
-from evercal.networks.trainer import FitOptions, HeadTrainer, Replay
+from evercal.networks.head import Head, HeadOptions
+from evercal.networks.hooks import TrainingHooks
+from evercal.networks.trainer import FitOptions, HeadTrainer
+
+from .by_hand import stage_start
 
 Learnable = Callable[..., tuple[FeatureBuffer, Tensor]]
 OPTIONS = FitOptions(iterations=20, batch=96, replay_batch=60)
-
-
-def cost(output: HeadOutput, rows: Rows, progress: float) -> Tensor:
-    return output.points.abs().mean()
+MIR = MaximallyInterferedRetrieval()
 
 
 def head_of(buffers: list[FeatureBuffer]) -> Head:
@@ -36,7 +36,7 @@ def taught(learnable: Learnable) -> tuple[Head, FeatureBuffer]:
     buffer, _ = learnable(views=24)
     head = head_of([buffer])
     options = FitOptions(iterations=600, batch=512, replay_batch=64)
-    *_, last = HeadTrainer(head, [buffer], None, options, 0).run()
+    *_, last = HeadTrainer(head, [buffer], options, 0).run()
     assert last.inlier_share > 0.5
     return head, buffer
 
@@ -51,10 +51,12 @@ def test_views_that_the_new_rows_contradict_are_found(
     rows = buffer.rows(torch.nonzero(buffer.tensors["view"] == harmed)[:, 0])
     rows.target.pixels = rows.target.pixels + torch.tensor([6.0, 0.0])
     found = [
-        mir_views(head, rows, buffer, 5e-4, torch.Generator().manual_seed(seed)).tolist()
+        interfered_views(
+            MIR, head, rows, buffer, 5e-4, torch.Generator().manual_seed(seed)
+        ).tolist()
         for seed in range(5)
     ]
-    assert all(len(set(views)) == CHOSEN for views in found)
+    assert all(len(set(views)) == MIR.chosen for views in found)
     hits = sum(harmed in views for views in found)
     assert hits >= 4  # by chance a third of them
     for name, value in head.state_dict().items():
@@ -62,24 +64,47 @@ def test_views_that_the_new_rows_contradict_are_found(
 
 
 def test_only_chosen_views_are_replayed_and_a_stop_does_not_show(learnable: Learnable) -> None:
-    old, _ = learnable(0, views=24)
-    new, _ = learnable(1)
+    old, new = learnable(0, views=24)[0], learnable(1)[0]
     seen: list[set[int]] = []
 
-    def watched(output: HeadOutput, rows: Rows, progress: float) -> Tensor:
-        seen.append(set(old.tensors["view"][rows.index].tolist()))
-        return cost(output, rows, progress)
+    def hooks_for(head: Head) -> TrainingHooks:
+        hooks = MIR.begin(stage_start(head, [old], replay_rows=60))
+        replayed = hooks.replayed
+
+        def watched(fresh: Rows, step: int, rate: float, generator: torch.Generator) -> list[Rows]:
+            parts = replayed(fresh, step, rate, generator)
+            seen.append(set(old.tensors["view"][parts[0].index].tolist()))
+            assert len(parts[0].scene) == 60
+            return parts
+
+        hooks.replayed = watched  # type: ignore[method-assign]
+        return hooks
 
     head = head_of([old, new])
     twin, third = copy.deepcopy(head), copy.deepcopy(head)
-    list(HeadTrainer(head, [new], Replay([old], watched, choose_views=mir_views), OPTIONS, 3).run())
-    assert len(set.union(*seen)) <= CHOSEN  # one choice lasts for these twenty steps
-    first = HeadTrainer(twin, [new], Replay([old], cost, choose_views=mir_views), OPTIONS, 3)
+    list(HeadTrainer(head, [new], OPTIONS, 3, hooks_for(head)).run())
+    assert len(set.union(*seen)) <= MIR.chosen  # one choice lasts for these twenty steps
+    first = HeadTrainer(twin, [new], OPTIONS, 3, hooks_for(twin))
     list(islice(first.run(), 7))
-    second = HeadTrainer(third, [new], Replay([old], cost, choose_views=mir_views), OPTIONS, 3)
+    second = HeadTrainer(third, [new], OPTIONS, 3, hooks_for(third))
     second.load({key: value.clone() for key, value in first.state().items()})
     list(second.run())
     for (name, value), other in zip(
         head.state_dict().items(), third.state_dict().values(), strict=True
     ):
         assert torch.equal(value, other), name
+
+
+def test_a_stop_after_the_second_choice_goes_on_with_that_choice(learnable: Learnable) -> None:
+    old, new = learnable(0, views=24)[0], learnable(1)[0]
+    head = head_of([old, new])
+    hooks = MIR.begin(stage_start(head, [old], replay_rows=60))
+    fresh = new.draw(30, torch.Generator().manual_seed(0))
+    for step in range(23):
+        hooks.replayed(fresh, step, 1e-3, torch.Generator().manual_seed(step))
+    again = MIR.begin(stage_start(head, [old], replay_rows=60))
+    again.load({key: value.clone() for key, value in hooks.state().items()})
+    parts = [
+        h.replayed(fresh, 23, 1e-3, torch.Generator().manual_seed(23))[0] for h in (hooks, again)
+    ]
+    assert torch.equal(parts[0].index, parts[1].index)

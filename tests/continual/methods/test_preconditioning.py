@@ -1,18 +1,54 @@
 """Protection: exact in a linear case, less drift of old scenes, and the same after a resumption."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.methods.preconditioning import GradientPreconditioning, preconditioner
+from evercal.continual.methods.penalties import Penalty
+from evercal.continual.methods.preconditioning import PreconditionedReplay, held_rows
 from evercal.networks.buffer import FeatureBuffer, Rows
 from evercal.networks.head import Head, HeadOptions, HeadOutput
-from evercal.networks.trainer import FitOptions, HeadTrainer, Replay
+from evercal.networks.hooks import ProposedStep, TrainingHooks
+from evercal.networks.trainer import FitOptions, HeadTrainer
+
+from .by_hand import stage_start, wave_buffer, wave_head
 
 Learnable = Callable[..., tuple[FeatureBuffer, Tensor]]
 OPTIONS = FitOptions(iterations=30, batch=128, replay_batch=128)
+
+
+@dataclass(frozen=True)
+class Free(Penalty):
+    """Replayed rows cost nothing."""
+
+    needs_teacher = False
+
+    def __call__(
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+    ) -> Tensor:
+        """Zero."""
+        return torch.zeros(())
+
+
+@dataclass(frozen=True)
+class Short(Penalty):
+    """Points near the middle cost less: a pull on everything."""
+
+    needs_teacher = False
+
+    def __call__(
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+    ) -> Tensor:
+        """Mean length."""
+        return student.points.abs().mean()
+
+
+def hooks_for(head: Head, memories: list[FeatureBuffer], penalty: Penalty, strength: float):
+    method = PreconditionedReplay(penalty=penalty, strength=strength)
+    return method.begin(stage_start(head, memories, replay_rows=128))
 
 
 def head_of(buffers: list[FeatureBuffer]) -> Head:
@@ -24,44 +60,45 @@ def head_of(buffers: list[FeatureBuffer]) -> Head:
     return head
 
 
+def edited(hooks: TrainingHooks, head: Head, changes: dict[str, Tensor]) -> dict[str, Tensor]:
+    zero = {name: torch.zeros_like(value) for name, value in head.named_parameters()}
+    proposed = ProposedStep(zero | changes, zero, torch.zeros(0), [], 0, 1.0)
+    hooks.edit_step(proposed)
+    return proposed.changes
+
+
 @pytest.mark.parametrize("scenes", [1, 2])
-def test_updates_are_damped_as_the_formula_says(learnable: Learnable, scenes: int) -> None:
+def test_changes_are_damped_as_the_formula_says(learnable: Learnable, scenes: int) -> None:
     buffers = [learnable(scene)[0] for scene in range(scenes)]
     head, strength = head_of(buffers), 3.0
     seen: list[Tensor] = []
     first = head.first[0]
     assert isinstance(first, torch.nn.Linear)
     hook = first.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0]))
-    preconditioning = GradientPreconditioning(head, buffers, strength, seed=4)
+    hooks = hooks_for(head, buffers, Free(), strength)
     hook.remove()
     moments = [x.double().T @ x.double() / len(x) for x in seen]
     assert len(moments) == scenes
     moment = torch.stack([m / m.diagonal().mean() for m in moments]).sum(0)
     expected = torch.linalg.inv(torch.eye(48) + strength * moment)
     change = torch.randn(32, 48, generator=torch.Generator().manual_seed(2))
-    before, bias = first.weight.detach().clone(), first.bias.detach().clone()
-    with preconditioning.damped(), torch.no_grad():
-        first.weight.add_(change)
-        first.bias.add_(1)
-    found = first.weight.detach() - before
-    torch.testing.assert_close(found.double(), change.double() @ expected, atol=1e-4, rtol=1e-4)
-    torch.testing.assert_close(first.bias.detach(), bias + 1)
+    bias = torch.ones(32)
+    found = edited(hooks, head, {"first.0.weight": change.clone(), "first.0.bias": bias.clone()})
+    damped = found["first.0.weight"]
+    torch.testing.assert_close(damped.double(), change.double() @ expected, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(found["first.0.bias"], bias)
     # A direction that the scene uses moves less than one that it hardly uses.
     _, axes = torch.linalg.eigh(moment)
-    kept = [float((found.double() @ a).norm() / (change.double() @ a).norm()) for a in axes.T]
+    kept = [float((damped.double() @ a).norm() / (change.double() @ a).norm()) for a in axes.T]
     assert kept[-1] < 0.3 < 0.9 < kept[0]
 
 
 def test_what_one_remembered_scene_owns_does_not_move(learnable: Learnable) -> None:
     buffers = [learnable(scene)[0] for scene in range(3)]
     head = head_of(buffers)
-
-    def cost(output: HeadOutput, rows: Rows, progress: float) -> Tensor:
-        return output.points.abs().mean()
-
     before = {name: value.clone() for name, value in head.state_dict().items()}
-    replay = Replay(buffers[:2], cost, precondition=preconditioner(1e-6))
-    list(HeadTrainer(head, buffers[2:], replay, OPTIONS, 0).run())
+    hooks = hooks_for(head, buffers[:2], Short(), 1e-6)
+    list(HeadTrainer(head, buffers[2:], OPTIONS, 0, hooks).run())
     after = head.state_dict()
     own = {"code": torch.tensor([True, True, False])}
     for name in ("logit", "logit_bias", "offset", "offset_bias"):
@@ -74,23 +111,30 @@ def test_what_one_remembered_scene_owns_does_not_move(learnable: Learnable) -> N
     assert (after["last.1.weight"] != before["last.1.weight"]).any()
 
 
+def test_centres_that_belong_to_no_scene_are_free_to_learn() -> None:
+    """On the paper's network the first scene's centres are those of all."""
+    options = HeadOptions(width=16, condition="descriptor", centres="fixed", whiten=False)
+    head = wave_head(1, options)
+    head.grow(torch.zeros(0, 3), seed=1)
+    assert held_rows(head, [wave_buffer(0)]) == {}
+    before = {name: value.clone() for name, value in head.state_dict().items()}
+    hooks = hooks_for(head, [wave_buffer(0)], Free(), 0.5)
+    list(HeadTrainer(head, [wave_buffer(1, shift_px=9.0)], OPTIONS, 0, hooks).run())
+    for name in ("logit", "offset", "offset_bias"):
+        assert not torch.equal(head.state_dict()[name], before[name])
+
+
 def test_an_old_scene_drifts_less(learnable: Learnable) -> None:
     old, new = learnable(0)[0], learnable(1)[0]
-
-    def free(output: object, rows: Rows, progress: float) -> Tensor:
-        return torch.zeros(())
-
     drift = {}
     for strength in (0.0, 30.0):
         head = head_of([old, new])
         rows = old.draw(500, torch.Generator().manual_seed(0))
         with torch.no_grad():
             before = head(rows.features.float(), 0, None).points
-        list(
-            HeadTrainer(
-                head, [new], Replay([old], free, precondition=preconditioner(strength)), OPTIONS, 0
-            ).run()
-        )
+        hooks = hooks_for(head, [old], Free(), strength)
+        assert hooks.edits_steps == (strength > 0)
+        list(HeadTrainer(head, [new], OPTIONS, 0, hooks).run())
         with torch.no_grad():
             after = head(rows.features.float(), 0, None).points
         drift[strength] = float((after - before).norm(dim=-1).median())
@@ -99,19 +143,12 @@ def test_an_old_scene_drifts_less(learnable: Learnable) -> None:
 
 @pytest.mark.parametrize("stop", [1, 17])
 def test_a_resumed_run_protects_the_same_directions(learnable: Learnable, stop: int) -> None:
+    """The matrices are those of the head before the stage, though they are made anew."""
     old, new = learnable(0)[0], learnable(1)[0]
 
-    def free(output: object, rows: Rows, progress: float) -> Tensor:
-        return torch.zeros(())
-
-    def trainer() -> HeadTrainer:
-        return HeadTrainer(
-            head_of([old, new]),
-            [new],
-            Replay([old], free, precondition=preconditioner(5.0)),
-            OPTIONS,
-            0,
-        )
+    def trainer(strength: float = 5.0) -> HeadTrainer:
+        head = head_of([old, new])
+        return HeadTrainer(head, [new], OPTIONS, 0, hooks_for(head, [old], Free(), strength))
 
     whole, part, rest = trainer(), trainer(), trainer()
     list(whole.run())
@@ -122,7 +159,7 @@ def test_a_resumed_run_protects_the_same_directions(learnable: Learnable, stop: 
     list(rest.run())
     for name, value in whole.head.state_dict().items():
         torch.testing.assert_close(rest.head.state_dict()[name], value, rtol=0, atol=1e-6)
-    unprotected = HeadTrainer(head_of([old, new]), [new], Replay([old], free), OPTIONS, 0)
+    unprotected = trainer(0.0)
     list(unprotected.run())
     name = "first.1.weight"
     assert not torch.allclose(unprotected.head.state_dict()[name], whole.head.state_dict()[name])

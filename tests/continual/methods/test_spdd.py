@@ -38,13 +38,14 @@ def softmax(values, temperature):
 
 
 def slow_terms(student, teacher, active, temperature):
-    """The docstring of spdd_loss in plain loops, for finite logits and per_centre offsets."""
+    """The docstring of spdd_loss in plain loops, for per_centre offsets; -inf masks a centre."""
     zs, zt = student.logits.tolist(), teacher.logits.tolist()
     ds, dt = student.offsets.tolist(), teacher.offsets.tolist()
     rows, old = len(zt), len(zt[0])
     prior = metric = output = 0.0
     for n in range(rows):
-        best = sorted(range(old), key=lambda k: -zt[n][k])[: max(1, min(active, old // 2))]
+        alive = [k for k in range(old) if -INF not in (zt[n][k], zs[n][k])]
+        best = sorted(alive, key=lambda k: -zt[n][k])[:active]
         p = softmax([zt[n][k] for k in best], temperature)
         q = softmax([zs[n][k] for k in best] + zs[n][old:], temperature)
         prior += temperature**2 * sum(a * math.log(a / b) for a, b in zip(p, q, strict=False))
@@ -54,7 +55,7 @@ def slow_terms(student, teacher, active, temperature):
 
 
 def two_rows():
-    """K = 4 centres, so M_a = 2; A is {0, 2} in the first row and {1, 3} in the second."""
+    """With M_a = 2 of 4 centres, A is {0, 2} in the first row and {1, 3} in the second."""
     teacher = Output(
         tensor([[2.0, -1.0, 1.0, 0.0], [0.0, 3.0, -2.0, 3.5]]),
         tensor([[[0.0] * 3, [9.0] * 3, [1.0, 2.0, 3.0], [9.0] * 3]] * 2),
@@ -75,7 +76,9 @@ def two_rows():
 
 def test_two_rows_by_hand():
     student, teacher = two_rows()
-    terms = spdd_loss(student, teacher, SpddOptions(2.0, 3.0, 5.0, temperature=2.0))
+    terms = spdd_loss(
+        student, teacher, SpddOptions(2.0, 3.0, 5.0, temperature=2.0, active_centres=2)
+    )
     # Row 1: teacher logits 2, 1 over 2 -> sigmoid(0.5); student 1, 1 -> one half each.
     p = 1 / (1 + math.exp(-0.5))
     first = p * math.log(p / 0.5) + (1 - p) * math.log((1 - p) / 0.5)
@@ -121,12 +124,13 @@ def test_mass_on_a_new_centre_costs_its_share():
     for row, logit in zip(teacher.logits.tolist(), new[:, 0].tolist(), strict=True):
         kept = sum(math.exp(z / 2) for z in sorted(row)[-4:])
         expected += 4 * -math.log(kept / (kept + math.exp(logit / 2))) / 5
-    terms = spdd_loss(student, teacher, SpddOptions())
+    options = SpddOptions(active_centres=4)
+    terms = spdd_loss(student, teacher, options)
     assert terms.prior.item() == pytest.approx(expected, rel=1e-10)
     assert expected > 0.1
 
     student.logits.requires_grad_()
-    spdd_loss(student, teacher, SpddOptions()).prior.backward()
+    spdd_loss(student, teacher, options).prior.backward()
     gradient = student.logits.grad
     assert gradient is not None
     assert (gradient[:, 8] > 0).all()  # descent lowers the new centre on old rows
@@ -147,11 +151,11 @@ def test_new_centres_without_mass_cost_nothing_more():
 
 def test_logits_and_offsets_outside_the_active_set_are_free():
     student, teacher = two_rows()
-    before = spdd_loss(student, teacher, SpddOptions())
+    before = spdd_loss(student, teacher, SpddOptions(active_centres=2))
     outside = tensor([[0.0, 1.0, 0.0, 1.0], [1.0, 0.0, 1.0, 0.0]])
     student.logits = student.logits + 100 * outside
     student.offsets = student.offsets + 7 * outside[:, :, None]
-    after = spdd_loss(student, teacher, SpddOptions())
+    after = spdd_loss(student, teacher, SpddOptions(active_centres=2))
     assert after.prior.item() == before.prior.item()
     assert after.metric.item() == before.metric.item()
 
@@ -177,7 +181,7 @@ def test_a_hot_softmax_becomes_a_squared_difference():
     best = teacher.logits[0].topk(3).indices
     gap = (teacher.logits - student.logits)[0, best]
     limit = 0.5 * gap.var(correction=0).item()
-    found = spdd_loss(student, teacher, SpddOptions(temperature=1e4)).prior.item()
+    found = spdd_loss(student, teacher, SpddOptions(temperature=1e4, active_centres=3)).prior.item()
     assert found == pytest.approx(limit, rel=1e-2)
 
 
@@ -266,12 +270,41 @@ def test_a_diverged_student_is_not_hidden():
     assert math.isnan(spdd_loss(student, teacher, SpddOptions()).total.item())
 
 
-@pytest.mark.parametrize("centres", [1, 2, 3])
-def test_one_centre_stays_active(centres):
+@pytest.mark.parametrize("centres", [1, 2, 3, 49, 50, 51, 80])
+def test_all_centres_are_active_where_there_are_no_more_than_fifty(centres):
     teacher, student = random_output(3, centres, 22), random_output(3, centres, 23)
+    student.offsets.requires_grad_()
     terms = spdd_loss(student, teacher, SpddOptions())
-    assert terms.prior.item() == 0.0
-    assert terms.metric.item() == pytest.approx(slow_terms(student, teacher, 50, 2.0)[1])
+    found = terms.prior.item(), terms.metric.item(), terms.output.item()
+    detached = Output(student.logits, student.offsets.detach(), student.points)
+    assert found == pytest.approx(slow_terms(detached, teacher, 50, 2.0), rel=1e-10, abs=1e-12)
+    terms.metric.backward()
+    assert student.offsets.grad is not None
+    active = (student.offsets.grad.abs().sum(2) > 0).sum(1)
+    assert active.tolist() == [min(50, centres)] * 3
+
+
+def test_of_a_scene_with_four_own_centres_all_four_take_part():
+    """Rows of two scenes in one head of three: the others' centres are masked."""
+    teacher, student = random_output(6, 12, 30), random_output(6, 12, 31)
+    owner = torch.arange(12) // 4
+    for output in (teacher, student):
+        for row in range(6):
+            output.logits[row, owner != row % 2] = -INF
+    student.offsets.requires_grad_()
+    student.logits.requires_grad_()
+    terms = spdd_loss(student, teacher, SpddOptions())
+    detached = Output(student.logits.detach(), student.offsets.detach(), student.points)
+    found = terms.prior.item(), terms.metric.item(), terms.output.item()
+    assert found == pytest.approx(slow_terms(detached, teacher, 50, 2.0), rel=1e-10)
+    (terms.metric + terms.prior).backward()
+    assert student.offsets.grad is not None
+    assert student.logits.grad is not None
+    for row in range(6):
+        expected = [4 * (row % 2) + k for k in range(4)]
+        moved = student.offsets.grad[row].abs().sum(1).nonzero().flatten().tolist()
+        routed = student.logits.grad[row].nonzero().flatten().tolist()
+        assert moved == routed == expected
 
 
 def test_no_rows_cost_nothing():

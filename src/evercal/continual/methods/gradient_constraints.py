@@ -200,7 +200,8 @@ def nearest_change(changes: Tensor, g: Tensor, most: Tensor) -> Tensor:
     """The change u nearest to a given one with <g_t, u> <= most_t for every t.
 
     u = changes - sum_t lambda_t g_t with lambda >= 0. The dual, min 1/2 l'Gl - l'b with G = g g'
-    and b = g changes - most, is a least-squares problem in the root of G.
+    and b = g changes - most, is a least-squares problem in the root of G. Every constraint is
+    first divided by the length of its gradient, which changes nothing about what it allows.
 
     Args:
         changes: (p,).
@@ -209,7 +210,10 @@ def nearest_change(changes: Tensor, g: Tensor, most: Tensor) -> Tensor:
     """
     if not len(g):
         return changes
-    over = (g @ changes - most.to(g)).double().cpu().numpy()
+    size = g.norm(dim=1)
+    some = size > 0  # what no change can alter asks for none
+    g, most = g[some] / size[some, None], most.to(g)[some] / size[some]
+    over = (g @ changes - most).double().cpu().numpy()
     if (over <= 0).all():
         return changes
     from scipy.optimize import nnls

@@ -71,7 +71,9 @@ class _PreconditionedHooks(ReplayHooks):
 
 
 def held_rows(head: Head, memories: Sequence[FeatureBuffer]) -> dict[str, Tensor]:
-    """By parameter name, the rows that remembered scenes own."""
+    """By parameter name, the rows that remembered scenes own; none where centres are shared."""
+    if head.options.centres != "grow":
+        return {}
     scenes = torch.tensor([memory.scene for memory in memories], device=head.centre_scene.device)
     held = {"code": scenes}
     if head.options.offsets == "per_centre":

@@ -7,18 +7,24 @@ import torch
 from torch import Tensor
 
 from evercal.continual.methods.method import FinishedScene, Method, StageStart
-from evercal.continual.methods.preconditioning import input_moments
+from evercal.continual.methods.preconditioning import ROWS, input_moments
+from evercal.networks.buffer import FeatureBuffer
+from evercal.networks.head import Head
 from evercal.networks.hooks import ProposedStep, TrainingHooks
+
+OUTPUTS = "outputs"
+"""Names the basis of the last hidden layer, from which logits and offsets are read."""
 
 
 @dataclass(frozen=True)
 class GradientProjectionMemory(Method):
     """GPM: a change of a matrix is freed of the directions in which earlier inputs vary.
 
-    Of a finished scene the main directions of every layer's inputs are kept, so many that they hold
-    the given share of what is left of the inputs outside the directions kept before. Later changes
-    are projected off them; the original projects the gradient and steps with SGD. What an earlier
-    scene owns alone (its code, logits and offsets) does not move.
+    Of a finished scene the main directions of every layer's inputs are kept, so many that they and
+    those kept before hold the given share of the squared inputs. Later changes are projected off
+    them; the original projects the gradient and steps with SGD. Biases, which the original's
+    networks lack, stay as the first scene left them. What an earlier scene owns alone (its code,
+    logits and offsets) does not move; outputs that scenes share are projected like a layer.
     """
 
     citation: ClassVar[str] = "Saha et al., Gradient projection memory, ICLR 2021"
@@ -32,7 +38,9 @@ class GradientProjectionMemory(Method):
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
         """`basis.NAME` (inputs, k) of every matrix, half precision: orthonormal columns."""
         before = scene.earlier[-1] if scene.earlier else {}
-        moments = input_moments(scene.head, [scene.rows()], scene.number)
+        buffer = scene.rows()
+        moments = input_moments(scene.head, [buffer], scene.number)
+        moments[OUTPUTS] = hidden_moment(scene.head, buffer)
         found = {}
         for name, moment in moments.items():
             old = before.get(f"basis.{name}", torch.zeros(len(moment), 0)).to(moment)
@@ -44,24 +52,44 @@ class _ProjectedSteps(TrainingHooks):
     edits_steps = True
 
     def __init__(self, start: StageStart):
-        named = dict(start.head.named_parameters())
-        self._bases = {
-            name.removeprefix("basis."): basis.to(named[name.removeprefix("basis.")])
-            for name, basis in start.states[-1].items()
-        }
-        self._earlier = len(start.states)
-        scene = start.head.centre_scene
-        self._own = torch.nonzero(scene < self._earlier)[:, 0] if len(scene) else scene
-        self._per_centre = start.head.options.offsets == "per_centre"
+        head = start.head
+        found = {k.removeprefix("basis."): b for k, b in start.states[-1].items()}
+        # Stored in half precision, columns are orthonormal to three digits only.
+        bases = {k: torch.linalg.qr(b.to(head.logit)).Q for k, b in found.items()}
+        outputs = bases.pop(OUTPUTS)
+        shared = _shared_outputs(head)
+        self._bases = bases | dict.fromkeys(shared, outputs)
+        layers = [k.removesuffix("weight") + "bias" for k in bases]
+        self._still = [*layers, *(f"{name}_bias" for name in shared)]
+        earlier = len(start.states)
+        own = torch.nonzero(head.centre_scene < earlier)[:, 0]
+        self._held = {"code": torch.arange(earlier, device=own.device)}
+        for name in {"logit", "offset"} - set(shared):
+            self._held |= {name: own, f"{name}_bias": own}
 
     def edit_step(self, proposed: ProposedStep) -> None:
-        proposed.changes["code"][: self._earlier] = 0.0
-        if self._per_centre:
-            for name in ("logit", "logit_bias", "offset", "offset_bias"):
-                proposed.changes[name][self._own] = 0.0
+        changes = proposed.changes
+        for name, where in self._held.items():
+            changes[name][where] = 0.0
+        for name in self._still:
+            changes[name].zero_()
         for name, basis in self._bases.items():
-            change = proposed.changes[name]
-            proposed.changes[name] = change - (change @ basis) @ basis.T
+            changes[name] = changes[name] - (changes[name] @ basis) @ basis.T
+
+
+def _shared_outputs(head: Head) -> list[str]:
+    """Which of the outputs every scene uses, by parameter name."""
+    if head.options.condition == "descriptor":
+        return ["logit", "offset"]
+    return ["offset"] if head.options.offsets == "shared" else []
+
+
+@torch.no_grad()
+def hidden_moment(head: Head, buffer: FeatureBuffer) -> Tensor:
+    """(width, width) second moment of the last hidden layer over a scene's rows, double."""
+    rows = buffer.draw(ROWS, torch.Generator().manual_seed(buffer.scene))
+    hidden = head.hidden(rows.features.float(), rows.scene, rows.descriptor).double()
+    return hidden.T @ hidden
 
 
 def grown_basis(old: Tensor, moment: Tensor, share: float) -> Tensor:

@@ -1,0 +1,94 @@
+"""Rows, outputs and scenes small enough to do by hand."""
+
+import torch
+from torch import Tensor
+
+from evercal.continual.methods.method import MethodState, StageStart
+from evercal.geometry import SE3
+from evercal.networks.buffer import FeatureBuffer, Rows
+from evercal.networks.head import Head, HeadOptions, HeadOutput
+from evercal.networks.loss import Target
+
+DEPTH_M, FOCAL_PX = 2.0, 100.0
+
+
+def rows(count: int, scene: int = 0) -> Rows:
+    """Rows seen by a camera at the origin, each of which must project to the image centre."""
+    target = Target(
+        torch.full((count, 2), 50.0),
+        torch.tensor([FOCAL_PX, FOCAL_PX, 50.0, 50.0]).repeat(count, 1),
+        torch.eye(4)[:3].repeat(count, 1, 1),
+    )
+    which = torch.full((count,), scene)
+    zero = torch.zeros(count, dtype=torch.long)
+    return Rows(torch.zeros(count, 1), which, torch.zeros(count, 1), target, zero)
+
+
+def off_by(pixels: float) -> list[float]:
+    """A point that projects `pixels` to the right of where it must."""
+    return [pixels / FOCAL_PX * DEPTH_M, 0.0, DEPTH_M]
+
+
+def says(points: list[list[float]], hidden: list[list[float]] | None = None) -> HeadOutput:
+    """A head's output with these points (camera frame, metres)."""
+    where = torch.tensor(points, requires_grad=True)
+    zero = torch.zeros(len(points), 2)
+    felt = zero if hidden is None else torch.tensor(hidden)
+    return HeadOutput(zero, torch.zeros(len(points), 1, 3), where, felt)
+
+
+def wave_buffer(scene: int, views: int = 4, shift_px: float = 0.0, few: int = 0) -> FeatureBuffer:
+    """Points in front of a camera; their features are waves of them, the same in every scene.
+
+    So two scenes whose pixels differ by `shift_px` contradict one another. With `few`, a view shows
+    so many different points only.
+    """
+    generator = torch.Generator().manual_seed(100)
+    points = torch.randn(50 * views, 3, generator=generator) + torch.tensor([0.0, 0, 4])
+    points[:, 2].clamp_(min=2.0)
+    if few:
+        points = points[:few].repeat(len(points) // few + 1, 1)[: len(points)]
+    buffer = FeatureBuffer(scene, SE3.identity())
+    buffer.restore(
+        {
+            "features": torch.cat([points.sin(), points.cos(), points], 1).half(),
+            "pixels": 100 * points[:, :2] / points[:, 2:] + 50 + torch.tensor([shift_px, 0.0]),
+            "view": torch.arange(views, dtype=torch.int32).repeat_interleave(50),
+            "intrinsics": torch.tensor([[100.0, 100, 50, 50]] * views),
+            "camera_from_atlas": torch.eye(4)[None, :3].repeat(views, 1, 1),
+            "descriptors": torch.nn.functional.normalize(torch.ones(views, 4), dim=-1),
+        }
+    )
+    return buffer
+
+
+def wave_head(scenes: int, options: HeadOptions | None = None) -> Head:
+    """A head with room for such scenes."""
+    torch.manual_seed(0)
+    head = Head(9, 4, options or HeadOptions(width=16, blocks=1, whiten=False))
+    for scene in range(scenes):
+        head.grow(torch.tensor([[0.3, 0.0, 4.0], [-0.3, 0.2, 3.5]]), seed=scene)
+    return head
+
+
+def stage_start(
+    head: Head,
+    memories: list[FeatureBuffer],
+    *,
+    teacher: Head | None = None,
+    states: list[MethodState] | None = None,
+    replay_rows: int = 64,
+) -> StageStart:
+    """A stage that begins with these memories."""
+    kept: list[MethodState] = [{} for _ in memories] if states is None else states
+    return StageStart(head, teacher, memories, kept, replay_rows, 0)
+
+
+def flat(head: Head) -> Tensor:
+    """(p,) a copy of all weights."""
+    return torch.cat([value.detach().flatten() for value in head.parameters()]).clone()
+
+
+def flat_of(head: Head, named: dict[str, Tensor]) -> Tensor:
+    """(p,) tensors by parameter name, in the order of `flat`."""
+    return torch.cat([named[name].flatten() for name, _ in head.named_parameters()]).clone()

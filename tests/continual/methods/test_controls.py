@@ -1,0 +1,77 @@
+"""Isolation: a head of its own for every scene, which begins where the last one stands."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+import torch
+
+from evercal.continual.methods.controls import FineTuning, Isolation
+from evercal.networks.hooks import TrainingHooks
+
+from ..stages import continued, outcome, weights
+from .by_hand import stage_start, wave_head
+
+if TYPE_CHECKING:
+    from evercal.continual.stage import StageOptions
+    from evercal.mapping.scene_maps import SceneMaps
+    from evercal.networks.head import Head
+
+    from ..stages import Rooms
+
+
+def saved(head: Head) -> bytes:
+    """The head as a file."""
+    file = io.BytesIO()
+    torch.save(head.state_dict(), file)
+    return file.getvalue()
+
+
+def test_neither_adds_anything_to_training() -> None:
+    for method in (FineTuning(), Isolation()):
+        hooks = method.begin(stage_start(wave_head(1), []))
+        assert type(hooks) is TrainingHooks
+        assert not method.replays
+
+
+@pytest.mark.parametrize("offsets", ["per_centre", "shared"])
+@pytest.mark.parametrize("condition", ["code", "descriptor"])
+def test_new_heads_start_from_the_last_trunk_and_earlier_ones_stay(
+    condition: str, offsets: str, first: dict[str, SceneMaps], rooms: Rooms, quick: StageOptions
+) -> None:
+    """With no step at all, the second head is the first one but for what the scene owns."""
+    from evercal.continual.learn import learn
+    from evercal.continual.strategies import STRATEGIES
+
+    isolation = STRATEGIES["isolation"]
+    shape = replace(quick.head, offsets=offsets, condition=condition)  # pyright: ignore
+    options = replace(quick, head=shape)
+    blank = replace(first["isolation"], heads=[], scenes=[], keyframes=[], method_states=[])
+    maps = outcome(learn(blank, isolation, rooms[0], options))
+    before = saved(maps.heads[0])
+    untrained = replace(options, fit=replace(quick.fit, iterations=0))
+    same = outcome(continued(maps, rooms, untrained))
+    trained = outcome(continued(maps, rooms, options))
+    third = outcome(learn(trained, isolation, rooms[2], untrained))
+    own = {"code", "logit", "logit_bias", "centres"}
+    own |= {"offset", "offset_bias"} if offsets == "per_centre" else set()
+    for heads in (same.heads, trained.heads, third.heads):
+        assert saved(heads[0]) == before
+    assert saved(third.heads[1]) == saved(trained.heads[1])
+    for new, last in (
+        (same.heads[1], maps.heads[0]),
+        (third.heads[2], trained.heads[1]),
+    ):
+        assert new.scenes == 1
+        assert len(new.centres) == 3
+        for name, value in weights(new).items():
+            if name == "centre_scene":
+                continue
+            assert torch.equal(value, weights(last)[name]) != (name in own), name
+    assert not torch.equal(
+        weights(trained.heads[1])["first.1.weight"], weights(maps.heads[0])["first.1.weight"]
+    )
+    assert [maps.head_for(0)[1], trained.head_for(1)[1], third.head_for(2)[1]] == [0, 0, 0]

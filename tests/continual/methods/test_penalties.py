@@ -1,0 +1,166 @@
+"""What replayed rows cost, on rows small enough to do by hand."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from evercal.continual.methods.penalties import (
+    AnchoredReprojection,
+    BoundedByTeacher,
+    Distillation,
+    OldOutput,
+    Penalty,
+    Relations,
+    Reprojection,
+    StoredOutput,
+)
+from evercal.continual.methods.spdd import SpddOptions, spdd_loss
+from evercal.networks.head import HeadOutput
+from evercal.networks.loss import LossOptions, clamp_px
+
+from .by_hand import DEPTH_M, off_by, rows, says
+
+PX_PER_M = 50.0
+WITH_TRUTH: list[Penalty] = [
+    Reprojection(),
+    OldOutput(),
+    BoundedByTeacher(),
+    StoredOutput(),
+    Relations(),
+    AnchoredReprojection(),
+]
+
+
+def cost(
+    penalty: Penalty, student: HeadOutput, teacher: HeadOutput | None, some: object, at: float
+) -> float:
+    return float(penalty(student, teacher, some, at).detach())  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(("progress", "tau"), [(0.0, 100.0), (0.5, 10.0), (1.0, 1.0)])
+def test_plain_replay_costs_what_new_rows_cost(progress: float, tau: float) -> None:
+    assert clamp_px(LossOptions(), progress) == pytest.approx(tau)
+    found = cost(Reprojection(), says([off_by(3.0), off_by(0.0)]), None, rows(2), progress)
+    assert found == pytest.approx(tau * math.tanh(3.0 / tau) / 2, rel=1e-5)
+
+
+def test_old_output_by_hand() -> None:
+    # The student is 3 px (6 cm) right of the truth, the teacher 2 px (4 cm) left of it.
+    found = cost(OldOutput(), says([off_by(3.0)]), says([off_by(-2.0)]), rows(1), 1.0)
+    assert found == pytest.approx(math.tanh(3.0) + PX_PER_M * 0.10, rel=1e-5)
+    half = cost(OldOutput(px_per_m=25.0), says([off_by(3.0)]), says([off_by(-2.0)]), rows(1), 1.0)
+    assert found - half == pytest.approx(2.5, rel=1e-5)
+
+
+def test_a_teacher_bounds_only_who_is_worse_than_it() -> None:
+    # Row 0: student 3 px, teacher 1 px off: pulled by 4 cm. Row 1: the teacher is worse: free.
+    student = says([off_by(3.0), off_by(1.0)])
+    teacher = says([off_by(1.0), off_by(2.0)])
+    truth = (math.tanh(3.0) + math.tanh(1.0)) / 2
+    expected = 0.5 * truth + 0.5 * PX_PER_M * 0.04 / 2
+    assert cost(BoundedByTeacher(), student, teacher, rows(2), 1.0) == pytest.approx(expected)
+
+
+def test_stored_output_by_hand() -> None:
+    # Two rows 3 px (6 cm) off; what was said of the first is the truth, of the second nothing: the
+    # distance is a mean over rows of which something was said.
+    told = replace(rows(2), stored=torch.tensor([off_by(0.0), [math.nan] * 3]))
+    found = cost(StoredOutput(), says([off_by(3.0)] * 2), None, told, 1.0)
+    assert found == pytest.approx(0.5 * math.tanh(3.0) + 0.5 * PX_PER_M * 0.06, rel=1e-5)
+
+
+def test_relations_by_hand() -> None:
+    # To the teacher rows 0 and 1 are alike and row 2 differs; the student has 1 and 2 alike.
+    right = [off_by(0.0)] * 3
+    teacher = says(right, [[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    student = says(right, [[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+    near = 1 / (1 + math.exp(-1 / 0.2))
+    # Row 0: teacher near and far, student halves. Row 1: swapped. Row 2: halves, student far, near.
+    row_0 = near * math.log(2 * near) + (1 - near) * math.log(2 * (1 - near))
+    row_1 = near * math.log(near / (1 - near)) + (1 - near) * math.log((1 - near) / near)
+    row_2 = -0.5 * (math.log(2 * near) + math.log(2 * (1 - near)))
+    found = cost(Relations(), student, teacher, rows(3), 1.0)
+    assert found == pytest.approx((row_0 + row_1 + row_2) / 3, rel=1e-4)
+    assert cost(Relations(), teacher, teacher, rows(3), 1.0) == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("scene", range(4))
+def test_relations_take_part_in_every_remembered_scene(scene: int) -> None:
+    """Rows come scene by scene, 700 of each; what changes in one of them must cost something."""
+    generator = torch.Generator().manual_seed(1)
+    felt = torch.randn(2800, 8, generator=generator)
+    right = [off_by(0.0)] * 2800
+    teacher = says(right, felt.tolist())
+    moved = felt.clone()
+    moved[700 * scene : 700 * (scene + 1), 0] += 2.0
+    found = cost(Relations(), says(right, moved.tolist()), teacher, rows(2800), 1.0)
+    assert found > 1e-2
+    # Each scene has its share of the 512 rows that are compared.
+    student = says(right, felt.tolist())
+    student.hidden.requires_grad_()
+    student.hidden.data += 0.1 * torch.randn(2800, 8, generator=generator)
+    Relations()(student, teacher, rows(2800), 1.0).backward()
+    assert student.hidden.grad is not None
+    used = (student.hidden.grad.abs().sum(1) > 0)[700 * scene : 700 * (scene + 1)].sum()
+    assert 120 <= int(used) <= 136
+
+
+def test_anchored_reprojection_by_hand() -> None:
+    # Row 0: the teacher is right, the student 3 px (6 cm) off: it pays for both.
+    # Row 1: the teacher is far off, the student right: it pays nothing, however far they are apart.
+    penalty = AnchoredReprojection(clamp_px=5.0, teacher_limit_px=10.0)
+    teacher = says([off_by(0.0), off_by(40.0)])
+    student = says([off_by(3.0), off_by(0.0)])
+    expected = 5 * math.tanh(3.0 / 5) / 2 + PX_PER_M * 0.06 / 2
+    for progress in (0.0, 1.0):  # its clamp does not follow the schedule
+        assert cost(penalty, student, teacher, rows(2), progress) == pytest.approx(expected)
+
+
+def test_depth_that_no_pixel_sees_is_held_by_a_teacher_who_is_right() -> None:
+    student, right = says([[0.0, 0.0, DEPTH_M + 0.1]]), says([off_by(0.0)])
+    penalty = AnchoredReprojection()
+    assert cost(penalty, student, right, rows(1), 0.0) == pytest.approx(PX_PER_M * 0.1, rel=1e-5)
+    wrong = says([off_by(20.0)])
+    assert cost(penalty, student, wrong, rows(1), 0.0) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_teacher_behind_the_camera_holds_nothing() -> None:
+    behind = says([[0.0, 0.0, -DEPTH_M]])  # projects to the very pixel, if one divides blindly
+    found = cost(AnchoredReprojection(), says([off_by(0.0)]), behind, rows(1), 0.0)
+    assert found == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("penalty", WITH_TRUTH, ids=lambda p: type(p).__name__)
+def test_the_teacher_is_frozen_and_agreement_with_the_truth_is_free(penalty: Penalty) -> None:
+    told = replace(rows(3), stored=torch.tensor([off_by(0.0)] * 3))
+    teacher, student = says([off_by(0.0)] * 3), says([off_by(1.0)] * 3)
+    now = penalty(student, teacher, told, 0.3)
+    now.backward()
+    assert student.points.grad is not None
+    assert bool((student.points.grad[:, 0] > 0).all())  # back towards the truth
+    assert teacher.points.grad is None
+    assert cost(penalty, says([off_by(0.0)] * 3), teacher, told, 0.3) == pytest.approx(0, abs=1e-6)
+    assert float(now.detach()) > 1e-3
+
+
+def output(centres: int, generator: torch.Generator) -> HeadOutput:
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    return HeadOutput(draw(5, centres), draw(5, centres, 3), draw(5, 3), draw(5, 4))
+
+
+def test_the_papers_penalty_is_spdd_with_its_defaults_and_a_scale() -> None:
+    generator = torch.Generator().manual_seed(0)
+    teacher, student = output(6, generator), output(8, generator)
+    expected = float(spdd_loss(student, teacher, SpddOptions()).total)
+    assert cost(Distillation(), student, teacher, rows(5), 0.7) == pytest.approx(expected)
+    ten = cost(Distillation(scale=10.0), student, teacher, rows(5), 0.7)
+    assert ten == pytest.approx(10 * expected, rel=1e-6)
+    # Without the first two terms it is the L1 distance of the points alone.
+    alone = Distillation(SpddOptions(prior_weight=0.0, metric_weight=0.0))
+    drift = float((student.points - teacher.points).abs().sum(-1).mean())
+    assert cost(alone, student, teacher, rows(5), 0.7) == pytest.approx(drift, rel=1e-6)

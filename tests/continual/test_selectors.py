@@ -1,0 +1,59 @@
+"""Which frames stay: within the capacity, in recorded order, whatever the rule."""
+
+import numpy as np
+import pytest
+
+from evercal.continual.frame_statistics import FrameStatistics
+from evercal.continual.selectors import SELECTORS
+from evercal.datasets.frame import Frame
+from evercal.geometry import SE3, Camera
+from evercal.networks.buffer import FeatureBuffer
+from evercal.networks.head import Head, HeadOptions
+
+
+class Known(FrameStatistics):
+    """Frames of a camera that moves by random steps; what a head would say is made up."""
+
+    def __init__(self, positions: np.ndarray, quaternions: np.ndarray):
+        camera, image = Camera(8, 8, 8, 8, 3.5, 3.5), np.zeros((8, 8, 3), np.uint8)
+        frames = [
+            Frame(f"{i}", image, camera, SE3(quaternions[i], positions[i]))
+            for i in range(len(positions))
+        ]
+        head = Head(4, 4, HeadOptions(width=4))
+        super().__init__(frames, head, lambda: FeatureBuffer(0, SE3.identity()), 0)
+        self._made_up = np.random.default_rng(7).normal(size=(len(positions), 40))
+
+    def features(self) -> np.ndarray:
+        return self._made_up
+
+    def gradients(self) -> np.ndarray:
+        return self._made_up
+
+    def visible_parts(self) -> list[np.ndarray]:
+        return [np.flatnonzero(row > 1) for row in self._made_up]
+
+
+@pytest.mark.parametrize("count", [10, 37, 100, 256])
+@pytest.mark.parametrize("name", SELECTORS)
+def test_no_selection_exceeds_its_capacity(name: str, count: int) -> None:
+    rng = np.random.default_rng(count)
+    positions = np.cumsum(rng.normal(0, 0.05, (count, 3)), axis=0)
+    turns = np.array([1.0, 0, 0, 0]) + np.cumsum(rng.normal(0, 0.1, (count, 4)), axis=0)
+    quaternions = turns / np.linalg.norm(turns, axis=1, keepdims=True)
+    capacity = count // 10
+    kept = SELECTORS[name](Known(positions, quaternions), capacity)
+    assert 1 <= len(kept) <= capacity
+    assert np.issubdtype(kept.dtype, np.integer)
+    assert (np.diff(kept) > 0).all()
+    assert kept[0] >= 0
+    assert kept[-1] < count
+
+
+def test_only_the_papers_own_radius_leaves_memory_unused() -> None:
+    # A camera that moves little relative to its turning stays within r = 0.5 of few frames.
+    positions = np.linspace(0, 1, 200)[:, None] * [1.0, 0, 0]
+    quaternions = np.tile([1.0, 0, 0, 0], (200, 1))
+    kept = {name: len(rule(Known(positions, quaternions), 20)) for name, rule in SELECTORS.items()}
+    assert kept.pop("sars") < 20
+    assert set(kept.values()) == {20}
