@@ -252,7 +252,7 @@ def test_the_paper_knows_all_centres_from_the_start(
     asked = replace(options, stage=stage, strategies=named("sars_spdd", "joint", "evercal"))
     how = RunOptions(stage(0), 120, tmp_path / "features", tmp_path)
     run = strategy_run._Run(asked.strategies[0], list(arcs), how, None)
-    assert (run.stage.grid_scenes, len(run.stage.fixed_centres_m)) == (2, 10)
+    assert (run.stage.grid_scenes, len(run.stage.fixed_centres_m)) == (2, 5)
     assert run.stage.head.width == 24
     assert run.stage.head.condition == "descriptor"
     assert run.stage.fit.iterations == options.stage(0).fit.iterations
@@ -261,7 +261,7 @@ def test_the_paper_knows_all_centres_from_the_start(
     assert [s.strategy for s in steps] == [s.name for s in asked.strategies for _ in arcs]
     first = Store.open(tmp_path / "runs" / "first-one-0").maps
     # No scene brings any of its own.
-    assert len(first.heads[0].centres) == 10
+    assert len(first.heads[0].centres) == 5
     assert first.scenes[0].cell.side_m == 5.0
     ends = {o.strategy: o for o in read(tmp_path) if (o.stage, o.scene) == (1, "two")}
     # Twelve steps teach this network nothing, but what is remembered answers all the same.

@@ -51,10 +51,10 @@ class RunOptions:
     """Working size of images, pixels."""
     features: Path
     """Folder of encoded views, shared by all runs."""
-    device: torch.device
-    """What the networks run on."""
     out: Path
     """Folder of results; stores under way are in its folder `runs`."""
+    device: torch.device = torch.device("cpu")
+    """What the networks run on."""
 
 
 def run_strategy(
