@@ -58,7 +58,7 @@ class _ProjectedSteps(TrainingHooks):
         bases = {k: torch.linalg.qr(b.to(head.logit)).Q for k, b in found.items()}
         outputs = bases.pop(OUTPUTS)
         shared = _shared_outputs(head)
-        self._bases: dict[str, Tensor] = {**bases, **{name: outputs for name in shared}}
+        self._bases: dict[str, Tensor] = {**bases, **dict.fromkeys(shared, outputs)}
         layers = [k.removesuffix("weight") + "bias" for k in bases]
         self._still = [*layers, *(f"{name}_bias" for name in shared)]
         earlier = len(start.states)
