@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from evercal.localization.keyframe_bank import LoadedKeyframe
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import RefinedPose, refine_pose
 from evercal.mapping.landmarks import project_surface
-from evercal.mapping.patches import align_patches, from_level, to_level, whitening
+from evercal.mapping.patches import Patches, align_patches, from_level, to_level, whitening
 
 Array = NDArray[np.floating]
 
@@ -82,6 +83,35 @@ class _Found:
     whitening: Array
 
 
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """The landmarks of some keyframes as one set."""
+
+    keyframes: Sequence[LoadedKeyframe]
+    starts: NDArray[np.int64]
+    """(keyframes + 1,) the first landmark of each, and their number."""
+    surface_m: Array
+    """(3, n, 3), see `LoadedKeyframe`."""
+
+    @classmethod
+    def of(cls, keyframes: Sequence[LoadedKeyframe]) -> Self:
+        """Of keyframes in their order."""
+        surfaces = [keyframe.surface_m for keyframe in keyframes]
+        counts = [surface.shape[1] for surface in surfaces]
+        return cls(keyframes, np.cumsum([0, *counts]), np.concatenate(surfaces, 1))
+
+    def patches(self, level: int, which: NDArray[np.int64]) -> Patches:
+        """Templates of some landmarks in rising order."""
+        ends = np.searchsorted(which, self.starts)
+        parts = [
+            keyframe.patches[level].take(which[a:b] - start)
+            for keyframe, start, a, b in zip(
+                self.keyframes, self.starts, ends, ends[1:], strict=False
+            )
+        ]
+        return Patches.joined(parts)
+
+
 def align_pose(
     pyramid: Sequence[Array],
     camera: Camera,
@@ -102,9 +132,10 @@ def align_pose(
         None where too few landmarks are found.
     """
     pose, refined, found = start, None, None
+    target = _Target.of(keyframes)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     for number, step in enumerate(options.rounds):
-        found = _look(pyramid, camera, keyframes, pose, step, options)
+        found = _look(pyramid, camera, target, pose, step, options)
         if len(found.pixels) < options.min_found:
             return None
         ideal = _undistorted(found.pixels, camera)
@@ -134,7 +165,7 @@ def align_pose(
 def _look(
     pyramid: Sequence[Array],
     camera: Camera,
-    keyframes: Sequence[LoadedKeyframe],
+    target: _Target,
     pose: SE3,
     step: AlignmentRound,
     options: AlignmentOptions,
@@ -142,28 +173,22 @@ def _look(
     """Landmarks of all keyframes in one round."""
     inverse = pose.inverse()
     turn, shift = inverse.rotation_matrix(), inverse.translation_m
-    seen = [project_surface(k.surface_m, turn, shift, camera) for k in keyframes]
-    every = max(1, -(-sum(len(which) for which, _, _ in seen) // step.landmarks))
-    parts, expected = [], 0
-    for keyframe, (which, pixels, affines) in zip(keyframes, seen, strict=True):
-        which, pixels, affines = which[::every], pixels[::every], affines[::every]
-        if not len(which):
-            continue
-        expected += len(which)
-        patches = keyframe.patches[step.level].take(which)
-        at, correlation = align_patches(
-            patches, pyramid[step.level], to_level(pixels, step.level), affines, step.iterations
-        )
-        at = from_level(at.astype(np.float64), step.level)
-        good = correlation > options.min_correlation
-        good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
-        spread = patches.inverse_hessian[good]
-        white = whitening(affines[good], spread, options.floor_px, options.noise * 2**step.level)
-        parts.append((at[good], keyframe.surface_m[0, which[good]], white))
-    if not parts:
+    which, pixels, affines = project_surface(target.surface_m, turn, shift, camera)
+    every = max(1, -(-len(which) // step.landmarks))
+    which, pixels, affines = which[::every], pixels[::every], affines[::every]
+    if not len(which):
         none = np.zeros((0, 2))
         return _Found(0, none, np.zeros((0, 3)), np.zeros((0, 2, 2)))
-    return _Found(expected, *(np.concatenate(column) for column in zip(*parts, strict=True)))
+    patches = target.patches(step.level, which)
+    at, correlation = align_patches(
+        patches, pyramid[step.level], to_level(pixels, step.level), affines, step.iterations
+    )
+    at = from_level(at.astype(np.float64), step.level)
+    good = correlation > options.min_correlation
+    good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
+    spread = patches.inverse_hessian[good]
+    white = whitening(affines[good], spread, options.floor_px, options.noise * 2**step.level)
+    return _Found(len(which), at[good], target.surface_m[0, which[good]], white)
 
 
 def _undistorted(pixels: Array, camera: Camera) -> Array:
