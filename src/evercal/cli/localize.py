@@ -63,19 +63,24 @@ class Localize:
     ) -> list[tuple[Path, "PoseEstimate", float]]:
         """Per image its path, the answer and the milliseconds that it took, decoding included."""
         from evercal.datasets import read_image, write_image
+        from evercal.localization.parallel import in_parallel
         from evercal.reports.pictures import draw_estimate, scene_camera
+
+        def answer(number: int) -> tuple[Path, "PoseEstimate", float]:
+            path, began = self.images[number], time.perf_counter()
+            image = read_image(path)
+            estimate = localizer.localize(image, camera)
+            ms = 1000 * (time.perf_counter() - began)
+            if self.overlay is not None and estimate.scene is not None:
+                lens = camera or scene_camera(localizer, estimate.scene)
+                drawn = draw_estimate(image, estimate, lens)
+                write_image(self.overlay / self._overlay_name(number), drawn)
+            return path, estimate, ms
 
         answers = []
         with progress_bar("localizing", len(self.images), "image") as bar:
-            for number, path in enumerate(self.images):
-                began = time.perf_counter()
-                image = read_image(path)
-                estimate = localizer.localize(image, camera)
-                answers.append((path, estimate, 1000 * (time.perf_counter() - began)))
-                if self.overlay is not None and estimate.scene is not None:
-                    lens = camera or scene_camera(localizer, estimate.scene)
-                    drawn = draw_estimate(image, estimate, lens)
-                    write_image(self.overlay / self._overlay_name(number), drawn)
+            for found in in_parallel(answer, range(len(self.images))):
+                answers.append(found)
                 bar.update()
         return answers
 

@@ -38,7 +38,7 @@ class AlignmentOptions:
 
     rounds: tuple[AlignmentRound, ...] = (
         AlignmentRound(1, 6, 300, 24.0),
-        AlignmentRound(0, 4, 600, 6.0),
+        AlignmentRound(0, 4, 300, 6.0),
         AlignmentRound(0, 3, 900, 3.0),
     )
     """From coarse to fine."""
