@@ -1,7 +1,7 @@
 """Alignment: landmarks of keyframes are found in an image to a tenth of a pixel, then the pose."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -27,7 +27,7 @@ class AlignmentRound:
     iterations: int
     """Alignment steps of every patch."""
     landmarks: int
-    """Landmarks looked for, at most."""
+    """Landmarks looked for, at most; more of them where few are found."""
     reach_px: float
     """How far from where it was expected a landmark may be found, pixels of the image."""
 
@@ -42,6 +42,12 @@ class AlignmentOptions:
         AlignmentRound(0, 3, 900, 3.0),
     )
     """From coarse to fine."""
+    enough_found: float = 0.4
+    """Where a smaller share of the landmarks was found in one round, the next looks for as many
+    more,"""
+    most_more: float = 3.0
+    """but at most for so many times as many: of an image that is covered, or seen from far, the
+    precision lies in the few that can be found."""
     min_correlation: float = 0.7
     """Smallest normalised cross-correlation of a landmark that was found."""
     min_found: int = 12
@@ -68,6 +74,8 @@ class Alignment:
     """(n, 2) landmarks that agree, pixels of the image."""
     points_m: Array
     """(n, 3) the same in the base frame."""
+    planned: int
+    """Landmarks that the last round would have looked for, had enough of them been found before."""
 
     @property
     def share(self) -> float:
@@ -135,7 +143,10 @@ def align_pose(
     target = _Target.of(keyframes)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     for number, step in enumerate(options.rounds):
-        found = _look(pyramid, camera, target, pose, step, options)
+        share = 1.0 if found is None else len(found.pixels) / found.expected
+        more = min(max(1.0, options.enough_found / max(share, 1e-3)), options.most_more)
+        wider = replace(step, landmarks=int(more * step.landmarks))
+        found = _look(pyramid, camera, target, pose, wider, options)
         if len(found.pixels) < options.min_found:
             return None
         ideal = _undistorted(found.pixels, camera)
@@ -159,6 +170,7 @@ def align_pose(
         len(found.pixels),
         found.pixels[agree],
         found.points_m[agree],
+        min(found.expected, options.rounds[-1].landmarks),
     )
 
 

@@ -226,6 +226,7 @@ class Localizer:
             found.points_m,
             aligned=True,
             matched=found.matched,
+            planned=found.planned,
         )
 
     def _scene_of(self, rough: PnpResult, scene: int) -> int:

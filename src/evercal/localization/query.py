@@ -98,9 +98,12 @@ class Hypothesis:
     points_m: np.ndarray | None = None
     aligned: bool = False
     matched: int = 0
+    planned: int = 0
 
     @property
     def support(self) -> float:
         """What the scene's threshold is compared with, see `localization.acceptance`."""
-        exact = self.inliers / max(1, self.matched) if self.aligned else 1.0
-        return self.ratio * exact * self.inliers**0.5
+        if not self.aligned:
+            return self.ratio * self.inliers**0.5
+        exact = self.inliers / max(1, self.matched)
+        return self.ratio * exact**2 * (self.ratio * self.planned) ** 0.5
