@@ -100,13 +100,17 @@ class _Target:
     """(keyframes + 1,) the first landmark of each, and their number."""
     surface_m: Array
     """(3, n, 3), see `LoadedKeyframe`."""
+    depth_error_m: Array
+    """(n, 3) where a landmark may move for its depth is uncertain: one standard deviation."""
 
     @classmethod
     def of(cls, keyframes: Sequence[LoadedKeyframe]) -> Self:
         """Of keyframes in their order."""
         surfaces = [keyframe.surface_m for keyframe in keyframes]
         counts = [surface.shape[1] for surface in surfaces]
-        return cls(keyframes, np.cumsum([0, *counts]), np.concatenate(surfaces, 1))
+        errors = [k.depth_noise[:, None] * (k.surface_m[0] - k.position_m) for k in keyframes]
+        starts = np.cumsum([0, *counts])
+        return cls(keyframes, starts, np.concatenate(surfaces, 1), np.concatenate(errors))
 
     def patches(self, level: int, which: NDArray[np.int64]) -> Patches:
         """Templates of some landmarks in rising order."""
@@ -199,8 +203,17 @@ def _look(
     good = correlation > options.min_correlation
     good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
     spread = patches.inverse_hessian[good]
-    white = whitening(affines[good], spread, options.floor_px, options.noise * 2**step.level)
-    return _Found(len(which), at[good], target.surface_m[0, which[good]], white)
+    which, noise = which[good], options.noise * 2**step.level
+    error = _shift_px(target.surface_m[0, which], target.depth_error_m[which], turn, shift, camera)
+    white = whitening(affines[good], spread, options.floor_px, noise, error)
+    return _Found(len(good), at[good], target.surface_m[0, which], white)
+
+
+def _shift_px(points: Array, moves: Array, turn: Array, shift: Array, camera: Camera) -> Array:
+    """(n, 2) how far points (n, 3) move in the ideal pinhole where they move by `moves` (n, 3)."""
+    local, move = points @ turn.T + shift, moves @ turn.T
+    plane = move[:, :2] - local[:, :2] * (move[:, 2:] / local[:, 2:])
+    return plane / local[:, 2:] * [camera.fx, camera.fy]
 
 
 def _undistorted(pixels: Array, camera: Camera) -> Array:

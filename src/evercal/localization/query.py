@@ -31,7 +31,7 @@ class LocalizeOptions:
 
     candidates: int = 3
     """At most this many scenes are tried for an image."""
-    attempts: tuple[Attempt, ...] = (Attempt(12, 3), Attempt(48, 1), Attempt(200, 1))
+    attempts: tuple[Attempt, ...] = (Attempt(12, 2), Attempt(48, 1), Attempt(200, 1))
     """Where no pose is accepted, the next attempt follows."""
     keyframes: int = 6
     """Keyframes of a scene that an image is matched to and aligned with."""

@@ -168,7 +168,13 @@ def align_down(
     return at, correlation
 
 
-def whitening(affines: Array, inverse_hessian: Array, floor_px: float, noise: float) -> Array:
+def whitening(
+    affines: Array,
+    inverse_hessian: Array,
+    floor_px: float,
+    noise: float,
+    shift_px: Array | None = None,
+) -> Array:
     """(n, 2, 2) matrices that make the errors of aligned positions independent, of unit variance.
 
     A patch on an edge is located well across the edge and badly along it; its Hessian says so.
@@ -178,9 +184,13 @@ def whitening(affines: Array, inverse_hessian: Array, floor_px: float, noise: fl
         inverse_hessian: (n, 2, 2) of the patches.
         floor_px: error of a perfect patch, pixels.
         noise: standard deviation of intensities, in deviations of a patch.
+        shift_px: (n, 2) one standard deviation of an error along one line, as that of a landmark
+            whose depth is uncertain.
     """
     spread = (affines @ inverse_hessian @ affines.transpose(0, 2, 1)).astype(np.float64)
     spread = noise**2 * (spread + floor_px**2 * np.eye(2))
+    if shift_px is not None:
+        spread += shift_px[:, :, None] * shift_px[:, None]
     return np.linalg.cholesky(np.linalg.inv(spread)).transpose(0, 2, 1)
 
 
