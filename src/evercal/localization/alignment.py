@@ -28,6 +28,8 @@ class AlignmentRound:
     """Alignment steps of every patch."""
     landmarks: int
     """Landmarks looked for, at most; more of them where few are found."""
+    steps: int
+    """Steps of the pose, at most."""
     reach_px: float
     """How far from where it was expected a landmark may be found, pixels of the image."""
 
@@ -37,9 +39,9 @@ class AlignmentOptions:
     """How landmarks are looked for in an image."""
 
     rounds: tuple[AlignmentRound, ...] = (
-        AlignmentRound(1, 6, 300, 24.0),
-        AlignmentRound(0, 4, 300, 6.0),
-        AlignmentRound(0, 3, 900, 3.0),
+        AlignmentRound(1, 6, 300, 3, 24.0),
+        AlignmentRound(0, 4, 300, 3, 6.0),
+        AlignmentRound(0, 3, 900, 10, 3.0),
     )
     """From coarse to fine."""
     enough_found: float = 0.4
@@ -161,7 +163,9 @@ def align_pose(
             if rough is None:
                 return None
             pose = rough.world_from_camera
-        refined = refine_pose(ideal, found.points_m, found.whitening, intrinsics, pose)
+        refined = refine_pose(
+            ideal, found.points_m, found.whitening, intrinsics, pose, step.steps
+        )
         pose = refined.base_from_camera
     assert refined is not None
     assert found is not None
