@@ -26,9 +26,9 @@ ACCEPTANCE_FRACTION = 1 / 6
 """Where the threshold lies between the inlier ratios of negative and of positive images."""
 
 
-MAX_SUPPORT = 0.5
+MAX_SUPPORT = 0.36
 """Support that no image of another room reached (docs/experiments/map.md)."""
-MIN_SUPPORT = 0.15
+MIN_SUPPORT = 0.14
 """Where the stated poses of a recording fit the images badly, right poses have little support: the
 threshold then falls to half of what held-out frames have, but not below this."""
 MAP_COVARIANCE_SCALE = 1.3

@@ -130,13 +130,17 @@ class Localizer:
         cameras = self._cameras(camera, image.shape)
         usable = [i for i, c in enumerate(cameras) if c is not None]
         best: Hypothesis | None = None
-        for attempt in self.options.attempts if len(self._bank) else (Attempt(0, 1),):
+        attempts = self.options.attempts if len(self._bank) else (Attempt(0, 1),)
+        for number, attempt in enumerate(attempts):
             for candidate in self._matcher.candidates(query, usable, attempt, self._one_answer()):
                 trial = self._hypothesis(query, candidate, cameras)
                 if best is None or trial.support > best.support:
                     best = trial
-                if trial.aligned and self._accepted(trial):
+                if trial.aligned and self._accepted(trial, self.options.sure):
                     return self._answer(trial, began)
+            # A pose that is only just good enough may be beaten by another look.
+            if number and best is not None and best.aligned and self._accepted(best):
+                break
         assert best is not None, "at least one scene is tried"
         return self._answer(best, began)
 
@@ -236,10 +240,10 @@ class Localizer:
         found = self.maps.atlas().scene_at(place)
         return scene if found is None else found
 
-    def _accepted(self, best: Hypothesis) -> bool:
+    def _accepted(self, best: Hypothesis, times: float = 1.0) -> bool:
         record = self.maps.scenes[best.scene]
         if best.aligned:
-            return best.inliers > 0 and best.support >= record.min_support
+            return best.inliers > 0 and best.support >= times * record.min_support
         return best.ratio >= record.inlier_threshold
 
     def _answer(self, best: Hypothesis, began: float) -> PoseEstimate:

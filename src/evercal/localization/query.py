@@ -33,6 +33,9 @@ class LocalizeOptions:
     """At most this many scenes are tried for an image."""
     attempts: tuple[Attempt, ...] = (Attempt(12, 2), Attempt(48, 1), Attempt(200, 1))
     """Where no pose is accepted, the next attempt follows."""
+    sure: float = 2.0
+    """After the first attempt a pose is taken at once where its support is so many times what is
+    needed; else the second attempt follows, and the better pose is taken."""
     keyframes: int = 6
     """Keyframes of a scene that an image is matched to and aligned with."""
     retrieval_stride: int = 16
