@@ -163,9 +163,7 @@ def align_pose(
             if rough is None:
                 return None
             pose = rough.world_from_camera
-        refined = refine_pose(
-            ideal, found.points_m, found.whitening, intrinsics, pose, step.steps
-        )
+        refined = refine_pose(ideal, found.points_m, found.whitening, intrinsics, pose, step.steps)
         pose = refined.base_from_camera
     assert refined is not None
     assert found is not None
