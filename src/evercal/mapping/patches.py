@@ -198,7 +198,8 @@ def _sample(image: Array, right: Array, down: Array) -> Array:
     """(n, p) intensities at (n, p) columns and rows."""
     if not len(right):
         return np.zeros(right.shape, np.float32)
-    return cv2.remap(image, right, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    values = cv2.remap(image, right, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, np.float32)
 
 
 def _centred(patches: Array) -> tuple[Array, Array]:
