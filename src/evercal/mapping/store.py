@@ -54,7 +54,7 @@ from evercal.storage.manifest import (
     write_manifest,
 )
 
-SCHEMA = 2
+SCHEMA = 3
 LEARNING = "learning"
 STAGES = "stages"
 MEMORY_FILES = ("memory.safetensors", "notes.safetensors")
@@ -151,7 +151,9 @@ class Store:
                 " new store"
             )
         if schema != SCHEMA:
-            raise InputError(f"store {root}: schema {schema!r} is not {SCHEMA}; update evercal")
+            older = isinstance(schema, int) and schema < SCHEMA
+            todo = "learn its scenes again" if older else "update evercal"
+            raise InputError(f"store {root}: schema {schema!r}, this evercal has {SCHEMA}; {todo}")
         networks = payload["networks"]
         local, descriptor = (str(name) for name in networks)  # type: ignore[attr-defined]
         maps = SceneMaps(
