@@ -273,8 +273,8 @@ def test_a_running_note_begins_with_the_first_scene(
 ) -> None:
     steps = list(run_bench(arcs, replace(options, strategies=named("ewc_online")), tmp_path))
     sizes = [step.results[0].memory_bytes for step in steps]
-    # One anchor and one Fisher matrix a scene, both of the whole head.
-    assert 0 < sizes[0] < sizes[1]
+    # One anchor and one sum of importances of the whole head, which grows by what a scene adds.
+    assert 0 < sizes[0] < sizes[1] < 1.2 * sizes[0]
 
 
 def test_joint_training_may_build_maps_too(

@@ -1,4 +1,4 @@
-"""Replay: how many rows of which scenes, what they cost together, and what is stored beside them."""
+"""Replay: rows of which scenes, what they cost together, and what is stored beside them."""
 
 import copy
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from evercal.networks.buffer import Rows, join
 from evercal.networks.head import HeadOutput
 from evercal.networks.hooks import TrainingHooks
 
-from .by_hand import off_by, rows, says, stage_start, wave_buffer, wave_head
+from .by_hand import off_by, says, stage_start, wave_buffer, wave_head
 
 
 @dataclass(frozen=True)
