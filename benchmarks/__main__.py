@@ -1,4 +1,4 @@
-"""`python -m benchmarks real|speed|rooms|peers|gate ...`: makes what docs/results.md reports."""
+"""`python -m benchmarks real|speed|peers|gate ...`: makes what docs/results.md reports."""
 
 import os
 import sys
@@ -38,6 +38,40 @@ def speed(store: Path, image: Path, repeat: int = 50) -> None:
     from benchmarks.speed import run
 
     run(store, image, repeat)
+
+
+def trainer(widths: tuple[int, ...] = (256, 384), batch: int = 2048, repeat: int = 30) -> None:
+    """Times a training step beside its bare matrix products.
+
+    Args:
+        widths: of the head.
+        batch: rows of a step.
+        repeat: steps timed.
+    """
+    from benchmarks.trainer import run
+
+    run(widths, batch, repeat)
+
+
+def tune(
+    suite: tyro.conf.Positional[str],
+    file: Path,
+    data: Path | None = None,
+    scenes: int = 3,
+    out: Path = Path("runs/tune"),
+) -> None:
+    """Three trials of every method's setting on held-out training frames; goes on where it stopped.
+
+    Args:
+        suite: whose first scenes are learned.
+        file: the best rows are written here, for `evercal bench --rows`.
+        data: folder of the suite's recordings.
+        scenes: how many of its scenes.
+        out: where runs and results are kept.
+    """
+    from benchmarks.tuning import run
+
+    run(suite, data, scenes, out / suite, file)
 
 
 def rooms(
@@ -162,6 +196,48 @@ def handeye(trials: int = 1000, thorough: bool = False) -> None:
     run(trials, thorough)
 
 
+def intervals(trials: int = 2000) -> None:
+    """Counts how often 95 % bounds of a paired difference hold the truth, before and now.
+
+    Args:
+        trials: of each setting.
+    """
+    from benchmarks.intervals import run
+
+    run(trials)
+
+
+def publish(
+    source: tyro.conf.Positional[Path],
+    name: tyro.conf.Positional[str],
+    groups: tuple[str, ...] = (),
+    note: str = "",
+) -> None:
+    """Puts the numbers of a measurement into results/NAME.jsonl, for `tables`.
+
+    Args:
+        source: a folder of `evercal bench`, or rows in JSON from maps, calibration or peers.
+        name: of the file.
+        groups: rows that a table takes together, each TITLE=ROW,ROW.
+        note: what a reader must know besides.
+    """
+    from benchmarks.publish import groups_of
+    from benchmarks.publish import publish as write
+
+    print(write(source, name, groups_of(groups), note))
+
+
+def tables(check: bool = False) -> int:
+    """Makes the tables of the docs anew from results/.
+
+    Args:
+        check: write nothing; fail where a page does not agree with its data.
+    """
+    from benchmarks.tables import run
+
+    return run(check)
+
+
 def main() -> int:
     """Runs one benchmark; `--gate` is short for `gate`."""
     from evercal.errors import InputError
@@ -170,6 +246,8 @@ def main() -> int:
     verbs = {
         "real": real,
         "speed": speed,
+        "trainer": trainer,
+        "tune": tune,
         "rooms": rooms,
         "peers": peers,
         "gate": gate,
@@ -177,6 +255,9 @@ def main() -> int:
         "handeye": handeye,
         "calibration": calibration,
         "crowd": crowd,
+        "intervals": intervals,
+        "publish": publish,
+        "tables": tables,
     }
     try:
         code = tyro.extras.subcommand_cli_from_dict(verbs, args=args)

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from tabulate import tabulate
 from tqdm import tqdm
 
-from benchmarks.maps import CHI2_6
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.drift import check
 from evercal.calibration.from_images import Images, calibrate
@@ -19,6 +18,7 @@ from evercal.continual.learn_scene import LearnOptions, learn_scene
 from evercal.continual.presets import preset
 from evercal.datasets import Scene, load_scene
 from evercal.errors import InputError
+from evercal.evaluation.metrics import CHI2_6, squared_mahalanobis
 from evercal.geometry import SE3, pose_distance
 from evercal.localization.localizer import Localizer
 from evercal.simulation.mini import FOLDER
@@ -181,14 +181,12 @@ def _some(images: Images, count: int, rng: np.random.Generator) -> Images:
 
 def _error(found: SE3, covariance: np.ndarray, truth: SE3) -> dict[str, object]:
     metres, radians = pose_distance(found, truth)
-    shift = truth.translation_m - found.translation_m
-    error = np.concatenate([shift, (found.inverse() @ truth).log()[3:]])
     return {
         "mm": 1000 * float(metres),
         "deg": float(np.rad2deg(radians)),
         "sigma_mm": 1000 * float(np.sqrt(np.trace(covariance[:3, :3]) / 3)),
         "sigma_deg": float(np.rad2deg(np.sqrt(np.trace(covariance[3:, 3:]) / 3))),
-        "squared_mahalanobis": float(error @ np.linalg.solve(covariance, error)),
+        "squared_mahalanobis": squared_mahalanobis(found, covariance, truth),
     }
 
 

@@ -16,14 +16,12 @@ from evercal.continual.learn_scene import LearnOptions, LearnReport, learn_scene
 from evercal.continual.presets import preset
 from evercal.datasets import Frame, Scene, load_scene, posed
 from evercal.errors import InputError
+from evercal.evaluation.metrics import CHI2_6, squared_mahalanobis
 from evercal.geometry import SE3, Camera, average_poses, pose_distance
-from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import LocalizeOptions, Localizer
 from evercal.simulation.mini import mini_rooms
 
 BOUNDS = ((0.05, 5.0), (0.02, 2.0), (0.01, 1.0), (0.005, 0.5))
-CHI2_6 = 12.592
-"""95 % quantile for six dimensions."""
 
 
 def learned(
@@ -65,8 +63,9 @@ def errors(
         metres.append(float(m))
         radians.append(float(r))
         if m < 0.05:
-            inside.append(squared_mahalanobis(found, truth) < CHI2_6)
             assert found.covariance is not None
+            squared = squared_mahalanobis(found.base_from_camera, found.covariance, truth)
+            inside.append(squared < CHI2_6)
             sigma.append(float(np.sqrt(np.trace(found.covariance[:3, :3]) / 3)))
     m, d = np.array(metres), np.rad2deg(radians)
     return {
@@ -81,16 +80,6 @@ def errors(
         "sigma_mm": 1000 * float(np.median(sigma)) if sigma else float("nan"),
         "ms": float(np.median(ms)),
     }
-
-
-def squared_mahalanobis(found: PoseEstimate, truth: SE3) -> float:
-    """Squared error of a pose in units of its own covariance."""
-    assert found.base_from_camera is not None
-    assert found.covariance is not None
-    shift = truth.translation_m - found.base_from_camera.translation_m
-    turn = (found.base_from_camera.inverse() @ truth).log()[3:]
-    error = np.concatenate([shift, turn])
-    return float(error @ np.linalg.solve(found.covariance, error))
 
 
 def _bound(metres: float, degrees: float) -> str:
@@ -311,7 +300,8 @@ def _believed(localizer: Localizer, name: str, images: Sequence[np.ndarray]) -> 
     for image in images:
         height, width = image.shape[:2]
         fits = abs(own.width * height / (own.height * width) - 1) < 0.01
-        camera = None if fits else Camera(width, height, width, width, width / 2, height / 2)
+        middle = (width - 1) / 2, (height - 1) / 2
+        camera = None if fits else Camera(width, height, width, width, *middle)
         found.append(localizer.localize(image, camera))
     support = [estimate.support for estimate in found]
     return {

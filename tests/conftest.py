@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
+    import torch
+
     from evercal.continual.stage import Stage, StageOptions
     from evercal.datasets.frame import Scene
     from evercal.mapping.scene_maps import SceneMaps
@@ -54,6 +56,18 @@ def one_thread() -> None:
     import torch
 
     torch.set_num_threads(1)
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> torch.device:
+    """The CPU, and with `-m gpu` a CUDA device; without one the test is skipped."""
+    import torch
+
+    from evercal.features.device import device_of
+
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("PyTorch finds no CUDA device on this machine")
+    return device_of(request.param)
 
 
 @pytest.fixture(scope="session")

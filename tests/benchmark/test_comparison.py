@@ -92,10 +92,43 @@ def test_the_method_table_shows_means_and_spread() -> None:
     # along the way (80 + 70 + 60) / 3 and (90 + 90 + 50) / 3.
     assert ours[:7] == ["ours", "2", "67.5 ± 3.5", "0.0", "73.3", "55.0", "5.0"]
     # Of the 38 frames in the right scene 26 and 28 are right.
-    assert ours[9:] == ["5.0", "2.0", "71.1", "2.0", "3.0", "21.0"]
+    assert ours[9:] == ["5.0", "0.0", "-", "2.0", "71.1", "2.0", "3.0", "21.0"]
     assert theirs[2] == "45.0"
     text = as_text([header, ours, theirs], "markdown")
-    assert [line.count("|") for line in text.splitlines()] == [16] * 4
+    assert [line.count("|") for line in text.splitlines()] == [18] * 4
+
+
+def test_refused_frames_and_ellipsoids_are_counted() -> None:
+    """Two of 20 frames are refused, and of 17 poses 3 lie outside their ellipsoid."""
+
+    def told(outcome: SceneResult) -> SceneResult:
+        errors = (*outcome.translation_m[:-2], math.inf, math.inf)
+        squared = (*(20.0,) * 3, *(5.0,) * 14, *(math.nan,) * 3)
+        return replace(outcome, translation_m=errors, squared_mahalanobis=squared)
+
+    header, ours = method_rows(runs_of([told(o) for o in lines("ours", 0, [[16], [16, 16]])]))
+    columns = dict(zip(header, ours, strict=True))
+    assert columns["wrong scene %"] == "5.0"
+    assert columns["refused %"] == "10.0"
+    assert columns["in 95 % ellipsoid"] == f"{100 * 14 / 17:.1f}"
+
+
+def test_intervals_resample_whole_runs_of_frames() -> None:
+    """The same flags, their frames numbered as one run or as four: other pieces, other bounds."""
+    runs = runs_of(OURS + THEIRS)
+
+    def named(run: Run, names: list[str]) -> Run:
+        results = {k: replace(o, frames=tuple(names)) for k, o in run.results.items()}
+        return replace(run, results=results)
+
+    sequences = [f"seq-{i // 5}/frame-{i:06d}" for i in range(FRAMES)]
+    pieces = []
+    for names in ([f"frame-{i:06d}" for i in range(FRAMES)], sequences):
+        found = difference([named(runs[0], names)], [named(runs[2], names)])
+        assert found is not None
+        pieces.append(found.high - found.low)
+    # Ours is right on 16 and 10 more frames of b: of two halves 2 and 8, of four fifths 0 0 5 5.
+    assert pieces[0] != pytest.approx(pieces[1], rel=0.1)
 
 
 def test_bounds_are_strict() -> None:

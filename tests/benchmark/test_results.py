@@ -60,6 +60,17 @@ def test_what_was_kept_is_told_where_it_is_known(tmp_path: Path) -> None:
     assert read(tmp_path) == [result(1)]
 
 
+def test_squared_errors_and_refusals(tmp_path: Path) -> None:
+    told = result(squared_mahalanobis=(3.25, math.nan, math.nan), wrong_scene=(False, False, False))
+    append(tmp_path, [told, result()])
+    first, second = read(tmp_path)
+    assert first.squared_mahalanobis[0] == 3.25
+    assert np.isnan(first.squared_mahalanobis[1:]).all()
+    assert first.refused.tolist() == [False, True, False]
+    assert second.squared_mahalanobis == ()
+    assert "squared" not in (tmp_path / RESULTS).read_text().splitlines()[1]
+
+
 @pytest.mark.parametrize("cut", [1, 40])
 def test_a_line_cut_short_is_taken_away(tmp_path: Path, cut: int) -> None:
     append(tmp_path, [result(), result(1)])

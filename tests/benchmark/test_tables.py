@@ -21,7 +21,11 @@ def test_scene_rows_and_their_mean_in_markdown() -> None:
     lines = score_table(scores, "markdown").splitlines()
     assert cells(lines[0])[:4] == ["scene", "frames", "5cm 5deg %", "2cm 2deg %"]
     assert set(lines[1]) <= set("|-: ")
-    shares, median, rest = ["90.0", "8.0", "1.0", "0.7"], "2.0 cm", ["0.50", "2.0", "3.0", "4.0"]
+    shares, median, rest = (
+        ["90.0", "8.0", "1.0", "0.7"],
+        "2.0 cm",
+        ["0.50", "2.0", "3.0", "-", "4.0"],
+    )
     assert cells(lines[2]) == ["chess", "100", *shares, median, *rest]
     assert lines[3].replace(" ", "").startswith("|a\\|b|7|61.3|8.0|1.0|0.7|infcm|")
     assert cells(lines[4])[:3] == ["mean", "", "75.6"]

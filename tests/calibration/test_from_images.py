@@ -236,3 +236,13 @@ def test_episodes_with_wrong_poses_are_listed(
     write_image(tmp_path / "bare" / "0.png", frame.read_image())
     with pytest.raises(InputError, match=r"bare: states no camera pose.*--calibration"):
         audit(localizer, tmp_path)
+
+
+def test_an_episode_inside_a_bag_is_audited_too(
+    localizer: Localizer, hall: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "bag").mkdir()
+    frames = tuple(replace(frame, image=frame.read_image()) for frame in hall.test[3:4])
+    monkeypatch.setattr("evercal.calibration.audit.load_scene", lambda _: Scene("bag", frames, ()))
+    [episode] = audit(localizer, tmp_path)
+    assert episode.verdict == "right"

@@ -36,6 +36,7 @@ def test_json_is_the_contract(run: Any, store: Path, rooms: Any) -> None:
         "wrong_scene",
         "unknown",
         "near_training_frame",
+        "inside_95",
     }
     assert scores["scenes"]["box-room-41"]["frames"] == 6
 

@@ -175,3 +175,15 @@ def test_bad_input_is_one_line_before_anything_else(
         assert json.loads(ran.out) == {"error": ran.err[0].removeprefix("error: ")}
     else:
         assert ran.out == ""
+
+
+def test_a_device_that_is_not_there_is_refused_in_one_line(
+    run: Any, store: Path, images: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    refused = run("localize", store, images[0], "--device", "cuda")
+    assert refused.code == 2
+    assert len(refused.err) == 1
+    assert refused.err[0].startswith("error: device 'cuda': ")

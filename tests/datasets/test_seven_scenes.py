@@ -56,7 +56,7 @@ def test_poses_are_those_that_were_written(kitchen: Path) -> None:
 def test_without_a_file_the_camera_is_the_usual_one_at_this_size(kitchen: Path) -> None:
     camera = seven_scenes.load(kitchen).train[0].camera
     assert (camera.width, camera.height) == (64, 48)
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (52.5, 52.5, 32.0, 24.0)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (52.5, 52.5, 31.5, 23.5)
 
 
 def test_the_intrinsics_file_is_taken_as_it_is(kitchen: Path) -> None:

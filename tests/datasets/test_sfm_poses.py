@@ -48,7 +48,12 @@ def test_poses_are_inverted_and_frames_without_one_left_out(tmp_path: Path) -> N
     expected[:3, 3] = turn.inv().apply([0.0, 0.0, -1.0])
     np.testing.assert_allclose(pose.matrix(), expected, atol=1e-7)
     assert found.test[0].camera.fx == found.test[0].camera.fy == 527.745
-    assert found.test[0].camera.cx == 320.0
+    # The middle of the image, whatever the original calibration says: its corners are seen under
+    # the same angle, and a COLMAP camera with its defaults projects to half a pixel more.
+    camera = found.test[0].camera
+    corners = camera.unproject([[-0.5, -0.5], [639.5, 479.5]])
+    np.testing.assert_allclose(corners[0, :2], -corners[1, :2], atol=1e-12)
+    assert (camera.cx + 0.5, camera.cy + 0.5) == (camera.width / 2, camera.height / 2)
 
 
 def test_twelve_scenes_name_no_sequence(tmp_path: Path) -> None:

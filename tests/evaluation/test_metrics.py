@@ -5,14 +5,18 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import chi2, kstest
 
 from evercal.evaluation import (
     FrameResult,
     continual_scores,
     correct,
     scores,
+    share_inside,
+    squared_mahalanobis,
 )
-from evercal.evaluation.metrics import FINE
+from evercal.evaluation.metrics import CHI2_6, FINE
+from evercal.geometry import SE3
 
 DEGREE = math.pi / 180
 
@@ -99,6 +103,7 @@ def test_json_has_the_agreed_fields_and_null_for_infinite() -> None:
         "wrong_scene",
         "unknown",
         "near_training_frame",
+        "inside_95",
     ]
     assert data["scenes"]["b"]["median_translation_cm"] is None
     assert data["scenes"]["a"]["median_translation_cm"] == pytest.approx(1.0)
@@ -161,3 +166,27 @@ def test_one_scene_leaves_nothing_to_forget() -> None:
 def test_a_broken_matrix_is_refused(matrix: object) -> None:
     with pytest.raises(ValueError, match="accuracies"):
         continual_scores(matrix)  # pyright: ignore[reportArgumentType]
+
+
+def test_squared_errors_follow_chi_square_where_the_covariance_is_right() -> None:
+    rng = np.random.default_rng(0)
+    deviation = np.array([1e-3, 2e-3, 5e-4, 1e-3, 3e-3, 2e-3])
+    root = np.linalg.qr(rng.normal(size=(6, 6)))[0] * deviation
+    found = SE3.exp(rng.normal(size=6))
+    squared = []
+    for error in rng.normal(size=(2000, 6)) @ root.T:
+        turned = found @ SE3.exp([0, 0, 0, *error[3:]])
+        truth = SE3(turned.rotation_wxyz, found.translation_m + error[:3])
+        squared.append(squared_mahalanobis(found, root @ root.T, truth))
+    assert kstest(squared, chi2(6).cdf).pvalue > 0.01
+    assert chi2(6).cdf(CHI2_6) == pytest.approx(0.95, abs=1e-5)
+    assert share_inside(squared) == pytest.approx(95, abs=1.5)
+
+
+def test_the_share_inside_counts_those_that_have_one() -> None:
+    assert share_inside([1.0, 20.0, math.nan, 12.0, math.inf]) == 50.0
+    assert math.isnan(share_inside([math.nan]))
+    assert math.isnan(share_inside([]))
+    rows = [result(squared_mahalanobis=value) for value in (1.0, 20.0, 12.0, math.nan)]
+    assert scores(rows).scenes["a"].inside_95 == pytest.approx(200 / 3)
+    assert scores([result()]).to_dict()["scenes"]["a"]["inside_95"] is None  # pyright: ignore[reportIndexIssue]

@@ -25,9 +25,9 @@ class Counting(nn.Module):
 
 
 @torch.inference_mode()
-def test_every_image_is_encoded_once(tmp_path: Path) -> None:
-    images = torch.rand(5, 1, 16, 24, generator=torch.Generator().manual_seed(0))
-    plain, encoder = Counting(), Counting()
+def test_every_image_is_encoded_once(tmp_path: Path, device: torch.device) -> None:
+    images = torch.rand(5, 1, 16, 24, generator=torch.Generator().manual_seed(0)).to(device)
+    plain, encoder = Counting().to(device), Counting().to(device)
     cache_features(encoder, tmp_path)
     first = encoder(images[:3])
     torch.testing.assert_close(first, plain(images[:3]), atol=1e-3, rtol=0)
@@ -35,12 +35,13 @@ def test_every_image_is_encoded_once(tmp_path: Path) -> None:
     assert encoder.seen == 4
     assert torch.equal(mixed[1], first[1])
     assert torch.equal(mixed[2], first[0])
-    again = Counting()
+    again = Counting().to(device)
     cache_features(again, tmp_path)
     assert torch.equal(again(images[[4, 1, 0]]), mixed)
     assert again.seen == 0
-    with torch.autocast("cpu", torch.bfloat16):
+    with torch.autocast(device.type, torch.bfloat16):
         assert torch.equal(again(images[:3]), first)
+    assert first.device == device
 
 
 @torch.inference_mode()

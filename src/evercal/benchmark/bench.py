@@ -28,6 +28,7 @@ from evercal.continual.strategies import Strategy
 from evercal.datasets import Scene
 from evercal.errors import InputError
 from evercal.features.descriptor import DESCRIPTOR_FILE
+from evercal.features.device import device_of
 from evercal.features.encoder import ENCODER_FILE
 from evercal.storage import lock_settings, sha256_file, write_json
 
@@ -51,6 +52,8 @@ class BenchOptions:
     """Working size of images, pixels."""
     settings: dict[str, object] = field(default_factory=dict)
     """What else decides the results, for settings.json."""
+    device: str = "auto"
+    """What the networks run on, see `features.device.device_of`."""
     features: Path | None = None
     """Where encoded views are kept; in the folder of results when None."""
 
@@ -95,7 +98,8 @@ def run_bench(
     features = options.features or out / "features"
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
-        how = RunOptions(options.stage(seed), options.short_side, features, out)
+        stage, device = options.stage(seed), device_of(options.device)
+        how = RunOptions(stage, options.short_side, features, device, out)
         for stage, these in run_strategy(strategy, ordered, how, on_event):
             if (strategy.name, seed, stage) not in found:
                 results.append(out, these)

@@ -6,14 +6,21 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from evercal.benchmark.results import SceneResult
+from evercal.benchmark.published import LOOSE, PublishedScene
+from evercal.benchmark.results import NETWORK, SceneResult
 from evercal.benchmark.tables import Style, table
 from evercal.errors import InputError
-from evercal.evaluation.metrics import COARSE, FINE, ContinualScores, continual_scores
-from evercal.evaluation.statistics import Interval, paired_difference
+from evercal.evaluation.metrics import (
+    COARSE,
+    FINE,
+    MIDDLE,
+    ContinualScores,
+    continual_scores,
+    share_inside,
+)
+from evercal.evaluation.statistics import Interval, frame_pieces, paired_difference
 
-BLOCK = 10
-BOUNDS = ((0.10, np.deg2rad(10)), COARSE, (0.02, np.deg2rad(2)), FINE)
+BOUNDS = (LOOSE, COARSE, MIDDLE, FINE)
 """Metres and radians under which accuracy is asked."""
 
 TableRows = list[list[str]]
@@ -30,8 +37,8 @@ class Run:
     """Which seed."""
     scenes: tuple[str, ...]
     """In order of learning."""
-    results: dict[tuple[int, str], SceneResult]
-    """By stage and scene; of joint training only those of the last stage."""
+    results: dict[tuple[int, str], SceneResult | PublishedScene]
+    """By stage and scene, the last stage frame by frame; joint training has the last alone."""
     description: Mapping[str, object] = field(default_factory=dict)
     """What the strategy is (`Strategy.description`); empty in older results."""
 
@@ -42,7 +49,9 @@ class Run:
 
     def end(self, scene: str) -> SceneResult:
         """What is known of one scene at the end."""
-        return self.results[len(self.scenes) - 1, scene]
+        found = self.results[len(self.scenes) - 1, scene]
+        assert isinstance(found, SceneResult)
+        return found
 
     @property
     def memory_mb(self) -> float:
@@ -60,7 +69,7 @@ class Run:
         found = np.full((count, count), math.nan)
         for (stage, scene), result in self.results.items():
             column = self.scenes.index(scene)
-            found[stage, column] = 100 * result.correct(thresholds).mean()
+            found[stage, column] = 100 * result.accuracy(thresholds)
         return found
 
     def scores(self, thresholds: tuple[float, float] = COARSE) -> ContinualScores:
@@ -73,7 +82,8 @@ class Run:
 
 
 def runs_of(
-    results: Sequence[SceneResult], strategies: Mapping[str, Mapping[str, object]] | None = None
+    results: Sequence[SceneResult | PublishedScene],
+    strategies: Mapping[str, Mapping[str, object]] | None = None,
 ) -> list[Run]:
     """The runs whose last stage is done, in the order of their first lines.
 
@@ -84,7 +94,7 @@ def runs_of(
     Raises:
         InputError: no run is done.
     """
-    grouped: dict[tuple[str, int], dict[tuple[int, str], SceneResult]] = {}
+    grouped: dict[tuple[str, int], dict[tuple[int, str], SceneResult | PublishedScene]] = {}
     for result in results:
         run = grouped.setdefault((result.strategy, result.seed), {})
         run[result.stage, result.scene] = result
@@ -93,10 +103,17 @@ def runs_of(
     for (strategy, seed), of in grouped.items():
         order = tuple(scene for stage, scene in of if stage == count - 1)
         if len(order) == count:
-            found.append(Run(strategy, seed, order, of, (strategies or {}).get(strategy, {})))
+            found.append(Run(strategy, seed, order, of, _described(strategy, strategies or {})))
     if not found:
         raise InputError("no run is done yet; go on with 'evercal bench'")
     return found
+
+
+def _described(name: str, strategies: Mapping[str, Mapping[str, object]]) -> Mapping[str, object]:
+    """What a row is; one that judges the network of a run alone is that without its map."""
+    of, _, judged = name.partition(":")
+    found = strategies.get(of, {})
+    return {**found, "map": False} if found and f":{judged}" == NETWORK else found
 
 
 def as_text(rows: TableRows, style: Style = "terminal") -> str:
@@ -129,7 +146,7 @@ def selector_rows(runs: Sequence[Run]) -> TableRows:
     """One row per strategy that keeps frames: how they lie among those learned, mean of scenes."""
     rows = [["strategy", "frames kept", "covering radius", "smallest pair"]]
     for name, of in by_strategy(runs).items():
-        told = [o for run in of for o in run.results.values() if o.keyframe_positions_m]
+        told = [o for run in of for o in run.results.values() if math.isfinite(o.covering_radius)]
         if told:
             cells = [
                 np.mean([getattr(o, key) for o in told])
@@ -157,7 +174,7 @@ def scene_rows(runs: Sequence[Run]) -> TableRows:
 def difference_rows(runs: Sequence[Run], reference: str) -> TableRows:
     """How much better `reference` ends than each other strategy, on the seeds that both ran.
 
-    Bounds are those of a paired bootstrap over runs and blocks of 10 frames.
+    Bounds are those of `evaluation.paired_difference` over whole runs of frames and over seeds.
     """
     grouped = by_strategy(runs)
     rows = [["difference in points", "mean", "95 % low", "95 % high"]]
@@ -172,7 +189,11 @@ def difference_rows(runs: Sequence[Run], reference: str) -> TableRows:
 
 
 def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
-    """Final accuracy of one strategy less that of another; None without a common seed."""
+    """Final accuracy of one strategy less that of another, and 95 % bounds, both within -1 to 1.
+
+    None without a common seed, or where a scene has one test frame, of whose choice nobody can say
+    how much it matters.
+    """
     pairs = [(a, b) for a in ours for b in theirs if a.seed == b.seed]
     if not pairs:
         return None
@@ -182,9 +203,12 @@ def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
         ends = [pair[which].end(name) for pair in pairs]
         return np.array([end.correct() for end in ends], float)
 
+    pieces = [frame_pieces(pairs[0][0].end(name).frames) for name in names]
+    if not all(of[-1] > 0 for of in pieces):
+        return None
     first, second = ([flags(which, name) for name in names] for which in (0, 1))
-    block = min(BLOCK, *(rows.shape[1] // 2 for rows in first))
-    return paired_difference(first, second, block)
+    found = paired_difference(first, second, pieces)
+    return Interval(found.mean, max(found.low, -1.0), min(found.high, 1.0))
 
 
 def by_strategy(runs: Sequence[Run]) -> dict[str, list[Run]]:
@@ -233,6 +257,15 @@ def _wrong_scene(run: Run) -> float:
     return 100 * float(np.mean([np.mean(o.wrong_scene) for o in run.last]))
 
 
+def _refused(run: Run) -> float:
+    return 100 * float(np.mean([np.mean(o.refused) for o in run.last]))
+
+
+def _inside(run: Run) -> float:
+    """Per cent of all poses in the right scene that lie in the ellipsoid stated for them."""
+    return share_inside(np.concatenate([o.squared_mahalanobis for o in run.last]))
+
+
 def _seconds(run: Run) -> float:
     stages = {stage: result.seconds for (stage, _), result in run.results.items()}
     return float(sum(stages.values()))
@@ -247,6 +280,8 @@ _COLUMNS: tuple[tuple[str, Callable[[Run], float]], ...] = (
     ("forgetting", lambda run: run.scores().forgetting),
     ("BWT", lambda run: run.scores().backward_transfer),
     ("wrong scene %", _wrong_scene),
+    ("refused %", _refused),
+    ("in 95 % ellipsoid", _inside),
     ("median cm, right scene", _fine_median_cm),
     ("%, right scene", _fine_accuracy),
     ("memory MB", lambda run: run.memory_mb),

@@ -17,7 +17,10 @@ from evercal.evaluation.metrics import COARSE, FrameResult
 from evercal.storage import read_settings
 
 RESULTS, SETTINGS, STRATEGIES = "results.jsonl", "settings.json", "strategies.json"
-_LATER = {"keyframe_positions_m", "covering_radius", "min_spacing"}
+NETWORK, UNALIGNED = ":network", ":unaligned"
+"""Added to a strategy's name where the same run is judged by its network alone, or by the first
+pose from matched keyframes, whose landmarks are not aligned."""
+_LATER = {"keyframe_positions_m", "covering_radius", "min_spacing", "squared_mahalanobis"}
 """Fields that older results lack."""
 _FORMERLY = {
     "kept_m": "keyframe_positions_m",
@@ -63,6 +66,18 @@ class SceneResult:
     """Largest distance, in the metric of SARS, from a training frame to one that was kept."""
     min_spacing: float = math.nan
     """Smallest such distance between two that were kept."""
+    squared_mahalanobis: tuple[float, ...] = ()
+    """Squared error of each pose in units of its covariance, NaN without a pose in the right scene
+    or without a covariance; empty where no frame has one."""
+
+    @property
+    def refused(self) -> np.ndarray:
+        """(frames,) bool: those without any pose."""
+        return ~np.isfinite(self.translation_m) & ~np.array(self.wrong_scene, bool)
+
+    def accuracy(self, thresholds: tuple[float, float] = COARSE) -> float:
+        """Share of correct frames, 0 to 1."""
+        return float(self.correct(thresholds).mean())
 
     def correct(self, thresholds: tuple[float, float] = COARSE) -> np.ndarray:
         """(frames,) bool: both errors strictly below (metres, radians)."""
@@ -79,6 +94,7 @@ def scene_result(results: Sequence[FrameResult], **of: object) -> SceneResult:
         rotation_rad=tuple(r.rotation_error_rad for r in results),
         wrong_scene=tuple(r.wrong_scene for r in results),
         near_training_frame=tuple(r.near_training_frame for r in results),
+        squared_mahalanobis=tuple(r.squared_mahalanobis for r in results),
         **of,  # pyright: ignore[reportArgumentType]
     )
 
@@ -129,9 +145,16 @@ def _plain(result: SceneResult) -> dict[str, object]:
     record = asdict(result)
     for name in ("translation_m", "rotation_rad"):
         record[name] = [round(v, 6) if math.isfinite(v) else None for v in record[name]]
+    squared = record.pop("squared_mahalanobis")
+    if not all(map(math.isnan, squared)):
+        record["squared_mahalanobis"] = [_significant(v) for v in squared]
     for name in ("covering_radius", "min_spacing"):
         record[name] = record[name] if math.isfinite(record[name]) else None
     return record
+
+
+def _significant(value: float) -> float | None:
+    return None if math.isnan(value) else float(f"{value:.4g}")
 
 
 def _result(record: object) -> SceneResult:
@@ -144,6 +167,8 @@ def _result(record: object) -> SceneResult:
     for name, value in found.items():
         if name == "keyframe_positions_m":
             found[name] = tuple(map(tuple, value))
+        elif name == "squared_mahalanobis":
+            found[name] = tuple(math.nan if v is None else v for v in value)
         elif isinstance(value, list):
             found[name] = tuple(math.inf if v is None else v for v in value)
         elif value is None:

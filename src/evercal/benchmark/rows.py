@@ -53,14 +53,23 @@ def load_rows(name: str) -> tuple[Strategy, ...]:
         raise InputError(f"rows {name}: not JSON ({error})") from None
     if not isinstance(rows, list):
         raise InputError(f"rows {name}: give a list of rows")
-    return tuple(_strategy(name, row) for row in rows)
+    return tuple(strategy_from_row(name, row) for row in rows)
 
 
 def _folder():
     return files("evercal.benchmark") / "tables"
 
 
-def _strategy(file: str, row: object) -> Strategy:
+def strategy_from_row(file: str, row: object) -> Strategy:
+    """The strategy of one row.
+
+    Args:
+        file: where it comes from, for errors.
+        row: see above.
+
+    Raises:
+        InputError: it makes no strategy.
+    """
     if not isinstance(row, dict) or not {"name", "of"} <= row.keys() <= _KEYS:
         raise InputError(f"rows {file}: a row is {row!r}; give name, of, and if need be with, map")
     name, of = str(row["name"]), strategy_named(str(row["of"]))

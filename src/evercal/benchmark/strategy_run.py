@@ -8,8 +8,9 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from evercal.benchmark.results import SceneResult, scene_result
+from evercal.benchmark.results import NETWORK, UNALIGNED, SceneResult, scene_result
 from evercal.benchmark.scene_views import keep_views
 from evercal.continual.finish_scene import Learned, finished_stage, memory_bytes
 from evercal.continual.learn_jointly import learn_jointly
@@ -28,8 +29,10 @@ from evercal.evaluation.protocol import evaluate
 from evercal.features.feature_cache import cache_features
 from evercal.localization.acceptance import fitted_record
 from evercal.localization.localizer import Localizer
+from evercal.localization.query import LocalizeOptions
 from evercal.mapping.atlas import combined_centres
 from evercal.mapping.build import finished
+from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.selection import covering_radius, smallest_pair
 from evercal.mapping.stage_files import head_bytes
@@ -48,6 +51,8 @@ class RunOptions:
     """Working size of images, pixels."""
     features: Path
     """Folder of encoded views, shared by all runs."""
+    device: torch.device
+    """What the networks run on."""
     out: Path
     """Folder of results; stores under way are in its folder `runs`."""
 
@@ -90,16 +95,18 @@ class _Run:
             if number >= len(Store.open(self.store).stages):
                 learn_scene(self.store, self.scenes[number], self._how(), self.on_event)
             opened = Store.open(self.store)
+            opened.maps.to(self.options.device)
             self._cached(opened.maps)
             seconds = float(opened.report()["seconds"])
             yield number, self._judge(opened.maps, number, seconds)
-        shutil.rmtree(self.store)
+        shutil.rmtree(self.store, ignore_errors=True)
 
     def _how(self, strategy: Strategy | None = None) -> LearnOptions:
         return LearnOptions(
             self.stage,
             strategy or self.strategy,
             short_side=self.options.short_side,
+            device=self.options.device,
             cache=self.options.features,
         )
 
@@ -120,7 +127,7 @@ class _Run:
             learn_scene(shared, scene, self._how(STRATEGIES["finetune"]), self.on_event)
         first = Store.open(shared)
         began = time.perf_counter()
-        maps = first.maps.copy_for_training()
+        maps = first.maps.copy_for_training().to(self.options.device)
         maps.strategy, maps.keyframes, maps.method_states = self.strategy.name, [], []
         self._cached(maps)
         train, aside = validation_split(scene.train)
@@ -138,7 +145,7 @@ class _Run:
 
         @cache
         def rows() -> FeatureBuffer:
-            buffer = scene_buffer(0, maps.scenes[0].cell, train)
+            buffer = scene_buffer(0, maps.scenes[0].cell, train, maps.device)
             finished(encoded(buffer, train, view_plan(self.stage, maps.short_side), maps))
             return buffer
 
@@ -150,7 +157,7 @@ class _Run:
     def jointly(self) -> Iterator[tuple[int, tuple[SceneResult, ...]]]:
         """See `run_strategy`; a killed run begins anew."""
         shutil.rmtree(self.store, ignore_errors=True)
-        maps = open_or_create(self.store, self._how()).maps
+        maps = open_or_create(self.store, self._how()).maps.to(self.options.device)
         self._cached(maps)
         split = [validation_split(scene.train) for scene in self.scenes]
         train_splits = [replace(s, train=t) for s, (t, _) in zip(self.scenes, split, strict=True)]
@@ -170,26 +177,53 @@ class _Run:
         shutil.rmtree(self.store, ignore_errors=True)  # nothing was committed to it
 
     def _judge(self, maps: SceneMaps, number: int, seconds: float) -> tuple[SceneResult, ...]:
-        learned = {scene.name: scene for scene in self.scenes[: number + 1]}
-        localizer = Localizer(maps)
-        found = evaluate(localizer, learned)
+        """Results of all scenes known; of what answers alone, too, where several things answer."""
+        name, localizer = self.strategy.name, Localizer(maps)
+        found = self._results(name, localizer, number, seconds)
         if number == len(self.scenes) - 1:
-            keep_views(self.options.out, self.strategy.name, localizer, self.scenes)
+            keep_views(self.options.out, name, localizer, self.scenes)
+        if not self.strategy.builds_map:
+            return found
+        if self.strategy.method is None:
+            localizer = Localizer(maps, LocalizeOptions(align=False))
+            return found + self._results(name + UNALIGNED, localizer, number, seconds)
+        alone = _without_map(maps, self.strategy.method.replays)
+        for i, scene in enumerate(self.scenes[: number + 1]):
+            _, aside = validation_split(scene.train)
+            alone.scenes[i] = fitted_record(alone, aside, i)
+        return found + self._results(name + NETWORK, Localizer(alone), number, seconds)
+
+    def _results(
+        self, name: str, localizer: Localizer, number: int, seconds: float
+    ) -> tuple[SceneResult, ...]:
+        maps = localizer.maps
+        found = evaluate(localizer, {s.name: s for s in self.scenes[: number + 1]})
         size, keyframes = sum(head_bytes(head) for head in maps.heads), maps.keyframes[number]
+        newest = self.scenes[number].name
         return tuple(
             scene_result(
-                [r for r in found if r.scene == name],
-                strategy=self.strategy.name,
+                [r for r in found if r.scene == scene.name],
+                strategy=name,
                 seed=self.stage.seed,
                 stage=number,
                 seconds=seconds,
                 memory_bytes=memory_bytes(maps, self.strategy),
                 head_bytes=size,
                 frames_kept=len(keyframes.images) if keyframes else 0,
-                **(_spread(maps, number, self.scenes) if name == self.scenes[number].name else {}),
+                **(_spread(maps, number, self.scenes) if scene.name == newest else {}),
             )
-            for name in learned
+            for scene in self.scenes[: number + 1]
         )
+
+
+def _without_map(maps: SceneMaps, replays: bool) -> SceneMaps:
+    """What the network of the same training knows; keyframes stay where it replays them."""
+    alone = maps.copy_for_training()
+    for i, keyframes in enumerate(alone.keyframes):
+        assert keyframes is not None, "a map has keyframes"
+        images = Keyframes(keyframes.images, keyframes.cameras, keyframes.base_from_camera)
+        alone.keyframes[i] = images if replays else None
+    return alone
 
 
 def _with_centres(stage: StageOptions, scenes: Sequence[Scene]) -> StageOptions:

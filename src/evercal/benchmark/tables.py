@@ -20,6 +20,7 @@ _SCENE_COLUMNS: tuple[tuple[str, str, Callable[[float], str]], ...] = (
     ("median deg", "median_rotation_deg", lambda x: _number(x, 2)),
     ("wrong scene %", "wrong_scene", lambda x: _number(x, 1)),
     ("unknown %", "unknown", lambda x: _number(x, 1)),
+    ("in 95 % ellipsoid", "inside_95", lambda x: _number(x, 1)),
     ("near training %", "near_training_frame", lambda x: _number(x, 1)),
 )
 SCENE_HEADER = ("scene", "frames", *(title for title, _, _ in _SCENE_COLUMNS))

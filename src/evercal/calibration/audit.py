@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evercal.calibration.calibration import read_transform
 from evercal.calibration.located import Located, deviations, fuse, length_mm_deg, locate
@@ -97,7 +99,7 @@ class _Shot:
     """An image with the pose that is stated for it."""
 
     name: str
-    image: Path
+    read: Callable[[], NDArray[np.uint8]]
     camera: Camera | None
     base_from_camera: SE3
 
@@ -109,7 +111,7 @@ def _audited(
     chosen = np.unique(np.linspace(0, len(shots) - 1, options.images).round().astype(int))
     differences, reason = [], ""
     for shot in (shots[i] for i in chosen):
-        [found] = locate(localizer, [(shot.name, read_image(shot.image))], shot.camera)
+        [found] = locate(localizer, [(shot.name, shot.read())], shot.camera)
         if found.found:
             in_stated = shot.base_from_camera.inverse() @ found.pose
             differences.append(Located(shot.name, found.estimate, in_stated, found.covariance))
@@ -137,12 +139,16 @@ def _shots(episode: Path, stated: SE3 | None) -> list[_Shot]:
                 f"{episode}: states no camera pose; put a {' or '.join(POSE_FILES)} there, or give"
                 " the pose of all episodes with --calibration"
             ) from None
-        shots = [_Shot(path.name, path, None, pose) for path in files if pose is not None]
+        shots = [
+            _Shot(path.name, partial(read_image, path), None, pose)
+            for path in files
+            if pose is not None
+        ]
     else:
         shots = [
-            _Shot(frame.name, frame.image, frame.camera, frame.base_from_camera)
+            _Shot(frame.name, frame.read_image, frame.camera, frame.base_from_camera)
             for frame in (*scene.train, *scene.test)
-            if frame.base_from_camera is not None and isinstance(frame.image, Path)
+            if frame.base_from_camera is not None
         ]
     if not shots:
         raise InputError(f"{episode}: no images with a stated camera pose in it")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next
+from evercal.cli.device import Device
 from evercal.cli.image_words import image_files, read_images
 from evercal.errors import InputError
 
@@ -44,6 +45,7 @@ class Align:
     """Where the points are in images: lines of image, name, u, v in pixels."""
     unknown_scale: bool = False
     """The scene was not learned in metres: its scale is found too."""
+    device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
@@ -55,11 +57,13 @@ class Align:
                 "give either images with --robot-poses, or --points with --picks, to say where the"
                 " base is"
             )
+        from evercal.features.device import device_of
         from evercal.localization.localizer import Localizer
         from evercal.mapping.store import Store
 
+        where = device_of(self.device)
         opened = Store.open(self.store)
-        localizer = Localizer(opened.maps)
+        localizer = Localizer(opened.maps.to(where))
         found = self._by_points(localizer) if by_points else self._by_gripper(localizer)
         record = next(known for known in opened.maps.scenes if known.name == self.scene)
         opened.replace_record(

@@ -8,6 +8,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, progress_bar
+from evercal.cli.device import Device
 from evercal.errors import InputError
 
 
@@ -31,6 +32,7 @@ class Audit:
     """Largest difference of position that is still right."""
     most_deg: Annotated[float, arg(metavar="DEG")] = 0.5
     """Largest difference of rotation that is still right."""
+    device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
@@ -44,7 +46,7 @@ class Audit:
 
         stated = None if self.calibration is None else read_transform(self.calibration)
         total = len(episode_folders(self.folder))
-        localizer = Localizer.open(self.store)
+        localizer = Localizer.open(self.store, device=self.device)
         options = AuditOptions(self.images, self.most_mm, self.most_deg)
         with progress_bar("episodes", total, "episode") as bar:
             found = audit(localizer, self.folder, stated, options, on_episode=bar.update)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli.bench_report import show_report
+from evercal.cli.device import Device
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -64,6 +65,7 @@ class Bench:
     """How many keyframes are kept of a scene: a share of its frames (10%) or bytes (5MB)."""
     held_out: bool = False
     """Judge on a fifth of the training frames instead of the test frames, to choose settings."""
+    device: Device = "auto"
     plugin: Annotated[Path | None, arg(metavar="FILE.py", help_behavior_hint="")] = None
     """File with strategies of one's own (see examples/my_strategy.py)."""
     ray: Annotated[str | None, arg(metavar="ADDRESS", help_behavior_hint="")] = None
@@ -78,11 +80,12 @@ class Bench:
         seeds = _numbers(self.seeds)
         from evercal.benchmark.bench import BenchOptions
         from evercal.continual.plugin import load_plugin
+        from evercal.continual.presets import short_side
         from evercal.networks.distributed import join_processes, rank, wait_for_all
 
         if self.plugin is not None:
             load_plugin(self.plugin)
-        join_processes()
+        device = join_processes(self.device)
         out = self.out if rank() == 0 else _mirror(self.out)
         wait_for_all()
         options = BenchOptions(
@@ -90,11 +93,13 @@ class Bench:
             self._strategies(),
             seeds,
             self.order,
+            short_side(self.preset),
             settings={
                 "suite": self.suite,
                 "poses": "sfm" if self.poses else "original",
                 "judged": "held-out training frames" if self.held_out else "test frames",
             },
+            device=str(device),
             features=self.out.absolute() / "features",
         )
         said = sys.stderr if self.json else sys.stdout
@@ -150,13 +155,16 @@ class Bench:
     def _stage(self, seed: int) -> "StageOptions":
         from evercal.cli.learn import parse_memory
         from evercal.continual.memory_budget import with_memory
-        from evercal.continual.presets import on_paper_backbone, preset
+        from evercal.continual.presets import PAPER_SIM_STEPS, on_paper_backbone, preset
 
         parse_memory(self.memory)
         stage = with_memory(preset(self.preset, seed), self.memory)
-        if self.backbone == "paper":
+        if "paper" in (self.backbone, self.preset):
             stage = on_paper_backbone(stage)
-        steps = stage.fit.iterations if self.steps is None else self.steps
+        preset_steps = stage.fit.iterations
+        if self.preset == "paper" and self.suite.startswith("sim"):
+            preset_steps = PAPER_SIM_STEPS
+        steps = preset_steps if self.steps is None else self.steps
         if steps < 1:
             raise InputError(f"--steps {steps}: give a number >= 1")
         return dataclasses.replace(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for, image_files, read_images
 from evercal.errors import InputError
 
@@ -42,6 +43,7 @@ class Calibrate:
     """File of the intrinsics; those of the scene that is found when left out."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("calibration.json")
     """Where the calibration is written."""
+    device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
@@ -51,10 +53,10 @@ class Calibrate:
         from evercal.localization.localizer import Localizer
 
         if named:
-            return self._rig(Localizer.open(self.store), named)
+            return self._rig(Localizer.open(self.store, device=self.device), named)
         files = image_files([Path(word) for word in self.images])
         given = self._given(files)
-        localizer = Localizer.open(self.store)
+        localizer = Localizer.open(self.store, device=self.device)
         found = self._calibrated(localizer, given)
         found.write(self.out)
         if self.json:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for, image_files, read_images
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ class Check:
     """The camera's calibration, as 'evercal calibrate' wrote it."""
     camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """File of the intrinsics; those in the reference when left out."""
+    device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
@@ -38,7 +40,7 @@ class Check:
         reference = read_calibration(self.reference)
         lens = camera_for(self.camera, files) or reference.camera
         images = read_images(files)
-        localizer = Localizer.open(self.store)
+        localizer = Localizer.open(self.store, device=self.device)
         with progress_bar("localizing", len(images), "image") as bar:
             shift, uses = check(localizer, images, reference, lens, on_image=bar.update)
         if self.json:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 from evercal.cli.console import print_json, print_next, progress_bar, size
+from evercal.cli.device import Device
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,12 +37,14 @@ class Demo:
     compare: bool = False
     """Train two networks on the same rooms as well, and compare what they remember; this takes some
     minutes more."""
+    device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
         """Takes about a minute on two cores, and some minutes more with --compare."""
-        outcome = run_demo(self.out, DemoOptions(self.compare), _quiet if self.json else _say)
+        options = DemoOptions(self.compare, device=self.device)
+        outcome = run_demo(self.out, options, _quiet if self.json else _say)
         if self.json:
             print_json(outcome.to_dict())
             return 0
@@ -58,6 +61,8 @@ class DemoOptions:
     """Train the networks of fine-tuning and of SARS + SPDD as well."""
     rooms: "tuple[CellRoom, ...] | None" = None
     """Two or more; those that come with the package when None."""
+    device: str = "auto"
+    """What networks run on, see `features.device.device_of`."""
 
 
 def _say(line: str) -> None:
@@ -77,9 +82,10 @@ def run_demo(out: Path, options: DemoOptions, say: Say = _quiet) -> "DemoOutcome
         say: told in a line what happens and what came out.
 
     Raises:
-        InputError: `out` holds something else under a name that the demo needs.
+        InputError: `out` holds something else under a name that the demo needs, or no such device.
     """
     from evercal.datasets import write_image
+    from evercal.features.device import device_of
     from evercal.localization.localizer import Localizer
     from evercal.reports.demo_outcome import MAP, METHODS, DemoOutcome
     from evercal.reports.demo_page import write_pictures
@@ -89,6 +95,7 @@ def run_demo(out: Path, options: DemoOptions, say: Say = _quiet) -> "DemoOutcome
     began, store = time.perf_counter(), out / STORE
     if store.exists() and not (store / MANIFEST).is_file():
         raise InputError(f"{store}: exists and is not an evercal store; give another --out")
+    device_of(options.device)  # refused before anything is learned
     out.mkdir(parents=True, exist_ok=True)
     rooms = options.rooms or mini_rooms()
     scenes = [room.scene for room in rooms]
@@ -96,11 +103,11 @@ def run_demo(out: Path, options: DemoOptions, say: Say = _quiet) -> "DemoOutcome
     work = Path(tempfile.mkdtemp(prefix=".demo-", dir=out))
     try:
         for method in METHODS if options.compare else (MAP,):
-            _learn_rooms(work / method, method, scenes, _Teller(outcome, say, options.compare))
+            _learn_rooms(work / method, method, scenes, _Teller(outcome, say, options))
         replace_folder(work / MAP, store)
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    localizer = Localizer.open(store)
+    localizer = Localizer.open(store, device=options.device)
     _measure(localizer, rooms, outcome, say)
     write_pictures(out, localizer, rooms, outcome)
     middle = scenes[0].test[len(scenes[0].test) // 2]
@@ -116,7 +123,7 @@ class _Teller:
 
     outcome: "DemoOutcome"
     say: Say
-    compare: bool
+    options: DemoOptions
 
 
 def _learn_rooms(store: Path, method: str, scenes: "Sequence[Scene]", teller: _Teller) -> None:
@@ -131,7 +138,7 @@ def _learn_rooms(store: Path, method: str, scenes: "Sequence[Scene]", teller: _T
     for i, scene in enumerate(scenes):
         say(f"{METHODS[method]}: learning {scene.name} from {len(scene.train)} posed images")
         began = time.perf_counter()
-        options = LearnOptions(_stage(method), STRATEGIES[method])
+        options = LearnOptions(_stage(method), STRATEGIES[method], device=teller.options.device)
         with LearnBars() as bars:
             report = learn_scene(store, scene, options, bars)
         seconds += time.perf_counter() - began
@@ -139,8 +146,9 @@ def _learn_rooms(store: Path, method: str, scenes: "Sequence[Scene]", teller: _T
             _note_map(report, outcome, say)
         else:
             say(f"  {report.iterations} training steps in {report.seconds / 60:.1f} minutes")
-        if teller.compare:
-            row = _accuracies(Localizer.open(store), scenes[: i + 1])
+        if teller.options.compare:
+            localizer = Localizer.open(store, device=teller.options.device)
+            row = _accuracies(localizer, scenes[: i + 1])
             outcome.accuracy.setdefault(method, []).append(row)
     outcome.minutes[method] = seconds / 60
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.device import Device
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ class Evaluate:
     """Folders of recorded scenes; write NAME=SCENE where the store knows one by another name."""
     report: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
     """HTML file to write error curves, trajectories and the worst frames to."""
+    device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
@@ -41,7 +43,7 @@ class Evaluate:
         from evercal.reports.evaluate_page import Watch, evaluation_page
         from evercal.storage import write_bytes
 
-        watch = Watch(Localizer.open(self.store), scenes)
+        watch = Watch(Localizer.open(self.store, device=self.device), scenes)
         with progress_bar("evaluating", 0, "image") as bar:
 
             def show(done: int, total: int) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, size
+from evercal.cli.device import Device
 from evercal.cli.learn_bars import LearnBars
 from evercal.cli.reading import Reading
 from evercal.continual import memory_budget
@@ -55,6 +56,7 @@ class Learn:
     recording that states gripper poses only: what is found from the images is compared with it."""
     calibration: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Where to write the gripper_from_camera that was found, for 'evercal export'."""
+    device: Device = "auto"
     seed: int = 0
     """Seed of all that is drawn at random."""
     json: bool = False
@@ -119,7 +121,7 @@ class Learn:
 
     def _options(self) -> "LearnOptions":
         from evercal.continual.learn_scene import LearnOptions
-        from evercal.continual.presets import preset
+        from evercal.continual.presets import preset, short_side
         from evercal.continual.strategies import strategy_named
 
         if self.encoder is not None and not self.encoder.is_file():
@@ -139,7 +141,8 @@ class Learn:
             from evercal.calibration.calibration import read_transform
 
             rough = read_transform(self.gripper_from_camera)
-        return LearnOptions(stage, strategy, self.encoder, gripper_from_camera=rough)
+        side = short_side(self.preset)
+        return LearnOptions(stage, strategy, self.encoder, side, rough, self.device)
 
     def _strategy(self) -> str:
         """The strategy asked for, else the store's; refuses what a store cannot change later."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for
 from evercal.errors import InputError
 
@@ -32,6 +33,7 @@ class Localize:
     they are those of the scene that is found."""
     overlay: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder for copies of the images with the landmarks that were found drawn in."""
+    device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
@@ -45,7 +47,7 @@ class Localize:
         camera = camera_for(self.camera, self.images)
         from evercal.localization.localizer import Localizer
 
-        localizer = Localizer.open(self.store)
+        localizer = Localizer.open(self.store, device=self.device)
         if self.overlay is not None:
             self.overlay.mkdir(parents=True, exist_ok=True)
         answers = self._answers(localizer, camera)

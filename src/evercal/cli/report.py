@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.device import Device
 from evercal.cli.image_words import image_files
 from evercal.errors import InputError
 
@@ -33,6 +34,7 @@ class Report:
     """An older calibration of the camera, to be compared with."""
     out: Annotated[Path, arg(metavar="FILE.html")] = Path("report.html")
     """Where the page is written; it holds all its pictures."""
+    device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
@@ -82,7 +84,7 @@ class Report:
         if self.store is not None:
             from evercal.localization.localizer import Localizer
 
-            localizer = Localizer.open(self.store)
+            localizer = Localizer.open(self.store, device=self.device)
         before = None if older is None else older.found
         with progress_bar("drawing", len(files), "image") as bar:
             return views_of(found, files, before, localizer, on_image=bar.update)

@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.check import shift_dict, shift_line
 from evercal.cli.console import print_json
+from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for
 from evercal.errors import InputError
 
@@ -36,6 +37,7 @@ class Watch:
     """Stop with exit code 0 when no image has come for so long; never when left out."""
     camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """File of the intrinsics; those in the reference when left out."""
+    device: Device = "auto"
     json: bool = False
     """Print one JSON object for every image."""
 
@@ -52,7 +54,7 @@ class Watch:
         from evercal.localization.localizer import Localizer
 
         reference = read_calibration(self.reference)
-        localizer = Localizer.open(self.store)
+        localizer = Localizer.open(self.store, device=self.device)
         recent: deque[Located] = deque(maxlen=self.window)
         seen: set[Path] = set()
         last = time.monotonic()

@@ -77,7 +77,8 @@ def _state(maps: SceneMaps, method: Method, scene: Learned, options: StageOption
 
     def remembered() -> FeatureBuffer:
         assert keyframes is not None, "a method whose state is about keyframes selects some"
-        buffer = FeatureBuffer(local, maps.scenes[-1].cell.atlas_from_base)
+        place = maps.scenes[-1].cell.atlas_from_base
+        buffer = FeatureBuffer(local, place, device=maps.device)
         plan = replay_plan(options, maps.short_side)
         for _ in encode_frames(buffer, keyframes.frames(), plan, maps.encoder, maps.descriptor):
             pass

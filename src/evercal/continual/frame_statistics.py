@@ -53,7 +53,7 @@ class FrameStatistics:
     @cached_property
     def _first_rows(self) -> Tensor:
         """(n + 1,) where the rows of each frame begin, and where the last end."""
-        count = torch.bincount(self._buffer.tensors["view"].long(), minlength=len(self))
+        count = torch.bincount(self._buffer.tensors["view"].cpu().long(), minlength=len(self))
         return torch.cat([torch.zeros(1, dtype=torch.long), count[: len(self)].cumsum(0)])
 
     def _of(self, frame: int) -> Rows:
@@ -67,7 +67,7 @@ class FrameStatistics:
     def features(self) -> np.ndarray:
         """(n, width) activations of the last hidden layer, mean over each image."""
         pooled = [self._hidden(self._of(i)).mean(0) for i in range(len(self))]
-        return torch.stack(pooled).double().numpy()
+        return torch.stack(pooled).double().cpu().numpy()
 
     @torch.no_grad()
     def visible_parts(self) -> list[np.ndarray]:
@@ -83,7 +83,7 @@ class FrameStatistics:
             rows = self._of(i)
             points = self._head.decode(self._hidden(rows).float(), self._buffer.scene).points
             _, error = fixed_clamp_loss(points, rows.target)
-            found.append(points[error < RELIABLE_PX].double().numpy())
+            found.append(points[error < RELIABLE_PX].double().cpu().numpy())
         every = np.concatenate(found)
         if not len(every):
             return [np.zeros(0, dtype=np.int64) for _ in found]
@@ -111,4 +111,4 @@ class FrameStatistics:
             shared = len(by_offset) != len(by_logit)
             parts = (by_logit[own], by_offset if shared else by_offset[own])
             found.append(torch.cat([part.flatten() for part in parts]))
-        return torch.stack(found).double().numpy()
+        return torch.stack(found).double().cpu().numpy()

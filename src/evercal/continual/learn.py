@@ -50,7 +50,7 @@ def learn(
     cell = after.atlas(options.grid_scenes).place(positions)
     in_atlas = cell.atlas_from_base.apply(positions)
     head, local = head_for_scene(after, method.head_per_scene, options, in_atlas)
-    buffer, pacer = scene_buffer(local, cell, frames), Pacer()
+    buffer, pacer = scene_buffer(local, cell, frames, maps.device), Pacer()
     plan = view_plan(options, maps.short_side)
     yield from encoded(buffer, frames, plan, maps, resume, pacer)
     if teacher is None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from evercal.continual.learn_scene import LearnOptions, LearnReport, OnEvent, learn_scene
 from evercal.continual.memory_budget import with_memory
-from evercal.continual.presets import PRESETS, Preset
+from evercal.continual.presets import PRESETS, Preset, short_side
 from evercal.continual.presets import preset as stage_options
 from evercal.continual.strategies import strategy_named
 from evercal.datasets import Scene, load_scene
@@ -20,6 +20,7 @@ def learn(
     preset: Preset = "fast",
     memory: str | int = "10%",
     strategy: str | None = None,
+    device: str = "auto",
     on_event: OnEvent | None = None,
 ) -> LearnReport:
     """Learns a scene into a store, or goes on where an interrupted call of the same kind stopped.
@@ -33,6 +34,7 @@ def learn(
             "auto": the fewest with which its other frames are located well.
         strategy: "evercal" builds a map, other names train a network; that of the store when left
             out, and "evercal" for a new store.
+        device: what networks run on: "auto" (a CUDA device where there is one), "cpu", "cuda".
         on_event: called with everything that happens, for progress bars.
 
     Returns:
@@ -47,7 +49,12 @@ def learn(
     stage = with_memory(stage_options(preset), memory)
     root = Path(store)
     recorded = scene if isinstance(scene, Scene) else load_scene(scene)
-    options = LearnOptions(stage, strategy_named(strategy or _made_with(root)))
+    options = LearnOptions(
+        stage,
+        strategy_named(strategy or _made_with(root)),
+        short_side=short_side(preset),
+        device=device,
+    )
     return learn_scene(root, recorded, options, on_event)
 
 

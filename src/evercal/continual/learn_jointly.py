@@ -39,7 +39,7 @@ def learn_jointly(
         positions = known_poses(scene.train).translation_m
         cells.append(atlas.place(positions))
         places.append(cells[-1].atlas_from_base.apply(positions))
-        buffers.append(scene_buffer(number, cells[-1], scene.train))
+        buffers.append(scene_buffer(number, cells[-1], scene.train, maps.device))
         yield from encoded(buffers[-1], scene.train, plan, maps)
     head = head_for_all(after, options, places)
     whiten(head, buffers, options.seed)

@@ -23,6 +23,7 @@ from evercal.continual.wrist_camera import (
 )
 from evercal.datasets.frame import MIN_TRAIN_FRAMES, Frame, Scene, posed_scene
 from evercal.errors import InputError
+from evercal.features.device import device_of
 from evercal.features.feature_cache import cache_features
 from evercal.features.weights_file import network_bytes
 from evercal.geometry.se3 import SE3
@@ -52,6 +53,8 @@ class LearnOptions:
     gripper_from_camera: SE3 | None = None
     """Where the camera roughly sits on the gripper (CAD), for recordings of gripper poses alone:
     what is found is compared with it."""
+    device: str | torch.device = "auto"
+    """What the networks run on, see `device_of`."""
     cache: Path | None = None
     """Folder for features of views, for many runs over the same frames (`cache_features`)."""
 
@@ -104,8 +107,9 @@ def learn_scene(
         on_event: called with everything that happens, for progress bars.
 
     Raises:
-        InputError: too few frames, a name that the store knows already, another strategy than the
-            store's, a store that is none or that another process is learning into.
+        InputError: no such device, too few frames, a name that the store knows already, another
+            strategy than the store's, a store that is none or that another process is learning
+            into.
     """
     with _store_lock(store):
         return _learn_scene(store, scene, options, on_event)
@@ -138,8 +142,10 @@ def _learn_scene(
     began = time.perf_counter()
     wrist = lacks_camera_poses(scene)
     scene = scene if wrist else posed_scene(scene)
+    device = device_of(options.device)
     opened = open_or_create(store, options)
     _check(opened, scene, options)
+    opened.maps.to(device)
     stage_options, start = options.stage, None
     if wrist:
         scene, start = posed_by_gripper(scene, opened.maps.encoder, on_event or (lambda _: None))

@@ -1,6 +1,7 @@
 """Strategies from a user's own file."""
 
 import importlib.util
+import sys
 from pathlib import Path
 
 from evercal.continual.strategies import STRATEGIES, Strategy
@@ -26,6 +27,7 @@ def load_plugin(path: Path) -> tuple[str, ...]:
     if spec is None or spec.loader is None:
         raise InputError(f"plugin {path}: not a Python file; give one that ends in .py")
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses and pickles look for their module there
     try:
         spec.loader.exec_module(module)
     except Exception as error:

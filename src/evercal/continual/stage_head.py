@@ -5,7 +5,7 @@ from itertools import islice
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from evercal.continual.stage import StageOptions
 from evercal.mapping.atlas import camera_clusters, spiral
@@ -33,7 +33,7 @@ def head_for_scene(
     if not maps.heads:
         head = fresh_head(maps, options)
     elif own:
-        head = _without_scenes(maps.heads[-1])
+        head = maps.heads[-1].without_scenes()
     else:
         head = maps.heads.pop()
     local = head.scenes
@@ -54,7 +54,7 @@ def head_for_all(maps: SceneMaps, options: StageOptions, positions_m: Sequence[n
 def fresh_head(maps: SceneMaps, options: StageOptions) -> Head:
     """A head that knows no scene."""
     torch.manual_seed(options.seed)
-    return Head(maps.encoder.width, maps.descriptor.width, options.head)
+    return Head(maps.encoder.width, maps.descriptor.width, options.head).to(maps.device)
 
 
 def whiten(head: Head, buffers: Sequence[FeatureBuffer], seed: int) -> None:
@@ -64,26 +64,6 @@ def whiten(head: Head, buffers: Sequence[FeatureBuffer], seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     drawn = [buffer.draw(WHITENING_ROWS // len(buffers), generator) for buffer in buffers]
     head.whiten(torch.cat([rows.features for rows in drawn]))
-
-
-def _without_scenes(head: Head) -> Head:
-    """A copy with the shared weights alone; centres that belong to no scene stay."""
-    copy = Head(head.features, head.descriptor, head.options)
-    state = head.state_dict()
-    owned = {"code"}
-    if head.options.centres == "grow":
-        owned |= {"logit", "logit_bias", "centres", "centre_scene"}
-        owned |= {"offset", "offset_bias"} if head.options.offsets == "per_centre" else set()
-    for name, value in state.items():
-        if name in owned:
-            continue
-        place, _, last = name.rpartition(".")
-        module = copy.get_submodule(place)
-        if last in dict(module.named_parameters(recurse=False)):
-            setattr(module, last, nn.Parameter(value.clone()))
-        else:
-            module.register_buffer(last, value.clone())
-    return copy
 
 
 def _new_centres(head: Head, options: StageOptions, positions_m: np.ndarray) -> Tensor:

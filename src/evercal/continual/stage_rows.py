@@ -4,6 +4,8 @@ import time
 from collections.abc import Generator, Sequence
 from dataclasses import replace
 
+import torch
+
 from evercal.continual.stage import Encoding, Event, StageOptions
 from evercal.datasets.frame import Frame
 from evercal.mapping.atlas import Cell
@@ -29,16 +31,20 @@ class Pacer:
         return True
 
 
-def scene_buffer(number: int, cell: Cell, frames: Sequence[Frame]) -> FeatureBuffer:
+def scene_buffer(
+    number: int, cell: Cell, frames: Sequence[Frame], device: torch.device
+) -> FeatureBuffer:
     """An empty buffer for a scene's frames.
 
     Args:
         number: of the scene in the head.
         cell: where the scene lies in the atlas.
         frames: whose camera may be corrected if one without known distortion took them all.
+        device: where its rows are used.
     """
     one = all(frame.camera == frames[0].camera for frame in frames)
-    return FeatureBuffer(number, cell.atlas_from_base, one and not frames[0].camera.distortion)
+    correctable = one and not frames[0].camera.distortion
+    return FeatureBuffer(number, cell.atlas_from_base, correctable, device)
 
 
 def encoded(
@@ -85,7 +91,8 @@ def remembered(
     for number, keyframes in enumerate(maps.keyframes):
         if keyframes is None or not keyframes.images:
             continue
-        buffer = FeatureBuffer(number, maps.scenes[number].cell.atlas_from_base)
+        place = maps.scenes[number].cell.atlas_from_base
+        buffer = FeatureBuffer(number, place, device=maps.device)
         yield from encoded(buffer, keyframes.frames(), replay_plan(options, maps.short_side), maps)
         buffers.append(buffer)
     return buffers

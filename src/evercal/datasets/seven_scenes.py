@@ -6,9 +6,12 @@
     ROOT/seq-03/frame-000000.pose.txt      4x4 base_from_camera, metres
 
 Camera axes are OpenCV's. Without the intrinsics file the colour camera has the focal length that
-the field uses, 525 pixels at 640x480 and scaled with the size, and the principal point (width / 2,
-height / 2) that goes with it. A pose with inf or nan marks a frame that was not tracked: it is left
-out and counted. Every sequence is taken to come from one camera. Depth files are not read.
+the field uses, 525 pixels at 640x480 and scaled with the size, and its principal point in the
+middle of the image: nobody calibrated it. Code that writes (width / 2, height / 2) for the middle
+counts pixels from the image's corner; here pixel (0, 0) is a centre, so the middle is at ((width -
+1) / 2, (height - 1) / 2). An intrinsics file is taken at its word, with (0, 0) a centre. A pose
+with inf or nan marks a frame that was not tracked: it is left out and counted. Every sequence is
+taken to come from one camera. Depth files are not read.
 """
 
 import itertools
@@ -103,7 +106,7 @@ def _camera(root: Path, image: Path) -> Camera:
     file = root / "camera-intrinsics.txt"
     if not file.exists():
         focal = _FOCAL_AT_640 * max(width, height) / 640.0
-        return Camera(width, height, focal, focal, width / 2, height / 2)
+        return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     matrix = read_numbers(file, 9, "3x3 intrinsic").reshape(3, 3)
     try:
         return Camera.from_matrix(matrix, width, height)

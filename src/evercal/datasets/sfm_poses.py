@@ -7,7 +7,11 @@ Re-Localization (ICCV 2021), one for each split of a scene:
         seq-01/frame-000768.color.png qw qx qy qz tx ty tz f
 
 The pose maps the world to the camera (COLMAP's convention, metres), f is the focal length in pixels
-of the image as published. Frames that the reconstruction does not hold are left out and counted.
+of the image as published. The files name no principal point: COLMAP keeps it at (width / 2, height
+/ 2) unless told otherwise, counted from the image's corner, which is ((width - 1) / 2, (height - 1)
+/ 2) here, where pixel (0, 0) is a centre. It replaces that of the original calibration, with which
+these focal lengths were not found. Frames that the reconstruction does not hold are left out and
+counted.
 Which poses are truer nobody knows; results under both belong side by side.
 """
 
@@ -47,7 +51,8 @@ def with_sfm_poses(scene: Scene, folder: Path, name: str) -> Scene:
 
 def _placed(frame: Frame, base_from_camera: SE3, focal: float) -> Frame:
     c = frame.camera
-    camera = Camera(c.width, c.height, focal, focal, c.cx, c.cy, c.distortion)
+    middle = (c.width - 1) / 2, (c.height - 1) / 2
+    camera = Camera(c.width, c.height, focal, focal, *middle, c.distortion)
     return replace(frame, camera=camera, base_from_camera=base_from_camera)
 
 

@@ -6,8 +6,10 @@
     ROOT/data/frame-000000.pose.txt       4x4 base_from_camera, metres
 
 As the field does, the first sequence is tested on and the others are learned. Camera axes are
-OpenCV's; the intrinsics are those of info.txt at the size it names, scaled to the images'. A pose
-with inf or nan marks a frame that was not tracked: it is left out and counted.
+OpenCV's; the intrinsics are those of info.txt at the size it names, scaled to the images'. They are
+taken as they stand, with pixel (0, 0) a centre: the data set states no convention, and its cy of
+483.5 is the middle of 968 rows counted so. A pose with inf or nan marks a frame that was not
+tracked: it is left out and counted.
 """
 
 import os

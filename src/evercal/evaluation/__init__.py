@@ -7,7 +7,10 @@ from evercal.evaluation.metrics import Scores as Scores
 from evercal.evaluation.metrics import continual_scores as continual_scores
 from evercal.evaluation.metrics import correct as correct
 from evercal.evaluation.metrics import scores as scores
+from evercal.evaluation.metrics import share_inside as share_inside
+from evercal.evaluation.metrics import squared_mahalanobis as squared_mahalanobis
 from evercal.evaluation.protocol import evaluate as evaluate
 from evercal.evaluation.statistics import Interval as Interval
-from evercal.evaluation.statistics import block_bootstrap as block_bootstrap
+from evercal.evaluation.statistics import frame_pieces as frame_pieces
+from evercal.evaluation.statistics import mean_interval as mean_interval
 from evercal.evaluation.statistics import paired_difference as paired_difference

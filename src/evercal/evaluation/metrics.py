@@ -14,6 +14,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evercal.geometry import SE3
+
 Status = Literal["ok", "unknown_scene", "failed"]
 
 COARSE = (0.05, math.radians(5.0))
@@ -24,6 +26,9 @@ FINE = (0.01, math.radians(1.0))
 """1 cm and 1 deg, in metres and radians."""
 FINEST = (0.005, math.radians(0.5))
 """5 mm and 0.5 deg, in metres and radians."""
+
+CHI2_6 = 12.5916
+"""95 % quantile of chi square with six degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,9 @@ class FrameResult:
     """How many scene points agree with the pose."""
     inlier_ratio: float
     """The same as a share of all scene points, 0 to 1."""
+    squared_mahalanobis: float = math.nan
+    """Squared error of the pose in units of its own covariance; NaN without a pose in the right
+    scene or without a covariance."""
 
     @property
     def wrong_scene(self) -> bool:
@@ -81,6 +89,9 @@ class SceneScores:
     """Per cent of frames that the localizer said it does not know."""
     near_training_frame: float
     """Per cent of frames with a training frame within 5 cm and 5 deg: what a lookup could reach."""
+    inside_95: float = math.nan
+    """Per cent of the frames with a pose in the right scene whose true pose lies inside the 95 %
+    ellipsoid that was stated for it; NaN where none was."""
 
 
 @dataclass(frozen=True)
@@ -163,6 +174,30 @@ def scores(results: Sequence[FrameResult]) -> Scores:
     )
 
 
+def squared_mahalanobis(found: SE3, covariance: ArrayLike, truth: SE3) -> float:
+    """Squared error of a pose in units of its own covariance.
+
+    If the covariance is right, 95 % lie below `CHI2_6`.
+
+    Args:
+        found: base_from_camera.
+        covariance: (6, 6) of (translation in the base frame, metres; rotation about camera axes,
+            radians).
+        truth: base_from_camera.
+    """
+    shift = truth.translation_m - found.translation_m
+    turn = (found.inverse() @ truth).log()[3:]
+    error = np.concatenate([shift, turn])
+    return float(error @ np.linalg.solve(np.asarray(covariance, dtype=np.float64), error))
+
+
+def share_inside(squared: ArrayLike) -> float:
+    """Per cent inside the 95 % ellipsoid among squared errors that are not NaN; NaN for none."""
+    values = np.asarray(squared, dtype=np.float64)
+    known = values[~np.isnan(values)]
+    return _percent(known < CHI2_6) if len(known) else math.nan
+
+
 def continual_scores(accuracies: ArrayLike) -> ContinualScores:
     """Sums up one run through a sequence of scenes.
 
@@ -222,6 +257,7 @@ def _scene_scores(rows: list[FrameResult]) -> SceneScores:
         wrong_scene=_percent([row.wrong_scene for row in rows]),
         unknown=_percent([row.status == "unknown_scene" for row in rows]),
         near_training_frame=_percent([row.near_training_frame for row in rows]),
+        inside_95=share_inside([row.squared_mahalanobis for row in rows]),
     )
 
 

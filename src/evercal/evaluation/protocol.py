@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from evercal.datasets import Frame, Scene, known_poses, posed
 from evercal.errors import InputError
-from evercal.evaluation.metrics import FrameResult, Status
+from evercal.evaluation.metrics import FrameResult, Status, squared_mahalanobis
 from evercal.geometry import SE3, Camera, near_training, pose_distance
 
 
@@ -123,11 +123,16 @@ def _result(
     estimate = localizer.localize(frame.read_image(), frame.camera)
     milliseconds = 1e3 * (time.perf_counter() - start)
     metres = radians = np.inf
+    squared = np.nan
+    # Not in `Estimate`: a localizer need not say how sure it is.
+    covariance = getattr(estimate, "covariance", None)
     truth, found = frame.base_from_camera, estimate.base_from_camera
     if estimate.status == "ok" and estimate.scene in alike:
         assert truth is not None
         assert found is not None, "an estimate whose status is ok has a pose"
         metres, radians = pose_distance(truth, found)
+        if covariance is not None:
+            squared = squared_mahalanobis(found, covariance, truth)
     return FrameResult(
         scene=name,
         frame=frame.name,
@@ -139,6 +144,7 @@ def _result(
         milliseconds=milliseconds,
         inliers=int(estimate.inliers),
         inlier_ratio=float(estimate.inlier_ratio),
+        squared_mahalanobis=squared,
     )
 
 

@@ -1,10 +1,15 @@
 """How sure a mean or a difference is, when frames follow one another and runs differ by seed.
 
 Neighbouring frames of a recording see nearly the same, so they are right or wrong together and
-count for less than as many independent ones. Resampling blocks of consecutive frames keeps that
-(circular block bootstrap, Politis and Romano 1992); resampling runs adds what the seed does.
+count for less than as many independent ones. What counts is how many pieces of recording there are:
+whole runs of consecutive frames or, where a scene was recorded in one go, long blocks of it (batch
+means; Schmeiser, Batch Size Effects in the Analysis of Simulation Output, Oper. Res. 1982). Pieces
+are few, often four a scene, and the bootstrap of few things is too narrow. So bounds are Student's,
+with the degrees of freedom of Satterthwaite (An Approximate Distribution of Estimates of Variance
+Components, Biometrics 1946). `python -m benchmarks intervals` measures how often such bounds hold.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,6 +17,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
+
+SHORTEST_BLOCK, MOST_BLOCKS = 10, 20
+"""A recording in one go is cut into blocks of ten frames or more, and into twenty at most."""
+LARGEST_STEP = 10
+"""A run goes on over a gap of fewer frames than this: a tracker may have lost some."""
 
 
 @dataclass(frozen=True)
@@ -23,52 +34,88 @@ class Interval:
     high: float
 
 
-def block_bootstrap(
-    values: ArrayLike | Sequence[ArrayLike], block: int = 10, samples: int = 2000, seed: int = 0
+def frame_pieces(names: Sequence[str]) -> Labels:
+    """Which piece of its recording each frame belongs to: what may be taken as independent.
+
+    A run of consecutive frames is a piece. It ends where what stands before the frame number
+    changes (`seq-03/frame-000039`, `seq-08/frame-000000`), where the number falls, and where it
+    steps over ten frames or more; the usual step of the recording counts as one, so that every
+    fifth frame of a path is still one run. A scene with a single run, whose frames all stand
+    alone or whose names hold no numbers is cut into blocks of neighbouring frames of equal length,
+    at least ten frames each and at most twenty of them.
+
+    Args:
+        names: of one scene's frames, in recorded order.
+
+    Returns:
+        (frames,) 0 for the first piece, 1 for the next and so on.
+    """
+    places = [re.fullmatch(r"(.*?)(\d+(?:\.\d+)?)(\.\w+)?", name, re.DOTALL) for name in names]
+    if all(places):
+        before = np.array([place[1] for place in places if place])
+        steps = np.diff([float(place[2]) for place in places if place])
+        together = before[1:] == before[:-1]
+        forward = steps[together & (steps > 0)]
+        usual = float(np.median(forward)) if len(forward) else 1.0
+        ends = ~together | (steps <= 0) | (steps > LARGEST_STEP * usual)
+        if ends.any() and not ends.all():
+            return np.concatenate([[0], np.cumsum(ends)]).astype(np.int64)
+    return blocks(len(names))
+
+
+def blocks(frames: int) -> Labels:
+    """(frames,) labels of blocks of neighbouring frames, as `frame_pieces` cuts a single run.
+
+    Fewer than twenty frames are cut in two.
+    """
+    count = min(max(frames // SHORTEST_BLOCK, 2), MOST_BLOCKS)
+    return np.arange(frames, dtype=np.int64) * count // max(frames, 1)
+
+
+def mean_interval(
+    values: ArrayLike | Sequence[ArrayLike], pieces: Sequence[ArrayLike] | None = None
 ) -> Interval:
     """The mean over scenes of the mean over runs and frames, with 95 % bounds.
 
-    Each sample draws runs with replacement, the same for all scenes, since a run is one network
-    for them all, and blocks of consecutive frames within each scene, the same for all runs,
-    since a hard image is hard for every run. With one run the bounds tell of the choice of frames
-    alone; with few they are somewhat narrow, as the bootstrap of few things is.
+    Two things are drawn by chance: the pieces of recording that a scene is judged by, which are
+    the same for all runs, and the runs, which are the same for all scenes. Each adds the variance
+    that its means show. Chance that strikes one run on one piece shows in both and is counted
+    twice, which makes the bounds a little wide (as in Owen, The Pigeonhole Bootstrap, Ann. Appl.
+    Stat. 2007). With one run the bounds tell of the choice of frames alone. Values that are all
+    equal have no width, however few they are.
 
     Args:
         values: (runs, frames) or (frames,) for one scene, or a list of such arrays, one per scene;
             frames in recorded order. Typically per-frame correctness.
-        block: Frames in a block; about as many as stay alike.
-        samples: How often to resample.
-        seed: Of the resampling.
+        pieces: (frames,) labels for each scene, as `frame_pieces` gives; `blocks` when None.
 
     Raises:
         ValueError: Shapes that do not fit, values that are not finite, scenes with different
-            numbers of runs, or a scene of fewer than two blocks, whose spread nobody can tell.
+            numbers of runs, or a scene of one piece, whose spread nobody can tell.
     """
     scenes = _scenes(values)
-    if block < 1 or samples < 1:
-        raise ValueError(f"block and samples are at least 1, got {block} and {samples}")
-    short = next((i for i, rows in enumerate(scenes) if rows.shape[1] < 2 * block), None)
-    if short is not None:
+    given = [blocks(rows.shape[1]) for rows in scenes] if pieces is None else list(pieces)
+    labels = [np.asarray(of) for of in given]
+    if [of.shape for of in labels] != [rows.shape[1:] for rows in scenes]:
         raise ValueError(
-            f"scene {short} has {scenes[short].shape[1]} frames; bounds from blocks of {block}"
-            f" frames take at least {2 * block}, so give more frames or a smaller block"
+            f"pieces are (frames,) per scene, got {[of.shape for of in labels]} for frames"
+            f" {[rows.shape[1] for rows in scenes]}"
         )
-    generator = np.random.default_rng(seed)
-    runs = len(scenes[0])
-    weights = generator.multinomial(runs, np.full(runs, 1.0 / runs), size=samples) / runs
-    drawn = np.zeros(samples)
-    for rows in scenes:
-        drawn += (weights * _block_means(rows, block, samples, generator)).sum(axis=1)
-    low, high = np.percentile(drawn / len(scenes), [2.5, 97.5])
-    return Interval(float(np.mean([rows.mean() for rows in scenes])), float(low), float(high))
+    alone = next((i for i, of in enumerate(labels) if len(np.unique(of)) < 2), None)
+    if alone is not None:
+        raise ValueError(
+            f"scene {alone} is one piece of recording of {len(labels[alone])} frames; bounds take"
+            f" at least two"
+        )
+    mean = float(np.mean([rows.mean() for rows in scenes]))
+    half = _half_width(scenes, labels)
+    return Interval(mean, mean - half, mean + half)
 
 
 def paired_difference(
     a: ArrayLike | Sequence[ArrayLike],
     b: ArrayLike | Sequence[ArrayLike],
-    block: int = 10,
-    samples: int = 2000,
-    seed: int = 0,
+    pieces: Sequence[ArrayLike] | None = None,
 ) -> Interval:
     """How much better method `a` is than `b` on the same frames, with 95 % bounds.
 
@@ -76,21 +123,46 @@ def paired_difference(
     difference is real, at that level, if zero lies outside.
 
     Args:
-        a: Per-frame correctness, as `block_bootstrap` takes it.
+        a: Per-frame correctness, as `mean_interval` takes it.
         b: The same scenes, runs and frames in the same order.
-        block: Frames in a block.
-        samples: How often to resample.
-        seed: Of the resampling.
+        pieces: As `mean_interval` takes it.
 
     Raises:
-        ValueError: As `block_bootstrap`, or `a` and `b` of different shapes.
+        ValueError: As `mean_interval`, or `a` and `b` of different shapes.
     """
     first, second = _scenes(a), _scenes(b)
     shapes = [rows.shape for rows in first], [rows.shape for rows in second]
     if shapes[0] != shapes[1]:
         raise ValueError(f"a and b hold the same scenes, runs and frames, got {shapes}")
-    differences = [x - y for x, y in zip(first, second, strict=True)]
-    return block_bootstrap(differences, block, samples, seed)
+    return mean_interval([x - y for x, y in zip(first, second, strict=True)], pieces)
+
+
+def _half_width(scenes: Sequence[Array], labels: Sequence[Labels]) -> float:
+    """Half the width of the bounds."""
+    from scipy.stats import t
+
+    # (variance, degrees of freedom) that pieces of each scene, and runs, add to the mean.
+    parts = []
+    for rows, of in zip(scenes, labels, strict=True):
+        shares = _shares(rows.mean(axis=0), of)
+        spread = len(shares) / (len(shares) - 1) * float((shares**2).sum())
+        parts.append((spread / len(scenes) ** 2, len(shares) - 1))
+    runs = len(scenes[0])
+    if runs > 1:
+        means = np.mean([rows.mean(axis=1) for rows in scenes], axis=0)
+        parts.append((float(means.var(ddof=1)) / runs, runs - 1))
+    variance = sum(part for part, _ in parts)
+    if variance <= 1e-24:  # of values around one, that is rounding
+        return 0.0
+    freedom = variance**2 / sum(part**2 / freedom for part, freedom in parts)
+    return float(t.ppf(0.975, freedom)) * variance**0.5
+
+
+def _shares(values: Array, labels: Labels) -> Array:
+    """(pieces,) the sum over a piece of (frames,) values less their mean, by all frames."""
+    _, piece = np.unique(labels, return_inverse=True)
+    sums = np.bincount(piece, (values - values.mean()) / len(values))
+    return sums.astype(np.float64)
 
 
 def _scenes(values: ArrayLike | Sequence[ArrayLike]) -> list[Array]:
@@ -106,16 +178,3 @@ def _scenes(values: ArrayLike | Sequence[ArrayLike]) -> list[Array]:
     if not all(np.isfinite(rows).all() for rows in scenes):
         raise ValueError("values are finite, got inf or nan; give correctness, not errors")
     return scenes
-
-
-def _block_means(rows: Array, block: int, samples: int, generator: np.random.Generator) -> Array:
-    """(samples, runs) means over resampled frames, exactly as many as there are in each sample."""
-    frames = rows.shape[1]
-    # The recording is closed to a ring, so that every frame is drawn equally often.
-    ring = np.concatenate([np.zeros((len(rows), 1)), rows, rows[:, :block]], axis=1)
-    before = np.cumsum(ring, axis=1)
-    lengths = np.full(-(-frames // block), block)
-    lengths[-1] = frames - block * (len(lengths) - 1)
-    starts = generator.integers(frames, size=(samples, len(lengths)))
-    sums = np.stack([(run[starts + lengths] - run[starts]).sum(axis=1) for run in before], axis=1)
-    return sums / frames

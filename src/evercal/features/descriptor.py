@@ -62,7 +62,8 @@ class PooledDescriptor(nn.Module):
         self.width = width
         self.settings = {"inputs": inputs, "width": width}
         generator = torch.Generator().manual_seed(0)
-        projection = torch.randn(2 * inputs, width, generator=generator) / inputs**0.5
+        drawn = torch.randn(2 * inputs, width, generator=generator, device="cpu")
+        projection = drawn / inputs**0.5
         self.register_buffer("projection", projection)
 
     def forward(self, features: Tensor) -> Tensor:

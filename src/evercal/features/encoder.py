@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from evercal.errors import InputError
+from evercal.features.device import device_of_network
 from evercal.features.weights_file import load_strictly
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -194,7 +195,8 @@ def checked_encoder(module: nn.Module) -> Encoder:
     module.eval().requires_grad_(False)
     side = 8 * module.stride
     with torch.inference_mode():
-        shape = tuple(module(torch.zeros(1, 1, side, side)).shape)
+        image = torch.zeros(1, 1, side, side, device=device_of_network(module))
+        shape = tuple(module(image).shape)
     if shape != (1, module.width, 8, 8):
         raise InputError(
             f"encoder {type(module).__name__}: made {shape} of a (1, 1, {side}, {side}) image, "

@@ -26,7 +26,7 @@ def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int = LIMIT_BY
     """
     weights = hashlib.blake2b(digest_size=8)
     for value in encoder.state_dict().values():
-        weights.update(value.detach().float().numpy().tobytes())
+        weights.update(value.detach().cpu().float().numpy().tobytes())
     folder = folder / weights.hexdigest()
     folder.mkdir(parents=True, exist_ok=True)
     compute = encoder.forward
@@ -38,20 +38,24 @@ def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int = LIMIT_BY
         found = [_read(folder / name) for name in names]
         missing = [i for i, value in enumerate(found) if value is None]
         if missing:
-            made = compute(grey[missing]).half()
+            made = compute(grey[missing]).half().cpu()
             for i, value in zip(missing, made, strict=True):
                 found[i] = value
                 if room > value.nbytes:
                     _write(folder / names[i], value)
                     room -= value.nbytes
-        return torch.stack([value.float() for value in found if value is not None])
+        whole = torch.stack([value.float() for value in found if value is not None])
+        return whole.to(grey.device)
 
     encoder.forward = forward
 
 
 def _name(image: Tensor) -> str:
     shape = "x".join(map(str, image.shape))
-    return f"{shape}-{hashlib.blake2b(image.numpy().tobytes(), digest_size=16).hexdigest()}.npy"
+    digest = hashlib.blake2b(image.cpu().numpy().tobytes(), digest_size=16).hexdigest()
+    # Another kind of device rounds otherwise: its features are its own.
+    kind = "" if image.device.type == "cpu" else f"-{image.device.type}"
+    return f"{shape}-{digest}{kind}.npy"
 
 
 def _read(path: Path) -> Tensor | None:

@@ -38,15 +38,26 @@ class Vlad:
 
     def __init__(self, centroids: Tensor, projection: Tensor):
         self.centroids, self.projection = centroids, projection
+        self._copies: dict[torch.device, tuple[Tensor, Tensor]] = {}
 
     @torch.inference_mode()
     def __call__(self, features: Tensor) -> Tensor:
-        """(cells, channels) unit vectors of an image -> (width,) unit vector."""
-        nearest = (features @ self.centroids.T).argmax(1)
-        sums = torch.zeros_like(self.centroids)
-        sums.index_add_(0, nearest, features - self.centroids[nearest])
+        """(cells, channels) unit vectors of an image -> (width,) unit vector, on their device."""
+        centroids, projection = self._on(features.device)
+        nearest = (features @ centroids.T).argmax(1)
+        apart = features - centroids[nearest]
+        if features.device.type == "cpu":
+            sums = torch.zeros_like(centroids).index_add_(0, nearest, apart)
+        else:  # there `index_add_` adds in any order, and the last bits would change with it
+            sums = F.one_hot(nearest, len(centroids)).to(apart.dtype).T @ apart
         whole = F.normalize(sums, dim=1).flatten()
-        return F.normalize(whole @ self.projection, dim=0)
+        return F.normalize(whole @ projection, dim=0)
+
+    def _on(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Centroids and projection on a device; moved there once."""
+        if device not in self._copies:
+            self._copies[device] = self.centroids.to(device), self.projection.to(device)
+        return self._copies[device]
 
 
 def vlad_for(encoder: Encoder) -> Vlad:
@@ -67,7 +78,9 @@ def fit_centroids(encoder: Encoder) -> Tensor:
     """(k, channels) centroids of the features of procedural rooms, by spherical k-means."""
     features = torch.cat([_room_features(encoder, seed) for seed in _ROOMS])
     generator = torch.Generator().manual_seed(0)
-    centroids = features[torch.randperm(len(features), generator=generator)[:CENTROIDS]]
+    centroids = features[
+        torch.randperm(len(features), generator=generator, device="cpu")[:CENTROIDS]
+    ]
     for _ in range(_ROUNDS):
         nearest = (features @ centroids.T).argmax(1)
         sums = torch.zeros_like(centroids).index_add_(0, nearest, features)
@@ -88,7 +101,8 @@ def save_centroids(encoder: nn.Module, path: Path) -> None:
 def _projected(centroids: Tensor) -> Vlad:
     # A fixed random projection keeps angles well enough and a quarter of the numbers.
     shape = (centroids.numel(), WIDTH)
-    projection = torch.randn(shape, generator=torch.Generator().manual_seed(1))
+    drawn = torch.Generator().manual_seed(1)
+    projection = torch.randn(shape, generator=drawn, device="cpu")
     return Vlad(centroids, projection / shape[0] ** 0.5)
 
 
@@ -103,5 +117,5 @@ def _room_features(encoder: Encoder, seed: int) -> Tensor:
     for _ in range(_VIEWS):
         image = room.render(camera, room.random_view(rng))
         view = plain_view(image, camera, encoder.stride, ViewOptions())
-        rows.append(encode_features([view], encoder)[0].flatten(1).T[::3])
+        rows.append(encode_features([view], encoder, "cpu")[0].flatten(1).T[::3])
     return torch.cat(rows)

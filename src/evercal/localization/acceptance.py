@@ -66,7 +66,10 @@ def fit_threshold(
     Returns:
         (smallest inlier ratio that is accepted, factor on covariances).
     """
-    localizer = Localizer(maps)
+    # What was fitted before, such as for another strategy with the same head, must not count twice.
+    plain = with_fit(maps.scenes[scene], 0.0, 1.0)
+    scenes = [plain if record is maps.scenes[scene] else record for record in maps.scenes]
+    localizer = Localizer(replace(maps, scenes=scenes))
     right, ratios = [], []
     for frame in held_out:
         estimate = localizer.localize(frame.read_image(), frame.camera)

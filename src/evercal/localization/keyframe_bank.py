@@ -26,7 +26,7 @@ class LoadedKeyframe:
     """A keyframe ready to be matched and aligned; coordinates in the base frame of its scene."""
 
     features: Tensor
-    """(cells, channels), bfloat16 where that is fast."""
+    """(cells, channels) on the encoder's device, bfloat16 where that is fast."""
     points_m: np.ndarray
     """(cells, 3) what the patches of the feature grid show."""
     surface_m: np.ndarray
@@ -59,7 +59,7 @@ class KeyframeBank:
             descriptors.append(keyframes.descriptors.float())
         self.scene = np.concatenate([np.zeros(0, int), *scenes])
         self._number = np.concatenate([np.zeros(0, int), *numbers])
-        self._descriptors = torch.cat(descriptors) if descriptors else None
+        self._descriptors = torch.cat(descriptors).to(maps.device) if descriptors else None
 
     def __len__(self) -> int:
         return len(self.scene)
@@ -70,12 +70,12 @@ class KeyframeBank:
         One product of a matrix and a vector: 3 ms for 10,000 keyframes, so no index is needed.
 
         Args:
-            features: (cells, channels) of the query.
+            features: (cells, channels) of the query, on the encoder's device.
             scenes: scenes in question.
         """
         if self._descriptors is None:
             return np.zeros(0, np.int64)
-        likeness = (self._descriptors @ vlad_for(self._maps.encoder)(features)).numpy()
+        likeness = (self._descriptors @ vlad_for(self._maps.encoder)(features)).cpu().numpy()
         order = np.argsort(-likeness, kind="stable")
         return order[np.isin(self.scene[order], scenes)]
 
@@ -102,7 +102,7 @@ class KeyframeBank:
         depth = 1 / keyframes.inverse_depth[number].double().numpy()
         pyramid = image_pyramid(grey, ALIGNED_LEVELS)
         return LoadedKeyframe(
-            features.to(torch.bfloat16 if fast_bfloat16() else torch.float32),
+            features.to(torch.bfloat16 if fast_bfloat16(features.device) else torch.float32),
             pose.apply(rays * depth[:, None]),
             pose.apply(marks.surface(camera)),
             marks.sigma / marks.inverse_depth,

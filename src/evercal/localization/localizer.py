@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from evercal.errors import InputError
+from evercal.features.device import device_of
 from evercal.features.encode import ENCODE_BATCH, encode_features
 from evercal.features.views import View, ViewOptions, plain_view
 from evercal.geometry.camera import Camera
@@ -30,11 +31,13 @@ from evercal.localization.query import Attempt, Candidate, Hypothesis, LocalizeO
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 
 ASPECT_TOLERANCE = 0.01
-DEVICES = ("auto", "cpu")
 
 
 class Localizer:
     """Finds the camera in any of the scenes that a store knows.
+
+    Images are encoded, matched and shown to networks where the encoder's weights lie; poses are
+    computed on the CPU.
 
     Args:
         maps: encoder, scene records, keyframes and, where scenes have one, networks.
@@ -63,19 +66,19 @@ class Localizer:
             store: its folder.
             options: how to locate.
             encoder: only for a store made with a module of one's own: that module.
-            device: "cpu", or "auto", which is the CPU today.
+            device: what the networks run on: `auto` (a CUDA device where there is one), `cpu` or
+                `cuda`; see `features.device.device_of`.
 
         Raises:
-            InputError: not a store, an empty one, or a damaged file; another device.
+            InputError: not a store, an empty one, or a damaged file; no such device.
         """
-        if device not in DEVICES:
-            raise InputError(f"device {device!r}: images are located on the CPU; use auto or cpu")
+        where = device_of(device)
         from evercal.mapping.store import Store
 
         opened = Store.open(Path(store), encoder)
         if not opened.maps.scenes:
             raise InputError(f"store {store}: no scene learned yet; run 'evercal learn' first")
-        return cls(opened.maps, options)
+        return cls(opened.maps.to(where), options)
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -135,7 +138,7 @@ class Localizer:
         return plain_view(image, plain, self.maps.encoder.stride, self._view)
 
     def _encode(self, views: Sequence[View]) -> list[Tensor]:
-        """(channels, rows, columns) features of views of one size."""
+        """(channels, rows, columns) features of views of one size, on the encoder's device."""
         return list(encode_features(views, self.maps.encoder))
 
     def _locate(

@@ -24,7 +24,7 @@ class Matcher:
 
     def __init__(self, maps: SceneMaps, bank: KeyframeBank, options: LocalizeOptions):
         self._maps, self._bank, self._options = maps, bank, options
-        self._prototypes = [record.prototypes.float() for record in maps.scenes]
+        self._prototypes = [record.prototypes.float().to(maps.device) for record in maps.scenes]
 
     def candidates(
         self, query: Query, usable: list[int], attempt: Attempt, one_answer: bool
@@ -66,7 +66,8 @@ class Matcher:
         for index in proposed:
             keys = self._bank.load(int(index)).features
             best.append((some.to(keys.dtype) @ keys.T).max(1).values.float())
-        votes = np.bincount(torch.stack(best).argmax(0).numpy(), minlength=len(proposed))
+        voted_for = torch.stack(best).argmax(0).cpu().numpy()
+        votes = np.bincount(voted_for, minlength=len(proposed))
         order = np.argsort(-votes, kind="stable")
         scene = self._bank.scene[proposed]
         total = {int(s): int(votes[scene == s].sum()) for s in np.unique(scene)}
@@ -129,18 +130,21 @@ class Matcher:
     def _predicted(self, query: Query, scene: int) -> np.ndarray:
         """(cells, 3) points that the network predicts, in the scene's base frame."""
         head, local = self._maps.head_for(scene)
-        features = query.features.flatten(1).T
-        with autocast():
-            output = head(features, local, self._descriptor(query).expand(len(features), -1))
-        points = output.points.double().numpy()
+        features = query.features.flatten(1).T.to(head.device)
+        descriptor = self._descriptor(query).to(head.device)
+        with autocast(head.device):
+            output = head(features, local, descriptor.expand(len(features), -1))
+        points = output.points.cpu().double().numpy()
         return self._maps.scenes[scene].cell.atlas_from_base.inverse().apply(points)
 
 
 def _largest(value: Tensor) -> np.ndarray:
     """(n,) the column of the largest value of each row.
 
-    The bits of a positive float are ordered as it is; numpy finds the largest of them in a
-    hundredth of the time that torch takes for bfloat16.
+    The bits of a positive float are ordered as it is; on the CPU numpy finds the largest of them in
+    a hundredth of the time that torch takes for bfloat16.
     """
+    if value.device.type != "cpu":
+        return value.argmax(1).cpu().numpy()
     kind = torch.int16 if value.dtype == torch.bfloat16 else torch.int32
     return value.contiguous().view(kind).numpy().argmax(1)

@@ -59,8 +59,11 @@ class Query:
     """An image on its way."""
 
     image: np.ndarray
+    """(h, w, 3) or (h, w) uint8."""
     features: Tensor
+    """(channels, rows, columns) on the encoder's device."""
     short_side: int
+    """Of `grey` at most, pixels."""
 
     @cached_property
     def grey(self) -> np.ndarray:

@@ -105,19 +105,19 @@ def camera_clusters(positions_m: np.ndarray, count: int, seed: int) -> np.ndarra
 def combined_centres(
     positions_m: Sequence[np.ndarray], count: int, seed: int
 ) -> tuple[tuple[float, float, float], ...]:
-    """Cluster centres of all scenes in the paper's layout, known before the first is learned.
+    """Cluster centres for all scenes in the paper's layout, known before the first is learned.
+
+    As in GLACE, k-means of the camera positions of all scenes together.
 
     Args:
         positions_m: (n, 3) camera positions of each scene in its base frame.
-        count: centres of a scene, by k-means.
+        count: centres of all scenes together (K of the paper).
         seed: of the k-means.
     """
-    atlas, found = Atlas("paper", len(positions_m)), []
-    for positions in positions_m:
-        shift = atlas.place(positions).atlas_from_base
-        means = camera_clusters(shift.apply(positions), count, seed)
-        found += [(float(x), float(y), float(z)) for x, y, z in means]
-    return tuple(found)
+    atlas = Atlas("paper", len(positions_m))
+    placed = [atlas.place(positions).atlas_from_base.apply(positions) for positions in positions_m]
+    means = camera_clusters(np.concatenate(placed), count, seed)
+    return tuple((float(x), float(y), float(z)) for x, y, z in means)
 
 
 def spiral() -> Iterator[np.ndarray]:

@@ -280,7 +280,7 @@ def _pair_motions(
         images.append(grey)
         cameras.append(camera)
         view = plain_view(grey, camera, encoder.stride, ViewOptions())
-        whole.append(vlad(encode_features([view], encoder)[0].flatten(1).T))
+        whole.append(vlad(encode_features([view], encoder, "cpu")[0].flatten(1).T))
     like = torch.stack(whole) @ torch.stack(whole).T
     like.fill_diagonal_(-1)
     nearest = like.topk(min(options.partners, len(frames) - 1)).indices.tolist()

@@ -99,10 +99,10 @@ class Recording:
         return plain_view(self.grey[i], self.cameras[i], self.encoder.stride, options)
 
     def features(self, i: int) -> Tensor:
-        """(cells, channels) features of a frame; kept in half precision."""
+        """(cells, channels) features of a frame; kept in half precision, on the CPU."""
         if i not in self._features:
             features = encode_features([self.view(i)], self.encoder)
-            self._features[i] = features[0].flatten(1).T.half()
+            self._features[i] = features[0].flatten(1).T.half().cpu()
         return self._features[i].float()
 
     def posed_cells(self, i: int) -> PosedCells:

@@ -3,11 +3,14 @@
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from evercal.features.descriptor import Descriptor
+from evercal.features.device import device_of_network
 from evercal.features.encoder import Encoder
 from evercal.geometry.camera import Camera
 from evercal.geometry.pose_covariance import cross_matrix, with_translation_by
@@ -219,6 +222,21 @@ class SceneMaps:
     """Named tensors that the strategy keeps of each scene (`continual.method_state`)."""
 
     @property
+    def device(self) -> torch.device:
+        """Where the encoder's weights lie, and so where images are encoded."""
+        return device_of_network(self.encoder)
+
+    def to(self, device: torch.device) -> Self:
+        """Moves encoder, descriptor and heads to a device, in place; what is kept stays.
+
+        Keyframes, prototypes and method states stay on the CPU: who uses them moves them.
+        """
+        for network in (self.encoder, self.descriptor, *self.heads):
+            if isinstance(network, nn.Module):
+                network.to(device)
+        return self
+
+    @property
     def memory_bytes(self) -> int:
         """Size of all that is kept for later stages: keyframes and method states."""
         frames = sum(keyframes.bytes for keyframes in self.keyframes if keyframes is not None)
@@ -257,7 +275,7 @@ class SceneMaps:
 
 
 def prototypes(descriptors: Tensor) -> Tensor:
-    """At most 256 descriptors (n, width) spread evenly over a recording, half precision."""
+    """At most 256 descriptors (n, width), spread evenly over a recording; half, on the CPU."""
     count = min(MAX_PROTOTYPES, len(descriptors))
     index = np.linspace(0, len(descriptors) - 1, count).round().astype(int)
-    return descriptors[index].half()
+    return descriptors[index].half().cpu()

@@ -72,16 +72,10 @@ def read_head(folder: Path, features: int) -> Head:
     state = load_tensors(path)
     with safe_open(path, "pt") as file:
         settings = json.loads((file.metadata() or {})["head"])
-    head = Head(settings["features"], settings["descriptor"], HeadOptions(**settings["options"]))
-    if head.features != features:
+    if settings["features"] != features:
         raise InputError(f"{path}: made with another encoder than the store's")
-    for name in ("code", "logit", "logit_bias", "offset", "offset_bias"):
-        setattr(head, name, torch.nn.Parameter(torch.zeros(state[name].shape)))
-    head.centres, head.centre_scene = state["centres"], state["centre_scene"]
-    head.load_state_dict(
-        {key: v.float() if v.dtype == torch.half else v for key, v in state.items()}
-    )
-    return head.eval()
+    options = HeadOptions(**settings["options"])
+    return Head.from_state(features, settings["descriptor"], options, state).eval()
 
 
 def write_record(folder: Path, record: SceneRecord) -> None:
@@ -158,7 +152,9 @@ def save_tensors(
     """Writes named tensors, whole or not at all."""
     from safetensors.torch import save
 
-    write_bytes(path, save({k: v.detach().contiguous() for k, v in tensors.items()}, metadata))
+    write_bytes(
+        path, save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, metadata)
+    )
 
 
 def load_tensors(path: Path) -> dict[str, Tensor]:

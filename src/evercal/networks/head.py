@@ -11,9 +11,9 @@ offset in homogeneous form. Scenes may be told apart in two ways (`HeadOptions.c
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -43,7 +43,7 @@ class HeadOptions:
     """Where centres come from: each scene appends its own, all scenes at once in advance (the
     paper; needs the future), or the middles of the atlas cells."""
     centres_per_scene: int = 4
-    """Cluster centres that a scene adds."""
+    """Cluster centres that a scene adds; of all scenes together where they are `fixed`."""
     whiten: bool = True
     """Features are centred, scaled and half decorrelated before the first layer. Without it their
     few strong directions drown the many weak ones, which tell neighbouring points apart."""
@@ -115,10 +115,42 @@ class Head(nn.Module):
         self.register_buffer("centres", torch.zeros(0, 3))
         self.register_buffer("centre_scene", torch.zeros(0, dtype=torch.long))
 
+    @classmethod
+    def from_state(
+        cls, features: int, descriptor: int, options: HeadOptions, state: Mapping[str, Tensor]
+    ) -> Self:
+        """A head with the weights of another one's `state_dict()`, half floats or single."""
+        head = cls(features, descriptor, options).to(state["code"].device)
+        state = {name: v.float() if v.dtype == torch.half else v for name, v in state.items()}
+        # These grow with every scene; whatever their shape is in the state, it is theirs.
+        head.code = nn.Parameter(state["code"].clone())
+        head.logit = nn.Parameter(state["logit"].clone())
+        head.logit_bias = nn.Parameter(state["logit_bias"].clone())
+        head.offset = nn.Parameter(state["offset"].clone())
+        head.offset_bias = nn.Parameter(state["offset_bias"].clone())
+        head.centres, head.centre_scene = state["centres"].clone(), state["centre_scene"].clone()
+        head.load_state_dict(state)
+        return head
+
+    def without_scenes(self) -> "Head":
+        """A copy of what scenes share, which knows none; centres that belong to none stay."""
+        state = dict(self.state_dict())
+        state["code"] = state["code"][:0]
+        if self.options.centres == "grow":
+            owned = ["logit", "logit_bias", "centres", "centre_scene"]
+            owned += ["offset", "offset_bias"] if self.options.offsets == "per_centre" else []
+            state |= {name: state[name][:0] for name in owned}
+        return Head.from_state(self.features, self.descriptor, self.options, state)
+
     @property
     def layers(self) -> int:
         """Hidden layers, each with a row in a scene's code."""
         return 3 + 3 * self.options.blocks + 2
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights lie."""
+        return self.feature_mean.device
 
     @property
     def scenes(self) -> int:
@@ -132,7 +164,8 @@ class Head(nn.Module):
         a such that the variance over all rows and channels is 1.
 
         Args:
-            features: (n, features) rows of the first scene, n well above the number of channels.
+            features: (n, features) rows of the first scene, n well above the number of channels;
+                on any device.
         """
         features = features.double()
         mean = features.mean(0)
@@ -149,6 +182,8 @@ class Head(nn.Module):
     def grow(self, centres: Tensor, seed: int) -> None:
         """Makes room for one more scene; what the head says about others does not change.
 
+        The new rows are drawn on the CPU, so that they are the same on every device.
+
         Args:
             centres: (k, 3) atlas coordinates of the new scene's centres, metres; k may be 0.
             seed: of the new rows.
@@ -157,17 +192,17 @@ class Head(nn.Module):
         width, count = self.options.width, len(centres)
 
         def draw(*shape: int, scale: float) -> Tensor:
-            return (torch.rand(*shape, generator=generator) * 2 - 1) * scale
+            return (torch.rand(*shape, generator=generator, device="cpu") * 2 - 1) * scale
 
         bound = 1 / math.sqrt(width)
         self.code = _append(self.code, draw(1, self.layers, width, scale=0.2))
         self.logit = _append(self.logit, draw(count, width, scale=bound))
-        self.logit_bias = _append(self.logit_bias, torch.zeros(count))
+        self.logit_bias = _append(self.logit_bias, self.logit_bias.new_zeros(count))
         if self.options.offsets == "per_centre":
             self.offset = _append(self.offset, draw(count, 4, width, scale=bound))
-            self.offset_bias = _append(self.offset_bias, torch.zeros(count, 4))
-        scene = torch.full((count,), self.scenes - 1)
-        self.centres = torch.cat([self.centres, centres.float()])
+            self.offset_bias = _append(self.offset_bias, self.offset_bias.new_zeros(count, 4))
+        scene = torch.full((count,), self.scenes - 1, device=self.device)
+        self.centres = torch.cat([self.centres, centres.to(self.centres)])
         self.centre_scene = torch.cat([self.centre_scene, scene])
 
     def forward(
@@ -184,7 +219,7 @@ class Head(nn.Module):
             What the head says, in fp32, whatever autocast does inside.
         """
         hidden = self.hidden(features, scene, descriptor)
-        with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+        with torch.autocast(hidden.device.type, enabled=False):
             return self.decode(hidden.float(), scene)
 
     def hidden(self, features: Tensor, scene: Tensor | int, descriptor: Tensor | None) -> Tensor:

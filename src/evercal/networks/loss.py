@@ -41,6 +41,11 @@ class Target:
     camera_from_atlas: Tensor
     """(n, 3, 4)."""
 
+    def to(self, device: torch.device, non_blocking: bool = False) -> "Target":
+        """The same on a device."""
+        parts = (self.pixels, self.intrinsics, self.camera_from_atlas)
+        return Target(*(part.to(device, non_blocking=non_blocking) for part in parts))
+
 
 def clamp_px(options: LossOptions, progress: float) -> float:
     """Soft clamp tau at `progress` in [0, 1]: wide first, tight last."""
@@ -62,7 +67,7 @@ def reprojection_error(
             principal point in units of the focal length (x, y), OpenCV's k1 and k2.
     """
     matrix = target.camera_from_atlas
-    in_camera = torch.einsum("nij,nj->ni", matrix[:, :, :3], points) + matrix[:, :, 3]
+    in_camera = _turned(matrix[:, :, :3], points) + matrix[:, :, 3]
     depth = in_camera[:, 2:].clamp(min=MIN_DEPTH_M)
     plane = in_camera[:, :2] / depth
     if correction is not None:
@@ -71,6 +76,14 @@ def reprojection_error(
         plane = plane * bend * (1.0 + correction[:, :1]) + correction[:, 1:3]
     projected = plane * target.intrinsics[:, :2] + target.intrinsics[:, 2:]
     return projected - target.pixels, in_camera
+
+
+def _turned(matrices: Tensor, points: Tensor) -> Tensor:
+    """(n, 3) products of (n, 3, 3) and (n, 3) in full fp32."""
+    if points.device.type == "cpu":
+        return torch.einsum("nij,nj->ni", matrices, points)
+    # A matrix product might round to TF32, which is millimetres in a room; sums never do.
+    return (matrices * points[:, None]).sum(-1)
 
 
 def reprojection_loss(

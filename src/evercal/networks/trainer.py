@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from evercal.features.device import allow_tf32
 from evercal.features.precision import autocast
 from evercal.networks.buffer import FeatureBuffer, Rows, join
-from evercal.networks.distributed import average, own_share, processes
+from evercal.networks.distributed import average, broadcast, own_share, processes
 from evercal.networks.head import Head
 from evercal.networks.hooks import ProposedStep, TrainingHooks
 from evercal.networks.loss import LossOptions, clamp_px, reprojection_loss
@@ -30,7 +31,7 @@ class FitOptions:
     """Optimiser steps."""
     batch: int = 2048
     """Rows of the scenes being learned in a step."""
-    replay_batch: int = 2048
+    replay_batch: int = 1024
     """Replayed rows in a step, drawn evenly from all remembered scenes."""
     peak_rate: float = 4e-3
     """Peak of the one-cycle learning rate (cosine up and down) of AdamW."""
@@ -82,7 +83,8 @@ class HeadTrainer:
     would have seen.
 
     Args:
-        head: trained in place.
+        head: trained in place, on the device where it lies and the buffers give their rows; all
+            processes begin with the weights of the first.
         buffers: rows of the scenes being learned.
         options: how.
         seed: random seed.
@@ -100,8 +102,12 @@ class HeadTrainer:
         self.head, self.buffers = head, buffers
         self.options, self.seed, self.step = options, seed, 0
         self.hooks = TrainingHooks() if hooks is None else hooks
-        self.correction = torch.nn.Parameter(torch.zeros(len(buffers), 5))
-        self._correctable = torch.tensor([[buffer.correctable] for buffer in buffers]).float()
+        self.device = head.device
+        allow_tf32(self.device)
+        broadcast([*head.parameters(), *head.buffers()])
+        self.correction = torch.nn.Parameter(torch.zeros(len(buffers), 5, device=self.device))
+        correctable = [[float(buffer.correctable)] for buffer in buffers]
+        self._correctable = torch.tensor(correctable, device=self.device)
         self._optimisers = _optimisers(head, self.correction, options)
 
     def run(self) -> Iterator[Progress]:
@@ -121,7 +127,7 @@ class HeadTrainer:
         # One scene for all rows is a plain bias, a scene per row another product in every layer.
         alone = len(self.buffers) == 1 and fresh == len(rows.scene)
         scene = self.buffers[0].scene if alone else rows.scene
-        with autocast():
+        with autocast(self.device):
             output = self.head(rows.features.float(), scene, rows.descriptor)
         costs, errors = self._fresh_costs(output.points[:fresh], rows.part(slice(0, fresh)))
         loss = costs.mean()
@@ -188,7 +194,11 @@ class HeadTrainer:
         if not before:
             return
         with torch.no_grad():
-            found = torch.stack([loss.detach() for loss in losses]) if losses else torch.zeros(0)
+            found = (
+                torch.stack([loss.detach() for loss in losses])
+                if losses
+                else self.correction[:0, 0]
+            )
             average([found])
             changes = {name: value - before[name] for name, value in named.items()}
             gradients = {
@@ -209,7 +219,8 @@ class HeadTrainer:
             for i, slots in optimiser.state_dict()["state"].items():
                 state |= {f"optimiser.{which}.{i}.{name}": v for name, v in slots.items()}
         # Copies: training goes on while someone may be writing them.
-        return {k: v.clone() for k, v in state.items()} | {"step": torch.tensor(self.step)}
+        copies = {k: v.detach().cpu().clone() for k, v in state.items()}
+        return copies | {"step": torch.tensor(self.step)}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
         """Goes back to where `state()` was taken; the head must have the same shape."""

@@ -77,7 +77,7 @@ def _parts(tables: Tables) -> list[Section]:
     parts = [
         _table(rows, said)
         for rows, said in (
-            (tables.ablation, "After the paper's Table 4; bounds of a paired bootstrap"),
+            (tables.ablation, "After the paper's Table 4; 95 % bounds as below"),
             (tables.grid, "Final accuracy (TFR) by which frames stay and what replay costs"),
         )
         if len(rows) > 1
@@ -88,7 +88,7 @@ def _parts(tables: Tables) -> list[Section]:
 def _differences(tables: Tables) -> list[Section]:
     if len(tables.differences) <= 1:
         return []
-    said = "Paired bootstrap over runs and blocks of 10 frames; real where 0 lies outside."
+    said = "95 % bounds over runs and pieces of recording; real where 0 lies outside."
     return [Section("Differences", [_table(tables.differences, said)])]
 
 

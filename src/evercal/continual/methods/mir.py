@@ -54,9 +54,10 @@ class _MirHooks(ReplayHooks):
             ]
         rows = []
         for memory, views in zip(self.memories, self._views, strict=True):
-            where = torch.nonzero(torch.isin(memory.tensors["view"], views))[:, 0]
+            view = memory.tensors["view"]
+            where = torch.nonzero(torch.isin(view, views.to(view.device)))[:, 0]
             drawn = torch.randint(len(where), (self.each,), generator=generator)
-            rows.append(memory.rows(where[drawn]))
+            rows.append(memory.rows(where[drawn.to(where.device)]))
         return rows
 
     def state(self) -> dict[str, Tensor]:
@@ -85,7 +86,7 @@ def interfered_views(
         generator: of the draws.
     """
     drawn = torch.randperm(memory.views, generator=generator)[: method.candidates]
-    view = memory.tensors["view"]
+    view = memory.tensors["view"].cpu()
     starts = torch.searchsorted(view, drawn.to(view.dtype))
     ends = torch.searchsorted(view, drawn.to(view.dtype), right=True)
     offsets = torch.rand(len(drawn), method.view_rows, generator=generator)
@@ -102,7 +103,7 @@ def interfered_views(
             size = gradient.square().mean().sqrt().clamp(min=1e-12)
             parameter.sub_(rate * gradient / size)
     spoiled = _losses(moved, rows, len(drawn)) - before
-    return drawn[spoiled.topk(min(method.chosen, len(drawn))).indices]
+    return drawn[spoiled.topk(min(method.chosen, len(drawn))).indices.cpu()]
 
 
 @torch.no_grad()

@@ -80,7 +80,7 @@ def rows_each(start: StageStart) -> int:
 
 def teacher_output(teacher: Head, rows: Rows) -> HeadOutput:
     """What a frozen head says about rows."""
-    with torch.no_grad(), autocast():
+    with torch.no_grad(), autocast(rows.features.device):
         return teacher(rows.features.float(), rows.scene, rows.descriptor)
 
 

@@ -219,7 +219,7 @@ def mean_over_images(
     generator = torch.Generator().manual_seed(buffer.scene)
     parameters = dict(head.named_parameters())
     total = {name: torch.zeros_like(p) for name, p in parameters.items()}
-    view = buffer.tensors["view"]
+    view = buffer.tensors["view"].cpu()
     drawn = torch.randperm(buffer.views, generator=generator)[:images]
     for number in drawn.tolist():
         index = torch.nonzero(view == number)[:, 0]

@@ -1,0 +1,85 @@
+"""What a training step costs beside its matrix products, measured in the same run."""
+
+import time
+from collections.abc import Callable
+
+import torch
+from tabulate import tabulate
+
+from evercal.features.descriptor import load_descriptor
+from evercal.features.encoder import load_encoder
+from evercal.features.precision import fast_bfloat16
+from evercal.geometry import SE3
+from evercal.networks.buffer import FeatureBuffer
+from evercal.networks.head import Head, HeadOptions
+from evercal.networks.trainer import MUON_STEPS, FitOptions, HeadTrainer
+
+ROWS, VIEWS = 60_000, 100
+
+
+def run(widths: tuple[int, ...], batch: int, repeat: int) -> None:
+    """Prints a row for each width: milliseconds of processor time, and the share of the peak."""
+    rows = []
+    for width in widths:
+        trainer = _trainer(width, batch)
+        step = _milliseconds(trainer._train_step, repeat)
+        forward_backward, muon = _products(trainer.head, batch, repeat)
+        share = 100 * (forward_backward + muon) / step
+        rows.append([width, batch, step, forward_backward, muon, f"{share:.0f} %"])
+    kind = "bfloat16" if fast_bfloat16() else "float32"
+    print(f"{kind}, {torch.get_num_threads()} threads, processor time")
+    heads = ["width", "rows", "step ms", "products of the head ms", "of Muon ms", "share"]
+    print(tabulate(rows, heads, floatfmt=".1f"))
+
+
+def _trainer(width: int, batch: int) -> HeadTrainer:
+    encoder, descriptor = load_encoder(), load_descriptor()
+    generator = torch.Generator().manual_seed(0)
+    buffer = FeatureBuffer(0, SE3.identity())
+    pose = torch.eye(4)[:3].clone()
+    pose[2, 3] = 3.0
+    descriptors = torch.randn(VIEWS, descriptor.width, generator=generator)
+    buffer.restore(
+        {
+            "features": torch.randn(ROWS, encoder.width, generator=generator).half(),
+            "pixels": 200 * torch.rand(ROWS, 2, generator=generator),
+            "view": torch.arange(VIEWS, dtype=torch.int32).repeat_interleave(ROWS // VIEWS),
+            "intrinsics": torch.tensor([[200.0, 200.0, 160.0, 120.0]]).repeat(VIEWS, 1),
+            "camera_from_atlas": pose.repeat(VIEWS, 1, 1),
+            "descriptors": torch.nn.functional.normalize(descriptors, dim=-1),
+        }
+    )
+    head = Head(encoder.width, descriptor.width, HeadOptions(width=width))
+    head.grow(torch.zeros(4, 3), 0)
+    return HeadTrainer(head, [buffer], FitOptions(iterations=10_000, batch=batch), 0)
+
+
+def _products(head: Head, batch: int, repeat: int) -> tuple[float, float]:
+    """Milliseconds of the bare products of one step: forward and backward, and Muon's."""
+    kind = torch.bfloat16 if fast_bfloat16() else torch.float32
+    width, hidden = head.options.width, head.layers - 1
+    x, w = torch.randn(batch, width, dtype=kind), torch.randn(width, width, dtype=kind)
+    first, w0 = torch.randn(batch, head.features, dtype=kind), w[: head.features]
+    small = torch.randn(width, width, dtype=torch.bfloat16)
+
+    def layers() -> None:
+        for inputs, weights in [(first, w0)] * 2 + [(x, w)] * hidden:
+            y = torch.mm(inputs, weights)
+            torch.mm(inputs.T, y)
+            if inputs is x:
+                torch.mm(y, weights.T)
+
+    def newton_schulz() -> None:
+        for _ in range(hidden * MUON_STEPS * 3):
+            torch.mm(small, small)
+
+    return _milliseconds(layers, repeat), _milliseconds(newton_schulz, repeat)
+
+
+def _milliseconds(work: Callable[[], object], repeat: int) -> float:
+    for _ in range(3):
+        work()
+    began = time.process_time()
+    for _ in range(repeat):
+        work()
+    return 1000 * (time.process_time() - began) / repeat

@@ -1,0 +1,82 @@
+"""Tunes every method alike: three trials of its one setting, judged on held-out training frames."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from tabulate import tabulate
+
+from evercal.benchmark import results
+from evercal.benchmark.bench import BenchOptions, run_bench
+from evercal.benchmark.rows import strategy_from_row
+from evercal.benchmark.suites import load_suite, tuning_split
+from evercal.continual.presets import preset
+from evercal.continual.strategies import Strategy
+
+Trials = Sequence[Mapping[str, object]]
+WEIGHTS: Trials = [{"weight": w} for w in (0.1, 0.3, 1.0)]
+STRENGTHS: Trials = [{"strength": s} for s in (10.0, 100.0, 1000.0)]
+CLAMPS: Trials = [{"clamp_px": c} for c in (20.0, 50.0, 100.0)]
+ALPHAS: Trials = [{"alpha": a} for a in (0.15, 0.5, 1.5)]
+TRIALS: dict[str, Trials] = {
+    **dict.fromkeys(("er", "hybrid", "gdr", "gss", "mir", "lwf"), WEIGHTS),
+    **dict.fromkeys(("icarl", "buff_cs", "der", "co2l"), WEIGHTS),
+    **dict.fromkeys(("ewc", "ewc_online", "si", "mas"), STRENGTHS),
+    **dict.fromkeys(("agem", "gem"), CLAMPS),
+    **dict.fromkeys(("gec", "gec_moving"), ALPHAS),
+    "gpm": [{"kept_share": k} for k in (0.9, 0.97, 0.99)],
+    "sars_spdd": [{"penalty": {"scale": s}} for s in (1.0, 10.0, 50.0)],
+    "evercal_network": [{"weight": w} for w in (0.17, 0.5, 1.5)],
+}
+"""The setting of each method that is tuned; `finetune`, `joint` and `isolation` have none."""
+
+
+def run(suite: str, data: Path | None, scenes: int, out: Path, file: Path) -> None:
+    """Runs what is missing, and writes the best row of every method, best first in a table.
+
+    Args:
+        suite: whose first scenes are learned.
+        data: folder of its recordings.
+        scenes: how many of them.
+        out: folder of results; the same command goes on there.
+        file: JSON of `evercal bench --rows`; a folder beside it gets all outcomes.
+    """
+    recorded = load_suite(suite, data, (), None)[:scenes]
+    split = [tuning_split(scene) for scene in recorded]
+    rows = [row for name in TRIALS for row in _rows(name)]
+    strategies = tuple(strategy_from_row("tuning", row) for row in rows)
+    judged: dict[str, object] = {"suite": suite, "judged": "held-out training frames"}
+    options = BenchOptions(lambda seed: preset("bench", seed), strategies, (0,), settings=judged)
+    for step in run_bench(split, options, out):
+        print(f"[{step.done}/{step.total}] {step.strategy}", flush=True)
+    final = _final_accuracy(out, strategies, len(split))
+    best = [max(_rows(name), key=lambda row: final[str(row["name"])]) for name in TRIALS]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    chosen = [{**row, "name": row["of"]} for row in best]
+    file.write_text("[\n" + ",\n".join(f"  {json.dumps(row)}" for row in chosen) + "\n]\n")
+    told = [[row["of"], json.dumps(row["with"]), final[str(row["name"])]] for row in rows]
+    outcomes = file.with_suffix(".outcomes.jsonl")
+    outcomes.write_text(
+        "".join(
+            json.dumps({"method": of, "setting": setting, "accuracy_5cm_5deg": score}) + "\n"
+            for of, setting, score in told
+        )
+    )
+    print(tabulate(told, ["method", "setting", "5 cm/5 deg, held-out frames"], floatfmt=".1f"))
+
+
+def _rows(name: str) -> list[dict[str, object]]:
+    return [
+        {"name": f"{name}_{number}", "of": name, "with": changes}
+        for number, changes in enumerate(TRIALS[name])
+    ]
+
+
+def _final_accuracy(out: Path, strategies: tuple[Strategy, ...], stages: int) -> dict[str, float]:
+    """By strategy, per cent of the frames at the end, mean over scenes."""
+    found: dict[str, list[float]] = {strategy.name: [] for strategy in strategies}
+    for result in results.read(out):
+        if result.stage == stages - 1 and result.strategy in found:
+            found[result.strategy].append(100 * float(np.mean(result.correct())))
+    return {name: float(np.mean(values)) for name, values in found.items()}

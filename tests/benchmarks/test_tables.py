@@ -1,0 +1,126 @@
+"""Docs and data agree, and a number changed by hand does not go unseen."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks import tables
+from benchmarks.publish import FOLDER, groups_of, publish
+from evercal.benchmark import results
+from evercal.benchmark.published import read_published
+from evercal.errors import InputError
+from evercal.storage import write_json
+from tests.benchmark.test_comparison import lines
+
+
+def test_every_table_of_the_docs_is_what_its_data_say() -> None:
+    pages = tables.pages()
+    assert tables.DOCS / "results.md" in pages
+    for page in pages:
+        text = page.read_text()
+        assert tables.regenerated(text) == text, f"{page}: run 'python -m benchmarks tables'"
+
+
+def test_a_number_changed_by_hand_is_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "docs" / "results.md"
+    page.parent.mkdir()
+    before = (tables.DOCS / "results.md").read_text()
+    assert before.count("| 1.09 mm, 0.025 deg |") == 1
+    page.write_text(before.replace("| 1.09 mm, 0.025 deg |", "| 1.08 mm, 0.025 deg |"))
+    monkeypatch.setattr(tables, "DOCS", page.parent)
+    monkeypatch.setattr(tables.pages, "__defaults__", (page.parent,))
+    assert tables.run(check=True) == 1
+    assert "docs/results.md: out of date" in capsys.readouterr().out
+    assert tables.run(check=False) == 0
+    assert page.read_text() == before
+    assert tables.run(check=True) == 0
+
+
+def test_published_files_are_small_and_whole() -> None:
+    files = sorted(FOLDER.glob("*.jsonl"))
+    assert files
+    for file in files:
+        assert read_published(file).name == file.stem
+        assert file.stat().st_size < 500_000
+
+
+def test_other_pages_and_prose_stay_as_they_are() -> None:
+    text = "# Title\n\n| a |\n|---|\n| 1 |\n"
+    assert tables.regenerated(text) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<!-- table: mini accuracy -->\n| a |\n", "'<!-- end -->'"),
+        ("<!-- table: mini -->\n<!-- end -->\n", "not written"),
+        ("<!-- table: mini pie -->\n<!-- end -->\n", "'pie': choose one of methods"),
+        ("<!-- table: nothing accuracy -->\n<!-- end -->\n", r"nothing\.jsonl: no such results"),
+    ],
+)
+def test_what_cannot_be_made_is_named(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        tables.regenerated(text)
+
+
+def bench(folder: Path) -> Path:
+    write_json(folder / results.SETTINGS, {"suite": "two", "scenes": [["b", 9, 20], ["a", 9, 20]]})
+    for seed in (0, 1):
+        results.append(folder, lines("ours", seed, [[16], [14, 12 + seed]]))
+        results.append(folder, lines("theirs", seed, [[16], [4, 14]]))
+    results.append(folder, lines("single", 1, [[16], [10, 10]]))
+    return folder
+
+
+def test_one_run_stands_apart_from_several(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    publish(bench(tmp_path / "run"), "two", {}, out=tmp_path)
+    text = "<!-- table: two methods -->\n<!-- end -->\n<!-- table: two differences ours -->\n"
+    made = tables.regenerated(text + "<!-- end -->\n", tmp_path)
+    methods, differences = made.split("<!-- table: two differences ours -->")
+    for part, row in ((methods, "single"), (differences, "ours - single")):
+        several, alone = part.split(tables.ONE_RUN)
+        assert f"| {row} |" in alone
+        assert row not in several
+    # Finals 65 and 67.5; those of theirs 45.
+    assert "| ours | 2 | 66.2 ± 1.8 |" in methods
+    assert "| ours - theirs | +21.2 |" in differences
+    assert tables.regenerated(made, tmp_path) == made
+
+
+def test_without_several_runs_nothing_is_set_apart(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    folder = tmp_path / "run"
+    write_json(folder / results.SETTINGS, {})
+    results.append(folder, lines("ours", 0, [[16], [14, 12]]))
+    publish(folder, "one", {}, out=tmp_path)
+    text = "<!-- table: one scenes -->\n<!-- end -->\n"
+    assert tables.ONE_RUN not in tables.regenerated(text, tmp_path)
+    with pytest.raises(InputError, match="no strategy 'er'"):
+        tables.regenerated(text.replace("scenes", "differences er"), tmp_path)
+
+
+def test_rows_of_any_measurement(tmp_path: Path) -> None:
+    rows = [{"scene": "a", "x": 1.23456789, "n": 3, "lost": float("nan")}]
+    (tmp_path / "rows.json").write_text(json.dumps({"rows": rows, "settings": {"k": 1}}))
+    (tmp_path / "rows.jsonl").write_text(json.dumps({"scene": "a", "x": True}) + "\n")
+    peers = {"limit": 5, "scenes": {"a": [{"method": "sift", "accuracy": {"1 cm": 50.0}}]}}
+    (tmp_path / "peers.json").write_text(json.dumps(peers))
+    found = {
+        file.name: read_published(publish(file, file.stem, {}, out=tmp_path / "out"))
+        for file in sorted(tmp_path.glob("*.json*"))
+    }
+    assert found["rows.json"].rows == ({"scene": "a", "x": 1.23457, "n": 3, "lost": None},)
+    assert found["rows.json"].settings == {"k": 1}
+    assert found["rows.jsonl"].rows == ({"scene": "a", "x": True},)
+    assert found["peers.json"].rows == ({"scene": "a", "method": "sift", "1 cm": 50.0},)
+    assert found["peers.json"].settings == {"limit": 5}
+    grouped = publish(tmp_path / "rows.json", "g", groups_of(["all of it=a"]), out=tmp_path)
+    assert read_published(grouped).groups == {"all of it": ("a",)}
+    with pytest.raises(InputError, match="no row is called 'b'"):
+        publish(tmp_path / "rows.json", "g", {"both": ("a", "b")}, out=tmp_path)
+    with pytest.raises(InputError, match="TITLE=ROW"):
+        groups_of(["all"])
