@@ -144,8 +144,8 @@ class Bench:
     """Strategy, stages that were there, and whether the folder lies in the folder of results."""
 
     def __call__(self, scenes: list[Any], options: BenchOptions, folder: Path) -> Iterator[Any]:
-        (seed,) = options.seeds
-        strategy = options.strategies[0].name
+        (asked,), (seed,) = options.strategies, options.seeds
+        strategy = asked.name
         there = len({o.stage for o in read(folder)})
         self.began.append((strategy, there, "ray" in folder.parts))
         stops = self.fail.get(strategy, [])

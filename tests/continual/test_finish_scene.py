@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from evercal.continual.finish_scene import memory_bytes
 from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.learn import learn
 from evercal.continual.methods.method import FinishedScene, Method, StageStart
@@ -21,7 +22,7 @@ from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Store
 from evercal.networks.hooks import TrainingHooks
 
-from .stages import Blank, Rooms, continued, outcome, weights
+from .stages import Blank, Rooms, assert_same, continued, outcome, weights
 
 STATEFUL = ["gec", "der", "ewc", "ewc_online", "si", "mas", "gpm"]
 
@@ -101,6 +102,29 @@ def test_states_reach_the_next_stage_and_count_as_memory(
     assert second.memory_bytes == images + size
     assert size > 0
     assert all(bool(v.isfinite().all()) for state in second.method_states for v in state.values())
+
+
+def test_only_what_later_stages_look_at_counts_as_memory(
+    first: dict[str, SceneMaps], rooms: Rooms, quick: StageOptions
+) -> None:
+    """Two scenes of EWC cost two anchors, a running sum one; and the rest is really not read."""
+    sizes = {}
+    for name in ("ewc", "ewc_online", "si", "mas", "gpm"):
+        strategy = STRATEGIES[name]
+        second = outcome(continued(first[name], rooms, quick))
+        states = [sum(v.nbytes for v in state.values()) for state in second.method_states]
+        sizes[name] = memory_bytes(second, strategy) / states[-1]
+        assert memory_bytes(first[name], strategy) == first[name].memory_bytes
+        blanked = second.copy_for_training()
+        if name != "ewc":
+            assert memory_bytes(second, strategy) == states[-1]
+            blanked.method_states[0] = {}
+            third, again = (
+                outcome(learn(maps, strategy, rooms[2], quick)) for maps in (second, blanked)
+            )
+            assert_same(weights(third.heads[0]), weights(again.heads[0]))
+    assert sizes.pop("ewc") > 1.8  # the head has grown a little
+    assert set(sizes.values()) == {1.0}
 
 
 @pytest.mark.parametrize("name", ["ewc", "ewc_online", "si", "mas", "gpm", "der"])

@@ -93,9 +93,8 @@ def test_the_example_learns_two_scenes(blank: Blank, rooms: Rooms, quick: StageO
     """Its frames are replayed, with its penalty: without a weight it ends elsewhere."""
     (name,) = load_plugin(EXAMPLE)
     strategy = strategy_named(name)
-    maps = blank(name)
-    for scene in rooms[:2]:
-        before, maps = maps, outcome(learn(maps, strategy, scene, quick))
+    before = outcome(learn(blank(name), strategy, rooms[0], quick))
+    maps = outcome(learn(before, strategy, rooms[1], quick))
     assert [len(kept) for kept in maps.keyframes if kept is not None] == [3, 3]
     method = strategy.method
     assert method is not None

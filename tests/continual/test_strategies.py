@@ -108,6 +108,7 @@ def test_neighbours_differ_in_what_their_names_say() -> None:
 def test_the_paper_is_replayed_as_it_is_printed() -> None:
     """SARS with the fixed radius, the teacher alone, all weights 1, tau 2, 50 active centres."""
     method = STRATEGIES["sars_spdd"].method
+    assert isinstance(method, Replay)
     assert method == Replay("sars", Distillation(), weight=1.0)
     assert isinstance(method.penalty, Distillation)
     options = method.penalty.options

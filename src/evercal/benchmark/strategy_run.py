@@ -12,7 +12,7 @@ import torch
 
 from evercal.benchmark.results import NETWORK, UNALIGNED, SceneResult, scene_result
 from evercal.benchmark.scene_views import keep_views
-from evercal.continual.finish_scene import Learned, finished_stage
+from evercal.continual.finish_scene import Learned, finished_stage, memory_bytes
 from evercal.continual.learn_jointly import learn_jointly
 from evercal.continual.learn_scene import (
     LearnOptions,
@@ -208,7 +208,7 @@ class _Run:
                 seed=self.stage.seed,
                 stage=number,
                 seconds=seconds,
-                memory_bytes=maps.memory_bytes,
+                memory_bytes=memory_bytes(maps, self.strategy),
                 head_bytes=size,
                 frames_kept=len(keyframes.images) if keyframes else 0,
                 **(_spread(maps, number, self.scenes) if scene.name == newest else {}),

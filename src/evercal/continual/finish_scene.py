@@ -92,6 +92,14 @@ def _state(maps: SceneMaps, method: Method, scene: Learned, options: StageOption
     )
 
 
+def memory_bytes(maps: SceneMaps, strategy: Strategy) -> int:
+    """Size of all that later stages look at: keyframes and the method states that are needed."""
+    if strategy.method is None:
+        return maps.memory_bytes
+    needed = list(strategy.method.needed(maps.method_states))
+    return replace(maps, method_states=needed).memory_bytes
+
+
 def sized(options: MapOptions, maps: SceneMaps) -> MapOptions:
     """The options at the working size of a store."""
     return replace(options, size=replace(options.size, cells=maps.short_side))

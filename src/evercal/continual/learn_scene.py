@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 from filelock import FileLock, Timeout
 
+from evercal.continual.finish_scene import memory_bytes
 from evercal.continual.learn import learn
 from evercal.continual.stage import Encoding, Stage, StageOptions
 from evercal.continual.strategies import STRATEGIES, Strategy
@@ -168,7 +169,7 @@ def _learn_scene(
         scene.name,
         time.perf_counter() - began,
         stage.iterations,
-        maps.memory_bytes,
+        memory_bytes(maps, options.strategy),
         sum(head_bytes(head) for head in maps.heads),
         stage.frames_kept,
         len(train),

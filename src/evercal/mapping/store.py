@@ -145,15 +145,13 @@ class Store:
         if problems:
             raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
         schema = payload.get("schema")
-        if schema == 1:
+        if isinstance(schema, int) and schema < SCHEMA:
             raise InputError(
-                f"store {root}: schema 1 is of an earlier evercal; learn the scenes again into a"
-                " new store"
+                f"store {root}: schema {schema} is of an earlier evercal; learn the scenes again"
+                " into a new store"
             )
         if schema != SCHEMA:
-            older = isinstance(schema, int) and schema < SCHEMA
-            todo = "learn its scenes again" if older else "update evercal"
-            raise InputError(f"store {root}: schema {schema!r}, this evercal has {SCHEMA}; {todo}")
+            raise InputError(f"store {root}: schema {schema!r} is not {SCHEMA}; update evercal")
         networks = payload["networks"]
         local, descriptor = (str(name) for name in networks)  # type: ignore[attr-defined]
         maps = SceneMaps(

@@ -1,4 +1,4 @@
-"""Constraints hold for the step that is taken, whatever the optimisers make of a gradient."""
+"""Constraints hold for the step that is really taken, whatever optimisers make of a gradient."""
 
 import copy
 import itertools

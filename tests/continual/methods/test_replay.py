@@ -1,4 +1,4 @@
-"""Replay: how many rows of which scenes, what they cost, and what is stored beside them."""
+"""Replay: rows of which scenes, what they cost together, and what is stored beside them."""
 
 import copy
 from dataclasses import dataclass, replace

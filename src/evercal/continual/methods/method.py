@@ -85,6 +85,10 @@ class Method:
         """What is kept of a finished scene beside its keyframes."""
         return {}
 
+    def needed(self, states: Sequence[MethodState]) -> Sequence[MethodState]:
+        """Those of the states so far that later stages look at, and that count as memory."""
+        return states
+
 
 def described(record: object) -> dict[str, object]:
     """A dataclass as plain data: its class under `kind`, and its fields."""

@@ -1,12 +1,13 @@
 """Gradient projection memory: steps stay out of the subspaces that earlier scenes use."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from evercal.continual.methods.method import FinishedScene, Method, StageStart
+from evercal.continual.methods.method import FinishedScene, Method, MethodState, StageStart
 from evercal.continual.methods.preconditioning import ROWS, input_moments
 from evercal.networks.buffer import FeatureBuffer
 from evercal.networks.head import Head
@@ -47,6 +48,10 @@ class GradientProjectionMemory(Method):
             found[f"basis.{name}"] = grown_basis(old, moment, self.kept_share).half().cpu()
         return found
 
+    def needed(self, states: Sequence[MethodState]) -> Sequence[MethodState]:
+        """The newest bases hold all earlier ones."""
+        return states[-1:]
+
 
 class _ProjectedSteps(TrainingHooks):
     edits_steps = True
@@ -55,10 +60,12 @@ class _ProjectedSteps(TrainingHooks):
         head = start.head
         found = {k.removeprefix("basis."): b for k, b in start.states[-1].items()}
         # Stored in half precision, columns are orthonormal to three digits only.
-        bases = {k: torch.linalg.qr(b.to(head.logit)).Q for k, b in found.items()}
+        bases: dict[str, Tensor] = {}
+        for name, basis in found.items():
+            bases[name] = torch.linalg.qr(basis.to(head.logit)).Q
         outputs = bases.pop(OUTPUTS)
         shared = _shared_outputs(head)
-        self._bases: dict[str, Tensor] = {**bases, **dict.fromkeys(shared, outputs)}
+        self._bases: dict[str, Tensor] = bases | dict.fromkeys(shared, outputs)
         layers = [k.removesuffix("weight") + "bias" for k in bases]
         self._still = [*layers, *(f"{name}_bias" for name in shared)]
         earlier = len(start.states)

@@ -50,6 +50,10 @@ class WeightRegularization(Method):
         anchors = {f"anchor.{k}": _half(v.detach()) for k, v in scene.head.named_parameters()}
         return anchors | {f"importance.{k}": _half(v) for k, v in found.items()}
 
+    def needed(self, states: Sequence[MethodState]) -> Sequence[MethodState]:
+        """The newest alone where there is a running sum."""
+        return states[-1:] if self.running else states
+
     def importance(self, scene: FinishedScene) -> dict[str, Tensor]:
         """How much every weight mattered for a finished scene, by parameter name."""
         raise NotImplementedError
@@ -58,8 +62,7 @@ class WeightRegularization(Method):
 class _TiedWeights(TrainingHooks):
     def __init__(self, method: WeightRegularization, start: StageStart):
         self.method, self._head = method, start.head
-        states = start.states[-1:] if method.running else start.states
-        self._ties = [_ties(state, start.head) for state in states]
+        self._ties = [_ties(state, start.head) for state in method.needed(start.states)]
 
     def regularizer(self) -> Tensor | None:
         return self.method.strength * tie_cost(self._head, self._ties)
@@ -161,7 +164,7 @@ class _PathIntegral(TrainingHooks):
 
     def __init__(self, method: SynapticIntelligence, start: StageStart):
         self.method, self._head = method, start.head
-        self._ties = [_ties(state, start.head) for state in start.states[-1:]]
+        self._ties = [_ties(state, start.head) for state in method.needed(start.states)]
         named = dict(start.head.named_parameters())
         self._path = {name: torch.zeros_like(value) for name, value in named.items()}
         self._first = {name: value.detach().clone() for name, value in named.items()}
