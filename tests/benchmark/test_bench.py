@@ -15,7 +15,14 @@ import torch
 from evercal.benchmark import bench, strategy_run
 from evercal.benchmark.bench import BenchOptions, begin_bench, in_order, run_bench
 from evercal.benchmark.comparison import runs_of
-from evercal.benchmark.results import RESULTS, STRATEGIES, SceneResult, read, read_strategies
+from evercal.benchmark.results import (
+    NETWORK,
+    RESULTS,
+    STRATEGIES,
+    SceneResult,
+    read,
+    read_strategies,
+)
 from evercal.benchmark.strategy_run import RunOptions
 from evercal.benchmark.suites import SUITES, load_suite, regions, tuning_split
 from evercal.continual.methods.replay import Replay
@@ -285,7 +292,7 @@ def test_joint_training_may_build_maps_too(
     found = read(tmp_path)
     ours = {o.scene: o for o in found if o.strategy == "joint_map"}
     # Its network alone is judged beside both together, and remembers nothing.
-    alone = [o for o in found if o.strategy == "joint_map:network"]
+    alone = [o for o in found if o.strategy == "joint_map" + NETWORK]
     assert {o.scene for o in alone} == {"one", "two"}
     plain = {o.scene: o for o in read(done[0]) if o.strategy == "joint"}
     assert ours.keys() == plain.keys() == {"one", "two"}

@@ -24,6 +24,7 @@ from evercal.datasets.frame import Scene
 from evercal.errors import InputError
 from evercal.geometry.se3 import SE3
 from evercal.localization import acceptance
+from evercal.localization.acceptance import MAX_SUPPORT, MIN_SUPPORT
 from evercal.localization.localizer import Localizer
 from evercal.mapping.build import Mapping
 from evercal.mapping.stage_files import head_bytes
@@ -330,7 +331,7 @@ def test_a_map_is_learned_without_a_step(
         assert report.adjusted is not None
         assert report.adjusted.residual_px < 0.5
         assert report.adjusted.wrong_poses == ()
-        assert 0.5 <= record.min_support <= 1.5
+        assert MIN_SUPPORT <= record.min_support <= MAX_SUPPORT
         assert record.refined_camera is not None
     whats = {event.what for event in events if isinstance(event, Mapping)}
     assert whats == {"encoding", "mapping", "adjusting"}

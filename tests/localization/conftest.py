@@ -6,7 +6,7 @@ oracle looks up what that view sees at that cell and says the true point, in clo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import cast
@@ -28,6 +28,15 @@ from evercal.simulation.box_room import BoxRoom, default_camera
 
 SHORT = 120
 CAMERA = default_camera(160, 120)
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """torch with two threads, whatever the machine has."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
 
 
 @cache

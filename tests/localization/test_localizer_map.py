@@ -187,15 +187,12 @@ def test_support_decides(hall: Scene, hall_maps: SceneMaps, answers: list[PoseEs
             assert found.base_from_camera is None
 
 
-def test_a_batch_says_the_same(
-    hall: Scene, hall_maps: SceneMaps, answers: list[PoseEstimate]
+def test_a_batch_says_the_same_to_the_last_bit(
+    two_threads: None, hall: Scene, hall_maps: SceneMaps
 ) -> None:
-    frames = hall.test[1:9:2]
-    localizer = Localizer(hall_maps)
-    batch = localizer.localize_batch([f.read_image() for f in frames], [f.camera for f in frames])
-    for found, single in zip(batch, answers, strict=False):
-        assert (found.status, found.scene) == (single.status, single.scene)
-        assert found.base_from_camera is not None
-        assert single.base_from_camera is not None
-        # Products of other shapes may be summed in another order.
-        assert pose_distance(found.base_from_camera, single.base_from_camera)[0] < 1e-3
+    frames, localizer = hall.test[1:13:2], Localizer(hall_maps)
+    alone = [localizer.localize(f.read_image(), f.camera) for f in frames]
+    # Threads that have decoded no keyframe yet get in each other's way most.
+    for batch in (localizer, Localizer(hall_maps)):
+        found = batch.localize_batch([f.read_image() for f in frames], [f.camera for f in frames])
+        assert [everything(a) for a in found] == [everything(a) for a in alone]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from evercal.mapping.patches import (
     SIDE,
+    Patches,
     align_down,
     align_patches,
     cut_patches,
@@ -210,3 +211,23 @@ def test_edges_are_located_across_and_not_along() -> None:
     patch = cut_patches(stripes, np.array([[80.0, 60.0]]))
     white = whitening(np.eye(2)[None], patch.inverse_hessian, 0.1, 0.8)[0]
     assert np.linalg.norm(white @ [1, 0]) > 20 * np.linalg.norm(white @ [0, 1])
+
+
+def test_an_error_along_one_line_is_whitened_too() -> None:
+    rng = np.random.default_rng(0)
+    affines = rng.normal(0, 0.2, (7, 2, 2)) + np.eye(2)
+    root = rng.normal(0, 0.3, (7, 2, 2))
+    hessian = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(2)
+    line = rng.normal(0, 0.5, (7, 2))
+    for i, white in enumerate(whitening(affines, hessian, 0.1, 0.8, line)):
+        spread = affines[i] @ hessian[i] @ affines[i].T + 0.01 * np.eye(2)
+        whole = 0.64 * spread + np.outer(line[i], line[i])
+        np.testing.assert_allclose(white @ whole @ white.T, np.eye(2), atol=1e-9)
+
+
+def test_sets_of_patches_are_joined_in_order() -> None:
+    plain, at = image(picture(0), np.eye(2), np.zeros(2)), spots(20)
+    whole = cut_patches(plain, at)
+    parts = Patches.joined([cut_patches(plain, at[:7]), cut_patches(plain, at[7:])])
+    for name in ("intensity", "descent", "inverse_hessian", "rest"):
+        np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), atol=1e-6)

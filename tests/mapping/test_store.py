@@ -206,8 +206,8 @@ def changed(root: Path, **change: object) -> None:
 
 def test_a_store_of_another_version_is_refused(taught: Stages, tmp_path: Path, make: Make) -> None:
     make(tmp_path, taught["evercal_network"][:1])
-    changed(tmp_path, schema=3)
-    with pytest.raises(InputError, match=r"schema 3 .*update evercal"):
+    changed(tmp_path, schema=4)
+    with pytest.raises(InputError, match=r"schema 4 .*update evercal"):
         Store.open(tmp_path)
 
 

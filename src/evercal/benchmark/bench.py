@@ -99,7 +99,7 @@ def run_bench(
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
         stage, device = options.stage(seed), device_of(options.device)
-        how = RunOptions(stage, options.short_side, features, device, out)
+        how = RunOptions(stage, options.short_side, features, out, device)
         for stage, these in run_strategy(strategy, ordered, how, on_event):
             if (strategy.name, seed, stage) not in found:
                 results.append(out, these)

@@ -26,6 +26,7 @@ from evercal.continual.stage_rows import encoded, scene_buffer, view_plan
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.datasets import Frame, Scene, known_poses
 from evercal.evaluation.protocol import evaluate
+from evercal.features.device import device_of
 from evercal.features.feature_cache import cache_features
 from evercal.localization.acceptance import fitted_record
 from evercal.localization.localizer import Localizer
@@ -51,10 +52,10 @@ class RunOptions:
     """Working size of images, pixels."""
     features: Path
     """Folder of encoded views, shared by all runs."""
-    device: torch.device
-    """What the networks run on."""
     out: Path
     """Folder of results; stores under way are in its folder `runs`."""
+    device: str | torch.device = "cpu"
+    """What the networks run on."""
 
 
 def run_strategy(
@@ -95,7 +96,7 @@ class _Run:
             if number >= len(Store.open(self.store).stages):
                 learn_scene(self.store, self.scenes[number], self._how(), self.on_event)
             opened = Store.open(self.store)
-            opened.maps.to(self.options.device)
+            opened.maps.to(device_of(self.options.device))
             self._cached(opened.maps)
             seconds = float(opened.report()["seconds"])
             yield number, self._judge(opened.maps, number, seconds)
@@ -127,7 +128,7 @@ class _Run:
             learn_scene(shared, scene, self._how(STRATEGIES["finetune"]), self.on_event)
         first = Store.open(shared)
         began = time.perf_counter()
-        maps = first.maps.copy_for_training().to(self.options.device)
+        maps = first.maps.copy_for_training().to(device_of(self.options.device))
         maps.strategy, maps.keyframes, maps.method_states = self.strategy.name, [], []
         self._cached(maps)
         train, aside = validation_split(scene.train)
@@ -157,7 +158,7 @@ class _Run:
     def jointly(self) -> Iterator[tuple[int, tuple[SceneResult, ...]]]:
         """See `run_strategy`; a killed run begins anew."""
         shutil.rmtree(self.store, ignore_errors=True)
-        maps = open_or_create(self.store, self._how()).maps.to(self.options.device)
+        maps = open_or_create(self.store, self._how()).maps.to(device_of(self.options.device))
         self._cached(maps)
         split = [validation_split(scene.train) for scene in self.scenes]
         train_splits = [replace(s, train=t) for s, (t, _) in zip(self.scenes, split, strict=True)]

@@ -1,5 +1,6 @@
 """`evercal localize`."""
 
+import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,6 +46,9 @@ class Localize:
             if not path.is_file():
                 raise InputError(f"{path}: image file is missing; check the path")
         camera = camera_for(self.camera, self.images)
+        # Threads of torch that wait for each other by spinning take ten times as long where other
+        # programs use the cores. It is read once, when torch is loaded.
+        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
         from evercal.localization.localizer import Localizer
 
         localizer = Localizer.open(self.store, device=self.device)
@@ -65,19 +69,24 @@ class Localize:
     ) -> list[tuple[Path, "PoseEstimate", float]]:
         """Per image its path, the answer and the milliseconds that it took, decoding included."""
         from evercal.datasets import read_image, write_image
+        from evercal.localization.parallel import in_parallel
         from evercal.reports.pictures import draw_estimate, scene_camera
+
+        def answer(number: int) -> tuple[Path, "PoseEstimate", float]:
+            path, began = self.images[number], time.perf_counter()
+            image = read_image(path)
+            estimate = localizer.localize(image, camera)
+            ms = 1000 * (time.perf_counter() - began)
+            if self.overlay is not None and estimate.scene is not None:
+                lens = camera or scene_camera(localizer, estimate.scene)
+                drawn = draw_estimate(image, estimate, lens)
+                write_image(self.overlay / self._overlay_name(number), drawn)
+            return path, estimate, ms
 
         answers = []
         with progress_bar("localizing", len(self.images), "image") as bar:
-            for number, path in enumerate(self.images):
-                began = time.perf_counter()
-                image = read_image(path)
-                estimate = localizer.localize(image, camera)
-                answers.append((path, estimate, 1000 * (time.perf_counter() - began)))
-                if self.overlay is not None and estimate.scene is not None:
-                    lens = camera or scene_camera(localizer, estimate.scene)
-                    drawn = draw_estimate(image, estimate, lens)
-                    write_image(self.overlay / self._overlay_name(number), drawn)
+            for found in in_parallel(answer, range(len(self.images))):
+                answers.append(found)
                 bar.update()
         return answers
 

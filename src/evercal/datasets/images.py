@@ -65,11 +65,9 @@ def decode_image(data: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
     import cv2
 
     # A rotated image would not fit the intrinsics, which are those of the sensor.
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(data, flags) if data.size else None
-    if image is None:
-        return None
-    return np.ascontiguousarray(image[:, :, ::-1]).astype(np.uint8, copy=False)
+    return None if image is None else image.astype(np.uint8, copy=False)
 
 
 def image_file(data: bytes) -> tuple[str, bytes] | None:

@@ -51,8 +51,8 @@ class _Residual(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         y = x
         for i, layer in enumerate(self.layers):
-            y = layer(y) if i == 2 else F.relu(layer(y))
-        return F.relu(x + y)
+            y = layer(y) if i == 2 else F.relu(layer(y), inplace=True)
+        return F.relu(y + x, inplace=True)
 
 
 class LocalEncoder(nn.Module):
@@ -108,7 +108,7 @@ class LocalEncoder(nn.Module):
         x = standardise(grey[..., :height, :width])
         x = F.pixel_unshuffle(x, 2).contiguous(memory_format=torch.channels_last)
         for layer in self.stem:
-            x = F.relu(layer(x))
+            x = F.relu(layer(x), inplace=True)
         for block in self.blocks:
             x = block(x)
         return F.normalize(self.project(x).float(), dim=1)

@@ -23,11 +23,11 @@ def axis_deviation(covariance: Array) -> tuple[float, float]:
     return 1000 * float(metres), float(np.rad2deg(radians))
 
 
-def with_translation_by(matrix: Array, covariance: Array) -> Array:
+def with_translation_by(matrix: ArrayLike, covariance: ArrayLike) -> Array:
     """(6, 6) covariance after the translation alone was multiplied by a matrix (3, 3).
 
     A rotation matrix gives it in the axes of another parent frame.
     """
     whole = np.eye(6)
     whole[:3, :3] = matrix
-    return whole @ covariance @ whole.T
+    return whole @ np.asarray(covariance, dtype=np.float64) @ whole.T

@@ -1,10 +1,11 @@
 """Which poses are accepted, fitted when a scene is learned.
 
 A pose of a map is accepted by its support: the share of the landmarks that should be visible and
-agree with the pose to a pixel, times the share that these are of all whose patch was found nearby,
-times the square root of their number. The first factor falls where another room is seen, the second
-where patches were found by chance; a hand before the lens lowers the first alone. Without a map it
-is the share of the image's patches that agree.
+agree with the pose to a pixel, times the square of the share that these are of all whose patch was
+found nearby, times the square root of their number, counted as if no more had been looked for than
+for an ordinary image. The first factor falls where another room is seen, the second where patches
+were found by chance; a hand before the lens lowers the first alone. Without a map it is the share
+of the image's patches that agree.
 """
 
 from collections.abc import Sequence
@@ -25,9 +26,9 @@ ACCEPTANCE_FRACTION = 1 / 6
 """Where the threshold lies between the inlier ratios of negative and of positive images."""
 
 
-MAX_SUPPORT = 0.7
-"""Support that no image of another room reached (docs/experiments/acceptance.md)."""
-MIN_SUPPORT = 0.25
+MAX_SUPPORT = 0.36
+"""Support that no image of another room reached (docs/experiments/map.md)."""
+MIN_SUPPORT = 0.14
 """Where the stated poses of a recording fit the images badly, right poses have little support: the
 threshold then falls to half of what held-out frames have, but not below this."""
 MAP_COVARIANCE_SCALE = 1.3

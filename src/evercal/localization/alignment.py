@@ -1,7 +1,8 @@
 """Alignment: landmarks of keyframes are found in an image to a tenth of a pixel, then the pose."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from evercal.localization.keyframe_bank import LoadedKeyframe
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import RefinedPose, refine_pose
 from evercal.mapping.landmarks import project_surface
-from evercal.mapping.patches import align_patches, from_level, to_level, whitening
+from evercal.mapping.patches import Patches, align_patches, from_level, to_level, whitening
 
 Array = NDArray[np.floating]
 
@@ -26,7 +27,9 @@ class AlignmentRound:
     iterations: int
     """Alignment steps of every patch."""
     landmarks: int
-    """Landmarks looked for, at most."""
+    """Landmarks looked for, at most; more of them where few are found."""
+    steps: int
+    """Steps of the pose, at most."""
     reach_px: float
     """How far from where it was expected a landmark may be found, pixels of the image."""
 
@@ -36,11 +39,17 @@ class AlignmentOptions:
     """How landmarks are looked for in an image."""
 
     rounds: tuple[AlignmentRound, ...] = (
-        AlignmentRound(1, 6, 300, 24.0),
-        AlignmentRound(0, 4, 600, 6.0),
-        AlignmentRound(0, 3, 900, 3.0),
+        AlignmentRound(1, 6, 300, 3, 24.0),
+        AlignmentRound(0, 4, 300, 3, 6.0),
+        AlignmentRound(0, 3, 900, 10, 3.0),
     )
     """From coarse to fine."""
+    enough_found: float = 0.4
+    """Where a smaller share of the landmarks was found in one round, the next looks for as many
+    more,"""
+    most_more: float = 3.0
+    """but at most for so many times as many: of an image that is covered, or seen from far, the
+    precision lies in the few that can be found."""
     min_correlation: float = 0.7
     """Smallest normalised cross-correlation of a landmark that was found."""
     min_found: int = 12
@@ -67,6 +76,8 @@ class Alignment:
     """(n, 2) landmarks that agree, pixels of the image."""
     points_m: Array
     """(n, 3) the same in the base frame."""
+    planned: int
+    """Landmarks that the last round would have looked for, had enough of them been found before."""
 
     @property
     def share(self) -> float:
@@ -80,6 +91,39 @@ class _Found:
     pixels: Array
     points_m: Array
     whitening: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """The landmarks of some keyframes as one set."""
+
+    keyframes: Sequence[LoadedKeyframe]
+    starts: NDArray[np.int64]
+    """(keyframes + 1,) the first landmark of each, and their number."""
+    surface_m: Array
+    """(3, n, 3), see `LoadedKeyframe`."""
+    depth_error_m: Array
+    """(n, 3) where a landmark may move for its depth is uncertain: one standard deviation."""
+
+    @classmethod
+    def of(cls, keyframes: Sequence[LoadedKeyframe]) -> Self:
+        """Of keyframes in their order."""
+        surfaces = [keyframe.surface_m for keyframe in keyframes]
+        counts = [surface.shape[1] for surface in surfaces]
+        errors = [k.depth_noise[:, None] * (k.surface_m[0] - k.position_m) for k in keyframes]
+        starts = np.cumsum([0, *counts])
+        return cls(keyframes, starts, np.concatenate(surfaces, 1), np.concatenate(errors))
+
+    def patches(self, level: int, which: NDArray[np.int64]) -> Patches:
+        """Templates of some landmarks in rising order."""
+        ends = np.searchsorted(which, self.starts)
+        parts = [
+            keyframe.patches[level].take(which[a:b] - start)
+            for keyframe, start, a, b in zip(
+                self.keyframes, self.starts, ends, ends[1:], strict=False
+            )
+        ]
+        return Patches.joined(parts)
 
 
 def align_pose(
@@ -102,9 +146,13 @@ def align_pose(
         None where too few landmarks are found.
     """
     pose, refined, found = start, None, None
+    target = _Target.of(keyframes)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     for number, step in enumerate(options.rounds):
-        found = _look(pyramid, camera, keyframes, pose, step, options)
+        share = 1.0 if found is None else len(found.pixels) / found.expected
+        more = min(max(1.0, options.enough_found / max(share, 1e-3)), options.most_more)
+        wider = replace(step, landmarks=int(more * step.landmarks))
+        found = _look(pyramid, camera, target, pose, wider, options)
         if len(found.pixels) < options.min_found:
             return None
         ideal = _undistorted(found.pixels, camera)
@@ -115,7 +163,7 @@ def align_pose(
             if rough is None:
                 return None
             pose = rough.world_from_camera
-        refined = refine_pose(ideal, found.points_m, found.whitening, intrinsics, pose)
+        refined = refine_pose(ideal, found.points_m, found.whitening, intrinsics, pose, step.steps)
         pose = refined.base_from_camera
     assert refined is not None
     assert found is not None
@@ -128,13 +176,14 @@ def align_pose(
         len(found.pixels),
         found.pixels[agree],
         found.points_m[agree],
+        min(found.expected, options.rounds[-1].landmarks),
     )
 
 
 def _look(
     pyramid: Sequence[Array],
     camera: Camera,
-    keyframes: Sequence[LoadedKeyframe],
+    target: _Target,
     pose: SE3,
     step: AlignmentRound,
     options: AlignmentOptions,
@@ -142,28 +191,31 @@ def _look(
     """Landmarks of all keyframes in one round."""
     inverse = pose.inverse()
     turn, shift = inverse.rotation_matrix(), inverse.translation_m
-    seen = [project_surface(k.surface_m, turn, shift, camera) for k in keyframes]
-    every = max(1, -(-sum(len(which) for which, _, _ in seen) // step.landmarks))
-    parts, expected = [], 0
-    for keyframe, (which, pixels, affines) in zip(keyframes, seen, strict=True):
-        which, pixels, affines = which[::every], pixels[::every], affines[::every]
-        if not len(which):
-            continue
-        expected += len(which)
-        patches = keyframe.patches[step.level].take(which)
-        at, correlation = align_patches(
-            patches, pyramid[step.level], to_level(pixels, step.level), affines, step.iterations
-        )
-        at = from_level(at.astype(np.float64), step.level)
-        good = correlation > options.min_correlation
-        good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
-        spread = patches.inverse_hessian[good]
-        white = whitening(affines[good], spread, options.floor_px, options.noise * 2**step.level)
-        parts.append((at[good], keyframe.surface_m[0, which[good]], white))
-    if not parts:
+    which, pixels, affines = project_surface(target.surface_m, turn, shift, camera)
+    every = max(1, -(-len(which) // step.landmarks))
+    which, pixels, affines = which[::every], pixels[::every], affines[::every]
+    if not len(which):
         none = np.zeros((0, 2))
         return _Found(0, none, np.zeros((0, 3)), np.zeros((0, 2, 2)))
-    return _Found(expected, *(np.concatenate(column) for column in zip(*parts, strict=True)))
+    patches = target.patches(step.level, which)
+    at, correlation = align_patches(
+        patches, pyramid[step.level], to_level(pixels, step.level), affines, step.iterations
+    )
+    at = from_level(at.astype(np.float64), step.level)
+    good = correlation > options.min_correlation
+    good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
+    spread = patches.inverse_hessian[good]
+    which, noise = which[good], options.noise * 2**step.level
+    error = _shift_px(target.surface_m[0, which], target.depth_error_m[which], turn, shift, camera)
+    white = whitening(affines[good], spread, options.floor_px, noise, error)
+    return _Found(len(good), at[good], target.surface_m[0, which], white)
+
+
+def _shift_px(points: Array, moves: Array, turn: Array, shift: Array, camera: Camera) -> Array:
+    """(n, 2) how far points (n, 3) move in the ideal pinhole where they move by `moves` (n, 3)."""
+    local, move = points @ turn.T + shift, moves @ turn.T
+    plane = move[:, :2] - local[:, :2] * (move[:, 2:] / local[:, 2:])
+    return plane / local[:, 2:] * [camera.fx, camera.fy]
 
 
 def _undistorted(pixels: Array, camera: Camera) -> Array:

@@ -8,7 +8,6 @@ source gives 2D-3D correspondences and one solver takes them all.
 import os
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Self
@@ -19,13 +18,14 @@ from torch import Tensor
 
 from evercal.errors import InputError
 from evercal.features.device import device_of
-from evercal.features.encode import ENCODE_BATCH, encode_features
+from evercal.features.encode import encode_features
 from evercal.features.views import View, ViewOptions, plain_view
 from evercal.geometry.camera import Camera
 from evercal.localization.alignment import Alignment, align_pose
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.matching import Matcher
+from evercal.localization.parallel import in_parallel
 from evercal.localization.pnp import PnpResult, solve_pnp
 from evercal.localization.query import Attempt, Candidate, Hypothesis, LocalizeOptions, Query
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord
@@ -103,24 +103,9 @@ class Localizer:
     def localize_batch(
         self, images: Sequence[np.ndarray], cameras: Sequence[Camera | None]
     ) -> list[PoseEstimate]:
-        """`localize` for many images: encoded several at once, poses found in parallel."""
-        answers: dict[int, PoseEstimate] = {}
-        views = [self._prepare(image, c) for image, c in zip(images, cameras, strict=True)]
-        by_shape: dict[tuple[int, ...], list[int]] = {}
-        for i, view in enumerate(views):
-            by_shape.setdefault(view.grey.shape, []).append(i)
-        with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
-            for group in by_shape.values():
-                for start in range(0, len(group), ENCODE_BATCH):
-                    chunk = group[start : start + ENCODE_BATCH]
-                    began = time.perf_counter()
-                    features = self._encode([views[i] for i in chunk])
-                    jobs = [
-                        pool.submit(self._locate, images[i], f, cameras[i], began)
-                        for i, f in zip(chunk, features, strict=True)
-                    ]
-                    answers |= {i: job.result() for i, job in zip(chunk, jobs, strict=True)}
-        return [answers[i] for i in range(len(images))]
+        """`localize` for many images, some at a time; the answers are the same to the last bit."""
+        pairs = list(zip(images, cameras, strict=True))
+        return list(in_parallel(lambda pair: self.localize(*pair), pairs))
 
     def _prepare(self, image: np.ndarray, camera: Camera | None) -> View:
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
@@ -148,13 +133,17 @@ class Localizer:
         cameras = self._cameras(camera, image.shape)
         usable = [i for i, c in enumerate(cameras) if c is not None]
         best: Hypothesis | None = None
-        for attempt in self.options.attempts if len(self._bank) else (Attempt(0, 1),):
+        attempts = self.options.attempts if len(self._bank) else (Attempt(0, 1),)
+        for number, attempt in enumerate(attempts):
             for candidate in self._matcher.candidates(query, usable, attempt, self._one_answer()):
                 trial = self._hypothesis(query, candidate, cameras)
                 if best is None or trial.support > best.support:
                     best = trial
-                if trial.aligned and self._accepted(trial):
+                if trial.aligned and self._accepted(trial, self.options.sure):
                     return self._answer(trial, began)
+            # A pose that is only just good enough may be beaten by another look.
+            if number and best is not None and best.aligned and self._accepted(best):
+                break
         assert best is not None, "at least one scene is tried"
         return self._answer(best, began)
 
@@ -244,6 +233,7 @@ class Localizer:
             found.points_m,
             aligned=True,
             matched=found.matched,
+            planned=found.planned,
         )
 
     def _scene_of(self, rough: PnpResult, scene: int) -> int:
@@ -253,10 +243,10 @@ class Localizer:
         found = self.maps.atlas().scene_at(place)
         return scene if found is None else found
 
-    def _accepted(self, best: Hypothesis) -> bool:
+    def _accepted(self, best: Hypothesis, times: float = 1.0) -> bool:
         record = self.maps.scenes[best.scene]
         if best.aligned:
-            return best.inliers > 0 and best.support >= record.min_support
+            return best.inliers > 0 and best.support >= times * record.min_support
         return best.ratio >= record.inlier_threshold
 
     def _answer(self, best: Hypothesis, began: float) -> PoseEstimate:

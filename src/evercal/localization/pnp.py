@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from evercal.geometry.pose_covariance import with_translation_by
 from evercal.geometry.se3 import SE3
+from evercal.localization.pose_refinement import linearised
 
 
 @dataclass(frozen=True)
@@ -78,30 +80,10 @@ def pose_covariance(
     Returns:
         (6, 6) of (dt in metres, dr in radians).
     """
-    camera_from_world = world_from_camera.inverse()
-    x, y, z = camera_from_world.apply(points_m).T
-    z = np.maximum(z, 1e-6)
-    fx, fy, cx, cy = intrinsics
-    residual = np.stack([fx * x / z + cx, fy * y / z + cy], -1) - pixels
-    zero = np.zeros_like(x)
-    projection = np.stack(
-        [
-            np.stack([fx / z, zero, -fx * x / z**2], -1),
-            np.stack([zero, fy / z, -fy * y / z**2], -1),
-        ],
-        1,
-    )
-    # Exp(-dr) X = X - dr x X = X + [X]x dr
-    cross = np.stack(
-        [
-            np.stack([zero, -z, y], -1),
-            np.stack([z, zero, -x], -1),
-            np.stack([-y, x, zero], -1),
-        ],
-        1,
-    )
-    move = np.broadcast_to(-camera_from_world.rotation_matrix(), cross.shape)
-    jacobian = projection @ np.concatenate([move, cross], -1)
-    information = np.einsum("nij,nik->jk", jacobian, jacobian)
+    turn = world_from_camera.rotation_matrix()
+    place = world_from_camera.translation_m
+    residual, slope = linearised(pixels, points_m, turn, place, intrinsics)
+    rows = slope.transpose(1, 0, 2).reshape(6, -1)
     variance = float((residual**2).mean()) + 1e-6
-    return variance * np.linalg.pinv(information, hermitian=True)
+    covariance = variance * np.linalg.pinv(rows @ rows.T, hermitian=True)
+    return with_translation_by(turn, covariance)

@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from evercal.geometry.pose_covariance import with_translation_by
 from evercal.geometry.se3 import SE3
 
 Array = NDArray[np.floating]
@@ -44,48 +46,54 @@ def refine_pose(
         iterations: Gauss-Newton steps, at most.
     """
     turn, place = start.rotation_matrix(), start.translation_m
-    focal, centre = intrinsics[:2], intrinsics[2:]
+    white = np.ascontiguousarray(whitening.transpose(1, 2, 0))
     variance, information = 1.0, np.eye(6)
     for _ in range(max(iterations, 1)):
-        raw, jacobian = _linearised(pixels, points_m, turn, place, focal, centre)
-        residual = (whitening @ raw[..., None])[..., 0]
-        jacobian = whitening @ jacobian
-        squares = (residual**2).sum(1)
+        raw, slope = linearised(pixels, points_m, turn, place, intrinsics)
+        residual = white[:, 0] * raw[0] + white[:, 1] * raw[1]
+        slope = white[:, 0, None] * slope[0] + white[:, 1, None] * slope[1]
+        squares = (residual**2).sum(0)
         # The scale follows the data: half of the errors lie below 1.18 standard deviations.
         variance = max(float(np.median(squares)) / 1.386, 0.05)
-        weight = 1 / (1 + squares / variance)
-        weighted = (jacobian * weight[:, None, None]).reshape(-1, 6)
-        information = weighted.T @ jacobian.reshape(-1, 6) + 1e-9 * np.eye(6)
-        step = -np.linalg.solve(information, weighted.T @ residual.ravel())
+        root = 1 / np.sqrt(1 + squares / variance)
+        rows = (slope * root).transpose(1, 0, 2).reshape(6, -1)
+        information = rows @ rows.T + 1e-9 * np.eye(6)
+        step = -np.linalg.solve(information, rows @ (residual * root).ravel())
         place = place + turn @ step[:3]
-        turn = turn @ Rotation.from_rotvec(step[3:]).as_matrix()
+        turn = turn @ cv2.Rodrigues(step[3:])[0]
         if np.abs(step).max() < _SMALL:
             break
-    raw, _ = _linearised(pixels, points_m, turn, place, focal, centre)
-    rotation = np.eye(6)
-    rotation[:3, :3] = turn
-    covariance = rotation @ (variance * np.linalg.inv(information)) @ rotation.T
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = turn, place
-    return RefinedPose(SE3.from_matrix(matrix), np.linalg.norm(raw, axis=1), covariance)
+    raw, _ = linearised(pixels, points_m, turn, place, intrinsics)
+    covariance = with_translation_by(turn, variance * np.linalg.inv(information))
+    quaternion = Rotation.from_matrix(turn).as_quat(scalar_first=True)
+    return RefinedPose(SE3(quaternion, place), np.hypot(*raw), covariance)
 
 
-def _linearised(
-    pixels: Array, points_m: Array, turn: Array, place: Array, focal: Array, centre: Array
+def linearised(
+    pixels: Array, points_m: Array, turn: Array, place: Array, intrinsics: Array
 ) -> tuple[Array, Array]:
-    """Residuals (n, 2) and derivatives (n, 2, 6) by a motion in the camera frame."""
-    local = (points_m - place) @ turn
-    depth = np.maximum(local[:, 2], 1e-3)
-    x, y = (local[:, :2] / depth[:, None]).T
-    (fx, fy), zero = focal, np.zeros_like(x)
-    residual = np.stack([x * fx, y * fy], -1) + centre - pixels
-    jacobian = np.empty((len(x), 2, 6))
-    for row, values in enumerate(
-        (
-            (-fx / depth, zero, fx * x / depth, fx * x * y, -fx * (1 + x * x), fx * y),
-            (zero, -fy / depth, fy * y / depth, fy * (1 + y * y), -fy * x * y, -fy * x),
-        )
-    ):
-        for column, value in enumerate(values):
-            jacobian[:, row, column] = value
-    return residual, jacobian
+    """How far points are projected from where they were seen, and how that changes.
+
+    Args:
+        pixels: (n, 2) in the ideal pinhole.
+        points_m: (n, 3).
+        turn: (3, 3) rotation of base_from_camera.
+        place: (3,) its translation.
+        intrinsics: (4,) fx, fy, cx, cy.
+
+    Returns:
+        Residuals (2, n) and their derivatives (2, 6, n) by a motion (translation, rotation) in the
+        camera frame.
+    """
+    fx, fy, cx, cy = intrinsics
+    local = turn.T @ (points_m - place).T
+    inverse = 1 / np.maximum(local[2], 1e-3)
+    x, y = local[0] * inverse, local[1] * inverse
+    residual = np.stack([x * fx + (cx - pixels[:, 0]), y * fy + (cy - pixels[:, 1])])
+    slope = np.empty((2, 6, len(x)))
+    slope[0, 0], slope[0, 1], slope[0, 2] = -inverse, 0, x * inverse
+    slope[0, 3], slope[0, 4], slope[0, 5] = x * y, -1 - x * x, y
+    slope[1, 0], slope[1, 1], slope[1, 2] = 0, -inverse, y * inverse
+    slope[1, 3], slope[1, 4], slope[1, 5] = 1 + y * y, -slope[0, 3], -x
+    slope *= np.array([fx, fy])[:, None, None]
+    return residual, slope

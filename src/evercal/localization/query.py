@@ -33,6 +33,9 @@ class LocalizeOptions:
     """At most this many scenes are tried for an image."""
     attempts: tuple[Attempt, ...] = (Attempt(12, 2), Attempt(48, 1), Attempt(200, 1))
     """Where no pose is accepted, the next attempt follows."""
+    sure: float = 2.0
+    """After the first attempt a pose is taken at once where its support is so many times what is
+    needed; else the second attempt follows, and the better pose is taken."""
     keyframes: int = 6
     """Keyframes of a scene that an image is matched to and aligned with."""
     retrieval_stride: int = 16
@@ -101,9 +104,12 @@ class Hypothesis:
     points_m: np.ndarray | None = None
     aligned: bool = False
     matched: int = 0
+    planned: int = 0
 
     @property
     def support(self) -> float:
         """What the scene's threshold is compared with, see `localization.acceptance`."""
-        exact = self.inliers / max(1, self.matched) if self.aligned else 1.0
-        return self.ratio * exact * self.inliers**0.5
+        if not self.aligned:
+            return self.ratio * self.inliers**0.5
+        exact = self.inliers / max(1, self.matched)
+        return self.ratio * exact**2 * (self.ratio * self.planned) ** 0.5

@@ -54,7 +54,7 @@ from evercal.storage.manifest import (
     write_manifest,
 )
 
-SCHEMA = 2
+SCHEMA = 3
 LEARNING = "learning"
 STAGES = "stages"
 MEMORY_FILES = ("memory.safetensors", "notes.safetensors")
@@ -145,10 +145,10 @@ class Store:
         if problems:
             raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
         schema = payload.get("schema")
-        if schema == 1:
+        if isinstance(schema, int) and schema < SCHEMA:
             raise InputError(
-                f"store {root}: schema 1 is of an earlier evercal; learn the scenes again into a"
-                " new store"
+                f"store {root}: schema {schema} is of an earlier evercal; learn the scenes again"
+                " into a new store"
             )
         if schema != SCHEMA:
             raise InputError(f"store {root}: schema {schema!r} is not {SCHEMA}; update evercal")
