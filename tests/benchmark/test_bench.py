@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import torch
 
 from evercal.benchmark import bench, strategy_run
 from evercal.benchmark.bench import BenchOptions, begin_bench, in_order, run_bench
@@ -258,7 +257,7 @@ def test_the_paper_knows_all_centres_from_the_start(
         return replace(made, head=replace(made.head, centres_per_scene=5))
 
     asked = replace(options, stage=stage, strategies=named("sars_spdd", "joint", "evercal"))
-    how = RunOptions(stage(0), 120, tmp_path / "features", torch.device("cpu"), tmp_path)
+    how = RunOptions(stage(0), 120, tmp_path / "features", tmp_path)
     run = strategy_run._Run(asked.strategies[0], list(arcs), how, None)
     assert (run.stage.grid_scenes, len(run.stage.fixed_centres_m)) == (2, 5)
     assert run.stage.head.width == 24
