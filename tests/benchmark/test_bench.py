@@ -288,7 +288,11 @@ def test_joint_training_may_build_maps_too(
     arcs: Arcs, options: BenchOptions, done: tuple[Path, list[bench.Step]], tmp_path: Path
 ) -> None:
     list(run_bench(arcs, replace(options, strategies=named("joint_map")), tmp_path))
-    ours = {o.scene: o for o in read(tmp_path) if not o.strategy.endswith(NETWORK)}
+    found = read(tmp_path)
+    ours = {o.scene: o for o in found if o.strategy == "joint_map"}
+    # Its network alone is judged beside both together, and remembers nothing.
+    alone = [o for o in found if o.strategy == "joint_map" + NETWORK]
+    assert {o.scene for o in alone} == {"one", "two"}
     plain = {o.scene: o for o in read(done[0]) if o.strategy == "joint"}
     assert ours.keys() == plain.keys() == {"one", "two"}
     assert ours["two"].frames_kept == len(ours["two"].keyframe_positions_m) == 2

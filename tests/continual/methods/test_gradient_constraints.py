@@ -291,7 +291,7 @@ def test_the_first_steps_of_an_episode_are_plain_replay() -> None:
     costs = []
     for step in range(7):
         cost = hooks.cost(output, some, 1.0)
-        costs.append(None if cost is None else float(cost))
+        costs.append(None if cost is None else float(cost.detach()))
         proposed = proposed_of([9.0, 9.0], [0.0, 0.0], step=step)
         hooks.edit_step(proposed)
         moved = proposed.changes["w"].abs().max() > 0
