@@ -17,7 +17,7 @@ def test_a_wheel_holds_the_tables_of_the_benchmark(tmp_path: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         held = set(archive.namelist())
     source = ROOT / "src"
-    tables = sorted((source / "evercal" / "benchmark" / "tables").glob("*.json"))
+    tables = sorted((source / "evercal" / "benchmark" / "row_files").glob("*.json"))
     assert len(tables) >= 3
     for path in tables:
         assert path.relative_to(source).as_posix() in held

@@ -57,7 +57,7 @@ def load_rows(name: str) -> tuple[Strategy, ...]:
 
 
 def _folder():
-    return files("evercal.benchmark") / "tables"
+    return files("evercal.benchmark") / "row_files"
 
 
 def strategy_from_row(file: str, row: object) -> Strategy:

@@ -256,7 +256,7 @@ def edited(method: ConstrainedStep, proposed: ProposedStep, references: list[flo
 
 
 def test_the_episodic_constraint_by_hand() -> None:
-    gec = EpisodicConstraint(alpha=0.5, eta=0.1)
+    gec = EpisodicConstraint(alpha=0.5, eta=0.1, longest=9.0)
     # h = 5 - 1.05 x 2 = 2.9: the loss must fall by 0.5 x 0.1 x 2.9; below the reference, with
     # h = 1 - 2.1 = -1.1, it may rise by 0.055.
     proposed = proposed_of([5.0, 1.0], [0.3, 0.3])
@@ -265,12 +265,14 @@ def test_the_episodic_constraint_by_hand() -> None:
     assert edited(gec, proposed_of([5.0, 1.0], [-0.2, 0.05]), [2.0, 2.0]) == [-0.2, 0.05]
     # Half way down the schedule half of it is asked; the share of slack is of the reference.
     assert edited(gec, proposed_of([5.0], [0.3], schedule=0.5), [2.0]) == [-0.0725]
-    slack = EpisodicConstraint(alpha=1.0, eta=0.1, slack=0.5)
+    slack = EpisodicConstraint(alpha=1.0, eta=0.1, slack=0.5, longest=9.0)
     assert edited(slack, proposed_of([3.0], [0.3]), [2.0]) == [0.0]
     # Steps of the warm-up are not edited, and a scene without a reference has no constraint.
     assert edited(gec, proposed_of([5.0], [0.3], step=4), [2.0]) == [pytest.approx(0.3)]
     assert edited(gec, proposed_of([5.0], [0.3], step=5), [2.0]) == [-0.145]
     assert edited(gec, proposed_of([5.0, 5.0], [0.3, 0.3]), [float("nan"), 2.0])[0] == 0.3
+    # Whatever is asked, no more than the length of the step is added to it.
+    assert edited(EpisodicConstraint(), proposed_of([900.0], [0.3]), [2.0]) == [0.0]
 
 
 def test_averaged_and_single_constraints_by_hand() -> None:
@@ -292,9 +294,9 @@ def test_the_first_steps_of_an_episode_are_plain_replay() -> None:
     for step in range(7):
         cost = hooks.cost(output, some, 1.0)
         costs.append(None if cost is None else float(cost.detach()))
-        proposed = proposed_of([9.0, 9.0], [0.0, 0.0], step=step)
+        proposed = proposed_of([9.0, 9.0], [0.5, 0.5], step=step)
         hooks.edit_step(proposed)
-        moved = proposed.changes["w"].abs().max() > 0
+        moved = (proposed.changes["w"] - 0.5).abs().max() > 0
         assert bool(moved) == (step >= 5)
     # At the last step's clamp of 1 px: the mean of tanh 3 and tanh 1.
     assert costs[:5] == pytest.approx([(np.tanh(3.0) + np.tanh(1.0)) / 2] * 5, rel=1e-5)
@@ -304,7 +306,7 @@ def test_the_first_steps_of_an_episode_are_plain_replay() -> None:
 def test_the_moving_reference_is_the_step_before() -> None:
     head, memories = wave_head(2), [wave_buffer(0)]
     state: list[MethodState] = [{"reference": torch.tensor(1.0)}]
-    method = EpisodicConstraint(alpha=1.0, eta=1.0, warm_steps=0, moving=True)
+    method = EpisodicConstraint(alpha=1.0, eta=1.0, longest=9.0, warm_steps=0, moving=True)
     hooks = method.begin(stage_start(head, memories, states=state))
     # The first step knows of none before it, however bad the scene is.
     first = proposed_of([9.0], [0.7])

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from evercal.continual.methods.method import FinishedScene, StageStart
 from evercal.continual.methods.penalties import Reprojection
-from evercal.continual.methods.replay import Replay, ReplayHooks, by_scene
+from evercal.continual.methods.replay import EpisodicMemory, MemoryHooks, by_scene
 from evercal.networks.buffer import Rows
 from evercal.networks.head import HeadOutput
 from evercal.networks.hooks import ProposedStep, TrainingHooks
@@ -26,7 +26,7 @@ REFERENCE_ROWS = 8192
 
 
 @dataclass(frozen=True)
-class ConstrainedStep(Replay):
+class ConstrainedStep(EpisodicMemory):
     """What GEM, A-GEM and GEC share: losses of remembered scenes that are not minimised."""
 
     clamp_px: float = 50.0
@@ -56,21 +56,17 @@ class ConstrainedStep(Replay):
         return cost.mean()
 
 
-class ConstraintHooks(ReplayHooks):
+class ConstraintHooks(MemoryHooks):
     """Asks for the gradient of every remembered scene and lets the method edit the step."""
 
     edits_steps = True
 
     def __init__(self, method: ConstrainedStep, start: StageStart):
-        super().__init__(method, start)
+        super().__init__(start)
         self._rule = method
         unknown = torch.tensor(torch.nan)
         kept = [start.states[memory.scene].get("reference", unknown) for memory in self.memories]
         self._references = torch.stack(kept)
-
-    def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
-        """Nothing: remembered rows are not trained on."""
-        return None
 
     def constraints(self, output: HeadOutput, rows: Rows, progress: float) -> list[Tensor]:
         """The loss of each remembered scene."""
@@ -139,6 +135,10 @@ class EpisodicConstraint(ConstrainedStep):
     """The original's learning rate; here it is only the length that alpha is meant for."""
     slack: float = 0.05
     """Share by which a remembered loss may rise."""
+    longest: float = 1.0
+    """What is added to a step is at most so long as the step itself. A scene whose rows all lie
+    beyond the clamp has lost much and has a short gradient: unbounded, it asks for a step that
+    destroys the network."""
     warm_steps: int = 5
     """Steps of plain replay at the start of a stage."""
     moving: bool = False
@@ -159,7 +159,9 @@ class EpisodicConstraint(ConstrainedStep):
         # Warmed up and annealed like every other step: at the end nothing moves any more.
         most = -self.alpha * self.eta * proposed.schedule * h
         known = torch.isfinite(h)
-        return nearest_change(changes, g[known], most[known])
+        added = nearest_change(changes, g[known], most[known]) - changes
+        limit = self.longest * changes.norm() / added.norm().clamp(min=1e-12)
+        return changes + limit.clamp(max=1.0) * added
 
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
         """`reference`: the loss on remembered rows as they are replayed."""

@@ -23,13 +23,40 @@ from evercal.networks.hooks import TrainingHooks
 
 
 @dataclass(frozen=True)
-class Replay(Method):
-    """Replays keyframes (Chaudhry et al., On tiny episodic memories, 2019)."""
+class EpisodicMemory(Method):
+    """Keeps keyframes whose rows join every step; a subclass says what they do there."""
 
-    citation: ClassVar[str] = "Vitter 1985; Chaudhry et al., On tiny episodic memories, 2019"
     replays: ClassVar[bool] = True
     selector: str = "reservoir"
     """Which frames stay: a key of SELECTORS."""
+
+    def select(self, frames: FrameStatistics, capacity: int) -> np.ndarray | None:
+        """As the selector says."""
+        return SELECTORS[self.selector](frames, capacity)
+
+
+class MemoryHooks(TrainingHooks):
+    """Draws the same number of rows of each remembered scene.
+
+    Args:
+        start: of the stage; it must have memories.
+    """
+
+    def __init__(self, start: StageStart):
+        self.memories, self.each = start.memories, rows_each(start)
+
+    def replayed(
+        self, fresh: Rows, step: int, rate: float, generator: torch.Generator
+    ) -> list[Rows]:
+        """As many rows of each remembered scene."""
+        return [memory.draw(self.each, generator) for memory in self.memories]
+
+
+@dataclass(frozen=True)
+class Replay(EpisodicMemory):
+    """Replays keyframes (Chaudhry et al., On tiny episodic memories, 2019)."""
+
+    citation: ClassVar[str] = "Vitter 1985; Chaudhry et al., On tiny episodic memories, 2019"
     penalty: Penalty = field(default_factory=Reprojection)
     """What a replayed row costs."""
     weight: float = 1.0
@@ -37,17 +64,13 @@ class Replay(Method):
     every_scene: bool = True
     """Whether each remembered scene costs that much; False: all of them together."""
 
-    def select(self, frames: FrameStatistics, capacity: int) -> np.ndarray | None:
-        """As the selector says."""
-        return SELECTORS[self.selector](frames, capacity)
-
     def begin(self, start: StageStart) -> TrainingHooks:
         """Replay from the stage's memories; nothing for the first scene."""
         return ReplayHooks(self, start) if start.memories else TrainingHooks()
 
 
-class ReplayHooks(TrainingHooks):
-    """Draws the same number of rows of each remembered scene, and adds their penalty.
+class ReplayHooks(MemoryHooks):
+    """Adds the penalty of the replayed rows.
 
     Args:
         method: what is replayed and at what cost.
@@ -55,15 +78,9 @@ class ReplayHooks(TrainingHooks):
     """
 
     def __init__(self, method: Replay, start: StageStart):
-        self.method, self.memories = method, start.memories
-        self.each = rows_each(start)
+        super().__init__(start)
+        self.method = method
         self._teacher = start.teacher if method.penalty.needs_teacher else None
-
-    def replayed(
-        self, fresh: Rows, step: int, rate: float, generator: torch.Generator
-    ) -> list[Rows]:
-        """As many rows of each remembered scene."""
-        return [memory.draw(self.each, generator) for memory in self.memories]
 
     def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
         """The weighted penalty."""
