@@ -53,6 +53,27 @@ def trainer(widths: tuple[int, ...] = (256, 384), batch: int = 2048, repeat: int
     run(widths, batch, repeat)
 
 
+def paper(
+    suite: str = "sim-mini",
+    data: Path | None = None,
+    steps: int = 200,
+    device: str = "auto",
+    out: Path = Path("runs/paper.jsonl"),
+) -> None:
+    """Runs the first steps of preset `paper` on the first scene of a suite, and times them.
+
+    Args:
+        suite: whose scenes; all of them give the centres.
+        data: folder of its recordings.
+        steps: how many of the 5,000.
+        device: auto, cpu or cuda.
+        out: loss, seconds and memory every ten steps, JSON lines.
+    """
+    from benchmarks.paper import run
+
+    run(suite, data, steps, device, out)
+
+
 def tune(
     suite: tyro.conf.Positional[str],
     file: Path,
@@ -247,6 +268,7 @@ def main() -> int:
         "real": real,
         "speed": speed,
         "trainer": trainer,
+        "paper": paper,
         "tune": tune,
         "rooms": rooms,
         "peers": peers,

@@ -1,0 +1,66 @@
+"""The first steps of preset `paper`: its shapes, memory, loss and seconds on this machine."""
+
+import json
+import resource
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from evercal.benchmark.suites import load_suite
+from evercal.continual.learn import learn
+from evercal.continual.learn_scene import validation_split
+from evercal.continual.presets import PAPER_SIM_STEPS, on_paper_backbone, preset, short_side
+from evercal.continual.stage import Encoding
+from evercal.continual.strategies import strategy_named
+from evercal.datasets import known_poses
+from evercal.features.descriptor import load_descriptor
+from evercal.features.device import device_of
+from evercal.features.encoder import load_encoder
+from evercal.mapping.atlas import combined_centres
+from evercal.mapping.scene_maps import SceneMaps
+from evercal.networks.trainer import Progress
+
+TOLD_EVERY = 10
+
+
+def run(suite: str, data: Path | None, steps: int, device: str, out: Path) -> None:
+    """Prints a line every ten steps and appends it to `out`, JSON lines."""
+    scenes = load_suite(suite, data, (), None)
+    train = validation_split(scenes[0].train)[0]
+    stage = on_paper_backbone(preset("paper"))
+    places = [known_poses(validation_split(scene.train)[0]).translation_m for scene in scenes]
+    centres = combined_centres(places, stage.head.centres_per_scene, 0)
+    fit = replace(stage.fit, iterations=PAPER_SIM_STEPS)
+    stage = replace(stage, fit=fit, grid_scenes=len(scenes), fixed_centres_m=centres)
+    maps = SceneMaps(load_encoder(), load_descriptor(), "sars_spdd", short_side("paper"))
+    maps.to(device_of(device))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    began, spent = time.perf_counter(), time.process_time()
+    for event in learn(maps, strategy_named("sars_spdd"), replace(scenes[0], train=train), stage):
+        if isinstance(event, Encoding):
+            began, spent = time.perf_counter(), time.process_time()
+        if not isinstance(event, Progress) or event.step % TOLD_EVERY:
+            continue
+        told = {
+            "step": event.step,
+            "loss_px": round(event.loss, 3),
+            "within_5_px": round(100 * event.inlier_share, 2),
+            "seconds_a_step": round((time.perf_counter() - began) / event.step, 2),
+            "processor_seconds_a_step": round((time.process_time() - spent) / event.step, 2),
+            "peak_gb": round(_peak_gb(maps.device), 2),
+        }
+        print(json.dumps(told), flush=True)
+        with open(out, "a", encoding="utf-8") as file:
+            file.write(json.dumps(told) + "\n")
+        if event.step >= steps:
+            return
+
+
+def _peak_gb(device: torch.device) -> float:
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 1e9
+    unit = 1 if sys.platform == "darwin" else 1000
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
