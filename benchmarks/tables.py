@@ -28,7 +28,7 @@ from evercal.benchmark.comparison import (
 )
 from evercal.benchmark.published import Published, Row, read_published
 from evercal.errors import InputError
-from evercal.evaluation.metrics import CHI2_6
+from evercal.evaluation.metrics import CHI2_6, COARSE, FINE, FINEST
 
 DOCS = FOLDER.parent / "docs"
 REGION = re.compile(
@@ -109,6 +109,24 @@ def _differences(sources: Sequence[Published], reference: str) -> str:
         rows = difference_rows(of, reference)
         parts += [_markdown(rows)] if len(rows) > 1 else []
     return f"\n\n{ONE_RUN}\n\n".join(parts)
+
+
+def _memory(sources: Sequence[Published], _: str) -> str:
+    """A row for each strategy and memory: what the same scenes come to with fewer keyframes."""
+    bounds = {"5 cm/5 deg": COARSE, "1 cm/1 deg": FINE, "5 mm/0.5 deg": FINEST}
+    rows = [["keyframes", "strategy", *bounds, "median mm", "wrong scene", "MB"]]
+    for source in sources:
+        share = source.settings["memory_share"]
+        assert isinstance(share, float)
+        for name, of in by_strategy(runs_of(source.results())).items():
+            run, last = of[0], of[0].last
+            told = [f"{run.scores(bound).final_accuracy:.1f}" for bound in bounds.values()]
+            median = 1000 * np.median(np.concatenate([scene.translation_m for scene in last]))
+            size = (last[0].memory_bytes + last[0].head_bytes) / 1e6
+            wrong = sum(int(np.sum(scene.wrong_scene)) for scene in last)
+            more = [f"{median:.1f}", str(wrong), f"{size:.1f}"]
+            rows.append([f"{100 * share:.0f} %", name, *told, *more])
+    return _markdown(rows)
 
 
 BOUNDS = ("5 cm/5 deg", "2 cm/2 deg", "1 cm/1 deg", "0.5 cm/0.5 deg")
@@ -259,6 +277,7 @@ KINDS: dict[str, Callable[[Sequence[Published], str], str]] = {
     "scenes": _bench(scene_rows),
     "selectors": _bench(selector_rows),
     "differences": _differences,
+    "memory": _memory,
     "accuracy": _accuracy,
     "spoiled": _spoiled,
     "fixed": _fixed,
