@@ -7,13 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import torch
 
 from evercal.datasets.frame import Frame, Scene
 from evercal.geometry.se3 import SE3
 from evercal.localization import acceptance
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
-from evercal.mapping.scene_maps import SceneMaps, with_fit
+from evercal.mapping.atlas import Atlas
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord, with_fit
 from evercal.simulation.box_room import BoxRoom, default_camera
 
 
@@ -37,8 +39,10 @@ def fit(
     said = [*positives, *(Answer(ratio) for ratio in negatives)]
 
     class Fake:
-        def __init__(self, *_: object) -> None:
-            pass
+        def __init__(self, maps: SceneMaps, *_: object) -> None:
+            # What an earlier fit had found must not count twice.
+            assert maps.scenes[0].covariance_scale == 1.0
+            assert maps.scenes[0].inlier_threshold == 0.0
 
         def localize(self, image: np.ndarray, camera: object = None) -> PoseEstimate:
             number = int(image.ravel()[0]) + 256 * int(image.ravel()[1])
@@ -55,7 +59,11 @@ def fit(
     with monkeypatch.context() as patch:
         patch.setattr(acceptance, "Localizer", Fake)
         patch.setattr(acceptance, "_negative_images", lambda *_: unknown)
-        return acceptance.fit_threshold(blank("evercal_network"), frames)
+        maps = blank("evercal_network")
+        place = Atlas().place(np.zeros((1, 3)))
+        record = SceneRecord("x", camera, place, torch.zeros(0, maps.descriptor.width), 30)
+        maps.scenes.append(with_fit(record, 0.4, 5.0))
+        return acceptance.fit_threshold(maps, frames)
 
 
 def test_the_threshold_lies_a_sixth_of_the_way_up(

@@ -68,8 +68,8 @@ def fit_threshold(
         (smallest inlier ratio that is accepted, factor on covariances).
     """
     # What was fitted before, such as for another strategy with the same head, must not count twice.
-    plain = with_fit(maps.scenes[scene], 0.0, 1.0)
-    scenes = [plain if record is maps.scenes[scene] else record for record in maps.scenes]
+    scenes = list(maps.scenes)
+    scenes[scene] = with_fit(scenes[scene], 0.0, 1.0)
     localizer = Localizer(replace(maps, scenes=scenes))
     right, ratios = [], []
     for frame in held_out:
