@@ -124,7 +124,7 @@ def _memory(sources: Sequence[Published], _: str) -> str:
             median = 1000 * np.median(np.concatenate([scene.translation_m for scene in last]))
             size = (last[0].memory_bytes + last[0].head_bytes) / 1e6
             wrong = sum(int(np.sum(scene.wrong_scene)) for scene in last)
-            more = [f"{median:.1f}", str(wrong), f"{size:.1f}"]
+            more = [f"{median:.1f}" if np.isfinite(median) else "-", str(wrong), f"{size:.1f}"]
             rows.append([f"{100 * share:.0f} %", name, *told, *more])
     return _markdown(rows)
 

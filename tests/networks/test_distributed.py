@@ -27,13 +27,13 @@ from evercal.networks.buffer import (
     Rows,
     encode_batches,
     encode_frames,
+    own_share,
 )
 from evercal.networks.distributed import (
     average,
     broadcast,
     gather,
     join_processes,
-    own_share,
     processes,
     rank,
     shared_out,

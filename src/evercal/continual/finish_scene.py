@@ -9,11 +9,13 @@ from evercal.continual.stage import Event, Stage, StageOptions
 from evercal.continual.stage_rows import replay_plan
 from evercal.continual.strategies import Strategy
 from evercal.datasets.frame import Frame
+from evercal.geometry.camera import Camera
 from evercal.mapping.build import MapOptions, Mapping, SceneMap, map_steps, spread_frames
 from evercal.mapping.keyframes import Keyframes, store_keyframes
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord, corrected_camera
 from evercal.networks.buffer import FeatureBuffer, encode_frames
 from evercal.networks.hooks import TrainingHooks
+from evercal.networks.trainer import HeadTrainer
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,15 @@ def memory_bytes(maps: SceneMaps, strategy: Strategy) -> int:
         return maps.memory_bytes
     needed = list(strategy.method.needed(maps.method_states))
     return replace(maps, method_states=needed).memory_bytes
+
+
+def refined_camera(trainer: HeadTrainer, number: int, nominal: Camera) -> Camera | None:
+    """The camera of one of the trainer's buffers as training corrected it; None if trusted."""
+    options = trainer.options
+    trained = options.intrinsics_rate > 0 and options.iterations > 0
+    if not trained or not trainer.buffers[number].correctable:
+        return None
+    return corrected_camera(nominal, trainer.correction[number].detach())
 
 
 def sized(options: MapOptions, maps: SceneMaps) -> MapOptions:

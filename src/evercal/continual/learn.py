@@ -7,16 +7,21 @@ from dataclasses import replace
 import torch
 
 from evercal.continual.fewest_keyframes import AutoMemoryOptions, fewest_keyframes
-from evercal.continual.finish_scene import Learned, finished_stage, mapped_record, sized
+from evercal.continual.finish_scene import (
+    Learned,
+    finished_stage,
+    mapped_record,
+    refined_camera,
+    sized,
+)
 from evercal.continual.methods.method import StageStart
 from evercal.continual.stage import Event, Stage, StageOptions
 from evercal.continual.stage_head import head_for_scene, whiten
 from evercal.continual.stage_rows import Pacer, encoded, remembered, scene_buffer, view_plan
 from evercal.continual.strategies import Strategy
 from evercal.datasets.frame import Scene, known_poses
-from evercal.geometry.camera import Camera
 from evercal.mapping.build import map_steps, spread_frames
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord, corrected_camera, prototypes
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord, prototypes
 from evercal.mapping.store import Checkpoint, Resume
 from evercal.networks.trainer import HeadTrainer
 
@@ -71,15 +76,6 @@ def learn(
     after.scenes.append(record)
     done = Learned(frames, lambda: buffer, hooks)
     yield (yield from finished_stage(after, strategy, done, options))
-
-
-def refined_camera(trainer: HeadTrainer, number: int, nominal: Camera) -> Camera | None:
-    """The camera of one of the trainer's buffers as training corrected it; None if trusted."""
-    options = trainer.options
-    trained = options.intrinsics_rate > 0 and options.iterations > 0
-    if not trained or not trainer.buffers[number].correctable:
-        return None
-    return corrected_camera(nominal, trainer.correction[number].detach())
 
 
 def _learn_map(maps: SceneMaps, scene: Scene, options: StageOptions) -> Iterator[Event]:

@@ -3,8 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from evercal.continual.finish_scene import Learned, finished_stage
-from evercal.continual.learn import refined_camera
+from evercal.continual.finish_scene import Learned, finished_stage, refined_camera
 from evercal.continual.methods.method import Method
 from evercal.continual.stage import Event, Stage, StageOptions
 from evercal.continual.stage_head import head_for_all, whiten

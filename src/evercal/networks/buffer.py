@@ -258,6 +258,15 @@ def join(parts: Sequence[Rows]) -> Rows:
     return Rows(cat("features"), cat("scene"), cat("descriptor"), target, cat("index"), stored)
 
 
+def own_share(rows: Rows) -> Rows:
+    """The rows of a batch that this process trains on, as many as every other's."""
+    count = processes()
+    if count == 1:
+        return rows
+    whole = len(rows.scene) // count * count
+    return rows.part(slice(rank(), whole, count))
+
+
 def encode_frames(
     buffer: FeatureBuffer,
     frames: Sequence[Frame],

@@ -10,16 +10,13 @@ of the CPU; tensors that lie elsewhere are copied there and back.
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor, distributed
 
 from evercal.errors import InputError
 from evercal.features.device import device_of
-
-if TYPE_CHECKING:
-    from evercal.networks.buffer import Rows
 
 Work = TypeVar("Work")
 
@@ -65,15 +62,6 @@ def join_processes(device: str | torch.device = "auto") -> torch.device:
         else:
             distributed.init_process_group("gloo")
     return found
-
-
-def own_share(rows: "Rows") -> "Rows":
-    """The rows of a batch that this process trains on, as many as every other's."""
-    count = processes()
-    if count == 1:
-        return rows
-    whole = len(rows.scene) // count * count
-    return rows.part(slice(rank(), whole, count))
 
 
 @torch.no_grad()

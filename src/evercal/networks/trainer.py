@@ -10,8 +10,8 @@ from torch.nn import functional as F
 
 from evercal.features.device import allow_tf32
 from evercal.features.precision import autocast
-from evercal.networks.buffer import FeatureBuffer, Rows, join
-from evercal.networks.distributed import average, broadcast, own_share, processes
+from evercal.networks.buffer import FeatureBuffer, Rows, join, own_share
+from evercal.networks.distributed import average, broadcast, processes
 from evercal.networks.head import Head
 from evercal.networks.hooks import ProposedStep, TrainingHooks
 from evercal.networks.loss import LossOptions, clamp_px, reprojection_loss
