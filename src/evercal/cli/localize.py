@@ -1,6 +1,5 @@
 """`evercal localize`."""
 
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,9 +45,6 @@ class Localize:
             if not path.is_file():
                 raise InputError(f"{path}: image file is missing; check the path")
         camera = camera_for(self.camera, self.images)
-        # Threads of torch that wait for each other by spinning take ten times as long where other
-        # programs use the cores. It is read once, when torch is loaded.
-        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
         from evercal.localization.localizer import Localizer
 
         localizer = Localizer.open(self.store, device=self.device)
