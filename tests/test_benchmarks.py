@@ -21,8 +21,8 @@ def test_the_gate_names_what_is_worse(monkeypatch: pytest.MonkeyPatch) -> None:
     rows, broken = gate.judge(now, now)
     assert broken == []
     assert {row[-1] for row in rows} == {"yes"}
-    worse = {**now, "accuracy, 5 cm 5 deg": 20.0, "learning": 200.0}
-    assert gate.judge(now, worse)[1] == ["accuracy, 5 cm 5 deg", "learning"]
+    worse = {**now, "accuracy, 1 cm 1 deg": 20.0, "learning a map": 200.0}
+    assert gate.judge(now, worse)[1] == ["accuracy, 1 cm 1 deg", "learning a map"]
     # What has no baseline is not waved through.
     known = {name: value for name, value in now.items() if name != "head"}
     assert gate.judge(known, now)[1] == ["head"]
