@@ -50,6 +50,21 @@ STOPS: dict[str, Callable[[Sequence[Checkpoint]], bool]] = {
 }
 
 
+def whole_and_interrupted(
+    maps: SceneMaps,
+    rooms: Rooms,
+    options: StageOptions,
+    where: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> tuple[SceneMaps, Resume]:
+    """What the second stage comes to in one go, and what it leaves behind where it is stopped."""
+    whole = outcome(continued(maps, rooms, options))
+    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
+    resume = interrupted(continued(maps, rooms, options), STOPS[where])
+    assert resume is not None
+    return whole, resume
+
+
 @pytest.mark.parametrize("where", STOPS)
 @pytest.mark.parametrize("name", ["evercal_network", "sars_spdd", "isolation"])
 def test_an_interruption_does_not_show(
@@ -61,10 +76,7 @@ def test_an_interruption_does_not_show(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     maps = first[name]
-    whole = outcome(continued(maps, rooms, quick))
-    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
-    resume = interrupted(continued(maps, rooms, quick), STOPS[where])
-    assert resume is not None
+    whole, resume = whole_and_interrupted(maps, rooms, quick, where, monkeypatch)
     again = list(continued(maps, rooms, quick, resume))
     assert_same(weights(outcome(again).heads[-1]), weights(whole.heads[-1]))
     a, b = outcome(again), whole
@@ -127,10 +139,7 @@ def test_no_method_forgets_where_it_stood(
 ) -> None:
     """After five of eight steps of the second scene; what is kept of the scene is the same, too."""
     maps = first[name]
-    whole = outcome(continued(maps, rooms, quick))
-    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
-    resume = interrupted(continued(maps, rooms, quick), STOPS["fifth step"])
-    assert resume is not None
+    whole, resume = whole_and_interrupted(maps, rooms, quick, "fifth step", monkeypatch)
     events = list(continued(maps, rooms, quick, resume))
     assert [event.step for event in events if isinstance(event, Progress)] == [6, 7, 8]
     again = outcome(events)

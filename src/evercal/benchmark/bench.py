@@ -28,7 +28,6 @@ from evercal.continual.strategies import Strategy
 from evercal.datasets import Scene
 from evercal.errors import InputError
 from evercal.features.descriptor import DESCRIPTOR_FILE
-from evercal.features.device import device_of
 from evercal.features.encoder import ENCODER_FILE
 from evercal.storage import lock_settings, sha256_file, write_json
 
@@ -98,8 +97,7 @@ def run_bench(
     features = options.features or out / "features"
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
-        stage, device = options.stage(seed), device_of(options.device)
-        how = RunOptions(stage, options.short_side, features, out, device)
+        how = RunOptions(options.stage(seed), options.short_side, features, out, options.device)
         for stage, these in run_strategy(strategy, ordered, how, on_event):
             if (strategy.name, seed, stage) not in found:
                 results.append(out, these)

@@ -8,7 +8,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from evercal.benchmark.results import NETWORK, UNALIGNED, SceneResult, scene_result
 from evercal.benchmark.scene_views import keep_views
@@ -54,8 +53,8 @@ class RunOptions:
     """Folder of encoded views, shared by all runs."""
     out: Path
     """Folder of results; stores under way are in its folder `runs`."""
-    device: str | torch.device = "cpu"
-    """What the networks run on."""
+    device: str = "cpu"
+    """What the networks run on, see `features.device.device_of`."""
 
 
 def run_strategy(
@@ -86,6 +85,7 @@ class _Run:
         on_event: OnEvent | None,
     ):
         self.strategy, self.scenes, self.on_event = strategy, scenes, on_event
+        self.device = device_of(options.device)
         self.options, self.stage = options, _with_centres(options.stage, scenes)
         self.store = options.out / "runs" / f"{strategy.name}-{options.stage.seed}"
 
@@ -96,7 +96,7 @@ class _Run:
             if number >= len(Store.open(self.store).stages):
                 learn_scene(self.store, self.scenes[number], self._how(), self.on_event)
             opened = Store.open(self.store)
-            opened.maps.to(device_of(self.options.device))
+            opened.maps.to(self.device)
             self._cached(opened.maps)
             seconds = float(opened.report()["seconds"])
             yield number, self._judge(opened.maps, number, seconds)
@@ -107,7 +107,7 @@ class _Run:
             self.stage,
             strategy or self.strategy,
             short_side=self.options.short_side,
-            device=self.options.device,
+            device=self.device,
             cache=self.options.features,
         )
 
@@ -128,7 +128,7 @@ class _Run:
             learn_scene(shared, scene, self._how(STRATEGIES["finetune"]), self.on_event)
         first = Store.open(shared)
         began = time.perf_counter()
-        maps = first.maps.copy_for_training().to(device_of(self.options.device))
+        maps = first.maps.copy_for_training().to(self.device)
         maps.strategy, maps.keyframes, maps.method_states = self.strategy.name, [], []
         self._cached(maps)
         train, aside = validation_split(scene.train)
@@ -158,7 +158,7 @@ class _Run:
     def jointly(self) -> Iterator[tuple[int, tuple[SceneResult, ...]]]:
         """See `run_strategy`; a killed run begins anew."""
         shutil.rmtree(self.store, ignore_errors=True)
-        maps = open_or_create(self.store, self._how()).maps.to(device_of(self.options.device))
+        maps = open_or_create(self.store, self._how()).maps.to(self.device)
         self._cached(maps)
         split = [validation_split(scene.train) for scene in self.scenes]
         train_splits = [replace(s, train=t) for s, (t, _) in zip(self.scenes, split, strict=True)]

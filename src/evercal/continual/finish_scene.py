@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.methods.method import FinishedScene, Method, MethodState
 from evercal.continual.stage import Event, Stage, StageOptions
-from evercal.continual.stage_rows import replay_plan
+from evercal.continual.stage_rows import keyframe_rows
 from evercal.continual.strategies import Strategy
-from evercal.datasets.frame import Frame
-from evercal.geometry.camera import Camera
-from evercal.mapping.build import MapOptions, Mapping, SceneMap, map_steps, spread_frames
+from evercal.datasets.frame import Frame, Scene
+from evercal.mapping.atlas import Cell
+from evercal.mapping.build import MapOptions, Mapping, SceneMap, finished, map_steps, spread_frames
 from evercal.mapping.keyframes import Keyframes, store_keyframes
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord, corrected_camera
-from evercal.networks.buffer import FeatureBuffer, encode_frames
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord, corrected_camera, prototypes
+from evercal.networks.buffer import FeatureBuffer
 from evercal.networks.hooks import TrainingHooks
 from evercal.networks.trainer import HeadTrainer
 
@@ -79,12 +79,7 @@ def _state(maps: SceneMaps, method: Method, scene: Learned, options: StageOption
 
     def remembered() -> FeatureBuffer:
         assert keyframes is not None, "a method whose state is about keyframes selects some"
-        place = maps.scenes[-1].cell.atlas_from_base
-        buffer = FeatureBuffer(local, place, device=maps.device)
-        plan = replay_plan(options, maps.short_side)
-        for _ in encode_frames(buffer, keyframes.frames(), plan, maps.encoder, maps.descriptor):
-            pass
-        return buffer
+        return finished(keyframe_rows(maps, len(maps.scenes) - 1, keyframes, options))
 
     kept = len(keyframes) if keyframes else 0
     return method.after_scene(
@@ -102,13 +97,21 @@ def memory_bytes(maps: SceneMaps, strategy: Strategy) -> int:
     return replace(maps, method_states=needed).memory_bytes
 
 
-def refined_camera(trainer: HeadTrainer, number: int, nominal: Camera) -> Camera | None:
-    """The camera of one of the trainer's buffers as training corrected it; None if trusted."""
-    options = trainer.options
-    trained = options.intrinsics_rate > 0 and options.iterations > 0
-    if not trained or not trainer.buffers[number].correctable:
-        return None
-    return corrected_camera(nominal, trainer.correction[number].detach())
+def trained_record(scene: Scene, cell: Cell, trainer: HeadTrainer, number: int) -> SceneRecord:
+    """The record of a scene that was trained on, without its map.
+
+    Args:
+        scene: with its training frames.
+        cell: its place in the atlas.
+        trainer: of the training.
+        number: which of the trainer's buffers holds the scene's rows, its frames as they are first.
+    """
+    frames, buffer, options = scene.train, trainer.buffers[number], trainer.options
+    camera, refined = frames[0].camera, None
+    if options.intrinsics_rate > 0 and options.iterations > 0 and buffer.correctable:
+        refined = corrected_camera(camera, trainer.correction[number].detach())
+    seen = prototypes(buffer.tensors["descriptors"][: len(frames)])
+    return SceneRecord(scene.name, camera, cell, seen, len(frames), refined)
 
 
 def sized(options: MapOptions, maps: SceneMaps) -> MapOptions:

@@ -11,8 +11,8 @@ from evercal.continual.finish_scene import (
     Learned,
     finished_stage,
     mapped_record,
-    refined_camera,
     sized,
+    trained_record,
 )
 from evercal.continual.methods.method import StageStart
 from evercal.continual.stage import Event, Stage, StageOptions
@@ -21,7 +21,7 @@ from evercal.continual.stage_rows import Pacer, encoded, remembered, scene_buffe
 from evercal.continual.strategies import Strategy
 from evercal.datasets.frame import Scene, known_poses
 from evercal.mapping.build import map_steps, spread_frames
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord, prototypes
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 from evercal.mapping.store import Checkpoint, Resume
 from evercal.networks.trainer import HeadTrainer
 
@@ -70,10 +70,7 @@ def learn(
         yield progress
         if pacer.due():
             yield Checkpoint({}, trainer.state())
-    refined = refined_camera(trainer, 0, frames[0].camera)
-    seen = prototypes(buffer.tensors["descriptors"][: len(frames)])
-    record = SceneRecord(scene.name, frames[0].camera, cell, seen, len(frames), refined)
-    after.scenes.append(record)
+    after.scenes.append(trained_record(scene, cell, trainer, 0))
     done = Learned(frames, lambda: buffer, hooks)
     yield (yield from finished_stage(after, strategy, done, options))
 

@@ -3,14 +3,14 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from evercal.continual.finish_scene import Learned, finished_stage, refined_camera
+from evercal.continual.finish_scene import Learned, finished_stage, trained_record
 from evercal.continual.methods.method import Method
 from evercal.continual.stage import Event, Stage, StageOptions
 from evercal.continual.stage_head import head_for_all, whiten
 from evercal.continual.stage_rows import encoded, scene_buffer, view_plan
 from evercal.continual.strategies import Strategy
 from evercal.datasets.frame import Scene, known_poses
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord, prototypes
+from evercal.mapping.scene_maps import SceneMaps
 from evercal.networks.trainer import HeadTrainer
 
 
@@ -47,16 +47,10 @@ def learn_jointly(
     whole = replace(fit, iterations=fit.iterations * len(scenes), batch=rows)
     trainer = HeadTrainer(head, buffers, whole, options.seed)
     yield from trainer.run()
-    kept = 0
+    kept, alone = 0, replace(strategy, method=Method())
     for number, scene in enumerate(scenes):
-        frames, camera = scene.train, scene.train[0].camera
-        refined = refined_camera(trainer, number, camera)
-        seen = prototypes(buffers[number].tensors["descriptors"][: len(frames)])
-        after.scenes.append(
-            SceneRecord(scene.name, camera, cells[number], seen, len(frames), refined)
-        )
-        done = Learned(frames, lambda number=number: buffers[number])
-        alone = replace(strategy, method=Method())
+        after.scenes.append(trained_record(scene, cells[number], trainer, number))
+        done = Learned(scene.train, lambda number=number: buffers[number])
         stage = yield from finished_stage(after, alone, done, options)
         kept = stage.frames_kept
     yield Stage(after, whole.iterations, kept)

@@ -194,8 +194,7 @@ def open_or_create(store: Path, options: LearnOptions) -> Store:
     """
     if (store / MANIFEST).exists():
         own = options.encoder if isinstance(options.encoder, torch.nn.Module) else None
-        opened = Store.open(store, own)
-        return opened
+        return Store.open(store, own)
     return Store.create(store, options.strategy.name, options.short_side, options.encoder)
 
 

@@ -9,6 +9,7 @@ import torch
 from evercal.continual.stage import Encoding, Event, StageOptions
 from evercal.datasets.frame import Frame
 from evercal.mapping.atlas import Cell
+from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Checkpoint, Resume
 from evercal.networks.buffer import EncodePlan, FeatureBuffer, encode_frames
@@ -91,14 +92,18 @@ def remembered(
     for number, keyframes in enumerate(maps.keyframes):
         if keyframes is None or not keyframes.images:
             continue
-        place = maps.scenes[number].cell.atlas_from_base
-        buffer = FeatureBuffer(number, place, device=maps.device)
-        yield from encoded(buffer, keyframes.frames(), replay_plan(options, maps.short_side), maps)
-        buffers.append(buffer)
+        buffers.append((yield from keyframe_rows(maps, number, keyframes, options)))
     return buffers
 
 
-def replay_plan(options: StageOptions, short_side: int) -> EncodePlan:
-    """Views of remembered keyframes; the first pass shows them as they are."""
-    plan = view_plan(options, short_side)
-    return replace(plan, views_per_frame=options.replay_views_per_frame)
+def keyframe_rows(
+    maps: SceneMaps, number: int, keyframes: Keyframes, options: StageOptions
+) -> Generator[Event, None, FeatureBuffer]:
+    """Encodes a scene's keyframes as they are replayed; the first pass shows them as they are."""
+    _, local = maps.head_for(number)
+    place = maps.scenes[number].cell.atlas_from_base
+    buffer = FeatureBuffer(local, place, device=maps.device)
+    plan = view_plan(options, maps.short_side)
+    plan = replace(plan, views_per_frame=options.replay_views_per_frame)
+    yield from encoded(buffer, keyframes.frames(), plan, maps)
+    return buffer

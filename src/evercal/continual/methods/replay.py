@@ -36,14 +36,15 @@ class EpisodicMemory(Method):
 
 
 class MemoryHooks(TrainingHooks):
-    """Draws the same number of rows of each remembered scene.
+    """Draws the same number of rows of each remembered scene, at least one.
 
     Args:
         start: of the stage; it must have memories.
     """
 
     def __init__(self, start: StageStart):
-        self.memories, self.each = start.memories, rows_each(start)
+        self.memories = start.memories
+        self.each = max(1, start.replay_rows // len(start.memories))
 
     def replayed(
         self, fresh: Rows, step: int, rate: float, generator: torch.Generator
@@ -88,11 +89,6 @@ class ReplayHooks(MemoryHooks):
         scenes = len(self.memories) if self.method.every_scene else 1
         penalty = self.method.penalty(output, teacher, rows, progress)
         return scenes * self.method.weight * penalty
-
-
-def rows_each(start: StageStart) -> int:
-    """Rows that a step replays of each remembered scene, at least one."""
-    return max(1, start.replay_rows // len(start.memories))
 
 
 def teacher_output(teacher: Head, rows: Rows) -> HeadOutput:

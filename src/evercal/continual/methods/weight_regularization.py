@@ -36,8 +36,6 @@ class WeightRegularization(Method):
 
     def begin(self, start: StageStart) -> TrainingHooks:
         """The cost of moving; nothing for the first scene."""
-        if not start.states:
-            return TrainingHooks()
         return _TiedWeights(self, start)
 
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
@@ -65,6 +63,8 @@ class _TiedWeights(TrainingHooks):
         self._ties = [_ties(state, start.head) for state in method.needed(start.states)]
 
     def regularizer(self) -> Tensor | None:
+        if not self._ties:
+            return None
         return self.method.strength * tie_cost(self._head, self._ties)
 
 
@@ -159,20 +159,15 @@ class SynapticIntelligence(WeightRegularization):
         return scene.hooks.importance(scene.head)
 
 
-class _PathIntegral(TrainingHooks):
+class _PathIntegral(_TiedWeights):
     edits_steps = True
 
     def __init__(self, method: SynapticIntelligence, start: StageStart):
-        self.method, self._head = method, start.head
-        self._ties = [_ties(state, start.head) for state in method.needed(start.states)]
+        super().__init__(method, start)
+        self._damping = method.damping
         named = dict(start.head.named_parameters())
         self._path = {name: torch.zeros_like(value) for name, value in named.items()}
         self._first = {name: value.detach().clone() for name, value in named.items()}
-
-    def regularizer(self) -> Tensor | None:
-        if not self._ties:
-            return None
-        return self.method.strength * tie_cost(self._head, self._ties)
 
     def edit_step(self, proposed: ProposedStep) -> None:
         """Adds gradient x change to the path; the step stays as it is.
@@ -194,7 +189,7 @@ class _PathIntegral(TrainingHooks):
         """max(path, 0) / (way^2 + damping x mean way^2), by parameter name."""
         ways = {k: (v.detach() - self._first[k]).square() for k, v in head.named_parameters()}
         mean = sum(float(w.sum()) for w in ways.values()) / sum(w.numel() for w in ways.values())
-        floor = max(self.method.damping * mean, 1e-30)
+        floor = max(self._damping * mean, 1e-30)
         return {k: self._path[k].clamp(min=0) / (way + floor) for k, way in ways.items()}
 
     def state(self) -> dict[str, Tensor]:
