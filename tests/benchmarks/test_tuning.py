@@ -1,0 +1,69 @@
+"""Which trial of a method is taken."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from benchmarks import tuning
+from evercal.benchmark import results
+from evercal.benchmark.bench import BenchOptions
+from evercal.benchmark.results import SceneResult
+from evercal.benchmark.rows import strategy_from_row
+
+
+def result(strategy: str, stage: int, scene: str, errors_m: tuple[float, ...]) -> SceneResult:
+    n = len(errors_m)
+    return SceneResult(
+        strategy,
+        0,
+        stage,
+        scene,
+        tuple(map(str, range(n))),
+        errors_m,
+        (0.0,) * n,
+        (False,) * n,
+        (False,) * n,
+        1.0,
+        0,
+        0,
+        0,
+    )
+
+
+def test_area_counts_every_centimetre_and_only_the_last_stage(tmp_path: Path) -> None:
+    found = [
+        result("er_0", 0, "a", (0.0, 0.0)),  # forgotten later
+        result("er_0", 1, "a", (0.1, math.inf)),
+        result("er_0", 1, "b", (0.04, 0.0)),
+    ]
+    results.append(tmp_path, found)
+    row = {"name": "er_0", "of": "er", "with": {"weight": 0.1}}
+    assert tuning.final_scores(tmp_path, [strategy_from_row("t", row)], 2) == {
+        "er_0": pytest.approx((100 * (0.25 + 0.9) / 2, 50.0))
+    }
+
+
+def test_the_best_trial_of_every_method_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors = {"er_0": 0.15, "er_1": 0.02, "er_2": 0.06}
+
+    def bench(scenes: list[object], options: BenchOptions, out: Path) -> list[object]:
+        out.mkdir()
+        results.append(out, [result(k, 1, "a", (v,)) for k, v in errors.items()])
+        assert options.settings["judged"] == "held-out training frames"
+        return []
+
+    monkeypatch.setattr(tuning, "TRIALS", {"er": tuning.WEIGHTS})
+    monkeypatch.setattr(tuning, "load_suite", lambda *_: ["a", "b"])
+    monkeypatch.setattr(tuning, "tuning_split", lambda scene: scene)
+    monkeypatch.setattr(tuning, "run_bench", bench)
+    file = tmp_path / "tuned.json"
+    tuning.run("sim-mini", None, 2, tmp_path / "out", file)
+    assert json.loads(file.read_text()) == [{"name": "er", "of": "er", "with": {"weight": 0.3}}]
+    outcomes = file.with_suffix(".outcomes.jsonl").read_text().splitlines()
+    told = [json.loads(line) for line in outcomes]
+    assert [one["auc_20cm"] for one in told] == [25.0, 90.0, 70.0]
+    assert [one["accuracy_5cm_5deg"] for one in told] == [0.0, 100.0, 0.0]
