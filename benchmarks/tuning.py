@@ -22,12 +22,13 @@ Trials = Sequence[Mapping[str, object]]
 WEIGHTS: Trials = [{"weight": w} for w in (0.1, 0.3, 1.0)]
 STRENGTHS: Trials = [{"strength": s} for s in (10.0, 100.0, 1000.0)]
 CLAMPS: Trials = [{"clamp_px": c} for c in (20.0, 50.0, 100.0)]
-ALPHAS: Trials = [{"alpha": a} for a in (0.15, 0.5, 1.5)]
+ALPHAS: Trials = [{"alpha": a} for a in (0.5, 2.0, 8.0)]
 TRIALS: dict[str, Trials] = {
     **dict.fromkeys(("er", "hybrid", "gdr", "gss", "mir", "lwf"), WEIGHTS),
     **dict.fromkeys(("icarl", "buff_cs", "der", "co2l"), WEIGHTS),
     **dict.fromkeys(("ewc", "ewc_online", "si", "mas"), STRENGTHS),
-    **dict.fromkeys(("agem", "gem"), CLAMPS),
+    "agem": CLAMPS,
+    "gem": [{"margin": m} for m in (0.01, 0.03, 0.1)],
     **dict.fromkeys(("gec", "gec_moving"), ALPHAS),
     "gpm": [{"kept_share": k} for k in (0.9, 0.97, 0.99)],
     "sars_spdd": [{"penalty": {"scale": s}} for s in (1.0, 10.0, 50.0)],

@@ -158,7 +158,7 @@ def bounds(method: ConstrainedStep, step: Taken) -> tuple[Tensor, Tensor]:
     return step.g, -0.5 * 0.03 * share * h
 
 
-METHODS = [AveragedGem(), Gem(), EpisodicConstraint(warm_steps=0)]
+METHODS = [AveragedGem(), Gem(margin=0.0), EpisodicConstraint(warm_steps=0)]
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
@@ -279,9 +279,19 @@ def test_averaged_and_single_constraints_by_hand() -> None:
     # The mean of both gradients is (1, 1) / 2: what goes against it is taken out of the step.
     proposed = proposed_of([1.0, 1.0], [0.5, -0.1])
     assert edited(AveragedGem(), proposed, [1.0, 1.0]) == [0.3, -0.3]
-    assert edited(Gem(), proposed, [1.0, 1.0]) == [0.0, -0.1]
+    assert edited(Gem(margin=0.0), proposed, [1.0, 1.0]) == [0.0, -0.1]
     agreed = proposed_of([1.0, 1.0], [-0.5, 0.1])
     assert edited(AveragedGem(), agreed, [1.0, 1.0]) == [-0.5, 0.1]
+
+
+def test_the_margin_of_gem_goes_down_every_remembered_loss() -> None:
+    # A step (0.3, -0.4) is half a unit long: a tenth of that is added against each gradient, which
+    # is an axis; where that is not enough the step is projected as well.
+    proposed = proposed_of([1.0, 1.0], [0.3, -0.4])
+    assert edited(Gem(margin=0.1), proposed, [1.0, 1.0]) == [0.0, pytest.approx(-0.45)]
+    harmless = proposed_of([1.0, 1.0], [-0.3, -0.4])
+    expected = [pytest.approx(-0.35), pytest.approx(-0.45)]
+    assert edited(Gem(margin=0.1), harmless, [1.0, 1.0]) == expected
 
 
 def test_the_first_steps_of_an_episode_are_plain_replay() -> None:

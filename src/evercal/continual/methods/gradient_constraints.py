@@ -103,17 +103,22 @@ class AveragedGem(ConstrainedStep):
 class Gem(ConstrainedStep):
     """GEM: the step may not raise the loss of any remembered scene.
 
-    The original adds a margin to the dual variables, in units of SGD's gradient; steps of AdamW and
-    Muon have no such unit, and there is none here.
+    The original keeps the dual variables above a margin, in units of SGD's gradient. Here a step
+    goes down every remembered loss by at least that share of its own length: a constraint holds to
+    first order, and without a margin what the step does to second order adds up.
     """
 
     citation: ClassVar[str] = "Lopez-Paz and Ranzato, Gradient episodic memory, NeurIPS 2017"
+    margin: float = 0.03
+    """Least length that is added against every gradient g_t, as a share of the step's."""
 
     def edit(
         self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
     ) -> Tensor:
-        """The nearest change with <g_t, u> <= 0 for every scene."""
-        return nearest_change(changes, g, torch.zeros(len(g)))
+        """The nearest change with <g_t, u> <= 0 for every scene, beyond the margin."""
+        unit = g / g.norm(dim=1, keepdim=True).clamp(min=1e-12)
+        pushed = changes - self.margin * changes.norm() * unit.sum(0)
+        return nearest_change(pushed, g, torch.zeros(len(g)))
 
 
 @dataclass(frozen=True)
