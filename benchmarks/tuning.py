@@ -35,6 +35,8 @@ TRIALS: dict[str, Trials] = {
     "evercal_network": [{"weight": w} for w in (0.17, 0.5, 1.5)],
 }
 """The setting of each method that is tuned; `finetune`, `joint` and `isolation` have none."""
+ALIKE = {"evercal_hybrid": "evercal_network", "sars_spdd_filled": "sars_spdd"}
+"""Strategies that take the setting of another: the same method beside a map, or other frames."""
 
 
 def run(suite: str, data: Path | None, scenes: int, out: Path, file: Path) -> None:
@@ -58,7 +60,9 @@ def run(suite: str, data: Path | None, scenes: int, out: Path, file: Path) -> No
     final = final_scores(out, strategies, len(split))
     best = [max(_rows(name), key=lambda row: final[str(row["name"])]) for name in TRIALS]
     file.parent.mkdir(parents=True, exist_ok=True)
-    chosen = [{**row, "name": row["of"]} for row in best]
+    settings = {str(row["of"]): row["with"] for row in best}
+    settings |= {name: settings[like] for name, like in ALIKE.items() if like in settings}
+    chosen = [{"name": name, "of": name, "with": changes} for name, changes in settings.items()]
     file.write_text("[\n" + ",\n".join(f"  {json.dumps(row)}" for row in chosen) + "\n]\n")
     told = [
         {"method": row["of"], "setting": row["with"]}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,6 +30,7 @@ from evercal.continual.strategies import Strategy, strategy_named
 from evercal.datasets import Frame, Scene
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 from evercal.mapping.store import Store
 
 if TYPE_CHECKING:
@@ -300,6 +301,29 @@ def test_joint_training_may_build_maps_too(
     # The memory is of both scenes, and answers for both.
     for scene in ours:
         assert ours[scene].correct().sum() > plain[scene].correct().sum()
+
+
+def test_thresholds_of_a_network_beside_a_map_are_fitted_once(
+    arcs: Arcs, options: BenchOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fitted, fit = [], strategy_run.fitted_record
+
+    def noted(maps: SceneMaps, held_out: Sequence[Frame], scene: int = -1) -> SceneRecord:
+        keyframes = maps.keyframes[scene]
+        if keyframes is not None and not keyframes.landmarks:
+            fitted.append(scene)
+        return fit(maps, held_out, scene)
+
+    monkeypatch.setattr(strategy_run, "fitted_record", noted)
+    both = replace(options, strategies=(replace(strategy_named("er"), name="a", builds_map=True),))
+    steps = run_bench(arcs, both, tmp_path)
+    next(steps)
+    steps.close()  # as if killed: what was fitted for the first scene is still known
+    assert fitted == [0]
+    assert len(list(run_bench(arcs, both, tmp_path))) == 2
+    assert fitted == [0, 1]
+    assert {o.strategy for o in read(tmp_path)} == {"a", "a" + NETWORK}
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["first-one-0"]
 
 
 def test_regions_share_the_base_frame_and_split_every_frame() -> None:

@@ -6,6 +6,7 @@
     OUT/views/                    see `benchmark.scene_views`; of each strategy's first run
     OUT/features/                 encoded views, shared by all runs; may be deleted
     OUT/runs/STRATEGY-SEED/       a store under way, gone when its sequence is done
+    OUT/runs/STRATEGY-SEED.network.json    thresholds of its network where a map answers beside it
     OUT/runs/first-SCENE-SEED/    the first scene, which all strategies learn alike
 
 A run that is killed goes on from the checkpoint inside its stage, as `evercal learn` does.

@@ -1,5 +1,6 @@
 """One strategy with one seed over a sequence of scenes, going on where it was interrupted."""
 
+import json
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -33,12 +34,12 @@ from evercal.localization.query import LocalizeOptions
 from evercal.mapping.atlas import combined_centres
 from evercal.mapping.build import finished
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.scene_maps import SceneMaps, with_fit
 from evercal.mapping.selection import covering_radius, smallest_pair
 from evercal.mapping.stage_files import head_bytes
 from evercal.mapping.store import Store
 from evercal.networks.buffer import FeatureBuffer
-from evercal.storage import MANIFEST
+from evercal.storage import MANIFEST, write_json
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,7 @@ class _Run:
         self.device = device_of(options.device)
         self.options, self.stage = options, _with_centres(options.stage, scenes)
         self.store = options.out / "runs" / f"{strategy.name}-{options.stage.seed}"
+        self._network_fits = self.store.with_name(f"{self.store.name}.network.json")
 
     def stages(self) -> Iterator[tuple[int, tuple[SceneResult, ...]]]:
         """See `run_strategy`."""
@@ -100,7 +102,11 @@ class _Run:
             self._cached(opened.maps)
             seconds = float(opened.report()["seconds"])
             yield number, self._judge(opened.maps, number, seconds)
+        self._remove()
+
+    def _remove(self) -> None:
         shutil.rmtree(self.store, ignore_errors=True)
+        self._network_fits.unlink(missing_ok=True)
 
     def _how(self, strategy: Strategy | None = None) -> LearnOptions:
         return LearnOptions(
@@ -118,7 +124,7 @@ class _Run:
         """
         if (self.store / MANIFEST).exists():
             return
-        shutil.rmtree(self.store, ignore_errors=True)  # left by a commit that was killed
+        self._remove()  # left by a commit that was killed
         scene, method = self.scenes[0], self.strategy.method
         if method is None or not method.first_scene_alike:
             learn_scene(self.store, scene, self._how(), self.on_event)
@@ -157,7 +163,7 @@ class _Run:
 
     def jointly(self) -> Iterator[tuple[int, tuple[SceneResult, ...]]]:
         """See `run_strategy`; a killed run begins anew."""
-        shutil.rmtree(self.store, ignore_errors=True)
+        self._remove()
         maps = open_or_create(self.store, self._how()).maps.to(self.device)
         self._cached(maps)
         split = [validation_split(scene.train) for scene in self.scenes]
@@ -175,7 +181,7 @@ class _Run:
         for number in range(last):
             yield number, ()
         yield last, self._judge(maps, last, seconds)
-        shutil.rmtree(self.store, ignore_errors=True)  # nothing was committed to it
+        self._remove()  # nothing was committed to it
 
     def _judge(self, maps: SceneMaps, number: int, seconds: float) -> tuple[SceneResult, ...]:
         """Results of all scenes known; of what answers alone, too, where several things answer."""
@@ -188,11 +194,28 @@ class _Run:
         if self.strategy.method is None:
             localizer = Localizer(maps, LocalizeOptions(align=False))
             return found + self._results(name + UNALIGNED, localizer, number, seconds)
-        alone = _without_map(maps, self.strategy.method.replays)
-        for i, scene in enumerate(self.scenes[: number + 1]):
-            _, aside = validation_split(scene.train)
-            alone.scenes[i] = fitted_record(alone, aside, i)
+        alone = self._network_alone(maps, self.strategy.method.replays)
         return found + self._results(name + NETWORK, Localizer(alone), number, seconds)
+
+    def _network_alone(self, maps: SceneMaps, replays: bool) -> SceneMaps:
+        """What the network of the same training knows; keyframes stay where it replays them.
+
+        Its thresholds are fitted when a scene is learned and then stay, as without a map.
+        """
+        alone, path = maps.copy_for_training(), self._network_fits
+        for i, keyframes in enumerate(alone.keyframes):
+            assert keyframes is not None, "a map has keyframes"
+            images = Keyframes(keyframes.images, keyframes.cameras, keyframes.base_from_camera)
+            alone.keyframes[i] = images if replays else None
+        fits: list[list[float]] = json.loads(path.read_text()) if path.exists() else []
+        for i in range(len(fits), len(alone.scenes)):
+            _, aside = validation_split(self.scenes[i].train)
+            record = fitted_record(alone, aside, i)
+            fits.append([record.inlier_threshold, record.covariance_scale])
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_json(path, fits)
+        alone.scenes = [with_fit(r, *fit) for r, fit in zip(alone.scenes, fits, strict=True)]
+        return alone
 
     def _results(
         self, name: str, localizer: Localizer, number: int, seconds: float
@@ -215,16 +238,6 @@ class _Run:
             )
             for scene in self.scenes[: number + 1]
         )
-
-
-def _without_map(maps: SceneMaps, replays: bool) -> SceneMaps:
-    """What the network of the same training knows; keyframes stay where it replays them."""
-    alone = maps.copy_for_training()
-    for i, keyframes in enumerate(alone.keyframes):
-        assert keyframes is not None, "a map has keyframes"
-        images = Keyframes(keyframes.images, keyframes.cameras, keyframes.base_from_camera)
-        alone.keyframes[i] = images if replays else None
-    return alone
 
 
 def _with_centres(stage: StageOptions, scenes: Sequence[Scene]) -> StageOptions:
