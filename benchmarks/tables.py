@@ -245,6 +245,24 @@ def _bump(sources: Sequence[Published], what: str) -> str:
     return _markdown([[title, *moved], ["called moved", *cells]])
 
 
+def _tuning(sources: Sequence[Published], what: str) -> str:
+    """`tune`: a row for each method, its trials in order, the one that was taken in bold."""
+    suites = [str(source.settings["suite"]) for source in sources]
+    table = [["method", "setting", "trials", *suites]]
+    for method in dict.fromkeys(str(row["method"]) for row in sources[0].rows):
+        of = [[row for row in source.rows if row["method"] == method] for source in sources]
+        trials = ", ".join(f"{value:g}" for value in _column(of[0], "value"))
+        cells = []
+        for rows in of:
+            areas = _column(rows, "auc_20cm")
+            told = [f"{area:.1f}" for area in areas]
+            best = int(areas.argmax())
+            told[best] = f"**{told[best]}**"
+            cells.append(" / ".join(told))
+        table.append([method, str(of[0][0]["setting"]), trials, *cells])
+    return _markdown(table)
+
+
 def _markdown(rows: TableRows) -> str:
     """A table without padding: a cell that changes changes one line."""
     header, *body = [[cell.replace("|", "\\|") for cell in row] for row in rows]
@@ -284,5 +302,6 @@ KINDS: dict[str, Callable[[Sequence[Published], str], str]] = {
     "badposes": _bad_poses,
     "trials": _trials,
     "bump": _bump,
+    "tuning": _tuning,
 }
 """What a table may be; a bench's tables come first."""

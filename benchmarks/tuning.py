@@ -13,6 +13,7 @@ from evercal.benchmark.rows import strategy_from_row
 from evercal.benchmark.suites import load_suite, tuning_split
 from evercal.continual.presets import preset
 from evercal.continual.strategies import Strategy
+from evercal.storage import read_settings, write_json
 
 WITHIN_M = 0.2
 """Position errors up to here count: few frames are held out, and the share within one bound jumps
@@ -47,7 +48,7 @@ def run(suite: str, data: Path | None, scenes: int, out: Path, file: Path) -> No
         data: folder of its recordings.
         scenes: how many of them.
         out: folder of results; the same command goes on there.
-        file: JSON of `evercal bench --rows`; a folder beside it gets all outcomes.
+        file: JSON of `evercal bench --rows`; `.outcomes.json` beside it gets all trials.
     """
     recorded = load_suite(suite, data, (), None)[:scenes]
     split = [tuning_split(scene) for scene in recorded]
@@ -65,14 +66,22 @@ def run(suite: str, data: Path | None, scenes: int, out: Path, file: Path) -> No
     chosen = [{"name": name, "of": name, "with": changes} for name, changes in settings.items()]
     file.write_text("[\n" + ",\n".join(f"  {json.dumps(row)}" for row in chosen) + "\n]\n")
     told = [
-        {"method": row["of"], "setting": row["with"]}
+        {"method": row["of"], **_setting(row["with"])}
         | {"auc_20cm": round(auc, 2), "accuracy_5cm_5deg": round(share, 2)}
         for row in rows
         for auc, share in [final[str(row["name"])]]
     ]
-    outcomes = file.with_suffix(".outcomes.jsonl")
-    outcomes.write_text("".join(json.dumps(one) + "\n" for one in told))
+    outcomes = {"settings": read_settings(out / results.SETTINGS), "rows": told}
+    write_json(file.with_suffix(".outcomes.json"), outcomes)
     print(tabulate(told, headers="keys", floatfmt=".1f"))
+
+
+def _setting(changes: object) -> dict[str, object]:
+    """The one number that a trial changes, by the name of its field."""
+    name = ""
+    while isinstance(changes, dict):
+        ((name, changes),) = changes.items()
+    return {"setting": name, "value": changes}
 
 
 def _rows(name: str) -> list[dict[str, object]]:

@@ -127,3 +127,19 @@ def test_rows_of_any_measurement(tmp_path: Path) -> None:
         publish(tmp_path / "rows.json", "g", {"both": ("a", "b")}, out=tmp_path)
     with pytest.raises(InputError, match="TITLE=ROW"):
         groups_of(["all"])
+
+
+def test_the_trial_that_was_taken_is_bold(tmp_path: Path) -> None:
+    rows = [
+        {"method": "er", "setting": "weight", "value": value, "auc_20cm": area}
+        for value, area in ((0.1, 40.0), (0.3, 52.25), (1.0, 51.0))
+    ]
+    source = tmp_path / "tuned.json"
+    write_json(source, {"settings": {"suite": "sim-mini"}, "rows": rows})
+    publish(source, "tuned", {}, out=tmp_path)
+    made = tables.regenerated("<!-- table: tuned tuning -->\n<!-- end -->\n", tmp_path)
+    assert made.splitlines()[1:4] == [
+        "| method | setting | trials | sim-mini |",
+        "| --- | ---: | ---: | ---: |",
+        "| er | weight | 0.1, 0.3, 1 | 40.0 / **52.2** / 51.0 |",
+    ]

@@ -11,6 +11,7 @@ from evercal.benchmark import results
 from evercal.benchmark.bench import BenchOptions
 from evercal.benchmark.results import SceneResult
 from evercal.benchmark.rows import strategy_from_row
+from evercal.storage import write_json
 
 
 def result(strategy: str, stage: int, scene: str, errors_m: tuple[float, ...]) -> SceneResult:
@@ -52,6 +53,7 @@ def test_the_best_trial_of_every_method_is_written(
 
     def bench(scenes: list[object], options: BenchOptions, out: Path) -> list[object]:
         out.mkdir()
+        write_json(out / results.SETTINGS, {"suite": "sim-mini"})
         results.append(out, [result(k, 1, "a", (v,)) for k, v in errors.items()])
         assert options.settings["judged"] == "held-out training frames"
         return []
@@ -63,7 +65,13 @@ def test_the_best_trial_of_every_method_is_written(
     file = tmp_path / "tuned.json"
     tuning.run("sim-mini", None, 2, tmp_path / "out", file)
     assert json.loads(file.read_text()) == [{"name": "er", "of": "er", "with": {"weight": 0.3}}]
-    outcomes = file.with_suffix(".outcomes.jsonl").read_text().splitlines()
-    told = [json.loads(line) for line in outcomes]
+    outcomes = json.loads(file.with_suffix(".outcomes.json").read_text())
+    told = outcomes["rows"]
+    assert outcomes["settings"] == {"suite": "sim-mini"}
+    assert [(one["method"], one["setting"], one["value"]) for one in told] == [
+        ("er", "weight", 0.1),
+        ("er", "weight", 0.3),
+        ("er", "weight", 1.0),
+    ]
     assert [one["auc_20cm"] for one in told] == [25.0, 90.0, 70.0]
     assert [one["accuracy_5cm_5deg"] for one in told] == [0.0, 100.0, 0.0]
