@@ -81,7 +81,7 @@ def tune(
     scenes: int = 3,
     out: Path = Path("runs/tune"),
 ) -> None:
-    """Three trials of every method's setting on held-out training frames; goes on where it stopped.
+    """Four trials of every method's setting on held-out training frames; goes on where it stopped.
 
     Args:
         suite: whose first scenes are learned.

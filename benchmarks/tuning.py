@@ -1,4 +1,4 @@
-"""Tunes every method alike: three trials of its one setting, judged on held-out training frames."""
+"""Tunes every method alike: four trials of its one setting, judged on held-out training frames."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -20,20 +20,20 @@ WITHIN_M = 0.2
 from run to run."""
 
 Trials = Sequence[Mapping[str, object]]
-WEIGHTS: Trials = [{"weight": w} for w in (0.1, 0.3, 1.0)]
-STRENGTHS: Trials = [{"strength": s} for s in (10.0, 100.0, 1000.0)]
-CLAMPS: Trials = [{"clamp_px": c} for c in (20.0, 50.0, 100.0)]
-ALPHAS: Trials = [{"alpha": a} for a in (0.5, 2.0, 8.0)]
+WEIGHTS: Trials = [{"weight": w} for w in (0.1, 0.3, 1.0, 3.0)]
+STRENGTHS: Trials = [{"strength": s} for s in (10.0, 100.0, 1e3, 1e5)]
+CLAMPS: Trials = [{"clamp_px": c} for c in (20.0, 50.0, 100.0, 200.0)]
+ALPHAS: Trials = [{"alpha": a} for a in (0.5, 2.0, 8.0, 32.0)]
 TRIALS: dict[str, Trials] = {
     **dict.fromkeys(("er", "hybrid", "gdr", "gss", "mir", "lwf"), WEIGHTS),
     **dict.fromkeys(("icarl", "buff_cs", "der", "co2l"), WEIGHTS),
     **dict.fromkeys(("ewc", "ewc_online", "si", "mas"), STRENGTHS),
     "agem": CLAMPS,
-    "gem": [{"margin": m} for m in (0.01, 0.03, 0.1)],
+    "gem": [{"margin": m} for m in (0.01, 0.03, 0.1, 0.3)],
     **dict.fromkeys(("gec", "gec_moving"), ALPHAS),
-    "gpm": [{"kept_share": k} for k in (0.9, 0.97, 0.99)],
-    "sars_spdd": [{"penalty": {"scale": s}} for s in (1.0, 10.0, 50.0)],
-    "evercal_network": [{"weight": w} for w in (0.17, 0.5, 1.5)],
+    "gpm": [{"kept_share": k} for k in (0.9, 0.97, 0.99, 0.999)],
+    "sars_spdd": [{"penalty": {"scale": s}} for s in (1.0, 10.0, 50.0, 200.0)],
+    "evercal_network": [{"weight": w} for w in (0.17, 0.5, 1.5, 4.5)],
 }
 """The setting of each method that is tuned; `finetune`, `joint` and `isolation` have none."""
 ALIKE = {"evercal_hybrid": "evercal_network", "sars_spdd_filled": "sars_spdd"}

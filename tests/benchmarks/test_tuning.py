@@ -49,7 +49,7 @@ def test_area_counts_every_centimetre_and_only_the_last_stage(tmp_path: Path) ->
 def test_the_best_trial_of_every_method_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    errors = {"er_0": 0.15, "er_1": 0.02, "er_2": 0.06}
+    errors = {"er_0": 0.15, "er_1": 0.02, "er_2": 0.06, "er_3": 0.3}
 
     def bench(scenes: list[object], options: BenchOptions, out: Path) -> list[object]:
         out.mkdir()
@@ -72,6 +72,7 @@ def test_the_best_trial_of_every_method_is_written(
         ("er", "weight", 0.1),
         ("er", "weight", 0.3),
         ("er", "weight", 1.0),
+        ("er", "weight", 3.0),
     ]
-    assert [one["auc_20cm"] for one in told] == [25.0, 90.0, 70.0]
-    assert [one["accuracy_5cm_5deg"] for one in told] == [0.0, 100.0, 0.0]
+    assert [one["auc_20cm"] for one in told] == [25.0, 90.0, 70.0, 0.0]
+    assert [one["accuracy_5cm_5deg"] for one in told] == [0.0, 100.0, 0.0, 0.0]
