@@ -21,7 +21,7 @@ from run to run."""
 
 Trials = Sequence[Mapping[str, object]]
 WEIGHTS: Trials = [{"weight": w} for w in (0.1, 0.3, 1.0, 3.0)]
-STRENGTHS: Trials = [{"strength": s} for s in (10.0, 100.0, 1e3, 1e5)]
+STRENGTHS: Trials = [{"strength": s} for s in (1e4, 1e5, 1e6, 1e7)]
 CLAMPS: Trials = [{"clamp_px": c} for c in (20.0, 50.0, 100.0, 200.0)]
 ALPHAS: Trials = [{"alpha": a} for a in (0.5, 2.0, 8.0, 32.0)]
 TRIALS: dict[str, Trials] = {
