@@ -246,7 +246,10 @@ def _bump(sources: Sequence[Published], what: str) -> str:
 
 
 def _tuning(sources: Sequence[Published], what: str) -> str:
-    """`tune`: a row for each method, its trials in order, the one that was taken in bold."""
+    """`tune`: a row for each method, its trials in order, the one that was taken in bold.
+
+    A trial is told by its area under the curve for the earlier scenes + that for the newest.
+    """
     suites = [str(source.settings["suite"]) for source in sources]
     table = [["method", "setting", "trials", *suites]]
     for method in dict.fromkeys(str(row["method"]) for row in sources[0].rows):
@@ -254,11 +257,11 @@ def _tuning(sources: Sequence[Published], what: str) -> str:
         trials = ", ".join(f"{value:g}" for value in _column(of[0], "value"))
         cells = []
         for rows in of:
-            areas = _column(rows, "auc_20cm")
-            told = [f"{area:.1f}" for area in areas]
-            best = int(areas.argmax())
+            parts = zip(_column(rows, "auc_earlier"), _column(rows, "auc_newest"), strict=True)
+            told = [f"{earlier:.0f}+{newest:.0f}" for earlier, newest in parts]
+            best = int(_column(rows, "auc_20cm").argmax())
             told[best] = f"**{told[best]}**"
-            cells.append(" / ".join(told))
+            cells.append(", ".join(told))
         table.append([method, str(of[0][0]["setting"]), trials, *cells])
     return _markdown(table)
 

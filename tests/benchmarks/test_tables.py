@@ -130,9 +130,11 @@ def test_rows_of_any_measurement(tmp_path: Path) -> None:
 
 
 def test_the_trial_that_was_taken_is_bold(tmp_path: Path) -> None:
+    trials = ((0.1, 30.0, 50.0), (0.3, 52.4, 52.1), (1.0, 60.0, 42.0))
     rows = [
-        {"method": "er", "setting": "weight", "value": value, "auc_20cm": area}
-        for value, area in ((0.1, 40.0), (0.3, 52.25), (1.0, 51.0))
+        {"method": "er", "setting": "weight", "value": value}
+        | {"auc_20cm": (earlier + newest) / 2, "auc_earlier": earlier, "auc_newest": newest}
+        for value, earlier, newest in trials
     ]
     source = tmp_path / "tuned.json"
     write_json(source, {"settings": {"suite": "sim-mini"}, "rows": rows})
@@ -141,5 +143,5 @@ def test_the_trial_that_was_taken_is_bold(tmp_path: Path) -> None:
     assert made.splitlines()[1:4] == [
         "| method | setting | trials | sim-mini |",
         "| --- | ---: | ---: | ---: |",
-        "| er | weight | 0.1, 0.3, 1 | 40.0 / **52.2** / 51.0 |",
+        "| er | weight | 0.1, 0.3, 1 | 30+50, **52+52**, 60+42 |",
     ]
