@@ -32,7 +32,7 @@ TRIALS: dict[str, Trials] = {
     "agem": CLAMPS,
     "gem": [{"margin": m} for m in (0.01, 0.03, 0.1, 0.3)],
     **dict.fromkeys(("gec", "gec_moving"), ALPHAS),
-    "gpm": [{"kept_share": k} for k in (0.9, 0.97, 0.99, 0.999)],
+    "gpm": [{"kept_share": k} for k in (0.6, 0.8, 0.9, 0.97)],
     "sars_spdd": [{"penalty": {"scale": s}} for s in (1.0, 10.0, 50.0, 200.0)],
     "evercal_network": [{"weight": w} for w in (0.17, 0.5, 1.5, 4.5)],
 }
