@@ -1,4 +1,8 @@
-"""Tunes every method alike: four trials of its one setting, judged on held-out training frames."""
+"""Tunes every method alike: four trials of its one setting, judged on held-out training frames.
+
+Few frames are held out, and the share within one bound jumps from run to run; so the judge is the
+area under the curve of recall over position error (`evaluation.recall_area`).
+"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -13,11 +17,8 @@ from evercal.benchmark.rows import strategy_from_row
 from evercal.benchmark.suites import load_suite, tuning_split
 from evercal.continual.presets import preset
 from evercal.continual.strategies import Strategy
+from evercal.evaluation import recall_area
 from evercal.storage import read_settings, write_json
-
-WITHIN_M = 0.2
-"""Position errors up to here count: few frames are held out, and the share within one bound jumps
-from run to run."""
 
 Trials = Sequence[Mapping[str, object]]
 WEIGHTS: Trials = [{"weight": w} for w in (0.1, 0.3, 1.0, 3.0)]
@@ -103,8 +104,7 @@ def final_scores(
     shares: dict[str, list[float]] = {strategy.name: [] for strategy in strategies}
     for result in results.read(out):
         if result.stage == stages - 1 and result.strategy in areas:
-            near = np.clip(1 - np.array(result.translation_m) / WITHIN_M, 0, 1)
-            areas[result.strategy].append(100 * float(near.mean()))
+            areas[result.strategy].append(recall_area(result.translation_m))
             shares[result.strategy].append(100 * result.accuracy())
     return {
         name: {

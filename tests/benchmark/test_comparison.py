@@ -133,9 +133,10 @@ def test_intervals_resample_whole_runs_of_frames() -> None:
 
 def test_bounds_are_strict() -> None:
     header, ours = threshold_rows(runs_of(OURS))
-    assert header == ["strategy", "10 cm 10 deg", "5 cm 5 deg", "2 cm 2 deg", "1 cm 1 deg"]
-    # Errors are 2 cm or 30 cm.
-    assert ours == ["ours", "67.5", "67.5", "0.0", "0.0"]
+    bounds = ["10 cm 10 deg", "5 cm 5 deg", "2 cm 2 deg", "1 cm 1 deg"]
+    assert header == ["strategy", "area to 20 cm", *bounds]
+    # Errors are 2 cm or 30 cm: each of the former has nine tenths of the area.
+    assert ours == ["ours", "60.8", "67.5", "67.5", "0.0", "0.0"]
 
 
 def test_selectors_are_told_by_how_their_frames_lie() -> None:

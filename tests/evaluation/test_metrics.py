@@ -11,6 +11,7 @@ from evercal.evaluation import (
     FrameResult,
     continual_scores,
     correct,
+    recall_area,
     scores,
     share_inside,
     squared_mahalanobis,
@@ -190,3 +191,12 @@ def test_the_share_inside_counts_those_that_have_one() -> None:
     rows = [result(squared_mahalanobis=value) for value in (1.0, 20.0, 12.0, math.nan)]
     assert scores(rows).scenes["a"].inside_95 == pytest.approx(200 / 3)
     assert scores([result()]).to_dict()["scenes"]["a"]["inside_95"] is None  # pyright: ignore[reportIndexIssue]
+
+
+def test_recall_area_is_that_under_the_curve() -> None:
+    assert recall_area([0.0, 0.05, 0.2, math.inf]) == pytest.approx(100 * 1.75 / 4)
+    errors = np.random.default_rng(3).exponential(0.15, 400)
+    grid = np.linspace(0, 0.2, 4001)
+    curve = (errors[:, None] <= grid).mean(0)
+    assert recall_area(errors) == pytest.approx(500 * np.trapezoid(curve, grid), abs=0.02)
+    assert recall_area(errors, 0.1) < recall_area(errors)

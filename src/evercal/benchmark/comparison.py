@@ -16,6 +16,7 @@ from evercal.evaluation.metrics import (
     MIDDLE,
     ContinualScores,
     continual_scores,
+    recall_area,
     share_inside,
 )
 from evercal.evaluation.statistics import Interval, frame_pieces, paired_difference
@@ -133,12 +134,13 @@ def method_rows(runs: Sequence[Run]) -> TableRows:
 
 
 def threshold_rows(runs: Sequence[Run]) -> TableRows:
-    """One row per strategy: final accuracy in per cent under looser and tighter bounds."""
-    rows = [["strategy", *(f"{100 * m:.0f} cm {np.rad2deg(r):.0f} deg" for m, r in BOUNDS)]]
+    """One row per strategy: `recall_area` at the end and accuracy under several bounds."""
+    bounds = [f"{100 * m:.0f} cm {np.rad2deg(r):.0f} deg" for m, r in BOUNDS]
+    rows = [["strategy", "area to 20 cm", *bounds]]
     for name, of in by_strategy(runs).items():
-        rows.append(
-            [name, *(_mean([run.scores(bound).final_accuracy for run in of]) for bound in BOUNDS)]
-        )
+        areas = [recall_area(scene.translation_m) for run in of for scene in run.last]
+        shares = [_mean([run.scores(bound).final_accuracy for run in of]) for bound in BOUNDS]
+        rows.append([name, _mean(areas), *shares])
     return rows
 
 

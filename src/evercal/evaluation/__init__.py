@@ -6,6 +6,7 @@ from evercal.evaluation.metrics import SceneScores as SceneScores
 from evercal.evaluation.metrics import Scores as Scores
 from evercal.evaluation.metrics import continual_scores as continual_scores
 from evercal.evaluation.metrics import correct as correct
+from evercal.evaluation.metrics import recall_area as recall_area
 from evercal.evaluation.metrics import scores as scores
 from evercal.evaluation.metrics import share_inside as share_inside
 from evercal.evaluation.metrics import squared_mahalanobis as squared_mahalanobis
