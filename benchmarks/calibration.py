@@ -18,8 +18,8 @@ from evercal.continual.learn_scene import LearnOptions, learn_scene
 from evercal.continual.presets import preset
 from evercal.datasets import Scene, load_scene
 from evercal.errors import InputError
-from evercal.evaluation.metrics import CHI2_6, squared_mahalanobis
-from evercal.geometry import SE3, pose_distance
+from evercal.evaluation.metrics import CHI2_6
+from evercal.geometry import SE3, pose_distance, squared_mahalanobis
 from evercal.localization.localizer import Localizer
 from evercal.simulation.mini import FOLDER
 

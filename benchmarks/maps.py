@@ -16,8 +16,8 @@ from evercal.continual.learn_scene import LearnOptions, LearnReport, learn_scene
 from evercal.continual.presets import preset
 from evercal.datasets import Frame, Scene, load_scene, posed
 from evercal.errors import InputError
-from evercal.evaluation.metrics import CHI2_6, squared_mahalanobis
-from evercal.geometry import SE3, Camera, average_poses, pose_distance
+from evercal.evaluation.metrics import CHI2_6
+from evercal.geometry import SE3, Camera, average_poses, pose_distance, squared_mahalanobis
 from evercal.localization.localizer import LocalizeOptions, Localizer
 from evercal.simulation.mini import mini_rooms
 

@@ -14,10 +14,9 @@ from evercal.evaluation import (
     recall_area,
     scores,
     share_inside,
-    squared_mahalanobis,
 )
 from evercal.evaluation.metrics import CHI2_6, FINE
-from evercal.geometry import SE3
+from evercal.geometry import SE3, squared_mahalanobis
 
 DEGREE = math.pi / 180
 

@@ -9,7 +9,6 @@ from evercal.evaluation.metrics import correct as correct
 from evercal.evaluation.metrics import recall_area as recall_area
 from evercal.evaluation.metrics import scores as scores
 from evercal.evaluation.metrics import share_inside as share_inside
-from evercal.evaluation.metrics import squared_mahalanobis as squared_mahalanobis
 from evercal.evaluation.protocol import evaluate as evaluate
 from evercal.evaluation.statistics import Interval as Interval
 from evercal.evaluation.statistics import frame_pieces as frame_pieces

@@ -14,8 +14,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evercal.geometry import SE3
-
 Status = Literal["ok", "unknown_scene", "failed"]
 
 COARSE = (0.05, math.radians(5.0))
@@ -172,23 +170,6 @@ def scores(results: Sequence[FrameResult]) -> Scores:
         float(np.mean([row.accuracy_1cm_1deg for row in scenes.values()])),
         float(np.mean([result.milliseconds for result in results])),
     )
-
-
-def squared_mahalanobis(found: SE3, covariance: ArrayLike, truth: SE3) -> float:
-    """Squared error of a pose in units of its own covariance.
-
-    If the covariance is right, 95 % lie below `CHI2_6`.
-
-    Args:
-        found: base_from_camera.
-        covariance: (6, 6) of (translation in the base frame, metres; rotation about camera axes,
-            radians).
-        truth: base_from_camera.
-    """
-    shift = truth.translation_m - found.translation_m
-    turn = (found.inverse() @ truth).log()[3:]
-    error = np.concatenate([shift, turn])
-    return float(error @ np.linalg.solve(np.asarray(covariance, dtype=np.float64), error))
 
 
 def share_inside(squared: ArrayLike) -> float:

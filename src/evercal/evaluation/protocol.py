@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from evercal.datasets import Frame, Scene, known_poses, posed
 from evercal.errors import InputError
-from evercal.evaluation.metrics import FrameResult, Status, squared_mahalanobis
-from evercal.geometry import SE3, Camera, near_training, pose_distance
+from evercal.evaluation.metrics import FrameResult, Status
+from evercal.geometry import SE3, Camera, near_training, pose_distance, squared_mahalanobis
 
 
 class Estimate(Protocol):

@@ -6,6 +6,8 @@ Of translation in the parent frame, metres, and rotation about the axes of the c
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evercal.geometry.se3 import SE3
+
 Array = NDArray[np.float64]
 
 
@@ -31,3 +33,21 @@ def with_translation_by(matrix: ArrayLike, covariance: ArrayLike) -> Array:
     whole = np.eye(6)
     whole[:3, :3] = matrix
     return whole @ np.asarray(covariance, dtype=np.float64) @ whole.T
+
+
+def squared_mahalanobis(found: SE3, covariance: ArrayLike, truth: SE3) -> float:
+    """Squared error of a pose in units of its own covariance.
+
+    If the covariance is right, it has a chi-squared distribution of six degrees of freedom.
+
+    Args:
+        found: base_from_camera.
+        covariance: (6, 6) of (translation in the base frame, metres; rotation about camera axes,
+            radians).
+        truth: base_from_camera.
+    """
+    shift = truth.translation_m - found.translation_m
+    turn = (found.inverse() @ truth).log()[3:]
+    error = np.concatenate([shift, turn])
+    # A pose from few points may be certain in some direction: the pseudo-inverse leaves that out.
+    return float(error @ np.linalg.pinv(np.asarray(covariance, dtype=np.float64)) @ error)

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from evercal.datasets.frame import Frame
-from evercal.geometry.se3 import pose_distance
+from evercal.geometry import pose_distance, squared_mahalanobis
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord, with_fit
 from evercal.simulation.box_room import BoxRoom, default_camera
@@ -79,10 +79,10 @@ def fit_threshold(
             continue
         metres, radians = pose_distance(estimate.base_from_camera, frame.base_from_camera)
         if metres < 0.25 and radians < np.deg2rad(15) and estimate.covariance is not None:
-            moved = estimate.base_from_camera.inverse() @ frame.base_from_camera
-            shift = frame.base_from_camera.translation_m - estimate.base_from_camera.translation_m
-            error = np.concatenate([shift, moved.log()[3:]])
-            right.append(float(error @ np.linalg.pinv(estimate.covariance) @ error))
+            error = squared_mahalanobis(
+                estimate.base_from_camera, estimate.covariance, frame.base_from_camera
+            )
+            right.append(error)
     negatives = [localizer.localize(image).inlier_ratio for image in _negative_images(maps, scene)]
     top = float(np.quantile(negatives, 0.95))
     known_low = float(np.quantile(ratios, 0.05)) if ratios else 1.0
