@@ -203,6 +203,7 @@ class _Run:
         Its thresholds are fitted when a scene is learned and then stay, as without a map.
         """
         alone, path = maps.copy_for_training(), self._network_fits
+        path.parent.mkdir(parents=True, exist_ok=True)  # joint training commits no store
         for i, keyframes in enumerate(alone.keyframes):
             assert keyframes is not None, "a map has keyframes"
             images = Keyframes(keyframes.images, keyframes.cameras, keyframes.base_from_camera)
@@ -212,7 +213,6 @@ class _Run:
             _, aside = validation_split(self.scenes[i].train)
             record = fitted_record(alone, aside, i)
             fits.append([record.inlier_threshold, record.covariance_scale])
-            path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, fits)
         alone.scenes = [with_fit(r, *fit) for r, fit in zip(alone.scenes, fits, strict=True)]
         return alone

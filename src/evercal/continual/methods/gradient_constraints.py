@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from evercal.continual.methods.method import FinishedScene, StageStart
 from evercal.continual.methods.penalties import Reprojection
@@ -116,8 +117,7 @@ class Gem(ConstrainedStep):
         self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
     ) -> Tensor:
         """The nearest change with <g_t, u> <= 0 for every scene, beyond the margin."""
-        unit = g / g.norm(dim=1, keepdim=True).clamp(min=1e-12)
-        pushed = changes - self.margin * changes.norm() * unit.sum(0)
+        pushed = changes - self.margin * changes.norm() * F.normalize(g, dim=1).sum(0)
         return nearest_change(pushed, g, torch.zeros(len(g)))
 
 
