@@ -83,10 +83,19 @@ def _runs(sources: Sequence[Published]) -> list[Run]:
 
 
 def _bench(rows_of: Callable[[Sequence[Run]], TableRows]) -> Callable[..., str]:
-    """A table of strategies; those with one run stand apart where others have several."""
+    """A table of strategies; those with one run stand apart where others have several.
 
-    def made(sources: Sequence[Published], _: str) -> str:
+    The argument `map` keeps those with a map, `network` those without one.
+    """
+
+    def made(sources: Sequence[Published], part: str) -> str:
         runs = _runs(sources)
+        if part:
+            runs = [
+                run
+                for run in runs
+                if run.description["map"] == {"map": True, "network": False}[part]
+            ]
         counts = {name: len(of) for name, of in by_strategy(runs).items()}
         several = [run for run in runs if counts[run.strategy] > 1]
         alone = [run for run in runs if counts[run.strategy] == 1]
@@ -112,20 +121,36 @@ def _differences(sources: Sequence[Published], reference: str) -> str:
 
 
 def _memory(sources: Sequence[Published], _: str) -> str:
-    """A row for each strategy and memory: what the same scenes come to with fewer keyframes."""
+    """What the same scenes come to with fewer keyframes."""
+    shares = [_number(source.settings["memory_share"]) for source in sources]
+    return _along(sources, "keyframes", [f"{100 * share:.0f} %" for share in shares])
+
+
+def _steps(sources: Sequence[Published], _: str) -> str:
+    """What the same scenes come to with more steps: a learning curve."""
+    fits = [source.settings["fit"] for source in sources]
+    steps = [_number(fit["iterations"]) for fit in fits if isinstance(fit, dict)]
+    return _along(sources, "steps a scene", [f"{of:,.0f}" for of in steps])
+
+
+def _number(value: object) -> float:
+    assert isinstance(value, float | int), value
+    return value
+
+
+def _along(sources: Sequence[Published], title: str, told: Sequence[str]) -> str:
+    """A row for each strategy and file, means over its runs."""
     bounds = {"5 cm/5 deg": COARSE, "1 cm/1 deg": FINE, "5 mm/0.5 deg": FINEST}
-    rows = [["keyframes", "strategy", *bounds, "median mm", "wrong scene", "MB"]]
-    for source in sources:
-        share = source.settings["memory_share"]
-        assert isinstance(share, float)
+    rows = [[title, "strategy", *bounds, "median mm", "wrong scene", "MB"]]
+    for source, label in zip(sources, told, strict=True):
         for name, of in by_strategy(runs_of(source.results())).items():
-            run, last = of[0], of[0].last
-            told = [f"{run.scores(bound).final_accuracy:.1f}" for bound in bounds.values()]
+            last = [scene for run in of for scene in run.last]
+            shares = [np.mean([r.scores(b).final_accuracy for r in of]) for b in bounds.values()]
             median = 1000 * np.median(np.concatenate([scene.translation_m for scene in last]))
             size = (last[0].memory_bytes + last[0].head_bytes) / 1e6
-            wrong = sum(int(np.sum(scene.wrong_scene)) for scene in last)
-            more = [f"{median:.1f}" if np.isfinite(median) else "-", str(wrong), f"{size:.1f}"]
-            rows.append([f"{100 * share:.0f} %", name, *told, *more])
+            wrong = sum(int(np.sum(scene.wrong_scene)) for scene in last) / len(of)
+            more = [f"{median:.1f}" if np.isfinite(median) else "-", f"{wrong:.0f}", f"{size:.1f}"]
+            rows.append([label, name, *(f"{share:.1f}" for share in shares), *more])
     return _markdown(rows)
 
 
@@ -299,6 +324,7 @@ KINDS: dict[str, Callable[[Sequence[Published], str], str]] = {
     "selectors": _bench(selector_rows),
     "differences": _differences,
     "memory": _memory,
+    "steps": _steps,
     "accuracy": _accuracy,
     "spoiled": _spoiled,
     "fixed": _fixed,

@@ -145,3 +145,33 @@ def test_the_trial_that_was_taken_is_bold(tmp_path: Path) -> None:
         "| --- | ---: | ---: | ---: |",
         "| er | weight | 0.1, 0.3, 1 | 30+50, **52+52**, 60+42 |",
     ]
+
+
+def test_rows_with_a_map_stand_apart_from_networks(tmp_path: Path) -> None:
+    (folder := tmp_path / "run").mkdir()
+    write_json(folder / results.SETTINGS, {})
+    write_json(folder / results.STRATEGIES, {"er_map": {"method": {"kind": "Replay"}, "map": True}})
+    for name in ("er_map", "er_map:network"):
+        results.append(folder, lines(name, 0, [[16], [14, 12]]))
+    publish(folder, "beside", {}, out=tmp_path)
+
+    def rows(part: str) -> list[str]:
+        made = tables.regenerated(f"<!-- table: beside methods{part} -->\n<!-- end -->\n", tmp_path)
+        return re.findall(r"^\| (er\S+)", made, re.MULTILINE)
+
+    assert rows("") == ["er_map", "er_map:network"]
+    assert rows(" map") == ["er_map"]
+    assert rows(" network") == ["er_map:network"]
+
+
+def test_a_learning_curve_has_a_row_for_each_number_of_steps(tmp_path: Path) -> None:
+    for steps, right in ((600, 4), (9600, 16)):
+        (folder := tmp_path / f"run-{steps}").mkdir()
+        write_json(folder / results.SETTINGS, {"fit": {"iterations": steps}})
+        for seed in (0, 1):
+            results.append(folder, lines("er", seed, [[16], [right - seed, right]]))
+        publish(folder, f"at-{steps}", {}, out=tmp_path)
+    made = tables.regenerated("<!-- table: at-600+at-9600 steps -->\n<!-- end -->\n", tmp_path)
+    # Of 20 frames 3.5 and 4 are right with 600 steps, 15.5 and 16 with 9,600.
+    assert "| 600 | er | 18.8 |" in made
+    assert "| 9,600 | er | 78.8 |" in made
