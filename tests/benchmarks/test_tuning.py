@@ -35,14 +35,14 @@ def result(strategy: str, stage: int, scene: str, errors_m: tuple[float, ...]) -
 
 def test_area_counts_every_centimetre_and_only_the_last_stage(tmp_path: Path) -> None:
     found = [
-        result("er_0", 0, "a", (0.0, 0.0)),  # forgotten later
-        result("er_0", 1, "a", (0.1, math.inf)),
-        result("er_0", 1, "b", (0.04, 0.0)),
+        result("er_0.1", 0, "a", (0.0, 0.0)),  # forgotten later
+        result("er_0.1", 1, "a", (0.1, math.inf)),
+        result("er_0.1", 1, "b", (0.04, 0.0)),
     ]
     results.append(tmp_path, found)
-    row = {"name": "er_0", "of": "er", "with": {"weight": 0.1}}
+    row = {"name": "er_0.1", "of": "er", "with": {"weight": 0.1}}
     assert tuning.final_scores(tmp_path, [strategy_from_row("t", row)], 2) == {
-        "er_0": {
+        "er_0.1": {
             "auc_20cm": 57.5,
             "auc_earlier": 25.0,
             "auc_newest": 90.0,
@@ -54,7 +54,7 @@ def test_area_counts_every_centimetre_and_only_the_last_stage(tmp_path: Path) ->
 def test_the_best_trial_of_every_method_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    errors = {"er_0": 0.15, "er_1": 0.02, "er_2": 0.06, "er_3": 0.3}
+    errors = {"er_0.1": 0.15, "er_0.3": 0.02, "er_1": 0.06, "er_3": 0.3}
 
     def bench(scenes: list[object], options: BenchOptions, out: Path) -> list[object]:
         out.mkdir()

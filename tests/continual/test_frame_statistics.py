@@ -94,6 +94,24 @@ def test_a_gradient_says_how_the_loss_falls(
     assert before - after == pytest.approx(step * float(part.norm()) ** 2, rel=0.1)
 
 
+def test_where_centres_are_known_in_advance_all_of_them_give_gradients(
+    seen: tuple[FrameStatistics, Head, FeatureBuffer], rooms: Rooms
+) -> None:
+    """They belong to no scene: those of a later scene would have none of its own."""
+    _, known, buffer = seen
+    torch.manual_seed(0)
+    options = HeadOptions(
+        width=16, blocks=1, condition="descriptor", centres="fixed", centres_per_scene=6
+    )
+    head = Head(known.features, known.descriptor, options)
+    head.grow(torch.randn(6, 3) + torch.tensor([0.0, 0.0, 2.0]), seed=0)
+    later = FeatureBuffer(1, buffer.atlas_from_base)
+    later.restore(dict(buffer.tensors))
+    gradients = FrameStatistics(rooms[0].train, head, lambda: later, 5).gradients()
+    assert gradients.shape == (len(rooms[0].train), head.logit.numel() + head.offset.numel())
+    assert np.abs(gradients).max() > 0
+
+
 def test_poses_are_those_of_the_frames_and_draws_repeat(rooms: Rooms) -> None:
     frames = rooms[1].train
 

@@ -26,6 +26,7 @@ from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Checkpoint
 from evercal.networks.buffer import Rows
 from evercal.networks.head import HeadOutput
+from evercal.networks.loss import LossOptions, clamp_px
 from evercal.networks.trainer import Progress
 
 from .stages import Blank, Rooms, assert_same, continued, outcome, weights
@@ -197,10 +198,10 @@ class Spy(Penalty):
     seen: list[tuple[HeadOutput, Rows, float]] = field(default_factory=list)
 
     def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
         assert teacher is not None
-        self.seen.append((teacher, rows, progress))
+        self.seen.append((teacher, rows, tau_px))
         return student.points.square().mean()
 
 
@@ -211,9 +212,12 @@ def test_replayed_rows_are_the_old_scenes_and_their_teacher_stays_as_it_was(
     keyframes = maps.keyframes[0]
     assert keyframes is not None
     spy = Spy()
+    circle = LossOptions(schedule="circle", clamp_start_px=50.0)
+    quick = replace(quick, fit=replace(quick.fit, loss=circle))
     list(learn(maps, Strategy("spied", Replay("sars_filled", spy)), rooms[1], quick))
     seen = spy.seen
-    assert [progress for *_, progress in seen] == [i / 8 for i in range(8)]
+    # Replayed rows have the clamp of new ones, whatever the schedule.
+    assert [tau_px for *_, tau_px in seen] == [clamp_px(circle, i / 8) for i in range(8)]
     centres = maps.scenes[0].cell.atlas_from_base.apply(keyframes.base_from_camera.translation_m)
     for teacher, rows, _ in seen:
         assert len(rows.scene) == 32

@@ -83,12 +83,12 @@ class Both(TrainingHooks):
     ) -> list[Rows]:
         return [memory.draw(16, generator) for memory in self.memories]
 
-    def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
+    def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
         if self.rule == "constraints":
             return None
         return (output.points - rows.features[:, 6:].float()).abs().mean()
 
-    def constraints(self, output: HeadOutput, rows: Rows, progress: float) -> list[Tensor]:
+    def constraints(self, output: HeadOutput, rows: Rows, tau_px: float) -> list[Tensor]:
         if self.rule == "cost":
             return []
         each = len(rows.scene) // 2

@@ -14,7 +14,7 @@ from evercal.geometry import SE3, Camera
 from evercal.networks.buffer import FeatureBuffer, Rows
 from evercal.networks.head import Head, HeadOptions, HeadOutput
 from evercal.networks.hooks import ProposedStep, TrainingHooks
-from evercal.networks.loss import LossOptions, reprojection_error
+from evercal.networks.loss import LossOptions, clamp_px, reprojection_error
 from evercal.networks.trainer import FitOptions, HeadTrainer, Progress, one_cycle
 
 CAMERA = Camera(160, 120, 131.0, 128.0, 79.5, 59.5)
@@ -43,8 +43,8 @@ class Replayed(TrainingHooks):
     ) -> list[Rows]:
         return [memory.draw(30, generator) for memory in self.memories]
 
-    def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
-        return self.penalty(output, rows, progress)
+    def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
+        return self.penalty(output, rows, tau_px)
 
 
 class Counted(Replayed):
@@ -132,7 +132,7 @@ def test_stopping_and_going_on_changes_nothing(
     twin, third = copy.deepcopy(head), copy.deepcopy(head)
 
     def hooks() -> Replayed:
-        return kind([past], lambda output, rows, progress: output.points.abs().mean())
+        return kind([past], lambda output, rows, tau_px: output.points.abs().mean())
 
     whole = HeadTrainer(head, [fresh], OPTIONS, 3, hooks())
     expected = list(whole.run())
@@ -213,9 +213,9 @@ def test_replay_gets_remembered_rows_evenly_and_its_cost_is_trained(learnable: L
     # A cost that fresh rows alone would never pay: all logits' biases of scene 0 to -3.
     head = head_for(buffers)
 
-    def penalty(output: HeadOutput, rows: Rows, progress: float) -> Tensor:
+    def penalty(output: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
         assert len(output.points) == len(rows.scene) == len(rows.features)
-        seen.append((rows.scene, progress))
+        seen.append((rows.scene, tau_px))
         own = output.logits[rows.scene == 0][:, head.centre_scene == 0]
         return 100 * (own + 3).square().mean()
 
@@ -230,7 +230,8 @@ def test_replay_gets_remembered_rows_evenly_and_its_cost_is_trained(learnable: L
     assert abs(mean_logit() + 3) < 0.3 < abs(before + 3)
     for scene, _ in seen:
         assert torch.bincount(scene, minlength=3).tolist() == [30, 30, 0]
-    assert [progress for _, progress in seen] == pytest.approx([i / 60 for i in range(60)])
+    clamps = [clamp_px(options.loss, i / 60) for i in range(60)]  # those of the new rows
+    assert [tau_px for _, tau_px in seen] == pytest.approx(clamps)
 
 
 def test_several_scenes_share_a_batch_evenly(learnable: Learnable) -> None:
@@ -372,7 +373,7 @@ class Watching(Replayed):
         self.last: ProposedStep | None = None
         self.schedules: list[float] = []
 
-    def constraints(self, output: HeadOutput, rows: Rows, progress: float) -> list[Tensor]:
+    def constraints(self, output: HeadOutput, rows: Rows, tau_px: float) -> list[Tensor]:
         return [output.points[:30].square().mean(), output.points[30:].square().mean()]
 
     def edit_step(self, proposed: ProposedStep) -> None:
@@ -387,7 +388,7 @@ def test_proposed_changes_sum_up_to_the_way_of_the_weights(learnable: Learnable)
     buffers = [learnable(scene)[0] for scene in range(3)]
     head = head_for(buffers)
     first = {name: value.detach().clone() for name, value in head.named_parameters()}
-    hooks = Watching(buffers[:2], lambda output, rows, progress: output.points.abs().mean())
+    hooks = Watching(buffers[:2], lambda output, rows, tau_px: output.points.abs().mean())
     list(HeadTrainer(head, buffers[2:], OPTIONS, 0, hooks).run())
     assert hooks.way.keys() == first.keys()
     for name, value in head.named_parameters():
@@ -426,7 +427,7 @@ def test_constraints_are_not_minimised_and_their_gradients_are_their_own(
     """With and without them the step is the same, and each gradient is that of one scene's rows."""
     buffers = [learnable(scene)[0] for scene in range(3)]
 
-    def nothing(output: HeadOutput, rows: Rows, progress: float) -> Tensor:
+    def nothing(output: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
         return 0 * output.points.sum()
 
     watched, plain = head_for(buffers), head_for(buffers)
@@ -458,7 +459,7 @@ def test_replayed_rows_cost_nothing_where_the_hook_says_none(learnable: Learnabl
             assert rate == one_cycle(OPTIONS, step)
             return [buffers[0].draw(7, generator)]
 
-        def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
+        def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
             assert len(output.points) == len(rows.scene) == 7
             self.rows += 7
             return None

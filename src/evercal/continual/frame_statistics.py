@@ -94,10 +94,14 @@ class FrameStatistics:
         return [np.unique(vq(points, centres)[0]) for points in found]
 
     def gradients(self) -> np.ndarray:
-        """(n, p) gradients of each frame's loss by the scene's own logits and offsets."""
+        """(n, p) gradients of each frame's loss by the scene's own logits and offsets.
+
+        Centres that are known in advance belong to no scene; then by all logits and offsets.
+        """
         head, generator = self._head, torch.Generator().manual_seed(self._seed)
         parameters = (head.logit, head.offset)
-        own = torch.nonzero(head.centre_scene == self._buffer.scene)[:, 0]
+        shared_centres = head.options.centres != "grow"
+        own = torch.nonzero(shared_centres | (head.centre_scene == self._buffer.scene))[:, 0]
         found = []
         for i in range(len(self)):
             start, end = self._first_rows[i : i + 2].tolist()

@@ -51,17 +51,17 @@ class TrainingHooks:
         """
         return []
 
-    def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
+    def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
         """What replayed rows cost.
 
         Args:
             output: of the head on them.
             rows: the parts of `replayed`, one after the other.
-            progress: in [0, 1], share of the steps done.
+            tau_px: soft clamp of the loss on new rows in this step, pixels.
         """
         return None
 
-    def constraints(self, output: HeadOutput, rows: Rows, progress: float) -> list[Tensor]:
+    def constraints(self, output: HeadOutput, rows: Rows, tau_px: float) -> list[Tensor]:
         """Losses on replayed rows that are not minimised but whose gradients `edit_step` needs."""
         return []
 

@@ -129,16 +129,16 @@ class HeadTrainer:
         scene = self.buffers[0].scene if alone else rows.scene
         with autocast(self.device):
             output = self.head(rows.features.float(), scene, rows.descriptor)
-        costs, errors = self._fresh_costs(output.points[:fresh], rows.part(slice(0, fresh)))
+        tau_px = clamp_px(options.loss, self.step / options.iterations)
+        costs, errors = self._fresh_costs(output.points[:fresh], rows.part(slice(0, fresh)), tau_px)
         loss = costs.mean()
         held, remembered = output.part(slice(fresh, None)), rows.part(slice(fresh, None))
-        progress = self.step / options.iterations
         more = [self.hooks.regularizer()]
         if fresh < len(rows.scene):
-            more.append(self.hooks.cost(held, remembered, progress))
+            more.append(self.hooks.cost(held, remembered, tau_px))
         for cost in more:
             loss = loss if cost is None else loss + cost
-        losses = self.hooks.constraints(held, remembered, progress)
+        losses = self.hooks.constraints(held, remembered, tau_px)
         constraints = [self._gradients(one) for one in losses]
         loss.backward()
         every = [*self.head.parameters(), self.correction]
@@ -163,15 +163,14 @@ class HeadTrainer:
             rows.descriptor = F.normalize(rows.descriptor + noise, dim=-1)
         return rows, fresh * (share // processes())
 
-    def _fresh_costs(self, points: Tensor, rows: Rows) -> tuple[Tensor, Tensor]:
+    def _fresh_costs(self, points: Tensor, rows: Rows, tau_px: float) -> tuple[Tensor, Tensor]:
         """Loss and error in pixels of the rows being learned."""
         options = self.options
-        tau = clamp_px(options.loss, self.step / options.iterations)
         correction = None
-        if options.intrinsics_rate > 0 and tau < CORRECTION_FROM_PX:
+        if options.intrinsics_rate > 0 and tau_px < CORRECTION_FROM_PX:
             share = len(points) // len(self.buffers)
             correction = (self.correction * self._correctable).repeat_interleave(share, 0)
-        return reprojection_loss(points, rows.target, tau, options.loss, correction)
+        return reprojection_loss(points, rows.target, tau_px, options.loss, correction)
 
     def _gradients(self, loss: Tensor) -> dict[str, Tensor]:
         """Gradient of a loss by every weight of the head; the graph stays."""

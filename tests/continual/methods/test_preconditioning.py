@@ -27,7 +27,7 @@ class Free(Penalty):
     needs_teacher = False
 
     def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
         """Zero."""
         return torch.zeros(())
@@ -40,7 +40,7 @@ class Short(Penalty):
     needs_teacher = False
 
     def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
         """Mean length."""
         return student.points.abs().mean()
@@ -133,7 +133,6 @@ def test_an_old_scene_drifts_less(learnable: Learnable) -> None:
         with torch.no_grad():
             before = head(rows.features.float(), 0, None).points
         hooks = hooks_for(head, [old], Free(), strength)
-        assert hooks.edits_steps == (strength > 0)
         list(HeadTrainer(head, [new], OPTIONS, 0, hooks).run())
         with torch.no_grad():
             after = head(rows.features.float(), 0, None).points

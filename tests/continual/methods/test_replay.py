@@ -30,7 +30,7 @@ class OneEach(Penalty):
     needs_teacher = False
 
     def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
         """The mean of ones."""
         assert teacher is None

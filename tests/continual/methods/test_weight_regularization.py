@@ -151,6 +151,24 @@ def test_running_sums(finished: FinishedScene) -> None:
     assert all(torch.equal(alone[key], again[key]) for key in alone)
 
 
+def test_a_weight_that_moves_a_whole_image_matters_to_mas(finished: FinishedScene) -> None:
+    """Points of an image count from the middle of the scene, not from the middle of the image."""
+    one_point = wave_buffer(1, views=2, few=1)
+    two_images = wave_buffer(1, views=4)
+    found = MemoryAwareSynapses().importance(replace(finished, rows=lambda: two_images))
+    assert float(found["offset_bias"].max()) > 0
+    # A scene of one point reacts to nothing: all of it lies in its middle.
+    found = MemoryAwareSynapses().importance(replace(finished, rows=lambda: one_point))
+    assert max(float(value.max()) for value in found.values()) < 1e-4
+    # Two images of a point each, which differ: with a middle of each image's own nothing would
+    # matter.
+    apart = wave_buffer(1, views=2)
+    apart.tensors["features"][:50] = apart.tensors["features"][0]
+    apart.tensors["features"][50:] = apart.tensors["features"][50]
+    found = MemoryAwareSynapses().importance(replace(finished, rows=lambda: apart))
+    assert max(float(value.max()) for value in found.values()) > 1e-3
+
+
 def test_a_running_sum_takes_rows_that_were_appended_as_they_are(finished: FinishedScene) -> None:
     method = ElasticWeightConsolidation(running=True)
     earlier = {

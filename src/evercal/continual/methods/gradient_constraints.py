@@ -69,7 +69,7 @@ class ConstraintHooks(MemoryHooks):
         kept = [start.states[memory.scene].get("reference", unknown) for memory in self.memories]
         self._references = torch.stack(kept)
 
-    def constraints(self, output: HeadOutput, rows: Rows, progress: float) -> list[Tensor]:
+    def constraints(self, output: HeadOutput, rows: Rows, tau_px: float) -> list[Tensor]:
         """The loss of each remembered scene."""
         return [self._rule.loss(o, r) for o, r in by_scene(output, rows, self.memories)]
 
@@ -105,8 +105,9 @@ class Gem(ConstrainedStep):
     """GEM: the step may not raise the loss of any remembered scene.
 
     The original keeps the dual variables above a margin, in units of SGD's gradient. Here a step
-    goes down every remembered loss by at least that share of its own length: a constraint holds to
-    first order, and without a margin what the step does to second order adds up.
+    goes down every remembered loss by at least that share of its own length, whether or not it was
+    about to raise one: a constraint holds to first order, and without a margin what the step does
+    to second order adds up.
     """
 
     citation: ClassVar[str] = "Lopez-Paz and Ranzato, Gradient episodic memory, NeurIPS 2017"
@@ -184,11 +185,11 @@ class _EpisodicHooks(ConstraintHooks):
         if method.moving:
             self._references = torch.full_like(self._references, torch.nan)
 
-    def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
+    def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
         """Plain replay during the first steps, averaged over the scenes."""
         if self._steps >= self._warm:
             return None
-        return Reprojection()(output, None, rows, progress)
+        return Reprojection()(output, None, rows, tau_px)
 
     def edit_step(self, proposed: ProposedStep) -> None:
         super().edit_step(proposed)

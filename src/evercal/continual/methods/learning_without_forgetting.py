@@ -54,7 +54,7 @@ class _OldAnswers(TrainingHooks):
             parts.append(part)
         return parts
 
-    def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
+    def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
         old = teacher_output(self._teacher, rows)
         drift = (output.points - old.points).abs().sum(-1).mean()
         return self._teacher.scenes * self.method.weight * self.method.px_per_m * drift

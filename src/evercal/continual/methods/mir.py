@@ -13,7 +13,7 @@ from evercal.continual.methods.replay import Replay, ReplayHooks
 from evercal.networks.buffer import FeatureBuffer, Rows
 from evercal.networks.head import Head
 from evercal.networks.hooks import TrainingHooks
-from evercal.networks.loss import fixed_clamp_loss
+from evercal.networks.loss import LossOptions, reprojection_loss
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,9 @@ class MaximallyInterferedRetrieval(Replay):
     """Rows by which a view is judged."""
     every_steps: int = 20
     """How often views are chosen anew; the original chooses in every step."""
+    clamp_px: float = 50.0
+    """Fixed soft clamp of the virtual step's loss and of those it raises, pixels: with a narrow one
+    a view that is lost already could not get worse."""
 
     def begin(self, start: StageStart) -> TrainingHooks:
         """Replay of chosen views; nothing for the first scene."""
@@ -93,22 +96,22 @@ def interfered_views(
     index = (starts[:, None] + offsets * (ends - starts)[:, None]).long()
     rows = memory.rows(index.clamp(max=len(memory) - 1).flatten())
     moved = copy.deepcopy(head)
-    before = _losses(head, rows, len(drawn))
+    before = _losses(method, head, rows, len(drawn))
     points = moved(fresh.features.float(), fresh.scene, fresh.descriptor).points
-    cost, _ = fixed_clamp_loss(points, fresh.target)
+    cost, _ = reprojection_loss(points, fresh.target, method.clamp_px, LossOptions())
     parameters = list(moved.parameters())
     found = torch.autograd.grad(cost.mean(), parameters, materialize_grads=True)
     with torch.no_grad():
         for parameter, gradient in zip(parameters, found, strict=True):
             size = gradient.square().mean().sqrt().clamp(min=1e-12)
             parameter.sub_(rate * gradient / size)
-    spoiled = _losses(moved, rows, len(drawn)) - before
+    spoiled = _losses(method, moved, rows, len(drawn)) - before
     return drawn[spoiled.topk(min(method.chosen, len(drawn))).indices.cpu()]
 
 
 @torch.no_grad()
-def _losses(head: Head, rows: Rows, views: int) -> Tensor:
+def _losses(method: MaximallyInterferedRetrieval, head: Head, rows: Rows, views: int) -> Tensor:
     """(views,) mean loss of each view's rows."""
     points = head(rows.features.float(), rows.scene, rows.descriptor).points
-    loss, _ = fixed_clamp_loss(points, rows.target)
+    loss, _ = reprojection_loss(points, rows.target, method.clamp_px, LossOptions())
     return loss.view(views, -1).mean(1)

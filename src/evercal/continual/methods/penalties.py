@@ -9,7 +9,7 @@ from torch import Tensor
 from evercal.continual.methods.spdd import SpddOptions, spdd_loss
 from evercal.networks.buffer import Rows
 from evercal.networks.head import HeadOutput
-from evercal.networks.loss import LossOptions, clamp_px, fixed_clamp_loss, reprojection_loss
+from evercal.networks.loss import LossOptions, fixed_clamp_loss, reprojection_loss
 
 PX_PER_M = 50.0
 """Weight of a distance in scene coordinates, pixels per metre: the parallax of a pixel at 3 m."""
@@ -23,7 +23,7 @@ class Penalty:
     """Whether the output of the head before the stage is needed, which costs a forward pass."""
 
     def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
         """Cost of replayed rows, pixels.
 
@@ -31,7 +31,7 @@ class Penalty:
             student: what the head says.
             teacher: what the head said before the stage; None unless `needs_teacher`.
             rows: the replayed rows.
-            progress: share of the stage's steps done, in [0, 1].
+            tau_px: soft clamp of the loss on new rows in this step, pixels.
         """
         raise NotImplementedError
 
@@ -43,12 +43,10 @@ class Reprojection(Penalty):
     needs_teacher: ClassVar[bool] = False
 
     def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
         """Mean reprojection loss."""
-        options = LossOptions()
-        tau = clamp_px(options, progress)
-        cost, _ = reprojection_loss(student.points, rows.target, tau, options)
+        cost, _ = reprojection_loss(student.points, rows.target, tau_px, LossOptions())
         return cost.mean()
 
 
@@ -64,12 +62,12 @@ class OldOutput(Penalty):
     """Weight of the distance, pixels per metre."""
 
     def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
         """Mean of both."""
         assert teacher is not None
         drift = (student.points - teacher.points.detach()).abs().sum(-1).mean()
-        return Reprojection()(student, None, rows, progress) + self.px_per_m * drift
+        return Reprojection()(student, None, rows, tau_px) + self.px_per_m * drift
 
 
 @dataclass(frozen=True)
@@ -84,7 +82,7 @@ class BoundedByTeacher(Penalty):
     """Weight of the distance to the teacher's points, pixels per metre."""
 
     def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
         """Mean of both halves."""
         assert teacher is not None
@@ -92,7 +90,7 @@ class BoundedByTeacher(Penalty):
         _, bound = fixed_clamp_loss(teacher.points, rows.target)
         drift = (student.points - teacher.points.detach()).abs().sum(-1)
         pulled = torch.where(error > bound, drift, torch.zeros_like(drift)).mean()
-        truth = Reprojection()(student, None, rows, progress)
+        truth = Reprojection()(student, None, rows, tau_px)
         return 0.5 * truth + 0.5 * self.px_per_m * pulled
 
 
@@ -108,14 +106,14 @@ class StoredOutput(Penalty):
     """Weight of the distance to the stored points, pixels per metre."""
 
     def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
         """Mean of both halves."""
         assert rows.stored is not None, "the method stores points when a scene is finished"
         kept = ~rows.stored[:, 0].isnan()
         drift = (student.points[kept] - rows.stored[kept]).abs().sum(-1)
         held = drift.sum() / max(len(drift), 1)
-        truth = Reprojection()(student, None, rows, progress)
+        truth = Reprojection()(student, None, rows, tau_px)
         return 0.5 * truth + 0.5 * self.px_per_m * held
 
 
@@ -135,7 +133,7 @@ class Relations(Penalty):
     """Of the softmax over cosines (no unit)."""
 
     def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
         """Mean reprojection loss and the divergence, nats."""
         assert teacher is not None
@@ -151,7 +149,7 @@ class Relations(Penalty):
 
         old, new = similarity(teacher.hidden.detach()), similarity(student.hidden)
         moved = (old.exp() * (old - new)).sum(-1).mean()
-        return Reprojection()(student, None, rows, progress) + moved
+        return Reprojection()(student, None, rows, tau_px) + moved
 
 
 @dataclass(frozen=True)
@@ -172,7 +170,7 @@ class AnchoredReprojection(Penalty):
     """The teacher is right where it reprojects within so many pixels."""
 
     def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
         """Mean of both."""
         assert teacher is not None
@@ -198,7 +196,7 @@ class Distillation(Penalty):
     """Pixels per metre and per nat; 1 is the paper's."""
 
     def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, progress: float
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
         """The weighted sum of the three terms."""
         assert teacher is not None

@@ -35,19 +35,19 @@ class PreconditionedReplay(Replay):
 
 
 class _PreconditionedHooks(ReplayHooks):
+    edits_steps = True
+
     def __init__(self, method: PreconditionedReplay, start: StageStart):
         super().__init__(method, start)
-        self.edits_steps = method.strength > 0
-        if self.edits_steps:
-            self._held = held_rows(start.head, start.memories)
-            seen = input_moments(start.head, start.memories, start.seed)
-            self._damping = {
-                name: torch.linalg.inv(
-                    torch.eye(len(moment), dtype=moment.dtype, device=moment.device)
-                    + method.strength * moment
-                ).float()
-                for name, moment in seen.items()
-            }
+        self._held = held_rows(start.head, start.memories)
+        seen = input_moments(start.head, start.memories, start.seed)
+        self._damping = {
+            name: torch.linalg.inv(
+                torch.eye(len(moment), dtype=moment.dtype, device=moment.device)
+                + method.strength * moment
+            ).float()
+            for name, moment in seen.items()
+        }
 
     def edit_step(self, proposed: ProposedStep) -> None:
         """Damps changes of shared matrices, and undoes those of what a remembered scene owns.

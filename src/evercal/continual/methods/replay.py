@@ -83,11 +83,11 @@ class ReplayHooks(MemoryHooks):
         self.method = method
         self._teacher = start.teacher if method.penalty.needs_teacher else None
 
-    def cost(self, output: HeadOutput, rows: Rows, progress: float) -> Tensor | None:
+    def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
         """The weighted penalty."""
         teacher = None if self._teacher is None else teacher_output(self._teacher, rows)
         scenes = len(self.memories) if self.method.every_scene else 1
-        penalty = self.method.penalty(output, teacher, rows, progress)
+        penalty = self.method.penalty(output, teacher, rows, tau_px)
         return scenes * self.method.weight * penalty
 
 

@@ -19,6 +19,8 @@ from evercal.networks.loss import fixed_clamp_loss
 
 IMAGE_ROWS = 256
 """Of each image whose gradient is taken."""
+MEAN_ROWS = 8192
+"""By which the mean of a scene's points is told."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,8 @@ class ElasticWeightConsolidation(WeightRegularization):
 class MemoryAwareSynapses(WeightRegularization):
     """MAS: importance is how much the squared length of the output reacts to a weight.
 
-    The output is the predicted point, from the mean of the scene's points: its length in the atlas
-    would only tell where the scene lies.
+    The output is the predicted point, from the mean of the points predicted for the scene: its
+    length in the atlas would only tell where the scene lies.
     """
 
     citation: ClassVar[str] = "Aljundi et al., Memory aware synapses, ECCV 2018"
@@ -126,12 +128,19 @@ class MemoryAwareSynapses(WeightRegularization):
 
     def importance(self, scene: FinishedScene) -> dict[str, Tensor]:
         """Mean absolute gradients."""
+        buffer = scene.rows()
+
+        def points(rows: Rows) -> Tensor:
+            return scene.head(rows.features.float(), scene.number, rows.descriptor).points
+
+        with torch.no_grad():
+            drawn = buffer.draw(MEAN_ROWS, torch.Generator().manual_seed(scene.number))
+            middle = points(drawn).mean(0)
 
         def length(rows: Rows) -> Tensor:
-            points = scene.head(rows.features.float(), scene.number, rows.descriptor).points
-            return (points - points.mean(0).detach()).square().sum(-1).mean()
+            return (points(rows) - middle).square().sum(-1).mean()
 
-        return mean_over_images(scene.head, scene.rows(), self.images, length, torch.abs)
+        return mean_over_images(scene.head, buffer, self.images, length, torch.abs)
 
 
 @dataclass(frozen=True)
@@ -199,8 +208,9 @@ class _PathIntegral(_TiedWeights):
 
     def load(self, state: Mapping[str, Tensor]) -> None:
         for name in self._path:
-            self._path[name] = state[f"path.{name}"].clone()
-            self._first[name] = state[f"first.{name}"].clone()
+            device = self._path[name].device
+            self._path[name] = state[f"path.{name}"].to(device, copy=True)
+            self._first[name] = state[f"first.{name}"].to(device, copy=True)
 
 
 def mean_over_images(
