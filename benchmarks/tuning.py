@@ -16,7 +16,7 @@ from evercal.benchmark.bench import BenchOptions, run_bench
 from evercal.benchmark.rows import strategy_from_row
 from evercal.benchmark.suites import load_suite, tuning_split
 from evercal.continual.presets import preset
-from evercal.continual.strategies import Strategy
+from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.evaluation import recall_area
 from evercal.storage import read_settings, write_json
 
@@ -37,8 +37,15 @@ TRIALS: dict[str, Trials] = {
     "evercal_network": [{"weight": w} for w in (0.17, 0.5, 1.5, 4.5)],
 }
 """The setting of each method that is tuned; `finetune`, `joint` and `isolation` have none."""
-ALIKE = {"evercal_hybrid": "evercal_network", "sars_spdd_filled": "sars_spdd"}
-"""Strategies that take the setting of another: the same method beside a map, or other frames."""
+ALIKE: Mapping[str, tuple[str, Mapping[str, object]]] = {
+    "evercal_hybrid": ("evercal_network", {}),
+    "sars_spdd_filled": ("sars_spdd", {}),
+    "sars_old_output": ("icarl", {"selector": "sars"}),
+    "sars_reprojection": ("er", {"selector": "sars"}),
+    "reservoir_spdd": ("sars_spdd", {"selector": "reservoir"}),
+}
+"""Rows with the setting of another: the same method beside a map or with other frames, and those
+of the paper's Table 4."""
 
 
 def run(suite: str, data: Path | None, scenes: int, out: Path, file: Path) -> None:
@@ -60,11 +67,16 @@ def run(suite: str, data: Path | None, scenes: int, out: Path, file: Path) -> No
     for step in run_bench(split, options, out):
         print(f"[{step.done}/{step.total}] {step.strategy}", flush=True)
     final = final_scores(out, strategies, len(split))
-    best = [max(_rows(name), key=lambda r: final[str(r["name"])]["auc_20cm"]) for name in TRIALS]
     file.parent.mkdir(parents=True, exist_ok=True)
-    settings = {str(row["of"]): row["with"] for row in best}
-    settings |= {name: settings[like] for name, like in ALIKE.items() if like in settings}
+    settings = {
+        of: max(trials, key=lambda changes: final[_name(of, changes)]["auc_20cm"])
+        for of, trials in TRIALS.items()
+    }
     chosen = [{"name": name, "of": name, "with": changes} for name, changes in settings.items()]
+    for name, (like, others) in ALIKE.items():
+        if like in settings:
+            of = name if name in STRATEGIES else like
+            chosen.append({"name": name, "of": of, "with": {**settings[like], **others}})
     file.write_text("[\n" + ",\n".join(f"  {json.dumps(row)}" for row in chosen) + "\n]\n")
     told = [
         {"method": row["of"], **_setting(row["with"]), **final[str(row["name"])]} for row in rows
@@ -84,10 +96,11 @@ def _setting(changes: object) -> dict[str, object]:
 
 def _rows(name: str) -> list[dict[str, object]]:
     """The trials of a method, named by their values so that a range may be moved later."""
-    return [
-        {"name": f"{name}_{_setting(changes)['value']:g}", "of": name, "with": changes}
-        for changes in TRIALS[name]
-    ]
+    return [{"name": _name(name, changes), "of": name, "with": changes} for changes in TRIALS[name]]
+
+
+def _name(method: str, changes: Mapping[str, object]) -> str:
+    return f"{method}_{_setting(changes)['value']:g}"
 
 
 def final_scores(

@@ -10,7 +10,7 @@ from benchmarks import tuning
 from evercal.benchmark import results
 from evercal.benchmark.bench import BenchOptions
 from evercal.benchmark.results import SceneResult
-from evercal.benchmark.rows import strategy_from_row
+from evercal.benchmark.rows import load_rows, strategy_from_row
 from evercal.storage import write_json
 
 
@@ -70,7 +70,12 @@ def test_the_best_trial_of_every_method_is_written(
     monkeypatch.setattr(tuning, "run_bench", bench)
     file = tmp_path / "tuned.json"
     tuning.run("sim-mini", None, 2, tmp_path / "out", file)
-    assert json.loads(file.read_text()) == [{"name": "er", "of": "er", "with": {"weight": 0.3}}]
+    found, others = {"weight": 0.3}, {"weight": 0.3, "selector": "sars"}
+    assert json.loads(file.read_text()) == [
+        {"name": "er", "of": "er", "with": found},
+        {"name": "sars_reprojection", "of": "er", "with": others},
+    ]
+    assert [strategy.name for strategy in load_rows(str(file))] == ["er", "sars_reprojection"]
     outcomes = json.loads(file.with_suffix(".outcomes.json").read_text())
     told = outcomes["rows"]
     assert outcomes["settings"] == {"suite": "sim-mini"}
