@@ -23,14 +23,14 @@ from evercal.storage import read_settings, write_json
 Trials = Sequence[Mapping[str, object]]
 WEIGHTS: Trials = [{"weight": w} for w in (0.1, 0.3, 1.0, 3.0)]
 STRENGTHS: Trials = [{"strength": s} for s in (1e4, 1e5, 1e6, 1e7)]
-ALPHAS: Trials = [{"alpha": a} for a in (2.0, 8.0, 32.0, 128.0)]
+ALPHAS: Trials = [{"alpha": a} for a in (8.0, 32.0, 128.0, 512.0)]
 TRIALS: dict[str, Trials] = {
     **dict.fromkeys(("er", "hybrid", "gdr", "gss", "mir", "lwf"), WEIGHTS),
     **dict.fromkeys(("icarl", "buff_cs", "der", "co2l"), WEIGHTS),
     **dict.fromkeys(("ewc", "ewc_online", "si"), STRENGTHS),
     "mas": [{"strength": s} for s in (1e3, 1e4, 1e5, 1e6)],
     "agem": [{"clamp_px": c} for c in (20.0, 50.0, 100.0, 200.0)],
-    "gem": [{"margin": m} for m in (0.03, 0.1, 0.3, 1.0)],
+    "gem": [{"margin": m} for m in (0.3, 1.0, 3.0, 10.0)],
     **dict.fromkeys(("gec", "gec_moving"), ALPHAS),
     "gpm": [{"kept_share": k} for k in (0.6, 0.8, 0.9, 0.97)],
     "sars_spdd": [{"penalty": {"scale": s}} for s in (0.3, 1.0, 3.0, 10.0)],
