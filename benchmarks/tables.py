@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.publish import FOLDER
+from evercal.benchmark.ablation import ablation_rows
 from evercal.benchmark.comparison import (
     Run,
     TableRows,
@@ -118,6 +119,11 @@ def _differences(sources: Sequence[Published], reference: str) -> str:
         rows = difference_rows(of, reference)
         parts += [_markdown(rows)] if len(rows) > 1 else []
     return f"\n\n{ONE_RUN}\n\n".join(parts)
+
+
+def _ablation(sources: Sequence[Published], suite: str) -> str:
+    """The paper's Table 4; its own numbers stand beside ours where the suite is one of its."""
+    return _markdown(ablation_rows(_runs(sources), suite))
 
 
 def _memory(sources: Sequence[Published], _: str) -> str:
@@ -323,6 +329,7 @@ KINDS: dict[str, Callable[[Sequence[Published], str], str]] = {
     "scenes": _bench(scene_rows),
     "selectors": _bench(selector_rows),
     "differences": _differences,
+    "ablation": _ablation,
     "memory": _memory,
     "steps": _steps,
     "accuracy": _accuracy,

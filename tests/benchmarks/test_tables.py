@@ -164,6 +164,23 @@ def test_rows_with_a_map_stand_apart_from_networks(tmp_path: Path) -> None:
     assert rows(" network") == ["er_map:network"]
 
 
+def test_table_4_is_made_from_its_strategies(tmp_path: Path) -> None:
+    (folder := tmp_path / "run").mkdir()
+    write_json(folder / results.SETTINGS, {})
+    for name, right in (("icarl", 10), ("sars_old_output", 12), ("sars_spdd", 18)):
+        for seed in (0, 1):
+            results.append(folder, lines(name, seed, [[16], [right, right + seed]]))
+    publish(folder, "steps", {}, out=tmp_path)
+    made = tables.regenerated("<!-- table: steps ablation i12s -->\n<!-- end -->\n", tmp_path)
+    rows = [line.split(" | ") for line in made.splitlines()[3:-1]]
+    # 12.5 of 20 frames less 10.5; then 18.5. The paper's numbers are of its suite.
+    assert [row[2:4] + row[-1:] for row in rows[:3]] == [
+        ["51.2", "", "66.0 |"],
+        ["61.2", "+10.0", "90.9 |"],
+        ["91.2", "+30.0", "91.8 |"],
+    ]
+
+
 def test_a_learning_curve_has_a_row_for_each_number_of_steps(tmp_path: Path) -> None:
     for steps, right in ((600, 4), (9600, 16)):
         (folder := tmp_path / f"run-{steps}").mkdir()
