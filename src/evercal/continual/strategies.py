@@ -48,14 +48,11 @@ class Strategy:
         return found
 
 
-_OF_OLD_OUTPUT, _OF_TRUTH = 0.3, 0.3
-"""Weights chosen of three on held-out frames; see docs/methods.md."""
-
-
 def _named(*strategies: Strategy) -> dict[str, Strategy]:
     return {strategy.name: strategy for strategy in strategies}
 
 
+# Settings with the largest mean of `benchmarks tune` over its suites; see docs/methods.md.
 STRATEGIES: dict[str, Strategy] = _named(
     Strategy(
         "evercal",
@@ -65,15 +62,15 @@ STRATEGIES: dict[str, Strategy] = _named(
     Strategy("evercal_network", PreconditionedReplay()),
     Strategy("evercal_hybrid", PreconditionedReplay(), builds_map=True),
     Strategy("finetune", FineTuning()),
-    Strategy("er", Replay(weight=_OF_TRUTH)),
+    Strategy("er", Replay(weight=0.3)),
     Strategy(
         "hybrid",
-        Replay("hybrid", weight=_OF_TRUTH),
+        Replay("hybrid", weight=0.3),
         source="Bahadir et al., continual hand-eye calibration, Mach. Vis. Appl. 2024 (abstract)",
     ),
     Strategy(
         "icarl",
-        Replay("herding", OldOutput(), _OF_OLD_OUTPUT),
+        Replay("herding", OldOutput()),
         source="Rebuffi et al., iCaRL, CVPR 2017, ported to points",
     ),
     Strategy(
@@ -83,25 +80,25 @@ STRATEGIES: dict[str, Strategy] = _named(
     ),
     Strategy(
         "gdr",
-        Replay("leverage", weight=_OF_TRUTH),
+        Replay("leverage"),
         source="Qi et al., FedCBDR's global-perspective data replay, NeurIPS 2025",
     ),
     Strategy(
         "gss",
-        Replay("gradients", weight=_OF_TRUTH),
+        Replay("gradients", weight=0.3),
         source="Aljundi et al., Gradient based sample selection, NeurIPS 2019",
     ),
-    Strategy("mir", MaximallyInterferedRetrieval(weight=_OF_TRUTH)),
+    Strategy("mir", MaximallyInterferedRetrieval(weight=0.3)),
     Strategy("der", DarkExperienceReplay()),
     Strategy(
         "co2l",
-        Replay("reservoir", Relations(), 0.3),
+        Replay("reservoir", Relations()),
         source="Cha et al., Co2L's relation distillation, ICCV 2021, ported to points",
     ),
-    Strategy("agem", AveragedGem()),
+    Strategy("agem", AveragedGem(clamp_px=100.0)),
     Strategy("gem", Gem()),
     Strategy("gec", EpisodicConstraint()),
-    Strategy("gec_moving", EpisodicConstraint(moving=True)),
+    Strategy("gec_moving", EpisodicConstraint(moving=True, alpha=32.0)),
     Strategy("ewc", ElasticWeightConsolidation()),
     Strategy("ewc_online", ElasticWeightConsolidation(running=True)),
     Strategy("si", SynapticIntelligence()),

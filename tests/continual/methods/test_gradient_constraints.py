@@ -158,7 +158,7 @@ def bounds(method: ConstrainedStep, step: Taken) -> tuple[Tensor, Tensor]:
     return step.g, -0.5 * 0.03 * share * h
 
 
-METHODS = [AveragedGem(), Gem(margin=0.0), EpisodicConstraint(warm_steps=0)]
+METHODS = [AveragedGem(), Gem(margin=0.0), EpisodicConstraint(alpha=0.5, warm_steps=0)]
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
@@ -195,7 +195,7 @@ def test_a_projected_gradient_would_not_do() -> None:
     """The reason why steps are projected: Muon and momentum turn an allowed gradient around."""
     head, opposed = wave_head(2), 0
     old, new = wave_buffer(0), wave_buffer(1, shift_px=-12.0)
-    method = Gem()
+    method = Gem(margin=0.03)
 
     class OfGradient(ConstraintHooks):
         def edit_step(self, proposed: ProposedStep) -> None:

@@ -111,7 +111,7 @@ class Gem(ConstrainedStep):
     """
 
     citation: ClassVar[str] = "Lopez-Paz and Ranzato, Gradient episodic memory, NeurIPS 2017"
-    margin: float = 0.03
+    margin: float = 1.0
     """Least length that is added against every gradient g_t, as a share of the step's."""
 
     def edit(
@@ -135,7 +135,7 @@ class EpisodicConstraint(ConstrainedStep):
     """
 
     citation: ClassVar[str] = "Lai et al., GEC, NeurIPS 2025, several constraints"
-    alpha: float = 0.5
+    alpha: float = 128.0
     """Share of h_t that a step of unit length makes up for (no unit)."""
     eta: float = 0.03
     """The original's learning rate; here it is only the length that alpha is meant for."""

@@ -25,7 +25,7 @@ class LearningWithoutForgetting(Method):
     """
 
     citation: ClassVar[str] = "Li and Hoiem, Learning without forgetting, ECCV 2016"
-    weight: float = 1.0
+    weight: float = 0.3
     """What the distance of each earlier scene is multiplied by."""
     px_per_m: float = PX_PER_M
     """Weight of the distance between old and new points, pixels per metre."""

@@ -29,7 +29,7 @@ class GradientProjectionMemory(Method):
     """
 
     citation: ClassVar[str] = "Saha et al., Gradient projection memory, ICLR 2021"
-    kept_share: float = 0.97
+    kept_share: float = 0.9
     """Share of the squared inputs that the kept directions hold."""
 
     def begin(self, start: StageStart) -> TrainingHooks:

@@ -27,7 +27,7 @@ MEAN_ROWS = 8192
 class WeightRegularization(Method):
     """What the three share: cost = strength / 2 x mean over weights of sum_s I_s (w - w_s)^2."""
 
-    strength: float = 100.0
+    strength: float = 1e6
     """What the mean squared change costs, weighted by importances of mean 1."""
     running: bool = False
     """Keep one running sum of importances and the newest weights, not one of each per scene."""
@@ -153,6 +153,7 @@ class SynapticIntelligence(WeightRegularization):
 
     citation: ClassVar[str] = "Zenke et al., Continual learning through SI, ICML 2017"
     first_scene_alike: ClassVar[bool] = False
+    strength: float = 1e7
     running: bool = True
     decay: float = 1.0
     damping: float = 0.1
