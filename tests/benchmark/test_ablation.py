@@ -33,8 +33,16 @@ def test_steps_of_the_ablation() -> None:
         ["+ SARS + SPDD", "60.0", "-10.0"],
         ["random, reprojection", "40.0", ""],
         ["SARS, SPDD", "60.0", ""],  # the step between was not run
+        ["random, reprojection", "40.0", ""],  # the same, the penalty first
+        ["SARS, SPDD", "60.0", ""],
     ]
-    assert [row[-1] for row in rows] == ["65.2", "72.0", "74.9", "", ""]
+    assert [row[-1] for row in rows] == ["65.2", "72.0", "74.9", "", "", "", ""]
+    other = ablation_rows(runs(er=8, reservoir_spdd=11, sars_spdd=12))[-3:]
+    assert [row[1:4] for row in other] == [
+        ["random, reprojection", "40.0", ""],
+        ["random, SPDD", "55.0", "+15.0"],
+        ["SARS, SPDD", "60.0", "+5.0"],
+    ]
     low, high = map(float, rows[1][4].split())
     assert low <= 20 <= high
     # On other data nothing published is comparable.

@@ -21,6 +21,11 @@ ABLATIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("SARS, reprojection", "sars_reprojection"),
         ("SARS, SPDD", "sars_spdd"),
     ),
+    "the penalty first": (
+        ("random, reprojection", "er"),
+        ("random, SPDD", "reservoir_spdd"),
+        ("SARS, SPDD", "sars_spdd"),
+    ),
 }
 """Rows of Table 4 and their strategies. As printed, the first step changes the selector and keeps
 iCaRL's penalty, the second changes the penalty from one with true poses to one without."""
