@@ -64,6 +64,7 @@ def test_bench_and_its_report(
         (["sim-mini", "--rows", "table5"], "rows table5: give spdd-sweep, table4, with-map"),
         (["sim-mini", "--rows", "nowhere.json"], "rows nowhere.json: no such file"),
         (["sim-mini", "--steps", "0"], "--steps 0: give a number >= 1"),
+        (["sim-mini", "--batch", "63"], "--batch 63: give a number >= 64"),
         (["sim-mini", "--memory", "all"], "--memory all: give a share"),
         (["sim-mini", "--scenes", "bedroom"], "two or more"),
         (["real2"], "--data"),
@@ -118,5 +119,10 @@ def test_the_backbone_of_the_paper() -> None:
     assert stage.head.centres == "fixed"
     assert stage.head.width == ours._stage(3).head.width
     assert ours._stage(3).head.condition == "code"
+    whole, part = (verb.Bench("sim", preset="paper", batch=n)._stage(0) for n in (None, 2048))
+    assert (whole.fit.batch, whole.fit.replay_batch) == (40_960, 40_960)
+    changed = replace(whole.fit, batch=2048, replay_batch=2048)
+    assert part == replace(whole, fit=changed)
+    assert verb.Bench("sim-mini", batch=512)._stage(0).fit.replay_batch == 256
     shared = verb.Bench("sim-mini", backbone="paper", offsets="shared")._stage(0)
     assert (shared.head.offsets, shared.head.centres) == ("shared", "fixed")

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from evercal.datasets import Scene
 
 
+LEAST_BATCH = 64
+"""Rows of a step below which nothing is learned."""
+
+
 @dataclass(frozen=True)
 class Bench:
     """Compare strategies on a sequence of scenes; what is done is kept, what is missing is run.
@@ -61,6 +65,9 @@ class Bench:
     """An offset and scale for each centre (the paper), or one for all (GLACE)."""
     steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Optimiser steps of a stage; the preset's number when left out."""
+    batch: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Rows of a new scene in a step, and replayed ones in the preset's proportion; the preset's
+    number when left out."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
     """How many keyframes are kept of a scene: a share of its frames (10%) or bytes (5MB)."""
     held_out: bool = False
@@ -167,11 +174,14 @@ class Bench:
         steps = preset_steps if self.steps is None else self.steps
         if steps < 1:
             raise InputError(f"--steps {steps}: give a number >= 1")
-        return dataclasses.replace(
-            stage,
-            head=dataclasses.replace(stage.head, offsets=self.offsets),
-            fit=dataclasses.replace(stage.fit, iterations=steps),
-        )
+        fit = dataclasses.replace(stage.fit, iterations=steps)
+        if self.batch is not None:
+            if self.batch < LEAST_BATCH:
+                raise InputError(f"--batch {self.batch}: give a number >= {LEAST_BATCH}")
+            replayed = fit.replay_batch * self.batch // fit.batch
+            fit = dataclasses.replace(fit, batch=self.batch, replay_batch=replayed)
+        head = dataclasses.replace(stage.head, offsets=self.offsets)
+        return dataclasses.replace(stage, head=head, fit=fit)
 
 
 def _mirror(out: Path) -> Path:
