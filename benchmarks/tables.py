@@ -92,11 +92,8 @@ def _bench(rows_of: Callable[[Sequence[Run]], TableRows]) -> Callable[..., str]:
     def made(sources: Sequence[Published], part: str) -> str:
         runs = _runs(sources)
         if part:
-            runs = [
-                run
-                for run in runs
-                if run.description["map"] == {"map": True, "network": False}[part]
-            ]
+            wanted = {"map": True, "network": False}[part]
+            runs = [run for run in runs if run.description["map"] == wanted]
         counts = {name: len(of) for name, of in by_strategy(runs).items()}
         several = [run for run in runs if counts[run.strategy] > 1]
         alone = [run for run in runs if counts[run.strategy] == 1]

@@ -13,10 +13,10 @@ from tabulate import tabulate
 
 from evercal.benchmark import results
 from evercal.benchmark.bench import BenchOptions, run_bench
-from evercal.benchmark.rows import strategy_from_row
+from evercal.benchmark.rows import read_rows, strategy_from_row
 from evercal.benchmark.suites import load_suite, tuning_split
 from evercal.continual.presets import preset
-from evercal.continual.strategies import STRATEGIES, Strategy
+from evercal.continual.strategies import Strategy
 from evercal.evaluation import recall_area
 from evercal.storage import read_settings, write_json
 
@@ -37,15 +37,8 @@ TRIALS: dict[str, Trials] = {
     "evercal_network": [{"weight": w} for w in (0.17, 0.5, 1.5, 4.5)],
 }
 """The setting of each method that is tuned; `finetune`, `joint` and `isolation` have none."""
-ALIKE: Mapping[str, tuple[str, Mapping[str, object]]] = {
-    "evercal_hybrid": ("evercal_network", {}),
-    "sars_spdd_filled": ("sars_spdd", {}),
-    "sars_old_output": ("icarl", {"selector": "sars"}),
-    "sars_reprojection": ("er", {"selector": "sars"}),
-    "reservoir_spdd": ("sars_spdd", {"selector": "reservoir"}),
-}
-"""Rows with the setting of another: the same method beside a map or with other frames, and those
-of the paper's Table 4."""
+ALIKE = {"evercal_hybrid": "evercal_network", "sars_spdd_filled": "sars_spdd"}
+"""Strategies that take the setting of another: the same method beside a map, or other frames."""
 
 
 def run(suite: str, data: Path | None, scenes: int, out: Path, file: Path) -> None:
@@ -72,11 +65,11 @@ def run(suite: str, data: Path | None, scenes: int, out: Path, file: Path) -> No
         of: max(trials, key=lambda changes: final[_name(of, changes)]["auc_20cm"])
         for of, trials in TRIALS.items()
     }
+    settings |= {name: settings[like] for name, like in ALIKE.items() if like in settings}
     chosen = [{"name": name, "of": name, "with": changes} for name, changes in settings.items()]
-    for name, (like, others) in ALIKE.items():
-        if like in settings:
-            of = name if name in STRATEGIES else like
-            chosen.append({"name": name, "of": of, "with": {**settings[like], **others}})
+    for row in read_rows("table4"):
+        if row["of"] in settings and row["name"] not in settings:
+            chosen.append({**row, "with": {**settings[row["of"]], **row["with"]}})
     file.write_text("[\n" + ",\n".join(f"  {json.dumps(row)}" for row in chosen) + "\n]\n")
     told = [
         {"method": row["of"], **_setting(row["with"]), **final[str(row["name"])]} for row in rows

@@ -37,6 +37,15 @@ def load_rows(name: str) -> tuple[Strategy, ...]:
     Raises:
         InputError: no such file or table, or a row that makes no strategy.
     """
+    return tuple(strategy_from_row(name, row) for row in read_rows(name))
+
+
+def read_rows(name: str) -> list[Any]:
+    """The rows of a file or table as they are written, not yet checked.
+
+    Raises:
+        InputError: no such file or table, or no list.
+    """
     path = Path(name)
     if path.suffix != ".json":
         shipped = sorted(f.name.removesuffix(".json") for f in _folder().iterdir())
@@ -53,7 +62,7 @@ def load_rows(name: str) -> tuple[Strategy, ...]:
         raise InputError(f"rows {name}: not JSON ({error})") from None
     if not isinstance(rows, list):
         raise InputError(f"rows {name}: give a list of rows")
-    return tuple(strategy_from_row(name, row) for row in rows)
+    return rows
 
 
 def _folder():

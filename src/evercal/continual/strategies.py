@@ -89,7 +89,7 @@ STRATEGIES: dict[str, Strategy] = _named(
         source="Aljundi et al., Gradient based sample selection, NeurIPS 2019",
     ),
     Strategy("mir", MaximallyInterferedRetrieval(weight=0.3)),
-    Strategy("der", DarkExperienceReplay()),
+    Strategy("der", DarkExperienceReplay(weight=0.3)),
     Strategy(
         "co2l",
         Replay("reservoir", Relations()),

@@ -114,9 +114,11 @@ def reprojection_loss(
     return loss, pixels
 
 
-def fixed_clamp_loss(points: Tensor, target: Target) -> tuple[Tensor, Tensor]:
+def fixed_clamp_loss(
+    points: Tensor, target: Target, tau: float = FIXED_CLAMP_PX
+) -> tuple[Tensor, Tensor]:
     """`reprojection_loss` with a fixed clamp, so that losses of different times can be compared.
 
     With the schedule of the training, the clamp would decide and not the points.
     """
-    return reprojection_loss(points, target, FIXED_CLAMP_PX, LossOptions())
+    return reprojection_loss(points, target, tau, LossOptions())

@@ -21,7 +21,7 @@ from evercal.continual.methods.replay import EpisodicMemory, MemoryHooks, by_sce
 from evercal.networks.buffer import Rows
 from evercal.networks.head import HeadOutput
 from evercal.networks.hooks import ProposedStep, TrainingHooks
-from evercal.networks.loss import LossOptions, reprojection_loss
+from evercal.networks.loss import fixed_clamp_loss
 
 REFERENCE_ROWS = 8192
 
@@ -53,7 +53,7 @@ class ConstrainedStep(EpisodicMemory):
 
     def loss(self, output: HeadOutput, rows: Rows) -> Tensor:
         """Mean loss of remembered rows at the fixed clamp."""
-        cost, _ = reprojection_loss(output.points, rows.target, self.clamp_px, LossOptions())
+        cost, _ = fixed_clamp_loss(output.points, rows.target, self.clamp_px)
         return cost.mean()
 
 

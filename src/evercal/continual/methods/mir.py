@@ -13,7 +13,7 @@ from evercal.continual.methods.replay import Replay, ReplayHooks
 from evercal.networks.buffer import FeatureBuffer, Rows
 from evercal.networks.head import Head
 from evercal.networks.hooks import TrainingHooks
-from evercal.networks.loss import LossOptions, reprojection_loss
+from evercal.networks.loss import fixed_clamp_loss
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def interfered_views(
     moved = copy.deepcopy(head)
     before = _losses(method, head, rows, len(drawn))
     points = moved(fresh.features.float(), fresh.scene, fresh.descriptor).points
-    cost, _ = reprojection_loss(points, fresh.target, method.clamp_px, LossOptions())
+    cost, _ = fixed_clamp_loss(points, fresh.target, method.clamp_px)
     parameters = list(moved.parameters())
     found = torch.autograd.grad(cost.mean(), parameters, materialize_grads=True)
     with torch.no_grad():
@@ -113,5 +113,5 @@ def interfered_views(
 def _losses(method: MaximallyInterferedRetrieval, head: Head, rows: Rows, views: int) -> Tensor:
     """(views,) mean loss of each view's rows."""
     points = head(rows.features.float(), rows.scene, rows.descriptor).points
-    loss, _ = reprojection_loss(points, rows.target, method.clamp_px, LossOptions())
+    loss, _ = fixed_clamp_loss(points, rows.target, method.clamp_px)
     return loss.view(views, -1).mean(1)

@@ -174,9 +174,8 @@ class AnchoredReprojection(Penalty):
     ) -> Tensor:
         """Mean of both."""
         assert teacher is not None
-        options = LossOptions()
-        cost, _ = reprojection_loss(student.points, rows.target, self.clamp_px, options)
-        _, error = reprojection_loss(teacher.points, rows.target, self.clamp_px, options)
+        cost, _ = fixed_clamp_loss(student.points, rows.target, self.clamp_px)
+        _, error = fixed_clamp_loss(teacher.points, rows.target, self.clamp_px)
         drift = (student.points - teacher.points.detach()).abs().sum(-1)
         held = torch.where(error < self.teacher_limit_px, drift, torch.zeros_like(drift))
         return cost.mean() + self.px_per_m * held.mean()

@@ -112,7 +112,6 @@ class DarkExperienceReplay(Replay):
 
     citation: ClassVar[str] = "Buzzega et al., Dark experience (DER++), NeurIPS 2020"
     penalty: Penalty = field(default_factory=StoredOutput)
-    weight: float = 0.3
 
     def begin(self, start: StageStart) -> TrainingHooks:
         """Replay with the stored points beside the rows of plain views."""
