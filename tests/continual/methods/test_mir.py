@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice
 
 import pytest
@@ -61,6 +62,27 @@ def test_views_that_the_new_rows_contradict_are_found(
     assert hits >= 4  # by chance a third of them
     for name, value in head.state_dict().items():
         assert torch.equal(value, before[name]), name
+
+
+def test_a_view_that_is_already_lost_can_still_be_harmed(
+    taught: tuple[Head, FeatureBuffer],
+) -> None:
+    """Its points are 20 px off; under a clamp of 5 px nothing more could be lost there."""
+    head, buffer = taught
+    harmed = buffer.tensors["view"] == 17
+    rows = buffer.rows(torch.nonzero(harmed)[:, 0])
+    rows.target.pixels = rows.target.pixels - torch.tensor([6.0, 0.0])
+    buffer = copy.deepcopy(buffer)
+    buffer.tensors["pixels"][harmed] += torch.tensor([20.0, 0.0])
+
+    def hits(method: MaximallyInterferedRetrieval) -> int:
+        views = [
+            interfered_views(method, head, rows, buffer, 5e-4, torch.Generator().manual_seed(seed))
+            for seed in range(5)
+        ]
+        return sum(17 in chosen.tolist() for chosen in views)
+
+    assert hits(MIR) >= 4 > hits(replace(MIR, clamp_px=5.0))
 
 
 def test_only_chosen_views_are_replayed_and_a_stop_does_not_show(learnable: Learnable) -> None:

@@ -93,11 +93,14 @@ def test_changes_are_damped_as_the_formula_says(learnable: Learnable, scenes: in
     assert kept[-1] < 0.3 < 0.9 < kept[0]
 
 
-def test_what_one_remembered_scene_owns_does_not_move(learnable: Learnable) -> None:
+@pytest.mark.parametrize("strength", [0.0, 0.5])
+def test_what_one_remembered_scene_owns_does_not_move(
+    learnable: Learnable, strength: float
+) -> None:
     buffers = [learnable(scene)[0] for scene in range(3)]
     head = head_of(buffers)
     before = {name: value.clone() for name, value in head.state_dict().items()}
-    hooks = hooks_for(head, buffers[:2], Short(), 1e-6)
+    hooks = hooks_for(head, buffers[:2], Short(), strength)
     list(HeadTrainer(head, buffers[2:], OPTIONS, 0, hooks).run())
     after = head.state_dict()
     own = {"code": torch.tensor([True, True, False])}

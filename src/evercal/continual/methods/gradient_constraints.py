@@ -174,7 +174,7 @@ class EpisodicConstraint(ConstrainedStep):
         buffer = scene.remembered()
         rows = buffer.draw(REFERENCE_ROWS, torch.Generator().manual_seed(scene.number))
         with torch.no_grad():
-            output = scene.head(rows.features.float(), scene.number, rows.descriptor)
+            output = scene.output(rows)
             return {"reference": self.loss(output, rows).cpu()}
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from torch import Tensor
 
 from evercal.continual.frame_statistics import FrameStatistics
-from evercal.networks.buffer import FeatureBuffer
-from evercal.networks.head import Head
+from evercal.networks.buffer import FeatureBuffer, Rows
+from evercal.networks.head import Head, HeadOutput
 from evercal.networks.hooks import TrainingHooks
 
 MethodState = Mapping[str, Tensor]
@@ -58,6 +58,10 @@ class FinishedScene:
     """Of all earlier scenes in order."""
     hooks: TrainingHooks | None
     """Those of the stage; None where the scene was learned by plain training."""
+
+    def output(self, rows: Rows) -> HeadOutput:
+        """What the head says now about rows of this scene."""
+        return self.head(rows.features.float(), self.number, rows.descriptor)
 
 
 @dataclass(frozen=True)

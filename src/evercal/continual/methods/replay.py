@@ -129,6 +129,6 @@ class DarkExperienceReplay(Replay):
         plain = int((buffer.tensors["view"] < scene.keyframes).sum())
         rows = buffer.rows(torch.arange(plain))
         with torch.no_grad():
-            points = scene.head(rows.features.float(), scene.number, rows.descriptor).points
+            points = scene.output(rows).points
         origin = points.mean(0)
         return {"points": (points - origin).half().cpu(), "origin": origin.cpu()}

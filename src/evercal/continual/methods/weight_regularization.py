@@ -108,7 +108,7 @@ class ElasticWeightConsolidation(WeightRegularization):
         """Mean squared gradients."""
 
         def loss(rows: Rows) -> Tensor:
-            points = scene.head(rows.features.float(), scene.number, rows.descriptor).points
+            points = scene.output(rows).points
             return fixed_clamp_loss(points, rows.target)[0].mean()
 
         return mean_over_images(scene.head, scene.rows(), self.images, loss, torch.square)
@@ -131,7 +131,7 @@ class MemoryAwareSynapses(WeightRegularization):
         buffer = scene.rows()
 
         def points(rows: Rows) -> Tensor:
-            return scene.head(rows.features.float(), scene.number, rows.descriptor).points
+            return scene.output(rows).points
 
         with torch.no_grad():
             drawn = buffer.draw(MEAN_ROWS, torch.Generator().manual_seed(scene.number))
