@@ -105,6 +105,8 @@ def by_hand(head: Head, feature: np.ndarray, scene: int, descriptor: np.ndarray)
 
     if head.options.whiten:
         feature = (feature - w["feature_mean"]) @ w["feature_map"]
+    else:
+        feature = math.sqrt(len(feature)) * feature  # unit length to unit variance
     x = feature if coded else np.concatenate([descriptor, feature])
     y = x
     for i in range(3):

@@ -45,8 +45,9 @@ class HeadOptions:
     centres_per_scene: int = 4
     """Cluster centres that a scene adds; of all scenes together where they are `fixed`."""
     whiten: bool = True
-    """Features are centred, scaled and half decorrelated before the first layer. Without it their
-    few strong directions drown the many weak ones, which tell neighbouring points apart."""
+    """Features are centred, scaled and half decorrelated before the first layer. Without it they
+    are scaled alone, and their few strong directions drown the many weak ones, which tell
+    neighbouring points apart."""
     activation: Literal["gelu", "relu"] = "gelu"
     """Between layers; ACE and GLACE have `relu`."""
 
@@ -226,6 +227,10 @@ class Head(nn.Module):
         """Activations (n, width) of the last hidden layer; arguments as of `forward`."""
         if self.options.whiten:
             features = (features - self.feature_mean) @ self.feature_map
+        else:
+            # They have unit length, and layers are initialised for unit variance: left as they
+            # are, biases drown them and the network takes several times as many steps.
+            features = features * math.sqrt(self.features)
         if self.options.condition == "code":
             return self._trunk(features, self._codes(scene))
         assert descriptor is not None, "condition 'descriptor' needs the image descriptors"

@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from evercal.continual.methods.method import MethodState, StageStart
 from evercal.geometry import SE3
@@ -51,12 +52,12 @@ def wave_buffer(scene: int, views: int = 4, shift_px: float = 0.0, few: int = 0)
     buffer = FeatureBuffer(scene, SE3.identity())
     buffer.restore(
         {
-            "features": torch.cat([points.sin(), points.cos(), points], 1).half(),
+            "features": normalize(torch.cat([points.sin(), points.cos(), points], 1)).half(),
             "pixels": 100 * points[:, :2] / points[:, 2:] + 50 + torch.tensor([shift_px, 0.0]),
             "view": torch.arange(views, dtype=torch.int32).repeat_interleave(50),
             "intrinsics": torch.tensor([[100.0, 100, 50, 50]] * views),
             "camera_from_atlas": torch.eye(4)[None, :3].repeat(views, 1, 1),
-            "descriptors": torch.nn.functional.normalize(torch.ones(views, 4), dim=-1),
+            "descriptors": normalize(torch.ones(views, 4), dim=-1),
         }
     )
     return buffer
