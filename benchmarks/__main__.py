@@ -79,6 +79,9 @@ def tune(
     file: Path,
     data: Path | None = None,
     scenes: int = 3,
+    methods: tuple[str, ...] = (),
+    backbone: Literal["evercal", "paper"] = "evercal",
+    steps: int | None = None,
     out: Path = Path("runs/tune"),
 ) -> None:
     """Four trials of every method's setting on held-out training frames; goes on where it stopped.
@@ -88,11 +91,14 @@ def tune(
         file: the best rows are written here, for `evercal bench --rows`.
         data: folder of the suite's recordings.
         scenes: how many of its scenes.
+        methods: which; all when left out.
+        backbone: what is trained: our network, or the paper's.
+        steps: optimiser steps of a stage; those of preset `bench` when left out.
         out: where runs and results are kept.
     """
     from benchmarks.tuning import run
 
-    run(suite, data, scenes, out / suite, file)
+    run(suite, data, scenes, out / suite, file, methods, backbone == "paper", steps)
 
 
 def rooms(

@@ -6,6 +6,7 @@ area under the curve of recall over position error (`evaluation.recall_area`).
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,10 @@ from evercal.benchmark import results
 from evercal.benchmark.bench import BenchOptions, run_bench
 from evercal.benchmark.rows import read_rows, strategy_from_row
 from evercal.benchmark.suites import load_suite, tuning_split
-from evercal.continual.presets import preset
+from evercal.continual.presets import on_paper_backbone, preset
+from evercal.continual.stage import StageOptions
 from evercal.continual.strategies import Strategy
+from evercal.errors import InputError
 from evercal.evaluation import recall_area
 from evercal.storage import read_settings, write_json
 
@@ -41,7 +44,16 @@ ALIKE = {"evercal_hybrid": "evercal_network", "sars_spdd_filled": "sars_spdd"}
 """Strategies that take the setting of another: the same method beside a map, or other frames."""
 
 
-def run(suite: str, data: Path | None, scenes: int, out: Path, file: Path) -> None:
+def run(
+    suite: str,
+    data: Path | None,
+    scenes: int,
+    out: Path,
+    file: Path,
+    methods: Sequence[str] = (),
+    paper_backbone: bool = False,
+    steps: int | None = None,
+) -> None:
     """Runs what is missing, and writes the best row of every method, best first in a table.
 
     Args:
@@ -50,20 +62,36 @@ def run(suite: str, data: Path | None, scenes: int, out: Path, file: Path) -> No
         scenes: how many of them.
         out: folder of results; the same command goes on there.
         file: JSON of `evercal bench --rows`; `.outcomes.json` beside it gets all trials.
+        methods: keys of `TRIALS`; all when empty.
+        paper_backbone: on the paper's network instead of ours.
+        steps: optimiser steps of a stage; those of preset `bench` when None.
+
+    Raises:
+        InputError: a method that has no setting to tune.
     """
+    unknown = [name for name in methods if name not in TRIALS]
+    if unknown:
+        raise InputError(f"--methods {' '.join(unknown)}: choose of {', '.join(TRIALS)}")
+    tried = {name: trials for name, trials in TRIALS.items() if not methods or name in methods}
+
+    def stage(seed: int) -> StageOptions:
+        of = preset("bench", seed)
+        of = on_paper_backbone(of) if paper_backbone else of
+        return of if steps is None else replace(of, fit=replace(of.fit, iterations=steps))
+
     recorded = load_suite(suite, data, (), None)[:scenes]
     split = [tuning_split(scene) for scene in recorded]
-    rows = [row for name in TRIALS for row in _rows(name)]
+    rows = [row for name in tried for row in _rows(name)]
     strategies = tuple(strategy_from_row("tuning", row) for row in rows)
     judged: dict[str, object] = {"suite": suite, "judged": "held-out training frames"}
-    options = BenchOptions(lambda seed: preset("bench", seed), strategies, (0,), settings=judged)
+    options = BenchOptions(stage, strategies, (0,), settings=judged)
     for step in run_bench(split, options, out):
         print(f"[{step.done}/{step.total}] {step.strategy}", flush=True)
     final = final_scores(out, strategies, len(split))
     file.parent.mkdir(parents=True, exist_ok=True)
     settings = {
         of: max(trials, key=lambda changes: final[_name(of, changes)]["auc_20cm"])
-        for of, trials in TRIALS.items()
+        for of, trials in tried.items()
     }
     settings |= {name: settings[like] for name, like in ALIKE.items() if like in settings}
     chosen = [{"name": name, "of": name, "with": changes} for name, changes in settings.items()]

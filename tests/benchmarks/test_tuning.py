@@ -11,6 +11,7 @@ from evercal.benchmark import results
 from evercal.benchmark.bench import BenchOptions
 from evercal.benchmark.results import SceneResult
 from evercal.benchmark.rows import load_rows, strategy_from_row
+from evercal.errors import InputError
 from evercal.storage import write_json
 
 
@@ -87,3 +88,34 @@ def test_the_best_trial_of_every_method_is_written(
     ]
     assert [one["auc_20cm"] for one in told] == [25.0, 90.0, 70.0, 0.0]
     assert [one["accuracy_5cm_5deg"] for one in told] == [0.0, 100.0, 0.0, 0.0]
+
+
+def test_what_is_trained_can_be_the_papers_network_and_a_few_methods(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[BenchOptions] = []
+
+    def bench(scenes: list[object], options: BenchOptions, out: Path) -> list[object]:
+        asked.append(options)
+        out.mkdir()
+        write_json(out / results.SETTINGS, {"suite": "sim-mini"})
+        results.append(
+            out, [result(s.name, 1, at, (0.1,)) for s in options.strategies for at in "ab"]
+        )
+        return []
+
+    monkeypatch.setattr(tuning, "load_suite", lambda *_: ["a", "b"])
+    monkeypatch.setattr(tuning, "tuning_split", lambda scene: scene)
+    monkeypatch.setattr(tuning, "run_bench", bench)
+    where = ("sim-mini", None, 2, tmp_path / "out", tmp_path / "tuned.json")
+    tuning.run(*where, methods=("er", "sars_spdd"), paper_backbone=True, steps=7)
+    (options,) = asked
+    assert {s.name.rpartition("_")[0] for s in options.strategies} == {"er", "sars_spdd"}
+    stage = options.stage(0)
+    assert stage.fit.iterations == 7
+    assert stage.head.condition == "descriptor"
+    assert stage.fit.loss.schedule == "circle"
+    names = [row["name"] for row in json.loads((tmp_path / "tuned.json").read_text())]
+    assert names == ["er", "sars_spdd", "sars_spdd_filled", "sars_reprojection", "reservoir_spdd"]
+    with pytest.raises(InputError, match="--methods joint: choose of er, "):
+        tuning.run(*where, methods=("joint",))
