@@ -112,6 +112,17 @@ def test_settings_are_chosen_on_training_frames(
     assert "now it is 'test frames'" in " ".join(found.err)
 
 
+def test_rows_stand_alone_unless_strategies_are_named() -> None:
+    def names(**words: str) -> list[str]:
+        return [one.name for one in verb.Bench("sim-mini", **words)._strategies()]
+
+    alone = names(rows="table4")
+    assert "sars_spdd" in alone
+    assert not {"evercal", "joint", "finetune"} & set(alone)
+    assert names(rows="table4", strategies="joint") == ["joint", *alone]
+    assert names() == ["evercal", "joint", "finetune", "er", "sars_spdd"]
+
+
 def test_the_backbone_of_the_paper() -> None:
     ours, paper = (verb.Bench("sim-mini", backbone=b, steps=7) for b in ("evercal", "paper"))
     stage = paper._stage(3)

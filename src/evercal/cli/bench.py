@@ -38,8 +38,9 @@ class Bench:
         Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="")
     ] = ()
     """Scene folders of the suite custom, in order of learning; a single one for regions."""
-    strategies: Annotated[str, arg(metavar="A,B")] = "evercal,joint,finetune,er,sars_spdd"
-    """Strategies with commas between; the others are compared with the first."""
+    strategies: Annotated[str | None, arg(metavar="A,B", help_behavior_hint="")] = None
+    """Strategies with commas between; the others are compared with the first. When left out, those
+    of --rows alone, or evercal,joint,finetune,er,sars_spdd."""
     rows: Annotated[str | None, arg(metavar="NAME|FILE.json", help_behavior_hint="")] = None
     """More strategies, made from others: table4, spdd-sweep, with-map, or a file of one's own (see
     `evercal.benchmark.rows`)."""
@@ -59,8 +60,7 @@ class Bench:
     preset: Literal["fast", "demo", "bench", "paper"] = "bench"
     """How much a network is trained in a stage."""
     backbone: Literal["evercal", "paper"] = "evercal"
-    """The network: ours, or the paper's with all centres known in advance and every stage at the
-    full rate."""
+    """The network: ours, or the paper's with all centres known in advance and trained its way."""
     offsets: Literal["per_centre", "shared"] = "per_centre"
     """An offset and scale for each centre (the paper), or one for all (GLACE)."""
     steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
@@ -123,7 +123,10 @@ class Bench:
         from evercal.benchmark.rows import load_rows
         from evercal.continual.strategies import strategy_named
 
-        named = [strategy_named(name) for name in _words(self.strategies)]
+        names = self.strategies
+        if names is None:
+            names = "" if self.rows else "evercal,joint,finetune,er,sars_spdd"
+        named = [strategy_named(name) for name in _words(names)]
         # Rows may repeat what is named: it is run once. Two of one name are refused later.
         return tuple(dict.fromkeys((*named, *(load_rows(self.rows) if self.rows else ()))))
 

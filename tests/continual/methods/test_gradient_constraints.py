@@ -3,7 +3,7 @@
 import copy
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -276,11 +276,15 @@ def test_the_episodic_constraint_by_hand() -> None:
 
 
 def test_averaged_and_single_constraints_by_hand() -> None:
-    # The mean of both gradients is (1, 1) / 2: what goes against it is taken out of the step.
+    # One loss is constrained, the mean of both, with the gradient (1, 1) / 2: what goes against it
+    # is taken out of the step.
+    (mean,) = AveragedGem().constrained([torch.tensor(1.0), torch.tensor(3.0)])
+    assert float(mean) == 2.0
     proposed = proposed_of([1.0, 1.0], [0.5, -0.1])
-    assert edited(AveragedGem(), proposed, [1.0, 1.0]) == [0.3, -0.3]
+    averaged = replace(proposed, constraints=[{"w": torch.tensor([0.5, 0.5])}])
+    assert edited(AveragedGem(), averaged, [1.0, 1.0]) == [0.3, -0.3]
     assert edited(Gem(margin=0.0), proposed, [1.0, 1.0]) == [0.0, -0.1]
-    agreed = proposed_of([1.0, 1.0], [-0.5, 0.1])
+    agreed = replace(averaged, changes={"w": torch.tensor([-0.5, 0.1])})
     assert edited(AveragedGem(), agreed, [1.0, 1.0]) == [-0.5, 0.1]
 
 

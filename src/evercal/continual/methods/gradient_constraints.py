@@ -45,11 +45,15 @@ class ConstrainedStep(EpisodicMemory):
 
         Args:
             changes: (p,) what the optimisers would change, all weights one after the other.
-            g: (t, p) gradients of the remembered scenes' losses.
+            g: (t, p) gradients of the losses that `constrained` gives.
             proposed: the step.
             references: (t,) the losses when the scenes were just learned; NaN where not kept.
         """
         raise NotImplementedError
+
+    def constrained(self, losses: list[Tensor]) -> list[Tensor]:
+        """The losses that may not rise, made of one loss for each remembered scene."""
+        return losses
 
     def loss(self, output: HeadOutput, rows: Rows) -> Tensor:
         """Mean loss of remembered rows at the fixed clamp."""
@@ -70,8 +74,9 @@ class ConstraintHooks(MemoryHooks):
         self._references = torch.stack(kept)
 
     def constraints(self, output: HeadOutput, rows: Rows, tau_px: float) -> list[Tensor]:
-        """The loss of each remembered scene."""
-        return [self._rule.loss(o, r) for o, r in by_scene(output, rows, self.memories)]
+        """The losses that may not rise."""
+        parts = by_scene(output, rows, self.memories)
+        return self._rule.constrained([self._rule.loss(o, r) for o, r in parts])
 
     def edit_step(self, proposed: ProposedStep) -> None:
         """Projects the step."""
@@ -92,12 +97,15 @@ class AveragedGem(ConstrainedStep):
 
     citation: ClassVar[str] = "Chaudhry et al., Efficient lifelong learning with A-GEM, ICLR 2019"
 
+    def constrained(self, losses: list[Tensor]) -> list[Tensor]:
+        """The mean alone."""
+        return [torch.stack(losses).mean()]
+
     def edit(
         self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
     ) -> Tensor:
         """Takes out of the change what raises the mean loss."""
-        mean = g.mean(0, keepdim=True)
-        return nearest_change(changes, mean, torch.zeros(1))
+        return nearest_change(changes, g, torch.zeros(1))
 
 
 @dataclass(frozen=True)
@@ -135,7 +143,7 @@ class EpisodicConstraint(ConstrainedStep):
     """
 
     citation: ClassVar[str] = "Lai et al., GEC, NeurIPS 2025, several constraints"
-    alpha: float = 128.0
+    alpha: float = 512.0
     """Share of h_t that a step of unit length makes up for (no unit)."""
     eta: float = 0.03
     """The original's learning rate; here it is only the length that alpha is meant for."""

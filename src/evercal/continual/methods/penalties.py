@@ -12,7 +12,8 @@ from evercal.networks.head import HeadOutput
 from evercal.networks.loss import LossOptions, fixed_clamp_loss, reprojection_loss
 
 PX_PER_M = 50.0
-"""Weight of a distance in scene coordinates, pixels per metre: the parallax of a pixel at 3 m."""
+"""Weight of a distance in scene coordinates, pixels per metre: about what a metre sideways is
+in the image at 5 m."""
 
 
 @dataclass(frozen=True)
