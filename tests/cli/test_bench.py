@@ -113,8 +113,9 @@ def test_settings_are_chosen_on_training_frames(
 
 
 def test_rows_stand_alone_unless_strategies_are_named() -> None:
-    def names(**words: str) -> list[str]:
-        return [one.name for one in verb.Bench("sim-mini", **words)._strategies()]
+    def names(rows: str | None = None, strategies: str | None = None) -> list[str]:
+        bench = verb.Bench("sim-mini", rows=rows, strategies=strategies)
+        return [one.name for one in bench._strategies()]
 
     alone = names(rows="table4")
     assert "sars_spdd" in alone
