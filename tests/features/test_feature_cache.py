@@ -1,6 +1,8 @@
 """Features that were computed before are found again, and what is broken is made again."""
 
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -79,3 +81,14 @@ def test_a_full_folder_is_read_but_not_written(tmp_path: Path) -> None:
     assert torch.equal(encoder(images), before)
     assert encoder.seen == 12 - len(kept)
     assert list(tmp_path.rglob("*.npy")) == kept
+
+
+@torch.inference_mode()
+def test_half_of_the_free_disk_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=80))
+    encoder = Counting()
+    cache_features(encoder, tmp_path)  # 16 bytes an image
+    encoder(torch.rand(6, 1, 16, 16, generator=torch.Generator().manual_seed(1)))
+    assert len(list(tmp_path.rglob("*.npy"))) == 2

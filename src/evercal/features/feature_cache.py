@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import shutil
 import uuid
 from pathlib import Path
 
@@ -9,11 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-LIMIT_BYTES = 8_000_000_000
-"""Of a folder: beyond, features are found but no longer kept."""
 
-
-def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int = LIMIT_BYTES) -> None:
+def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int | None = None) -> None:
     """Makes a frozen encoder look up what it has encoded before, and note what it has not.
 
     From then on features have half precision, found or not, so that results do not depend on what
@@ -22,7 +20,8 @@ def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int = LIMIT_BY
     Args:
         encoder: changed in place; its weights and type stay what they are.
         folder: where features are kept, one file per image; made when missing.
-        limit_bytes: how large the folder may grow.
+        limit_bytes: how much is added to the folder; beyond, features are found but no longer
+            kept. Half of what is free on the disk when left out.
     """
     weights = hashlib.blake2b(digest_size=8)
     for value in encoder.state_dict().values():
@@ -30,7 +29,7 @@ def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int = LIMIT_BY
     folder = folder / weights.hexdigest()
     folder.mkdir(parents=True, exist_ok=True)
     compute = encoder.forward
-    room = limit_bytes - sum(entry.stat().st_size for entry in os.scandir(folder))
+    room = shutil.disk_usage(folder).free // 2 if limit_bytes is None else limit_bytes
 
     def forward(grey: Tensor) -> Tensor:
         nonlocal room
