@@ -120,6 +120,14 @@ def test_a_transform_common_to_all_poses_is_found(arcs: tuple[Scene, Scene]) -> 
     assert radians < 0.004
     turn = np.deg2rad(found.adjusted.common_rotation_deg)
     np.testing.assert_allclose(turn, off.log()[3:], atol=4e-3)
+    # Frames as the map sees them stand where they really were.
+    seen = found.adjusted_frames(moved(frames, off.inverse()))
+    assert [frame.name for frame in seen] == [frame.name for frame in frames]
+    for frame, true in zip(seen, frames, strict=True):
+        assert frame.base_from_camera is not None
+        assert true.base_from_camera is not None
+        assert pose_distance(frame.base_from_camera, true.base_from_camera)[1] < 0.004
+        assert frame.camera == found.camera
 
 
 def test_poses_and_lens_may_be_taken_as_stated(arcs: tuple[Scene, Scene]) -> None:
@@ -140,7 +148,10 @@ def test_a_frame_in_the_wrong_place_is_named_and_left_out(hall: Scene) -> None:
     chosen = [0, 6, 12]
     found = build_map(frames, load_encoder(), chosen)
     assert found.adjusted.wrong_poses == (frames[6].name,)
-    assert len(found.keyframes) == 3  # another one stands in for it
+    assert len(found.keyframes) == len(found.names) == 3  # another one stands in for it
+    assert frames[6].name not in found.names
+    left = [frame.name for frame in frames if frame.name != frames[6].name]
+    assert [frame.name for frame in found.adjusted_frames(frames)] == left
     wrong = frames[6].base_from_camera
     assert wrong is not None
     places = found.keyframes.base_from_camera

@@ -126,7 +126,8 @@ class _Run:
             return
         self._remove()  # left by a commit that was killed
         scene, method = self.scenes[0], self.strategy.method
-        if method is None or not method.first_scene_alike:
+        # Beside a map the network learns frames as the map adjusted them.
+        if self.strategy.builds_map or method is None or not method.first_scene_alike:
             learn_scene(self.store, scene, self._how(), self.on_event)
             return
         shared = self.store.with_name(f"first-{scene.name}-{self.stage.seed}")
@@ -137,11 +138,9 @@ class _Run:
         maps = first.maps.copy_for_training().to(self.device)
         maps.strategy, maps.keyframes, maps.method_states = self.strategy.name, [], []
         self._cached(maps)
-        train, aside = validation_split(scene.train)
+        train, _ = validation_split(scene.train)
         learned = Learned(train, self._rows(maps, train))
-        stage = finished(finished_stage(maps, self.strategy, learned, self.stage))
-        if self.strategy.builds_map:  # another threshold than the network's alone
-            maps.scenes[0] = fitted_record(maps, aside, 0)
+        stage = finished_stage(maps, method, learned, self.stage)
         report = first.report()
         report["seconds"] = float(report["seconds"]) + time.perf_counter() - began
         report["frames_kept"] = stage.frames_kept

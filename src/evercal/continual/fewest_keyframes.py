@@ -11,7 +11,6 @@ from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.acceptance import MAX_SUPPORT
 from evercal.localization.localizer import Localizer
 from evercal.mapping.build import Mapping
-from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.selection import spread_poses
 
@@ -35,13 +34,13 @@ class AutoMemoryOptions:
 
 
 def fewest_keyframes(
-    maps: SceneMaps, frames: Sequence[Frame], options: AutoMemoryOptions | None = None
+    maps: SceneMaps, others: Sequence[Frame], options: AutoMemoryOptions | None = None
 ) -> Generator[Mapping, None, NDArray[np.int64]]:
     """Which keyframes of the newest scene are kept.
 
     Args:
         maps: with the scene's record and all of its keyframes.
-        frames: training frames of the scene.
+        others: posed training frames of the scene that are no keyframes, in recorded order.
         options: how many.
 
     Yields:
@@ -54,10 +53,11 @@ def fewest_keyframes(
     whole = maps.keyframes[-1]
     assert whole is not None, "a scene with a map has keyframes"
     everything = np.arange(len(whole))
-    probes = _probes(whole, frames, options.probes)
+    spread = np.linspace(0, len(others) - 1, min(options.probes, len(others))).round().astype(int)
+    probes = [others[i] for i in spread]
     truth = _located(maps, everything, probes)
     seen = [i for i, pose in enumerate(truth) if pose is not None]
-    sizes = sorted({max(1, int(share * len(frames))) for share in options.shares})
+    sizes = sorted({max(1, int(share * maps.scenes[-1].train_frames)) for share in options.shares})
     for step, size in enumerate(size for size in sizes if size < len(whole)):
         yield Mapping("choosing keyframes", step + 1, len(sizes))
         chosen = spread_poses(whole.base_from_camera, size)
@@ -68,19 +68,6 @@ def fewest_keyframes(
             return chosen
     yield Mapping("choosing keyframes", len(sizes), len(sizes))
     return everything
-
-
-def _probes(whole: Keyframes, frames: Sequence[Frame], count: int) -> list[Frame]:
-    """Frames spread over the recording, none of them a keyframe."""
-    taken = {pose.translation_m.tobytes() for pose in whole.base_from_camera}
-    others = [
-        frame
-        for frame in frames
-        if frame.base_from_camera is not None
-        and frame.base_from_camera.translation_m.tobytes() not in taken
-    ]
-    spread = np.unique(np.linspace(0, len(others) - 1, count).round().astype(int))
-    return [others[i] for i in spread] if others else []
 
 
 def _located(

@@ -1,16 +1,17 @@
 """What stays of a scene that was just learned: keyframes, their map, the method's state."""
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.methods.method import FinishedScene, Method, MethodState
-from evercal.continual.stage import Event, Stage, StageOptions
+from evercal.continual.stage import Stage, StageOptions
+from evercal.continual.stage_map import fitting
 from evercal.continual.stage_rows import keyframe_rows
 from evercal.continual.strategies import Strategy
 from evercal.datasets.frame import Frame, Scene
 from evercal.mapping.atlas import Cell
-from evercal.mapping.build import MapOptions, Mapping, SceneMap, finished, map_steps, spread_frames
+from evercal.mapping.build import SceneMap, finished
 from evercal.mapping.keyframes import Keyframes, store_keyframes
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord, corrected_camera, prototypes
 from evercal.networks.buffer import FeatureBuffer
@@ -28,48 +29,45 @@ class Learned:
     """Their rows; the first views are the frames as they are."""
     hooks: TrainingHooks | None = None
     """Those of the training; None where it was plain."""
+    scene_map: SceneMap | None = None
+    """Its map, from which the frames are; None where none is built."""
 
 
-def finished_stage(
-    maps: SceneMaps, strategy: Strategy, scene: Learned, options: StageOptions
-) -> Generator[Event, None, Stage]:
-    """Chooses what stays of the newest scene, maps it where that is wanted, and adds it to `maps`.
+def finished_stage(maps: SceneMaps, method: Method, scene: Learned, options: StageOptions) -> Stage:
+    """Chooses what stays of the newest scene and adds it to `maps`.
 
     Args:
         maps: with the scene's record and head, without its keyframes and state.
-        strategy: by which it was learned.
+        method: by which the head was trained.
         scene: what was learned.
         options: of the stage.
     """
-    number = len(maps.scenes) - 1
-    keyframes, scene_map = yield from _keyframes(maps, strategy, scene, options)
-    maps.scenes[number] = mapped_record(maps.scenes[number], scene_map)
+    maps.scenes[-1] = mapped_record(maps.scenes[-1], scene.scene_map)
+    keyframes = _keyframes(maps, method, scene, options)
     maps.keyframes.append(keyframes)
-    assert strategy.method is not None, "maps alone are finished in `learn`"
-    maps.method_states.append(_state(maps, strategy.method, scene, options))
+    maps.method_states.append(_state(maps, method, scene, options))
     kept = len(keyframes) if keyframes else 0
-    return Stage(maps, options.fit.iterations, kept, scene_map)
+    return Stage(maps, options.fit.iterations, kept, scene.scene_map)
 
 
 def _keyframes(
-    maps: SceneMaps, strategy: Strategy, scene: Learned, options: StageOptions
-) -> Generator[Mapping, None, tuple[Keyframes | None, SceneMap | None]]:
+    maps: SceneMaps, method: Method, scene: Learned, options: StageOptions
+) -> Keyframes | None:
+    """Those of the map; where there is none, those that the method selects."""
+    if scene.scene_map is not None:
+        return scene.scene_map.keyframes
     head, _ = maps.head_for(len(maps.scenes) - 1)
     statistics = FrameStatistics(scene.frames, head, scene.rows, options.seed)
-    capacity = options.capacity(scene.frames, maps.short_side)
-    chosen = strategy.method.select(statistics, capacity) if strategy.method else None
-    if strategy.builds_map:
-        if chosen is None:
-            chosen = spread_frames(scene.frames, capacity)
-        mapping = sized(options.map, maps)
-        scene_map = yield from map_steps(scene.frames, maps.encoder, chosen, mapping)
-        return scene_map.keyframes, scene_map
+    chosen = method.select(statistics, options.capacity(scene.frames, maps.short_side))
     if chosen is None:
-        return None, None
+        return None
     frames, refined = scene.frames, maps.scenes[-1].refined_camera
     if refined is not None:  # replay takes the camera as training corrected it
         frames = [replace(frame, camera=refined) for frame in frames]
-    return store_keyframes([frames[i] for i in chosen], maps.short_side), None
+    kept = store_keyframes([frames[i] for i in chosen], maps.short_side)
+    if options.memory_bytes is None:
+        return kept
+    return kept.take(fitting(kept, options.memory_bytes))
 
 
 def _state(maps: SceneMaps, method: Method, scene: Learned, options: StageOptions) -> MethodState:
@@ -97,26 +95,24 @@ def memory_bytes(maps: SceneMaps, strategy: Strategy) -> int:
     return replace(maps, method_states=needed).memory_bytes
 
 
-def trained_record(scene: Scene, cell: Cell, trainer: HeadTrainer, number: int) -> SceneRecord:
+def trained_record(
+    scene: Scene, cell: Cell, trainer: HeadTrainer, number: int, frames: int
+) -> SceneRecord:
     """The record of a scene that was trained on, without its map.
 
     Args:
-        scene: with its training frames.
+        scene: with its training frames as they are stated.
         cell: its place in the atlas.
         trainer: of the training.
-        number: which of the trainer's buffers holds the scene's rows, its frames as they are first.
+        number: which of the trainer's buffers holds the scene's rows.
+        frames: how many frames they show, each first as it is.
     """
-    frames, buffer, options = scene.train, trainer.buffers[number], trainer.options
-    camera, refined = frames[0].camera, None
+    buffer, options = trainer.buffers[number], trainer.options
+    camera, refined = scene.train[0].camera, None
     if options.intrinsics_rate > 0 and options.iterations > 0 and buffer.correctable:
         refined = corrected_camera(camera, trainer.correction[number].detach())
-    seen = prototypes(buffer.tensors["descriptors"][: len(frames)])
-    return SceneRecord(scene.name, camera, cell, seen, len(frames), refined)
-
-
-def sized(options: MapOptions, maps: SceneMaps) -> MapOptions:
-    """The options at the working size of a store."""
-    return replace(options, size=replace(options.size, cells=maps.short_side))
+    seen = prototypes(buffer.tensors["descriptors"][:frames])
+    return SceneRecord(scene.name, camera, cell, seen, len(scene.train), refined)
 
 
 def mapped_record(record: SceneRecord, scene_map: SceneMap | None) -> SceneRecord:

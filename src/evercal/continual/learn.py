@@ -7,20 +7,14 @@ from dataclasses import replace
 import torch
 
 from evercal.continual.fewest_keyframes import AutoMemoryOptions, fewest_keyframes
-from evercal.continual.finish_scene import (
-    Learned,
-    finished_stage,
-    mapped_record,
-    sized,
-    trained_record,
-)
+from evercal.continual.finish_scene import Learned, finished_stage, mapped_record, trained_record
 from evercal.continual.methods.method import StageStart
 from evercal.continual.stage import Event, Stage, StageOptions
 from evercal.continual.stage_head import head_for_scene, whiten
+from evercal.continual.stage_map import stage_map
 from evercal.continual.stage_rows import Pacer, encoded, remembered, scene_buffer, view_plan
 from evercal.continual.strategies import Strategy
 from evercal.datasets.frame import Scene, known_poses
-from evercal.mapping.build import map_steps, spread_frames
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 from evercal.mapping.store import Checkpoint, Resume
 from evercal.networks.trainer import HeadTrainer
@@ -45,11 +39,14 @@ def learn(
     Yields:
         `Encoding` and `Progress` as it goes, a `Checkpoint` every 10 seconds, a `Stage` at the end.
     """
-    if strategy.method is None:
+    method = strategy.method
+    if method is None:
         yield from _learn_map(maps, scene, options)
         return
-    method = strategy.method
-    after, frames = maps.copy_for_training(), scene.train
+    after, frames, scene_map = maps.copy_for_training(), scene.train, None
+    if strategy.builds_map:
+        scene_map = yield from stage_map(after, frames, options)
+        frames = scene_map.adjusted_frames(frames)
     teacher = copy.deepcopy(after.heads[-1]).eval() if after.heads else None
     positions = known_poses(frames).translation_m
     cell = after.atlas(options.grid_scenes).place(positions)
@@ -63,16 +60,17 @@ def learn(
     memories = (yield from remembered(maps, options)) if method.replays else []
     rows, states = options.fit.replay_batch, maps.method_states
     hooks = method.begin(StageStart(head, teacher, memories, states, rows, options.seed))
-    trainer = HeadTrainer(head, [buffer], options.fit, options.seed, hooks)
+    fit = options.fit if scene_map is None else options.fit.with_known_lens()
+    trainer = HeadTrainer(head, [buffer], fit, options.seed, hooks)
     if resume is not None and resume.trainer:
         trainer.load(dict(resume.trainer))
     for progress in trainer.run():
         yield progress
         if pacer.due():
             yield Checkpoint({}, trainer.state())
-    after.scenes.append(trained_record(scene, cell, trainer, 0))
-    done = Learned(frames, lambda: buffer, hooks)
-    yield (yield from finished_stage(after, strategy, done, options))
+    after.scenes.append(trained_record(scene, cell, trainer, 0, len(frames)))
+    done = Learned(frames, lambda: buffer, hooks, scene_map)
+    yield finished_stage(after, method, done, options)
 
 
 def _learn_map(maps: SceneMaps, scene: Scene, options: StageOptions) -> Iterator[Event]:
@@ -81,14 +79,14 @@ def _learn_map(maps: SceneMaps, scene: Scene, options: StageOptions) -> Iterator
     cell = after.atlas(options.grid_scenes).place(known_poses(frames).translation_m)
     if options.memory_auto:
         options = replace(options, memory_share=AutoMemoryOptions().most, memory_bytes=None)
-    chosen = spread_frames(frames, options.capacity(frames, options.map.size.patches))
-    scene_map = yield from map_steps(frames, maps.encoder, chosen, sized(options.map, maps))
+    scene_map = yield from stage_map(after, frames, options)
     nothing = torch.zeros(0, after.descriptor.width).half()
     record = SceneRecord(scene.name, frames[0].camera, cell, nothing, len(frames))
     after.scenes.append(mapped_record(record, scene_map))
     after.keyframes.append(scene_map.keyframes)
     after.method_states.append({})
     if options.memory_auto:
-        kept = scene_map.keyframes.take((yield from fewest_keyframes(after, frames)))
-        after.keyframes[-1], scene_map = kept, replace(scene_map, keyframes=kept)
+        others = [frame for frame in frames if frame.name not in scene_map.names]
+        scene_map = scene_map.take((yield from fewest_keyframes(after, others)))
+        after.keyframes[-1] = scene_map.keyframes
     yield Stage(after, 0, len(scene_map.keyframes), scene_map)

@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 from evercal.continual.finish_scene import Learned, finished_stage, trained_record
 from evercal.continual.methods.method import Method
 from evercal.continual.stage import Event, Stage, StageOptions
 from evercal.continual.stage_head import head_for_all, whiten
+from evercal.continual.stage_map import stage_map
 from evercal.continual.stage_rows import encoded, scene_buffer, view_plan
 from evercal.continual.strategies import Strategy
 from evercal.datasets.frame import Scene, known_poses
@@ -32,25 +34,31 @@ def learn_jointly(
     """
     after = maps.copy_for_training()
     plan = view_plan(options, maps.short_side)
-    cells, places, buffers = [], [], []
-    atlas = after.atlas(options.grid_scenes)
+    cells, places, buffers, learned, scene_maps = [], [], [], [], []
+    atlas, fit = after.atlas(options.grid_scenes), options.fit
     for number, scene in enumerate(scenes):
-        positions = known_poses(scene.train).translation_m
+        frames, scene_map = scene.train, None
+        if strategy.builds_map:
+            scene_map = yield from stage_map(after, frames, options)
+            frames, fit = scene_map.adjusted_frames(frames), fit.with_known_lens()
+        learned.append(frames)
+        scene_maps.append(scene_map)
+        positions = known_poses(frames).translation_m
         cells.append(atlas.place(positions))
         places.append(cells[-1].atlas_from_base.apply(positions))
-        buffers.append(scene_buffer(number, cells[-1], scene.train, maps.device))
-        yield from encoded(buffers[-1], scene.train, plan, maps)
+        buffers.append(scene_buffer(number, cells[-1], frames, maps.device))
+        yield from encoded(buffers[-1], frames, plan, maps)
     head = head_for_all(after, options, places)
     whiten(head, buffers, options.seed)
-    fit = options.fit
     rows = fit.batch + (fit.replay_batch if len(scenes) > 1 else 0)
     whole = replace(fit, iterations=fit.iterations * len(scenes), batch=rows)
     trainer = HeadTrainer(head, buffers, whole, options.seed)
     yield from trainer.run()
-    kept, alone = 0, replace(strategy, method=Method())
+    kept = 0
     for number, scene in enumerate(scenes):
-        after.scenes.append(trained_record(scene, cells[number], trainer, number))
-        done = Learned(scene.train, lambda number=number: buffers[number])
-        stage = yield from finished_stage(after, alone, done, options)
-        kept = stage.frames_kept
+        count = len(learned[number])
+        after.scenes.append(trained_record(scene, cells[number], trainer, number, count))
+        rows_of = partial(buffers.__getitem__, number)
+        done = Learned(learned[number], rows_of, scene_map=scene_maps[number])
+        kept = finished_stage(after, Method(), done, options).frames_kept
     yield Stage(after, whole.iterations, kept)

@@ -12,6 +12,9 @@ from evercal.networks.buffer import EncodePlan
 from evercal.networks.head import HeadOptions
 from evercal.networks.trainer import FitOptions, Progress
 
+SAMPLED_FRAMES = 8
+"""Frames whose size as keyframes is measured, where memory is given in bytes."""
+
 
 @dataclass(frozen=True)
 class StageOptions:
@@ -30,7 +33,7 @@ class StageOptions:
     memory_auto: bool = False
     """Keep the fewest keyframes with which other frames are located well; maps only."""
     memory_bytes: int | None = None
-    """N_b as a size instead; frames are counted at the size of the first one."""
+    """Size of a scene's keyframes instead; what a method keeps beside them is not counted."""
     fixed_centres_m: tuple[tuple[float, float, float], ...] = ()
     """Atlas coordinates of all centres, known in advance (HeadOptions.centres `fixed`)."""
     grid_scenes: int = 0
@@ -42,11 +45,15 @@ class StageOptions:
     """Random seed."""
 
     def capacity(self, frames: Sequence[Frame], short_side: int) -> int:
-        """N_b in frames, at least 1, for a scene of these training frames."""
+        """N_b in frames, at least 1, for a scene of these training frames.
+
+        Where memory is given in bytes, as many frames as fit by the images alone, from a sample.
+        """
         if self.memory_bytes is None:
             return max(1, int(self.memory_share * len(frames) + 1e-9))
-        one = store_keyframes(frames[:1], short_side).bytes
-        return min(len(frames), max(1, self.memory_bytes // one))
+        sample = frames[:: -(-len(frames) // SAMPLED_FRAMES)]
+        one = store_keyframes(sample, short_side).bytes / len(sample)
+        return min(len(frames), max(1, int(self.memory_bytes / one)))
 
 
 @dataclass

@@ -133,6 +133,35 @@ class SceneMap:
     """What the start of `gripper_from_camera` is corrected by; None where it was stated."""
     frame_covariance: NDArray[np.float64] | None = None
     """(6, 6) see `SceneRecord`."""
+    names: tuple[str, ...] = ()
+    """Of the frames that are keyframes."""
+
+    def take(self, index: NDArray[np.int64]) -> "SceneMap":
+        """The same map with some of its keyframes."""
+        names = tuple(self.names[i] for i in index.tolist())
+        return replace(self, keyframes=self.keyframes.take(index), names=names)
+
+    def adjusted_frames(self, frames: Sequence[Frame]) -> list[Frame]:
+        """Frames of the recording as the map sees them, without those whose pose is wrong.
+
+        Poses are corrected by what is common to all frames or to those nearby, and the lens is the
+        adjusted one, so that a network learns the same points as the landmarks.
+
+        Args:
+            frames: posed frames that the map was built from, and others of the same recording.
+        """
+        common = self.hand_eye.start_camera_from_camera if self.hand_eye else self.common
+        nominal, found = frames[0].camera, []
+        for frame in frames:
+            stated = frame.base_from_camera
+            if stated is None or frame.name in self.adjusted.wrong_poses:
+                continue
+            pose = stated @ common
+            if self.bend is not None:
+                pose = pose @ SE3.exp(self.bend.at(stated))
+            camera = self.camera if frame.camera == nominal else frame.camera
+            found.append(replace(frame, base_from_camera=pose, camera=camera))
+        return found
 
 
 @dataclass(frozen=True)
@@ -348,7 +377,8 @@ def _finished(
     if adjustment is not None:
         bend = fit_correction(stated, adjustment.poses, common)
     told = _adjusted(recording, adjustment, camera, wrong)
-    return SceneMap(complete, camera, common, spread, told, bend, hand_eye, loose)
+    names = tuple(recording.frames[i].name for i in numbers)
+    return SceneMap(complete, camera, common, spread, told, bend, hand_eye, loose, names)
 
 
 def _adjusted(

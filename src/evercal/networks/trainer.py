@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -49,6 +49,10 @@ class FitOptions:
     the head's; 0 trusts the given intrinsics. Cameras with known distortion stay as they are."""
     loss: LossOptions = field(default_factory=LossOptions)
     """Reprojection loss on the scenes being learned."""
+
+    def with_known_lens(self) -> "FitOptions":
+        """The same for frames whose lens is known better than training could correct it."""
+        return replace(self, intrinsics_rate=0.0)
 
 
 @dataclass
