@@ -13,6 +13,7 @@ A run that is killed goes on from the checkpoint inside its stage, as `evercal l
 """
 
 import json
+from collections import Counter
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -93,15 +94,16 @@ def run_bench(
     """
     total = len(options.seeds) * len(options.strategies) * len(scenes)
     missing = begin_bench(scenes, options, out)
-    found = {(o.strategy, o.seed, o.stage) for o in results.read(out)}
+    found = {(o.strategy, o.seed, o.stage, o.scene) for o in results.read(out)}
     done = total - len(missing) * len(scenes)
     features = options.features or out / "features"
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
         how = RunOptions(options.stage(seed), options.short_side, features, out, options.device)
         for stage, these in run_strategy(strategy, ordered, how, on_event):
-            if (strategy.name, seed, stage) not in found:
-                results.append(out, these)
+            # A kill may have left a part of the lines of a stage.
+            new = [o for o in these if (o.strategy, seed, stage, o.scene) not in found]
+            results.append(out, new)
             yield Step(strategy.name, seed, these, done + stage + 1, total)
         done += len(scenes)
 
@@ -121,9 +123,17 @@ def begin_bench(
         raise InputError(f"{len(scenes)} scene: forgetting takes two or more; give more scenes")
     lock_settings(out / results.SETTINGS, _settings(scenes, options))
     _note_strategies(out, options.strategies)
-    found = {(o.strategy, o.seed) for o in results.read(out) if o.stage == len(scenes) - 1}
+    found = results.read(out)
     runs = [(seed, strategy) for seed in options.seeds for strategy in options.strategies]
-    return [(seed, strategy) for seed, strategy in runs if (strategy.name, seed) not in found]
+    return [run for run in runs if not _done(run, found, len(scenes))]
+
+
+def _done(run: tuple[int, Strategy], found: Sequence[SceneResult], scenes: int) -> bool:
+    """Whether the last stage of a run has every line, also of what is judged alone beside it."""
+    seed, strategy = run
+    of = [o for o in found if o.seed == seed and o.strategy.partition(":")[0] == strategy.name]
+    last = Counter(o.strategy for o in of if o.stage == scenes - 1)
+    return bool(of) and all(last[name] == scenes for name in {o.strategy for o in of})
 
 
 def _note_strategies(out: Path, strategies: Sequence[Strategy]) -> None:
