@@ -97,9 +97,9 @@ def test_a_worker_of_a_cluster_that_dies_is_replaced(
 class FakeRay:
     """Ray's functions that are used here; tasks run in this process, the newest first."""
 
-    def __init__(self, crashes: int = 0) -> None:
+    def __init__(self, crashes: int = 0, gpus: int = 0) -> None:
         self.crashes, self.ran = crashes, 0
-        self.up = False
+        self.up, self.gpus, self.asked = False, gpus, -1
 
     def init(self, **_: object) -> None:
         self.up = True
@@ -110,8 +110,12 @@ class FakeRay:
     def put(self, value: object) -> object:
         return value
 
-    def remote(self, max_retries: int) -> Callable[[Any], Any]:
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": 2.0} | ({"GPU": float(self.gpus)} if self.gpus else {})
+
+    def remote(self, max_retries: int, num_gpus: int) -> Callable[[Any], Any]:
         assert max_retries == 0
+        self.asked = num_gpus
         return lambda function: SimpleNamespace(remote=partial(_Task, function))
 
     def wait(self, tasks: list[Any], num_returns: int) -> tuple[list[Any], list[Any]]:
@@ -162,7 +166,7 @@ class Bench:
 
 
 def start(
-    monkeypatch: pytest.MonkeyPatch, ray: FakeRay, bench: Bench, shared: bool
+    monkeypatch: pytest.MonkeyPatch, ray: FakeRay, bench: Bench, shared: bool, device: str = "auto"
 ) -> Callable[[Path], tuple[list[str], list[str], str]]:
     """A run on the fake: names of the steps, lines of failures, the error at the end."""
     monkeypatch.setattr(cluster, "_ray", lambda: ray)
@@ -173,6 +177,7 @@ def start(
 
     def run(out: Path) -> tuple[list[str], list[str], str]:
         options = BenchOptions(lambda _: None, (Strategy("ours"), Strategy("theirs")), (0,))  # pyright: ignore[reportArgumentType]
+        options = replace(options, device=device)
         said: list[str] = []
         steps, error = [], ""
         try:
@@ -260,6 +265,24 @@ def test_a_worker_that_dies_is_replaced(monkeypatch: pytest.MonkeyPatch, tmp_pat
     assert [line.split(": ", 1)[1] for line in said] == [
         "RuntimeError: It ran out of memory.; goes on from its last checkpoint"
     ] * 2
+
+
+@pytest.mark.parametrize(
+    ("device", "there", "asked"),
+    [("auto", 2, 1), ("cuda", 1, 1), ("cpu", 2, 0), ("auto", 0, 0)],
+)
+def test_a_task_asks_for_a_gpu_where_it_may_use_one(
+    device: str, there: int, asked: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    # Ray hides all GPUs from a task that asks for none.
+    ray = FakeRay(gpus=there)
+    start(monkeypatch, ray, Bench({}), True, device)(tmp_path)
+    assert ray.asked == asked
+
+
+def test_a_cluster_without_gpus_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    _, _, error = start(monkeypatch, FakeRay(), Bench({}), True, "cuda")(tmp_path)
+    assert error == "device 'cuda': the cluster has no GPU; take auto or cpu"
 
 
 def test_failures_go_to_stderr(

@@ -84,12 +84,12 @@ def run_on_ray(
 ) -> Iterator[Step]:
     """Runs what is missing, one task per strategy and seed; see `run_bench`.
 
-    Every task learns its first scene itself. Recordings, plugin and, where they are to be shared,
-    the features must lie under the same paths on all machines.
+    Every task learns its first scene itself, on the CPU or on one GPU. Recordings, plugin and,
+    where they are to be shared, the features must lie under the same paths on all machines.
 
     Args:
         scenes: two or more.
-        options: what is compared.
+        options: what is compared; the device is that of the workers: auto, cpu or cuda.
         out: folder of results on this machine.
         address: of a running Ray cluster, or `local` to start one on this machine.
         plugin: file of strategies that the workers must know.
@@ -111,7 +111,8 @@ def run_on_ray(
         total = len(options.seeds) * len(options.strategies) * len(scenes)
         done = total - len(missing) * len(scenes)
         given_up: list[str] = []
-        for job, outcome in _finished(ray, list(scenes), jobs, tell):
+        gpus = _gpus(ray, options.device)
+        for job, outcome in _finished(ray, list(scenes), jobs, gpus, tell):
             if outcome.error:
                 given_up.append(f"{job.name} ({outcome.error})")
                 continue
@@ -139,6 +140,14 @@ def _join(ray, address: str) -> None:
         raise InputError(f"--ray {address}: no cluster there ({error})") from error
 
 
+def _gpus(ray, device: str) -> int:
+    """How many GPUs a task asks for: Ray hides all of them from one that asks for none."""
+    there = ray.cluster_resources().get("GPU", 0) >= 1
+    if device == "cuda" and not there:
+        raise InputError("device 'cuda': the cluster has no GPU; take auto or cpu")
+    return int(there and device != "cpu")
+
+
 def _jobs(
     missing: Sequence[tuple[int, Strategy]], options: BenchOptions, plugin: Path | None, out: Path
 ) -> list[Job]:
@@ -160,11 +169,12 @@ def _jobs(
 
 
 def _finished(
-    ray, scenes: list[Scene], jobs: Sequence[Job], tell: Callable[[str], None]
+    ray, scenes: list[Scene], jobs: Sequence[Job], gpus: int, tell: Callable[[str], None]
 ) -> Iterator[tuple[Job, Outcome]]:
     """Jobs as they end, well or for good; what fails otherwise is tried again."""
     # Ray's own repetition would begin a run anew, unseen.
-    task, given = ray.remote(max_retries=0)(_one_run), ray.put(scenes)
+    how = {"max_retries": 0, "num_gpus": gpus}
+    task, given = ray.remote(**how)(_one_run), ray.put(scenes)
     tasks = {task.remote(given, job): (job, 1) for job in jobs}
     while tasks:
         (ready,), _ = ray.wait(list(tasks), num_returns=1)

@@ -92,7 +92,8 @@ class Bench:
 
         if self.plugin is not None:
             load_plugin(self.plugin)
-        device = join_processes(self.device)
+        # Workers of a cluster have GPUs of their own.
+        device = self.device if self.ray else str(join_processes(self.device))
         out = self.out if rank() == 0 else _mirror(self.out)
         wait_for_all()
         options = BenchOptions(
@@ -106,7 +107,7 @@ class Bench:
                 "poses": "sfm" if self.poses else "original",
                 "judged": "held-out training frames" if self.held_out else "test frames",
             },
-            device=str(device),
+            device=device,
             features=self.out.absolute() / "features",
         )
         said = sys.stderr if self.json else sys.stdout
