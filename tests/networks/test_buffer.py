@@ -18,6 +18,7 @@ from evercal.features.views import ViewOptions, augmented_view, cell_centres, fr
 from evercal.geometry import SE3, Camera
 from evercal.networks import buffer as module
 from evercal.networks.buffer import EncodePlan, FeatureBuffer, encode_frames, join
+from evercal.networks.loss import reprojection_error
 from evercal.simulation.box_room import BoxRoom
 
 LANDSCAPE = Camera(160, 120, 131.0, 128.0, 83.0, 57.0)
@@ -286,3 +287,28 @@ def test_rows_part_and_join_are_inverse(filled: Filled) -> None:
         assert torch.equal(getattr(again.target, name), getattr(rows.target, name))
     straight = buffer.rows(rows.index)
     assert torch.equal(straight.features, rows.features)
+
+
+def test_rows_of_a_corrected_lens_are_those_of_an_ideal_pinhole() -> None:
+    points = torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
+    points[:, 2] = points[:, 2].abs() + 3
+    correction = torch.tensor([0.02, 0.01, -0.02, -0.12, 0.03])
+    buffer = FeatureBuffer(0, SE3.identity())
+    rows = {
+        "features": torch.zeros(60, 1).half(),
+        "pixels": torch.zeros(60, 2),
+        "view": torch.arange(3, dtype=torch.int32).repeat_interleave(20),
+        "intrinsics": torch.tensor([[300.0, 310, 160, 120], [150, 150, 80, 60], [90, 90, 0, 0]]),
+        "camera_from_atlas": torch.eye(4)[None, :3].repeat(3, 1, 1),
+        "descriptors": torch.ones(3, 2),
+    }
+    buffer.restore(rows)
+    each = torch.arange(60)
+    # Pixels that the corrected lens sees the points at.
+    seen, _ = reprojection_error(points, buffer.rows(each).target, correction.expand(60, 5))
+    buffer = FeatureBuffer(0, SE3.identity())
+    buffer.restore({**rows, "pixels": seen})
+    assert reprojection_error(points, buffer.rows(each).target)[0].abs().max() > 3
+    buffer.correct_lens(correction)
+    assert reprojection_error(points, buffer.rows(each).target)[0].abs().max() < 0.01
+    assert buffer.take_new() == {}

@@ -46,7 +46,8 @@ from evercal.networks.trainer import FitOptions, HeadTrainer
 from evercal.simulation.box_room import default_camera
 
 OPTIONS = FitOptions(iterations=4, batch=64)
-RULES = ("cost", "constraints")
+RULES = ("cost", "constraints", "descriptor")
+"""What remembered rows do; with the last they cost something and the head sees descriptors."""
 STOPS = (0, 2)
 """Rounds of encoding after which a run is interrupted."""
 Made = list[dict[str, dict[str, Tensor]]]
@@ -89,7 +90,7 @@ class Both(TrainingHooks):
         return (output.points - rows.features[:, 6:].float()).abs().mean()
 
     def constraints(self, output: HeadOutput, rows: Rows, tau_px: float) -> list[Tensor]:
-        if self.rule == "cost":
+        if self.rule != "constraints":
             return []
         each = len(rows.scene) // 2
         off = (output.points - rows.features[:, 6:].float()).abs().mean(1)
@@ -106,7 +107,8 @@ def gradients(rule: str, steps: int = 1) -> dict[str, Tensor]:
     torch.manual_seed(0)
     torch.set_num_threads(1)
     buffers = [buffer_of(scene) for scene in range(3)]
-    head = Head(9, 4, HeadOptions(width=16, blocks=1, whiten=False))
+    condition = "descriptor" if rule == "descriptor" else "code"
+    head = Head(9, 4, HeadOptions(width=16, blocks=1, condition=condition, whiten=False))
     for scene in range(3):
         head.grow(torch.randn(2, 3), seed=scene)
     hooks = Both(rule, buffers[:2])

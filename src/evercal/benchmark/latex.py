@@ -62,7 +62,7 @@ def paper_table(runs: Sequence[Run], suite: str) -> str:
         suite: its name; simulated suites are judged at 1 cm and 1 deg as in the paper, others at 5.
     """
     grouped = by_strategy(runs)
-    thresholds = FINE if suite in ("sim", "sim-7", "sim-12") else COARSE
+    thresholds = FINE if suite.startswith("sim") else COARSE
     names = list(runs[0].scenes)
     heads = " & ".join(rf"\multicolumn{{3}}{{c}}{{{_escaped(name)}}}" for name in grouped)
     units = " & ".join([r"$t$, cm & $r$, deg & Acc"] * len(grouped))

@@ -12,7 +12,7 @@ import numpy as np
 
 from evercal.benchmark.results import NETWORK, UNALIGNED, SceneResult, scene_result
 from evercal.benchmark.scene_views import keep_views
-from evercal.continual.finish_scene import Learned, finished_stage, memory_bytes
+from evercal.continual.finish_scene import Learned, correct_lens, finished_stage, memory_bytes
 from evercal.continual.learn_jointly import learn_jointly
 from evercal.continual.learn_scene import (
     LearnOptions,
@@ -153,6 +153,7 @@ class _Run:
         def rows() -> FeatureBuffer:
             buffer = scene_buffer(0, maps.scenes[0].cell, train, maps.device)
             finished(encoded(buffer, train, view_plan(self.stage, maps.short_side), maps))
+            correct_lens(buffer, maps.scenes[0])
             return buffer
 
         return rows

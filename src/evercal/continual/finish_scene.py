@@ -13,7 +13,13 @@ from evercal.datasets.frame import Frame, Scene
 from evercal.mapping.atlas import Cell
 from evercal.mapping.build import SceneMap, finished
 from evercal.mapping.keyframes import Keyframes, store_keyframes
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord, corrected_camera, prototypes
+from evercal.mapping.scene_maps import (
+    SceneMaps,
+    SceneRecord,
+    corrected_camera,
+    correction_between,
+    prototypes,
+)
 from evercal.networks.buffer import FeatureBuffer
 from evercal.networks.hooks import TrainingHooks
 from evercal.networks.trainer import HeadTrainer
@@ -26,7 +32,7 @@ class Learned:
     frames: Sequence[Frame]
     """Its training frames in recorded order."""
     rows: Callable[[], FeatureBuffer]
-    """Their rows; the first views are the frames as they are."""
+    """Their rows, of the lens that training found; the first views are the frames as they are."""
     hooks: TrainingHooks | None = None
     """Those of the training; None where it was plain."""
     scene_map: SceneMap | None = None
@@ -82,7 +88,14 @@ def _state(maps: SceneMaps, method: Method, scene: Learned, options: StageOption
     kept = len(keyframes) if keyframes else 0
     return method.after_scene(
         FinishedScene(
-            head.eval(), local, scene.rows, remembered, kept, maps.method_states, scene.hooks
+            head.eval(),
+            local,
+            scene.rows,
+            remembered,
+            kept,
+            maps.method_states,
+            scene.hooks,
+            options.fit.diffusion if head.options.condition == "descriptor" else 0.0,
         )
     )
 
@@ -113,6 +126,12 @@ def trained_record(
         refined = corrected_camera(camera, trainer.correction[number].detach())
     seen = prototypes(buffer.tensors["descriptors"][:frames])
     return SceneRecord(scene.name, camera, cell, seen, len(scene.train), refined)
+
+
+def correct_lens(rows: FeatureBuffer, record: SceneRecord) -> None:
+    """Has a scene's rows say what the lens says that training found, if it found one."""
+    if record.refined_camera is not None:
+        rows.correct_lens(correction_between(record.camera, record.refined_camera))
 
 
 def mapped_record(record: SceneRecord, scene_map: SceneMap | None) -> SceneRecord:

@@ -54,11 +54,13 @@ class FrameStatistics:
     def _first_rows(self) -> Tensor:
         """(n + 1,) where the rows of each frame begin, and where the last end."""
         count = torch.bincount(self._buffer.tensors["view"].cpu().long(), minlength=len(self))
-        return torch.cat([torch.zeros(1, dtype=torch.long), count[: len(self)].cumsum(0)])
+        return torch.cat(
+            [torch.zeros(1, dtype=torch.long, device="cpu"), count[: len(self)].cumsum(0)]
+        )
 
     def _of(self, frame: int) -> Rows:
         start, end = self._first_rows[frame : frame + 2].tolist()
-        return self._buffer.rows(torch.arange(start, end))
+        return self._buffer.rows(torch.arange(start, end, device="cpu"))
 
     def _hidden(self, rows: Rows) -> Tensor:
         return self._head.hidden(rows.features.float(), self._buffer.scene, rows.descriptor)
@@ -105,7 +107,7 @@ class FrameStatistics:
         found = []
         for i in range(len(self)):
             start, end = self._first_rows[i : i + 2].tolist()
-            drawn = torch.randint(start, end, (GRADIENT_ROWS,), generator=generator)
+            drawn = torch.randint(start, end, (GRADIENT_ROWS,), generator=generator, device="cpu")
             rows = self._buffer.rows(drawn)
             with torch.no_grad():
                 hidden = self._hidden(rows).float()

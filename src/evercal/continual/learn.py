@@ -7,7 +7,13 @@ from dataclasses import replace
 import torch
 
 from evercal.continual.fewest_keyframes import AutoMemoryOptions, fewest_keyframes
-from evercal.continual.finish_scene import Learned, finished_stage, mapped_record, trained_record
+from evercal.continual.finish_scene import (
+    Learned,
+    correct_lens,
+    finished_stage,
+    mapped_record,
+    trained_record,
+)
 from evercal.continual.methods.method import StageStart
 from evercal.continual.stage import Event, Stage, StageOptions
 from evercal.continual.stage_head import head_for_scene, whiten
@@ -69,6 +75,7 @@ def learn(
         if pacer.due():
             yield Checkpoint({}, trainer.state())
     after.scenes.append(trained_record(scene, cell, trainer, 0, len(frames)))
+    correct_lens(buffer, after.scenes[-1])
     done = Learned(frames, lambda: buffer, hooks, scene_map)
     yield finished_stage(after, method, done, options)
 

@@ -1,14 +1,13 @@
 """The head that a stage trains: a new one, the last one grown by a scene, or a copy of it."""
 
 from collections.abc import Sequence
-from itertools import islice
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from evercal.continual.stage import StageOptions
-from evercal.mapping.atlas import camera_clusters, spiral
+from evercal.mapping.atlas import camera_clusters
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.networks.buffer import FeatureBuffer
 from evercal.networks.head import Head
@@ -68,11 +67,9 @@ def whiten(head: Head, buffers: Sequence[FeatureBuffer], seed: int) -> None:
 
 def _new_centres(head: Head, options: StageOptions, positions_m: np.ndarray) -> Tensor:
     """(k, 3) centres that the scene adds, from its camera positions (n, 3) in the atlas."""
-    kind, count = head.options.centres, head.options.centres_per_scene
-    if kind == "grow":
+    if head.options.centres == "grow":
+        count = head.options.centres_per_scene
         return torch.from_numpy(camera_clusters(positions_m, count, options.seed)).float()
     if len(head.centres):
         return torch.zeros(0, 3)
-    if kind == "fixed":
-        return torch.tensor(options.fixed_centres_m).reshape(-1, 3)
-    return torch.tensor(np.stack(list(islice(spiral(), count)))).float()
+    return torch.tensor(options.fixed_centres_m).reshape(-1, 3)

@@ -59,8 +59,8 @@ class FrameResult:
 
     @property
     def wrong_scene(self) -> bool:
-        """Whether a pose was given, but in another scene."""
-        return self.status == "ok" and self.found_scene != self.scene
+        """Whether a pose was given, but in a scene of another base frame."""
+        return self.status == "ok" and math.isinf(self.translation_error_m)
 
 
 @dataclass(frozen=True)

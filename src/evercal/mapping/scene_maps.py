@@ -200,6 +200,13 @@ def corrected_camera(camera: Camera, correction: Tensor) -> Camera:
     )
 
 
+def correction_between(nominal: Camera, refined: Camera) -> Tensor:
+    """(5,) the correction that makes one camera of the other: the reverse of `corrected_camera`."""
+    k1, k2 = refined.distortion[:2] or (0.0, 0.0)
+    shift = (refined.cx - nominal.cx) / nominal.fx, (refined.cy - nominal.cy) / nominal.fy
+    return torch.tensor([refined.fx / nominal.fx - 1, *shift, k1, k2])
+
+
 @dataclass
 class SceneMaps:
     """Everything that localization and the next stage need."""

@@ -1,11 +1,12 @@
 """The feature buffer: the frozen encoder runs once, its rows are trained on many times."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from evercal.datasets.frame import Frame
 from evercal.features.descriptor import Descriptor
@@ -14,8 +15,9 @@ from evercal.features.encoder import Encoder
 from evercal.features.views import View, ViewOptions, augmented_view, frame_view
 from evercal.geometry.se3 import SE3
 from evercal.networks.distributed import gather, processes, rank, shared_out
-from evercal.networks.loss import Target
+from evercal.networks.loss import MAX_RADIUS2, Target
 
+UNBEND_STEPS = 10
 SPARE_SHARE = 0.25
 """Of a GPU's memory, for all that is no feature row: weights, activations, the encoder."""
 
@@ -170,6 +172,28 @@ class FeatureBuffer:
     def __len__(self) -> int:
         return len(self.tensors["features"])
 
+    def correct_lens(self, correction: Tensor) -> None:
+        """Moves rows to where an ideal pinhole would see them, now that the lens is known better.
+
+        Args:
+            correction: (5,) see `reprojection_error`, of the one camera that took all frames.
+        """
+        t, view = self.tensors, self.tensors["view"].long()
+        focal, dx, dy, k1, k2 = correction.to(t["pixels"]).unbind()
+        scale = t["intrinsics"][:, :2]
+        focals, centres = (
+            scale * (1 + focal),
+            t["intrinsics"][:, 2:] + scale * torch.stack([dx, dy]),
+        )
+        bent = (t["pixels"] - centres[view]) / focals[view]
+        plane = bent
+        for _ in range(UNBEND_STEPS):
+            radius2 = (plane * plane).sum(-1, keepdim=True).clamp(max=MAX_RADIUS2)
+            plane = bent / (1 + k1 * radius2 + k2 * radius2 * radius2)
+        pixels, intrinsics = plane * focals[view] + centres[view], torch.cat([focals, centres], -1)
+        self._merged = {**t, "pixels": pixels, "intrinsics": intrinsics}
+        self._parts, self._taken = [self._merged], 1
+
     def draw(self, count: int, generator: torch.Generator) -> Rows:
         """`count` random rows, with replacement."""
         # The CPU's generator draws, so that the rows are the same on every device.
@@ -256,6 +280,19 @@ def join(parts: Sequence[Rows]) -> Rows:
             ]
         )
     return Rows(cat("features"), cat("scene"), cat("descriptor"), target, cat("index"), stored)
+
+
+def diffused(rows: Rows, deviation: float, generator: torch.Generator) -> Rows:
+    """The rows with noise on their descriptors (GLACE's feature diffusion).
+
+    Args:
+        rows: a batch.
+        deviation: of the noise on every channel; descriptors have unit length before and after.
+        generator: of the device where the rows lie.
+    """
+    noise = torch.randn(rows.descriptor.shape, generator=generator, device=generator.device)
+    descriptor = F.normalize(rows.descriptor + deviation * noise.to(rows.descriptor), dim=-1)
+    return replace(rows, descriptor=descriptor)
 
 
 def own_share(rows: Rows) -> Rows:

@@ -39,9 +39,9 @@ class HeadOptions:
     """What tells scenes apart: a code per scene, or the image's global descriptor in the input."""
     offsets: Literal["shared", "per_centre"] = "per_centre"
     """One offset and scale for all centres (GLACE), or one for each centre (the paper)."""
-    centres: Literal["grow", "fixed", "grid"] = "grow"
-    """Where centres come from: each scene appends its own, all scenes at once in advance (the
-    paper; needs the future), or the middles of the atlas cells."""
+    centres: Literal["grow", "fixed"] = "grow"
+    """Where centres come from: each scene appends its own, or those of all scenes are there in
+    advance (the paper; needs the future)."""
     centres_per_scene: int = 4
     """Cluster centres that a scene adds; of all scenes together where they are `fixed`."""
     whiten: bool = True

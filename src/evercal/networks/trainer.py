@@ -6,11 +6,10 @@ from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from evercal.features.device import allow_tf32
 from evercal.features.precision import autocast
-from evercal.networks.buffer import FeatureBuffer, Rows, join, own_share
+from evercal.networks.buffer import FeatureBuffer, Rows, diffused, join, own_share
 from evercal.networks.distributed import average, broadcast, processes
 from evercal.networks.head import Head
 from evercal.networks.hooks import ProposedStep, TrainingHooks
@@ -159,13 +158,12 @@ class HeadTrainer:
         parts = [buffer.draw(share, generator) for buffer in self.buffers]
         fresh = len(parts)
         parts += self.hooks.replayed(join(parts), self.step, rate, generator)
-        parts = [own_share(part) for part in parts]
-        rows = join(parts)
         if self.head.options.condition == "descriptor":
-            noise = torch.randn(rows.descriptor.shape, generator=generator)
-            noise = self.options.diffusion * noise.to(rows.descriptor)
-            rows.descriptor = F.normalize(rows.descriptor + noise, dim=-1)
-        return rows, fresh * (share // processes())
+            # Drawn where the rows lie, and for all processes' rows alike.
+            seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
+            noise = torch.Generator(self.device).manual_seed(seed)
+            parts = [diffused(part, self.options.diffusion, noise) for part in parts]
+        return join([own_share(part) for part in parts]), fresh * (share // processes())
 
     def _fresh_costs(self, points: Tensor, rows: Rows, tau_px: float) -> tuple[Tensor, Tensor]:
         """Loss and error in pixels of the rows being learned."""
@@ -223,7 +221,7 @@ class HeadTrainer:
                 state |= {f"optimiser.{which}.{i}.{name}": v for name, v in slots.items()}
         # Copies: training goes on while someone may be writing them.
         copies = {k: v.detach().cpu().clone() for k, v in state.items()}
-        return copies | {"step": torch.tensor(self.step)}
+        return copies | {"step": torch.tensor(self.step, device="cpu")}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
         """Goes back to where `state()` was taken; the head must have the same shape."""

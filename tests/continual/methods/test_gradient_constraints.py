@@ -20,8 +20,10 @@ from evercal.continual.methods.gradient_constraints import (
     nearest_change,
 )
 from evercal.continual.methods.method import FinishedScene, MethodState
+from evercal.networks.buffer import diffused
+from evercal.networks.head import HeadOptions
 from evercal.networks.hooks import ProposedStep, TrainingHooks
-from evercal.networks.loss import LossOptions, reprojection_loss
+from evercal.networks.loss import LossOptions, fixed_clamp_loss, reprojection_loss
 from evercal.networks.trainer import FitOptions, HeadTrainer, one_cycle
 
 from .by_hand import flat, flat_of, off_by, rows, says, stage_start, wave_buffer, wave_head
@@ -356,6 +358,22 @@ def test_the_reference_is_the_loss_of_the_rows_that_are_replayed() -> None:
     # 8,192 rows are drawn with replacement.
     assert found == pytest.approx(expected, abs=5 * spread / 90)
     assert abs(found - mean_loss(trained)[0]) > 20 * spread / 90
+
+
+def test_the_reference_is_taken_with_the_noise_of_replayed_descriptors() -> None:
+    options = HeadOptions(16, 1, "descriptor", centres="fixed", whiten=False)
+    head, buffer = wave_head(2, options), wave_buffer(1)
+    references = []
+    for diffusion in (0.0, 5.0):
+        scene = FinishedScene(head, 1, lambda: buffer, lambda: buffer, 2, [], None, diffusion)
+        references.append(float(EpisodicConstraint().after_scene(scene)["reference"]))
+    drawn = buffer.draw(8192, torch.Generator().manual_seed(1))
+    shaken = diffused(drawn, 5.0, torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        points = head(shaken.features.float(), 1, shaken.descriptor).points
+    loss = fixed_clamp_loss(points, shaken.target, 50.0)[0].mean()
+    assert references[1] == pytest.approx(float(loss), rel=1e-5)
+    assert references[1] != pytest.approx(references[0], rel=1e-4)
 
 
 @pytest.mark.parametrize("pixels", [5.0, 40.0])

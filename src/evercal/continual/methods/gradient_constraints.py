@@ -18,7 +18,7 @@ from torch.nn import functional as F
 from evercal.continual.methods.method import FinishedScene, StageStart
 from evercal.continual.methods.penalties import Reprojection
 from evercal.continual.methods.replay import EpisodicMemory, MemoryHooks, by_scene
-from evercal.networks.buffer import Rows
+from evercal.networks.buffer import Rows, diffused
 from evercal.networks.head import HeadOutput
 from evercal.networks.hooks import ProposedStep, TrainingHooks
 from evercal.networks.loss import fixed_clamp_loss
@@ -69,7 +69,7 @@ class ConstraintHooks(MemoryHooks):
     def __init__(self, method: ConstrainedStep, start: StageStart):
         super().__init__(start)
         self._rule = method
-        unknown = torch.tensor(torch.nan)
+        unknown = torch.tensor(torch.nan, device="cpu")
         kept = [start.states[memory.scene].get("reference", unknown) for memory in self.memories]
         self._references = torch.stack(kept)
 
@@ -105,7 +105,7 @@ class AveragedGem(ConstrainedStep):
         self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
     ) -> Tensor:
         """Takes out of the change what raises the mean loss."""
-        return nearest_change(changes, g, torch.zeros(1))
+        return nearest_change(changes, g, g.new_zeros(1))
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class Gem(ConstrainedStep):
     ) -> Tensor:
         """The nearest change with <g_t, u> <= 0 for every scene, beyond the margin."""
         pushed = changes - self.margin * changes.norm() * F.normalize(g, dim=1).sum(0)
-        return nearest_change(pushed, g, torch.zeros(len(g)))
+        return nearest_change(pushed, g, g.new_zeros(len(g)))
 
 
 @dataclass(frozen=True)
@@ -181,6 +181,9 @@ class EpisodicConstraint(ConstrainedStep):
         """`reference`: the loss on remembered rows as they are replayed."""
         buffer = scene.remembered()
         rows = buffer.draw(REFERENCE_ROWS, torch.Generator().manual_seed(scene.number))
+        if scene.diffusion:
+            noise = torch.Generator(rows.features.device).manual_seed(scene.number)
+            rows = diffused(rows, scene.diffusion, noise)
         with torch.no_grad():
             output = scene.output(rows)
             return {"reference": self.loss(output, rows).cpu()}
@@ -206,7 +209,7 @@ class _EpisodicHooks(ConstraintHooks):
             self._references = proposed.losses
 
     def state(self) -> dict[str, Tensor]:
-        return {"steps": torch.tensor(self._steps), "references": self._references}
+        return {"steps": torch.tensor(self._steps, device="cpu"), "references": self._references}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
         self._steps, self._references = int(state["steps"]), state["references"]

@@ -48,8 +48,9 @@ class _OldAnswers(TrainingHooks):
         """New rows once more, each part as if it showed another earlier scene."""
         parts = []
         for scene in range(self._teacher.scenes):
-            drawn = torch.randint(len(fresh.scene), (self._each,), generator=generator)
-            part = fresh.part(drawn)
+            size = len(fresh.scene), (self._each,)
+            drawn = torch.randint(*size, generator=generator, device="cpu")
+            part = fresh.part(drawn.to(fresh.scene.device))
             part.scene = torch.full_like(part.scene, scene)
             parts.append(part)
         return parts

@@ -58,6 +58,8 @@ class FinishedScene:
     """Of all earlier scenes in order."""
     hooks: TrainingHooks | None
     """Those of the stage; None where the scene was learned by plain training."""
+    diffusion: float = 0.0
+    """Noise on the descriptors of rows as they are replayed; 0 where the head sees none."""
 
     def output(self, rows: Rows) -> HeadOutput:
         """What the head says now about rows of this scene."""

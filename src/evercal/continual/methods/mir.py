@@ -59,7 +59,7 @@ class _MirHooks(ReplayHooks):
         for memory, views in zip(self.memories, self._views, strict=True):
             view = memory.tensors["view"]
             where = torch.nonzero(torch.isin(view, views.to(view.device)))[:, 0]
-            drawn = torch.randint(len(where), (self.each,), generator=generator)
+            drawn = torch.randint(len(where), (self.each,), generator=generator, device="cpu")
             rows.append(memory.rows(where[drawn.to(where.device)]))
         return rows
 
@@ -88,11 +88,11 @@ def interfered_views(
         rate: of the virtual step, whose length is that of an optimiser with unit updates.
         generator: of the draws.
     """
-    drawn = torch.randperm(memory.views, generator=generator)[: method.candidates]
+    drawn = torch.randperm(memory.views, generator=generator, device="cpu")[: method.candidates]
     view = memory.tensors["view"].cpu()
     starts = torch.searchsorted(view, drawn.to(view.dtype))
     ends = torch.searchsorted(view, drawn.to(view.dtype), right=True)
-    offsets = torch.rand(len(drawn), method.view_rows, generator=generator)
+    offsets = torch.rand(len(drawn), method.view_rows, generator=generator, device="cpu")
     index = (starts[:, None] + offsets * (ends - starts)[:, None]).long()
     rows = memory.rows(index.clamp(max=len(memory) - 1).flatten())
     moved = copy.deepcopy(head)

@@ -140,10 +140,11 @@ class Relations(Penalty):
         assert teacher is not None
         # Rows come scene by scene; the first ones alone would all be of the oldest scene.
         count = len(student.hidden)
-        chosen = torch.linspace(0, count - 1, min(count, self.related_rows)).round().long()
+        few, where = min(count, self.related_rows), student.hidden.device
+        chosen = torch.linspace(0, count - 1, few, device=where).round().long()
 
         def similarity(hidden: Tensor) -> Tensor:
-            unit = torch.nn.functional.normalize(hidden[chosen.to(hidden.device)], dim=-1)
+            unit = torch.nn.functional.normalize(hidden[chosen], dim=-1)
             others = ~torch.eye(len(unit), dtype=torch.bool, device=unit.device)
             logits = (unit @ unit.T / self.temperature)[others].view(len(unit), -1)
             return logits.log_softmax(-1)

@@ -44,7 +44,8 @@ class GradientProjectionMemory(Method):
         moments[OUTPUTS] = hidden_moment(scene.head, buffer)
         found = {}
         for name, moment in moments.items():
-            old = before.get(f"basis.{name}", torch.zeros(len(moment), 0)).to(moment)
+            none = moment.new_zeros(len(moment), 0)
+            old = before.get(f"basis.{name}", none).to(moment)
             found[f"basis.{name}"] = grown_basis(old, moment, self.kept_share).half().cpu()
         return found
 

@@ -127,7 +127,7 @@ class DarkExperienceReplay(Replay):
         """
         buffer = scene.remembered()
         plain = int((buffer.tensors["view"] < scene.keyframes).sum())
-        rows = buffer.rows(torch.arange(plain))
+        rows = buffer.rows(torch.arange(plain, device="cpu"))
         with torch.no_grad():
             points = scene.output(rows).points
         origin = points.mean(0)

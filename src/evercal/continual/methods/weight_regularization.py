@@ -226,12 +226,12 @@ def mean_over_images(
     parameters = dict(head.named_parameters())
     total = {name: torch.zeros_like(p) for name, p in parameters.items()}
     view = buffer.tensors["view"].cpu()
-    drawn = torch.randperm(buffer.views, generator=generator)[:images]
+    drawn = torch.randperm(buffer.views, generator=generator, device="cpu")[:images]
     for number in drawn.tolist():
         index = torch.nonzero(view == number)[:, 0]
-        some = index[torch.randint(len(index), (IMAGE_ROWS,), generator=generator)]
+        some = torch.randint(len(index), (IMAGE_ROWS,), generator=generator, device="cpu")
         found = torch.autograd.grad(
-            value(buffer.rows(some)), list(parameters.values()), materialize_grads=True
+            value(buffer.rows(index[some])), list(parameters.values()), materialize_grads=True
         )
         for name, gradient in zip(parameters, found, strict=True):
             total[name] += size(gradient) / len(drawn)

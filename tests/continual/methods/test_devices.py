@@ -1,0 +1,78 @@
+"""Every method keeps to one device: what it makes lies where its inputs lie."""
+
+from __future__ import annotations
+
+import copy
+from contextlib import nullcontext
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import torch
+
+from evercal.continual.frame_statistics import FrameStatistics
+from evercal.continual.methods.method import FinishedScene, Method, MethodState
+from evercal.continual.strategies import STRATEGIES
+from evercal.datasets.frame import Frame
+from evercal.geometry import SE3, Camera
+from evercal.networks.head import HeadOptions
+from evercal.networks.trainer import FitOptions, HeadTrainer
+
+from ...one_device import made_where_inputs_lie
+from .by_hand import stage_start, wave_buffer, wave_head
+
+if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+    from torch import Tensor
+
+METHODS = {
+    name: strategy.method
+    for name, strategy in STRATEGIES.items()
+    if strategy.method is not None and not strategy.builds_map
+}
+CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
+IMAGE = np.zeros((3, 4, 3), np.uint8)
+FIT = FitOptions(iterations=3, batch=64, replay_batch=48)
+BACKBONES = {
+    "ours": HeadOptions(width=16, blocks=1, whiten=False),
+    "paper": HeadOptions(16, 1, "descriptor", centres="fixed", whiten=False, activation="relu"),
+}
+
+
+def learned(
+    method: Method, options: HeadOptions, made: AbstractContextManager[None]
+) -> tuple[dict[str, Tensor], np.ndarray | None]:
+    """A second scene is learned and finished: all tensors that come of it, and the frames kept."""
+    own, memory = wave_buffer(1), wave_buffer(0, views=2)
+    head = wave_head(2, options)
+    teacher = copy.deepcopy(head).eval()
+    pose = SE3.identity()
+    frames = [Frame(str(i), "", Camera(4, 3, 4.0, 4.0, 1.5, 1.0), pose) for i in range(own.views)]
+    with made:
+        alone = method.begin(stage_start(teacher, []))
+        first = FinishedScene(teacher, 0, lambda: memory, lambda: memory, 2, [], alone, 0.1)
+        states: list[MethodState] = [method.after_scene(first)]
+        start = stage_start(head, [memory], teacher=teacher, states=states, replay_rows=48)
+        hooks = method.begin(start)
+        trainer = HeadTrainer(head, [own], FIT, 0, hooks)
+        list(trainer.run())
+        trainer.load(trainer.state())
+        chosen = method.select(FrameStatistics(frames, head, lambda: own, 0), 2)
+        last = FinishedScene(head, 1, lambda: own, lambda: memory, 2, states, hooks, 0.1)
+        kept = method.after_scene(last)
+    return dict(head.state_dict()) | {f"kept.{k}": v for k, v in kept.items()}, chosen
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+@pytest.mark.parametrize("name", METHODS)
+def test_nothing_is_made_on_the_default_device(name: str, backbone: str) -> None:
+    # The default device is `meta`, the inputs lie on the CPU: numbers must come out, and the same.
+    expected, frames = learned(METHODS[name], BACKBONES[backbone], nullcontext())
+    found, again = learned(METHODS[name], BACKBONES[backbone], made_where_inputs_lie())
+    assert found.keys() == expected.keys()
+    for key, value in found.items():
+        assert value.device.type == "cpu", key
+        torch.testing.assert_close(value, expected[key], msg=key)
+    assert (frames is None) == (again is None)
+    assert frames is None or again is None or frames.tolist() == again.tolist()
