@@ -48,7 +48,7 @@ def learned(
     head = wave_head(2, options)
     teacher = copy.deepcopy(head).eval()
     pose = SE3.identity()
-    frames = [Frame(str(i), "", Camera(4, 3, 4.0, 4.0, 1.5, 1.0), pose) for i in range(own.views)]
+    frames = [Frame(str(i), IMAGE, CAMERA, pose) for i in range(own.views)]
     with made:
         alone = method.begin(stage_start(teacher, []))
         first = FinishedScene(teacher, 0, lambda: memory, lambda: memory, 2, [], alone, 0.1)
