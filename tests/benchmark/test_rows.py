@@ -38,8 +38,11 @@ def test_the_sweep_changes_the_weight_of_spdd_alone() -> None:
     points = SpddOptions(prior_weight=0.0, metric_weight=0.0)
     expected = {
         f"spdd_{n}": replace(paper, penalty=Distillation(scale=float(n)))
-        for n in (1, 3, 10, 30, 100)
+        for n in (0.3, 1, 3, 10, 30, 100)
     }
+    # A mean over 50 active centres and 3 coordinates, not a sum.
+    offsets = SpddOptions(metric_weight=0.00667)
+    expected["spdd_offsets_averaged"] = replace(paper, penalty=Distillation(offsets))
     expected["spdd_together"] = replace(paper, every_scene=False)
     expected |= {
         f"points_only_{n}": replace(paper, penalty=Distillation(points, float(n))) for n in (10, 30)
