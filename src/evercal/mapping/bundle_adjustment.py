@@ -26,7 +26,6 @@ from evercal.mapping.jacobians import (
     SHIFT,
     Linearised,
     camera_jacobian,
-    projection_slopes,
     ray_slopes,
 )
 
@@ -220,10 +219,11 @@ class BundleAdjustment:
     def _linearised(self, tracks: BundleTracks, state: _State) -> Linearised:
         turn, place = self._poses(state)
         k, j = tracks.host[tracks.landmark], tracks.frame
-        ray = np.zeros((len(tracks.host), 3))
+        ray, moved = np.zeros((len(tracks.host), 3)), np.zeros((len(tracks.host), 2, LENS))
         for camera, rows in self._lenses(state, tracks.host):
             ray[rows] = camera.unproject(tracks.pixels[rows])
-        ray = ray[tracks.landmark]
+            moved[rows] = ray_slopes(ray[rows], camera)
+        ray, moved = ray[tracks.landmark], moved[tracks.landmark]
         rho = state.inverse_depth[tracks.landmark, None]
         back = turn[j].transpose(0, 2, 1)
         across = back @ turn[k]
@@ -231,25 +231,34 @@ class BundleAdjustment:
         seen += np.einsum("nij,nj->ni", back, place[k] - place[j])
         seen[:, 2] = np.maximum(seen[:, 2], 0.05)
         plane = seen[:, :2] / seen[:, 2:]
-        at, slope, bent = np.zeros_like(plane), np.zeros((len(j), 2, 2)), np.zeros((len(j), 2, 5))
+        at, slope, bent = (
+            np.zeros_like(plane),
+            np.zeros((len(j), 2, 2)),
+            np.zeros((len(j), 2, LENS)),
+        )
         for camera, rows in self._lenses(state, j):
             at[rows] = camera.project(seen[rows])
-            slope[rows], bent[rows] = projection_slopes(plane[rows], camera)
+            slope[rows], bent[rows] = camera.slopes(plane[rows])
         to_plane = np.zeros((len(j), 2, 3))
         to_plane[:, 0, 0] = to_plane[:, 1, 1] = 1 / seen[:, 2]
         to_plane[:, :, 2] = -plane / seen[:, 2:]
         by_point = slope @ to_plane
         by_host = by_point @ across
         by_ray = by_host[:, :, :2] / rho[..., None]
-        lens = bent + ray_slopes(by_ray, ray, self._cameras[0])
+        lens = bent + by_ray @ moved
         white = tracks.whitening
-        return Linearised(
+        parts = (
             np.einsum("nij,nj->ni", white, at - tracks.observed),
             white @ np.concatenate([by_host, -by_host @ cross_matrix(ray / rho)], 2),
             white @ np.concatenate([-by_point, by_point @ cross_matrix(seen)], 2),
             np.einsum("nij,njk,nk->ni", white, -by_host, ray) / rho**2,
             white @ lens,
         )
+        # A lens may come to hold no longer where something was seen: then that says nothing.
+        lost = ~np.isfinite(at).all(1)
+        for part in parts:
+            part[lost] = 0
+        return Linearised(*parts)
 
     def _step(self, tracks: BundleTracks, state: _State) -> None:
         """One Gauss-Newton step; landmarks are eliminated first."""

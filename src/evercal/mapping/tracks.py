@@ -89,6 +89,8 @@ def open_keyframe(recording: Recording, frame: int, options: TrackOptions) -> Ke
     near = select_source_views(1 / inverse, view, poses, cameras, options.source_views)
     cell_px = recording.cell_px(frame)
     pixels, cells = detect(recording.grey[frame], view.grid, cell_px)
+    there = np.isfinite(recording.cameras[frame].unproject(pixels)).all(1)
+    pixels, cells = pixels[there], cells[there]
     slant = slopes(inverse, view.grid, cell_px) * options.slant
     marks = Landmarks(pixels, inverse[cells], slant[cells], np.ones(len(cells)))
     pyramid = recording.pyramid(frame)
@@ -180,6 +182,10 @@ def joined(parts: Sequence[Observations]) -> Observations:
     )
 
 
+_FAR_OFF_PX = 1e3
+"""Residual of what lies where a lens no longer holds."""
+
+
 def _residuals(
     recording: Recording, keyframe: KeyframeTracks, seen: Observations
 ) -> tuple[Array, Array]:
@@ -194,8 +200,9 @@ def _residuals(
         ray, step = rays[which] @ turn.T, 1e-4 * rho[which, None]
         at = camera.project(_ahead(ray + rho[which, None] * shift))
         beside = camera.project(_ahead(ray + (rho[which, None] + step) * shift))
-        residual[here] = seen.pixels[here] - at
-        slope[here] = (beside - at) / step
+        known = np.isfinite(at + beside).all(1, keepdims=True)
+        residual[here] = np.where(known, seen.pixels[here] - at, _FAR_OFF_PX)
+        slope[here] = np.where(known, (beside - at) / step, 0)
     return residual, slope
 
 
