@@ -42,6 +42,9 @@ HAND_EYE_COVARIANCE_SCALE = 2.5
 """Alignment errors of a landmark go together over many frames, which the residuals cannot tell: the
 squared error of `gripper_from_camera` in 30 trials was 1.8 times what they say
 (docs/experiments/handeye.md)."""
+NOTICED_RAD = 1e-4
+"""Poses and lens are tracked again where they moved what is seen by more: some hundredths of a
+pixel."""
 
 
 @dataclass(frozen=True)
@@ -274,7 +277,7 @@ def _adjust(
         problem = BundleAdjustment(recording.stated, stated_cameras, velocity, options.bundle)
         adjustment = problem.solve(tracks)
         recording.adjust(adjustment.poses, adjustment.camera)
-        if not _moved(adjustment, stated_cameras[0]):
+        if not _moved(recording.stated, stated_cameras[0], adjustment):
             break
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:
             list(pool.map(partial(_refined_again, recording, options.tracks), keyframes))
@@ -287,21 +290,23 @@ def _refined_again(recording: Recording, options: TrackOptions, keyframe: Keyfra
     refine_depths(recording, keyframe, options, again=True)
 
 
-def _moved(adjustment: Adjustment, stated: Camera) -> bool:
-    """Whether anything was adjusted by an amount that landmarks would notice."""
-    common = adjustment.common.log()
-    sizeable = np.linalg.norm(common[:3]) > 2e-4 or np.linalg.norm(common[3:]) > 2e-4
-    loose = adjustment.sigma_m > 3e-4 or adjustment.sigma_rad > 2e-4
-    lens = adjustment.camera is not None and abs(adjustment.camera.fx / stated.fx - 1) > 1e-4
-    return bool(sizeable or loose or lens or _bent(adjustment.camera, stated))
+def _moved(stated: SE3, camera: Camera, adjustment: Adjustment) -> bool:
+    """Whether poses and lens were adjusted by an amount that landmarks would notice.
 
-
-def _bent(camera: Camera | None, stated: Camera) -> bool:
-    """Whether the distortion was changed."""
-    if camera is None:
-        return False
-    now, before = ((*c.distortion, 0.0, 0.0)[:2] for c in (camera, stated))
-    return float(np.abs(np.subtract(now, before)).max()) > 1e-3
+    Args:
+        stated: (n,) poses before.
+        camera: the lens before, where all frames share one.
+        adjustment: of both.
+    """
+    change = np.linalg.norm((stated.inverse() @ adjustment.poses).log().reshape(-1, 2, 3), axis=2)
+    metres, radians = np.median(change, 0)
+    lens = 0.0
+    if adjustment.camera is not None:
+        across = [np.linspace(0, side - 1, 9) for side in (camera.width, camera.height)]
+        grid = np.stack(np.meshgrid(*across), -1)
+        off = adjustment.camera.project(camera.unproject(grid)) - grid
+        lens = float(np.nanmedian(np.linalg.norm(off, axis=-1))) / camera.fx
+    return max(metres * np.median(adjustment.inverse_depth), radians, lens) > NOTICED_RAD
 
 
 def _finished(
@@ -346,7 +351,7 @@ def _finished(
         )
     bend = None
     if adjustment is not None:
-        bend = fit_correction(stated, adjustment.poses, common)
+        bend = fit_correction(adjustment.poses @ common.inverse(), adjustment.correction)
     told = _adjusted(recording, adjustment, camera, wrong)
     return SceneMap(complete, camera, common, spread, told, bend, hand_eye, loose)
 
