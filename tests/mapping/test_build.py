@@ -182,8 +182,9 @@ def test_what_landmarks_would_notice(
     change: np.ndarray, camera: Camera | None, noticed: bool
 ) -> None:
     stated, none = SE3.exp(np.random.default_rng(0).normal(size=(10, 6))), np.zeros((10, 6, 6))
+    change = np.broadcast_to(change, (10, 6))
     poses, common, nearness = (
-        stated @ SE3.exp(change + np.zeros((10, 6))),
+        stated @ SE3.exp(change),
         SE3.identity(),
         np.full(7, 0.5),
     )
@@ -214,6 +215,10 @@ def test_a_frame_in_the_wrong_place_is_named_and_left_out(hall: Scene) -> None:
     assert wrong is not None
     places = found.keyframes.base_from_camera
     assert min(pose_distance(places[i], wrong)[0] for i in range(3)) > 0.05
+    for number in (0, 12):  # and for no other
+        right = frames[number].base_from_camera
+        assert right is not None
+        assert min(pose_distance(places[i], right)[0] for i in range(3)) < 0.003
 
 
 def test_frames_from_one_spot_are_refused(arcs: tuple[Scene, Scene]) -> None:

@@ -163,11 +163,11 @@ def test_a_covariance_is_that_of_many_runs() -> None:
         errors_ = (made.truth.inverse() @ answer.poses).log()
         found.append(errors_)
         spread.append(np.einsum("nii->ni", answer.covariance))
-    # Claimed variances allow for alignment errors that go together, which there are none of here.
     for part in (slice(0, 3), slice(3, 6)):
         claimed = np.mean([s[:, part] for s in spread])
         true = np.mean([np.square(e[:, part]) for e in found])
-        assert 0.4 < claimed / true < 5
+        # 0.46 to 0.63 with other noise: three times more or less would be told.
+        assert 0.4 < claimed / true < 1.3
 
 
 def test_what_is_wrong_with_all_poses_is_found() -> None:

@@ -27,7 +27,7 @@ from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.pose_check import PoseCheckOptions, contradicting_frames
 from evercal.mapping.recording import Recording, WorkingSize
 from evercal.mapping.scene_maps import frame_moved_by_cameras
-from evercal.mapping.selection import spread_poses
+from evercal.mapping.selection import select_farthest, spread_poses
 from evercal.mapping.tracks import (
     KeyframeTracks,
     TrackOptions,
@@ -234,10 +234,11 @@ def _open(
     keep = sorted(set(range(len(support))) - set(bad.tolist()))
     if len(bad):
         recording = recording.without(bad)
-    keyframes = [new for new, old in enumerate(keep) if support[old] in wanted]
-    if len(keyframes) < len(wanted):  # others take the place of those that were left out
-        keyframes = spread_frames(recording.frames, len(wanted)).tolist()
-    return recording, keyframes, wrong
+    places, turns = recording.stated.translation_m, recording.stated.rotation_wxyz
+    good = [new for new, old in enumerate(keep) if support[old] in wanted]
+    # Others take the place of those that were left out.
+    keyframes = select_farthest(places, turns, len(wanted), start=good)
+    return recording, keyframes.tolist(), wrong
 
 
 def spread_frames(frames: Sequence[Frame], capacity: int) -> NDArray[np.int64]:
