@@ -63,6 +63,8 @@ def detect(image: np.ndarray, camera: Camera, detector: Detector, short_side: in
     grey, camera = working_image(image, camera, min(short_side, *image.shape[:2]))
     pixels, descriptors = detector(grey)
     rays = camera.unproject(pixels.astype(float))
+    known = np.isfinite(rays).all(1)
+    rays, descriptors = rays[known], descriptors[known]
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     return Features(rays[:, :2] * intrinsics[:2] + intrinsics[2:], descriptors, intrinsics)
 

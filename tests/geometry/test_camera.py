@@ -1,5 +1,7 @@
 """The camera against OpenCV, against closed forms, and against itself at other sizes."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -83,6 +85,71 @@ def test_resizing_matches_what_opencv_does_to_pixels() -> None:
 def test_short_side(size: tuple[int, int], expected: tuple[int, int]) -> None:
     camera = Camera(*size, 500.0, 500.0, size[0] / 2, size[1] / 2).short_side_resized(240)
     assert (camera.width, camera.height) == expected
+
+
+@pytest.mark.parametrize("distortion", LENSES)
+def test_slopes_are_finite_differences(distortion: tuple[float, ...]) -> None:
+    camera, step = camera_with(distortion), 1e-6
+    plane = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 2))
+
+    def seen(camera: Camera, move: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+        return camera.project(np.concatenate([plane + move, np.ones((20, 1))], 1))
+
+    def changed(size: float) -> list[Camera]:
+        k, grown = np.array(camera.coefficients), np.exp(size)
+        return [
+            replace(camera, fx=camera.fx * grown, fy=camera.fy * grown),
+            replace(camera, cx=camera.cx + size),
+            replace(camera, cy=camera.cy + size),
+            *(replace(camera, distortion=tuple(k + size * np.eye(8)[i])) for i in (0, 1)),
+        ]
+
+    by_plane, by_lens = camera.slopes(plane)
+    ahead, behind = ([seen(c) for c in changed(size)] for size in (step, -step))
+    truth = np.stack([a - b for a, b in zip(ahead, behind, strict=True)], -1) / (2 * step)
+    np.testing.assert_allclose(by_lens, truth, atol=1e-6 * np.abs(truth).max())
+    moves = (step, 0.0), (0.0, step)
+    along = [seen(camera, m) - seen(camera, (-m[0], -m[1])) for m in moves]
+    truth = np.stack(along, -1) / (2 * step)
+    np.testing.assert_allclose(by_plane, truth, atol=1e-6 * np.abs(truth).max())
+
+
+BARREL = Camera(640, 480, 400.0, 400.0, 319.5, 239.5, (-0.35, 0.0, 0.0, 0.0))
+
+
+def test_a_lens_that_folds_shows_nothing_beyond_the_fold() -> None:
+    """x (1 - 0.35 x^2) is largest at x = 0.976, where it is 0.651."""
+    assert BARREL.widest == pytest.approx((3 * 0.35) ** -0.5)
+    points = np.array([[0.97, 0, 1], [0.98, 0, 1], [1.7, 0, 1]])
+    pixels = BARREL.project(points)
+    assert pixels[0] == pytest.approx((319.5 + 400 * 0.97 * (1 - 0.35 * 0.97**2), 239.5))
+    assert np.isnan(pixels[1:]).all()
+    x, y = np.meshgrid(np.arange(0, 640, 7.0), np.arange(0, 480, 7.0))
+    seen = np.stack([x, y], -1)
+    rays = BARREL.unproject(seen)
+    there = np.isfinite(rays).all(-1)
+    assert (there == (np.hypot(x - 319.5, y - 239.5) < 400 * 0.6506)).all()
+    np.testing.assert_allclose(BARREL.project(rays)[there], seen[there], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "widest"),
+    [
+        ((), np.inf),
+        (KINECT, np.inf),
+        ((0.0, 0.0, 0.01, 0.01), np.inf),
+        ((0.0, 0.0, 0.0, 0.0, 0.0, -0.25, 0.0, 0.0), 2.0),  # its denominator is 0 there
+        ((0.0, 0.0, 0.0, 0.0, 0.0, 0.25, 0.0, 0.0), 2.0),  # x / (1 + x^2 / 4) is largest there
+    ],
+)
+def test_how_far_a_lens_holds(distortion: tuple[float, ...], widest: float) -> None:
+    assert camera_with(distortion).widest == pytest.approx(widest)
+
+
+def test_no_distortion_is_the_same_however_it_is_said() -> None:
+    for count in (4, 5, 8):
+        assert camera_with((0.0,) * count) == camera_with(())
+    assert camera_with(KINECT).coefficients == (*KINECT, 0.0, 0.0, 0.0)
 
 
 def test_points_behind_the_camera_have_no_pixel() -> None:

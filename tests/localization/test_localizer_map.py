@@ -99,8 +99,9 @@ def test_errors_are_as_large_as_the_covariance_says(
         turned = (pose.inverse() @ truth).log()[3:]
         error = np.concatenate([truth.translation_m - pose.translation_m, turned])
         squares.append(error @ np.linalg.solve(found.covariance, error))
-    # 5.3 is the median for six Gaussian axes; never ten times too sure in the median.
-    assert 0.5 < np.median(squares) < 53
+    # 5.3 is the median for six Gaussian axes; a drawn room without clutter is better than claimed.
+    # Covariances of three times or a third of these would be told.
+    assert 0.6 < np.median(squares) < 4.5
 
 
 @pytest.mark.parametrize("seed", [77, 78, 79])

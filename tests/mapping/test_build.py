@@ -7,13 +7,27 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+import torch
 
+from evercal.continual.finish_scene import mapped_record
 from evercal.datasets.frame import Frame, Scene
 from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
+from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3, pose_distance
-from evercal.mapping.build import MapOptions, Mapping, SceneMap, build_map, map_steps, spread_frames
+from evercal.mapping.atlas import Cell
+from evercal.mapping.build import (
+    MapOptions,
+    Mapping,
+    SceneMap,
+    _moved,
+    build_map,
+    map_steps,
+    spread_frames,
+)
+from evercal.mapping.bundle_adjustment import Adjustment
 from evercal.mapping.recording import WorkingSize
+from evercal.mapping.scene_maps import SceneRecord
 from evercal.simulation.box_room import BoxRoom
 
 if TYPE_CHECKING:
@@ -130,6 +144,62 @@ def test_a_transform_common_to_all_poses_is_found(arcs: tuple[Scene, Scene]) -> 
         assert frame.camera == found.camera
 
 
+def test_a_wrong_clock_bends_no_frame(arcs: tuple[Scene, Scene]) -> None:
+    """Answers are true poses, though poses are stated half a frame after their images."""
+    true = [frame.base_from_camera for frame in arcs[0].train]
+    frames = [
+        replace(frame, base_from_camera=late.base_from_camera)
+        for frame, late in zip(arcs[0].train, arcs[0].test, strict=True)
+    ]
+    chosen = spread_frames(frames, 6)
+    found = build_map(frames, load_encoder(), chosen, SMALL)
+    assert found.adjusted.time_shift_frames == pytest.approx(-0.5, abs=0.1)
+    cell = Cell((0.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0))
+    plain = SceneRecord("one", frames[0].camera, cell, torch.zeros(0), len(frames))
+    record, off, before = mapped_record(plain, found), [], []
+    for i, place in enumerate(chosen):
+        pose, stated = true[place], frames[place].base_from_camera
+        assert pose is not None
+        assert stated is not None
+        answer, _ = record.stated(found.keyframes.base_from_camera[i], None)
+        off.append(pose_distance(answer, pose)[0])
+        before.append(pose_distance(stated, pose)[0])
+    assert np.median(off) < 0.1 * np.median(before)
+
+
+STEADY = np.zeros(6)
+LENS = Camera(320, 240, 280.0, 280.0, 159.5, 119.5)
+
+
+@pytest.mark.parametrize(
+    ("change", "camera", "noticed"),
+    [
+        (STEADY, LENS, False),
+        (STEADY, None, False),
+        (np.array([0.005, 0, 0, 0, 0, 0]), LENS, True),  # as a shift in time does
+        (np.array([0, 0, 0, 0, 0.001, 0]), None, True),
+        (np.array([1e-5, 0, 0, 0, 1e-5, 0]), LENS, False),
+        (np.eye(10, 6), LENS, False),  # some frames only
+        (STEADY, replace(LENS, cx=160.0), True),
+        (STEADY, replace(LENS, fx=281.0, fy=281.0), True),
+        (STEADY, replace(LENS, distortion=(0.02, 0.0, 0.0, 0.0)), True),
+        (STEADY, replace(LENS, fx=280.001, cx=159.501), False),
+    ],
+)
+def test_what_landmarks_would_notice(
+    change: np.ndarray, camera: Camera | None, noticed: bool
+) -> None:
+    stated, none = SE3.exp(np.random.default_rng(0).normal(size=(10, 6))), np.zeros((10, 6, 6))
+    change = np.broadcast_to(change, (10, 6))
+    poses, common, nearness = (
+        stated @ SE3.exp(change),
+        SE3.identity(),
+        np.full(7, 0.5),
+    )
+    fixed = (0.0, 0.0, 0.0, 0.1, none[0], none[:, 0], np.ones(10), none, nearness)
+    assert _moved(stated, LENS, Adjustment(poses, camera, common, *fixed)) == noticed
+
+
 def test_poses_and_lens_may_be_taken_as_stated(arcs: tuple[Scene, Scene]) -> None:
     frames = arcs[0].train[:10]
     found = build_map(frames, load_encoder(), [2, 7], replace(SMALL, adjust=False))
@@ -156,6 +226,10 @@ def test_a_frame_in_the_wrong_place_is_named_and_left_out(hall: Scene) -> None:
     assert wrong is not None
     places = found.keyframes.base_from_camera
     assert min(pose_distance(places[i], wrong)[0] for i in range(3)) > 0.05
+    for number in (0, 12):  # and for no other
+        right = frames[number].base_from_camera
+        assert right is not None
+        assert min(pose_distance(places[i], right)[0] for i in range(3)) < 0.003
 
 
 def test_frames_from_one_spot_are_refused(arcs: tuple[Scene, Scene]) -> None:

@@ -163,11 +163,11 @@ def test_a_covariance_is_that_of_many_runs() -> None:
         errors_ = (made.truth.inverse() @ answer.poses).log()
         found.append(errors_)
         spread.append(np.einsum("nii->ni", answer.covariance))
-    # Claimed variances allow for alignment errors that go together, which there are none of here.
     for part in (slice(0, 3), slice(3, 6)):
         claimed = np.mean([s[:, part] for s in spread])
         true = np.mean([np.square(e[:, part]) for e in found])
-        assert 0.4 < claimed / true < 5
+        # 0.46 to 0.63 with other noise: three times more or less would be told.
+        assert 0.4 < claimed / true < 1.3
 
 
 def test_what_is_wrong_with_all_poses_is_found() -> None:
@@ -266,8 +266,18 @@ def test_few_wrong_tracks_change_little() -> None:
     assert metres.max() < 2e-3
 
 
-@pytest.mark.parametrize("camera", [CAMERA, replace(CAMERA, distortion=(-0.1, 0.05, 0.0, 0.0))])
-def test_derivatives_are_finite_differences(camera: Camera) -> None:
+LENSES = [
+    (),
+    (-0.1, 0.05, 0.0, 0.0),
+    (-0.1, 0.05, 0.004, -0.003),
+    (0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    (0.1, -0.05, 0.001, -0.002, 0.01, 0.15, 0.01, 0.002),
+]
+
+
+@pytest.mark.parametrize("distortion", LENSES)
+def test_derivatives_are_finite_differences(distortion: tuple[float, ...]) -> None:
+    camera = replace(CAMERA, distortion=distortion)
     made = world(camera)
     problem = BundleAdjustment(
         made.truth, [camera] * FRAMES, np.zeros((FRAMES, 6)), BundleOptions()
@@ -289,15 +299,11 @@ def test_derivatives_are_finite_differences(camera: Camera) -> None:
     poses = rng.choice(6 * FRAMES, 30, replace=False)
     lens = 6 * FRAMES + COMMON + SHIFT + np.arange(LENS)
     for column in (*poses.tolist(), *lens.tolist()):
-        # The derivative through the ray of the host is to first order in the distortion.
-        through_lens = column >= 6 * FRAMES and any(camera.distortion)
         step = np.zeros(6 * FRAMES + GLOBALS)
         # A distortion below 1e-4 is none.
         step[column] = 1e-3 if column >= 6 * FRAMES + GLOBALS - 2 else 1e-5
         slope = (residual(state(step)) - residual(state(-step))) / (2 * step[column])
-        scale = np.abs(slope).max()
-        tolerance = 0.15 if through_lens else 1e-3
-        np.testing.assert_allclose(jacobian[:, column], slope, atol=tolerance * scale)
+        np.testing.assert_allclose(jacobian[:, column], slope, atol=1e-3 * np.abs(slope).max())
     # Common transform and time shift act through the priors alone.
     assert not jacobian[:, 6 * FRAMES : 6 * FRAMES + COMMON + SHIFT].any()
     rho = tracks.inverse_depth

@@ -71,7 +71,7 @@ def test_a_recording_less_some_frames_keeps_the_others_as_they_are(recording: Re
     one, two = rest.poses[1], rest.poses[0]
     np.testing.assert_allclose(turn, (one.inverse() @ two).rotation_matrix(), atol=1e-12)
     np.testing.assert_allclose(shift, (one.inverse() @ two).translation_m, atol=1e-12)
-    assert rest.one_camera()
+    assert rest.cameras == [recording.cameras[i] for i in keep]
 
 
 def test_distances_from_segments() -> None:

@@ -48,3 +48,31 @@ def test_landmarks_are_seen_where_they_were_found(seed: int, bent: bool, aligned
 def test_an_alignment_is_undone() -> None:
     pose = SE3.exp([0.2, 0.1, -0.4, 1.0, 0.2, -0.3])
     assert max(pose_distance(ALIGNMENT.map_pose(ALIGNMENT.pose(pose)), pose)) < 1e-12
+
+
+BENT = (-0.2, 0.05, 0.001, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("own", "given", "refined"),
+    [
+        ((), None, True),
+        ((), (), True),
+        ((), (0.0,) * 5, True),  # as a ROS camera without distortion states it
+        (BENT, None, True),
+        (BENT, BENT, True),
+        (BENT, (*BENT, 0.0), True),
+        (BENT, (), False),  # a rectified image
+        (BENT, (*BENT, 0.1), False),
+        ((), BENT, False),
+    ],
+)
+def test_the_refined_lens_stands_for_the_one_that_was_stated(
+    own: tuple[float, ...], given: tuple[float, ...] | None, refined: bool
+) -> None:
+    better = replace(LENS, fx=303.0, fy=303.0, distortion=(-0.1, 0.0, 0.0, 0.0))
+    scene = record(camera=replace(LENS, distortion=own), refined_camera=better)
+    query = None if given is None else replace(LENS.resized(640, 480), distortion=given)
+    assert scene.query_camera(query) == (better if refined else query)
+    other = replace(LENS, fx=320.0, distortion=own)
+    assert scene.query_camera(other) == other

@@ -212,6 +212,13 @@ def test_farthest_keeps_repeats_only_when_nothing_else_is_left():
     assert select_farthest(positions, quaternions, 9).tolist() == [0, 1, 2, 3, 4]
 
 
+def test_farthest_keeps_what_it_starts_with():
+    positions = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [9, 0, 0], [10, 0, 0]])
+    quaternions = np.tile([1.0, 0, 0, 0], (5, 1))
+    assert select_farthest(positions, quaternions, 3, start=[1, 3]).tolist() == [1, 2, 3]
+    assert select_farthest(positions, quaternions, 2, start=[1, 3]).tolist() == [1, 3]
+
+
 def test_covering_radius_is_the_largest_gap():
     positions, quaternions = random_walk(np.random.default_rng(10), 60)
     table = metric_table(positions, quaternions)

@@ -145,7 +145,9 @@ def _measured(frame: Frame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     v, u = (DEPTH_STEP_PX * i for i in np.nonzero(depth[::DEPTH_STEP_PX, ::DEPTH_STEP_PX]))
     pixels = np.stack([u, v], 1).astype(float)
     rays = frame.camera.unproject(pixels)
-    return frame.base_from_camera.apply(rays * depth[v, u, None] / 1000), pixels
+    known = np.isfinite(rays).all(1)
+    points = frame.base_from_camera.apply(rays * depth[v, u, None] / 1000)
+    return points[known], pixels[known]
 
 
 def _numbers(pose: SE3 | None) -> list[list[float]] | None:

@@ -113,6 +113,8 @@ def _triangulated(images: Sequence[Picks]) -> dict[str, tuple[Array, Array]]:
         turn = image.map_from_camera.rotation_matrix()
         for name, point, pixel in zip(image.names, image.points, image.pixels, strict=True):
             ray = turn @ image.camera.unproject(pixel)
+            if not np.isfinite(ray).all():
+                continue
             rays.setdefault(name, []).append(
                 (image.map_from_camera.translation_m, ray / np.linalg.norm(ray))
             )

@@ -130,8 +130,9 @@ def _features(frame: Frame) -> tuple[Array, NDArray[np.float32]]:
     points, descriptors = sift.detectAndCompute(image, None)
     if descriptors is None:
         return np.empty((0, 2)), np.empty((0, 128), np.float32)
-    pixels = np.array([point.pt for point in points])
-    return camera.unproject(pixels)[:, :2], descriptors
+    rays = camera.unproject([point.pt for point in points])[:, :2]
+    known = np.isfinite(rays).all(1)
+    return rays[known], descriptors[known]
 
 
 def _pairs(poses: SE3) -> list[tuple[int, int]]:

@@ -41,7 +41,7 @@ class View:
     """(cells, 2) float32 pixels of the frame that the cells are centred on, in an ideal pinhole
     with `intrinsics`; row-major over the (h // stride, w // stride) grid."""
     valid: np.ndarray
-    """(cells,) bool: the cell shows something of the image."""
+    """(cells,) bool: the cell shows something of the image, and `cell_pixels` says what."""
     intrinsics: np.ndarray
     """(4,) fx, fy, cx, cy of the ideal pinhole, pixels."""
     base_from_camera: SE3
@@ -65,14 +65,16 @@ def plain_view(image: np.ndarray, camera: Camera, stride: int, options: ViewOpti
     """
     grey, camera = working_image(image, camera, options.short_side)
     pixels = ideal_cell_pixels(camera, stride)
-    return View(grey, pixels, np.ones(len(pixels), bool), _four(camera), SE3.identity())
+    valid = np.isfinite(pixels).all(1)
+    return View(grey, pixels, valid, _four(camera), SE3.identity())
 
 
 @lru_cache(maxsize=64)
 def ideal_cell_pixels(camera: Camera, stride: int) -> np.ndarray:
     """(cells, 2) float32: where the cell centres lie once the lens distortion is taken away.
 
-    The same array for the same camera: not to be written to.
+    nan where the distortion has no ray for them. The same array for the same camera: not to be
+    written to.
     """
     pixels = cell_centres(camera.height, camera.width, stride)
     if camera.distortion:
@@ -112,7 +114,7 @@ def augmented_view(
     if camera.distortion:
         v, u = np.mgrid[0:height, 0:width]
         rays = virtual.unproject(np.stack([u, v], -1).astype(float)) @ camera_from_view.T
-        where = camera.project(rays).astype(np.float32)
+        where = np.nan_to_num(camera.project(rays), nan=-1.0).astype(np.float32)
         warped = cv2.remap(grey, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)  # type: ignore[call-overload]
     else:
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

@@ -8,6 +8,7 @@ pixel, as in OpenCV and ROS, so an image covers -0.5 .. width - 0.5 and its midd
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -16,6 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 _COEFFICIENT_COUNTS = (0, 4, 5, 8)
+_EXACT = 1e-10
+"""How near undistorted points of the plane z = 1 come to their pixels."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ class Camera:
     cy: float
     """Principal point in pixels; 0 is the centre of the topmost pixel."""
     distortion: tuple[float, ...] = ()
-    """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty for none."""
+    """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty for none, also where all were given as 0."""
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
@@ -59,7 +62,7 @@ class Camera:
                 f"camera distortion has 0, 4, 5 or 8 finite coefficients"
                 f" (OpenCV's k1 k2 p1 p2 k3 k4 k5 k6), got {distortion}"
             )
-        object.__setattr__(self, "distortion", distortion)
+        object.__setattr__(self, "distortion", distortion if any(distortion) else ())
 
     @classmethod
     def from_matrix(
@@ -79,6 +82,26 @@ class Camera:
                 f" not supported"
             )
         return cls(width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], distortion)
+
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """All eight coefficients of the distortion; 0 where `distortion` has none."""
+        return (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
+
+    @cached_property
+    def widest(self) -> float:
+        """Largest tangent of the angle to the optical axis that the distortion holds for.
+
+        Beyond it the polynomial turns round and places what lies far outside back in the image.
+        """
+        k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
+        squared = np.polynomial.Polynomial([0, 1])
+        above = np.polynomial.Polynomial([1, k1, k2, k3])
+        below = np.polynomial.Polynomial([1, k4, k5, k6])
+        slope = above * below + 2 * squared * (above.deriv() * below - above * below.deriv())
+        turns = np.concatenate([slope.trim().roots(), below.trim().roots()])
+        real = turns.real[(np.abs(turns.imag) < 1e-9) & (turns.real > 0)]
+        return math.sqrt(min(real, default=math.inf))
 
     def matrix(self) -> Array:
         """(3, 3) intrinsic matrix."""
@@ -113,13 +136,16 @@ class Camera:
 
         Returns:
             (..., 2) pixels, x then y, not clipped to the image; nan for points that are not in
-            front of the camera.
+            front of the camera or lie where the distortion no longer holds (`widest`).
         """
         points = np.asarray(points_camera, dtype=np.float64)
         if points.shape[-1:] != (3,):
             raise ValueError(f"points are (..., 3), got {points.shape}")
         depth = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
-        plane = self._distort(points[..., :2] / depth)
+        plane = points[..., :2] / depth
+        if self.distortion:
+            within = (plane**2).sum(-1, keepdims=True) < self.widest**2
+            plane = self._distort(np.where(within, plane, np.nan))
         return plane * (self.fx, self.fy) + (self.cx, self.cy)
 
     def unproject(self, pixels: ArrayLike) -> Array:
@@ -129,26 +155,37 @@ class Camera:
             pixels: (..., 2), x then y.
 
         Returns:
-            (..., 3) rays in the camera frame with z = 1.
+            (..., 3) rays in the camera frame with z = 1; x and y are nan where the distortion
+            has no ray for a pixel.
         """
         pixels = np.asarray(pixels, dtype=np.float64)
         if pixels.shape[-1:] != (2,):
             raise ValueError(f"pixels are (..., 2), got {pixels.shape}")
-        if any(self.distortion) and pixels.size:
-            import cv2
-
-            # OpenCV's default of five rounds leaves errors of pixels with strong lenses.
-            criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-10)
-            plane = cv2.undistortPoints(
-                np.ascontiguousarray(pixels.reshape(-1, 1, 2)),
-                self.matrix(),
-                np.array(self.distortion),
-                criteria=criteria,
-            ).reshape(pixels.shape)
-            plane = np.asarray(plane, dtype=np.float64)
-        else:
-            plane = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
+        plane = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
+        if self.distortion and pixels.size:
+            plane = self._undistorted(plane)
         return np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
+
+    def slopes(self, plane: ArrayLike) -> tuple[Array, Array]:
+        """How pixels move with points of the plane z = 1 and with the lens.
+
+        Args:
+            plane: (..., 2) ideal points.
+
+        Returns:
+            Derivatives of pixels (..., 2, 2) by the points, and (..., 2, 5) by the logarithm of
+            both focal lengths, the principal point in pixels, k1 and k2.
+        """
+        plane = np.asarray(plane, dtype=np.float64)
+        focal, r2 = np.array([self.fx, self.fy]), (plane**2).sum(-1)
+        _, _, _, _, _, k4, k5, k6 = self.coefficients
+        below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        lens = np.zeros((*plane.shape, 5))
+        lens[..., 0] = self._distort(plane) * focal
+        lens[..., 0, 1] = lens[..., 1, 2] = 1
+        lens[..., 3] = plane * (r2 / below)[..., None] * focal
+        lens[..., 4] = plane * (r2**2 / below)[..., None] * focal
+        return self._distortion_slope(plane) * focal[:, None], lens
 
     def to_dict(self) -> dict[str, object]:
         """Plain numbers for JSON."""
@@ -187,12 +224,10 @@ class Camera:
 
     def _distort(self, plane: Array) -> Array:
         """(..., 2) ideal to distorted points of the plane z = 1."""
-        if not any(self.distortion):
-            return plane
-        k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
+        _, _, p1, p2, *_ = self.coefficients
         x, y = plane[..., 0], plane[..., 1]
         r2 = x * x + y * y
-        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        radial, _ = self._radial(r2)
         return np.stack(
             [
                 x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
@@ -200,6 +235,42 @@ class Camera:
             ],
             axis=-1,
         )
+
+    def _distortion_slope(self, plane: Array) -> Array:
+        """(..., 2, 2) derivatives of distorted by ideal points (..., 2) of the plane z = 1."""
+        _, _, p1, p2, *_ = self.coefficients
+        x, y = plane[..., 0], plane[..., 1]
+        radial, change = self._radial(x * x + y * y)
+        slope = np.empty((*plane.shape, 2))
+        slope[..., 0, 0] = radial + 2 * x * x * change + 2 * p1 * y + 6 * p2 * x
+        slope[..., 0, 1] = slope[..., 1, 0] = 2 * (x * y * change + p1 * x + p2 * y)
+        slope[..., 1, 1] = radial + 2 * y * y * change + 6 * p1 * y + 2 * p2 * x
+        return slope
+
+    def _radial(self, r2: Array) -> tuple[Array, Array]:
+        """Radial scale of points at squared distances from the axis, and its derivative by them."""
+        k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
+        below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
+        steeper = k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))
+        return radial, steeper / below
+
+    def _undistorted(self, distorted: Array) -> Array:
+        """(..., 2) distorted to ideal points of the plane z = 1; nan where there are none."""
+        plane, lost = distorted, np.ones(distorted.shape[:-1], bool)
+        for _ in range(50):  # Newton's method: a few steps but close to `widest`
+            far = np.sqrt((plane**2).sum(-1, keepdims=True))
+            plane = plane * np.minimum(1, 0.999999 * self.widest / np.maximum(far, 1e-12))
+            off = self._distort(plane) - distorted
+            lost = np.abs(off).max(-1) > _EXACT
+            if not lost.any():
+                break
+            (a, b), (_, d) = np.moveaxis(self._distortion_slope(plane), (-2, -1), (0, 1))
+            u, v = off[..., 0], off[..., 1]
+            plane = (
+                plane - np.stack([d * u - b * v, a * v - b * u], -1) / (a * d - b * b)[..., None]
+            )
+        return np.where(lost[..., None], np.nan, plane)
 
 
 def _number(value: object, name: str) -> float:

@@ -57,7 +57,8 @@ class AlignmentOptions:
     found_px: float = 1.0
     """A landmark agrees with the pose when it was found this near to where it should be."""
     floor_px: float = 0.1
-    """Alignment error of a perfect patch, pixels."""
+    """Alignment error of a perfect patch where `noise` is 1, pixels: with 0.8, 0.08 px at level 0.
+    """
     noise: float = 0.8
     """Standard deviation of intensities in aligned patches, in deviations of a patch."""
 
@@ -89,6 +90,7 @@ class Alignment:
 class _Found:
     expected: int
     pixels: Array
+    ideal: Array
     points_m: Array
     whitening: Array
 
@@ -155,15 +157,16 @@ def align_pose(
         found = _look(pyramid, camera, target, pose, wider, options)
         if len(found.pixels) < options.min_found:
             return None
-        ideal = _undistorted(found.pixels, camera)
         if number == 0:
             # Of the first round many are wrong: a sample consensus tells which agree.
             loose = PnpOptions(threshold_px=4.0, max_iterations=200, min_iterations=20)
-            rough = solve_pnp(ideal, found.points_m, intrinsics, loose)
+            rough = solve_pnp(found.ideal, found.points_m, intrinsics, loose)
             if rough is None:
                 return None
             pose = rough.world_from_camera
-        refined = refine_pose(ideal, found.points_m, found.whitening, intrinsics, pose, step.steps)
+        refined = refine_pose(
+            found.ideal, found.points_m, found.whitening, intrinsics, pose, step.steps
+        )
         pose = refined.base_from_camera
     assert refined is not None
     assert found is not None
@@ -196,7 +199,7 @@ def _look(
     which, pixels, affines = which[::every], pixels[::every], affines[::every]
     if not len(which):
         none = np.zeros((0, 2))
-        return _Found(0, none, np.zeros((0, 3)), np.zeros((0, 2, 2)))
+        return _Found(0, none, none, np.zeros((0, 3)), np.zeros((0, 2, 2)))
     patches = target.patches(step.level, which)
     at, correlation = align_patches(
         patches, pyramid[step.level], to_level(pixels, step.level), affines, step.iterations
@@ -204,11 +207,13 @@ def _look(
     at = from_level(at.astype(np.float64), step.level)
     good = correlation > options.min_correlation
     good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
+    ideal = _undistorted(at, camera)
+    good &= np.isfinite(ideal).all(1)
     spread = patches.inverse_hessian[good]
     which, noise = which[good], options.noise * 2**step.level
     error = _shift_px(target.surface_m[0, which], target.depth_error_m[which], turn, shift, camera)
     white = whitening(affines[good], spread, options.floor_px, noise, error)
-    return _Found(len(good), at[good], target.surface_m[0, which], white)
+    return _Found(len(good), at[good], ideal[good], target.surface_m[0, which], white)
 
 
 def _shift_px(points: Array, moves: Array, turn: Array, shift: Array, camera: Camera) -> Array:
@@ -219,8 +224,8 @@ def _shift_px(points: Array, moves: Array, turn: Array, shift: Array, camera: Ca
 
 
 def _undistorted(pixels: Array, camera: Camera) -> Array:
-    """(n, 2) pixels of the ideal pinhole."""
-    if not any(camera.distortion):
+    """(n, 2) pixels of the ideal pinhole; nan where the distortion has no ray."""
+    if not camera.distortion:
         return pixels
     plane = camera.unproject(pixels)[:, :2]
     return plane * [camera.fx, camera.fy] + [camera.cx, camera.cy]

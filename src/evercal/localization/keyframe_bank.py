@@ -98,12 +98,13 @@ class KeyframeBank:
         view = plain_view(grey, camera, stride, ViewOptions(short_side=maps.short_side))
         features = encode_features([view], maps.encoder)[0].flatten(1).T
         small = camera.short_side_resized(maps.short_side)
-        rays = PosedCells(features, small, pose, stride).rays()
-        depth = 1 / keyframes.inverse_depth[number].double().numpy()
+        points = PosedCells(features, small, pose, stride).rays()
+        points /= keyframes.inverse_depth[number].double().numpy()[:, None]
+        known = np.flatnonzero(np.isfinite(points).all(1))
         pyramid = image_pyramid(grey, ALIGNED_LEVELS)
         return LoadedKeyframe(
-            features.to(torch.bfloat16 if fast_bfloat16(features.device) else torch.float32),
-            pose.apply(rays * depth[:, None]),
+            features[known].to(torch.bfloat16 if fast_bfloat16(features.device) else torch.float32),
+            pose.apply(points[known]),
             pose.apply(marks.surface(camera)),
             marks.sigma / marks.inverse_depth,
             pose.translation_m,

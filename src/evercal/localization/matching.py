@@ -98,20 +98,14 @@ class Matcher:
         small = camera.short_side_resized(self._maps.short_side)
         pixels = ideal_cell_pixels(small, self._maps.encoder.stride).astype(np.float64)
         features = query.features.flatten(1).T
-        sources, cells = [], len(pixels)
+        some = self._strided(query, candidate)
+        some = some[np.isfinite(pixels[some]).all(1)]
+        points = []
         if len(candidate.keyframes):
-            some = self._strided(query, candidate)
-            cells = len(some)
-            sources.append((pixels[some], self._matched(features[some], candidate.keyframes)))
+            points.append(self._matched(features[some], candidate.keyframes))
         if self._maps.heads:
-            points = self._predicted(query, candidate.scene)
-            take = self._strided(query, candidate) if sources else slice(None)
-            sources.append((pixels[take], points[take]))
-        return (
-            np.concatenate([source[0] for source in sources]),
-            np.concatenate([source[1] for source in sources]),
-            cells,
-        )
+            points.append(self._predicted(query, candidate.scene)[some])
+        return np.tile(pixels[some], (len(points), 1)), np.concatenate(points), len(some)
 
     def _strided(self, query: Query, candidate: Candidate) -> NDArray[np.int64]:
         """The patches of the image that are matched to keyframes."""

@@ -27,7 +27,7 @@ from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.pose_check import PoseCheckOptions, contradicting_frames
 from evercal.mapping.recording import Recording, WorkingSize
 from evercal.mapping.scene_maps import frame_moved_by_cameras
-from evercal.mapping.selection import spread_poses
+from evercal.mapping.selection import select_farthest, spread_poses
 from evercal.mapping.tracks import (
     KeyframeTracks,
     TrackOptions,
@@ -42,6 +42,9 @@ HAND_EYE_COVARIANCE_SCALE = 2.5
 """Alignment errors of a landmark go together over many frames, which the residuals cannot tell: the
 squared error of `gripper_from_camera` in 30 trials was 1.8 times what they say
 (docs/experiments/handeye.md)."""
+NOTICED_RAD = 1e-4
+"""Poses and lens are tracked again where they moved what is seen by more: some hundredths of a
+pixel."""
 
 
 @dataclass(frozen=True)
@@ -260,10 +263,11 @@ def _open(
     keep = sorted(set(range(len(support))) - set(bad.tolist()))
     if len(bad):
         recording = recording.without(bad)
-    keyframes = [new for new, old in enumerate(keep) if support[old] in wanted]
-    if len(keyframes) < len(wanted):  # others take the place of those that were left out
-        keyframes = spread_frames(recording.frames, len(wanted)).tolist()
-    return recording, keyframes, wrong
+    places, turns = recording.stated.translation_m, recording.stated.rotation_wxyz
+    good = [new for new, old in enumerate(keep) if support[old] in wanted]
+    # Others take the place of those that were left out.
+    keyframes = select_farthest(places, turns, len(wanted), start=good)
+    return recording, keyframes.tolist(), wrong
 
 
 def spread_frames(frames: Sequence[Frame], capacity: int) -> NDArray[np.int64]:
@@ -303,7 +307,7 @@ def _adjust(
         problem = BundleAdjustment(recording.stated, stated_cameras, velocity, options.bundle)
         adjustment = problem.solve(tracks)
         recording.adjust(adjustment.poses, adjustment.camera)
-        if not _moved(adjustment, stated_cameras[0]):
+        if not _moved(recording.stated, stated_cameras[0], adjustment):
             break
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:
             list(pool.map(partial(_refined_again, recording, options.tracks), keyframes))
@@ -316,21 +320,23 @@ def _refined_again(recording: Recording, options: TrackOptions, keyframe: Keyfra
     refine_depths(recording, keyframe, options, again=True)
 
 
-def _moved(adjustment: Adjustment, stated: Camera) -> bool:
-    """Whether anything was adjusted by an amount that landmarks would notice."""
-    common = adjustment.common.log()
-    sizeable = np.linalg.norm(common[:3]) > 2e-4 or np.linalg.norm(common[3:]) > 2e-4
-    loose = adjustment.sigma_m > 3e-4 or adjustment.sigma_rad > 2e-4
-    lens = adjustment.camera is not None and abs(adjustment.camera.fx / stated.fx - 1) > 1e-4
-    return bool(sizeable or loose or lens or _bent(adjustment.camera, stated))
+def _moved(stated: SE3, camera: Camera, adjustment: Adjustment) -> bool:
+    """Whether poses and lens were adjusted by an amount that landmarks would notice.
 
-
-def _bent(camera: Camera | None, stated: Camera) -> bool:
-    """Whether the distortion was changed."""
-    if camera is None:
-        return False
-    now, before = ((*c.distortion, 0.0, 0.0)[:2] for c in (camera, stated))
-    return float(np.abs(np.subtract(now, before)).max()) > 1e-3
+    Args:
+        stated: (n,) poses before.
+        camera: the lens before, where all frames share one.
+        adjustment: of both.
+    """
+    change = np.linalg.norm((stated.inverse() @ adjustment.poses).log().reshape(-1, 2, 3), axis=2)
+    metres, radians = np.median(change, 0)
+    lens = 0.0
+    if adjustment.camera is not None:
+        across = [np.linspace(0, side - 1, 9) for side in (camera.width, camera.height)]
+        grid = np.stack(np.meshgrid(*across), -1)
+        off = adjustment.camera.project(camera.unproject(grid)) - grid
+        lens = float(np.nanmedian(np.linalg.norm(off, axis=-1))) / camera.fx
+    return max(metres * np.median(adjustment.inverse_depth), radians, lens) > NOTICED_RAD
 
 
 def _finished(
@@ -375,7 +381,7 @@ def _finished(
         )
     bend = None
     if adjustment is not None:
-        bend = fit_correction(stated, adjustment.poses, common)
+        bend = fit_correction(adjustment.poses @ common.inverse(), adjustment.correction)
     told = _adjusted(recording, adjustment, camera, wrong)
     names = tuple(recording.frames[i].name for i in numbers)
     return SceneMap(complete, camera, common, spread, told, bend, hand_eye, loose, names)

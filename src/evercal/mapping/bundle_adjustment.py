@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry.camera import Camera
@@ -26,7 +27,6 @@ from evercal.mapping.jacobians import (
     SHIFT,
     Linearised,
     camera_jacobian,
-    projection_slopes,
     ray_slopes,
 )
 
@@ -134,7 +134,8 @@ class _State:
     sigma: Array
     prior: Array
     weight: Array
-    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    root: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    """The covariance of corrections and shared parameters is root.T @ root."""
 
 
 class BundleAdjustment:
@@ -142,8 +143,7 @@ class BundleAdjustment:
 
     Args:
         stated: (n,) base_from_camera as the recording states them.
-        camera: the lens that all frames share, at the size patches are cut from.
-        cameras_alike: whether all frames share it; else the lens is not adjusted.
+        cameras: n lenses at the size patches are cut from; adjusted where all frames share one.
         velocity: (n, 6) motion from frame to frame in the camera frame, m and rad; 0 if unknown.
         options: priors.
     """
@@ -220,10 +220,11 @@ class BundleAdjustment:
     def _linearised(self, tracks: BundleTracks, state: _State) -> Linearised:
         turn, place = self._poses(state)
         k, j = tracks.host[tracks.landmark], tracks.frame
-        ray = np.zeros((len(tracks.host), 3))
+        ray, moved = np.zeros((len(tracks.host), 3)), np.zeros((len(tracks.host), 2, LENS))
         for camera, rows in self._lenses(state, tracks.host):
             ray[rows] = camera.unproject(tracks.pixels[rows])
-        ray = ray[tracks.landmark]
+            moved[rows] = ray_slopes(ray[rows], camera)
+        ray, moved = ray[tracks.landmark], moved[tracks.landmark]
         rho = state.inverse_depth[tracks.landmark, None]
         back = turn[j].transpose(0, 2, 1)
         across = back @ turn[k]
@@ -231,25 +232,34 @@ class BundleAdjustment:
         seen += np.einsum("nij,nj->ni", back, place[k] - place[j])
         seen[:, 2] = np.maximum(seen[:, 2], 0.05)
         plane = seen[:, :2] / seen[:, 2:]
-        at, slope, bent = np.zeros_like(plane), np.zeros((len(j), 2, 2)), np.zeros((len(j), 2, 5))
+        at, slope, bent = (
+            np.zeros_like(plane),
+            np.zeros((len(j), 2, 2)),
+            np.zeros((len(j), 2, LENS)),
+        )
         for camera, rows in self._lenses(state, j):
             at[rows] = camera.project(seen[rows])
-            slope[rows], bent[rows] = projection_slopes(plane[rows], camera)
+            slope[rows], bent[rows] = camera.slopes(plane[rows])
         to_plane = np.zeros((len(j), 2, 3))
         to_plane[:, 0, 0] = to_plane[:, 1, 1] = 1 / seen[:, 2]
         to_plane[:, :, 2] = -plane / seen[:, 2:]
         by_point = slope @ to_plane
         by_host = by_point @ across
         by_ray = by_host[:, :, :2] / rho[..., None]
-        lens = bent + ray_slopes(by_ray, ray, self._cameras[0])
+        lens = bent + by_ray @ moved
         white = tracks.whitening
-        return Linearised(
+        parts = (
             np.einsum("nij,nj->ni", white, at - tracks.observed),
             white @ np.concatenate([by_host, -by_host @ cross_matrix(ray / rho)], 2),
             white @ np.concatenate([-by_point, by_point @ cross_matrix(seen)], 2),
             np.einsum("nij,njk,nk->ni", white, -by_host, ray) / rho**2,
             white @ lens,
         )
+        # A lens may come to hold no longer where something was seen: then that says nothing.
+        lost = ~np.isfinite(at).all(1)
+        for part in parts:
+            part[lost] = 0
+        return Linearised(*parts)
 
     def _step(self, tracks: BundleTracks, state: _State) -> None:
         """One Gauss-Newton step; landmarks are eliminated first."""
@@ -274,8 +284,9 @@ class BundleAdjustment:
         system = (gram - eliminated).toarray()
         slope = scaled.T @ (lin.residual.ravel() * root) - mixed.T @ (pull / hold)
         self._add_priors(system, slope, state)
-        state.covariance = np.linalg.inv(system)
-        change = -state.covariance @ slope
+        lower = np.linalg.cholesky(system)
+        state.root = lapack.dtrtri(lower, lower=1)[0]  # pyright: ignore[reportAttributeAccessIssue]
+        change = -state.root.T @ (state.root @ slope)
         depths = (-pull - mixed @ change) / hold
         rho = state.inverse_depth
         state.inverse_depth = (rho + depths.clip(-0.2 * rho, 0.2 * rho)).clip(0.03, 6)
@@ -318,7 +329,7 @@ class BundleAdjustment:
         A correction d is the share K of what the images say, y = d / K, and y has the variance
         s^2 + v / K with v the posterior one; so s^2 is the mean of d^2 - v K over that of K^2.
         """
-        n, variance = self.n, np.diag(state.covariance)
+        n, variance = self.n, np.einsum("ij,ij->j", state.root, state.root)
         own = variance[: 6 * n].reshape(n, 6)
         off, weight = self._deviation(state), state.weight[:, None]
         share = 1 - np.minimum(own * weight / state.sigma**2, 1)
@@ -353,7 +364,7 @@ class BundleAdjustment:
         turn, place = self._poses(state)
         matrix = np.tile(np.eye(4), (n, 1, 1))
         matrix[:, :3, :3], matrix[:, :3, 3] = turn, place
-        blocks = state.covariance[: 6 * n, : 6 * n].reshape(n, 6, n, 6)
+        root = [state.root[:, 6 * i : 6 * i + 6] for i in range(n + 1)]
         return Adjustment(
             SE3.from_matrix(matrix),
             self._camera(state) if self._alike else None,
@@ -362,10 +373,10 @@ class BundleAdjustment:
             float(state.sigma[0]),
             float(state.sigma[3]),
             float(np.median(np.linalg.norm(unwhitened, axis=1))),
-            state.covariance[6 * n : 6 * n + COMMON, 6 * n : 6 * n + COMMON],
+            root[n].T @ root[n],
             self._deviation(state),
             np.minimum(state.weight, 1.0),
-            blocks[np.arange(n), :, np.arange(n), :],
+            np.stack([columns.T @ columns for columns in root[:n]]),
             state.inverse_depth,
         )
 

@@ -81,6 +81,6 @@ def _shared(recording: Recording, keyframe: KeyframeTracks) -> np.ndarray:
         at = camera.project(np.where(front[:, None], within[i], [0, 0, 1]))
         inside = front & (at > 0).all(1) & (at < [camera.width, camera.height]).all(1)
         like = ((unit[i] * unit[keyframe.frame]).sum(1) - 0.7).clip(0, 1) / 0.3
-        shared[i] = (inside * like).mean()
+        shared[i] = np.where(inside, like, 0).mean()
     shared[keyframe.frame] = 0
     return shared

@@ -28,28 +28,27 @@ SHRINKAGE = 0.3
 class FrameCorrection:
     """Corrections that bundle adjustment made to stated poses, to be taken back near them."""
 
-    stated: SE3
-    """(n,) base_from_camera as the recording states them."""
+    poses: SE3
+    """(n,) base_from_camera of the images as adjusted, less the transform common to all."""
     correction: Array
     """(n, 6) in the camera frame, metres and radians."""
     radius: tuple[float, float]
     """Metres and radians over which corrections go together."""
 
     def at(self, pose: SE3) -> Array:
-        """(6,) correction of a camera at a pose in the stated frame."""
-        weight = _closeness(self.stated, pose, self.radius)
+        """(6,) correction of a camera whose pose was told as `poses` are."""
+        weight = _closeness(self.poses, pose, self.radius)
         return (weight[:, None] * self.correction).sum(0) / (weight.sum() + SHRINKAGE)
 
 
-def fit_correction(stated: SE3, adjusted: SE3, common: SE3) -> FrameCorrection | None:
+def fit_correction(poses: SE3, correction: Array) -> FrameCorrection | None:
     """What neighbouring frames say about each other's corrections; None if they say too little.
 
     Args:
-        stated: (n,) poses as the recording states them.
-        adjusted: (n,) the same after bundle adjustment.
-        common: transform common to all frames, which is taken back anyway.
+        poses: (n,) see `FrameCorrection`.
+        correction: (n, 6) of each beside the common transform, which is taken back anyway, and the
+            shift in time: wrong clocks bend no frame.
     """
-    correction = ((stated @ common).inverse() @ adjusted).log()
     scale = np.repeat([np.abs(correction[:, :3]).mean(), np.abs(correction[:, 3:]).mean()], 3)
     if (scale[[0, 3]] < [1e-4, 1e-5]).any():
         return None
@@ -57,7 +56,7 @@ def fit_correction(stated: SE3, adjusted: SE3, common: SE3) -> FrameCorrection |
     total = float(((correction / scale) ** 2).sum())
     for metres, degrees in RADII:
         radius = (metres, float(np.deg2rad(degrees)))
-        weight = np.stack([_closeness(stated, stated[i], radius) for i in range(len(stated))])
+        weight = np.stack([_closeness(poses, poses[i], radius) for i in range(len(poses))])
         np.fill_diagonal(weight, 0)
         guess = weight @ correction / (weight.sum(1, keepdims=True) + SHRINKAGE)
         explained = 1 - float((((correction - guess) / scale) ** 2).sum()) / total
@@ -65,7 +64,7 @@ def fit_correction(stated: SE3, adjusted: SE3, common: SE3) -> FrameCorrection |
             best = (explained, radius)
     if best[0] <= LEAST_EXPLAINED:
         return None
-    return FrameCorrection(stated, correction, best[1])
+    return FrameCorrection(poses, correction, best[1])
 
 
 def _closeness(poses: SE3, pose: SE3, radius: tuple[float, float]) -> Array:

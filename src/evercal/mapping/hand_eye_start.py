@@ -336,9 +336,12 @@ def _motion(
         return None
     # Undistorted, so that poselib needs no camera model of its own.
     first, second = (cameras[i] for i in pair)
+    ideal_a = first.unproject(pixels_a[good])[:, :2] * first.fx
+    ideal_b = second.unproject(pixels_b[best[good]])[:, :2] * second.fx
+    known = np.isfinite(ideal_a + ideal_b).all(1)
     pose, told = poselib.estimate_relative_pose(
-        first.unproject(pixels_a[good])[:, :2] * first.fx,
-        second.unproject(pixels_b[best[good]])[:, :2] * second.fx,
+        ideal_a[known],
+        ideal_b[known],
         _ideal(first),
         _ideal(second),
         {"max_epipolar_error": options.max_epipolar_px},

@@ -27,36 +27,13 @@ class Linearised:
     lens: Array
 
 
-def _radial(camera: Camera) -> tuple[float, float]:
-    k1, k2 = (*camera.distortion[:2], 0.0, 0.0)[:2]
-    return k1, k2
+def ray_slopes(ray: Array, camera: Camera) -> Array:
+    """(n, 2, 5) how rays (n, 3) with z = 1 move in x and y with the lens that sees them at a pixel.
 
-
-def projection_slopes(plane: Array, camera: Camera) -> tuple[Array, Array]:
-    """Derivatives of pixels by points of the plane z = 1 (n, 2, 2) and by the lens (n, 2, 5)."""
-    (k1, k2), focal = _radial(camera), np.array([camera.fx, camera.fy])
-    r2 = (plane**2).sum(1)
-    radial = 1 + r2 * (k1 + r2 * k2)
-    outer = plane[:, :, None] * plane[:, None, :] * (2 * k1 + 4 * k2 * r2)[:, None, None]
-    by_plane = (np.eye(2) * radial[:, None, None] + outer) * focal[:, None]
-    lens = np.zeros((len(plane), 2, LENS))
-    lens[:, :, 0] = plane * radial[:, None] * focal
-    lens[:, 0, 1] = lens[:, 1, 2] = 1
-    lens[:, :, 3] = plane * r2[:, None] * focal
-    lens[:, :, 4] = plane * (r2**2)[:, None] * focal
-    return by_plane, lens
-
-
-def ray_slopes(by_ray: Array, ray: Array, camera: Camera) -> Array:
-    """(n, 2, 5) derivatives of pixels by the lens through the ray of the host, to first order."""
-    plane, focal = ray[:, :2], np.array([camera.fx, camera.fy])
-    r2 = (plane**2).sum(1)[:, None]
-    slopes = np.zeros((len(ray), 2, LENS))
-    slopes[:, :, 0] = -np.einsum("nij,nj->ni", by_ray, plane)
-    slopes[:, :, 1:3] = -by_ray / focal
-    slopes[:, :, 3] = -np.einsum("nij,nj->ni", by_ray, plane * r2)
-    slopes[:, :, 4] = -np.einsum("nij,nj->ni", by_ray, plane * r2**2)
-    return slopes
+    The columns are those of `Camera.slopes`.
+    """
+    by_plane, lens = camera.slopes(ray[:, :2])
+    return -np.linalg.solve(by_plane, lens)
 
 
 def camera_jacobian(

@@ -182,7 +182,8 @@ def whitening(
     Args:
         affines: (n, 2, 2) from keyframe pixels to pixels of the other image.
         inverse_hessian: (n, 2, 2) of the patches.
-        floor_px: error of a perfect patch, pixels.
+        floor_px: error of a perfect patch where `noise` is 1, pixels; it grows with `noise`, so
+            that 0.1 stands for 0.08 px where that is 0.8.
         noise: standard deviation of intensities, in deviations of a patch.
         shift_px: (n, 2) one standard deviation of an error along one line, as that of a landmark
             whose depth is uncertain.

@@ -52,7 +52,10 @@ class PosedCells:
         return self.camera.height // self.stride, self.camera.width // self.stride
 
     def rays(self) -> np.ndarray:
-        """(h * w, 3) rays through the cell centres in the camera frame, at depth 1."""
+        """(h * w, 3) rays through the cell centres in the camera frame, at depth 1.
+
+        nan where the distortion has no ray for a cell.
+        """
         c, pixels = self.camera, ideal_cell_pixels(self.camera, self.stride).astype(float)
         plane = (pixels - [c.cx, c.cy]) / [c.fx, c.fy]
         return np.concatenate([plane, np.ones((len(plane), 1))], 1)
@@ -87,7 +90,7 @@ def select_source_views(
     other /= np.linalg.norm(other, axis=-1, keepdims=True) + 1e-9
     parallax = np.arccos(np.clip((own * other).sum(-1), -1, 1))
     useful = np.clip(parallax / few, 0, 1) * np.clip((many - parallax) / (many - enough), 0, 1)
-    worth = (seen * useful).mean(-1)
+    worth = np.where(seen, useful, 0).mean(-1)
     best = np.argsort(-worth, kind="stable")[:count]
     return [int(i) for i in best if worth[i] > MIN_SHARED]
 
@@ -147,11 +150,12 @@ class _SourceView:
         self.alike = (view.features @ other.features.T).view(-1, *other.grid)
 
     def pixels(self, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (..., 2) of cells at inverse depths (cells, ...), and which are in front."""
+        """Pixels (..., 2) of cells at inverse depths (cells, ...), and which this view may see."""
         ray = self.ray.reshape(len(self.ray), *[1] * (inverse.ndim - 1), 3)
         point = ray + inverse[..., None] * self.shift
         front = point[..., 2] > 0.05
-        return self.other.camera.project(np.where(front[..., None], point, [0, 0, 1])), front
+        pixels = self.other.camera.project(np.where(front[..., None], point, [0, 0, 1]))
+        return np.nan_to_num(pixels), front & np.isfinite(pixels).all(-1)
 
     def along(self, inverse: Tensor) -> Tensor:
         """(cells, planes) likeness at inverse depths, 0 where this view sees nothing."""

@@ -81,7 +81,9 @@ def _distance(recording: Recording, i: int, j: int, options: PoseCheckOptions) -
     turn, shift = recording.relative(j, i)
     ends = [_pinhole(other, ray @ turn.T + shift / depth) for depth in (FAR_M, NEAR_M)]
     seen = ideal_cell_pixels(other, stride)[cells_b].astype(np.float64)
-    return float(np.median(_segment_distance(seen, *ends)))
+    distance = _segment_distance(seen, *ends)
+    known = distance[np.isfinite(distance)]  # the lens has no ray for some cells
+    return float(np.median(known)) if len(known) >= options.min_matches else None
 
 
 def _pinhole(camera, points: Array) -> Array:

@@ -44,8 +44,7 @@ class Recording:
     def __init__(self, frames: Sequence[Frame], encoder: Encoder, size: WorkingSize):
         self.frames, self.encoder, self.size = tuple(frames), encoder, size
         self.stated = known_poses(self.frames)
-        self.rotation = self.stated.rotation_matrix()
-        self.translation_m = self.stated.translation_m.copy()
+        self._place(self.stated)
         self.grey: list[NDArray[np.uint8]] = []
         self.cameras: list[Camera] = []
         for frame in self.frames:
@@ -67,8 +66,8 @@ class Recording:
             self.encoder,
             self.size,
         )
-        rest.stated, rest.rotation = self.stated[np.array(keep)], self.rotation[keep]
-        rest.translation_m = self.translation_m[keep]
+        rest.stated = self.stated[np.array(keep)]
+        rest._place(self.poses[np.array(keep)])
         rest.grey, rest.cameras = [self.grey[i] for i in keep], [self.cameras[i] for i in keep]
         known = self._features
         rest._features = {new: known[i] for new, i in enumerate(keep) if i in known}
@@ -77,13 +76,6 @@ class Recording:
 
     def __len__(self) -> int:
         return len(self.frames)
-
-    @property
-    def poses(self) -> SE3:
-        """(n,) base_from_camera as adjusted so far."""
-        matrix = np.zeros((len(self), 4, 4))
-        matrix[:, :3, :3], matrix[:, :3, 3], matrix[:, 3, 3] = self.rotation, self.translation_m, 1
-        return SE3.from_matrix(matrix)
 
     def cell_camera(self, i: int) -> Camera:
         """The camera of a frame at the encoder's working size."""
@@ -107,8 +99,8 @@ class Recording:
 
     def posed_cells(self, i: int) -> PosedCells:
         """The encoded cells of a frame with its pose and camera."""
-        pose = self.poses[i]
-        return PosedCells(self.features(i), self.cell_camera(i), pose, self.encoder.stride)
+        camera, stride = self.cell_camera(i), self.encoder.stride
+        return PosedCells(self.features(i), camera, self.poses[i], stride)
 
     def pyramid(self, i: int) -> list[np.ndarray]:
         """Image pyramid of a frame; the last ones used stay in memory."""
@@ -130,10 +122,11 @@ class Recording:
 
     def adjust(self, poses: SE3, camera: Camera | None) -> None:
         """Takes over adjusted poses (n,) and, where all frames share one, an adjusted camera."""
-        self.rotation, self.translation_m = poses.rotation_matrix(), poses.translation_m
+        self._place(poses)
         if camera is not None:
             self.cameras = [camera] * len(self)
 
-    def one_camera(self) -> bool:
-        """Whether all frames were taken with the same intrinsics."""
-        return all(camera == self.cameras[0] for camera in self.cameras)
+    def _place(self, poses: SE3) -> None:
+        """Frames are at `poses` (n,), base_from_camera, from now on."""
+        self.poses, self.rotation = poses, poses.rotation_matrix()
+        self.translation_m = poses.translation_m

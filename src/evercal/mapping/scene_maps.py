@@ -134,12 +134,11 @@ class SceneRecord:
 
     def query_camera(self, camera: Camera | None) -> Camera:
         """Intrinsics for a query: refined if the nominal ones or none are given, else as given."""
-        own = self.camera
         if camera is None or (
-            not camera.distortion
-            and np.allclose(_proportions(camera), _proportions(own), atol=1e-3)
+            np.allclose(_proportions(camera), _proportions(self.camera), atol=1e-3)
+            and np.allclose(camera.coefficients, self.camera.coefficients, atol=1e-6)
         ):
-            return self.refined_camera or own
+            return self.refined_camera or self.camera
         return camera
 
 

@@ -18,6 +18,7 @@ bit of the dot product into 3e-8 rad, while the chord of two identical rotations
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -270,20 +271,22 @@ def select_farthest(
     quaternions_wxyz: np.ndarray,
     capacity: int,
     rotation_weight: float = 1.0,
+    start: Sequence[int] = (),
 ) -> np.ndarray:
-    """Keep the first frame and then, again and again, the frame farthest from those kept.
+    """Keep the frames of `start`, or the first one, and then ever the one farthest from those kept.
 
     Farthest-point sampling: its covering radius is at most twice the smallest one possible.
     It sees the whole scene at once, which SARS does not. Ties go to the earlier frame.
     """
     space = PoseSpace.of(positions_m, quaternions_wxyz, rotation_weight)
     gap = np.full(len(space), np.inf)
-    kept = np.empty(min(_checked_capacity(capacity), len(space)), dtype=np.int64)
-    for place in range(len(kept)):
-        kept[place] = frame = int(gap.argmax())
-        np.minimum(gap, space.distances(frame), out=gap)
-        gap[frame] = -1.0  # a repeat of a kept pose may be kept, the frame itself not twice
-    return np.sort(kept)
+    kept = list(start)
+    for place in range(min(_checked_capacity(capacity), len(space))):
+        if place == len(kept):
+            kept.append(int(gap.argmax()))
+        np.minimum(gap, space.distances(kept[place]), out=gap)
+        gap[kept[: place + 1]] = -1.0  # a repeat of a kept pose may be kept, no frame twice
+    return np.sort(np.array(kept, np.int64))
 
 
 def covering_radius(

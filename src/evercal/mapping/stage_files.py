@@ -99,9 +99,9 @@ def write_record(folder: Path, record: SceneRecord) -> None:
     write_json(folder / "scene.json", content)
     tensors = {"prototypes": record.prototypes}
     if record.bend is not None:
-        stated = record.bend.stated
-        poses = np.concatenate([stated.rotation_wxyz, stated.translation_m], -1)
-        tensors["bend_poses"] = torch.from_numpy(poses)
+        poses = record.bend.poses
+        rows = np.concatenate([poses.rotation_wxyz, poses.translation_m], -1)
+        tensors["bend_poses"] = torch.from_numpy(rows)
         tensors["bend"] = torch.from_numpy(record.bend.correction)
         tensors["bend_radius"] = torch.tensor(record.bend.radius, dtype=torch.float64)
     if record.frame_covariance is not None:
@@ -142,8 +142,8 @@ def _bend_of(tensors: Mapping[str, Tensor]) -> FrameCorrection | None:
     if "bend" not in tensors:
         return None
     poses, radius = tensors["bend_poses"].numpy(), tensors["bend_radius"].tolist()
-    stated = SE3(poses[:, :4], poses[:, 4:])
-    return FrameCorrection(stated, tensors["bend"].numpy(), (radius[0], radius[1]))
+    correction = tensors["bend"].numpy()
+    return FrameCorrection(SE3(poses[:, :4], poses[:, 4:]), correction, (radius[0], radius[1]))
 
 
 def save_tensors(

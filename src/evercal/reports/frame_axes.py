@@ -171,7 +171,8 @@ def _seen(camera: Camera, points: Array) -> Array:
     """(n, 2) pixels; nan behind the camera and where the lens model no longer holds."""
     # A distortion polynomial folds back far outside the image: it would show what is not there.
     corners = [[x, y] for x in (-0.5, camera.width - 0.5) for y in (-0.5, camera.height - 0.5)]
-    limit = _BEYOND * float(np.linalg.norm(camera.unproject(corners)[:, :2], axis=1).max())
+    corner = np.linalg.norm(camera.unproject(corners)[:, :2], axis=1)
+    limit = _BEYOND * float(np.nan_to_num(corner, nan=camera.widest).max())
     depth = np.where(points[:, 2] >= 0.999 * _NEAR_M, points[:, 2], math.nan)
     slope = np.linalg.norm(points[:, :2], axis=1) / depth
     pixels = np.full((len(points), 2), math.nan)

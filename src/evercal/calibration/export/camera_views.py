@@ -64,7 +64,7 @@ def nerfstudio(export: Export) -> str:
     """
     camera = _camera(export, "nerfstudio")
     views = camera_views(export, "nerfstudio")
-    k1, k2, p1, p2, k3, *rational = (*camera.distortion, *(0.0,) * (8 - len(camera.distortion)))
+    k1, k2, p1, p2, k3, *rational = camera.coefficients
     if any(rational):
         # Its k4 is the fourth power of a polynomial, not OpenCV's k4.
         raise InputError(
@@ -112,4 +112,4 @@ def _colmap_lens(camera: Camera) -> tuple[str, list[float]]:
         return "PINHOLE", pinhole
     if len(camera.distortion) == 4:
         return "OPENCV", [*pinhole, *camera.distortion]
-    return "FULL_OPENCV", [*pinhole, *camera.distortion, *(0.0,) * (8 - len(camera.distortion))]
+    return "FULL_OPENCV", [*pinhole, *camera.coefficients]
