@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
-from evercal.localization.keyframe_bank import LoadedKeyframe
+from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import RefinedPose, refine_pose
 from evercal.mapping.landmarks import project_surface
@@ -97,16 +97,16 @@ class _Found:
 class _Target:
     """The landmarks of some keyframes as one set."""
 
-    keyframes: Sequence[LoadedKeyframe]
+    keyframes: Sequence[AlignedLandmarks]
     starts: NDArray[np.int64]
     """(keyframes + 1,) the first landmark of each, and their number."""
     surface_m: Array
-    """(3, n, 3), see `LoadedKeyframe`."""
+    """(3, n, 3), see `AlignedLandmarks`."""
     depth_error_m: Array
     """(n, 3) where a landmark may move for its depth is uncertain: one standard deviation."""
 
     @classmethod
-    def of(cls, keyframes: Sequence[LoadedKeyframe]) -> Self:
+    def of(cls, keyframes: Sequence[AlignedLandmarks]) -> Self:
         """Of keyframes in their order."""
         surfaces = [keyframe.surface_m for keyframe in keyframes]
         counts = [surface.shape[1] for surface in surfaces]
@@ -129,7 +129,7 @@ class _Target:
 def align_pose(
     pyramid: Sequence[Array],
     camera: Camera,
-    keyframes: Sequence[LoadedKeyframe],
+    keyframes: Sequence[AlignedLandmarks],
     start: SE3,
     options: AlignmentOptions,
 ) -> Alignment | None:
@@ -138,7 +138,7 @@ def align_pose(
     Args:
         pyramid: of the image, see `image_pyramid`.
         camera: intrinsics of its first level, distortion included.
-        keyframes: that show the same place.
+        keyframes: the landmarks of some that show the same place.
         start: base_from_camera, roughly.
         options: how.
 

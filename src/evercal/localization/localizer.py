@@ -211,7 +211,7 @@ class Localizer:
         self, query: Query, candidate: Candidate, camera: Camera, rough: PnpResult
     ) -> Hypothesis:
         height, width = query.grey.shape
-        keyframes = [self._bank.load(int(index)) for index in candidate.keyframes]
+        keyframes = [self._bank.load(int(index)).landmarks for index in candidate.keyframes]
         found: Alignment | None = align_pose(
             query.pyramid,
             camera.resized(width, height),
