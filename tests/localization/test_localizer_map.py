@@ -175,6 +175,16 @@ def test_answers_are_in_the_frame_that_the_recording_states(
         assert radians < 1e-7
 
 
+@pytest.mark.parametrize("align", [True, False])
+def test_a_map_answers_far_from_where_it_was_recorded(
+    align: bool, hall: Scene, hall_maps: SceneMaps
+) -> None:
+    record = hall_maps.scenes[0]
+    away = replace(record, cell=replace(record.cell, origin_m=(9.0, 9.0, 0.0)))
+    localizer = Localizer(replace(hall_maps, scenes=[away]), LocalizeOptions(align=align))
+    assert localizer.localize(hall.test[1].read_image(), hall.test[1].camera).status == "ok"
+
+
 def test_support_decides(hall: Scene, hall_maps: SceneMaps, answers: list[PoseEstimate]) -> None:
     frame, first = hall.test[1], answers[0]
     for factor, status in ((0.9, "ok"), (1.1, "unknown_scene")):

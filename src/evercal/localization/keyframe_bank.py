@@ -109,7 +109,7 @@ class KeyframeBank:
 
     Args:
         maps: with keyframes that have descriptors.
-        most_loaded: how many keyframes stay decoded in memory (2 to 3 MB each once aligned, else 1 MB).
+        most_loaded: how many keyframes stay decoded in memory (up to 3 MB each).
     """
 
     def __init__(self, maps: SceneMaps, most_loaded: int):

@@ -287,8 +287,13 @@ class Localizer:
         )
 
     def _outside(self, best: Hypothesis, record: SceneRecord) -> bool:
-        """Whether a pose lies where the scene has nothing; the atlas tells for networks."""
+        """Whether a network's pose lies outside the cell of the scene that it was asked for.
+
+        Only networks know of cells: a map may be looked at from far away.
+        """
         assert best.pose is not None
+        if best.aligned or not self.maps.heads:
+            return False
         place = record.cell.atlas_from_base.apply(best.pose.translation_m)
         return self.maps.atlas().scene_at(place) != best.scene
 
