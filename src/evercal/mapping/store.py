@@ -4,6 +4,7 @@
       manifest.json                 written last, by atomic replace; sha256 of every file
       encoder-SHA.safetensors       the networks that the stages were made with
       descriptor-SHA.safetensors
+      vlad-SHA.safetensors          where maps are made with another encoder than the shipped one
       stages/0001-NAME/
         scene.json                  camera, cell, thresholds
         head.safetensors            weights (fp16, centres fp32); of a shared head only the
@@ -34,7 +35,8 @@ from torch import Tensor, nn
 
 from evercal.errors import InputError
 from evercal.features.descriptor import PooledDescriptor, descriptor_for, load_descriptor
-from evercal.features.encoder import checked_encoder, load_encoder
+from evercal.features.encoder import Encoder, checked_encoder, load_encoder
+from evercal.features.vlad import load_centroids, save_centroids, shipped_centroids
 from evercal.features.weights_file import network_bytes
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord
@@ -85,11 +87,11 @@ class Store:
         root: folder of the store.
         maps: what it knows.
         stages: folder names of the stages, in order.
-        networks: file names of encoder and descriptor.
+        networks: file names of encoder and descriptor, and of centroids where there are some.
     """
 
     def __init__(
-        self, root: Path, maps: SceneMaps, stages: list[str], networks: tuple[str, str] | None
+        self, root: Path, maps: SceneMaps, stages: list[str], networks: tuple[str, ...] | None
     ):
         self.root, self.maps, self.stages, self.networks = root, maps, stages, networks
         place = root.resolve()  # one lock, by whatever name the store is called
@@ -168,6 +170,9 @@ class Store:
             str(payload["strategy"]),
             int(payload["short_side"]),
         )
+        centroids = tuple(str(name) for name in payload.get("centroids", []))
+        for name in centroids:
+            load_centroids(maps.encoder, root / name)
         stages = [str(name) for name in payload["stages"]]
         for name in stages:
             folder = root / STAGES / name
@@ -179,7 +184,7 @@ class Store:
             maps.method_states.append(load_tensors(state) if state.exists() else {})
             if f"{STAGES}/{name}/{HEAD}" in manifest.files:
                 maps.heads.append(read_head(folder, maps.encoder.width))
-        return cls(root, maps, stages, (local, descriptor))
+        return cls(root, maps, stages, (local, descriptor, *centroids))
 
     @contextmanager
     def writing(self) -> Iterator[Manifest | None]:
@@ -235,8 +240,9 @@ class Store:
         name = f"{len(self.stages) + 1:04d}-{legal}"
         with self.writing() as before:
             folder = self._fresh(name)
-            if self.networks is None:
-                self.networks = self._write_networks(maps)
+            self.networks = self.networks or self._write_networks(maps)
+            if keyframes is not None and keyframes.descriptors is not None:
+                self.networks = self._with_centroids(maps.encoder, self.networks)
             write_record(folder, record)
             if maps.heads:
                 write_head(folder, maps.heads[-1])
@@ -302,7 +308,8 @@ class Store:
             "schema": SCHEMA,
             "strategy": maps.strategy,
             "short_side": maps.short_side,
-            "networks": list(self.networks),
+            "networks": list(self.networks[:2]),
+            "centroids": list(self.networks[2:]),
             "stages": stages,
         }
         write_manifest(self.root, payload, listed, before)
@@ -318,17 +325,30 @@ class Store:
             if folder.name not in self.stages and re.match(r"\.?\d{4}-", folder.name):
                 shutil.rmtree(folder, ignore_errors=True)
         for unfinished in self.root.glob(".*.tmp"):
-            if unfinished.name.startswith((f".{MANIFEST}", ".encoder", ".descriptor")):
+            if unfinished.name.startswith((f".{MANIFEST}", ".encoder", ".descriptor", ".vlad")):
                 unfinished.unlink(missing_ok=True)
 
-    def _write_networks(self, maps: SceneMaps) -> tuple[str, str]:
+    def _with_centroids(self, encoder: Encoder, networks: tuple[str, ...]) -> tuple[str, ...]:
+        """File names of the networks, with the centroids that descriptors are made with.
+
+        The shipped encoder's are at hand; others take seconds to fit, and from weights in half
+        precision come out a little different.
+        """
+        first, *others = networks
+        if len(others) > 1 or shipped_centroids(encoder) is not None:
+            return networks
+        name = first.replace("encoder", "vlad", 1)
+        save_centroids(encoder, self.root / name)
+        return *networks, name
+
+    def _write_networks(self, maps: SceneMaps) -> tuple[str, ...]:
         names = []
         for kind, module in (("encoder", maps.encoder), ("descriptor", maps.descriptor)):
             assert isinstance(module, torch.nn.Module)
             data = network_bytes(module, kind)
             names.append(f"{kind}-{hashlib.sha256(data).hexdigest()[:12]}.safetensors")
             write_bytes(self.root / names[-1], data)
-        return names[0], names[1]
+        return tuple(names)
 
     def begin(self, identity: Mapping[str, object]) -> Resume | None:
         """Starts or picks up a stage.
@@ -396,5 +416,7 @@ def _free(root: Path) -> bool:
     if not root.is_dir():
         return False
     names = [path.name for path in root.iterdir()]
-    ours = re.compile(rf"{LEARNING}|{STAGES}|(encoder|descriptor)(-\w+)?\.safetensors|\..*\.tmp")
+    ours = re.compile(
+        rf"{LEARNING}|{STAGES}|(encoder|descriptor|vlad)(-\w+)?\.safetensors|\..*\.tmp"
+    )
     return not names or (LEARNING in names and all(map(ours.fullmatch, names)))
