@@ -89,8 +89,14 @@ class Alignment:
 class _Found:
     expected: int
     pixels: Array
+    """(n, 2) of the image."""
+    ideal: Array
+    """(n, 2) the same of the ideal pinhole."""
+    lens: Array | None
+    """(n, 2, 2) how the former move with the latter; None without distortion."""
     points_m: Array
     whitening: Array
+    """(n, 2, 2) of errors in the image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,15 +161,16 @@ def align_pose(
         found = _look(pyramid, camera, target, pose, wider, options)
         if len(found.pixels) < options.min_found:
             return None
-        ideal = _undistorted(found.pixels, camera)
         if number == 0:
             # Of the first round many are wrong: a sample consensus tells which agree.
             loose = PnpOptions(threshold_px=4.0, max_iterations=200, min_iterations=20)
-            rough = solve_pnp(ideal, found.points_m, intrinsics, loose)
+            rough = solve_pnp(found.ideal, found.points_m, intrinsics, loose)
             if rough is None:
                 return None
             pose = rough.world_from_camera
-        refined = refine_pose(ideal, found.points_m, found.whitening, intrinsics, pose, step.steps)
+        refined = refine_pose(
+            found.ideal, found.points_m, found.whitening, intrinsics, pose, step.steps, found.lens
+        )
         pose = refined.base_from_camera
     assert refined is not None
     assert found is not None
@@ -196,7 +203,7 @@ def _look(
     which, pixels, affines = which[::every], pixels[::every], affines[::every]
     if not len(which):
         none = np.zeros((0, 2))
-        return _Found(0, none, np.zeros((0, 3)), np.zeros((0, 2, 2)))
+        return _Found(0, none, none, None, np.zeros((0, 3)), np.zeros((0, 2, 2)))
     patches = target.patches(step.level, which)
     at, correlation = align_patches(
         patches, pyramid[step.level], to_level(pixels, step.level), affines, step.iterations
@@ -206,9 +213,12 @@ def _look(
     good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
     spread = patches.inverse_hessian[good]
     which, noise = which[good], options.noise * 2**step.level
-    error = _shift_px(target.surface_m[0, which], target.depth_error_m[which], turn, shift, camera)
+    points, ideal, lens = target.surface_m[0, which], *_through_lens(at[good], camera)
+    error = _shift_px(points, target.depth_error_m[which], turn, shift, camera)
+    if lens is not None:
+        error = np.einsum("nij,nj->ni", lens, error)
     white = whitening(affines[good], spread, options.floor_px, noise, error)
-    return _Found(len(good), at[good], target.surface_m[0, which], white)
+    return _Found(len(good), at[good], ideal, lens, points, white)
 
 
 def _shift_px(points: Array, moves: Array, turn: Array, shift: Array, camera: Camera) -> Array:
@@ -218,9 +228,12 @@ def _shift_px(points: Array, moves: Array, turn: Array, shift: Array, camera: Ca
     return plane / local[:, 2:] * [camera.fx, camera.fy]
 
 
-def _undistorted(pixels: Array, camera: Camera) -> Array:
-    """(n, 2) pixels of the ideal pinhole."""
-    if not any(camera.distortion):
-        return pixels
-    plane = camera.unproject(pixels)[:, :2]
-    return plane * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+def _through_lens(pixels: Array, camera: Camera) -> tuple[Array, Array | None]:
+    """(n, 2) pixels of the ideal pinhole, and (n, 2, 2) how pixels of the image move with them."""
+    if not any(camera.distortion) or not len(pixels):
+        return pixels, None
+    rays, step = camera.unproject(pixels), 1e-3
+    aside = step * np.eye(3)[:2, None]
+    moved = (camera.project(rays + aside) - camera.project(rays - aside)) / (2 * step)
+    focal = np.array([camera.fx, camera.fy])
+    return rays[:, :2] * focal + [camera.cx, camera.cy], moved.transpose(1, 2, 0) / focal
