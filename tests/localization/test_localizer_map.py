@@ -13,6 +13,7 @@ from evercal.datasets.frame import Scene
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import LocalizeOptions, Localizer
+from evercal.localization.query import Candidate
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Store
 from evercal.simulation.box_room import BoxRoom, default_camera
@@ -126,6 +127,18 @@ def test_blank_images_show_nothing(level: int, hall_maps: SceneMaps) -> None:
 def test_noise_shows_nothing(hall_maps: SceneMaps) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3)).astype(np.uint8)
     assert Localizer(hall_maps).localize(noise).status != "ok"
+
+
+def test_nothing_is_tried_twice(hall_maps: SceneMaps, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[Candidate] = []
+    whole = Localizer._hypothesis
+    monkeypatch.setattr(
+        Localizer, "_hypothesis", lambda *words: tried.append(words[2]) or whole(*words)
+    )
+    noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3)).astype(np.uint8)
+    assert Localizer(hall_maps).localize(noise).status != "ok"
+    # Of seven keyframes the first attempt proposes all; the third would ask what the second did.
+    assert [candidate.match_stride for candidate in tried] == [2, 1]
 
 
 def test_the_same_image_gives_the_same_answer_twice(

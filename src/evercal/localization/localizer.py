@@ -133,9 +133,14 @@ class Localizer:
         cameras = self._cameras(camera, image.shape)
         usable = [i for i, c in enumerate(cameras) if c is not None]
         best: Hypothesis | None = None
+        tried: set[tuple[int, int, bytes]] = set()
         attempts = self.options.attempts if len(self._bank) else (Attempt(0, 1),)
         for number, attempt in enumerate(attempts):
             for candidate in self._matcher.candidates(query, usable, attempt, self._one_answer()):
+                same = candidate.scene, candidate.match_stride, candidate.keyframes.tobytes()
+                if same in tried:
+                    continue  # in a small store a wider attempt often asks the same
+                tried.add(same)
                 trial = self._hypothesis(query, candidate, cameras)
                 if best is None or trial.support > best.support:
                     best = trial
