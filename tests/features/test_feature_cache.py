@@ -1,9 +1,11 @@
 """Features that were computed before are found again, and what is broken is made again."""
 
+import os
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
@@ -92,3 +94,39 @@ def test_half_of_the_free_disk_is_left_alone(
     cache_features(encoder, tmp_path)  # 16 bytes an image
     encoder(torch.rand(6, 1, 16, 16, generator=torch.Generator().manual_seed(1)))
     assert len(list(tmp_path.rglob("*.npy"))) == 2
+
+
+@torch.inference_mode()
+def test_a_disk_that_others_fill_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = iter([200, 200, 150, *[110] * 9])  # others write too
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=next(free)))
+    encoder = Counting()
+    cache_features(encoder, tmp_path)  # 16 bytes an image
+    encoder(torch.rand(6, 1, 16, 16, generator=torch.Generator().manual_seed(1)))
+    assert len(list(tmp_path.rglob("*.npy"))) == 2
+
+
+@pytest.mark.parametrize("call", ["save", "replace"])
+@torch.inference_mode()
+def test_a_full_disk_stops_caching_and_nothing_else(
+    call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images = torch.rand(4, 1, 16, 16, generator=torch.Generator().manual_seed(1))
+    plain, encoder = Counting(), Counting()
+    cache_features(encoder, tmp_path)
+    encoder(images[:1])
+    tries: list[object] = []
+
+    def full(*words: object) -> None:
+        tries.append(words)
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(np if call == "save" else os, call, full)
+        found = encoder(images)
+    torch.testing.assert_close(found, plain(images), atol=1e-3, rtol=0)
+    encoder(images)
+    assert len(tries) == 1
+    assert len([path for path in tmp_path.rglob("*") if path.is_file()]) == 1

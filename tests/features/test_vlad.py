@@ -13,7 +13,15 @@ from torch.nn import functional as F
 
 from evercal.features import vlad as module
 from evercal.features.encoder import LocalEncoder, load_encoder
-from evercal.features.vlad import CENTROIDS, VLAD_FILE, WIDTH, Vlad, save_centroids, vlad_for
+from evercal.features.vlad import (
+    CENTROIDS,
+    VLAD_FILE,
+    WIDTH,
+    Vlad,
+    load_centroids,
+    save_centroids,
+    vlad_for,
+)
 
 # Before fixtures of other tests put a quicker one in its place.
 FIT = module.fit_centroids
@@ -84,6 +92,8 @@ def test_saved_centroids_name_their_encoder(tmp_path: Path) -> None:
         found = file.get_tensor("centroids").float()
     assert named == module._digest(encoder) != module._digest(other)
     torch.testing.assert_close(found, FIT(encoder), atol=1e-3, rtol=0)
+    load_centroids(other, tmp_path / "vlad.safetensors")
+    assert torch.equal(vlad_for(other).centroids, vlad_for(encoder).centroids)
 
 
 def test_a_vector_is_the_sum_of_differences_from_the_nearest_centroids() -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from threading import Barrier
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from evercal.features.vlad import vlad_for
+from evercal.localization import keyframe_bank as module
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.mapping.scene_maps import SceneMaps
 
@@ -57,7 +61,7 @@ def test_retrieval_is_a_search_of_all(scenes: list[int], several: SceneMaps) -> 
 def test_a_keyframe_finds_itself(hall_maps: SceneMaps) -> None:
     bank = KeyframeBank(hall_maps, 9)
     for i in range(len(bank)):
-        assert bank.retrieve(bank.load(i).features.float(), [0])[0] == i
+        assert bank.retrieve(bank.load(i).cells.features.float(), [0])[0] == i
 
 
 @pytest.mark.parametrize("most", [1, 3, 7])
@@ -80,18 +84,53 @@ def test_what_was_dropped_comes_back_the_same(hall_maps: SceneMaps) -> None:
     bank = KeyframeBank(hall_maps, 1)
     one, _, again = bank.load(2), bank.load(3), bank.load(2)
     assert one is not again
-    assert torch.equal(one.features, again.features)
-    for name in ("points_m", "surface_m", "depth_noise", "position_m"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(again, name))
+    assert torch.equal(one.cells.features, again.cells.features)
+    np.testing.assert_array_equal(one.cells.points_m, again.cells.points_m)
+    for name in ("surface_m", "depth_noise", "position_m"):
+        before, after = (getattr(keyframe.landmarks, name) for keyframe in (one, again))
+        np.testing.assert_array_equal(before, after)
 
 
 def test_landmarks_stand_where_their_keyframe_sees_them(hall_maps: SceneMaps) -> None:
     bank, keyframes = KeyframeBank(hall_maps, 9), hall_maps.keyframes[0]
     assert keyframes is not None
     for i, marks in enumerate(keyframes.landmarks):
-        loaded, pose = bank.load(i), keyframes.base_from_camera[i]
+        loaded, pose = bank.load(i).landmarks, keyframes.base_from_camera[i]
         seen = keyframes.cameras[i].project(pose.inverse().apply(loaded.surface_m[0]))
         np.testing.assert_allclose(seen, marks.pixels, atol=1e-6)
         np.testing.assert_array_equal(loaded.position_m, pose.translation_m)
-        assert len(loaded.points_m) == len(loaded.features) == 30 * 40
+        cells = bank.load(i).cells
+        assert len(cells.points_m) == len(cells.features) == 30 * 40
         assert len(loaded.depth_noise) == len(marks) == len(loaded.patches[0].intensity)
+
+
+def test_only_what_is_asked_for_is_made(
+    hall_maps: SceneMaps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+    for name in ("encode_features", "cut_patches"):
+        whole = getattr(module, name)
+        monkeypatch.setattr(
+            module, name, lambda *a, name=name, whole=whole: made.append(name) or whole(*a)
+        )
+    keyframe = KeyframeBank(hall_maps, 9).load(0)
+    assert made == []
+    assert keyframe.cells is keyframe.cells
+    assert made == ["encode_features"]
+    assert keyframe.landmarks is keyframe.landmarks
+    assert made == ["encode_features", "cut_patches", "cut_patches"]
+
+
+def test_threads_read_other_keyframes_meanwhile(
+    hall_maps: SceneMaps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bank, whole, both = KeyframeBank(hall_maps, 9), module.encode_features, Barrier(2, timeout=20)
+
+    def together(*words: Any) -> torch.Tensor:
+        both.wait()  # raises where the second thread is kept waiting until the first is done
+        return whole(*words)
+
+    monkeypatch.setattr(module, "encode_features", together)
+    with ThreadPoolExecutor(2) as pool:
+        cells = list(pool.map(lambda i: bank.load(i).cells, (0, 1)))
+    assert not torch.equal(cells[0].features, cells[1].features)

@@ -13,6 +13,7 @@ from evercal.datasets.frame import Scene
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import LocalizeOptions, Localizer
+from evercal.localization.query import Candidate
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Store
 from evercal.simulation.box_room import BoxRoom, default_camera
@@ -129,6 +130,18 @@ def test_noise_shows_nothing(hall_maps: SceneMaps) -> None:
     assert Localizer(hall_maps).localize(noise).status != "ok"
 
 
+def test_nothing_is_tried_twice(hall_maps: SceneMaps, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[Candidate] = []
+    whole = Localizer._hypothesis
+    monkeypatch.setattr(
+        Localizer, "_hypothesis", lambda *words: tried.append(words[2]) or whole(*words)
+    )
+    noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3)).astype(np.uint8)
+    assert Localizer(hall_maps).localize(noise).status != "ok"
+    # Of seven keyframes the first attempt proposes all; the third would ask what the second did.
+    assert [candidate.match_stride for candidate in tried] == [2, 1]
+
+
 def test_the_same_image_gives_the_same_answer_twice(
     answers: list[PoseEstimate], hall: Scene, hall_maps: SceneMaps
 ) -> None:
@@ -174,6 +187,16 @@ def test_answers_are_in_the_frame_that_the_recording_states(
         metres, radians = pose_distance(found.base_from_camera, plain)
         assert metres < 1e-9
         assert radians < 1e-7
+
+
+@pytest.mark.parametrize("align", [True, False])
+def test_a_map_answers_far_from_where_it_was_recorded(
+    align: bool, hall: Scene, hall_maps: SceneMaps
+) -> None:
+    record = hall_maps.scenes[0]
+    away = replace(record, cell=replace(record.cell, origin_m=(9.0, 9.0, 0.0)))
+    localizer = Localizer(replace(hall_maps, scenes=[away]), LocalizeOptions(align=align))
+    assert localizer.localize(hall.test[1].read_image(), hall.test[1].camera).status == "ok"
 
 
 def test_support_decides(hall: Scene, hall_maps: SceneMaps, answers: list[PoseEstimate]) -> None:

@@ -15,6 +15,8 @@ from torch import Tensor
 
 from evercal.datasets.frame import Scene
 from evercal.errors import InputError
+from evercal.features import vlad
+from evercal.features.encoder import load_encoder
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import Alignment, SceneMaps
@@ -153,15 +155,16 @@ def test_any_name_of_a_scene_will_do(taught: Stages, tmp_path: Path, make: Make)
         shutil.rmtree(root)
 
 
-@pytest.mark.parametrize(("strategy", "heads"), [("evercal", 0), ("evercal_network", 1)])
+@pytest.mark.parametrize(("strategy", "more"), [("evercal", "vlad"), ("evercal_network", "head")])
 def test_every_flipped_byte_is_refused_by_name(
-    strategy: str, heads: int, taught: Stages, tmp_path: Path, make: Make, tree: Tree
+    strategy: str, more: str, taught: Stages, tmp_path: Path, make: Make, tree: Tree
 ) -> None:
     root = tmp_path / "store"
     make(root, taught[strategy][:2])
     names = list(tree(root))
-    # Two networks; camera, prototypes and report twice, memory twice, heads, the manifest.
-    assert len(names) == 2 + 2 * 4 + heads + 1
+    # Two networks; camera, prototypes and report twice, memory twice, the manifest; and one more.
+    assert len(names) == 2 + 2 * 4 + 1 + 1
+    assert sum(Path(name).name.startswith(more) for name in names) == 1
     rng = np.random.default_rng(0)
     for name in names:
         file = root / name
@@ -337,3 +340,32 @@ def test_a_record_is_replaced_and_nothing_else(
     assert kept is not None
     assert original is not None
     assert kept.images == original.images
+
+
+def test_centroids_of_another_encoder_stay_with_the_store(
+    taught: Stages, tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stages = taught["evercal"]
+    make(tmp_path, stages[:1])
+    listed = list(json.loads((tmp_path / MANIFEST).read_text())["files"])
+    with monkeypatch.context() as patch:
+        patch.setattr(vlad, "fit_centroids", None)  # nothing is fitted
+        opened = vlad.vlad_for(Store.open(tmp_path).maps.encoder)
+    assert torch.equal(opened.centroids, vlad.vlad_for(stages[0].encoder).centroids)
+    # One that was made without them opens too, and gets them with its next scene.
+    (file,) = tmp_path.glob("vlad-*.safetensors")
+    file.unlink()
+    payload = json.loads((tmp_path / MANIFEST).read_text())["payload"]
+    del payload["centroids"]
+    write_manifest(tmp_path, payload, [name for name in listed if name != file.name])
+    store = Store.open(tmp_path)
+    store.commit(stages[1], {})
+    assert file.exists()
+    assert verify(tmp_path) == []
+
+
+def test_centroids_that_are_shipped_are_not_stored(
+    taught: Stages, tmp_path: Path, make: Make
+) -> None:
+    make(tmp_path, [replace(taught["evercal"][0], encoder=load_encoder())])
+    assert not list(tmp_path.glob("vlad-*"))

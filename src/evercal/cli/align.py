@@ -63,13 +63,14 @@ class Align:
 
         where = device_of(self.device)
         opened = Store.open(self.store)
-        localizer = Localizer(opened.maps.to(where))
-        found = self._by_points(localizer) if by_points else self._by_gripper(localizer)
-        record = next(known for known in opened.maps.scenes if known.name == self.scene)
-        opened.replace_record(
-            self.scene,
-            replace(record, alignment=found.alignment, frame_covariance=found.frame_covariance),
-        )
+        with opened.writing():
+            localizer = Localizer(opened.maps.to(where))
+            found = self._by_points(localizer) if by_points else self._by_gripper(localizer)
+            record = next(known for known in opened.maps.scenes if known.name == self.scene)
+            placed = replace(
+                record, alignment=found.alignment, frame_covariance=found.frame_covariance
+            )
+            opened.replace_record(self.scene, placed)
         self._tell(found)
         return 0
 

@@ -3,13 +3,11 @@
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import torch
-from filelock import FileLock, Timeout
 
 from evercal.continual.finish_scene import memory_bytes
 from evercal.continual.learn import learn
@@ -111,39 +109,18 @@ def learn_scene(
             strategy than the store's, a store that is none or that another process is learning
             into.
     """
-    with _store_lock(store):
-        return _learn_scene(store, scene, options, on_event)
-
-
-@contextmanager
-def _store_lock(store: Path) -> Iterator[None]:
-    """Holds the lock that keeps a second learner out of a store; it lies beside the store."""
-    path = store.with_name(f".{store.name}.lock")
-    lock = FileLock(path)
-    try:
-        store.parent.mkdir(parents=True, exist_ok=True)
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise InputError(
-            f"store {store}: another process is learning into it; wait until it has finished"
-        ) from None
-    except OSError as error:
-        raise InputError(f"store {store}: cannot be written ({error.strerror})") from error
-    try:
-        yield
-    finally:
-        path.unlink(missing_ok=True)
-        lock.release()
+    began = time.perf_counter()
+    opened = open_or_create(store, options)
+    with opened.writing():
+        return _learn_scene(opened, scene, options, on_event, began)
 
 
 def _learn_scene(
-    store: Path, scene: Scene, options: LearnOptions, on_event: OnEvent | None
+    opened: Store, scene: Scene, options: LearnOptions, on_event: OnEvent | None, began: float
 ) -> LearnReport:
-    began = time.perf_counter()
     wrist = lacks_camera_poses(scene)
     scene = scene if wrist else posed_scene(scene)
     device = device_of(options.device)
-    opened = open_or_create(store, options)
     _check(opened, scene, options)
     opened.maps.to(device)
     stage_options, start = options.stage, None

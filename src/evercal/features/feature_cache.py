@@ -1,5 +1,6 @@
 """Features of images that were encoded before, for runs that see the same views again and again."""
 
+import contextlib
 import hashlib
 import os
 import shutil
@@ -21,7 +22,8 @@ def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int | None = N
         encoder: changed in place; its weights and type stay what they are.
         folder: where features are kept, one file per image; made when missing.
         limit_bytes: how much is added to the folder; beyond, features are found but no longer
-            kept. Half of what is free on the disk when left out.
+            kept. When left out, half of what is free on the disk now stays free, also where others
+            write to it. On a full disk nothing more is kept either.
     """
     weights = hashlib.blake2b(digest_size=8)
     for value in encoder.state_dict().values():
@@ -29,7 +31,8 @@ def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int | None = N
     folder = folder / weights.hexdigest()
     folder.mkdir(parents=True, exist_ok=True)
     compute = encoder.forward
-    room = shutil.disk_usage(folder).free // 2 if limit_bytes is None else limit_bytes
+    half = shutil.disk_usage(folder).free // 2
+    room, spare = (half, half) if limit_bytes is None else (limit_bytes, 0)
 
     def forward(grey: Tensor) -> Tensor:
         nonlocal room
@@ -40,9 +43,9 @@ def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int | None = N
             made = compute(grey[missing]).half().cpu()
             for i, value in zip(missing, made, strict=True):
                 found[i] = value
-                if room > value.nbytes:
-                    _write(folder / names[i], value)
-                    room -= value.nbytes
+                others = shutil.disk_usage(folder).free - spare
+                if min(room, others) > value.nbytes:
+                    room = room - value.nbytes if _written(folder / names[i], value) else 0
         whole = torch.stack([value.float() for value in found if value is not None])
         return whole.to(grey.device)
 
@@ -64,9 +67,16 @@ def _read(path: Path) -> Tensor | None:
         return None
 
 
-def _write(path: Path, features: Tensor) -> None:
+def _written(path: Path, features: Tensor) -> bool:
+    """Whether features could be kept."""
     # Whole or not at all, but not synced: what a power cut takes is made again.
     temporary = path.with_name(f".{uuid.uuid4().hex[:8]}.tmp")
-    with open(temporary, "wb") as file:
-        np.save(file, features.contiguous().numpy())
-    os.replace(temporary, path)
+    try:
+        with open(temporary, "wb") as file:
+            np.save(file, features.contiguous().numpy())
+        os.replace(temporary, path)
+    except OSError:  # a full disk, as a rule
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        return False
+    return True

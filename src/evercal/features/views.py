@@ -65,8 +65,8 @@ def plain_view(image: np.ndarray, camera: Camera, stride: int, options: ViewOpti
     """
     grey, camera = working_image(image, camera, options.short_side)
     pixels = ideal_cell_pixels(camera, stride)
-    valid = np.isfinite(pixels).all(1)
-    return View(grey, pixels, valid, _four(camera), SE3.identity())
+    valid = np.isfinite(pixels).all(axis=1)
+    return View(grey, pixels, np.asarray(valid), _four(camera), SE3.identity())
 
 
 @lru_cache(maxsize=64)

@@ -5,8 +5,8 @@ centroids come from procedural rooms, so nothing about them belongs to any scene
 """
 
 import hashlib
-from functools import lru_cache
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from evercal.features.encoder import WEIGHTS, Encoder
 from evercal.features.views import ViewOptions, plain_view
 from evercal.features.weights_file import network_bytes
 from evercal.simulation.box_room import BoxRoom, default_camera
+from evercal.storage.atomic import write_bytes
 
 VLAD_FILE = WEIGHTS / "vlad.safetensors"
 CENTROIDS = 32
@@ -60,18 +61,39 @@ class Vlad:
         return self._copies[device]
 
 
+_made: WeakKeyDictionary[Encoder, Vlad] = WeakKeyDictionary()
+
+
 def vlad_for(encoder: Encoder) -> Vlad:
-    """The VLAD of an encoder: the shipped one, or one that is made in some seconds a process."""
-    return _vlad_for(encoder)
+    """The VLAD of an encoder: the shipped one, that of a store, or one that is made in seconds."""
+    if encoder not in _made:
+        shipped = shipped_centroids(encoder)
+        _made[encoder] = _projected(fit_centroids(encoder) if shipped is None else shipped)
+    return _made[encoder]
 
 
-@lru_cache(maxsize=2)
-def _vlad_for(encoder: Encoder) -> Vlad:
+def shipped_centroids(encoder: Encoder) -> Tensor | None:
+    """(k, channels) centroids of the shipped encoder; None for another one."""
     if isinstance(encoder, nn.Module) and VLAD_FILE.exists():
         with safe_open(VLAD_FILE, "pt") as file:
             if (file.metadata() or {}).get("encoder") == _digest(encoder):
-                return _projected(file.get_tensor("centroids").float())
-    return _projected(fit_centroids(encoder))
+                return file.get_tensor("centroids").float()
+    return None
+
+
+def save_centroids(encoder: Encoder, path: Path) -> None:
+    """Writes the centroids of an encoder, whole or not at all, with the digest of its weights."""
+    from safetensors.torch import save
+
+    assert isinstance(encoder, nn.Module), "only modules have weights"
+    centroids = vlad_for(encoder).centroids.contiguous()
+    write_bytes(path, save({"centroids": centroids}, {"encoder": _digest(encoder)}))
+
+
+def load_centroids(encoder: Encoder, path: Path) -> None:
+    """Gives an encoder the centroids that were saved for it, so that none are fitted."""
+    with safe_open(path, "pt") as file:
+        _made[encoder] = _projected(file.get_tensor("centroids").float())
 
 
 def fit_centroids(encoder: Encoder) -> Tensor:
@@ -88,14 +110,6 @@ def fit_centroids(encoder: Encoder) -> Tensor:
         some = sums.norm(dim=1, keepdim=True) > 0
         centroids = torch.where(some, F.normalize(sums, dim=1), centroids)
     return centroids
-
-
-def save_centroids(encoder: nn.Module, path: Path) -> None:
-    """Writes the centroids of an encoder, with the digest of its weights."""
-    from safetensors.torch import save_file
-
-    assert isinstance(encoder, Encoder), "only encoders have features"
-    save_file({"centroids": fit_centroids(encoder).half()}, path, {"encoder": _digest(encoder)})
 
 
 def _projected(centroids: Tensor) -> Vlad:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
-from evercal.localization.keyframe_bank import LoadedKeyframe
+from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import RefinedPose, refine_pose
 from evercal.mapping.landmarks import project_surface
@@ -90,25 +90,30 @@ class Alignment:
 class _Found:
     expected: int
     pixels: Array
+    """(n, 2) of the image."""
     ideal: Array
+    """(n, 2) the same of the ideal pinhole."""
+    lens: Array | None
+    """(n, 2, 2) how the former move with the latter; None without distortion."""
     points_m: Array
     whitening: Array
+    """(n, 2, 2) of errors in the image."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Target:
     """The landmarks of some keyframes as one set."""
 
-    keyframes: Sequence[LoadedKeyframe]
+    keyframes: Sequence[AlignedLandmarks]
     starts: NDArray[np.int64]
     """(keyframes + 1,) the first landmark of each, and their number."""
     surface_m: Array
-    """(3, n, 3), see `LoadedKeyframe`."""
+    """(3, n, 3), see `AlignedLandmarks`."""
     depth_error_m: Array
     """(n, 3) where a landmark may move for its depth is uncertain: one standard deviation."""
 
     @classmethod
-    def of(cls, keyframes: Sequence[LoadedKeyframe]) -> Self:
+    def of(cls, keyframes: Sequence[AlignedLandmarks]) -> Self:
         """Of keyframes in their order."""
         surfaces = [keyframe.surface_m for keyframe in keyframes]
         counts = [surface.shape[1] for surface in surfaces]
@@ -131,7 +136,7 @@ class _Target:
 def align_pose(
     pyramid: Sequence[Array],
     camera: Camera,
-    keyframes: Sequence[LoadedKeyframe],
+    keyframes: Sequence[AlignedLandmarks],
     start: SE3,
     options: AlignmentOptions,
 ) -> Alignment | None:
@@ -140,7 +145,7 @@ def align_pose(
     Args:
         pyramid: of the image, see `image_pyramid`.
         camera: intrinsics of its first level, distortion included.
-        keyframes: that show the same place.
+        keyframes: the landmarks of some that show the same place.
         start: base_from_camera, roughly.
         options: how.
 
@@ -165,7 +170,7 @@ def align_pose(
                 return None
             pose = rough.world_from_camera
         refined = refine_pose(
-            found.ideal, found.points_m, found.whitening, intrinsics, pose, step.steps
+            found.ideal, found.points_m, found.whitening, intrinsics, pose, step.steps, found.lens
         )
         pose = refined.base_from_camera
     assert refined is not None
@@ -199,7 +204,7 @@ def _look(
     which, pixels, affines = which[::every], pixels[::every], affines[::every]
     if not len(which):
         none = np.zeros((0, 2))
-        return _Found(0, none, none, np.zeros((0, 3)), np.zeros((0, 2, 2)))
+        return _Found(0, none, none, None, np.zeros((0, 3)), np.zeros((0, 2, 2)))
     patches = target.patches(step.level, which)
     at, correlation = align_patches(
         patches, pyramid[step.level], to_level(pixels, step.level), affines, step.iterations
@@ -207,13 +212,19 @@ def _look(
     at = from_level(at.astype(np.float64), step.level)
     good = correlation > options.min_correlation
     good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
-    ideal = _undistorted(at, camera)
+    ideal, lens = _through_lens(at, camera)
     good &= np.isfinite(ideal).all(1)
+    if lens is not None:
+        good &= np.isfinite(lens).all((1, 2))
+        lens = lens[good]
     spread = patches.inverse_hessian[good]
     which, noise = which[good], options.noise * 2**step.level
-    error = _shift_px(target.surface_m[0, which], target.depth_error_m[which], turn, shift, camera)
+    points = target.surface_m[0, which]
+    error = _shift_px(points, target.depth_error_m[which], turn, shift, camera)
+    if lens is not None:
+        error = np.einsum("nij,nj->ni", lens, error)
     white = whitening(affines[good], spread, options.floor_px, noise, error)
-    return _Found(len(good), at[good], ideal[good], target.surface_m[0, which], white)
+    return _Found(len(good), at[good], ideal[good], lens, points, white)
 
 
 def _shift_px(points: Array, moves: Array, turn: Array, shift: Array, camera: Camera) -> Array:
@@ -223,9 +234,10 @@ def _shift_px(points: Array, moves: Array, turn: Array, shift: Array, camera: Ca
     return plane / local[:, 2:] * [camera.fx, camera.fy]
 
 
-def _undistorted(pixels: Array, camera: Camera) -> Array:
-    """(n, 2) pixels of the ideal pinhole; nan where the distortion has no ray."""
+def _through_lens(pixels: Array, camera: Camera) -> tuple[Array, Array | None]:
+    """(n, 2) pixels of the ideal pinhole, and (n, 2, 2) how pixels of the image move with them."""
     if not camera.distortion:
-        return pixels
-    plane = camera.unproject(pixels)[:, :2]
-    return plane * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        return pixels, None
+    plane, focal = camera.unproject(pixels)[:, :2], np.array([camera.fx, camera.fy])
+    by_plane, _ = camera.slopes(plane)
+    return plane * focal + [camera.cx, camera.cy], by_plane / focal

@@ -13,7 +13,8 @@ class PoseEstimate:
     """The answer for one image; failure is a value, not an exception."""
 
     status: Literal["ok", "unknown_scene", "failed"]
-    """`unknown_scene`: a pose was found but too little agrees with it. `failed`: none was found."""
+    """`unknown_scene`: a pose was found but too little agrees with it. `failed`: none was found, or
+    a network gave one outside the cell of its scene."""
     reason: str
     """Why the status is not `ok`; empty otherwise."""
     scene: str | None

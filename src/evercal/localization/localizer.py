@@ -133,9 +133,14 @@ class Localizer:
         cameras = self._cameras(camera, image.shape)
         usable = [i for i, c in enumerate(cameras) if c is not None]
         best: Hypothesis | None = None
+        tried: set[tuple[int, int, bytes]] = set()
         attempts = self.options.attempts if len(self._bank) else (Attempt(0, 1),)
         for number, attempt in enumerate(attempts):
             for candidate in self._matcher.candidates(query, usable, attempt, self._one_answer()):
+                same = candidate.scene, candidate.match_stride, candidate.keyframes.tobytes()
+                if same in tried:
+                    continue  # in a small store a wider attempt often asks the same
+                tried.add(same)
                 trial = self._hypothesis(query, candidate, cameras)
                 if best is None or trial.support > best.support:
                     best = trial
@@ -211,7 +216,7 @@ class Localizer:
         self, query: Query, candidate: Candidate, camera: Camera, rough: PnpResult
     ) -> Hypothesis:
         height, width = query.grey.shape
-        keyframes = [self._bank.load(int(index)) for index in candidate.keyframes]
+        keyframes = [self._bank.load(int(index)).landmarks for index in candidate.keyframes]
         found: Alignment | None = align_pose(
             query.pyramid,
             camera.resized(width, height),
@@ -287,8 +292,13 @@ class Localizer:
         )
 
     def _outside(self, best: Hypothesis, record: SceneRecord) -> bool:
-        """Whether a pose lies where the scene has nothing; the atlas tells for networks."""
+        """Whether a network's pose lies outside the cell of the scene that it was asked for.
+
+        Only networks know of cells: a map may be looked at from far away.
+        """
         assert best.pose is not None
+        if best.aligned or not self.maps.heads:
+            return False
         place = record.cell.atlas_from_base.apply(best.pose.translation_m)
         return self.maps.atlas().scene_at(place) != best.scene
 

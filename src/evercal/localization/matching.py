@@ -64,7 +64,7 @@ class Matcher:
         some = features[:: self._options.retrieval_stride]
         best = []
         for index in proposed:
-            keys = self._bank.load(int(index)).features
+            keys = self._bank.load(int(index)).cells.features
             best.append(_bits(some.to(keys.dtype) @ keys.T).max(1))
         votes = np.bincount(np.argmax(best, 0), minlength=len(proposed))
         order = np.argsort(-votes, kind="stable")
@@ -115,7 +115,7 @@ class Matcher:
 
     def _matched(self, features: Tensor, keyframes: NDArray[np.int64]) -> np.ndarray:
         """(n, 3) points of the keyframes' patches that are most similar to (n, channels)."""
-        loaded = [self._bank.load(int(index)) for index in keyframes]
+        loaded = [self._bank.load(int(index)).cells for index in keyframes]
         features = features.to(loaded[0].features.dtype)
         # One keyframe after the other: the products of all would not fit the processor's cache.
         likeness = [_bits(features @ keyframe.features.T) for keyframe in loaded]

@@ -22,7 +22,7 @@ class RefinedPose:
     base_from_camera: SE3
     """In the frame of the points."""
     residual_px: Array
-    """(n,) distances of the observations from the projected points, pixels."""
+    """(n,) distances of the observations from the projected points, pixels of the image."""
     covariance: Array
     """(6, 6) of (translation in the base frame, metres; rotation about camera axes, radians)."""
 
@@ -34,17 +34,21 @@ def refine_pose(
     intrinsics: Array,
     start: SE3,
     iterations: int = 10,
+    lens: Array | None = None,
 ) -> RefinedPose:
     """Moves a pose to where whitened reprojection errors are smallest, with Cauchy's weights.
 
     Args:
         pixels: (n, 2) in the ideal pinhole.
         points_m: (n, 3).
-        whitening: (n, 2, 2) matrices that give the errors of the pixels unit variance.
+        whitening: (n, 2, 2) matrices that give errors in the image unit variance.
         intrinsics: (4,) fx, fy, cx, cy.
         start: base_from_camera, roughly.
         iterations: Gauss-Newton steps, at most.
+        lens: (n, 2, 2) how pixels of the image move with those of the ideal pinhole; None where
+            they are the same.
     """
+    whitening = whitening if lens is None else whitening @ lens
     turn, place = start.rotation_matrix(), start.translation_m
     white = np.ascontiguousarray(whitening.transpose(1, 2, 0))
     variance, information = 1.0, np.eye(6)
@@ -64,6 +68,7 @@ def refine_pose(
         if np.abs(step).max() < _SMALL:
             break
     raw, _ = linearised(pixels, points_m, turn, place, intrinsics)
+    raw = raw if lens is None else np.einsum("nij,jn->in", lens, raw)
     covariance = with_translation_by(turn, variance * np.linalg.inv(information))
     quaternion = Rotation.from_matrix(turn).as_quat(scalar_first=True)
     return RefinedPose(SE3(quaternion, place), np.hypot(*raw), covariance)

@@ -4,6 +4,7 @@
       manifest.json                 written last, by atomic replace; sha256 of every file
       encoder-SHA.safetensors       the networks that the stages were made with
       descriptor-SHA.safetensors
+      vlad-SHA.safetensors          where maps are made with another encoder than the shipped one
       stages/0001-NAME/
         scene.json                  camera, cell, thresholds
         head.safetensors            weights (fp16, centres fp32); of a shared head only the
@@ -14,23 +15,28 @@
         report.json
       learning/                     checkpoints of an interrupted stage
 
-What the manifest does not list is no part of the store.
+What the manifest does not list is no part of the store. One process at a time writes into it; a
+lock beside the folder keeps others out. Readers need none.
 """
 
+import hashlib
 import json
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 import torch
+from filelock import FileLock, Timeout
 from torch import Tensor, nn
 
 from evercal.errors import InputError
 from evercal.features.descriptor import PooledDescriptor, descriptor_for, load_descriptor
-from evercal.features.encoder import checked_encoder, load_encoder
+from evercal.features.encoder import Encoder, checked_encoder, load_encoder
+from evercal.features.vlad import load_centroids, save_centroids, shipped_centroids
 from evercal.features.weights_file import network_bytes
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord
@@ -45,14 +51,7 @@ from evercal.mapping.stage_files import (
     write_record,
 )
 from evercal.storage.atomic import replace_folder, write_bytes, write_json
-from evercal.storage.manifest import (
-    MANIFEST,
-    listed_files,
-    read_manifest,
-    sha256_file,
-    verify,
-    write_manifest,
-)
+from evercal.storage.manifest import MANIFEST, Manifest, write_manifest
 
 SCHEMA = 3
 LEARNING = "learning"
@@ -88,13 +87,15 @@ class Store:
         root: folder of the store.
         maps: what it knows.
         stages: folder names of the stages, in order.
-        networks: file names of encoder and descriptor.
+        networks: file names of encoder and descriptor, and of centroids where there are some.
     """
 
     def __init__(
-        self, root: Path, maps: SceneMaps, stages: list[str], networks: tuple[str, str] | None
+        self, root: Path, maps: SceneMaps, stages: list[str], networks: tuple[str, ...] | None
     ):
         self.root, self.maps, self.stages, self.networks = root, maps, stages, networks
+        place = root.resolve()  # one lock, by whatever name the store is called
+        self._lock = FileLock(place.parent / f".{place.name}.lock")
 
     @classmethod
     def create(
@@ -140,8 +141,18 @@ class Store:
         Raises:
             InputError: not a store, a file missing or not matching its checksum.
         """
-        payload = read_manifest(root)
-        problems = verify(root)
+        while True:
+            manifest = Manifest.read(root)
+            try:
+                return cls._opened(root, manifest, encoder)
+            except (InputError, OSError):
+                # Where a writer has replaced files meanwhile, nothing is wrong with the store.
+                if Manifest.read(root) == manifest:
+                    raise
+
+    @classmethod
+    def _opened(cls, root: Path, manifest: Manifest, encoder: nn.Module | None) -> Self:
+        payload, problems = manifest.payload, manifest.problems(root)
         if problems:
             raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
         schema = payload.get("schema")
@@ -152,16 +163,17 @@ class Store:
             )
         if schema != SCHEMA:
             raise InputError(f"store {root}: schema {schema!r} is not {SCHEMA}; update evercal")
-        networks = payload["networks"]
-        local, descriptor = (str(name) for name in networks)  # type: ignore[attr-defined]
+        local, descriptor = (str(name) for name in payload["networks"])
         maps = SceneMaps(
             load_encoder(root / local) if encoder is None else own_encoder(encoder, root / local),
             load_descriptor(root / descriptor),
             str(payload["strategy"]),
-            int(payload["short_side"]),  # type: ignore[call-overload]
+            int(payload["short_side"]),
         )
-        stages = [str(name) for name in payload["stages"]]  # type: ignore[attr-defined]
-        listed = listed_files(root)
+        centroids = tuple(str(name) for name in payload.get("centroids", []))
+        for name in centroids:
+            load_centroids(maps.encoder, root / name)
+        stages = [str(name) for name in payload["stages"]]
         for name in stages:
             folder = root / STAGES / name
             maps.scenes.append(read_record(folder))
@@ -170,9 +182,47 @@ class Store:
             maps.keyframes.append(keyframes)
             state = folder / "notes.safetensors"
             maps.method_states.append(load_tensors(state) if state.exists() else {})
-            if f"{STAGES}/{name}/{HEAD}" in listed:
+            if f"{STAGES}/{name}/{HEAD}" in manifest.files:
                 maps.heads.append(read_head(folder, maps.encoder.width))
-        return cls(root, maps, stages, (local, descriptor))
+        return cls(root, maps, stages, (local, descriptor, *centroids))
+
+    @contextmanager
+    def writing(self) -> Iterator[Manifest | None]:
+        """Keeps every other writer out, for as long as this store is being changed.
+
+        `commit` and `replace_record` do so by themselves; who works long for what they will write
+        does it before.
+
+        Yields:
+            The manifest that will be replaced; None where there is none yet.
+
+        Raises:
+            InputError: another process is writing into the store, or has done so since it was
+                opened; it cannot be written.
+        """
+        lock = Path(self._lock.lock_file)
+        try:
+            lock.parent.mkdir(parents=True, exist_ok=True)
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            raise InputError(
+                f"store {self.root}: another process is learning into it or aligning it; wait until"
+                " it has finished"
+            ) from None
+        except OSError as error:
+            raise InputError(f"store {self.root}: cannot be written ({error.strerror})") from error
+        try:
+            known = (self.root / MANIFEST).exists()
+            before = Manifest.read(self.root) if known else None
+            if self.stages != (before.payload["stages"] if before else []):
+                raise InputError(
+                    f"store {self.root}: another process has changed it meanwhile; run this again"
+                )
+            yield before
+        finally:
+            if self._lock.lock_counter == 1:
+                lock.unlink(missing_ok=True)
+            self._lock.release()
 
     def commit(self, maps: SceneMaps, report: Mapping[str, object]) -> None:
         """Adds the newest scene of `maps` to the store: whole, or not at all.
@@ -180,26 +230,29 @@ class Store:
         Args:
             maps: the outcome of a stage.
             report: what `report.json` says.
+
+        Raises:
+            InputError: as `writing`.
         """
         record, keyframes = maps.scenes[-1], maps.keyframes[-1]
         # A scene may be called anything, a folder may not.
         legal = re.sub(r"[^\w.-]", "_", record.name)[:60]
         name = f"{len(self.stages) + 1:04d}-{legal}"
-        folder = self.root / STAGES / f".{name}"
-        shutil.rmtree(folder, ignore_errors=True)  # left by a commit that was killed
-        folder.mkdir(parents=True)
-        if self.networks is None:
-            self.networks = self._write_networks(maps)
-        write_record(folder, record)
-        if maps.heads:
-            write_head(folder, maps.heads[-1])
-        if keyframes is not None:
-            save_tensors(folder / "memory.safetensors", keyframes.to_tensors())
-        if maps.method_states[-1]:
-            save_tensors(folder / "notes.safetensors", maps.method_states[-1])
-        write_json(folder / "report.json", report)
-        replace_folder(folder, self.root / STAGES / name)
-        self._publish(maps, [*self.stages, name])
+        with self.writing() as before:
+            folder = self._fresh(name)
+            self.networks = self.networks or self._write_networks(maps)
+            if keyframes is not None and keyframes.descriptors is not None:
+                self.networks = self._with_centroids(maps.encoder, self.networks)
+            write_record(folder, record)
+            if maps.heads:
+                write_head(folder, maps.heads[-1])
+            if keyframes is not None:
+                save_tensors(folder / "memory.safetensors", keyframes.to_tensors())
+            if maps.method_states[-1]:
+                save_tensors(folder / "notes.safetensors", maps.method_states[-1])
+            write_json(folder / "report.json", report)
+            self._publish(maps, [*self.stages, name], name, before)
+            shutil.rmtree(self.root / LEARNING, ignore_errors=True)
 
     def replace_record(self, scene: str, record: SceneRecord) -> None:
         """Puts another record in the place of a scene's: whole, or not at all.
@@ -207,40 +260,59 @@ class Store:
         Args:
             scene: name of the scene.
             record: its new record.
+
+        Raises:
+            InputError: as `writing`.
         """
         index = [known.name for known in self.maps.scenes].index(scene)
         old = self.stages[index]
         number, _, name = old.partition("-")
         plain, _, version = name.partition("~")
         new = f"{number}-{plain}~{int(version or 1) + 1}"
-        folder = self.root / STAGES / f".{new}"
-        shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(self.root / STAGES / old, folder)
-        write_record(folder, record)
-        replace_folder(folder, self.root / STAGES / new)
-        self.maps.scenes[index] = record
-        stages = list(self.stages)
-        stages[index] = new
-        self._publish(self.maps, stages)
-
-    def _publish(self, maps: SceneMaps, stages: list[str]) -> None:
-        """Writes the manifest of these stages; from then on they are the store."""
-        assert self.networks is not None, "a store with stages has its networks"
-        newest, shared = stages[-1], len(maps.heads) == 1
-        files = [*self.networks]
-        for stage in stages:
+        with self.writing() as before:
+            assert before is not None, "a store with stages has a manifest"
+            folder = self._fresh(new)
             for file in STAGE_FILES:
-                superseded = shared and stage != newest and file == HEAD
-                if not superseded and (self.root / STAGES / stage / file).exists():
-                    files.append(f"{STAGES}/{stage}/{file}")
+                if f"{STAGES}/{old}/{file}" in before.files:
+                    shutil.copyfile(self.root / STAGES / old / file, folder / file)
+            write_record(folder, record)
+            stages = [*self.stages[:index], new, *self.stages[index + 1 :]]
+            self._publish(self.maps, stages, new, before)
+            self.maps.scenes[index] = record
+
+    def _fresh(self, stage: str) -> Path:
+        """An empty folder in which a stage is made ready."""
+        folder = self.root / STAGES / f".{stage}"
+        shutil.rmtree(folder, ignore_errors=True)  # left by a commit that was killed
+        folder.mkdir(parents=True)
+        return folder
+
+    def _publish(
+        self, maps: SceneMaps, stages: list[str], new: str, before: Manifest | None
+    ) -> None:
+        """Puts a new stage in place and writes the manifest; from then on `stages` are the store.
+
+        The other stages keep the files that the manifest lists of them.
+        """
+        assert self.networks is not None, "a store with stages has its networks"
+        folder, shared = self.root / STAGES / new, len(maps.heads) == 1
+        replace_folder(self.root / STAGES / f".{new}", folder)
+        made = [file for file in STAGE_FILES if (folder / file).exists()]
+        listed = [*self.networks, *(f"{STAGES}/{new}/{file}" for file in made)]
+        for file in before.files if before else ():
+            stage, _, name = file.removeprefix(f"{STAGES}/").partition("/")
+            superseded = shared and stage != stages[-1] and name == HEAD
+            if stage in stages and not superseded:
+                listed.append(file)
         payload = {
             "schema": SCHEMA,
             "strategy": maps.strategy,
             "short_side": maps.short_side,
-            "networks": list(self.networks),
+            "networks": list(self.networks[:2]),
+            "centroids": list(self.networks[2:]),
             "stages": stages,
         }
-        write_manifest(self.root, payload, files)
+        write_manifest(self.root, payload, listed, before)
         self.maps, self.stages = maps, stages
         self._tidy(shared)
 
@@ -253,20 +325,30 @@ class Store:
             if folder.name not in self.stages and re.match(r"\.?\d{4}-", folder.name):
                 shutil.rmtree(folder, ignore_errors=True)
         for unfinished in self.root.glob(".*.tmp"):
-            if unfinished.name.startswith((f".{MANIFEST}", ".encoder", ".descriptor")):
+            if unfinished.name.startswith((f".{MANIFEST}", ".encoder", ".descriptor", ".vlad")):
                 unfinished.unlink(missing_ok=True)
-        shutil.rmtree(self.root / LEARNING, ignore_errors=True)
 
-    def _write_networks(self, maps: SceneMaps) -> tuple[str, str]:
+    def _with_centroids(self, encoder: Encoder, networks: tuple[str, ...]) -> tuple[str, ...]:
+        """File names of the networks, with the centroids that descriptors are made with.
+
+        The shipped encoder's are at hand; others take seconds to fit, and from weights in half
+        precision come out a little different.
+        """
+        first, *others = networks
+        if len(others) > 1 or shipped_centroids(encoder) is not None:
+            return networks
+        name = first.replace("encoder", "vlad", 1)
+        save_centroids(encoder, self.root / name)
+        return *networks, name
+
+    def _write_networks(self, maps: SceneMaps) -> tuple[str, ...]:
         names = []
         for kind, module in (("encoder", maps.encoder), ("descriptor", maps.descriptor)):
             assert isinstance(module, torch.nn.Module)
-            path = self.root / f"{kind}.safetensors"
-            write_bytes(path, network_bytes(module, kind))
-            name = f"{kind}-{sha256_file(path)[:12]}.safetensors"
-            path.replace(self.root / name)
-            names.append(name)
-        return names[0], names[1]
+            data = network_bytes(module, kind)
+            names.append(f"{kind}-{hashlib.sha256(data).hexdigest()[:12]}.safetensors")
+            write_bytes(self.root / names[-1], data)
+        return tuple(names)
 
     def begin(self, identity: Mapping[str, object]) -> Resume | None:
         """Starts or picks up a stage.
@@ -298,7 +380,7 @@ class Store:
     def abandon(self) -> None:
         """Drops the stage under way, and the folder too if nothing else was ever stored in it."""
         shutil.rmtree(self.root / LEARNING, ignore_errors=True)
-        if self.root.is_dir() and not any(self.root.iterdir()):
+        with suppress(OSError):  # it holds something, or is called `.`
             self.root.rmdir()
 
     def checkpoint(self, checkpoint: Checkpoint) -> None:
@@ -334,5 +416,7 @@ def _free(root: Path) -> bool:
     if not root.is_dir():
         return False
     names = [path.name for path in root.iterdir()]
-    ours = re.compile(rf"{LEARNING}|{STAGES}|(encoder|descriptor)(-\w+)?\.safetensors|\..*\.tmp")
+    ours = re.compile(
+        rf"{LEARNING}|{STAGES}|(encoder|descriptor|vlad)(-\w+)?\.safetensors|\..*\.tmp"
+    )
     return not names or (LEARNING in names and all(map(ours.fullmatch, names)))

@@ -11,7 +11,9 @@ import hashlib
 import json
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any, Self
 
 from evercal.errors import InputError
 from evercal.storage.atomic import write_json
@@ -20,6 +22,9 @@ MANIFEST = "manifest.json"
 _FORMAT = "evercal-manifest"
 _SCHEMA = 1
 
+FileRecord = dict[str, object]
+"""`sha256` and `bytes` of a file."""
+
 
 def sha256_file(path: str | os.PathLike[str]) -> str:
     """Checksum of a file's bytes, 64 hexadecimal digits."""
@@ -27,8 +32,50 @@ def sha256_file(path: str | os.PathLike[str]) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+@dataclass(frozen=True)
+class Manifest:
+    """What a manifest said when it was read."""
+
+    payload: dict[str, Any]
+    """What the writer keeps beside the list."""
+    files: dict[str, FileRecord]
+    """What every listed file was when it was written, by its relative path."""
+
+    @classmethod
+    def read(cls, root: str | os.PathLike[str]) -> Self:
+        """Reads it once; files are not checked, see `problems`.
+
+        Raises:
+            InputError: No manifest, a broken one, or one of another schema.
+        """
+        whole = _read(Path(root))
+        return cls(whole["payload"], whole["files"])
+
+    def problems(self, root: str | os.PathLike[str]) -> list[str]:
+        """Compares every listed file with its size and checksum.
+
+        Returns:
+            One line per problem, each beginning with the file's path; empty if all is well.
+        """
+        found = []
+        for relative, record in self.files.items():
+            path = Path(root) / relative
+            try:
+                size = path.stat().st_size
+                if size != record["bytes"]:
+                    found.append(f"{path}: {size} bytes, expected {record['bytes']}")
+                elif sha256_file(path) != record["sha256"]:
+                    found.append(f"{path}: checksum does not match, its content was changed")
+            except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+                found.append(f"{path}: missing")
+        return found
+
+
 def write_manifest(
-    root: str | os.PathLike[str], payload: dict[str, object], files: Sequence[str]
+    root: str | os.PathLike[str],
+    payload: dict[str, object],
+    files: Sequence[str],
+    before: Manifest | None = None,
 ) -> None:
     """Puts the manifest of `files`, which must be complete on disk, in place atomically.
 
@@ -36,18 +83,21 @@ def write_manifest(
         root: The folder.
         payload: What the caller wants to keep beside the list; JSON.
         files: Paths relative to `root`, forward slashes.
+        before: The manifest that is replaced. What it says of a file stays, so that damage done
+            to it since then is still noticed.
 
     Raises:
         ValueError: A path that leaves `root`, or a payload that is no JSON.
         FileNotFoundError: One of the files is not there.
     """
-    root = Path(root)
-    records: dict[str, dict[str, object]] = {}
+    root, known = Path(root), before.files if before else {}
+    records: dict[str, FileRecord] = {}
     for relative in sorted(set(files)):
         if not _stays_inside(relative):
             raise ValueError(f"manifest files lie inside {root}, got {relative!r}")
         path = root / relative
-        records[relative] = {"sha256": sha256_file(path), "bytes": path.stat().st_size}
+        size = path.stat().st_size
+        records[relative] = known.get(relative) or {"sha256": sha256_file(path), "bytes": size}
     # Through JSON once, so that the checksum is that of what will be read back.
     body = json.loads(json.dumps({"payload": payload, "files": records}, allow_nan=False))
     write_json(
@@ -56,44 +106,27 @@ def write_manifest(
     )
 
 
-def read_manifest(root: str | os.PathLike[str]) -> dict[str, object]:
+def read_manifest(root: str | os.PathLike[str]) -> dict[str, Any]:
     """The payload; files are not checked, see `verify`.
 
     Raises:
-        InputError: No manifest, a broken one, or one of another schema.
+        InputError: As `Manifest.read`.
     """
-    return _read(Path(root))["payload"]
-
-
-def listed_files(root: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Relative paths of the files that the manifest lists; they are not checked, see `verify`.
-
-    Raises:
-        InputError: As `read_manifest`.
-    """
-    return tuple(_read(Path(root))["files"])
+    return Manifest.read(root).payload
 
 
 def verify(root: str | os.PathLike[str]) -> list[str]:
-    """Compares every listed file with its size and checksum.
-
-    Returns:
-        One line per problem, each beginning with the file's path; empty if all is well.
+    """Compares every listed file with its size and checksum; see `Manifest.problems`.
 
     Raises:
-        InputError: As `read_manifest`.
+        InputError: As `Manifest.read`.
     """
-    root = Path(root)
-    problems = []
-    for relative, record in _read(root)["files"].items():
-        path = root / relative
-        if not path.is_file():
-            problems.append(f"{path}: missing")
-        elif path.stat().st_size != record["bytes"]:
-            problems.append(f"{path}: {path.stat().st_size} bytes, expected {record['bytes']}")
-        elif sha256_file(path) != record["sha256"]:
-            problems.append(f"{path}: checksum does not match, its content was changed")
-    return problems
+    while True:
+        manifest = Manifest.read(root)
+        problems = manifest.problems(root)
+        # What a writer has replaced meanwhile is no problem of the folder.
+        if not problems or Manifest.read(root) == manifest:
+            return problems
 
 
 def _read(root: Path) -> dict[str, dict]:
