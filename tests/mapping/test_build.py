@@ -242,6 +242,23 @@ def test_frames_from_one_spot_are_refused(arcs: tuple[Scene, Scene]) -> None:
         build_map(frames, load_encoder(), [0, 8], SMALL)
 
 
+@pytest.mark.parametrize("scale", [0.05, 10.0])
+def test_maps_are_alike_at_other_scales(scale: float, arcs: tuple[Scene, Scene]) -> None:
+    frames, encoder = arcs[0].train[:10], load_encoder()
+    scaled = [
+        replace(f, base_from_camera=SE3(p.rotation_wxyz, scale * p.translation_m))
+        for f in frames
+        if (p := f.base_from_camera) is not None
+    ]
+    depths = []
+    for recorded in (frames, scaled):
+        found = build_map(recorded, encoder, [2, 7], SMALL)
+        assert found.adjusted.wrong_poses == ()
+        depths.append(np.concatenate([1 / m.inverse_depth for m in found.keyframes.landmarks]))
+    assert len(depths[1]) > 0.9 * len(depths[0])
+    assert np.median(depths[1]) == pytest.approx(scale * np.median(depths[0]), rel=0.03)
+
+
 def test_the_same_frames_give_the_same_map(arcs: tuple[Scene, Scene]) -> None:
     frames, encoder = arcs[1].train[:10], load_encoder()
     one, two = (build_map(frames, encoder, [2, 7], SMALL) for _ in range(2))

@@ -9,7 +9,13 @@ from evercal.datasets.frame import Scene
 from evercal.features.encoder import load_encoder
 from evercal.features.vlad import vlad_for
 from evercal.geometry.se3 import SE3
-from evercal.mapping.pose_check import PoseCheckOptions, _segment_distance, contradicting_frames
+from evercal.mapping.pose_check import (
+    PoseCheckOptions,
+    _segment_distance,
+    contradicting_frames,
+    depth_scale,
+    matched_pairs,
+)
 from evercal.mapping.recording import Recording, WorkingSize
 
 
@@ -30,7 +36,9 @@ def moved(recording: Recording, changes: dict[int, SE3]) -> Recording:
 
 
 def named(recording: Recording) -> list[int]:
-    return contradicting_frames(recording, vlad_for(recording.encoder), PoseCheckOptions()).tolist()
+    options = PoseCheckOptions()
+    pairs = matched_pairs(recording, vlad_for(recording.encoder), options)
+    return contradicting_frames(recording, pairs, options).tolist()
 
 
 def test_right_poses_contradict_nothing(recording: Recording) -> None:
@@ -51,6 +59,20 @@ def test_one_frame_30_cm_away_is_named(
 def test_two_wrong_frames_and_a_turned_one_are_named(recording: Recording) -> None:
     up, turned = SE3.exp(np.array([0, 0.3, 0, 0, 0, 0])), SE3.exp(np.array([0, 0, 0, 0, 0.2, 0]))
     assert named(moved(recording, {3: up, 10: turned})) == [3, 10]
+
+
+@pytest.mark.parametrize("scale", [0.1, 8.0])
+def test_depths_are_looked_for_at_the_scale_of_the_recording(
+    scale: float, recording: Recording
+) -> None:
+    options, vlad = PoseCheckOptions(), vlad_for(recording.encoder)
+    pairs, scaled = matched_pairs(recording, vlad, options), moved(recording, {})
+    assert depth_scale(recording, pairs) == 1  # as a room is
+    poses = recording.poses
+    scaled.adjust(SE3(poses.rotation_wxyz, scale * poses.translation_m), None)
+    scaled.depth_scale = depth_scale(scaled, pairs)
+    assert 0.3 * scale < scaled.depth_scale < 3 * scale
+    assert contradicting_frames(scaled, pairs, options).tolist() == []
 
 
 def test_errors_that_bundle_adjustment_corrects_are_left_to_it(recording: Recording) -> None:

@@ -24,7 +24,12 @@ from evercal.mapping.bundle_adjustment import (
 from evercal.mapping.bundle_tracks import bundle_tracks
 from evercal.mapping.frame_correction import FrameCorrection, fit_correction
 from evercal.mapping.keyframes import Keyframes, jpeg
-from evercal.mapping.pose_check import PoseCheckOptions, contradicting_frames
+from evercal.mapping.pose_check import (
+    PoseCheckOptions,
+    contradicting_frames,
+    depth_scale,
+    matched_pairs,
+)
 from evercal.mapping.recording import Recording, WorkingSize
 from evercal.mapping.scene_maps import frame_moved_by_cameras
 from evercal.mapping.selection import select_farthest, spread_poses
@@ -258,7 +263,9 @@ def _open(
     for i in range(len(recording)):
         recording.features(i)
         yield Mapping("encoding", i + 1, len(recording))
-    bad = contradicting_frames(recording, vlad_for(encoder), options.check)
+    pairs = matched_pairs(recording, vlad_for(encoder), options.check)
+    recording.depth_scale = depth_scale(recording, pairs)
+    bad = contradicting_frames(recording, pairs, options.check)
     wrong = tuple(recording.frames[i].name for i in bad)
     keep = sorted(set(range(len(support))) - set(bad.tolist()))
     if len(bad):

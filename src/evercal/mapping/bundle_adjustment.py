@@ -94,6 +94,8 @@ class BundleTracks:
     """(m, 2) pixels."""
     whitening: Array
     """(m, 2, 2), see `patches.whitening`."""
+    depth_scale: float = 1.0
+    """Of the depths that are possible, see `plane_sweep.NEAR_M`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +232,7 @@ class BundleAdjustment:
         across = back @ turn[k]
         seen = np.einsum("nij,nj->ni", across, ray / rho)
         seen += np.einsum("nij,nj->ni", back, place[k] - place[j])
-        seen[:, 2] = np.maximum(seen[:, 2], 0.05)
+        seen[:, 2] = np.maximum(seen[:, 2], 0.05 * tracks.depth_scale)
         plane = seen[:, :2] / seen[:, 2:]
         at, slope, bent = (
             np.zeros_like(plane),
@@ -289,7 +291,10 @@ class BundleAdjustment:
         change = -state.root.T @ (state.root @ slope)
         depths = (-pull - mixed @ change) / hold
         rho = state.inverse_depth
-        state.inverse_depth = (rho + depths.clip(-0.2 * rho, 0.2 * rho)).clip(0.03, 6)
+        scale = tracks.depth_scale
+        state.inverse_depth = (rho + depths.clip(-0.2 * rho, 0.2 * rho)).clip(
+            0.03 / scale, 6 / scale
+        )
         state.correction = state.correction + change[: 6 * n].reshape(n, 6)
         state.shared = state.shared + change[6 * n :]
 

@@ -48,6 +48,7 @@ def bundle_tracks(
         seen.frame[often],
         seen.pixels[often],
         seen.whitening[often],
+        recording.depth_scale,
     )
 
 
@@ -77,7 +78,7 @@ def _shared(recording: Recording, keyframe: KeyframeTracks) -> np.ndarray:
     within = np.einsum("nji,npj->npi", recording.rotation, towards)
     shared = np.zeros(len(recording))
     for i in range(len(recording)):
-        camera, front = recording.cameras[i], within[i, :, 2] > 0.1
+        camera, front = recording.cameras[i], within[i, :, 2] > 0
         at = camera.project(np.where(front[:, None], within[i], [0, 0, 1]))
         inside = front & (at > 0).all(1) & (at < [camera.width, camera.height]).all(1)
         like = ((unit[i] * unit[keyframe.frame]).sum(1) - 0.7).clip(0, 1) / 0.3

@@ -13,7 +13,7 @@ Array = NDArray[np.floating]
 MIN_TEXTURE = 1e-4
 """Smallest minimum eigenvalue (cv2.cornerMinEigenVal, 5x5) of a landmark's pixel."""
 BORDER_PX = 6
-NEAREST_M = 0.05
+NEAREST_M = 1e-3
 _TANGENT_PX = 2.0
 _LEAST_AREA, _MOST_AREA = 0.2, 5.0
 

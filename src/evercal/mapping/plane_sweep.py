@@ -17,7 +17,8 @@ from evercal.features.views import ideal_cell_pixels
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 
-NEAR_M, FAR_M = 0.25, 12.0
+NEAR_M, USUAL_M, FAR_M = 0.25, 1.5, 12.0
+"""Depths in a room; other recordings scale them (`pose_check.depth_scale`)."""
 PLANES = 96
 SEEN_BY = 4
 """A depth is scored by the mean similarity over its 4 best views, for others may be occluded."""
@@ -80,7 +81,7 @@ def select_source_views(
     few, enough, many = PARALLAX_RAD
     other = points - poses.translation_m[:, None]
     within = other @ poses.rotation_matrix()
-    front = within[..., 2:] > 0.1
+    front = within[..., 2:] > 0
     within = np.where(front, within, [0, 0, 1])
     seen = front[..., 0]
     for camera in set(cameras):
@@ -100,6 +101,7 @@ def inverse_depths(
     others: Sequence[PosedCells],
     guess_m: np.ndarray,
     guess_weight: float = GUESS_WEIGHT,
+    scale: float = 1.0,
 ) -> Tensor:
     """Inverse depth of every cell along the optical axis.
 
@@ -112,15 +114,17 @@ def inverse_depths(
         others: see `select_source_views`; with none the guess stands.
         guess_m: (h * w,) depths in metres, roughly right.
         guess_weight: what nearness to the guess is worth, as similarity; 0 leaves it out.
+        scale: of the depths that are searched, see `NEAR_M`.
 
     Returns:
-        (h * w,) per metre, within 1 / 12 and 1 / 0.25.
+        (h * w,) per metre, within 1 / 12 and 1 / 0.25 over the scale.
     """
-    guess = torch.from_numpy(1 / np.clip(guess_m, NEAR_M, FAR_M)).float()
+    least, most = 1 / (scale * FAR_M), 1 / (scale * NEAR_M)
+    guess = torch.from_numpy((1 / guess_m).clip(least, most)).float()
     if not others:
         return guess
     sources = [_SourceView(view, other) for other in others]
-    planes = torch.linspace(1 / FAR_M, 1 / NEAR_M, PLANES)
+    planes = torch.linspace(least, most, PLANES)
     spread = planes.expand(len(guess), PLANES)
     alike = torch.stack([source.along(spread) for source in sources])
     score = alike.topk(min(SEEN_BY, len(sources)), 0).values.mean(0)
@@ -135,7 +139,8 @@ def inverse_depths(
         for source in sources:
             pull_one, hold_one = source.step(found)
             pull, hold = pull + pull_one, hold + hold_one
-        found = (found + (pull / hold).clamp(-0.1, 0.1)).clamp(1 / FAR_M, 1 / NEAR_M)
+        step = (pull / hold).clamp(-0.1 / scale, 0.1 / scale)
+        found = (found + step).clamp(least, most)
     return found
 
 

@@ -13,10 +13,16 @@ from numpy.typing import NDArray
 
 from evercal.features.views import ideal_cell_pixels
 from evercal.features.vlad import Vlad
-from evercal.mapping.plane_sweep import FAR_M, NEAR_M
+from evercal.mapping.plane_sweep import FAR_M, NEAR_M, USUAL_M
 from evercal.mapping.recording import Recording
 
 Array = NDArray[np.floating]
+
+CLEAR_PX, BESIDE_PX = 16.0, 4.0
+"""Matches tell depths where parallax moves them by more than the first, and they lie nearer to
+their lines than the second: pixels at the encoder's working size."""
+LEAST_DEPTHS = 100
+"""Fewer of them tell nothing."""
 
 
 @dataclass(frozen=True)
@@ -36,15 +42,35 @@ class PoseCheckOptions:
     """Every so many-th patch is matched."""
 
 
-def contradicting_frames(
-    recording: Recording, vlad: Vlad, options: PoseCheckOptions
-) -> NDArray[np.int64]:
-    """Frames whose stated pose disagrees with most of the frames that look alike."""
+@dataclass(frozen=True, eq=False)
+class MatchedPair:
+    """Two frames that look alike and what matches between them, pixels of the ideal pinhole."""
+
+    first: int
+    second: int
+    """Numbers of the frames."""
+    ray: Array
+    """(n, 3) in the first one's camera frame, at depth 1."""
+    seen: Array
+    """(n, 2) pixels at working size in the second one."""
+
+
+def matched_pairs(recording: Recording, vlad: Vlad, options: PoseCheckOptions) -> list[MatchedPair]:
+    """Every frame with those that look most alike, where enough of their patches match."""
     count = len(recording)
     whole = torch.stack([vlad(recording.features(i)) for i in range(count)])
     alike = (whole @ whole.T).fill_diagonal_(-1).topk(min(options.partners, count - 1)).indices
     pairs = sorted({(min(i, j), max(i, j)) for i, row in enumerate(alike.tolist()) for j in row})
-    judged = [(i, j, d) for i, j in pairs if (d := _distance(recording, i, j, options)) is not None]
+    matched = [_matched(recording, i, j, options) for i, j in pairs]
+    return [pair for pair in matched if len(pair.ray) >= options.min_matches]
+
+
+def contradicting_frames(
+    recording: Recording, pairs: list[MatchedPair], options: PoseCheckOptions
+) -> NDArray[np.int64]:
+    """Frames whose stated pose disagrees with most of the frames that look alike."""
+    count = len(recording)
+    judged = [(pair.first, pair.second, _distance(recording, pair)) for pair in pairs]
     bad: list[int] = []
     while judged:
         against, total = np.zeros(count), np.zeros(count)
@@ -61,29 +87,61 @@ def contradicting_frames(
     return np.array(sorted(bad), np.int64)
 
 
-def _distance(recording: Recording, i: int, j: int, options: PoseCheckOptions) -> float | None:
-    """Median distance of matches from their segments; None where too little matches."""
+def depth_scale(recording: Recording, pairs: list[MatchedPair]) -> float:
+    """How far away surfaces are, in parts of what is usual in a room; 1 where that range fits.
+
+    Recordings have other scales where their unit of length is unknown, and seen from a wrist or in
+    a hall. Matches that parallax moves clearly are triangulated.
+    """
+    depths = [_triangulated(recording, pair) for pair in pairs]
+    depth = np.concatenate([np.zeros(0), *depths])
+    if len(depth) < LEAST_DEPTHS:
+        return 1.0
+    near, middle, far = np.quantile(depth, [0.1, 0.5, 0.9])
+    usual = near > NEAR_M and far < FAR_M / 2
+    return 1.0 if usual else float(middle / USUAL_M)
+
+
+def _matched(recording: Recording, i: int, j: int, options: PoseCheckOptions) -> MatchedPair:
+    """Patches that are most alike both ways."""
     a, b = recording.features(i)[:: options.stride], recording.features(j)
     similar = a.bfloat16() @ b.bfloat16().T
     best = similar.max(1)
     back = similar.argmax(0)
     rows = torch.arange(len(a))
     mutual = (back[best.indices] == rows) & (best.values > options.min_similarity)
-    if int(mutual.sum()) < options.min_matches:
-        return None
-    cells_a = (rows[mutual] * options.stride).numpy()
-    cells_b = best.indices[mutual].numpy()
     stride = recording.encoder.stride
     camera, other = recording.cell_camera(i), recording.cell_camera(j)
-    pixels = ideal_cell_pixels(camera, stride)[cells_a].astype(np.float64)
-    plane = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    pixels = ideal_cell_pixels(camera, stride)[(rows[mutual] * options.stride).numpy()]
+    plane = (pixels.astype(np.float64) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     ray = np.concatenate([plane, np.ones((len(plane), 1))], 1)
-    turn, shift = recording.relative(j, i)
-    ends = [_pinhole(other, ray @ turn.T + shift / depth) for depth in (FAR_M, NEAR_M)]
-    seen = ideal_cell_pixels(other, stride)[cells_b].astype(np.float64)
-    distance = _segment_distance(seen, *ends)
-    known = distance[np.isfinite(distance)]  # the lens has no ray for some cells
-    return float(np.median(known)) if len(known) >= options.min_matches else None
+    seen = ideal_cell_pixels(other, stride)[best.indices[mutual].numpy()].astype(np.float64)
+    known = np.isfinite(ray).all(1) & np.isfinite(seen).all(1)  # the lens has no ray for some cells
+    return MatchedPair(i, j, ray[known], seen[known])
+
+
+def _distance(recording: Recording, pair: MatchedPair) -> float:
+    """Median distance of matches from their segments."""
+    other, scale = recording.cell_camera(pair.second), recording.depth_scale
+    turn, shift = recording.relative(pair.second, pair.first)
+    ends = [
+        _pinhole(other, pair.ray @ turn.T + shift / (scale * depth)) for depth in (FAR_M, NEAR_M)
+    ]
+    return float(np.median(_segment_distance(pair.seen, *ends)))
+
+
+def _triangulated(recording: Recording, pair: MatchedPair) -> Array:
+    """Depths of the matches that parallax moves far along their lines and that lie near them."""
+    other = recording.cell_camera(pair.second)
+    turn, shift = recording.relative(pair.second, pair.first)
+    seen = (pair.seen - [other.cx, other.cy]) / [other.fx, other.fy]
+    far = pair.ray @ turn.T
+    # Where (far + shift / depth) is seen: off + along / depth = 0.
+    off, along = far[:, :2] - seen * far[:, 2:], shift[:2] - seen * shift[2]
+    inverse = -(off * along).sum(1) / np.maximum((along**2).sum(1), 1e-18)
+    moved = inverse * np.linalg.norm(along, axis=1) * other.fx
+    beside = np.linalg.norm(off + along * inverse[:, None], axis=1) * other.fx
+    return 1 / inverse[(moved > CLEAR_PX) & (beside < BESIDE_PX)]
 
 
 def _pinhole(camera, points: Array) -> Array:

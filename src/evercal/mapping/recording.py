@@ -53,6 +53,8 @@ class Recording:
             grey, camera = working_image(image, frame.camera, short)
             self.grey.append(grey)
             self.cameras.append(camera)
+        self.depth_scale = 1.0
+        """Of the depths that are looked for, see `plane_sweep.NEAR_M`."""
         self._features: dict[int, Tensor] = {}
         self._pyramids: OrderedDict[int, list[np.ndarray]] = OrderedDict()
         self._lock = Lock()
@@ -66,6 +68,7 @@ class Recording:
             self.encoder,
             self.size,
         )
+        rest.depth_scale = self.depth_scale
         rest.stated = self.stated[np.array(keep)]
         rest._place(self.poses[np.array(keep)])
         rest.grey, rest.cameras = [self.grey[i] for i in keep], [self.cameras[i] for i in keep]

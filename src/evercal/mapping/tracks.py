@@ -8,7 +8,13 @@ from numpy.typing import NDArray
 
 from evercal.mapping.landmarks import Landmarks, detect, project_surface, slopes
 from evercal.mapping.patches import Patches, align_down, cut_patches, to_level, whitening
-from evercal.mapping.plane_sweep import inverse_depths, select_source_views
+from evercal.mapping.plane_sweep import (
+    FAR_M,
+    NEAR_M,
+    USUAL_M,
+    inverse_depths,
+    select_source_views,
+)
 from evercal.mapping.recording import PYRAMID_LEVELS, Recording
 
 Array = NDArray[np.floating]
@@ -83,9 +89,11 @@ def open_keyframe(recording: Recording, frame: int, options: TrackOptions) -> Ke
     """Landmarks of a keyframe with depths from a plane sweep over other frames."""
     view, poses = recording.posed_cells(frame), recording.poses
     cameras = [recording.cell_camera(i) for i in range(len(recording))]
-    guess = np.full(len(view.features), 1.5)
+    scale = recording.depth_scale
+    guess = np.full(len(view.features), scale * USUAL_M)
     near = select_source_views(guess, view, poses, cameras, options.source_views)
-    swept = inverse_depths(view, [recording.posed_cells(i) for i in near], guess, guess_weight=0.0)
+    others = [recording.posed_cells(i) for i in near]
+    swept = inverse_depths(view, others, guess, guess_weight=0.0, scale=scale)
     inverse = swept.double().numpy()
     near = select_source_views(1 / inverse, view, poses, cameras, options.source_views)
     cell_px = recording.cell_px(frame)
@@ -223,7 +231,10 @@ def _depth_step(recording: Recording, keyframe: KeyframeTracks, seen: Observatio
     pull = np.bincount(seen.landmark, weight * (slope * residual).sum(1), n)
     hold = np.bincount(seen.landmark, weight * (slope**2).sum(1), n) + 1e-9
     rho = marks.inverse_depth
-    rho = (rho + (pull / hold).clip(-0.15 * rho, 0.15 * rho)).clip(0.05, 5)
+    least, most = 0.6 / FAR_M, 1.25 / NEAR_M
+    scale = recording.depth_scale
+    rho = rho + (pull / hold).clip(-0.15 * rho, 0.15 * rho)
+    rho = rho.clip(least / scale, most / scale)
     keyframe.landmarks = Landmarks(marks.pixels, rho, marks.slope, marks.sigma)
 
 
