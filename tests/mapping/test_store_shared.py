@@ -96,7 +96,7 @@ def test_a_stage_without_its_files_is_not_listed(
     listed = (root / manifest.MANIFEST).read_bytes()
     with pytest.raises(FileNotFoundError):
         store.commit(taught["evercal"][2], {})
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(InputError, match=r"memory\.safetensors: missing"):
         store.replace_record("alpha", moved(store))
     assert (root / manifest.MANIFEST).read_bytes() == listed
 
@@ -109,7 +109,7 @@ def test_what_was_damaged_while_a_scene_was_learned_is_noticed(root: Path, taugh
     assert verify(root) == [f"{file}: checksum does not match, its content was changed"]
 
 
-@pytest.mark.parametrize("moment", ["verified", "read"])
+@pytest.mark.parametrize("moment", ["verified", "before a scene", "within a scene"])
 def test_a_reader_starts_over_where_a_writer_was_faster(
     moment: str, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,11 +118,14 @@ def test_a_reader_starts_over_where_a_writer_was_faster(
     whole = getattr(place, name)
 
     def interrupted(path: Path) -> object:
+        found = whole(path) if moment == "within a scene" else None
         for _ in turns:
             writer.replace_record("alpha", moved(writer))
-        return whole(path)
+        return found or whole(path)
 
     monkeypatch.setattr(place, name, interrupted)
-    assert Store.open(root).maps.scenes[0].alignment is not None
+    maps = Store.open(root).maps
+    assert maps.scenes[0].alignment is not None
+    assert None not in maps.keyframes
     turns = iter("w")
     assert verify(root) == []

@@ -152,9 +152,8 @@ class Store:
 
     @classmethod
     def _opened(cls, root: Path, manifest: Manifest, encoder: nn.Module | None) -> Self:
-        payload, problems = manifest.payload, manifest.problems(root)
-        if problems:
-            raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
+        payload = manifest.payload
+        _check_files(root, manifest)
         schema = payload.get("schema")
         if isinstance(schema, int) and schema < SCHEMA:
             raise InputError(
@@ -177,11 +176,12 @@ class Store:
         for name in stages:
             folder = root / STAGES / name
             maps.scenes.append(read_record(folder))
-            kept = folder / "memory.safetensors"
-            keyframes = Keyframes.from_tensors(load_tensors(kept)) if kept.exists() else None
-            maps.keyframes.append(keyframes)
-            state = folder / "notes.safetensors"
-            maps.method_states.append(load_tensors(state) if state.exists() else {})
+            kept, state = (
+                load_tensors(folder / file) if f"{STAGES}/{name}/{file}" in manifest.files else {}
+                for file in MEMORY_FILES
+            )
+            maps.keyframes.append(Keyframes.from_tensors(kept) if kept else None)
+            maps.method_states.append(state)
             if f"{STAGES}/{name}/{HEAD}" in manifest.files:
                 maps.heads.append(read_head(folder, maps.encoder.width))
         return cls(root, maps, stages, (local, descriptor, *centroids))
@@ -262,7 +262,7 @@ class Store:
             record: its new record.
 
         Raises:
-            InputError: as `writing`.
+            InputError: as `writing`, and where a file is missing or was changed.
         """
         index = [known.name for known in self.maps.scenes].index(scene)
         old = self.stages[index]
@@ -271,6 +271,7 @@ class Store:
         new = f"{number}-{plain}~{int(version or 1) + 1}"
         with self.writing() as before:
             assert before is not None, "a store with stages has a manifest"
+            _check_files(self.root, before)  # copies are listed with checksums of their own
             folder = self._fresh(new)
             for file in STAGE_FILES:
                 if f"{STAGES}/{old}/{file}" in before.files:
@@ -409,6 +410,12 @@ class Store:
         sizes = {file: file.stat().st_size for file in files if file.exists()}
         memory = sum(size for file, size in sizes.items() if file.name in MEMORY_FILES)
         return {"memory": memory, "rest": sum(sizes.values()) - memory}
+
+
+def _check_files(root: Path, manifest: Manifest) -> None:
+    problems = manifest.problems(root)
+    if problems:
+        raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
 
 
 def _free(root: Path) -> bool:
