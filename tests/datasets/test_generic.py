@@ -2,12 +2,14 @@
 
 import dataclasses
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from evercal.datasets import Frame, Scene, generic, load_scene
+from evercal.datasets.images import write_image
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 
@@ -94,6 +96,46 @@ def test_the_writer_neither_overwrites_nor_repeats(tmp_path: Path) -> None:
         writer.add(scene.train[0], "train")
         with pytest.raises(InputError, match="'shot/0': already written"):
             writer.add(scene.train[0], "test")
+
+
+def numbered(folder: Path, count: int) -> Scene:
+    """Images that show their number, as files."""
+    folder.mkdir(parents=True)
+    frames = []
+    for i in range(count):
+        path = folder / f"{i:06d}.png"
+        write_image(path, np.full((3, 4, 3), i, np.uint8))
+        frames.append(Frame(str(i), path, Camera(4, 3, 4.0, 4.0, 1.5, 1.0), SE3.identity()))
+    return Scene("x", tuple(frames), ())
+
+
+def shown(scene: Scene) -> list[int]:
+    return [int(frame.read_image()[0, 0, 0]) for frame in scene.train]
+
+
+def test_images_of_the_source_are_never_written_to(tmp_path: Path) -> None:
+    scene = numbered(tmp_path / "source" / "images", 4)
+    fewer = replace(scene, train=scene.train[::2])
+    # In place, where image 1 would become image 2.
+    with pytest.raises(InputError, match=r"000001\.png: already there; give a new folder"):
+        generic.write(tmp_path / "source", fewer)
+    # Through hard links that an earlier copy left, whether its scene.json was removed ...
+    out = tmp_path / "out"
+    generic.write(out, scene, link=True)
+    (out / generic.FILE).unlink()
+    for _ in range(2):  # a refusal leaves nothing that would allow it afterwards
+        with pytest.raises(InputError, match=r"000001\.png: already there"):
+            generic.write(out, fewer)
+    # ... or it was cut off; then what it left is replaced.
+    other = tmp_path / "other"
+    writer = generic.SceneWriter(other, "x", link=True)
+    for frame in scene.train:
+        writer.add(frame, "train")
+    generic.write(other, fewer)
+    assert shown(generic.load(other)) == [0, 2]
+    assert shown(scene) == [0, 1, 2, 3]
+    assert {path.name for path in other.iterdir()} == {"images", "scene.json"}
+    assert not [path for path in (other / "images").iterdir() if path.name.startswith(".")]
 
 
 def test_unknown_keys_are_passed_over(tmp_path: Path) -> None:

@@ -34,6 +34,8 @@ from evercal.storage import write_json
 FILE = "scene.json"
 _FORMAT = "evercal-scene"
 _VERSION = 1
+_BEGUN = ".unfinished"
+"""Lies in a folder while it is written, and stays when the writer is cut off."""
 
 
 def detect(root: Path) -> bool:
@@ -116,7 +118,7 @@ class SceneWriter:
         link: Whether image files are hard links where the disk allows them.
 
     Raises:
-        InputError: `root` already holds a scene.
+        InputError: `root` already holds a scene; and from `add`, an image that is none of ours.
     """
 
     def __init__(self, root: str | os.PathLike[str], name: str, link: bool = False) -> None:
@@ -130,8 +132,12 @@ class SceneWriter:
         self._frames: list[dict[str, object]] = []
         self._names: set[str] = set()
         if (self._root / FILE).exists():
-            raise InputError(f"{self._root / FILE}: already there; give a new folder or remove it")
+            raise InputError(
+                f"{self._root / FILE}: already there; give a new folder, or remove the whole folder"
+            )
         (self._root / "images").mkdir(parents=True, exist_ok=True)
+        self._begun = self._root / _BEGUN
+        self._goes_on = self._begun.exists()
 
     def __enter__(self) -> Self:
         """Nothing to open: the folder was made with the writer."""
@@ -183,10 +189,11 @@ class SceneWriter:
             return relative
         stored = frame.image.file() if isinstance(frame.image, StoredImage) else None
         if stored is None:
-            write_image(self._root / f"{stem}.png", frame.read_image())
+            image = frame.read_image()
+            self._put(f"{stem}.png", lambda path: write_image(path, image))
             return f"{stem}.png"
         ending, content = stored
-        (self._root / f"{stem}{ending}").write_bytes(content)
+        self._put(f"{stem}{ending}", lambda path: path.write_bytes(content))
         return f"{stem}{ending}"
 
     def _copy(self, source: Path, relative: str) -> None:
@@ -196,11 +203,31 @@ class SceneWriter:
             return
         try:
             # A link through a link would point to nothing once the folder moves.
-            if self._link and not target.exists() and self._linked(source.resolve(), target):
-                return
-            shutil.copyfile(source, target)
+            self._put(
+                relative,
+                lambda path: (
+                    (self._link and self._linked(source.resolve(), path))
+                    or shutil.copyfile(source, path)
+                ),
+            )
         except OSError as error:
             raise InputError(f"{source}: cannot be copied ({error.strerror})") from None
+
+    def _put(self, relative: str, write: Callable[[Path], object]) -> None:
+        """Writes a file beside its place and moves it there, so no hard link is written through.
+
+        Raises:
+            InputError: A file lies there that is not left from a recording that was cut off.
+        """
+        target = self._root / relative
+        if target.exists() and not self._goes_on:
+            self._begun.unlink(missing_ok=True)
+            raise InputError(f"{target}: already there; give a new folder")
+        self._begun.touch()
+        beside = target.with_name(f".{target.name}")
+        beside.unlink(missing_ok=True)
+        write(beside)
+        beside.replace(target)
 
     @staticmethod
     def _linked(source: Path, target: Path) -> bool:
@@ -226,6 +253,7 @@ class SceneWriter:
         if self.render is not None:
             data["render"] = self.render
         write_json(self._root / FILE, data)
+        self._begun.unlink(missing_ok=True)
 
 
 def pose_to_dict(pose: SE3 | None) -> dict[str, object] | None:
