@@ -152,21 +152,23 @@ class SceneMap:
     def adjusted_frames(self, frames: Sequence[Frame]) -> list[Frame]:
         """Frames of the recording as the map sees them, without those whose pose is wrong.
 
-        Poses are corrected by what is common to all frames or to those nearby, and the lens is the
-        adjusted one, so that a network learns the same points as the landmarks.
+        Poses are corrected by the shift in time and by what is common to all frames or to those
+        nearby, and the lens is the adjusted one, so that a network learns the same points as the
+        landmarks.
 
         Args:
-            frames: posed frames that the map was built from, and others of the same recording.
+            frames: the posed frames that the map was built from, in recorded order.
         """
         common = self.hand_eye.start_camera_from_camera if self.hand_eye else self.common
+        moved = SE3.exp(self.adjusted.time_shift_frames * _velocity(frames))
+        poses = known_poses(frames) @ moved
         nominal, found = frames[0].camera, []
-        for frame in frames:
-            stated = frame.base_from_camera
-            if stated is None or frame.name in self.adjusted.wrong_poses:
+        for i, frame in enumerate(frames):
+            if frame.name in self.adjusted.wrong_poses:
                 continue
-            pose = stated @ common
+            pose = poses[i] @ common
             if self.bend is not None:
-                pose = pose @ SE3.exp(self.bend.at(stated))
+                pose = pose @ SE3.exp(self.bend.at(poses[i]))
             camera = self.camera if frame.camera == nominal else frame.camera
             found.append(replace(frame, base_from_camera=pose, camera=camera))
         return found
@@ -243,7 +245,8 @@ def map_steps(
             "no two training frames see the same surfaces under parallax: record views from at"
             " least 10 cm apart, or check that the stated poses belong to these images"
         )
-    velocity = _velocity(frames, recording)
+    place = {frame.name: i for i, frame in enumerate(frames)}
+    velocity = _velocity(frames)[[place[frame.name] for frame in recording.frames]]
     adjustment = None
     if options.adjust:
         adjustment = yield from _adjust(recording, keyframes, velocity, options)
@@ -282,22 +285,21 @@ def spread_frames(frames: Sequence[Frame], capacity: int) -> NDArray[np.int64]:
     return spread_poses(known_poses(frames), capacity)
 
 
-def _velocity(frames: Sequence[Frame], recording: Recording) -> np.ndarray:
+def _velocity(frames: Sequence[Frame]) -> np.ndarray:
     """(n, 6) motion a frame, camera frame, where the frames before and after are its neighbours.
 
     Jumps of the recording (blocks left out) are told by steps much longer than the median one.
     """
     poses = known_poses(frames)
     if len(frames) < 3:
-        return np.zeros((len(recording), 6))
+        return np.zeros((len(frames), 6))
     steps = (poses[:-1].inverse() @ poses[1:]).log()
     size = np.linalg.norm(steps, axis=1)
     smooth = size < 4 * np.median(size) + 1e-9
     velocity = np.zeros((len(frames), 6))
     both = smooth[:-1] & smooth[1:]
     velocity[1:-1][both] = (steps[:-1][both] + steps[1:][both]) / 2
-    place = {frame.name: i for i, frame in enumerate(frames)}
-    return velocity[[place[frame.name] for frame in recording.frames]]
+    return velocity
 
 
 def _adjust(
