@@ -27,6 +27,7 @@ from evercal.localization import acceptance
 from evercal.localization.acceptance import MAX_SUPPORT, MIN_SUPPORT
 from evercal.localization.localizer import Localizer
 from evercal.mapping.build import Mapping
+from evercal.mapping.scene_maps import Alignment
 from evercal.mapping.stage_files import head_bytes
 from evercal.mapping.store import Checkpoint, Store
 from evercal.networks.trainer import Progress
@@ -205,6 +206,24 @@ def test_an_interrupted_scene_goes_on_where_it_stopped(
         steps = [event.step for event in events if isinstance(event, Progress)]
         assert steps[0] == (number + 1 if kind == "trainer" else 1)
     assert learned(store) == learned(taught.root)
+
+
+def test_aligning_an_earlier_scene_does_not_begin_the_newest_anew(
+    taught: Taught,
+    rooms: Rooms,
+    options: LearnOptions,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
+    store = tmp_path / "store"
+    learn_scene(store, rooms[0], options)
+    with pytest.raises(Stop):
+        learn_scene(store, rooms[1], options, stop_at("rows", 1))
+    opened = Store.open(store)
+    aligned = replace(opened.maps.scenes[0], alignment=Alignment(SE3.exp([1.0, 2, 3, 0, 0, 0])))
+    opened.replace_record("alpha", aligned)
+    assert learn_scene(store, rooms[1], options).resumed
 
 
 def test_a_second_learner_is_kept_out(

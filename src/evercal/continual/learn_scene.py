@@ -225,7 +225,8 @@ def _identity(opened: Store, scene: Scene, options: LearnOptions) -> dict[str, o
         module = getattr(opened.maps, kind)
         assert isinstance(module, torch.nn.Module)
         networks.update(network_bytes(module, kind))
-    stages = list(opened.stages)
+    # Another version of a stage is the same scene, laid elsewhere by `evercal align`.
+    stages = [name.partition("~")[0] for name in opened.stages]
     return {
         "scene": scene.name,
         "networks": networks.hexdigest(),
