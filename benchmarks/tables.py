@@ -172,8 +172,8 @@ def _accuracy(sources: Sequence[Published], what: str) -> str:
             frames = _column(of, "frames")
             shares = [_share(np.average(_column(of, b), weights=frames)) for b in BOUNDS]
             counts = [f"{_column(of, key).sum():.0f}" for key in ("wrong_scene", "refused")]
-            inside = f"{np.average(_column(of, 'inside_95'), weights=frames):.0f} %"
-            table.append([title, f"{frames.sum():.0f}", *shares, _median(of), *counts, inside])
+            cells = [f"{frames.sum():.0f}", *shares, _median(of), *counts, _inside(of)]
+            table.append([title, *cells])
     return _markdown(table)
 
 
@@ -190,8 +190,7 @@ def _spoiled(sources: Sequence[Published], what: str) -> str:
     for title, of, times in [*parts, ("after a change in the room", changed, 1)]:
         shares = [_share(_column(of, bound).mean()) for bound in BOUNDS[2:]]
         refused, frames = (times * _column(of, key).sum() for key in ("refused", "frames"))
-        inside = f"{_column(of, 'inside_95').mean():.0f} %"
-        cells = [*shares, _median(of), f"{refused:.0f} of {frames:.0f}", inside]
+        cells = [*shares, _median(of), f"{refused:.0f} of {frames:.0f}", _inside(of)]
         table.append([title, *cells])
     return _markdown(table)
 
@@ -303,6 +302,14 @@ def _markdown(rows: TableRows) -> str:
 
 def _column(rows: Sequence[Row], key: str) -> np.ndarray:
     return np.array([np.nan if row[key] is None else row[key] for row in rows], dtype=float)
+
+
+def _inside(rows: Sequence[Row]) -> str:
+    """Per cent of all poses in the right scene that lie in their ellipsoid; "-" without any."""
+    poses = _column(rows, "frames") - _column(rows, "wrong_scene") - _column(rows, "refused")
+    if not (some := poses > 0).any():
+        return "-"
+    return f"{np.average(_column(rows, 'inside_95')[some], weights=poses[some]):.0f} %"
 
 
 def _share(percent: float) -> str:

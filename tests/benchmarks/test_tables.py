@@ -192,3 +192,19 @@ def test_a_learning_curve_has_a_row_for_each_number_of_steps(tmp_path: Path) -> 
     # Of 20 frames 3.5 and 4 are right with 600 steps, 15.5 and 16 with 9,600.
     assert "| 600 | er | 18.8 |" in made
     assert "| 9,600 | er | 78.8 |" in made
+
+
+def test_ellipsoids_weigh_by_the_poses_that_state_them(tmp_path: Path) -> None:
+    """A room with 39 poses and one with a single pose; one of which all frames were refused."""
+    told = (("a", 0, 0, 90.0), ("b", 36, 2, 0.0), ("c", 39, 0, float("nan")))
+    rows = [
+        {"scene": name, "frames": 39, "refused": refused, "wrong_scene": wrong, "inside_95": inside}
+        | dict.fromkeys((*tables.BOUNDS, "median_mm", "median_deg"), 50.0)
+        for name, refused, wrong, inside in told
+    ]
+    (tmp_path / "rows.json").write_text(json.dumps({"rows": rows}))
+    groups = {"both": ("a", "b"), "all": ("a", "b", "c"), "none": ("c",)}
+    publish(tmp_path / "rows.json", "rooms", groups, out=tmp_path)
+    made = tables.regenerated("<!-- table: rooms accuracy -->\n<!-- end -->\n", tmp_path)
+    inside = [line.split(" | ")[-1] for line in made.splitlines()[3:-1]]
+    assert inside == ["88 % |", "88 % |", "- |"]
