@@ -197,7 +197,13 @@ def calibration(
     run(what, rooms, out, draws, store)
 
 
-def crowd(store: Path, scenes: tuple[Path, ...], keyframes: int = 10_000, rooms: int = 10) -> None:
+def crowd(
+    store: Path,
+    scenes: tuple[Path, ...],
+    keyframes: int = 10_000,
+    rooms: int = 10,
+    out: Path = Path("runs/crowd.json"),
+) -> None:
     """Locates test frames of a store's scenes among thousands of keyframes of other rooms.
 
     Args:
@@ -205,10 +211,11 @@ def crowd(store: Path, scenes: tuple[Path, ...], keyframes: int = 10_000, rooms:
         scenes: their folders.
         keyframes: of the crowd.
         rooms: that they are shared out over.
+        out: the row of results, JSON; must not exist yet.
     """
     from benchmarks.crowd import run
 
-    run(store, scenes, keyframes, rooms)
+    run(store, scenes, keyframes, rooms, out)
 
 
 def handeye(trials: int = 1000, thorough: bool = False) -> None:
@@ -243,7 +250,7 @@ def publish(
     """Puts the numbers of a measurement into results/NAME.jsonl, for `tables`.
 
     Args:
-        source: a folder of `evercal bench`, or rows in JSON from maps, calibration or peers.
+        source: a folder of `evercal bench`, or rows in JSON from maps, crowd, calibration or peers.
         name: of the file.
         groups: rows that a table takes together, each TITLE=ROW,ROW.
         note: what a reader must know besides.

@@ -1,14 +1,11 @@
 """The first steps of preset `paper`: its shapes, memory, loss and seconds on this machine."""
 
 import json
-import resource
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
+from benchmarks.peak_memory import peak_gb
 from evercal.benchmark.suites import load_suite
 from evercal.continual.learn import learn
 from evercal.continual.learn_scene import validation_split
@@ -50,17 +47,10 @@ def run(suite: str, data: Path | None, steps: int, device: str, out: Path) -> No
             "within_5_px": round(100 * event.inlier_share, 2),
             "seconds_a_step": round((time.perf_counter() - began) / event.step, 2),
             "processor_seconds_a_step": round((time.process_time() - spent) / event.step, 2),
-            "peak_gb": round(_peak_gb(maps.device), 2),
+            "peak_gb": round(peak_gb(maps.device), 2),
         }
         print(json.dumps(told), flush=True)
         with open(out, "a", encoding="utf-8") as file:
             file.write(json.dumps(told) + "\n")
         if event.step >= steps:
             return
-
-
-def _peak_gb(device: torch.device) -> float:
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device) / 1e9
-    unit = 1 if sys.platform == "darwin" else 1000
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
