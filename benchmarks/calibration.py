@@ -111,11 +111,11 @@ def fixed(rooms: Sequence[Path], store: Path, draws: int) -> list[dict[str, obje
 
 
 def bumps(rooms: Sequence[Path], store: Path, draws: int) -> list[dict[str, object]]:
-    """Five images of a camera against its reference from 25 others or the same spot.
+    """Five images of a camera against its reference from all others that it took.
 
-    The rendered bump is 5 mm. Smaller ones come from moving the reference instead of the camera: a
-    reference that states a pose 2 mm or 0.1 deg off is what a camera looks like that was moved by
-    as much. False alarms come from five images of the unmoved camera that the reference never saw.
+    Bumps come from moving the reference instead of the camera: a reference that states a pose 2 mm
+    or 0.1 deg off is what a camera looks like that was moved by as much. False alarms come from
+    five images of the unmoved camera that the reference never saw.
     """
     localizer, rows = Localizer.open(store), []
     for room in tqdm(rooms, "rooms"):

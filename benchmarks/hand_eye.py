@@ -12,10 +12,8 @@ from evercal.calibration.calibration import Mount
 from evercal.calibration.closed_form import daniilidis, motions, park, shah
 from evercal.calibration.pairs import PosePairs
 from evercal.calibration.solve import solve
-from evercal.geometry import SE3, pose_distance
-
-CHI2_6 = 12.592
-"""95 % quantile for six dimensions."""
+from evercal.evaluation.metrics import share_inside
+from evercal.geometry import SE3, pose_distance, squared_mahalanobis
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,7 @@ def error(found: SE3, truth: SE3) -> np.ndarray:
 
 def trials(setting: Setting, count: int, first_seed: int = 0) -> dict[str, float]:
     """What many recordings of one setting give."""
-    mm, deg, inside, named, ms, scale = [], [], [], [], [], []
+    mm, deg, squared, named, ms, scale = [], [], [], [], [], []
     for seed in range(first_seed, first_seed + count):
         drawn = recording(setting, seed)
         began = time.process_time()
@@ -123,7 +121,9 @@ def trials(setting: Setting, count: int, first_seed: int = 0) -> dict[str, float
         off = error(found.parent_from_child, drawn.parent_from_camera)
         mm.append(1000 * np.linalg.norm(off[:3]))
         deg.append(np.rad2deg(np.linalg.norm(off[3:])))
-        inside.append(off @ np.linalg.solve(found.covariance, off) < CHI2_6)
+        squared.append(
+            squared_mahalanobis(found.parent_from_child, found.covariance, drawn.parent_from_camera)
+        )
         left_out = tuple(i for i, image in enumerate(found.images) if not image.used)
         named.append(left_out == drawn.spoiled)
         if setting.scale is not None:
@@ -132,7 +132,7 @@ def trials(setting: Setting, count: int, first_seed: int = 0) -> dict[str, float
         "median mm": float(np.median(mm)),
         "median deg": float(np.median(deg)),
         "largest mm": float(max(mm)),
-        "inside 95 %": 100 * float(np.mean(inside)),
+        "inside 95 %": share_inside(squared),
         "outliers exactly": 100 * float(np.mean(named)),
         "scale off %": float(max(scale)) if scale else float("nan"),
         "median ms": float(np.median(ms)),
