@@ -18,7 +18,7 @@ from evercal.continual.learn_scene import LearnOptions, learn_scene
 from evercal.continual.presets import preset
 from evercal.datasets import Scene, load_scene
 from evercal.errors import InputError
-from evercal.evaluation.metrics import CHI2_6
+from evercal.evaluation.metrics import share_inside
 from evercal.geometry import SE3, pose_distance, squared_mahalanobis
 from evercal.localization.localizer import Localizer
 from evercal.simulation.mini import FOLDER
@@ -195,22 +195,28 @@ def _short(row: dict[str, object]) -> dict[str, object]:
 
 
 def _summary(rows: Sequence[dict[str, object]]) -> None:
-    """Medians, worst cases and ellipsoids; of bumps the rates."""
+    """Medians, worst cases and ellipsoids by the number of images; of bumps the rates."""
     if "kind" in rows[0]:
         for kind in dict.fromkeys(row["kind"] for row in rows):
             of_kind = [row for row in rows if row["kind"] == kind]
             rate = 100 * np.mean([bool(row["moved"]) for row in of_kind])
             print(f"{kind}: moved in {rate:.1f} % of {len(of_kind)} trials")
         return
-    for prefix in ("", "fixed_"):
-        if f"{prefix}mm" not in rows[0]:
-            continue
-        mm, deg, m2 = (
-            np.array([float(str(row[f"{prefix}{key}"])) for row in rows])
-            for key in ("mm", "deg", "squared_mahalanobis")
-        )
-        print(
-            f"{prefix or 'camera '}: {len(mm)} trials, median {np.median(mm):.2f} mm and"
-            f" {np.median(deg):.3f} deg, worst {mm.max():.2f} mm and {deg.max():.3f} deg,"
-            f" {100 * np.mean(m2 < CHI2_6):.1f} % inside the 95 % ellipsoid"
-        )
+    for count in dict.fromkeys(row.get("images") for row in rows):
+        some = [row for row in rows if row.get("images") == count]
+        title = "camera" if count is None else f"camera, {count} images"
+        _print_errors(title, "", some)
+        if "fixed_mm" in some[0]:
+            _print_errors("fixed camera in that map", "fixed_", some)
+
+
+def _print_errors(title: str, prefix: str, rows: Sequence[dict[str, object]]) -> None:
+    mm, deg, m2 = (
+        np.array([float(str(row[f"{prefix}{key}"])) for row in rows])
+        for key in ("mm", "deg", "squared_mahalanobis")
+    )
+    print(
+        f"{title}: {len(mm)} trials, median {np.median(mm):.2f} mm and {np.median(deg):.3f} deg,"
+        f" worst {mm.max():.2f} mm and {deg.max():.3f} deg, {share_inside(m2):.1f} % inside the"
+        f" 95 % ellipsoid"
+    )
