@@ -90,23 +90,24 @@ def _bound(metres: float, degrees: float) -> str:
 
 def sequence(scenes: Sequence[Scene], out: Path, memory: float) -> list[dict[str, object]]:
     """Learns scenes in turn; every scene just after it was learned, and all at the end."""
-    store, rows, first = out / "store.evercal", [], {}
+    store, rows, first, before = out / "store.evercal", [], {}, 0
     for scene in tqdm(scenes, "learning", unit="scene"):
         report = learned(store, [scene], memory)[0]
         localizer = Localizer.open(store)
         first[scene.name] = errors(localizer, posed(scene.test), scene.name)
         first[scene.name]["seconds"] = report.seconds
-        first[scene.name]["bytes"] = report.memory_bytes
+        first[scene.name]["bytes"] = report.memory_bytes - before  # it counts all scenes
+        before = report.memory_bytes
     localizer = Localizer.open(store)
     for scene in tqdm(scenes, "evaluating", unit="scene"):
         row = errors(localizer, posed(scene.test), scene.name)
-        before = first[scene.name]
+        new = first[scene.name]
         rows.append(
             row
             | {
-                "forgotten_1cm": float(str(before["1 cm/1 deg"])) - float(str(row["1 cm/1 deg"])),
-                "seconds": before["seconds"],
-                "bytes": before["bytes"],
+                "forgotten_1cm": float(str(new["1 cm/1 deg"])) - float(str(row["1 cm/1 deg"])),
+                "seconds": new["seconds"],
+                "bytes": new["bytes"],
             }
         )
     rows.append(_mean("mean", rows))

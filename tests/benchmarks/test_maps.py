@@ -70,6 +70,18 @@ def test_the_share_of_keyframes_is_used_and_written(
     assert read_published(publish(source, what, {}, out=tmp_path)).rows
 
 
+def test_a_scene_of_a_sequence_counts_its_own_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A report counts those of all scenes of the store."""
+    reports = [SimpleNamespace(seconds=1.0, memory_bytes=n) for n in (300, 500, 900)]
+    monkeypatch.setattr(maps, "learn_scene", lambda *_: reports.pop(0))
+    monkeypatch.setattr(maps.Localizer, "open", lambda *_: Answers([0.001] * 10, 0.01))
+    scenes = [Scene(name, frames(3), frames(1)) for name in ("room", "hall", "attic")]
+    rows = maps.sequence(scenes, tmp_path, 0.1)
+    assert [row["bytes"] for row in rows] == [300, 200, 400, 300]
+
+
 def test_strangers_without_images_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
