@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
-from benchmarks.intervals import METHODS, Errors, coverage
+from benchmarks.intervals import METHODS, NOW, Errors, coverage, plain_students, students
 from evercal.evaluation import Interval, frame_pieces, mean_interval, paired_difference
-from evercal.evaluation.statistics import blocks
+from evercal.evaluation.statistics import _of_pieces, blocks
 
-NOW, BEFORE = "whole runs, Student's (now)", "blocks of ten, percentiles (before)"
+FIRST = "blocks of ten, percentiles (at first)"
 
 
 def numbered(*starts: int, frames: int = 40, step: int = 1) -> list[str]:
@@ -36,7 +36,7 @@ def test_runs_of_frames_are_found_by_sequence_and_number() -> None:
 def test_one_run_is_cut_into_blocks() -> None:
     assert lengths(numbered(0, frames=39)) == [13, 13, 13]
     assert lengths(numbered(0, frames=39, step=7)) == [13, 13, 13]
-    assert lengths(numbered(0, frames=1000)) == [50] * 20
+    assert lengths(numbered(0, frames=300)) == [38, 37, 38, 37, 38, 37, 38, 37]
     assert lengths([f"view {'abc'[i % 3]}" for i in range(25)]) == [13, 12]
     assert lengths([f"seq-{i:02d}/frame-000000" for i in range(25)]) == [13, 12]
     assert lengths(numbered(0, frames=5)) == [3, 2]
@@ -46,10 +46,10 @@ def test_one_run_is_cut_into_blocks() -> None:
 
 @pytest.mark.parametrize("runs", [2, 4])
 def test_bounds_hold_the_truth_about_as_often_as_they_say(runs: int) -> None:
-    held, _ = coverage(Errors(), runs, 300, METHODS[NOW])
+    held, _ = coverage(Errors(), (40,) * runs, 300, METHODS[NOW])
     assert held >= 92
     # What the audit found of blocks of ten: 80 to 92 %.
-    before, _ = coverage(Errors(), runs, 100, METHODS[BEFORE])
+    before, _ = coverage(Errors(), (40,) * runs, 100, METHODS[FIRST])
     assert before < 90
 
 
@@ -57,8 +57,21 @@ def test_bounds_hold_the_truth_about_as_often_as_they_say(runs: int) -> None:
 @pytest.mark.parametrize("seeds", [1, 3])
 @pytest.mark.parametrize("runs", [2, 4, 8, 12])
 def test_coverage_at_every_number_of_runs(runs: int, seeds: int) -> None:
-    assert coverage(Errors(seeds=seeds), runs, 1000, METHODS[NOW])[0] >= 93
-    assert coverage(Errors(seeds=seeds), runs, 200, METHODS[BEFORE])[0] < 90
+    assert coverage(Errors(seeds=seeds), (40,) * runs, 1000, METHODS[NOW])[0] >= 93
+    assert coverage(Errors(seeds=seeds), (40,) * runs, 200, METHODS[FIRST])[0] < 90
+
+
+@pytest.mark.parametrize("lengths", [(100, 20, 20, 20), (140, 20), (100, *(10,) * 6)])
+def test_a_long_run_beside_short_ones_is_not_taken_for_many(lengths: tuple[int, ...]) -> None:
+    assert coverage(Errors(), lengths, 300, students)[0] >= 92
+    assert coverage(Errors(), lengths, 300, plain_students)[0] < 92
+
+
+def test_one_long_run_is_cut_into_few_blocks() -> None:
+    errors = Errors(lasting=0.0)
+    held, _ = coverage(errors, (300,), 300, students)
+    assert held > coverage(errors, (300,), 300, plain_students)[0] + 2
+    assert held >= 89
 
 
 def test_pieces_of_equal_length_give_the_t_interval_of_their_means() -> None:
@@ -79,10 +92,22 @@ def test_seeds_alone_give_the_t_interval_of_theirs() -> None:
 def test_pieces_weigh_by_their_frames() -> None:
     """Two pieces of 30 and 10 frames, all right and all wrong: a ratio of sums, by hand."""
     found = mean_interval(np.arange(40) < 30, [np.arange(40) >= 30])
-    # Each piece is 30 * 0.25 / 40 from its expected part; twice the squares' sum, one freedom.
-    deviation = np.sqrt(2 * 2 * 0.1875**2)
+    # Each piece is 30 * 0.25 / 40 from its expected part, a share of 3/4 and 1/4; one freedom.
+    deviation = 0.1875 * np.sqrt(1 / 0.25 + 1 / 0.75)
     assert found.mean == 0.75
     assert found.high - found.mean == pytest.approx(t.ppf(0.975, 1) * deviation)
+
+
+def test_the_variance_that_pieces_give_and_its_degrees_of_freedom() -> None:
+    """Unbiased for independent frames; Satterthwaite's freedom where pieces vary alike."""
+    labels, rng = np.repeat(np.arange(4), [50, 10, 10, 10]), np.random.default_rng(1)
+    apart = [_of_pieces(rng.normal(size=80), labels)[0] for _ in range(10_000)]
+    assert np.mean(apart) == pytest.approx(1 / 80, rel=0.05)
+    alike = [_of_pieces(rng.normal(size=4)[labels], labels) for _ in range(10_000)]
+    variance, freedom = np.array(alike).T
+    # That of a multiple of chi square: twice its squared mean by its variance.
+    assert freedom[0] == pytest.approx(2 * variance.mean() ** 2 / variance.var(), rel=0.05)
+    assert freedom[0] < 1.5
 
 
 def test_for_independent_frames_the_width_is_that_of_the_binomial() -> None:

@@ -3,12 +3,16 @@
 Neighbouring frames of a recording see nearly the same, so they are right or wrong together and
 count for less than as many independent ones. What counts is how many pieces of recording there are:
 whole runs of consecutive frames or, where a scene was recorded in one go, long blocks of it (batch
-means; Schmeiser, Batch Size Effects in the Analysis of Simulation Output, Oper. Res. 1982). Pieces
-are few, often four a scene, and the bootstrap of few things is too narrow. So bounds are Student's,
-with the degrees of freedom of Satterthwaite (An Approximate Distribution of Estimates of Variance
-Components, Biometrics 1946). `python -m benchmarks intervals` measures how often such bounds hold.
+means; Flegal and Jones, Batch Means and Spectral Variance Estimators in MCMC, Ann. Stat. 2010).
+Such blocks tell how much that one path says; what another path would say nobody can know from it.
+Pieces are few, often four a scene, and the bootstrap of few things is too narrow. So bounds are
+Student's, from the cluster-robust variance CR2 of Bell and McCaffrey (Bias Reduction in Standard
+Errors for Linear Regression with Multi-Stage Samples, Surv. Methodol. 2002), with the degrees of
+freedom of Satterthwaite: a long run beside short ones counts for more than one piece of many.
+`python -m benchmarks intervals` measures how often such bounds hold.
 """
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,8 +23,6 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
-SHORTEST_BLOCK, MOST_BLOCKS = 10, 20
-"""A recording in one go is cut into blocks of ten frames or more, and into twenty at most."""
 LARGEST_STEP = 10
 """A run goes on over a gap of fewer frames than this: a tracker may have lost some."""
 
@@ -41,8 +43,7 @@ def frame_pieces(names: Sequence[str]) -> Labels:
     changes (`seq-03/frame-000039`, `seq-08/frame-000000`), where the number falls, and where it
     steps over ten frames or more; the usual step of the recording counts as one, so that every
     fifth frame of a path is still one run. A scene with a single run, whose frames all stand
-    alone or whose names hold no numbers is cut into blocks of neighbouring frames of equal length,
-    at least ten frames each and at most twenty of them.
+    alone or whose names hold no numbers is cut into `blocks` of neighbouring frames.
 
     Args:
         names: of one scene's frames, in recorded order.
@@ -66,9 +67,11 @@ def frame_pieces(names: Sequence[str]) -> Labels:
 def blocks(frames: int) -> Labels:
     """(frames,) labels of blocks of neighbouring frames, as `frame_pieces` cuts a single run.
 
-    Fewer than twenty frames are cut in two.
+    Their length and their number grow with the root of the frames, so that ends which are alike
+    matter less in longer recordings: 39 frames make three blocks, 300 make eight. There are two at
+    least.
     """
-    count = min(max(frames // SHORTEST_BLOCK, 2), MOST_BLOCKS)
+    count = max(math.isqrt(frames) // 2, 2)
     return np.arange(frames, dtype=np.int64) * count // max(frames, 1)
 
 
@@ -144,9 +147,8 @@ def _half_width(scenes: Sequence[Array], labels: Sequence[Labels]) -> float:
     # (variance, degrees of freedom) that pieces of each scene, and runs, add to the mean.
     parts = []
     for rows, of in zip(scenes, labels, strict=True):
-        shares = _shares(rows.mean(axis=0), of)
-        spread = len(shares) / (len(shares) - 1) * float((shares**2).sum())
-        parts.append((spread / len(scenes) ** 2, len(shares) - 1))
+        spread, freedom = _of_pieces(rows.mean(axis=0), of)
+        parts.append((spread / len(scenes) ** 2, freedom))
     runs = len(scenes[0])
     if runs > 1:
         means = np.mean([rows.mean(axis=1) for rows in scenes], axis=0)
@@ -158,11 +160,23 @@ def _half_width(scenes: Sequence[Array], labels: Sequence[Labels]) -> float:
     return float(t.ppf(0.975, freedom)) * variance**0.5
 
 
-def _shares(values: Array, labels: Labels) -> Array:
-    """(pieces,) the sum over a piece of (frames,) values less their mean, by all frames."""
-    _, piece = np.unique(labels, return_inverse=True)
-    sums = np.bincount(piece, (values - values.mean()) / len(values))
-    return sums.astype(np.float64)
+def _of_pieces(values: Array, labels: Labels) -> tuple[float, float]:
+    """Variance (CR2) of the mean of (frames,) values in pieces, and its degrees of freedom.
+
+    Pieces of equal length give the variance of the mean of their means, and one degree less than
+    pieces. Otherwise a piece that makes up a share of all frames pulls the mean towards itself, by
+    which its residual is too small; CR2 makes up for it, in full where frames are independent. The
+    degrees of freedom are those of pieces whose means vary alike however long they are, as they do
+    where what makes a run easy or hard lasts for the whole run: few where one piece dominates.
+    """
+    _, piece, counts = np.unique(labels, return_inverse=True, return_counts=True)
+    share = counts / len(values)
+    residual = np.bincount(piece, values - values.mean()) / len(values)
+    spread = float((residual**2 / (1 - share)).sum())
+    weight = np.sqrt(share**2 / (1 - share))
+    products = np.eye(len(share)) - share[:, None] - share + (share**2).sum()
+    matrix = weight[:, None] * products * weight
+    return spread, float(np.trace(matrix) ** 2 / (matrix**2).sum())
 
 
 def _scenes(values: ArrayLike | Sequence[ArrayLike]) -> list[Array]:
