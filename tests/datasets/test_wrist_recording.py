@@ -11,7 +11,7 @@ import pytest
 from evercal.datasets import ReadOptions, Scene, load_scene, wrist_recording, write_image
 from evercal.datasets.pairing import pair_images
 from evercal.datasets.robot_poses import RobotPoses
-from evercal.datasets.row_files import in_seconds, natural_key
+from evercal.datasets.row_files import in_seconds, natural_key, times_in_names
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 
@@ -135,6 +135,35 @@ def test_frame_numbers_are_not_times() -> None:
     assert "in order" in notes[0]
     with pytest.raises(InputError, match=r"3 poses for 2 images.*stamps\.csv"):
         pair_images([Path("000001.png"), Path("000002.png")], rows, None, Path("p"))
+
+
+def test_frame_numbers_are_no_seconds_among_poses_from_zero() -> None:
+    # A robot's clock often starts at 0: frame 50 was not taken 50 s later.
+    stamps = np.arange(2001) / 10
+    rows = RobotPoses(None, stamps, SE3.exp(np.outer(stamps, [0.001, 0, 0, 0, 0, 0])))
+    for form in ("{:06d}.png", "{}.png", "20240115_{:06d}.png", "20240115{:06d}.png"):
+        images = [Path(form.format(i)) for i in range(100)]
+        with pytest.raises(InputError, match=r"2001 poses for 100 images.*stamps\.csv"):
+            pair_images(images, rows, None, Path("p"))
+
+
+def test_names_that_are_times_of_another_clock_are_refused() -> None:
+    rows = RobotPoses(None, np.arange(3.0), some_poses(3))
+    for names in (("9.25", "9.5", "9.75"), ("1700000000123", "1700000000223", "1700000000323")):
+        images = [Path(f"{name}.png") for name in names]
+        with pytest.raises(InputError, match="are the clocks the same"):
+            pair_images(images, rows, None, Path("p"))
+
+
+def test_times_in_names() -> None:
+    for names, times in (
+        (("1403636579763555584.png",), [1403636579.763556]),
+        (("rgb/1403636579763.jpg", "1403636579863"), [1403636579.763, 1403636579.863]),
+        (("10.png", "10.5"), [10.0, 10.5]),
+    ):
+        assert times_in_names(names) == pytest.approx(times, abs=1e-6)
+    for name in ("0000000123.png", "12.png", "frame-1.5.png", "-1.5.png", "1e3.png", "nan.png"):
+        assert times_in_names([name]) is None
 
 
 def test_images_outside_the_poses_times_have_none(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from evercal.datasets.pose_track import MAX_GAP_S, PoseTrack
 from evercal.datasets.robot_poses import RobotPoses, read_robot_poses
-from evercal.datasets.row_files import in_seconds
+from evercal.datasets.row_files import times_in_names
 from evercal.errors import InputError
 from evercal.geometry import SE3
 
@@ -38,7 +38,7 @@ def pair_images(
         return _by_name(images, rows.names, rows.poses, file)
     times = None
     if rows.stamps_s is not None:
-        times = _image_times(images, rows.stamps_s, stamps_s)
+        times = _image_times(images, stamps_s)
     if times is not None and rows.stamps_s is not None:
         return _by_time(times, PoseTrack(rows.stamps_s, rows.poses), file)
     if len(rows.poses) != len(images):
@@ -106,6 +106,7 @@ def _by_time(
         raise InputError(
             f"{file}: no image was taken while poses were recorded: images at {times.min():.3f} to"
             f" {times.max():.3f} s, poses at {first:.3f} to {last:.3f} s; are the clocks the same?"
+            f" If not, name the image of each row in a column image"
         )
     notes = [f"gripper poses were interpolated at the times of {_count(len(times), 'image')}"]
     if not known.all():
@@ -117,22 +118,16 @@ def _by_time(
 
 
 def _image_times(
-    images: Sequence[Path], poses_s: NDArray[np.float64], stamps_s: Mapping[str, float] | None
+    images: Sequence[Path], stamps_s: Mapping[str, float] | None
 ) -> NDArray[np.float64] | None:
-    """(n,) seconds; from the stamps file, else from names that lie among the poses' times."""
+    """(n,) seconds; from the stamps file, else from names that are times."""
     if stamps_s is not None:
         times = [stamps_s.get(i.name, stamps_s.get(i.stem)) for i in images]
         if None in times:
             missing = images[times.index(None)]
             raise InputError(f"{missing}: stamps.csv has no row for it; add one for every image")
         return np.array(times, dtype=np.float64)
-    try:
-        numbers = in_seconds([float(image.stem) for image in images])
-    except ValueError:
-        return None
-    # 000123 is a number and no time; times lie where the poses' times lie.
-    inside = (numbers > poses_s.min() - 1.0) & (numbers < poses_s.max() + 1.0)
-    return numbers if inside.mean() >= 0.5 else None
+    return times_in_names([image.name for image in images])
 
 
 def _count(number: int, what: str) -> str:

@@ -4,17 +4,20 @@ import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.datasets.images import IMAGE_ENDINGS
 from evercal.datasets.pose_header import is_number
 from evercal.errors import InputError
 
 NAME_COLUMNS = ("name", "image", "image_name", "file", "filename", "file_name", "frame")
 STAMP_COLUMNS = ("stamp", "stamp_s", "timestamp", "timestamp_s", "time", "time_s", "t", "t_s")
 STAMP_COLUMNS_NS = ("stamp_ns", "timestamp_ns", "time_ns", "t_ns")
+_EARLIEST_S, _LATEST_S = 1e9, 4e9
+"""The years 2001 and 2096, in seconds since 1970: between them lie the times of recordings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +106,26 @@ def in_seconds(stamps: NDArray[np.float64] | Sequence[float]) -> NDArray[np.floa
     middle = float(np.median(stamps)) if stamps.size else 0.0
     unit = next((u for size, u in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)) if middle > size), 1.0)
     return stamps * unit
+
+
+def times_in_names(names: Sequence[str]) -> NDArray[np.float64] | None:
+    """(n,) seconds that the names of images are; None where they are frame numbers or words.
+
+    Times have a decimal point, or count whole milli-, micro- or nanoseconds since 1970. Frame
+    numbers have neither, so 000123.png is no image taken at 123 s.
+    """
+    stems = [without_ending(name) for name in names]
+    if not stems or not all(re.fullmatch(r"\d+(\.\d+)?", stem) for stem in stems):
+        return None
+    times = in_seconds([float(stem) for stem in stems])
+    since_1970 = ((times > _EARLIEST_S) & (times < _LATEST_S)).all()
+    return times if since_1970 or any("." in stem for stem in stems) else None
+
+
+def without_ending(name: str) -> str:
+    """The name of an image without its folder and ending; what follows the point of 12.5 stays."""
+    path = PurePath(name)
+    return path.stem if path.suffix.lower() in IMAGE_ENDINGS else path.name
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
