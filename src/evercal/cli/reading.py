@@ -22,6 +22,8 @@ class Reading:
     or ROS camera_info YAML."""
     image_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="")] = None
     """Which images of a bag or a LeRobot dataset; needed where there are several."""
+    pose_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="")] = None
+    """Which tf or joint states of a bag; needed where several topics say where the arm was."""
     base_frame: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """The robot's base, a tf frame of a bag or a link of the URDF."""
     gripper_frame: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None

@@ -14,6 +14,9 @@ class ReadOptions:
     image_topic: str | None = None
     """Which images: a topic of a bag, or a camera's key in a LeRobot dataset; None for the only
     one."""
+    pose_topic: str | None = None
+    """The tf or joint state topic of a bag that holds where several say where the arm was; None
+    where each frame or joint is on one only."""
     base_frame: str | None = None
     """The robot's base: a tf frame of a bag or a link of the URDF; None for the usual one."""
     gripper_frame: str | None = None
