@@ -24,6 +24,7 @@ from .bags import (
     picture,
     recording,
     refusal,
+    refusal_of,
     shoulder_from_tool,
 )
 
@@ -203,7 +204,12 @@ def test_of_several_image_topics_one_is_named(tmp_path: Path) -> None:
     # The depth image is no candidate.
     expected = "images on 2 topics; name one with --image-topic: /cam/image_raw, /left/image_raw"
     assert expected in refusal(bag, path)
-    options = ReadOptions(image_topic="/left/image_raw")
+    # The only camera_info is that of the other camera.
+    said = "no camera_info for /left/image_raw (/left/camera_info is expected, there is /cam/"
+    assert said in refusal_of(path / "wave", image_topic="/left/image_raw")
+    lens = tmp_path / "camera.txt"
+    lens.write_text("31 0 15\n0 31 11\n0 0 1\n")
+    options = ReadOptions(image_topic="/left/image_raw", camera=lens)
     scene = load_scene(path / "wave", options=options)
     np.testing.assert_array_equal(scene.train[0].read_image(), picture(9))
     with pytest.raises(InputError, match="no images on topic '/no'; images are on /cam/image_raw"):
