@@ -27,7 +27,8 @@ class Reading:
     base_frame: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """The robot's base, a tf frame of a bag or a link of the URDF."""
     gripper_frame: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """The gripper, a tf frame of a bag or a link of the URDF."""
+    """The gripper: a tf frame of a bag, a link of the URDF, or a feature or arm of a LeRobot
+    dataset."""
     urdf: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """URDF of the robot, where the recording has joint angles and no poses."""
     pose_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None

@@ -20,8 +20,8 @@ class ReadOptions:
     base_frame: str | None = None
     """The robot's base: a tf frame of a bag or a link of the URDF; None for the usual one."""
     gripper_frame: str | None = None
-    """What carries the camera or the target: a tf frame or a link of the URDF; None for the usual
-    one."""
+    """What carries the camera or the target: a tf frame, a link of the URDF, or a feature or arm of
+    a LeRobot dataset; None for the usual one."""
     urdf: Path | None = None
     """The robot's URDF, where the recording has joint angles; None for the one beside them."""
     pose_convention: str | None = None
