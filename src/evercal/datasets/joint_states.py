@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.datasets.kinematics import RobotModel
+from evercal.datasets.labels import labels_of_lists
 from evercal.datasets.pose_track import MAX_GAP_S
 from evercal.datasets.robot_poses import RobotPoses
 from evercal.datasets.row_files import Rows, read_rows
@@ -147,8 +148,7 @@ def read_joints(path: Path) -> Rows:
     try:
         columns = tuple(str(name) for name in data["joint_names"])
         values = np.array(data["positions"], dtype=np.float64)
-        names, stamps = data.get("images"), data.get("stamps_s")
-        times = None if stamps is None else np.array(stamps, dtype=np.float64)
+        names, times = labels_of_lists(data, len(values))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: {type(error).__name__} {error}; give {_JSON}") from None
     rows = len(values)
@@ -157,6 +157,4 @@ def read_joints(path: Path) -> Rows:
             f"{path}: 'positions' is a list of rows of {len(columns)} numbers, one for each of"
             f" 'joint_names'"
         )
-    if (names is not None and len(names) != rows) or (times is not None and len(times) != rows):
-        raise InputError(f"{path}: 'images' and 'stamps_s' are as many as 'positions', {rows}")
-    return Rows(None if names is None else tuple(map(str, names)), times, columns, values)
+    return Rows(names, times, columns, values)

@@ -85,7 +85,7 @@ def _by_name(
     if not any(pose is not None for pose in found):
         raise InputError(
             f"{file}: names no image of {images[0].parent}; its first is {names[0]!r}, the first"
-            f" image is {images[0].name!r}"
+            f" image is {images[0].name!r}; mend the names, or leave them out to pair in order"
         )
     notes = []
     if None in found:

@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.datasets.images import IMAGE_ENDINGS
+from evercal.datasets.labels import find_labels, seconds
 from evercal.datasets.pose_header import is_number
 from evercal.errors import InputError
 
-NAME_COLUMNS = ("name", "image", "image_name", "file", "filename", "file_name", "frame")
-STAMP_COLUMNS = ("stamp", "stamp_s", "timestamp", "timestamp_s", "time", "time_s", "t", "t_s")
-STAMP_COLUMNS_NS = ("stamp_ns", "timestamp_ns", "time_ns", "t_ns")
 _EARLIEST_S, _LATEST_S = 1e9, 4e9
 """The years 2001 and 2096, in seconds since 1970: between them lie the times of recordings."""
 
@@ -45,14 +43,13 @@ def read_rows(path: Path, what: str) -> Rows:
         InputError: missing, without a header or rows, or a cell that is not a finite number.
     """
     header, *lines = read_lines(path, what)
-    keys = [word.lower() for word in header]
-    name = next((i for i, key in enumerate(keys) if key in NAME_COLUMNS), None)
-    stamp = next((i for i, k in enumerate(keys) if k in STAMP_COLUMNS + STAMP_COLUMNS_NS), None)
+    labels = find_labels(header)
+    name, stamp = labels.name, labels.stamp
     if all(is_number(word) for word in header):
         raise InputError(f"{path}: the first line names no columns; write a header, then {what}")
     if not lines:
         raise InputError(f"{path}: holds a header and no rows; it is to hold {what}")
-    others = [i for i in range(len(header)) if i not in (name, stamp)]
+    others = [i for i in range(len(header)) if i not in labels.all]
     values = np.empty((len(lines), len(others)))
     stamps = np.empty(len(lines))
     for row, words in enumerate(lines):
@@ -65,7 +62,10 @@ def read_rows(path: Path, what: str) -> Rows:
         if stamp is not None:
             stamps[row] = _number(path, row, header[stamp], words[stamp])
     if stamp is not None:
-        stamps = stamps * 1e-9 if keys[stamp] in STAMP_COLUMNS_NS else in_seconds(stamps)
+        try:
+            stamps = seconds(stamps, labels.unit) if labels.unit else in_seconds(stamps)
+        except ValueError as error:
+            raise InputError(f"{path}: {error}") from None
     return Rows(
         None if name is None else tuple(words[name] for words in lines),
         None if stamp is None else stamps,
