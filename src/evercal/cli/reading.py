@@ -18,8 +18,8 @@ class Reading:
     """Format of the recording: generic, 7scenes, 12scenes, nerfstudio, colmap, wrist, lerobot or
     rosbag; it is recognised when left out."""
     camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """File of the intrinsics of all images, where the recording has none: 3x3 matrix as text, JSON
-    or ROS camera_info YAML."""
+    """File of the intrinsics of all images, where the recording has none: 3x3 matrix as text, JSON,
+    ROS camera_info YAML or OpenCV's storage."""
     image_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="")] = None
     """Which images of a bag or a LeRobot dataset; needed where there are several."""
     pose_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="")] = None
