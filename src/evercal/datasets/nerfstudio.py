@@ -47,6 +47,8 @@ def detect(root: Path) -> bool:
 def load(root: str | os.PathLike[str]) -> Scene:
     """Reads the poses and the size of one image of every camera; no other image is opened.
 
+    Where the file states no size, it is that of the first image.
+
     Raises:
         InputError: The file or an image is missing, or the file breaks the format; the message
             names the entry.
@@ -60,6 +62,7 @@ def load(root: str | os.PathLike[str]) -> Scene:
         entries = data.get("frames")
         if not isinstance(entries, list) or not entries:
             raise ValueError("'frames' is a list with at least one frame")
+        data = {**_first_size(root, data, entries), **data}
         frames = [_frame(root, data, i, entry, undo, scale) for i, entry in enumerate(entries)]
         test = _tested(root, data)
     except (ValueError, OverflowError) as error:
@@ -86,6 +89,20 @@ def _read(file: Path) -> dict[str, object]:
     if not isinstance(data, dict):
         raise InputError(f"{file}: no JSON object; it has 'frames' in it")
     return data
+
+
+def _first_size(
+    root: Path, data: Mapping[str, object], entries: list[object]
+) -> dict[str, object]:
+    """w and h of the first image, where neither the file nor its first frame states one of them."""
+    first = entries[0]
+    if not isinstance(first, dict) or {"w", "h"} & {*data, *first}:
+        return {}
+    name = first.get("file_path")
+    if not isinstance(name, str):
+        return {}
+    width, height = image_size(_image(root, name))
+    return {"w": width, "h": height}
 
 
 def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
@@ -148,9 +165,10 @@ def _camera(data: Mapping[str, object]) -> Camera:
     if data.get("is_fisheye"):
         raise ValueError("fisheye images are not supported; undistort them first")
     width, height = _number(data, "w"), _number(data, "h")
-    angle = data.get("camera_angle_x")
-    seen = None if angle is None else width / 2 / math.tan(_number(data, "camera_angle_x") / 2)
-    fx = _number(data, "fl_x", seen)
+    fx, fy = _focal(data, "x", width), _focal(data, "y", height)
+    if fx is None and fy is None:
+        raise ValueError("'fl_x' is missing, and so are 'fl_y' and 'camera_angle_x'")
+    fx, fy = fx or fy, fy or fx
     lens = [_number(data, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
     if _number(data, "k4", 0.0):
         raise ValueError("k4 is not 0; only k1, k2, k3, p1 and p2 are supported")
@@ -158,12 +176,24 @@ def _camera(data: Mapping[str, object]) -> Camera:
     return Camera(
         width,  # pyright: ignore[reportArgumentType]  # checked when constructed
         height,  # pyright: ignore[reportArgumentType]
-        fx,
-        _number(data, "fl_y", fx),
+        fx,  # pyright: ignore[reportArgumentType]  # not both are None
+        fy,  # pyright: ignore[reportArgumentType]
         _number(data, "cx", width / 2) - 0.5,
         _number(data, "cy", height / 2) - 0.5,
         tuple(lens) if any(lens) else (),
     )
+
+
+def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:
+    """A focal length in pixels, of itself or from the angle of view; None if neither is there."""
+    if data.get(f"fl_{axis}") is not None:
+        return _number(data, f"fl_{axis}")
+    if data.get(f"camera_angle_{axis}") is None:
+        return None
+    angle = _number(data, f"camera_angle_{axis}")
+    if not 0 < angle < math.pi:
+        raise ValueError(f"'camera_angle_{axis}' is between 0 and pi radians, got {angle}")
+    return size / 2 / math.tan(angle / 2)
 
 
 def _sized(file: Path, frames: list[Frame]) -> list[Frame]:

@@ -114,7 +114,8 @@ def _camera(root: Path, options: ReadOptions, image: Path) -> Camera:
             has = f"{' and '.join(found)} in it" if found else "no camera file in it"
             raise InputError(
                 f"{root}: {has}; name the file of the intrinsics with --camera (3x3 matrix, JSON,"
-                f" camera_info YAML or OpenCV's storage), or put it there as camera.json, .yaml or .txt"
+                f" camera_info YAML or OpenCV's storage), or put it there as camera.json,"
+                f" .yaml, .xml or .txt"
             )
         file = root / found[0]
     camera = read_camera(file, size)
