@@ -17,7 +17,7 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +64,7 @@ def load(root: str | os.PathLike[str]) -> Scene:
             raise ValueError("'frames' is a list with at least one frame")
         data = {**_first_size(root, data, entries), **data}
         frames = [_frame(root, data, i, entry, undo, scale) for i, entry in enumerate(entries)]
-        test = _tested(root, data)
+        test = _tested(root, data, {str(frame.image) for frame in frames})
     except (ValueError, OverflowError) as error:
         raise InputError(f"{file}: {error}") from None
     frames = _sized(file, frames)
@@ -91,10 +91,8 @@ def _read(file: Path) -> dict[str, object]:
     return data
 
 
-def _first_size(
-    root: Path, data: Mapping[str, object], entries: list[object]
-) -> dict[str, object]:
-    """w and h of the first image, where neither the file nor its first frame states one of them."""
+def _first_size(root: Path, data: Mapping[str, object], entries: list[object]) -> dict[str, object]:
+    """The first image's w and h, where neither the file nor its first frame states one of them."""
     first = entries[0]
     if not isinstance(first, dict) or {"w", "h"} & {*data, *first}:
         return {}
@@ -166,9 +164,9 @@ def _camera(data: Mapping[str, object]) -> Camera:
         raise ValueError("fisheye images are not supported; undistort them first")
     width, height = _number(data, "w"), _number(data, "h")
     fx, fy = _focal(data, "x", width), _focal(data, "y", height)
-    if fx is None and fy is None:
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    if fx is None or fy is None:
         raise ValueError("'fl_x' is missing, and so are 'fl_y' and 'camera_angle_x'")
-    fx, fy = fx or fy, fy or fx
     lens = [_number(data, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
     if _number(data, "k4", 0.0):
         raise ValueError("k4 is not 0; only k1, k2, k3, p1 and p2 are supported")
@@ -176,8 +174,8 @@ def _camera(data: Mapping[str, object]) -> Camera:
     return Camera(
         width,  # pyright: ignore[reportArgumentType]  # checked when constructed
         height,  # pyright: ignore[reportArgumentType]
-        fx,  # pyright: ignore[reportArgumentType]  # not both are None
-        fy,  # pyright: ignore[reportArgumentType]
+        fx,
+        fy,
         _number(data, "cx", width / 2) - 0.5,
         _number(data, "cy", height / 2) - 0.5,
         tuple(lens) if any(lens) else (),
@@ -226,12 +224,16 @@ def _resized(frame: Frame, size: tuple[int, int]) -> Frame:
     return Frame(frame.name, frame.image, frame.camera.resized(*size), frame.base_from_camera)
 
 
-def _tested(root: Path, data: Mapping[str, object]) -> set[Path]:
+def _tested(root: Path, data: Mapping[str, object], images: Container[str]) -> set[Path]:
     found: set[Path] = set()
     for key in ("val_filenames", "test_filenames"):
         names = data.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError(f"{key!r} is a list of file names")
+        # A test frame under another name would be learned from.
+        other = [name for name in names if str(_image(root, name)) not in images]
+        if other:
+            raise ValueError(f"{key!r} names {other[0]!r}, which no frame does; mend the name")
         found |= {_image(root, name) for name in names}
     return found
 
