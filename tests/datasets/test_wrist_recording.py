@@ -222,6 +222,7 @@ def test_what_is_missing_or_twice_is_named(tmp_path: Path) -> None:
         ("image,stamp_s\na.png\n", "row 1 has 1 cells"),
         ("image,stamp_s\na.png,nan\n", "'nan' is not a number"),
         ("image,x\na.png,1\n", "needs the columns image and stamp_s"),
+        ("image,stamp_s\nl/a.png,1\nr/a.png,2\n", "'a.png' comes twice"),
     ],
 )
 def test_broken_tables_are_named(tmp_path: Path, text: str, message: str) -> None:

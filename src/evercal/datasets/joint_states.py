@@ -57,7 +57,7 @@ def read_joint_poses(
     needed = model.joints_between(base, gripper)
     if not needed:
         raise InputError(f"{model.path}: no joint moves {gripper} against {base}; name other links")
-    names, values = _plain_columns(rows, model, unit)
+    names, values = _plain_columns(path, rows, model, unit)
     try:
         poses = model.base_from_gripper(names, values, base, gripper)
     except InputError as error:
@@ -69,7 +69,7 @@ def read_joint_poses(
 
 
 def _plain_columns(
-    rows: Rows, model: RobotModel, unit: str | None
+    path: Path, rows: Rows, model: RobotModel, unit: str | None
 ) -> tuple[list[str], NDArray[np.float64]]:
     """Joint names without their units, and (n, columns) values in radians and metres."""
     names, stated = [], []
@@ -78,6 +78,9 @@ def _plain_columns(
         says = ending in _UNITS and not model.has_joint(column) and model.has_joint(plain)
         names.append(plain if says else column)
         stated.append(ending if says else None)
+    twice = [name for i, name in enumerate(names) if name in names[:i] and model.has_joint(name)]
+    if twice:
+        raise InputError(f"{path}: several columns are of joint {twice[0]}; keep one of them")
     return names, in_radians(model, names, rows.values, [s or unit for s in stated])
 
 

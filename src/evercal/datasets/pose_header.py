@@ -84,18 +84,24 @@ def pose_header(cells: Sequence[str]) -> PoseHeader | None:
     """Reads the cells of a first line; None if they are numbers, a row and no header.
 
     Raises:
-        ValueError: The columns of one group differ in unit.
+        ValueError: The columns of one group differ in unit, or several groups may be meant.
     """
     numbers = [is_number(cell) for cell in cells]
     names, units = zip(*(name_and_unit(cell) for cell in cells), strict=True)
     groups: dict[str, tuple[int, ...]] = {}
     stated: dict[str, str] = {}
     for group, aliases in _ALIASES.items():
-        columns = [next((names.index(a) for a in some if a in names), None) for some in aliases]
-        found = tuple(column for column in columns if column is not None)
+        columns = [[i for i, name in enumerate(names) if name in some] for some in aliases]
+        found = tuple(column[0] for column in columns if column)
         # rotation_x is of a quaternion where there is a rotation_w.
         if len(found) < len(columns) or (group == "angles" and "quaternion" in groups):
             continue
+        alike = next((column for column in columns if len(column) > 1), None)
+        if alike is not None:
+            raise ValueError(
+                f"the columns {' and '.join(cells[c] for c in alike)} may both be the {group}'s;"
+                f" keep those of the pose"
+            )
         if len({units[column] for column in found}) > 1:
             raise ValueError(f"the columns {', '.join(cells[c] for c in found)} differ in unit")
         groups[group] = found

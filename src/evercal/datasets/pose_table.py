@@ -117,6 +117,13 @@ def _without_header(rows: list[list[str]], given: PoseConvention | None) -> Pose
         names = tuple(row[words[0]] for row in rows)
     table = np.array(numbers)
     stamps = seconds(table[:, 0], None) if extra > len(words) else None
+    back = np.flatnonzero(np.diff(table[:, 0]) < 0)
+    # A number behind the pose instead shows in quaternions and matrices, but not in angles.
+    if stamps is not None and given.has_angles and back.size:
+        raise ValueError(
+            f"the first number of row {back[0] + 2} is smaller than the one before, so it is no"
+            f" stamp; write a header that says what the {width} columns are"
+        )
     return PoseTable(table[:, table.shape[1] - given.count :], given, names, stamps)
 
 

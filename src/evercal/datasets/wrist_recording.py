@@ -135,4 +135,7 @@ def _stamps(root: Path) -> dict[str, float] | None:
     if rows.names is None or rows.stamps_s is None:
         raise InputError(f"{file}: needs the columns image and stamp_s")
     names = [PurePath(name).name for name in rows.names]
+    twice = [name for i, name in enumerate(names) if name in names[:i]]
+    if twice:
+        raise InputError(f"{file}: {twice[0]!r} comes twice; give every image one time")
     return dict(zip(names, rows.stamps_s.tolist(), strict=True))
