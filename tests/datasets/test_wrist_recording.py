@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evercal.cli.image_words import image_files
 from evercal.datasets import ReadOptions, Scene, load_scene, wrist_recording, write_image
 from evercal.datasets.pairing import pair_images
 from evercal.datasets.robot_poses import RobotPoses
@@ -173,6 +174,23 @@ def test_images_outside_the_poses_times_have_none(tmp_path: Path) -> None:
     found, notes = pair_images(images, rows, None, Path("p"))
     assert [pose is None for pose in found] == [True, False, True]
     assert notes[1].startswith("2 images lie outside")
+
+
+def test_images_in_another_order_than_their_names_are_not_paired_in_order() -> None:
+    rows = RobotPoses(None, None, some_poses(3))
+    images = [Path(f"{name}.png") for name in ("image-1", "image-10", "image-2")]
+    with pytest.raises(InputError, match=r"image-2\.png is given after image-10\.png"):
+        pair_images(images, rows, None, Path("p"))
+    # Every folder has an order of its own.
+    images = [Path(name) for name in ("b/1.png", "b/2.png", "a/1.png")]
+    assert None not in pair_images(images, rows, None, Path("p"))[0]
+
+
+def test_a_folder_given_to_a_command_is_in_natural_order(tmp_path: Path) -> None:
+    for i in range(1, 12):
+        (tmp_path / f"image-{i}.png").touch()
+    names = [file.name for file in image_files([tmp_path])]
+    assert names == [f"image-{i}.png" for i in range(1, 12)]
 
 
 def test_natural_order_takes_any_names() -> None:

@@ -1,5 +1,6 @@
 """Which gripper pose belongs to which image: by name, by time, or in order."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
 
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 
 from evercal.datasets.pose_track import MAX_GAP_S, PoseTrack
 from evercal.datasets.robot_poses import RobotPoses, read_robot_poses
-from evercal.datasets.row_files import times_in_names
+from evercal.datasets.row_files import natural_key, times_in_names
 from evercal.errors import InputError
 from evercal.geometry import SE3
 
@@ -47,6 +48,14 @@ def pair_images(
             f"{file}: {len(rows.poses)} poses for {len(images)} images in {images[0].parent}; give"
             f" each image a row, or add {how} that says which belong together"
         )
+    # A shell's *.png puts image-10 before image-2, the rows do not.
+    for before, after in itertools.pairwise(images):
+        same = before.parent == after.parent
+        if same and natural_key(before.name) > natural_key(after.name):
+            raise InputError(
+                f"{file}: {after.name} is given after {before.name}, so which row is whose is open;"
+                f" give the folder, or name the images in a column image"
+            )
     first, last = images[0].name, images[-1].name
     return list(rows.poses), [f"images and poses were paired in order, {first} to {last}"]
 
