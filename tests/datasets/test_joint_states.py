@@ -191,6 +191,19 @@ def test_angles_beyond_the_limits_are_noted(tmp_path: Path, model: RobotModel) -
     assert "shoulder goes from 3.50 to 3.50, the URDF allows -3.00 to 3.00" in notes[1]
 
 
+def test_turns_without_limits_that_look_like_degrees_are_noted(tmp_path: Path) -> None:
+    (tmp_path / "a.urdf").write_text(
+        '<robot name="a"><link name="base"/><link name="tip"/>'
+        '<joint name="turn" type="continuous"><parent link="base"/><child link="tip"/>'
+        '<axis xyz="0 0 1"/></joint></robot>'
+    )
+    file = tmp_path / "joints.csv"
+    for values, count in (((-170, 170), 1), ((100.0, 103.0), 0)):
+        file.write_text("turn\n" + "".join(f"{value}\n" for value in values))
+        _, notes = read_joint_poses(file, RobotModel(tmp_path / "a.urdf"))
+        assert len(notes) == 1 + count
+
+
 def test_joints_are_interpolated_but_not_over_a_turn_or_a_gap() -> None:
     times = np.array([0.0, 0.1, 0.2, 9.0])
     angles = np.array([3.0, -3.0, -2.9, -1.0])  # turns on through pi
