@@ -6,17 +6,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
+from evercal.datasets import ReadOptions, load_scene
+from evercal.errors import InputError
 from evercal.geometry import SE3
 
 KINDS = ("ros1", "sqlite3", "mcap")
 START_NS = 1_700_000_000_123_456_789
 WIDTH, HEIGHT = 32, 24
+# Not at the times of the transforms; the last two are after the arm was last seen.
+SHOTS = (0.0, 0.013, 0.5, 0.987, 1.711, 2.0, 2.05, 2.5)
 BASE_FROM_SHOULDER = SE3.exp([0.1, 0.2, 0.3, 0.0, 0.0, 0.5])
 TOOL_FROM_OPTICAL = SE3.exp([0.02, -0.05, 0.03, 0.3, -0.2, 1.2])
 
@@ -64,7 +69,8 @@ class Bag:
         """Recorded 5 ms after `seconds`."""
         self.messages.append((topic, kind, START_NS + round(seconds * 1e9) + 5_000_000, message))
 
-    def tf(self, seconds: float, parent: str, child: str, pose: SE3, static: bool = False) -> None:
+    def tf(self, seconds: float, parent: str, child: str, pose: SE3, static: bool = False,
+           robot: str = "") -> None:  # fmt: skip
         """One transform; static ones carry a stamp too, which means nothing."""
         w, x, y, z = pose.rotation_wxyz.tolist()
         tx, ty, tz = pose.translation_m.tolist()
@@ -79,7 +85,7 @@ class Bag:
             child_frame_id=child,
             transform=transform,
         )
-        topic = "/tf_static" if static else "/tf"
+        topic = robot + ("/tf_static" if static else "/tf")
         kind = "tf2_msgs/msg/TFMessage"
         self.add(topic, kind, seconds, self.make(kind, transforms=[entry]))
 
@@ -134,13 +140,14 @@ class Bag:
         )
         self.add(topic, kind, 0.0, message)
 
-    def joints(self, seconds: float, values: dict[str, float]) -> None:
+    def joints(self, seconds: float, values: dict[str, float],
+               topic: str = "/joint_states") -> None:  # fmt: skip
         """A joint state."""
         kind = "sensor_msgs/msg/JointState"
         numbers, none = np.array(list(values.values())), np.empty(0)
         message = self.make(kind, header=self.header(seconds, ""), name=list(values),
                             position=numbers, velocity=none, effort=none)  # fmt: skip
-        self.add("/joint_states", kind, seconds, message)
+        self.add(topic, kind, seconds, message)
 
     def write(self, root: Path) -> Path:
         """Writes all messages by time; gives the path of the bag."""
@@ -174,3 +181,27 @@ def arm(bag: Bag, first: float = 0.0, last: float = 2.0, rate: float = 25.0) -> 
         at = first + i / rate
         bag.tf(at, "shoulder", "tool0", shoulder_from_tool(at))
     return bag
+
+
+def recording(kind: str) -> Bag:
+    """An arm, a camera and its images."""
+    bag = arm(Bag(kind))
+    for i, at in enumerate(SHOTS):
+        bag.image(at, "/cam/image_raw", picture(i))
+    bag.info("/cam/camera_info")
+    return bag
+
+
+def refusal(bag: Bag, root: Path, **options: object) -> str:
+    """Why a bag cannot be read, in one line that names it."""
+    return refusal_of(bag.write(root), **options)
+
+
+def refusal_of(path: Path, **options: object) -> str:
+    """The same of a bag that was written."""
+    with pytest.raises(InputError) as caught:
+        load_scene(path, options=ReadOptions(**options))  # pyright: ignore[reportArgumentType]
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(str(path))
+    return message

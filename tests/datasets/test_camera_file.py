@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -72,6 +73,60 @@ def test_every_kind_gives_the_same_camera(tmp_path: Path) -> None:
     assert read_camera(written(tmp_path, MESSAGE)) == Camera(
         640, 480, LENS.fx, LENS.fy, LENS.cx, LENS.cy, (*LENS.distortion, 0.0, 0.0, 0.0)
     )
+
+
+def stored(folder: Path, ending: str = "yml", size: bool = True, **more: object) -> Path:
+    """What cv2.FileStorage writes of the camera."""
+    path = folder / f"stored.{ending}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    values = {"camera_matrix": LENS.matrix(), "dist_coeffs": np.array([LENS.distortion]), **more}
+    if size:
+        values |= {"image_Width": LENS.width, "image_Height": LENS.height}
+    for name, value in values.items():
+        storage.write(name, value)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    storage.release()
+    return path
+
+
+def test_the_storage_of_opencv_is_read(tmp_path: Path) -> None:
+    assert read_camera(stored(tmp_path, "xml")) == LENS
+    yaml = stored(tmp_path, fisheye_model=0, board="9x6")
+    assert read_camera(yaml, (320, 240)) == LENS
+    old = yaml.read_text().replace("%YAML 1.2", "%YAML:1.0")
+    assert read_camera(written(tmp_path, old)) == LENS
+    assert read_camera(stored(tmp_path, size=False), (640, 480)) == LENS
+    with pytest.raises(InputError, match="'image_width' is missing"):
+        read_camera(stored(tmp_path, size=False))
+    for more, said in (
+        ({"fisheye_model": 1}, "fisheye_model is set"),
+        ({"K": np.eye(3)}, "camera_matrix and K are the same; keep one"),
+        ({"camera_matrix": np.eye(2)}, "camera_matrix has 9 numbers, got 4"),
+    ):
+        with pytest.raises(InputError, match=said):
+            read_camera(stored(tmp_path, **more))  # pyright: ignore[reportArgumentType]
+    stereo = old.replace("camera_matrix", "M1").replace("dist_coeffs", "D1")
+    for text, said in (
+        (stereo, "'camera_matrix' is missing, there is M1, D1, fisheye_model"),
+        (old[:120], "OpenCV cannot read its storage"),
+        ("<opencv_storage><a>", "OpenCV cannot read its storage"),
+    ):
+        with pytest.raises(InputError, match=said) as caught:
+            read_camera(written(tmp_path, text), (640, 480))
+        assert "\n" not in str(caught.value)
+
+
+def test_a_byte_order_mark_is_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "camera.any"
+    for text in (json.dumps(LENS.to_dict()), CALIBRATION, MESSAGE, "525 0 319.5 0 525 239.5 0 0 1"):
+        path.write_text(text, encoding="utf-8-sig")
+        assert read_camera(path, (640, 480)).width == 640
+
+
+def test_a_lens_that_is_called_otherwise_is_not_passed_over(tmp_path: Path) -> None:
+    text = CALIBRATION.replace("distortion_coefficients", "dist_coeff")
+    with pytest.raises(InputError, match="'distortion_coefficients' is missing"):
+        read_camera(written(tmp_path, text))
+    assert read_camera(written(tmp_path, text + "d: [0, 0, 0, 0]\n")).distortion == ()
 
 
 def test_the_size_given_does_not_override_what_a_file_says(tmp_path: Path) -> None:

@@ -80,8 +80,9 @@ def test_points_land_where_colmap_says(model: str, kind: str, tmp_path: Path) ->
 def test_the_model_is_found_in_the_usual_places(place: str, tmp_path: Path) -> None:
     make(tmp_path, place=place)
     assert len(load_scene(tmp_path).train) == 4
-    # Pointing at the model itself does as well.
+    # Pointing at the model itself, or at the folder of models, does as well.
     assert len(load_scene(tmp_path / place).train) == 4
+    assert len(load_scene(tmp_path / place.removesuffix("/0")).train) == 4
 
 
 def test_of_several_models_the_largest_is_taken(tmp_path: Path) -> None:
@@ -90,6 +91,14 @@ def test_of_several_models_the_largest_is_taken(tmp_path: Path) -> None:
     scene = load_scene(tmp_path)
     assert len(scene.train) == 6
     assert scene.notes[1] == "took model 1, the one with the most images (0: 4, 1: 6)"
+
+
+def test_a_model_from_before_undistortion_is_not_mixed_in(tmp_path: Path) -> None:
+    make(tmp_path, "PINHOLE", images=3, place="sparse/0")
+    make(tmp_path, "OPENCV", images=4, place="distorted/sparse/0")  # one image more
+    scene = load_scene(tmp_path)
+    assert len(scene.train) == 3
+    assert scene.train[0].camera.distortion == ()
 
 
 @pytest.mark.parametrize(

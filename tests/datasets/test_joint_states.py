@@ -156,6 +156,7 @@ def test_json_and_csv_say_the_same(tmp_path: Path, model: RobotModel) -> None:
     [
         ("shoulder,elbow\n0,0\n", "no values for joint reach, which tip depends on"),
         ("shoulder,elbow,reach\n90,20,0\n", "joint shoulder is at 90.0.*shoulder_deg"),
+        ("shoulder,elbow,reach,elbow_deg\n0,1,0,90\n", "several columns are of joint elbow"),
         ("shoulder,elbow,reach\n0,x,0\n", "column 'elbow': 'x' is not a number"),
         ("shoulder,elbow,reach\n", "no rows"),
     ],
@@ -188,6 +189,19 @@ def test_angles_beyond_the_limits_are_noted(tmp_path: Path, model: RobotModel) -
     _, notes = read_joint_poses(file, model)
     assert len(notes) == 2
     assert "shoulder goes from 3.50 to 3.50, the URDF allows -3.00 to 3.00" in notes[1]
+
+
+def test_turns_without_limits_that_look_like_degrees_are_noted(tmp_path: Path) -> None:
+    (tmp_path / "a.urdf").write_text(
+        '<robot name="a"><link name="base"/><link name="tip"/>'
+        '<joint name="turn" type="continuous"><parent link="base"/><child link="tip"/>'
+        '<axis xyz="0 0 1"/></joint></robot>'
+    )
+    file = tmp_path / "joints.csv"
+    for values, count in (((-170, 170), 1), ((100.0, 103.0), 0)):
+        file.write_text("turn\n" + "".join(f"{value}\n" for value in values))
+        _, notes = read_joint_poses(file, RobotModel(tmp_path / "a.urdf"))
+        assert len(notes) == 1 + count
 
 
 def test_joints_are_interpolated_but_not_over_a_turn_or_a_gap() -> None:

@@ -206,6 +206,65 @@ def test_poses_in_a_given_convention(tmp_path: Path) -> None:
             load_scene(root, options=read)
 
 
+def two_arms(root: Path, names: Any) -> None:
+    """The dataset with a second pose behind the first, 5 m above it."""
+    for file in root.glob("data/*/*.parquet"):
+        read = pq.read_table(file)
+        both = [[*r, *r[:2], r[2] + 5, *r[3:]] for r in read["observation.ee"].to_pylist()]
+        column = pa.array(both, pa.list_(pa.float32(), 14))
+        where = read.schema.get_field_index("observation.ee")
+        pq.write_table(read.set_column(where, "observation.ee", column), file)
+    features = json.loads((root / "meta/info.json").read_text())["features"]
+    features["observation.ee"] = {"dtype": "float32", "shape": [14], "names": names}
+    change(root, features=features)
+
+
+def test_of_two_arms_one_is_named(tmp_path: Path) -> None:
+    root, parts = make(tmp_path / "wave", "v2.1", "image"), ["x", "y", "z", "qx", "qy", "qz", "qw"]
+    two_arms(root, [f"{side}_ee.{part}" for side in ("left", "right") for part in parts])
+    said = r"observation\.ee: holds several poses .*--gripper-frame left_ee or right_ee"
+    with pytest.raises(InputError, match=said):
+        load_scene(root, options=options(root))
+    for arm, height in (("left_ee", 0.5), ("right_ee", 5.5)):
+        frame = load_scene(root, options=options(root, gripper_frame=arm)).train[0]
+        assert frame.base_from_gripper is not None
+        assert frame.base_from_gripper.translation_m[2] == pytest.approx(height)
+    change_names(root, {"left": parts, "right": parts})
+    with pytest.raises(InputError, match="--gripper-frame left or right"):
+        load_scene(root, options=options(root))
+    change_names(root, parts * 2)
+    with pytest.raises(
+        InputError, match=r"holds several poses .*; give names that tell them apart"
+    ):
+        load_scene(root, options=options(root))
+    change_names(root, parts)
+    with pytest.raises(InputError, match=r"observation\.ee: has 14 numbers and 7 names"):
+        load_scene(root, options=options(root))
+    read = options(root, pose_convention="xyzw", gripper_frame="observation.ee")
+    assert (
+        "the first 7 of its 14 numbers were taken (x, y," in load_scene(root, options=read).notes[1]
+    )
+
+
+def change_names(root: Path, names: Any, feature: str = "observation.ee") -> None:
+    features = json.loads((root / "meta/info.json").read_text())["features"]
+    features[feature]["names"] = names
+    change(root, features=features)
+
+
+def test_joints_of_one_name_are_refused(tmp_path: Path) -> None:
+    pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
+    root = make(tmp_path / "wave", "v2.1", "image")
+    (root / "arm.urdf").write_text(URDF)
+    read = options(root, urdf=root / "arm.urdf")
+    change_names(root, ["shoulder.pos", "shoulder"], "observation.state")
+    with pytest.raises(InputError, match=r"state: 'shoulder' names several numbers"):
+        load_scene(root, options=read)
+    change_names(root, {"left": ["shoulder"], "right": ["reach"]}, "observation.state")
+    with pytest.raises(InputError, match=r"no values for joint shoulder.*left\.shoulder"):
+        load_scene(root, options=read)
+
+
 def test_embedded_images_are_written_out(tmp_path: Path) -> None:
     root = make(tmp_path / "wave", "v3.0", "image")
     generic.write(tmp_path / "out", load_scene(root, options=options(root, every=5)))

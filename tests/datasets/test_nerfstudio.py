@@ -147,11 +147,28 @@ def test_names_without_an_ending_and_an_angle_of_view(tmp_path: Path) -> None:
     assert frame.read_image().shape == (36, 24, 3)
 
 
+def test_an_angle_of_view_upwards_and_a_size_that_is_not_stated(tmp_path: Path) -> None:
+    write(tmp_path, entries(ring(2)), camera_angle_y=0.5)
+    camera = load_scene(tmp_path).train[1].camera
+    assert (camera.width, camera.height) == (24, 36)
+    assert camera.fx == camera.fy == pytest.approx(18 / np.tan(0.25))
+    write(tmp_path, entries(ring(2)), camera_angle_x=0.4, camera_angle_y=0.5)
+    camera = load_scene(tmp_path).train[1].camera
+    assert (camera.fx, camera.fy) == pytest.approx((12 / np.tan(0.2), 18 / np.tan(0.25)))
+    write(tmp_path, entries(ring(2)), fl_x=40.0, camera_angle_y=0.5)
+    camera = load_scene(tmp_path).train[1].camera
+    assert (camera.fx, camera.fy) == pytest.approx((40.0, 18 / np.tan(0.25)))
+
+
 BREAKS: list[tuple[dict[str, Any], str]] = [
     ({"camera_model": "OPENCV_FISHEYE"}, "camera_model 'OPENCV_FISHEYE' is not supported, only"),
     ({"is_fisheye": True}, "fisheye images are not supported; undistort"),
     ({"k4": 0.1}, "k4 is not 0"),
-    ({"fl_x": None}, "'fl_x' is missing"),
+    ({"fl_x": None, "fl_y": None}, "'fl_x' is missing, and so are"),
+    ({"fl_x": None, "camera_angle_x": 28.0}, "'camera_angle_x' is between 0 and pi radians"),
+    ({"fl_x": 0}, "fx is finite"),
+    ({"w": None}, "'w' is missing"),
+    ({"test_filenames": ["frame_00001.png"]}, "names 'frame_00001.png', which no frame does"),
     ({"fl_x": "wide"}, "'fl_x' is a number"),
     ({"fl_x": -3}, "fx is finite"),
     ({"w": 36, "h": 24}, "is 24x36, transforms.json says 36x24 .the image was turned"),

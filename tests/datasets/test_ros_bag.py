@@ -1,6 +1,5 @@
 """Bags of ROS 1 and ROS 2 and MCAP files, written by rosbags and read back."""
 
-import dataclasses
 import sqlite3
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -12,41 +11,24 @@ import pytest
 
 from evercal.datasets import ReadOptions, generic, load_scene
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry import Camera, pose_distance
 
 pytest.importorskip("rosbags", reason="the extra 'bags' is not installed")
 
 from .bags import (
     BASE_FROM_SHOULDER,
     KINDS,
-    TOOL_FROM_OPTICAL,
+    SHOTS,
     Bag,
     arm,
     picture,
+    recording,
+    refusal,
+    refusal_of,
     shoulder_from_tool,
 )
 
-# Not at the times of the transforms; the last two are after the arm was last seen.
-SHOTS = (0.0, 0.013, 0.5, 0.987, 1.711, 2.0, 2.05, 2.5)
 CAMERA = Camera(32, 24, 30.0, 30.0, 15.0, 11.0, (0.1, 0.0, 0.0, 0.0, 0.0))
-
-
-def recording(kind: str) -> Bag:
-    bag = arm(Bag(kind))
-    for i, at in enumerate(SHOTS):
-        bag.image(at, "/cam/image_raw", picture(i))
-    bag.info("/cam/camera_info")
-    return bag
-
-
-def refusal(bag: Bag, root: Path, **options: object) -> str:
-    path = bag.write(root)
-    with pytest.raises(InputError) as caught:
-        load_scene(path, options=ReadOptions(**options))  # pyright: ignore[reportArgumentType]
-    message = str(caught.value)
-    assert "\n" not in message
-    assert message.startswith(str(path))
-    return message
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -72,24 +54,6 @@ def test_a_recording_comes_back(kind: str, tmp_path: Path) -> None:
         assert scene.notes[0].startswith("2 of 8 images lie outside the recorded poses")
         assert scene.notes[1] == "poses of the gripper are those of tool0 in base_link, from tf"
         assert "tf states the camera too (camera_optical)" in scene.notes[2]
-
-
-def test_frames_may_be_chosen_and_the_camera_be_one(tmp_path: Path) -> None:
-    path = recording("mcap").write(tmp_path)
-    options = ReadOptions(base_frame="/shoulder", gripper_frame="camera_optical")
-    scene = load_scene(path, options=options)
-    for frame, at in zip(scene.train, SHOTS, strict=False):
-        assert frame.base_from_gripper is None
-        assert frame.base_from_camera is not None
-        expected = shoulder_from_tool(at) @ TOOL_FROM_OPTICAL
-        assert max(pose_distance(frame.base_from_camera, expected)) < 1e-7
-    # The other way round, through the shared ancestor of two side branches.
-    options = ReadOptions(base_frame="camera_optical", gripper_frame="world")
-    turned = load_scene(path, options=options).train[0].base_from_gripper
-    world_from_base = SE3.exp([9.0, 9.0, 9.0, 1.0, 0.0, 0.0])
-    base_from_optical = BASE_FROM_SHOULDER @ shoulder_from_tool(0) @ TOOL_FROM_OPTICAL
-    assert turned is not None
-    assert max(pose_distance(turned, (world_from_base @ base_from_optical).inverse())) < 1e-7
 
 
 def test_old_ros2_bags_hold_no_definitions(tmp_path: Path) -> None:
@@ -192,20 +156,6 @@ def test_rectified_images_have_the_projection_and_no_lens(tmp_path: Path) -> Non
     assert load_scene(bag.write(tmp_path)).train[0].camera == Camera(32, 24, 28, 28, 16, 12)
 
 
-def test_stop_and_go_needs_no_dense_tf(tmp_path: Path) -> None:
-    bag = Bag("sqlite3")
-    bag.tf(0.0, "base_link", "shoulder", BASE_FROM_SHOULDER, static=True)
-    # Stands for 3 s at two places; on the way nothing is recorded.
-    for at, place in ((0.0, 0.1), (3.0, 0.1), (6.0, 0.9), (9.0, 0.9)):
-        bag.tf(at, "shoulder", "tool0", shoulder_from_tool(place))
-    for at in (1.0, 4.5, 7.0):
-        bag.image(at, "/cam/image_raw", picture(0))
-    bag.info("/cam/camera_info")
-    scene = load_scene(bag.write(tmp_path))
-    assert [frame.name for frame in scene.train] == ["000000", "000002"]
-    assert scene.untracked == 1
-
-
 def test_images_without_stamps_take_the_time_of_recording(tmp_path: Path) -> None:
     bag = arm(Bag("mcap"))
     bag.image(0.5, "/cam/image_raw", picture(0), stamped=False)
@@ -217,34 +167,6 @@ def test_images_without_stamps_take_the_time_of_recording(tmp_path: Path) -> Non
     expected = BASE_FROM_SHOULDER @ shoulder_from_tool(0.505)
     assert max(pose_distance(pose, expected)) < 1e-6
     assert "carry no stamps" in scene.notes[0]
-
-
-def test_joint_states_and_a_urdf_do_without_tf(tmp_path: Path) -> None:
-    pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
-    urdf = tmp_path / "arm.urdf"
-    urdf.write_text(
-        '<robot name="a"><link name="base"/><link name="tip"/>'
-        '<joint name="turn" type="continuous"><parent link="base"/><child link="tip"/>'
-        '<origin xyz="1 0 0"/><axis xyz="0 0 1"/></joint></robot>'
-    )
-    bag = Bag("ros1")
-    for i in range(21):
-        bag.joints(i / 10, {"finger": 0.0, "turn": i / 10})
-    for at in (0.25, 1.99, 2.3):
-        bag.image(at, "/cam/image_raw", picture(0))
-    bag.info("/cam/camera_info")
-    path = bag.write(tmp_path)
-    scene = load_scene(path, options=ReadOptions(urdf=urdf))
-    assert scene.untracked == 1
-    for frame, at in zip(scene.train, (0.25, 1.99), strict=True):
-        assert frame.base_from_gripper is not None
-        expected = SE3.exp([1, 0, 0, 0, 0, 0]) @ SE3.exp([0, 0, 0, 0, 0, at])
-        assert max(pose_distance(frame.base_from_gripper, expected)) < 1e-7
-    with pytest.raises(InputError, match=r"no tf in it.*give the robot's --urdf for /joint_states"):
-        load_scene(path)
-    urdf.write_text(urdf.read_text().replace('"turn"', '"wheel"'))
-    with pytest.raises(InputError, match=r"joint states lack wheel, .* have finger, turn"):
-        load_scene(path, options=ReadOptions(urdf=urdf))
 
 
 def test_a_bag_without_images_tf_or_camera_info_says_which(tmp_path: Path) -> None:
@@ -282,7 +204,12 @@ def test_of_several_image_topics_one_is_named(tmp_path: Path) -> None:
     # The depth image is no candidate.
     expected = "images on 2 topics; name one with --image-topic: /cam/image_raw, /left/image_raw"
     assert expected in refusal(bag, path)
-    options = ReadOptions(image_topic="/left/image_raw")
+    # The only camera_info is that of the other camera.
+    said = "no camera_info for /left/image_raw (/left/camera_info is expected, there is /cam/"
+    assert said in refusal_of(path / "wave", image_topic="/left/image_raw")
+    lens = tmp_path / "camera.txt"
+    lens.write_text("31 0 15\n0 31 11\n0 0 1\n")
+    options = ReadOptions(image_topic="/left/image_raw", camera=lens)
     scene = load_scene(path / "wave", options=options)
     np.testing.assert_array_equal(scene.train[0].read_image(), picture(9))
     with pytest.raises(InputError, match="no images on topic '/no'; images are on /cam/image_raw"):
@@ -292,59 +219,6 @@ def test_of_several_image_topics_one_is_named(tmp_path: Path) -> None:
     assert "no pictures (/depth/image_raw: encoding '16UC1' holds depth" in (
         refusal(bag, tmp_path / "b")
     )
-
-
-def test_frames_that_cannot_be_guessed_are_asked_for(tmp_path: Path) -> None:
-    bag = recording("mcap")
-    path = bag.write(tmp_path)
-    for options, message in (
-        (
-            ReadOptions(base_frame="table"),
-            "--base-frame table: no such frame in tf; it has world, base_link",
-        ),
-        (ReadOptions(gripper_frame="hand"), "--gripper-frame hand: no such frame"),
-    ):
-        with pytest.raises(InputError, match=message):
-            load_scene(path, options=options)
-    (tmp_path / "ur").mkdir()
-    bag.tf(0.0, "base_link", "base", SE3.identity(), static=True)
-    assert "--base-frame (it may be base_link or base); tf has" in refusal(bag, tmp_path / "ur")
-    (tmp_path / "odd").mkdir()
-    odd = Bag("mcap")
-    odd.tf(0.0, "map", "phone", SE3.identity())
-    odd.image(0.0, "/cam/image_raw", picture(0))
-    odd.info("/cam/camera_info")
-    assert "--base-frame (none has a usual name); tf has map, phone" in refusal(
-        odd, tmp_path / "odd"
-    )
-
-
-def test_broken_trees_of_frames_are_named(tmp_path: Path) -> None:
-    for name, parent, child, message in (
-        ("apart", "elsewhere", "flange", "tf has no chain between 'base_link' and 'flange'"),
-        ("circle", "camera_optical", "world", "tf goes in a circle"),
-        ("two", "world", "tool0", "tf frame 'tool0' has several parents, shoulder, world"),
-    ):
-        bag = recording("mcap")
-        bag.tf(0.1, parent, child, SE3.identity())
-        (tmp_path / name).mkdir()
-        gripper = "flange" if name == "apart" else "tool0"
-        assert message in refusal(bag, tmp_path / name, gripper_frame=gripper)
-    bag = recording("mcap")
-    nothing = bag.messages[0][3].transforms[0]
-    zero = bag.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=0.0)
-    transform = dataclasses.replace(nothing.transform, rotation=zero)
-    bag.messages[0][3].transforms[0] = dataclasses.replace(nothing, transform=transform)
-    (tmp_path / "zero").mkdir()
-    assert "no rigid transform; mend what publishes it" in refusal(bag, tmp_path / "zero")
-
-
-def test_clocks_that_differ_are_named(tmp_path: Path) -> None:
-    bag = arm(Bag("mcap"))
-    bag.image(3600.0, "/cam/image_raw", picture(0))
-    bag.info("/cam/camera_info")
-    assert "no image has a pose" in (message := refusal(bag, tmp_path))
-    assert "tf covers -3600.0 to -3598.0 s; are the clocks the same?" in message
 
 
 @pytest.mark.parametrize(

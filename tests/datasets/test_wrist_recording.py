@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evercal.cli.image_words import image_files
 from evercal.datasets import ReadOptions, Scene, load_scene, wrist_recording, write_image
 from evercal.datasets.pairing import pair_images
 from evercal.datasets.robot_poses import RobotPoses
-from evercal.datasets.row_files import in_seconds, natural_key
+from evercal.datasets.row_files import in_seconds, natural_key, times_in_names
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 
@@ -137,6 +138,35 @@ def test_frame_numbers_are_not_times() -> None:
         pair_images([Path("000001.png"), Path("000002.png")], rows, None, Path("p"))
 
 
+def test_frame_numbers_are_no_seconds_among_poses_from_zero() -> None:
+    # A robot's clock often starts at 0: frame 50 was not taken 50 s later.
+    stamps = np.arange(2001) / 10
+    rows = RobotPoses(None, stamps, SE3.exp(np.outer(stamps, [0.001, 0, 0, 0, 0, 0])))
+    for form in ("{:06d}.png", "{}.png", "20240115_{:06d}.png", "20240115{:06d}.png"):
+        images = [Path(form.format(i)) for i in range(100)]
+        with pytest.raises(InputError, match=r"2001 poses for 100 images.*stamps\.csv"):
+            pair_images(images, rows, None, Path("p"))
+
+
+def test_names_that_are_times_of_another_clock_are_refused() -> None:
+    rows = RobotPoses(None, np.arange(3.0), some_poses(3))
+    for names in (("9.25", "9.5", "9.75"), ("1700000000123", "1700000000223", "1700000000323")):
+        images = [Path(f"{name}.png") for name in names]
+        with pytest.raises(InputError, match="are the clocks the same"):
+            pair_images(images, rows, None, Path("p"))
+
+
+def test_times_in_names() -> None:
+    for names, times in (
+        (("1403636579763555584.png",), [1403636579.763556]),
+        (("rgb/1403636579763.jpg", "1403636579863"), [1403636579.763, 1403636579.863]),
+        (("10.png", "10.5"), [10.0, 10.5]),
+    ):
+        assert times_in_names(names) == pytest.approx(times, abs=1e-6)
+    for name in ("0000000123.png", "12.png", "frame-1.5.png", "-1.5.png", "1e3.png", "nan.png"):
+        assert times_in_names([name]) is None
+
+
 def test_images_outside_the_poses_times_have_none(tmp_path: Path) -> None:
     stamps = np.array([10.0, 10.1, 10.2])
     images = [Path(f"{t}.png") for t in ("9.9", "10.05", "10.3")]
@@ -144,6 +174,23 @@ def test_images_outside_the_poses_times_have_none(tmp_path: Path) -> None:
     found, notes = pair_images(images, rows, None, Path("p"))
     assert [pose is None for pose in found] == [True, False, True]
     assert notes[1].startswith("2 images lie outside")
+
+
+def test_images_in_another_order_than_their_names_are_not_paired_in_order() -> None:
+    rows = RobotPoses(None, None, some_poses(3))
+    images = [Path(f"{name}.png") for name in ("image-1", "image-10", "image-2")]
+    with pytest.raises(InputError, match=r"image-2\.png is given after image-10\.png"):
+        pair_images(images, rows, None, Path("p"))
+    # Every folder has an order of its own.
+    images = [Path(name) for name in ("b/1.png", "b/2.png", "a/1.png")]
+    assert None not in pair_images(images, rows, None, Path("p"))[0]
+
+
+def test_a_folder_given_to_a_command_is_in_natural_order(tmp_path: Path) -> None:
+    for i in range(1, 12):
+        (tmp_path / f"image-{i}.png").touch()
+    names = [file.name for file in image_files([tmp_path])]
+    assert names == [f"image-{i}.png" for i in range(1, 12)]
 
 
 def test_natural_order_takes_any_names() -> None:
@@ -193,6 +240,7 @@ def test_what_is_missing_or_twice_is_named(tmp_path: Path) -> None:
         ("image,stamp_s\na.png\n", "row 1 has 1 cells"),
         ("image,stamp_s\na.png,nan\n", "'nan' is not a number"),
         ("image,x\na.png,1\n", "needs the columns image and stamp_s"),
+        ("image,stamp_s\nl/a.png,1\nr/a.png,2\n", "'a.png' comes twice"),
     ],
 )
 def test_broken_tables_are_named(tmp_path: Path, text: str, message: str) -> None:

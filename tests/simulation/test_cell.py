@@ -86,6 +86,26 @@ def test_a_change_is_recorded_after_the_rest(
         assert frame.depth.exists()
 
 
+@pytest.mark.usefixtures("small")
+def test_frames_that_are_there_take_no_more_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame = 32 * 24 * 4
+    run = simulate("sim", tmp_path / "rooms", TINY)
+    for _ in range(3):
+        next(run)
+    run.close()
+    usage = cell.shutil.disk_usage(tmp_path)
+    for free, enough in ((7 * frame, True), (7 * frame - 1, False)):
+        left = usage._replace(free=free)
+        monkeypatch.setattr(cell.shutil, "disk_usage", lambda _, left=left: left)
+        if enough:
+            assert next(simulate("sim", tmp_path / "rooms", TINY)).done == 1
+        else:
+            with pytest.raises(InputError, match="GB are free"):
+                next(simulate("sim", tmp_path / "rooms", TINY))
+
+
 def test_bad_input_is_named(tmp_path: Path) -> None:
     for name, options, message in (
         ("lab", TINY, "use one of sim, sim-7, sim-12, sim-mini"),
@@ -93,6 +113,9 @@ def test_bad_input_is_named(tmp_path: Path) -> None:
         ("sim", SimulateOptions(frames=10**9), r"GB are free"),
         ("sim", SimulateOptions(frames=1), "at least 2"),
         ("sim", SimulateOptions(size=(4, 4)), "at least 16x16"),
+        ("sim", SimulateOptions(samples=0), "samples 0: at least 1"),
+        ("sim", SimulateOptions(blur_steps=0), "blur steps 0: at least 1"),
+        ("sim", SimulateOptions(noise=float("nan")), "noise nan: at least 0"),
     ):
         with pytest.raises(InputError, match=message):
             next(simulate(name, tmp_path / "out", options))

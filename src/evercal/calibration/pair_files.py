@@ -3,7 +3,7 @@
 import json
 import re
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -15,6 +15,7 @@ from evercal.calibration.solve import BoardCorners
 from evercal.calibration.time_offset import CameraTrack, interpolated_pairs
 from evercal.datasets.pose_track import PoseTrack
 from evercal.datasets.robot_poses import RobotPoses, read_robot_poses
+from evercal.datasets.row_files import times_in_names, without_ending
 from evercal.errors import InputError
 from evercal.geometry import SE3
 
@@ -114,12 +115,12 @@ def _camera(files: PairFiles) -> _CameraPoses:
         board = replace(board, images=tuple(natural))
         names = tuple(image.name for image in board.images)
         poses = [image.camera_from_board for image in board.images]
-        found = _CameraPoses(names, _stamps_of(names), poses, board)
+        found = _CameraPoses(names, times_in_names(names), poses, board)
     else:
         read = read_robot_poses(files.camera, files.camera_convention)
         stamps = read.stamps_s
         if stamps is None and read.names is not None:
-            stamps = _stamps_of(read.names)
+            stamps = times_in_names(read.names)
         found = _CameraPoses(read.names, stamps, list(read.poses), None)
     if files.invert not in ("camera", "both"):
         return found
@@ -142,19 +143,17 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts if part]
 
 
-def _stamps_of(names: tuple[str, ...]) -> NDArray[np.float64] | None:
-    """Seconds, where all names are times: 1700000000.25.png, or whole nanoseconds."""
-    stems = [PurePath(name).stem for name in names]
-    if not all(re.fullmatch(r"\d+\.\d+|\d{16,19}", stem) for stem in stems):
-        return None
-    return np.array([float(s) if "." in s else int(s) * 1e-9 for s in stems])
-
-
 def _rows_by_name(
     files: PairFiles, robot: tuple[str, ...], camera: tuple[str, ...]
 ) -> list[int | None]:
-    where = {PurePath(name).stem: i for i, name in enumerate(robot)}
-    rows = [where.get(PurePath(name).stem) for name in camera]
+    where = {without_ending(name): i for i, name in enumerate(robot)}
+    twice = [n for i, n in enumerate(robot) if where[without_ending(n)] != i]
+    if twice:
+        raise InputError(
+            f"{files.robot}: {twice[0]!r} comes twice, apart from folder and ending; give every"
+            f" image a name of its own"
+        )
+    rows = [where.get(without_ending(name)) for name in camera]
     if all(row is None for row in rows):
         raise InputError(
             f"{files.robot}: names no image of {files.camera}; its first is {robot[0]!r}, the first"

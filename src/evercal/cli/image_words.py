@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def image_files(words: Sequence[Path]) -> list[Path]:
-    """Image files that words name; a folder stands for the images in it, in order of name.
+    """Image files that words name; a folder stands for its images, image-2 before image-10.
 
     Raises:
         InputError: no word, a file that is missing, or a folder without images.
@@ -21,11 +21,13 @@ def image_files(words: Sequence[Path]) -> list[Path]:
     if not words:
         raise InputError("no image given; name one or more image files after the store")
     from evercal.datasets.images import IMAGE_ENDINGS
+    from evercal.datasets.row_files import natural_key
 
     files: list[Path] = []
     for word in words:
         if word.is_dir():
-            inside = sorted(p for p in word.iterdir() if p.suffix.lower() in IMAGE_ENDINGS)
+            inside = [p for p in word.iterdir() if p.suffix.lower() in IMAGE_ENDINGS]
+            inside.sort(key=lambda p: natural_key(p.name))
             if not inside:
                 raise InputError(f"{word}: no images in this folder ({', '.join(IMAGE_ENDINGS)})")
             files += inside

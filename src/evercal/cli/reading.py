@@ -18,14 +18,17 @@ class Reading:
     """Format of the recording: generic, 7scenes, 12scenes, nerfstudio, colmap, wrist, lerobot or
     rosbag; it is recognised when left out."""
     camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """File of the intrinsics of all images, where the recording has none: 3x3 matrix as text, JSON
-    or ROS camera_info YAML."""
+    """File of the intrinsics of all images, where the recording has none: 3x3 matrix as text, JSON,
+    ROS camera_info YAML or OpenCV's storage."""
     image_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="")] = None
     """Which images of a bag or a LeRobot dataset; needed where there are several."""
+    pose_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="")] = None
+    """Which tf or joint states of a bag; needed where several topics say where the arm was."""
     base_frame: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """The robot's base, a tf frame of a bag or a link of the URDF."""
     gripper_frame: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """The gripper, a tf frame of a bag or a link of the URDF."""
+    """The gripper: a tf frame of a bag, a link of the URDF, or a feature or arm of a LeRobot
+    dataset."""
     urdf: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """URDF of the robot, where the recording has joint angles and no poses."""
     pose_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None

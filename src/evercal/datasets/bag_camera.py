@@ -11,7 +11,7 @@ from evercal.geometry import Camera
 
 
 def bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
-    """The first camera_info beside an image topic, or the only one in the bag.
+    """The first camera_info beside an image topic; that of another topic is another camera's.
 
     Args:
         bag: open.
@@ -22,23 +22,21 @@ def bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
         Its topic and the camera: K and D, or P without a lens where the image is rectified.
 
     Raises:
-        InputError: None or several, uncalibrated, or a lens that is not supported.
+        InputError: None, uncalibrated, or a lens that is not supported.
     """
     topics = bag.topics(CAMERA_INFO)
     image = image_topic.removesuffix("/compressed")
     beside = f"{image.rpartition('/')[0]}/camera_info"
-    if beside not in topics and len(topics) != 1:
-        has = f"several, {', '.join(topics)}" if topics else "none in the bag"
+    if beside not in topics:
         raise InputError(
-            f"{bag.path}: no camera_info for {image_topic} ({beside} is expected; there are {has});"
-            f" record it, or give the intrinsics with --camera"
+            f"{bag.path}: no camera_info for {image_topic} ({beside} is expected, there is"
+            f" {' and '.join(topics) or 'none'}); record it, or give the intrinsics with --camera"
         )
-    topic = beside if beside in topics else topics[0]
-    message = next(bag.messages([topic])).content
+    message = next(bag.messages([beside])).content
     try:
-        return topic, _camera(message, image.rpartition("/")[2].startswith("image_rect"))
+        return beside, _camera(message, image.rpartition("/")[2].startswith("image_rect"))
     except ValueError as error:
-        raise InputError(f"{bag.path}: {topic}: {error}") from None
+        raise InputError(f"{bag.path}: {beside}: {error}") from None
 
 
 def _camera(message: Any, rectified: bool) -> Camera:

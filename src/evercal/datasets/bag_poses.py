@@ -52,7 +52,7 @@ def place_images(
     """
     if options.urdf is not None:
         return _from_joints(bag, stamps_ns, options)
-    tree, times = _tf(bag, int(stamps_ns[0]))
+    tree, times = _tf(bag, int(stamps_ns[0]), options.pose_topic)
     stamps = (stamps_ns - stamps_ns[0]).astype(np.float64) * 1e-9
     base = _frame(bag, tree, options.base_frame, _BASES, "--base-frame")
     gripper = _frame(bag, tree, options.gripper_frame, _GRIPPERS, "--gripper-frame")
@@ -70,7 +70,7 @@ def place_images(
     return Placed(poses, known, of_camera, notes)
 
 
-def _tf(bag: BagFile, zero_ns: int) -> tuple[TfTree, NDArray[np.float64]]:
+def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[TfTree, NDArray[np.float64]]:
     """All transforms, and the times of the moving ones, in seconds after `zero_ns`."""
     topics = bag.topics(*TF)
     if not topics:
@@ -80,7 +80,8 @@ def _tf(bag: BagFile, zero_ns: int) -> tuple[TfTree, NDArray[np.float64]]:
             f"{bag.path}: no tf in it, so nothing says where the gripper was; record /tf and"
             f" /tf_static{instead}. It holds {bag.contents()}"
         )
-    tree, times = TfTree(str(bag.path)), []
+    _check_topic(bag, wanted, [t for t in topics if not t.endswith("tf_static")], "tf")
+    tree, times = TfTree(str(bag.path), wanted), []
     for message in bag.messages(topics):
         for entry in message.content.transforms:
             stamp = None
@@ -95,8 +96,17 @@ def _tf(bag: BagFile, zero_ns: int) -> tuple[TfTree, NDArray[np.float64]]:
                 stamp,
                 (moved.x, moved.y, moved.z),
                 (turned.w, turned.x, turned.y, turned.z),
+                message.topic.removesuffix("_static"),
             )
     return tree, np.array(times)
+
+
+def _check_topic(bag: BagFile, wanted: str | None, topics: Sequence[str], what: str) -> None:
+    if wanted is not None and wanted not in topics:
+        raise InputError(
+            f"{bag.path}: no {what} on --pose-topic {wanted}; it is on"
+            f" {', '.join(topics) or 'none'}"
+        )
 
 
 def _frame(
@@ -142,13 +152,9 @@ def _from_joints(bag: BagFile, stamps_ns: NDArray[np.int64], options: ReadOption
             f"{bag.path}: no joint states in it for --urdf {options.urdf}; it holds"
             f" {bag.contents()}"
         )
-    tracks: dict[str, list[tuple[float, float]]] = {}
+    _check_topic(bag, options.pose_topic, topics, "joint states")
     zero = int(stamps_ns[0])
-    for message in bag.messages(topics):
-        stamp = message.content.header.stamp
-        at = stamp.sec * 1_000_000_000 + stamp.nanosec or message.logged_ns
-        for name, position in zip(message.content.name, message.content.position, strict=False):
-            tracks.setdefault(name, []).append(((at - zero) * 1e-9, float(position)))
+    tracks = _tracks(bag, topics, zero)
     needed = model.joints_between(base, gripper)
     missing = [name for name in needed if name not in tracks]
     if missing:
@@ -156,15 +162,44 @@ def _from_joints(bag: BagFile, stamps_ns: NDArray[np.int64], options: ReadOption
             f"{bag.path}: joint states lack {', '.join(missing)}, which {gripper} depends on; they"
             f" have {', '.join(tracks)}"
         )
+    chosen = [_track(bag, name, tracks[name], options.pose_topic) for name in needed]
     stamps = (stamps_ns - zero).astype(np.float64) * 1e-9
     values, known = np.empty((len(stamps), len(needed))), np.ones(len(stamps), dtype=bool)
-    for column, name in enumerate(needed):
-        times, positions = np.array(tracks[name]).T
+    for column, track in enumerate(chosen):
+        times, positions = np.array(track).T
         values[:, column], seen = interpolate(times, positions, stamps)
         known &= seen
     if not known.any():
-        times = np.array([at for at, _ in tracks[needed[0]]])
+        times = np.array([at for at, _ in chosen[0]])
         _refuse_apart(bag, stamps, times, "the joint states")
     poses = model.base_from_gripper(needed, values, base, gripper)
     notes = [f"gripper poses are those of {gripper} in {base}, from {options.urdf.name}"]
     return Placed(poses, known, False, notes + model.beyond_limits(needed, values))
+
+
+def _tracks(
+    bag: BagFile, topics: Sequence[str], zero_ns: int
+) -> dict[str, dict[str, list[tuple[float, float]]]]:
+    """By joint and topic: seconds after `zero_ns`, and positions."""
+    found: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for message in bag.messages(topics):
+        stamp = message.content.header.stamp
+        at = stamp.sec * 1_000_000_000 + stamp.nanosec or message.logged_ns
+        for name, position in zip(message.content.name, message.content.position, strict=False):
+            track = found.setdefault(name, {}).setdefault(message.topic, [])
+            track.append(((at - zero_ns) * 1e-9, float(position)))
+    return found
+
+
+def _track(
+    bag: BagFile, joint: str, topics: dict[str, list[tuple[float, float]]], wanted: str | None
+) -> list[tuple[float, float]]:
+    """The positions of a joint on its only topic, or on the one asked for."""
+    if wanted in topics:
+        return topics[wanted]
+    if len(topics) > 1:
+        raise InputError(
+            f"{bag.path}: joint {joint} is on several topics, {', '.join(sorted(topics))}; name"
+            f" the one that holds with --pose-topic"
+        )
+    return next(iter(topics.values()))

@@ -1,4 +1,4 @@
-"""Intrinsics from a file: a 3x3 matrix as text, evercal's own JSON, or ROS's camera_info YAML.
+"""Intrinsics from a file: 3x3 matrix as text, evercal's JSON, ROS's camera_info, OpenCV's storage.
 
     525 0 319.5                  {"width": 640, "height": 480,       image_width: 640
     0 525 239.5                   "fx": 525, "fy": 525,              image_height: 480
@@ -7,8 +7,9 @@
 
 The file's content decides which of them it is, not its ending. Of ROS both the calibration file and
 a printed message (`ros2 topic echo --once .../camera_info`) are read, the matrix K and D of the raw
-image; the projection P of the rectified image is not used. All count pixels from the centre of the
-top-left pixel.
+image; the projection P of the rectified image is not used. What OpenCV's FileStorage writes (YAML
+that starts with %YAML:1.0, or XML) holds camera_matrix and distortion_coefficients too. All count
+pixels from the centre of the top-left pixel.
 """
 
 import json
@@ -21,6 +22,13 @@ from evercal.geometry import Camera
 
 _MODELS = ("plumb_bob", "rational_polynomial", "none", "")
 _LENGTHS = (0, 4, 5, 8)
+# What programs that write OpenCV's storage call the fields, in lower case without underscores.
+_CALLED = {
+    "camera_matrix": ("cameramatrix", "intrinsicmatrix", "k"),
+    "distortion_coefficients": ("distortioncoefficients", "distcoeffs", "distcoeff", "d"),
+    "image_width": ("imagewidth", "width"),
+    "image_height": ("imageheight", "height"),
+}
 
 
 def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> Camera:
@@ -28,15 +36,15 @@ def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = Non
 
     Args:
         path: The file.
-        size: (width, height) in pixels of the images that a bare 3x3 matrix belongs to; the other
-            kinds say it themselves.
+        size: (width, height) in pixels of the images that a bare 3x3 matrix belongs to, or
+            OpenCV's storage without a size; the other kinds say it themselves.
 
     Raises:
-        InputError: The file is missing, is none of the three kinds, or holds no usable camera.
+        InputError: The file is missing, is none of these kinds, or holds no usable camera.
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise InputError(f"{path}: camera file is missing; check the path") from None
     except OSError as error:
@@ -46,6 +54,8 @@ def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = Non
     try:
         if text.lstrip().startswith("{"):
             return Camera.from_dict(_json_object(text))
+        if text.startswith("%YAML:") or "opencv-matrix" in text or "<opencv_storage" in text:
+            return camera_from_ros(_stored_by_opencv(text, size))
         numbers = _plain_numbers(text)
         if numbers is not None:
             return _from_matrix(numbers, size)
@@ -54,7 +64,9 @@ def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = Non
         raise InputError(f"{path}: {error}") from None
 
 
-_EXPECTED = "give a 3x3 matrix as text, evercal's camera JSON or a ROS camera_info YAML"
+_EXPECTED = (
+    "give a 3x3 matrix as text, evercal's camera JSON, a ROS camera_info YAML or OpenCV's storage"
+)
 
 
 def _json_object(text: str) -> Mapping[str, object]:
@@ -95,6 +107,37 @@ def _yaml_mapping(text: str) -> Mapping[str, object]:
     return data
 
 
+def _stored_by_opencv(text: str, size: tuple[int, int] | None) -> dict[str, object]:
+    """The fields of a cv2.FileStorage, by ROS's names."""
+    import cv2
+
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        nodes = {key: storage.getNode(key) for key in storage.root().keys()}  # noqa: SIM118
+        values = {
+            key: node.mat().ravel().tolist() if node.isMap() else node.real()
+            for key, node in nodes.items()
+            if node.isMap() or node.isInt() or node.isReal()
+        }
+    except (cv2.error, SystemError, AttributeError) as error:
+        text = " ".join(str(error).split())[:100]
+        raise ValueError(f"OpenCV cannot read its storage ({text}); {_EXPECTED}") from None
+    if values.get("fisheye_model"):
+        raise ValueError("fisheye_model is set; rectify the images or calibrate without it")
+    found: dict[str, object] = {}
+    for name, called in _CALLED.items():
+        keys = [key for key in values if key.lower().replace("_", "") in called]
+        if len(keys) > 1:
+            raise ValueError(f"{' and '.join(keys)} are the same; keep one of them")
+        if keys:
+            found[name] = values[keys[0]]
+    if "camera_matrix" not in found:
+        raise ValueError(f"'camera_matrix' is missing, there is {', '.join(nodes) or 'nothing'}")
+    if size is not None and not {"image_width", "image_height"} & found.keys():
+        found |= {"image_width": size[0], "image_height": size[1]}
+    return found
+
+
 def camera_from_ros(data: Mapping[str, object]) -> Camera:
     """The raw image's camera of a camera_info message, by the names of its fields.
 
@@ -108,7 +151,14 @@ def camera_from_ros(data: Mapping[str, object]) -> Camera:
     width = _first(data, "image_width", "width")
     height = _first(data, "image_height", "height")
     matrix = _list(_first(data, "camera_matrix", "K", "k"), "camera_matrix")
-    lens = data.get("distortion_coefficients", data.get("D", data.get("d", [])))
+    lens = next(
+        (data[name] for name in ("distortion_coefficients", "D", "d") if name in data), None
+    )
+    if lens is None:  # it may stand under another name
+        raise ValueError(
+            f"'distortion_coefficients' is missing, there is {', '.join(map(str, data))}; write"
+            f" four zeros if images have no lens distortion"
+        )
     distortion = _list(lens, "distortion_coefficients")
     model = data.get("distortion_model", "")
     if model not in _MODELS:

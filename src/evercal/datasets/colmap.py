@@ -1,12 +1,12 @@
 """A COLMAP model (Schönberger and Frahm, CVPR 2016), read by pycolmap (extra `colmap`).
 
-    ROOT/sparse/0/cameras.bin, images.bin, points3D.bin    or .txt, or ROOT itself
+    ROOT/sparse/0/cameras.bin, images.bin, points3D.bin    or .txt, or ROOT itself, or ROOT/0
     ROOT/images/...
 
 COLMAP states camera_from_world and counts pixels from the image's corner, so that the centre of the
 top-left pixel is (0.5, 0.5); here it is (0, 0). The base frame and the unit of length are the
 model's own. Images without a pose, and those beside them that the model does not name, count as
-untracked. Of several models the one with the most images is taken.
+untracked. Of several models in one place the one with the most images is taken.
 """
 
 import os
@@ -68,13 +68,20 @@ def load(root: str | os.PathLike[str]) -> Scene:
 
 
 def _models(root: Path) -> list[Path]:
-    """Folders with a model in them."""
-    found = []
+    """Folders with a model in them, all in the first place that has one.
+
+    Models elsewhere are not of the same images: those of distorted/sparse are from before the lens
+    was taken out.
+    """
     for name in _MODEL_FOLDERS:
         place = root / name
-        inner = sorted(place.iterdir()) if place.is_dir() and name != "." else []
-        found += [f for f in (place, *inner) if f.is_dir() and _is_model(f)]
-    return list(dict.fromkeys(found))
+        inner = sorted(place.iterdir()) if place.is_dir() else []
+        if name == ".":  # may be a folder of models, which COLMAP numbers
+            inner = [folder for folder in inner if folder.name.isdigit()]
+        found = [f for f in (place, *inner) if f.is_dir() and _is_model(f)]
+        if found:
+            return found
+    return []
 
 
 def _is_model(folder: Path) -> bool:

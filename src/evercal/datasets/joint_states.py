@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.datasets.kinematics import RobotModel
+from evercal.datasets.labels import labels_of_lists
 from evercal.datasets.pose_track import MAX_GAP_S
 from evercal.datasets.robot_poses import RobotPoses
 from evercal.datasets.row_files import Rows, read_rows
@@ -56,7 +57,7 @@ def read_joint_poses(
     needed = model.joints_between(base, gripper)
     if not needed:
         raise InputError(f"{model.path}: no joint moves {gripper} against {base}; name other links")
-    names, values = _plain_columns(rows, model, unit)
+    names, values = _plain_columns(path, rows, model, unit)
     try:
         poses = model.base_from_gripper(names, values, base, gripper)
     except InputError as error:
@@ -68,7 +69,7 @@ def read_joint_poses(
 
 
 def _plain_columns(
-    rows: Rows, model: RobotModel, unit: str | None
+    path: Path, rows: Rows, model: RobotModel, unit: str | None
 ) -> tuple[list[str], NDArray[np.float64]]:
     """Joint names without their units, and (n, columns) values in radians and metres."""
     names, stated = [], []
@@ -77,6 +78,9 @@ def _plain_columns(
         says = ending in _UNITS and not model.has_joint(column) and model.has_joint(plain)
         names.append(plain if says else column)
         stated.append(ending if says else None)
+    twice = [name for i, name in enumerate(names) if name in names[:i] and model.has_joint(name)]
+    if twice:
+        raise InputError(f"{path}: several columns are of joint {twice[0]}; keep one of them")
     return names, in_radians(model, names, rows.values, [s or unit for s in stated])
 
 
@@ -147,8 +151,7 @@ def read_joints(path: Path) -> Rows:
     try:
         columns = tuple(str(name) for name in data["joint_names"])
         values = np.array(data["positions"], dtype=np.float64)
-        names, stamps = data.get("images"), data.get("stamps_s")
-        times = None if stamps is None else np.array(stamps, dtype=np.float64)
+        names, times = labels_of_lists(data, len(values))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: {type(error).__name__} {error}; give {_JSON}") from None
     rows = len(values)
@@ -157,6 +160,4 @@ def read_joints(path: Path) -> Rows:
             f"{path}: 'positions' is a list of rows of {len(columns)} numbers, one for each of"
             f" 'joint_names'"
         )
-    if (names is not None and len(names) != rows) or (times is not None and len(times) != rows):
-        raise InputError(f"{path}: 'images' and 'stamps_s' are as many as 'positions', {rows}")
-    return Rows(None if names is None else tuple(map(str, names)), times, columns, values)
+    return Rows(names, times, columns, values)

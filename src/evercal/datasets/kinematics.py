@@ -125,10 +125,18 @@ class RobotModel:
         return [kinds.get(name) in ("revolute", "continuous") for name in names]
 
     def beyond_limits(self, names: Sequence[str], values: NDArray[np.float64]) -> list[str]:
-        """One sentence for each joint whose values leave what the URDF allows by over 0.1."""
+        """One sentence for each joint whose values leave what the URDF allows by over 0.1.
+
+        A joint without limits may wind up, but degrees look the same.
+        """
         found = []
         for name, column in zip(names, values.T, strict=True):
             joint = self._urdf.joint_map.get(name)
+            if joint is not None and joint.type == "continuous" and np.ptp(column) > _LARGEST_RAD:
+                found.append(
+                    f"joint {name} goes from {column.min():.2f} to {column.max():.2f}, more than"
+                    f" two turns in radians; are these degrees?"
+                )
             limit = None if joint is None or joint.type == "continuous" else joint.limit
             if limit is None or limit.lower is None or limit.upper is None:
                 continue

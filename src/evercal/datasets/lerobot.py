@@ -6,12 +6,8 @@
     ROOT/data/chunk-000/file-000.parquet                      version 3: several in a file
     ROOT/meta/episodes/chunk-000/file-000.parquet, ROOT/videos/KEY/chunk-000/file-000.mp4
 
-Poses come from a feature whose names hold x, y, z and qx, qy, qz, qw, or wx, wy, wz for a rotation
-vector (`ee.x` and `x` alike), in metres and radians; or from the first numbers of observation.state
-in a convention that is given; or with a URDF from the joints of observation.state (`elbow.pos` is
-the joint elbow), in radians unless the convention deg is given. The format has no place for
-intrinsics: a camera file has to be given. Frames of all episodes are training frames with
-base_from_gripper.
+Poses come from the features, see `lerobot_poses`. The format has no place for intrinsics: a camera
+file has to be given. Frames of all episodes are training frames with base_from_gripper.
 """
 
 import json
@@ -26,19 +22,13 @@ from numpy.typing import NDArray
 from evercal.datasets.camera_file import read_camera
 from evercal.datasets.frame import Frame, Scene
 from evercal.datasets.images import StoredImage, decode_image, image_file
-from evercal.datasets.joint_states import in_radians
-from evercal.datasets.kinematics import RobotModel
+from evercal.datasets.lerobot_poses import feature_poses, pose_feature
 from evercal.datasets.read_options import ReadOptions
 from evercal.datasets.video_file import VideoFrame, Videos
 from evercal.errors import InputError
-from evercal.geometry import SE3
-from evercal.geometry.conventions import doubt, pose_convention, poses_from_numbers
 
 USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")
 INFO = Path("meta") / "info.json"
-_STATE = "observation.state"
-# By convention: how the numbers of a pose are called.
-_CALLED = {"xyzw": ("x", "y", "z", "qx", "qy", "qz", "qw"), "ur": ("x", "y", "z", "wx", "wy", "wz")}
 
 
 def detect(root: Path) -> bool:
@@ -72,9 +62,9 @@ def load(root: Path, options: ReadOptions | None = None) -> Scene:
             f"{options.camera}: is for images of {camera.width}x{camera.height}, {key} is"
             f" {width}x{height}; give the intrinsics of this image size"
         )
-    column = _pose_column(root, info, options)
+    column = pose_feature(root, info, options)
     table = _table(root, info, column)
-    poses, notes = _poses(root, info, column, table, options)
+    poses, notes = feature_poses(root, info, column, table.values, options)
     images = _images(root, info, key, table)
     frames = tuple(
         Frame(f"episode_{episode:06d}/{number:06d}", image, camera, None, pose)
@@ -113,52 +103,6 @@ def _camera_key(root: Path, info: Mapping[str, Any], wanted: str | None) -> str:
         return str(wanted)
     what = f"no camera {wanted!r}" if wanted else f"{len(keys)} cameras"
     raise InputError(f"{root}: {what}; name one with --image-topic: {', '.join(keys) or 'none'}")
-
-
-def _names(info: Mapping[str, Any], column: str) -> list[str]:
-    """What the numbers of a feature are called, without prefixes and `.pos`."""
-    names = info["features"].get(column, {}).get("names") or []
-    if isinstance(names, dict):  # {"motors": [...]}
-        names = [name for group in names.values() if isinstance(group, list) for name in group]
-    return [str(name).removesuffix(".pos") for name in names]
-
-
-def _pose_column(root: Path, info: Mapping[str, Any], options: ReadOptions) -> str:
-    """The feature that says where the arm was."""
-    if options.urdf is not None:
-        return _STATE
-    if options.pose_convention is not None:
-        column = options.gripper_frame or _STATE
-        if column not in info["features"]:
-            has = ", ".join(info["features"])
-            raise InputError(f"{root}: no feature {column!r}; --gripper-frame names one of {has}")
-        return column
-    keys = [key for key in info["features"] if key.startswith("observation")]
-    found = [key for key in keys if _called(_names(info, key))]
-    if options.gripper_frame is not None:
-        found = [key for key in found if key == options.gripper_frame]
-    if _STATE in found or len(found) == 1:
-        return _STATE if _STATE in found else found[0]
-    if found:
-        raise InputError(
-            f"{root}: gripper poses are in {' and '.join(found)}; name one with --gripper-frame"
-        )
-    has = "; ".join(
-        f"{key}: {', '.join(_names(info, key))}"
-        for key in info["features"]
-        if key.startswith("observation") and _names(info, key) and "image" not in key
-    )
-    raise InputError(
-        f"{root}: no feature holds a pose (x, y, z and qx, qy, qz, qw or wx, wy, wz), there are"
-        f" {has or 'no named numbers'}; for joint angles give --urdf, for a pose in another form"
-        f" --pose-convention and --gripper-frame FEATURE"
-    )
-
-
-def _called(names: list[str]) -> str | None:
-    """The convention that a feature's names speak of, if it is a pose."""
-    last = [name.rpartition(".")[2] for name in names]
-    return next((c for c, parts in _CALLED.items() if all(p in last for p in parts)), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,53 +155,6 @@ def _parquet(root: Path) -> Any:
             f"{root}: LeRobot datasets need pyarrow and PyAV; run: pip install 'evercal[lerobot]'"
         ) from None
     return parquet
-
-
-def _poses(
-    root: Path, info: Mapping[str, Any], column: str, table: _Table, options: ReadOptions
-) -> tuple[SE3, list[str]]:
-    """(n,) base_from_gripper and what was taken."""
-    names = _names(info, column)
-    if options.urdf is not None:
-        return _joint_poses(root, names, table, options)
-    if options.base_frame is not None:
-        raise InputError(f"{root}: --base-frame goes with --urdf only; leave it out")
-    try:
-        if options.pose_convention is not None:
-            convention = pose_convention(options.pose_convention)
-            numbers = table.values[:, : convention.count]
-        else:
-            called = _called(names)
-            assert called is not None
-            convention = pose_convention(called)
-            last = [name.rpartition(".")[2] for name in names]
-            numbers = table.values[:, [last.index(part) for part in _CALLED[called]]]
-        poses, why = poses_from_numbers(numbers, convention), doubt(numbers, convention)
-    except ValueError as error:
-        raise InputError(f"{root}: {column}: {error}") from None
-    if why is not None:
-        raise InputError(f"{root}: {column}: {why}")
-    return poses, [f"gripper poses are {column}: {convention.meaning}"]
-
-
-def _joint_poses(
-    root: Path, names: list[str], table: _Table, options: ReadOptions
-) -> tuple[SE3, list[str]]:
-    """Forward kinematics of observation.state."""
-    assert options.urdf is not None
-    if len(names) != table.values.shape[1]:
-        count = table.values.shape[1]
-        raise InputError(f"{root}: {_STATE} has {count} numbers and {len(names)} names")
-    model = RobotModel(options.urdf)
-    base = options.base_frame or model.base_link
-    gripper = options.gripper_frame or model.end_link()
-    values = in_radians(model, names, table.values, [options.pose_convention] * len(names))
-    try:
-        poses = model.base_from_gripper(names, values, base, gripper)
-    except InputError as error:
-        raise InputError(f"{root}: {_STATE}: {error} (or say --pose-convention deg)") from None
-    notes = [f"gripper poses are those of {gripper} in {base}, from {options.urdf.name}"]
-    return poses, notes + model.beyond_limits(names, values)
 
 
 def _images(

@@ -17,7 +17,7 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +47,8 @@ def detect(root: Path) -> bool:
 def load(root: str | os.PathLike[str]) -> Scene:
     """Reads the poses and the size of one image of every camera; no other image is opened.
 
+    Where the file states no size, it is that of the first image.
+
     Raises:
         InputError: The file or an image is missing, or the file breaks the format; the message
             names the entry.
@@ -60,8 +62,9 @@ def load(root: str | os.PathLike[str]) -> Scene:
         entries = data.get("frames")
         if not isinstance(entries, list) or not entries:
             raise ValueError("'frames' is a list with at least one frame")
+        data = {**_first_size(root, data, entries), **data}
         frames = [_frame(root, data, i, entry, undo, scale) for i, entry in enumerate(entries)]
-        test = _tested(root, data)
+        test = _tested(root, data, {str(frame.image) for frame in frames})
     except (ValueError, OverflowError) as error:
         raise InputError(f"{file}: {error}") from None
     frames = _sized(file, frames)
@@ -86,6 +89,18 @@ def _read(file: Path) -> dict[str, object]:
     if not isinstance(data, dict):
         raise InputError(f"{file}: no JSON object; it has 'frames' in it")
     return data
+
+
+def _first_size(root: Path, data: Mapping[str, object], entries: list[object]) -> dict[str, object]:
+    """The first image's w and h, where neither the file nor its first frame states one of them."""
+    first = entries[0]
+    if not isinstance(first, dict) or {"w", "h"} & {*data, *first}:
+        return {}
+    name = first.get("file_path")
+    if not isinstance(name, str):
+        return {}
+    width, height = image_size(_image(root, name))
+    return {"w": width, "h": height}
 
 
 def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
@@ -148,9 +163,10 @@ def _camera(data: Mapping[str, object]) -> Camera:
     if data.get("is_fisheye"):
         raise ValueError("fisheye images are not supported; undistort them first")
     width, height = _number(data, "w"), _number(data, "h")
-    angle = data.get("camera_angle_x")
-    seen = None if angle is None else width / 2 / math.tan(_number(data, "camera_angle_x") / 2)
-    fx = _number(data, "fl_x", seen)
+    fx, fy = _focal(data, "x", width), _focal(data, "y", height)
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    if fx is None or fy is None:
+        raise ValueError("'fl_x' is missing, and so are 'fl_y' and 'camera_angle_x'")
     lens = [_number(data, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
     if _number(data, "k4", 0.0):
         raise ValueError("k4 is not 0; only k1, k2, k3, p1 and p2 are supported")
@@ -159,11 +175,23 @@ def _camera(data: Mapping[str, object]) -> Camera:
         width,  # pyright: ignore[reportArgumentType]  # checked when constructed
         height,  # pyright: ignore[reportArgumentType]
         fx,
-        _number(data, "fl_y", fx),
+        fy,
         _number(data, "cx", width / 2) - 0.5,
         _number(data, "cy", height / 2) - 0.5,
         tuple(lens) if any(lens) else (),
     )
+
+
+def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:
+    """A focal length in pixels, of itself or from the angle of view; None if neither is there."""
+    if data.get(f"fl_{axis}") is not None:
+        return _number(data, f"fl_{axis}")
+    if data.get(f"camera_angle_{axis}") is None:
+        return None
+    angle = _number(data, f"camera_angle_{axis}")
+    if not 0 < angle < math.pi:
+        raise ValueError(f"'camera_angle_{axis}' is between 0 and pi radians, got {angle}")
+    return size / 2 / math.tan(angle / 2)
 
 
 def _sized(file: Path, frames: list[Frame]) -> list[Frame]:
@@ -196,12 +224,16 @@ def _resized(frame: Frame, size: tuple[int, int]) -> Frame:
     return Frame(frame.name, frame.image, frame.camera.resized(*size), frame.base_from_camera)
 
 
-def _tested(root: Path, data: Mapping[str, object]) -> set[Path]:
+def _tested(root: Path, data: Mapping[str, object], images: Container[str]) -> set[Path]:
     found: set[Path] = set()
     for key in ("val_filenames", "test_filenames"):
         names = data.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError(f"{key!r} is a list of file names")
+        # A test frame under another name would be learned from.
+        other = [name for name in names if str(_image(root, name)) not in images]
+        if other:
+            raise ValueError(f"{key!r} names {other[0]!r}, which no frame does; mend the name")
         found |= {_image(root, name) for name in names}
     return found
 

@@ -1,5 +1,6 @@
 """Which gripper pose belongs to which image: by name, by time, or in order."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
 
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 
 from evercal.datasets.pose_track import MAX_GAP_S, PoseTrack
 from evercal.datasets.robot_poses import RobotPoses, read_robot_poses
-from evercal.datasets.row_files import in_seconds
+from evercal.datasets.row_files import natural_key, times_in_names
 from evercal.errors import InputError
 from evercal.geometry import SE3
 
@@ -38,7 +39,7 @@ def pair_images(
         return _by_name(images, rows.names, rows.poses, file)
     times = None
     if rows.stamps_s is not None:
-        times = _image_times(images, rows.stamps_s, stamps_s)
+        times = _image_times(images, stamps_s)
     if times is not None and rows.stamps_s is not None:
         return _by_time(times, PoseTrack(rows.stamps_s, rows.poses), file)
     if len(rows.poses) != len(images):
@@ -47,6 +48,14 @@ def pair_images(
             f"{file}: {len(rows.poses)} poses for {len(images)} images in {images[0].parent}; give"
             f" each image a row, or add {how} that says which belong together"
         )
+    # A shell's *.png puts image-10 before image-2, the rows do not.
+    for before, after in itertools.pairwise(images):
+        same = before.parent == after.parent
+        if same and natural_key(before.name) > natural_key(after.name):
+            raise InputError(
+                f"{file}: {after.name} is given after {before.name}, so which row is whose is open;"
+                f" give the folder, or name the images in a column image"
+            )
     first, last = images[0].name, images[-1].name
     return list(rows.poses), [f"images and poses were paired in order, {first} to {last}"]
 
@@ -85,7 +94,7 @@ def _by_name(
     if not any(pose is not None for pose in found):
         raise InputError(
             f"{file}: names no image of {images[0].parent}; its first is {names[0]!r}, the first"
-            f" image is {images[0].name!r}"
+            f" image is {images[0].name!r}; mend the names, or leave them out to pair in order"
         )
     notes = []
     if None in found:
@@ -106,6 +115,7 @@ def _by_time(
         raise InputError(
             f"{file}: no image was taken while poses were recorded: images at {times.min():.3f} to"
             f" {times.max():.3f} s, poses at {first:.3f} to {last:.3f} s; are the clocks the same?"
+            f" If not, name the image of each row in a column image"
         )
     notes = [f"gripper poses were interpolated at the times of {_count(len(times), 'image')}"]
     if not known.all():
@@ -117,22 +127,16 @@ def _by_time(
 
 
 def _image_times(
-    images: Sequence[Path], poses_s: NDArray[np.float64], stamps_s: Mapping[str, float] | None
+    images: Sequence[Path], stamps_s: Mapping[str, float] | None
 ) -> NDArray[np.float64] | None:
-    """(n,) seconds; from the stamps file, else from names that lie among the poses' times."""
+    """(n,) seconds; from the stamps file, else from names that are times."""
     if stamps_s is not None:
         times = [stamps_s.get(i.name, stamps_s.get(i.stem)) for i in images]
         if None in times:
             missing = images[times.index(None)]
             raise InputError(f"{missing}: stamps.csv has no row for it; add one for every image")
         return np.array(times, dtype=np.float64)
-    try:
-        numbers = in_seconds([float(image.stem) for image in images])
-    except ValueError:
-        return None
-    # 000123 is a number and no time; times lie where the poses' times lie.
-    inside = (numbers > poses_s.min() - 1.0) & (numbers < poses_s.max() + 1.0)
-    return numbers if inside.mean() >= 0.5 else None
+    return times_in_names([image.name for image in images])
 
 
 def _count(number: int, what: str) -> str:

@@ -8,18 +8,18 @@ These names are known, in any case, with or without a unit behind them (`x_mm`, 
     matrix           m00 ... m33 (row, column)
     angles           rx  rot_x  rotation_x;  roll pitch yaw;  A B C;  W P R
     four numbers     q1 q2 q3 q4
-    others           name, image, file, ...;  stamp, time, t, ...
+    others           image, file, name, ...;  stamp, time, t, ...: see `labels`
 
 The first four say how the rotation is meant, and so do W P R (FANUC) and roll pitch yaw with a
 unit. The other ones mean different things to different robots and need a convention.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from evercal.datasets.labels import find_labels, name_and_unit
 from evercal.geometry.conventions import PoseConvention, known_conventions, pose_convention
 
 
@@ -27,6 +27,8 @@ from evercal.geometry.conventions import PoseConvention, known_conventions, pose
 class PoseHeader:
     """Which columns hold what."""
 
+    cells: tuple[str, ...]
+    """What the columns are called."""
     groups: dict[str, tuple[int, ...]]
     """Columns by what they are: `position`, `quaternion` (w x y z), `angles` (x y z), ..."""
     units: dict[str, str]
@@ -37,8 +39,11 @@ class PoseHeader:
     """Column of the stamps."""
     stamp_unit: str | None
     """`s`, `ms`, `us` or `ns` if the header says it."""
-    width: int
-    """How many columns."""
+
+    @property
+    def width(self) -> int:
+        """How many columns."""
+        return len(self.cells)
 
     @property
     def rotations(self) -> list[str]:
@@ -46,10 +51,6 @@ class PoseHeader:
         return [group for group in self.groups if group != "position"]
 
 
-_NAMES = {"name", "image", "file", "filename", "file_name", "image_name", "image_file", "path"}
-_STAMPS = {"stamp", "t", "time", "timestamp", "time_stamp"}
-_UNIT = re.compile(r"[\s_]*[\s_\[(](mm|m|degrees|deg|radians|rad|ns|us|ms|s)[\])]?$|\s*\[\s*\]$")
-_SHORT = {"degrees": "deg", "radians": "rad"}
 _ALIASES: dict[str, tuple[tuple[str, ...], ...]] = {
     "position": tuple(
         (a, f"t{a}", f"t_{a}", f"p{a}", f"pos_{a}", f"position_{a}", f"translation_{a}")
@@ -83,18 +84,24 @@ def pose_header(cells: Sequence[str]) -> PoseHeader | None:
     """Reads the cells of a first line; None if they are numbers, a row and no header.
 
     Raises:
-        ValueError: The columns of one group differ in unit.
+        ValueError: The columns of one group differ in unit, or several groups may be meant.
     """
     numbers = [is_number(cell) for cell in cells]
-    names, units = zip(*(_name_and_unit(cell) for cell in cells), strict=True)
+    names, units = zip(*(name_and_unit(cell) for cell in cells), strict=True)
     groups: dict[str, tuple[int, ...]] = {}
     stated: dict[str, str] = {}
     for group, aliases in _ALIASES.items():
-        columns = [next((names.index(a) for a in some if a in names), None) for some in aliases]
-        found = tuple(column for column in columns if column is not None)
+        columns = [[i for i, name in enumerate(names) if name in some] for some in aliases]
+        found = tuple(column[0] for column in columns if column)
         # rotation_x is of a quaternion where there is a rotation_w.
         if len(found) < len(columns) or (group == "angles" and "quaternion" in groups):
             continue
+        alike = next((column for column in columns if len(column) > 1), None)
+        if alike is not None:
+            raise ValueError(
+                f"the columns {' and '.join(cells[c] for c in alike)} may both be the {group}'s;"
+                f" keep those of the pose"
+            )
         if len({units[column] for column in found}) > 1:
             raise ValueError(f"the columns {', '.join(cells[c] for c in found)} differ in unit")
         groups[group] = found
@@ -102,18 +109,8 @@ def pose_header(cells: Sequence[str]) -> PoseHeader | None:
             stated[group] = units[found[0]]
     if all(numbers) or (not groups and any(numbers)):
         return None
-    name = next((i for i, n in enumerate(names) if n in _NAMES), None)
-    stamp = next((i for i, n in enumerate(names) if n in _STAMPS), None)
-    unit = None if stamp is None else units[stamp]
-    return PoseHeader(groups, stated, name, stamp, unit, len(cells))
-
-
-def _name_and_unit(cell: str) -> tuple[str, str | None]:
-    name = re.sub(r"^(pose|transform)[._/]", "", cell.strip().lower())
-    found = _UNIT.search(name)
-    unit = found.group(1) if found else None
-    name = name[: found.start()] if found else name
-    return re.sub(r"[\s.]+", "_", name), _SHORT.get(unit or "", unit)
+    labels = find_labels(cells)
+    return PoseHeader(tuple(cells), groups, stated, labels.name, labels.stamp, labels.unit)
 
 
 def is_number(cell: str) -> bool:

@@ -13,13 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.datasets.labels import image_column, seconds
 from evercal.datasets.pose_header import PoseHeader, is_number, meant, pose_header
 from evercal.geometry.conventions import PoseConvention, known_conventions
 
 Array = NDArray[np.float64]
-_PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
-_LATEST_S = 1e11
-"""The year 5138: a stamp beyond it is not in seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,28 +54,16 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
             raise ValueError(f"row {i + 1} has {len(row)} columns, the header {header.width}")
     convention, columns = meant(header, given)
     names = None if header.name is None else tuple(row[header.name] for row in rows)
+    if names is None:
+        cells = dict(zip(header.cells, zip(*rows, strict=True), strict=True))
+        named = image_column(cells)
+        names = None if named is None else cells[named]
     stamps = None
     if header.stamp is not None:
         column = np.array([_number(row[header.stamp], i) for i, row in enumerate(rows)])
         stamps = seconds(column, header.stamp_unit)
     numbers = np.array([[_number(row[c], i) for c in columns] for i, row in enumerate(rows)])
     return PoseTable(numbers, convention, names, stamps)
-
-
-def seconds(stamps: Array, unit: str | None) -> Array:
-    """Stamps (n,) in seconds.
-
-    Raises:
-        ValueError: Numbers that cannot be seconds, and no unit that says what they are.
-    """
-    if unit in _PER_SECOND:
-        return stamps / _PER_SECOND[unit]
-    if stamps.ndim != 1 or np.abs(stamps).max(initial=0.0) > _LATEST_S:
-        raise ValueError(
-            f"a stamp of {np.abs(stamps).max(initial=0.0):.4g} is not in seconds; call the column"
-            f" stamp_ns, stamp_us or stamp_ms"
-        )
-    return stamps
 
 
 def _split(text: str) -> tuple[PoseHeader | None, list[list[str]]]:
@@ -131,6 +117,13 @@ def _without_header(rows: list[list[str]], given: PoseConvention | None) -> Pose
         names = tuple(row[words[0]] for row in rows)
     table = np.array(numbers)
     stamps = seconds(table[:, 0], None) if extra > len(words) else None
+    back = np.flatnonzero(np.diff(table[:, 0]) < 0)
+    # A number behind the pose instead shows in quaternions and matrices, but not in angles.
+    if stamps is not None and given.has_angles and back.size:
+        raise ValueError(
+            f"the first number of row {back[0] + 2} is smaller than the one before, so it is no"
+            f" stamp; write a header that says what the {width} columns are"
+        )
     return PoseTable(table[:, table.shape[1] - given.count :], given, names, stamps)
 
 

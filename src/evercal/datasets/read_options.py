@@ -14,11 +14,14 @@ class ReadOptions:
     image_topic: str | None = None
     """Which images: a topic of a bag, or a camera's key in a LeRobot dataset; None for the only
     one."""
+    pose_topic: str | None = None
+    """The tf or joint state topic of a bag that holds where several say where the arm was; None
+    where each frame or joint is on one only."""
     base_frame: str | None = None
     """The robot's base: a tf frame of a bag or a link of the URDF; None for the usual one."""
     gripper_frame: str | None = None
-    """What carries the camera or the target: a tf frame or a link of the URDF; None for the usual
-    one."""
+    """What carries the camera or the target: a tf frame, a link of the URDF, or a feature or arm of
+    a LeRobot dataset; None for the usual one."""
     urdf: Path | None = None
     """The robot's URDF, where the recording has joint angles; None for the one beside them."""
     pose_convention: str | None = None

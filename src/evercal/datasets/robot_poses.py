@@ -3,7 +3,8 @@
     x,y,z,qw,qx,qy,qz,image           [{"translation_m": [3], "quaternion_wxyz": [4],
     0.31,-0.02,0.4,1,0,0,0,a.png        "image": "a.png", "stamp_s": 12.5}, ...]
 
-A table's header tells what its columns are (`pose_header`). JSON is a list of such objects, with
+A table's header tells what its columns are (`pose_header`), and what names images and times are
+called is the same everywhere (`labels`). JSON is a list of such objects, with
 `matrix` [4][4] in place of translation and quaternion if liked, or a list of lists of numbers; it
 may stand under `poses`. NPY is (n, 4, 4), or (n, k) numbers with a convention. A `.tum` file has
 lines of stamp, translation and quaternion x y z w. What a file leaves open, the convention
@@ -13,13 +14,20 @@ lines of stamp, translation and quaternion x y z w. What a file leaves open, the
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.datasets.pose_table import PoseTable, read_pose_table, seconds
+from evercal.datasets.labels import (
+    find_labels,
+    image_column,
+    labels_of_lists,
+    number_array,
+    seconds,
+)
+from evercal.datasets.pose_table import PoseTable, read_pose_table
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.geometry.conventions import (
@@ -29,9 +37,6 @@ from evercal.geometry.conventions import (
     pose_convention,
     poses_from_numbers,
 )
-
-_STAMPS = ("stamp", "stamp_s", "time", "time_s", "timestamp", "timestamp_s")
-_NAMES = ("name", "image", "file")
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,13 +151,20 @@ def _needed(given: PoseConvention | None, count: int) -> PoseConvention:
 
 def _json_table(data: object, given: PoseConvention | None) -> PoseTable:
     if isinstance(data, Mapping) and "poses" in data:
-        data = data["poses"]
+        table = _json_table(data["poses"], given)
+        beside = {key: value for key, value in data.items() if key != "poses"}
+        names, stamps = labels_of_lists(beside, len(table.numbers))
+        return replace(
+            table,
+            names=names if table.names is None else table.names,
+            stamps_s=stamps if table.stamps_s is None else table.stamps_s,
+        )
     if isinstance(data, Mapping):
         data = [data]
     if not isinstance(data, list) or not data:
         raise ValueError("JSON of poses is a list of objects, or of lists of numbers")
     if all(isinstance(entry, list) for entry in data):
-        numbers = _array(data, "a list of poses")
+        numbers = number_array(data, "a list of poses")
         if numbers.ndim == 3:
             convention = given or pose_convention("matrix")
             return PoseTable(_matrices(numbers, convention), convention, None, None)
@@ -169,7 +181,7 @@ def _object_table(
 ) -> PoseTable:
     if all("matrix" in entry for entry in entries):
         convention = given or pose_convention("matrix")
-        matrices = _array([entry["matrix"] for entry in entries], "'matrix'")
+        matrices = number_array([entry["matrix"] for entry in entries], "'matrix'")
         numbers = matrices if matrices.ndim == 2 else _matrices(matrices, convention)
     elif all({"translation_m", "quaternion_wxyz"} <= entry.keys() for entry in entries):
         convention = given or pose_convention("wxyz")
@@ -178,7 +190,7 @@ def _object_table(
                 f"'translation_m' and 'quaternion_wxyz' say how they are meant, --convention"
                 f" {convention.name} something else; leave it out, or give wxyz:inverse"
             )
-        parts = [_array([e[key] for e in entries], f"'{key}'") for key in _PARTS]
+        parts = [number_array([e[key] for e in entries], f"'{key}'") for key in _PARTS]
         if [part.shape[1:] for part in parts] != [(3,), (4,)]:
             raise ValueError("'translation_m' has three numbers and 'quaternion_wxyz' four")
         numbers = np.concatenate(parts, axis=-1)
@@ -195,16 +207,21 @@ _PARTS = ("translation_m", "quaternion_wxyz")
 def _labels(
     entries: Sequence[Mapping[str, object]],
 ) -> tuple[tuple[str, ...] | None, NDArray[np.float64] | None]:
-    """Names and stamps of JSON objects, None where not every one has them."""
-    names: tuple[str, ...] | None = None
-    stamps = None
-    for key in _NAMES:
-        if names is None and all(key in entry for entry in entries):
-            names = tuple(str(entry[key]) for entry in entries)
-    for key in _STAMPS:
-        if stamps is None and all(key in entry for entry in entries):
-            stamps = seconds(_array([entry[key] for entry in entries], f"'{key}'"), None)
-    return names, stamps
+    """Names and stamps of JSON objects, None where they have none."""
+    keys = [*dict.fromkeys(key for entry in entries for key in entry)]
+    found = find_labels(keys)
+    name, stamp = (None if i is None else keys[i] for i in (found.name, found.stamp))
+    if name is None:
+        name = image_column({key: [entry.get(key) for entry in entries] for key in keys})
+    for key in filter(None, (name, stamp)):
+        if not all(key in entry for entry in entries):
+            raise ValueError(f"some poses have {key!r}, others lack it; give it to all or none")
+    return (
+        None if name is None else tuple(str(entry[name]) for entry in entries),
+        None
+        if stamp is None
+        else seconds(number_array([entry[stamp] for entry in entries], f"{stamp!r}"), found.unit),
+    )
 
 
 def _matrices(matrices: NDArray[np.float64], convention: PoseConvention) -> NDArray[np.float64]:
@@ -217,10 +234,3 @@ def _matrices(matrices: NDArray[np.float64], convention: PoseConvention) -> NDAr
             f" {convention.meaning}; give matrix or franka, or leave it out"
         )
     return matrices.reshape(-1, 16)
-
-
-def _array(values: object, what: str) -> NDArray[np.float64]:
-    try:
-        return np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{what} is made of numbers and has the same shape everywhere") from None

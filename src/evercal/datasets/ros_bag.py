@@ -27,7 +27,7 @@ from evercal.datasets.tf_tree import plain
 from evercal.errors import InputError
 from evercal.geometry import Camera
 
-USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf")
+USES = ("camera", "image_topic", "pose_topic", "base_frame", "gripper_frame", "urdf")
 
 
 def detect(root: Path) -> bool:

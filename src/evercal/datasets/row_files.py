@@ -4,17 +4,18 @@ import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.datasets.images import IMAGE_ENDINGS
+from evercal.datasets.labels import find_labels, seconds
 from evercal.datasets.pose_header import is_number
 from evercal.errors import InputError
 
-NAME_COLUMNS = ("name", "image", "image_name", "file", "filename", "file_name", "frame")
-STAMP_COLUMNS = ("stamp", "stamp_s", "timestamp", "timestamp_s", "time", "time_s", "t", "t_s")
-STAMP_COLUMNS_NS = ("stamp_ns", "timestamp_ns", "time_ns", "t_ns")
+_EARLIEST_S, _LATEST_S = 1e9, 4e9
+"""The years 2001 and 2096, in seconds since 1970: between them lie the times of recordings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,14 +43,13 @@ def read_rows(path: Path, what: str) -> Rows:
         InputError: missing, without a header or rows, or a cell that is not a finite number.
     """
     header, *lines = read_lines(path, what)
-    keys = [word.lower() for word in header]
-    name = next((i for i, key in enumerate(keys) if key in NAME_COLUMNS), None)
-    stamp = next((i for i, k in enumerate(keys) if k in STAMP_COLUMNS + STAMP_COLUMNS_NS), None)
+    labels = find_labels(header)
+    name, stamp = labels.name, labels.stamp
     if all(is_number(word) for word in header):
         raise InputError(f"{path}: the first line names no columns; write a header, then {what}")
     if not lines:
         raise InputError(f"{path}: holds a header and no rows; it is to hold {what}")
-    others = [i for i in range(len(header)) if i not in (name, stamp)]
+    others = [i for i in range(len(header)) if i not in labels.all]
     values = np.empty((len(lines), len(others)))
     stamps = np.empty(len(lines))
     for row, words in enumerate(lines):
@@ -62,7 +62,10 @@ def read_rows(path: Path, what: str) -> Rows:
         if stamp is not None:
             stamps[row] = _number(path, row, header[stamp], words[stamp])
     if stamp is not None:
-        stamps = stamps * 1e-9 if keys[stamp] in STAMP_COLUMNS_NS else in_seconds(stamps)
+        try:
+            stamps = seconds(stamps, labels.unit) if labels.unit else in_seconds(stamps)
+        except ValueError as error:
+            raise InputError(f"{path}: {error}") from None
     return Rows(
         None if name is None else tuple(words[name] for words in lines),
         None if stamp is None else stamps,
@@ -103,6 +106,26 @@ def in_seconds(stamps: NDArray[np.float64] | Sequence[float]) -> NDArray[np.floa
     middle = float(np.median(stamps)) if stamps.size else 0.0
     unit = next((u for size, u in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)) if middle > size), 1.0)
     return stamps * unit
+
+
+def times_in_names(names: Sequence[str]) -> NDArray[np.float64] | None:
+    """(n,) seconds that the names of images are; None where they are frame numbers or words.
+
+    Times have a decimal point, or count whole milli-, micro- or nanoseconds since 1970. Frame
+    numbers have neither, so 000123.png is no image taken at 123 s.
+    """
+    stems = [without_ending(name) for name in names]
+    if not stems or not all(re.fullmatch(r"\d+(\.\d+)?", stem) for stem in stems):
+        return None
+    times = in_seconds([float(stem) for stem in stems])
+    since_1970 = ((times > _EARLIEST_S) & (times < _LATEST_S)).all()
+    return times if since_1970 or any("." in stem for stem in stems) else None
+
+
+def without_ending(name: str) -> str:
+    """The name of an image without its folder and ending; what follows the point of 12.5 stays."""
+    path = PurePath(name)
+    return path.stem if path.suffix.lower() in IMAGE_ENDINGS else path.name
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:

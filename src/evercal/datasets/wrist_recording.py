@@ -3,7 +3,7 @@
     ROOT/image-1.png, ...               or in ROOT/images, ROOT/rgb
     ROOT/base_from_gripper.csv          or .json, .npy, .tum, .txt: as `read_robot_poses` takes them
     ROOT/joints.csv, ROOT/arm.urdf      or joint angles and a URDF in its place
-    ROOT/camera.json                    or .yaml, .yml, .txt: as `read_camera` takes it
+    ROOT/camera.json                    or .yaml, .yml, .xml, .txt: as `read_camera` takes it
     ROOT/stamps.csv                     optional: columns image, stamp_s
 
 Rows go to images by name, by time or in order. Every image that gets a pose is a training frame
@@ -31,7 +31,7 @@ _JOINTS = ("joints.csv", "joints.json")
 _CAMERAS = tuple(
     f"{stem}.{ending}"
     for stem in ("camera", "camera_info")
-    for ending in ("json", "yaml", "yml", "txt")
+    for ending in ("json", "yaml", "yml", "xml", "txt")
 )
 _FOLDERS = (".", "images", "rgb")
 
@@ -113,8 +113,9 @@ def _camera(root: Path, options: ReadOptions, image: Path) -> Camera:
         if len(found) != 1:
             has = f"{' and '.join(found)} in it" if found else "no camera file in it"
             raise InputError(
-                f"{root}: {has}; name the file of the intrinsics with --camera (3x3 matrix, JSON or"
-                f" camera_info YAML), or put it there as camera.json, .yaml or .txt"
+                f"{root}: {has}; name the file of the intrinsics with --camera (3x3 matrix, JSON,"
+                f" camera_info YAML or OpenCV's storage), or put it there as camera.json,"
+                f" .yaml, .xml or .txt"
             )
         file = root / found[0]
     camera = read_camera(file, size)
@@ -134,4 +135,7 @@ def _stamps(root: Path) -> dict[str, float] | None:
     if rows.names is None or rows.stamps_s is None:
         raise InputError(f"{file}: needs the columns image and stamp_s")
     names = [PurePath(name).name for name in rows.names]
+    twice = [name for i, name in enumerate(names) if name in names[:i]]
+    if twice:
+        raise InputError(f"{file}: {twice[0]!r} comes twice; give every image one time")
     return dict(zip(names, rows.stamps_s.tolist(), strict=True))

@@ -132,7 +132,7 @@ def simulate(
     per_room = frames + 3 * CALIBRATION_FRAMES + suite.changed
     total, done = per_room * len(suite.rooms), 0
     taken = RenderOptions(
-        samples=options.samples or suite.samples,
+        samples=suite.samples if options.samples is None else options.samples,
         exposure_ev=options.exposure_ev,
         noise=options.noise,
         blur_steps=options.blur_steps,
@@ -145,7 +145,8 @@ def simulate(
         "jpeg_quality": suite.jpeg_quality,
         **asdict(taken),
     }
-    _refuse_full_disk(out, total * width * height * (4 if suite.depth else 2))
+    there = sum(1 for scene, *_ in suite.rooms for _ in (out / scene).glob("**/images/*.jpg"))
+    _refuse_full_disk(out, (total - there) * width * height * (4 if suite.depth else 2))
     mi = mitsuba()
     settings["renderer"] = f"mitsuba {mi.__version__} {mi.variant()}"
     lock_settings(out / "render.json", settings)
@@ -178,13 +179,16 @@ def _checked(name: str, options: SimulateOptions) -> Suite:
         raise InputError(f"frames {options.frames}: a room takes at least 2, one per split")
     if options.size is not None and min(options.size) < 16:
         raise InputError(f"size {options.size[0]}x{options.size[1]}: at least 16x16")
-    if min(options.samples or 1, options.blur_steps) < 1 or options.noise < 0:
-        raise InputError("samples and blur steps are at least 1, noise is not negative")
+    for what, count in (("samples", options.samples), ("blur steps", options.blur_steps)):
+        if count is not None and count < 1:
+            raise InputError(f"{what} {count}: at least 1")
+    if not options.noise >= 0:  # also nan
+        raise InputError(f"noise {options.noise:g}: at least 0")
     return SUITES[name]
 
 
 def _refuse_full_disk(out: Path, needed: int) -> None:
-    """A generous guess, made before hours of rendering end with a full disk."""
+    """A generous guess of what is yet to be written, before hours of rendering fill the disk."""
     place = out.resolve()
     while not place.exists():
         place = place.parent
