@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 from tabulate import tabulate
 from tqdm import tqdm
 
+from evercal.calibration.from_images import Images, calibrate
 from evercal.continual.learn_scene import LearnOptions, LearnReport, learn_scene
 from evercal.continual.presets import preset
 from evercal.continual.stage import StageOptions
 from evercal.datasets import Frame, Scene, load_scene, posed
 from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside
-from evercal.geometry import SE3, Camera, average_poses, pose_distance, squared_mahalanobis
+from evercal.geometry import SE3, Camera, pose_distance, squared_mahalanobis
 from evercal.localization.localizer import LocalizeOptions, Localizer
 from evercal.simulation.mini import mini_rooms
 
@@ -198,8 +199,8 @@ def fixed(out: Path, memory: float) -> list[dict[str, object]]:
 
 
 def _fixed_pose(localizer: Localizer, frames: Sequence[Frame]) -> SE3:
-    poses = [localizer.localize(f.read_image(), f.camera).base_from_camera for f in frames]
-    return average_poses(SE3.stack([pose for pose in poses if pose is not None]))
+    images = Images([(f.name, f.read_image()) for f in frames], frames[0].camera)
+    return calibrate(localizer, images, "eye_to_hand").parent_from_child
 
 
 OFFSET = SE3.exp(np.array([0.004, -0.003, 0.002, *np.deg2rad([0.4, -0.3, 0.2])]))

@@ -12,7 +12,8 @@ from evercal.features.precision import fast_bfloat16
 from evercal.geometry import SE3
 from evercal.networks.buffer import FeatureBuffer
 from evercal.networks.head import Head, HeadOptions
-from evercal.networks.trainer import MUON_STEPS, FitOptions, HeadTrainer
+from evercal.networks.muon import MUON_STEPS
+from evercal.networks.trainer import FitOptions, HeadTrainer
 
 ROWS, VIEWS = 60_000, 100
 
@@ -60,7 +61,7 @@ def _products(head: Head, batch: int, repeat: int) -> tuple[float, float]:
     width, hidden = head.options.width, head.layers - 1
     x, w = torch.randn(batch, width, dtype=kind), torch.randn(width, width, dtype=kind)
     first, w0 = torch.randn(batch, head.features, dtype=kind), w[: head.features]
-    small = torch.randn(width, width, dtype=torch.bfloat16)
+    small = torch.randn(width, width, dtype=kind)
 
     def layers() -> None:
         for inputs, weights in [(first, w0)] * 2 + [(x, w)] * hidden:

@@ -28,7 +28,8 @@ class Answers:
     """A localizer that knows one scene and is off by so many metres; None is refused."""
 
     def __init__(self, metres: list[float | None], sigma_m: float) -> None:
-        self.maps = SimpleNamespace(scenes=[SimpleNamespace(camera=CAMERA)])
+        self.maps = SimpleNamespace(scenes=[SimpleNamespace(camera=CAMERA)], keyframes=[None])
+        self.scenes = ["room"]
         self.metres, self.sigma_m = metres, sigma_m
 
     def localize(self, image: np.ndarray, camera: object = None) -> PoseEstimate:

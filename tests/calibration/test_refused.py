@@ -74,11 +74,13 @@ def test_one_outlier_does_not_make_a_second_axis() -> None:
         solve(replace(pairs, base_from_gripper=wrong), "eye_in_hand")
 
 
-def test_a_sphere_about_the_board_does_with_a_known_scale_alone() -> None:
-    # All motions turn about the board: the camera's lengths tie nothing, as on a hemisphere.
+@pytest.mark.parametrize("distance_m", [0.5, 0.0])
+def test_a_sphere_about_the_board_does_with_a_known_scale_alone(distance_m: float) -> None:
+    # All motions turn about the board: the camera's lengths tie nothing, as on a hemisphere. At no
+    # distance their scale moves no residual at all.
     rng = np.random.default_rng(3)
     turn = Rotation.from_rotvec(rng.normal(0, 0.5, (25, 3)))
-    seen = pose(turn, np.tile([0, 0, 0.5], (25, 1)))
+    seen = pose(turn, np.tile([0, 0, distance_m], (25, 1)))
     drawn = recording(Setting(noise_mm=0, noise_deg=0), 0)
     robot = drawn.fixed_from_board @ (drawn.parent_from_camera @ seen).inverse()
     pairs = PosePairs(drawn.pairs.names, robot, seen)

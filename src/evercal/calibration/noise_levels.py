@@ -69,7 +69,7 @@ def estimate_levels(
     chosen = np.unique(np.linspace(0, len(residual) - 1, MAX_POSES).round().astype(int))
     residual, jacobian, known = residual[chosen], jacobian[chosen], known[chosen]
     directions = {kind: columns[chosen] for kind, columns in directions.items()}
-    problem = _Problem(residual, jacobian, tuple(directions.values()), known)
+    problem = _Problem(residual, _basis(jacobian), tuple(directions.values()), known)
     variance = problem.first_guess() if start is None else start.variance
     forms = problem.at(variance)
     for _ in range(_ROUNDS):
@@ -106,7 +106,7 @@ def working_noise(noise: Array, use: NDArray[np.bool_]) -> Array:
 
 def normal_inverse(normal: Array) -> Array:
     """Inverse of (p, p) normal equations; what they leave open comes out huge, not zero."""
-    unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-200))
     values, axes = np.linalg.eigh(normal * np.outer(unit, unit))
     return np.outer(unit, unit) * ((axes / np.maximum(values, 1e-14)) @ axes.T)
 
@@ -206,7 +206,8 @@ class _Problem:
     """What the levels are judged from; m poses."""
 
     residual: Array
-    jacobian: Array
+    basis: Array
+    """(m, 6, r) of what the unknowns can explain."""
     directions: tuple[Array, ...]
     known: Array
 
@@ -228,8 +229,8 @@ class _Problem:
         for part, level in zip(self.directions, variance, strict=True):
             covariance = covariance + level * part @ part.transpose(0, 2, 1)
         weight = np.linalg.inv(covariance)
-        weighted = (weight @ self.jacobian).reshape(6 * m, -1)
-        normal = self.jacobian.reshape(6 * m, -1).T @ weighted
+        weighted = (weight @ self.basis).reshape(6 * m, -1)
+        normal = self.basis.reshape(6 * m, -1).T @ weighted
         projector = -weighted @ np.linalg.solve(normal, weighted.T)
         projector.reshape(m, 6, m, 6)[np.arange(m), :, np.arange(m)] += weight
         error = projector @ self.residual.ravel()
@@ -246,6 +247,18 @@ class _Problem:
         likelihood = -np.linalg.slogdet(covariance)[1].sum() - np.linalg.slogdet(normal)[1]
         likelihood -= error @ self.residual.ravel()
         return _Forms(gram[:-1, :-1], values[:-1] - gram[:-1, -1], float(likelihood))
+
+
+def _basis(jacobian: Array) -> Array:
+    """(m, 6, r) orthonormal columns in place of those of the unknowns.
+
+    The restricted likelihood depends on the space that the columns span alone. An unknown that the
+    poses leave open adds nothing to it; with its column the normal equations would be singular.
+    """
+    columns = jacobian.reshape(-1, jacobian.shape[2])
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
+    left, values, _ = np.linalg.svd(columns, full_matrices=False)
+    return left[:, values > 1e-10 * values[0]].reshape(*jacobian.shape[:2], -1)
 
 
 def _solve_nonnegative(gram: Array, forms: Array) -> Array:

@@ -1,7 +1,6 @@
 """Pose pairs from two files: robot poses and camera poses, paired by name, by time or in order."""
 
 import json
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -15,7 +14,7 @@ from evercal.calibration.solve import BoardCorners
 from evercal.calibration.time_offset import CameraTrack, interpolated_pairs
 from evercal.datasets.pose_track import PoseTrack
 from evercal.datasets.robot_poses import RobotPoses, read_robot_poses
-from evercal.datasets.row_files import times_in_names, without_ending
+from evercal.datasets.row_files import natural_key, times_in_names, without_ending
 from evercal.errors import InputError
 from evercal.geometry import SE3
 
@@ -111,7 +110,7 @@ def _robot(files: PairFiles) -> RobotPoses:
 def _camera(files: PairFiles) -> _CameraPoses:
     if _is_board_file(files.camera):
         board = read_board_poses(files.camera)
-        natural = sorted(board.images, key=lambda image: _natural(image.name))
+        natural = sorted(board.images, key=lambda image: natural_key(image.name))
         board = replace(board, images=tuple(natural))
         names = tuple(image.name for image in board.images)
         poses = [image.camera_from_board for image in board.images]
@@ -135,12 +134,6 @@ def _is_board_file(path: Path) -> bool:
     except (OSError, ValueError):
         return False  # the reader of poses says what is wrong with it
     return isinstance(data, dict) and data.get("format") == FORMAT
-
-
-def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Numbers in a name count as numbers: image-2 comes before image-10."""
-    parts = re.split(r"(\d+)", name)
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts if part]
 
 
 def _rows_by_name(

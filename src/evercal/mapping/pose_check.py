@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evercal.features.precision import fast_bfloat16
 from evercal.features.views import ideal_cell_pixels
 from evercal.features.vlad import Vlad
 from evercal.mapping.plane_sweep import FAR_M, NEAR_M, USUAL_M
@@ -105,7 +106,9 @@ def depth_scale(recording: Recording, pairs: list[MatchedPair]) -> float:
 def _matched(recording: Recording, i: int, j: int, options: PoseCheckOptions) -> MatchedPair:
     """Patches that are most alike both ways."""
     a, b = recording.features(i)[:: options.stride], recording.features(j)
-    similar = a.bfloat16() @ b.bfloat16().T
+    if fast_bfloat16(a.device):
+        a, b = a.bfloat16(), b.bfloat16()
+    similar = a @ b.T
     best = similar.max(1)
     back = similar.argmax(0)
     rows = torch.arange(len(a))

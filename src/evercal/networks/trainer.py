@@ -14,10 +14,9 @@ from evercal.networks.distributed import average, broadcast, processes
 from evercal.networks.head import Head
 from evercal.networks.hooks import ProposedStep, TrainingHooks
 from evercal.networks.loss import LossOptions, clamp_px, reprojection_loss
+from evercal.networks.muon import Muon
 
 INLIER_PX = 5.0
-# Newton-Schulz iterations of Muon. Three train as well as the usual five here, and cost less.
-MUON_STEPS = 3
 # While points are still far off, their errors say nothing about the lens.
 CORRECTION_FROM_PX = 20.0
 
@@ -265,7 +264,7 @@ def _optimisers(
     if not hidden:
         return [adamw]
     matrices = [{"params": hidden, "share": options.muon_rate / rate}]
-    return [adamw, torch.optim.Muon(matrices, weight_decay=weight_decay, ns_steps=MUON_STEPS)]
+    return [adamw, Muon(matrices, rate, weight_decay)]
 
 
 def one_cycle(options: FitOptions, step: int) -> float:

@@ -1,14 +1,20 @@
 """What the demo asks of a store that knows its rooms."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from evercal.datasets import Frame, Scene
+from evercal.calibration.calibration import Calibration
+from evercal.calibration.drift import Shift, check
+from evercal.calibration.from_images import Images, calibrate
+from evercal.datasets import Scene
+from evercal.errors import InputError
 from evercal.evaluation import FrameResult, evaluate, scores
-from evercal.geometry import SE3, average_poses, pose_distance_mm_deg
+from evercal.geometry import SE3, pose_distance_mm_deg
 from evercal.reports.demo_outcome import Bump, DemoOutcome, FixedCamera, UnknownRoom
 from evercal.simulation.box_room import BoxRoom
 
@@ -63,18 +69,24 @@ class Look:
             outcome.changed_errors_m = [result.translation_error_m for result in results]
 
     def find_fixed_cameras(self, outcome: DemoOutcome) -> None:
-        """The cameras that stand still, before and after the bump."""
+        """The cameras that stand still, calibrated, and checked after the bump."""
         for room in self.rooms:
             if room.fixed is None:
                 continue
             name = room.scene.name
-            before = self._poses(room.fixed, name)
+            before = self._calibrated(room.fixed, name)
             outcome.fixed.append(_fixed_camera(name, room.fixed, before))
             if room.bumped is None:
                 continue
-            after = self._poses(room.bumped, name)
-            if len(before) >= 2 and after:
-                outcome.bumps.append(_bump(name, (room.fixed, room.bumped), (before, after)))
+            if before is None:
+                for _ in room.bumped.test:
+                    self.on_image()
+                continue
+            with suppress(InputError):  # none of the images was located
+                shift, _ = check(
+                    self.localizer, _images(room.bumped), before, on_image=self.on_image
+                )
+                outcome.bumps.append(_bump(name, (room.fixed, room.bumped), shift))
 
     def show_unknown_room(self, outcome: DemoOutcome) -> None:
         """Images of a room of boxes that nobody ever learned."""
@@ -87,40 +99,41 @@ class Look:
             self.on_image()
         outcome.unknown = UnknownRoom(UNKNOWN_IMAGES, refused)
 
-    def _poses(self, recording: Scene, name: str) -> list[SE3]:
-        """Where the images of a recording were found, if in the room of this name."""
-        found = []
-        for frame in recording.test:
-            estimate = self.localizer.localize(frame.read_image(), frame.camera)
-            if estimate.scene == name and estimate.base_from_camera is not None:
-                found.append(estimate.base_from_camera)
-            self.on_image()
-        return found
+    def _calibrated(self, recording: Scene, name: str) -> Calibration | None:
+        """The camera of a recording, if it was found in the room of this name."""
+        given = Images(_images(recording), recording.test[0].camera)
+        try:
+            found = calibrate(self.localizer, given, "eye_to_hand", on_image=self.on_image)
+        except InputError:  # none of the images was located
+            return None
+        return found if found.source["scene"] == name else None
 
     def _tick(self, done: int, total: int) -> None:
         self.on_image()
 
 
-def _fixed_camera(name: str, recording: Scene, poses: list[SE3]) -> FixedCamera:
-    """One pose from all images of a camera that stands still, compared with the truth."""
-    truth = _truth(recording.test[0])
+def _images(recording: Scene) -> list[tuple[str, NDArray[np.uint8]]]:
+    return [(frame.name, frame.read_image()) for frame in recording.test]
+
+
+def _fixed_camera(name: str, recording: Scene, found: Calibration | None) -> FixedCamera:
+    """What was found, compared with the truth."""
     count = len(recording.test)
-    if not poses or truth is None:
-        return FixedCamera(name, count, len(poses), None, None)
+    if found is None:
+        return FixedCamera(name, count, 0, None, None)
+    used = sum(use.used for use in found.images)
     return FixedCamera(
-        name, count, len(poses), *pose_distance_mm_deg(average_poses(SE3.stack(poses)), truth)
+        name, count, used, *pose_distance_mm_deg(found.parent_from_child, _truth(recording))
     )
 
 
-def _bump(name: str, recordings: tuple[Scene, Scene], poses: tuple[list[SE3], list[SE3]]) -> Bump:
-    before, after = (average_poses(SE3.stack(found)) for found in poses)
-    first, second = (average_poses(SE3.stack(poses[0][start::2])) for start in (0, 1))
-    true_before, true_after = (_truth(recording.test[0]) for recording in recordings)
-    assert true_before is not None, "the simulator knows every pose"
-    assert true_after is not None, "the simulator knows every pose"
-    shift, true = pose_distance_mm_deg(before, after), pose_distance_mm_deg(true_before, true_after)
-    return Bump(name, *shift, *true, pose_distance_mm_deg(first, second)[0])
+def _bump(name: str, recordings: tuple[Scene, Scene], shift: Shift) -> Bump:
+    true = pose_distance_mm_deg(*(_truth(recording) for recording in recordings))
+    found = (shift.translation_mm, shift.rotation_deg)
+    return Bump(name, *found, *true, shift.sigma_mm, shift.moved)
 
 
-def _truth(frame: Frame) -> SE3 | None:
-    return frame.base_from_camera
+def _truth(recording: Scene) -> SE3:
+    truth = recording.test[0].base_from_camera
+    assert truth is not None, "the simulator knows every pose"
+    return truth

@@ -9,8 +9,8 @@ METHODS = {"evercal": "evercal", "finetune": "fine-tuning", "sars_spdd": "SARS +
 """Strategies and what pictures call them."""
 MAP = "evercal"
 """The strategy whose store stays and is looked at closely."""
-FIXED_HEADER = ("room", "images located", "error mm", "error deg")
-BUMP_HEADER = ("room", "moved mm", "in truth mm", "turned deg", "in truth deg", "before mm")
+FIXED_HEADER = ("room", "images used", "error mm", "error deg")
+BUMP_HEADER = ("room", "moved mm", "in truth mm", "turned deg", "in truth deg", "std. dev. mm")
 LEARNED_HEADER = ("room", "images", "keyframes", "landmarks", "residual px", "seconds")
 
 
@@ -40,8 +40,8 @@ class FixedCamera:
     """Where it stands."""
     images: int
     """Of the camera, the arm elsewhere in each."""
-    located: int
-    """Images that gave a pose in this room; their robust mean is the answer."""
+    used: int
+    """Images that the calibration rests on."""
     error_mm: float | None
     """Distance from the true position; None without an answer."""
     error_deg: float | None
@@ -55,20 +55,17 @@ class Bump:
     room: str
     """Where it stands."""
     shift_mm: float
-    """Distance between the robust means before and after."""
+    """Distance between the camera before and after, as `check` found it."""
     shift_deg: float
     """Angle between them."""
     true_mm: float
     """By how much it moved."""
     true_deg: float
     """By how much it turned."""
-    still_mm: float
-    """The same distance between two halves of the images before: what no bump looks like."""
-
-    @property
-    def noticed(self) -> bool:
-        """Whether the shift stands out from what a camera at rest shows."""
-        return self.shift_mm > max(1.0, 3 * self.still_mm) or self.shift_deg > 0.2
+    sigma_mm: float
+    """Standard deviation of the shift per axis."""
+    moved: bool
+    """Whether `check` calls it a move."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +119,7 @@ class DemoOutcome:
             "test": self.test.to_dict() if self.test else None,
             "changed": self.changed.to_dict() if self.changed else None,
             "fixed_cameras": [asdict(camera) for camera in self.fixed],
-            "bumps": [{**asdict(bump), "noticed": bump.noticed} for bump in self.bumps],
+            "bumps": [asdict(bump) for bump in self.bumps],
             "unknown_room": asdict(self.unknown) if self.unknown else None,
             "accuracy_5cm_5deg": self.accuracy,
             "minutes": self.minutes,
@@ -174,7 +171,7 @@ class DemoOutcome:
         return [
             [
                 camera.room,
-                f"{camera.located} of {camera.images}",
+                f"{camera.used} of {camera.images}",
                 "" if camera.error_mm is None else f"{camera.error_mm:.2f}",
                 "" if camera.error_deg is None else f"{camera.error_deg:.3f}",
             ]
@@ -190,7 +187,7 @@ class DemoOutcome:
                 f"{bump.true_mm:.2f}",
                 f"{bump.shift_deg:.3f}",
                 f"{bump.true_deg:.3f}",
-                f"{bump.still_mm:.2f}",
+                f"{bump.sigma_mm:.2f}",
             ]
             for bump in self.bumps
         ]

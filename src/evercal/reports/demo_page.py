@@ -128,16 +128,15 @@ def _fixed_cameras(outcome: DemoOutcome) -> list[Section]:
     sections = []
     if outcome.fixed:
         said = (
-            "A camera stands still while the arm moves. Its pose in the robot's base frame is the"
-            " robust mean over its images; no marker, no motion of the camera."
+            "A camera stands still while the arm moves. Its pose in the robot's base frame is put"
+            " together from its images; no marker, no motion of the camera."
         )
         table = Table(FIXED_HEADER, outcome.fixed_rows(), "base_from_camera against the truth")
         sections.append(Section("Calibration of a fixed camera", [said, table]))
     if outcome.bumps:
         said = (
             "Then somebody bumped into the camera. The images before and after tell by how much it"
-            " moved. The last column is the distance between two halves of the images before the"
-            " bump: what a camera at rest looks like."
+            " moved, and how sure that is (standard deviation per axis)."
         )
         table = Table(BUMP_HEADER, outcome.bump_rows(), "Found and true motion of the camera")
         sections.append(Section("A bump", [said, table]))

@@ -51,11 +51,11 @@ def about_fixed_cameras(outcome: DemoOutcome) -> list[str]:
             lines.append(f"{said}not found in any of {camera.images} images")
             continue
         lines.append(
-            f"{said}calibrated from {camera.located} of {camera.images} images:"
+            f"{said}calibrated from {camera.used} of {camera.images} images:"
             f" {camera.error_mm:.2f} mm and {camera.error_deg:.3f} deg from the truth"
         )
     for bump in outcome.bumps:
-        verdict = "its bump was noticed" if bump.noticed else "no bump was noticed"
+        verdict = "its bump was noticed" if bump.moved else "no bump was noticed"
         lines.append(
             f"the fixed camera in the {bump.room} seems to have moved by {bump.shift_mm:.2f} mm"
             f" and {bump.shift_deg:.3f} deg, so {verdict}; in truth it moved by"
