@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from evercal.errors import InputError
 from evercal.features.encoder import LocalEncoder
+from evercal.features.precision import autocast
 from evercal.features.pretraining.furnished import FurnishedViews, kept_furnished_views
 from evercal.features.pretraining.pairs import (
     FIRST_ROOM_SEED,
@@ -217,7 +218,7 @@ def matching_accuracy(
     """Share (%) of points whose best cell in the other image lies within 8 pixels of the truth."""
     right = total = 0
     for images, pixels, valid in batches:
-        with torch.autocast("cpu", torch.bfloat16):
+        with autocast():
             maps = encoder(images.flatten(0, 1)).float().unflatten(0, images.shape[:2])
         points = sample_features(maps[0], pixels[0])
         cells = maps[1].flatten(2)
@@ -267,7 +268,7 @@ def train_encoder(
     )
     began, losses = time.perf_counter(), []
     for images, pixels, valid in loader:
-        with torch.autocast("cpu", torch.bfloat16):
+        with autocast():
             maps = encoder(images.flatten(0, 1)).float().unflatten(0, images.shape[:2])
         points = torch.stack([sample_features(*of) for of in zip(maps, pixels, strict=True)])
         cells = maps.flatten(3).transpose(2, 3) if options.rivals == "cells" else None

@@ -9,6 +9,7 @@ from torch.nn import functional as F
 
 from evercal.features.descriptor import GlobalDescriptor
 from evercal.features.encoder import Encoder
+from evercal.features.precision import autocast
 from evercal.features.pretraining.contrastive import PretrainData, PretrainOptions
 from evercal.features.pretraining.pairs import (
     PER_ANCHOR,
@@ -28,7 +29,7 @@ def _encode(encoder: Encoder, rooms: Sequence[Views], rng: np.random.Generator) 
     maps = []
     for room in rooms:
         images = np.stack([photometric(image, rng) for image in room.images])
-        with torch.autocast("cpu", torch.bfloat16):
+        with autocast():
             maps.append(encoder(torch.from_numpy(images[:, None]).float() / 255).bfloat16())
     return torch.stack(maps).unflatten(1, (-1, PER_ANCHOR))
 
