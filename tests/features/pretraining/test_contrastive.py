@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.utils.data import DataLoader
 
 from evercal.errors import InputError
 from evercal.features.encoder import LocalEncoder
@@ -255,7 +256,11 @@ def test_training_lowers_the_loss(data: PretrainData, tmp_path: Path) -> None:
     assert losses[0] < math.log(3 * 64 + len(cell_pixels())) + 1
 
 
-def test_an_earlier_run_can_be_gone_on_from(data: PretrainData, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("small")
+def test_an_earlier_run_can_be_gone_on_from(
+    data: PretrainData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(contrastive, "DataLoader", DataLoader)  # here with its worker process
     said: list[str] = []
     first, second = tmp_path / "first", tmp_path / "second"
     for folder in (first, second):
