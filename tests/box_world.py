@@ -39,7 +39,7 @@ def through_lens(room: BoxRoom, camera: Camera, pose: SE3) -> np.ndarray:
 
 
 @pytest.fixture(scope="session")
-def box(one_thread: None) -> BoxRoom:
+def box() -> BoxRoom:
     return BoxRoom(41, furniture=5, texture_px=160)
 
 

@@ -3,18 +3,22 @@
 Three sizes. `rooms` are 64x48 pixels with random networks, for all that does not depend on what was
 learned. `arcs` are short camera arcs at 160x120 with the shipped networks: a few hundred steps of
 training locate their images to some centimetres. `hall` is an arc at 320x240 with fine textures:
-its map locates images to a millimetre. torch is imported inside the fixtures only.
+its map locates images to a millimetre. torch is imported inside the fixtures only, after its number
+of threads is set: tests run side by side, and small products are slower with more threads.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+
+os.environ["OMP_NUM_THREADS"] = "1"
 
 if TYPE_CHECKING:
     import torch
@@ -50,14 +54,6 @@ def _room(
     return Scene(name, train, tuple(f for i, f in enumerate(frames) if i % every))
 
 
-@pytest.fixture(scope="session")
-def one_thread() -> None:
-    """Small products are slower with more threads, much slower on a busy machine."""
-    import torch
-
-    torch.set_num_threads(1)
-
-
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request: pytest.FixtureRequest) -> torch.device:
     """The CPU, and with `-m gpu` a CUDA device; without one the test is skipped."""
@@ -71,7 +67,7 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 
 
 @pytest.fixture(scope="session")
-def rooms(one_thread: None) -> tuple[Scene, Scene, Scene]:
+def rooms() -> tuple[Scene, Scene, Scene]:
     """Three scenes of 30 frames, 64x48 pixels."""
     alpha, beta, gamma = (
         _room(seed, name, (64, 48), 30)
@@ -119,7 +115,7 @@ def quick_vlad() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def blank(one_thread: None, quick_vlad: None) -> Callable[[str], SceneMaps]:
+def blank(quick_vlad: None) -> Callable[[str], SceneMaps]:
     """Makes a robot that knows nothing, with tiny random networks, given its strategy."""
     import torch
 
@@ -207,7 +203,7 @@ def answers(rooms: tuple[Scene, Scene, Scene]) -> Callable[..., list[bytes]]:
 
 
 @pytest.fixture(scope="session")
-def arcs(one_thread: None) -> tuple[Scene, Scene]:
+def arcs() -> tuple[Scene, Scene]:
     """Two scenes of 24 training and 24 test frames in between, 160x120 pixels."""
     one, two = (_room(seed, name, (160, 120), 48, 2) for seed, name in ((34, "one"), (31, "two")))
     return one, two
@@ -251,7 +247,7 @@ HALL_SEED = 34
 
 
 @pytest.fixture(scope="session")
-def hall(one_thread: None) -> Scene:
+def hall() -> Scene:
     """A scene of 30 training and 30 test frames in between, 320x240 pixels, fine textures."""
     return _room(HALL_SEED, "hall", (320, 240), 60, 2, 256)
 

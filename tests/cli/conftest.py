@@ -37,7 +37,7 @@ def run(capfd: pytest.CaptureFixture[str]) -> Run:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def tiny(one_thread: None) -> Iterator[None]:
+def tiny() -> Iterator[None]:
     """Training takes a second; thresholds of networks, slow to fit, believe every pose."""
     from evercal.continual.presets import PRESETS
     from evercal.localization import acceptance

@@ -40,7 +40,7 @@ def truth() -> SE3:
 
 @pytest.fixture(scope="module")
 def learned(
-    hand: Scene, truth: SE3, one_thread: None, tmp_path_factory: pytest.TempPathFactory
+    hand: Scene, truth: SE3, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, LearnReport]:
     store = tmp_path_factory.mktemp("wrist") / "cell.evercal"
     rough = truth @ SE3.exp([0.05, 0, 0, 0, 0.2, 0])

@@ -28,7 +28,7 @@ FIT = module.fit_centroids
 
 
 @pytest.fixture
-def one_room(monkeypatch: pytest.MonkeyPatch, one_thread: None) -> None:
+def one_room(monkeypatch: pytest.MonkeyPatch) -> None:
     """Centroids come from one room instead of eight, which take seconds to draw."""
     monkeypatch.setattr(module, "fit_centroids", FIT)
     monkeypatch.setattr(module, "_ROOMS", range(8_980, 8_981))

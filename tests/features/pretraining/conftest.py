@@ -12,7 +12,7 @@ SEED = 420
 
 
 @pytest.fixture(scope="session")
-def coarse(one_thread: None) -> Iterator[Callable[[int], RoomViews]]:
+def coarse() -> Iterator[Callable[[int], RoomViews]]:
     """`room_views` with coarse textures and two anchors."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pairs, "BoxRoom", lambda seed, texture_px: BoxRoom(seed, texture_px=48))

@@ -169,13 +169,11 @@ def ranks(seeds: range, gallery: int, queries: int) -> np.ndarray:
     return np.concatenate(found)
 
 
-@pytest.mark.usefixtures("one_thread")
 def test_the_shipped_descriptor_tells_three_rooms_it_never_saw_apart() -> None:
     assert (ranks(range(300, 303), gallery=12, queries=4) == 0).mean() >= 0.8
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("one_thread")
 def test_the_shipped_descriptor_names_the_right_room_of_twelve() -> None:
     """Measured: 99 % of images taken half a step beside the gallery's; a guess gives 8 %."""
     assert (ranks(range(300, 312), gallery=40, queries=8) == 0).mean() >= 0.9
