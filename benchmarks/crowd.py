@@ -47,9 +47,11 @@ def run(store: Path, scenes: Sequence[Path], keyframes: int, rooms: int, out: Pa
         out: the row and the settings, JSON.
 
     Raises:
-        InputError: no scene, one that the store does not know, one without posed test frames, or
-            `out` is there already.
+        InputError: no scene, one that the store does not know, one without posed test frames, no
+            room, fewer keyframes than rooms, or `out` is there already.
     """
+    if not 0 < rooms <= keyframes:
+        raise InputError(f"--rooms {rooms}: give 1 to {keyframes}, the number of keyframes")
     if out.exists():
         raise InputError(f"{out}: exists; remove it or give another --out")
     localizer = Localizer.open(store)

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -294,33 +294,28 @@ def strangers(out: Path, folders: Sequence[Path], memory: float) -> list[dict[st
     learned(store, [known], memory)
     localizer = Localizer.open(store)
     for folder, scene in zip(folders[1:], others, strict=True):
-        rows.append(_believed(localizer, folder.name, [f.read_image() for f in scene.test]))
+        shown = ((frame.read_image(), frame.camera) for frame in scene.test)
+        rows.append(_believed(localizer, folder.name, shown))
     rng, size = np.random.default_rng(0), localizer.maps.scenes[0].camera
     shape = (size.height, size.width, 3)
     hand = cv2.GaussianBlur(rng.integers(90, 160, shape).astype(np.uint8), (0, 0), 25)
-    rows.append(_believed(localizer, "blank", [np.full(shape, 128, np.uint8)]))
-    noise = [rng.integers(0, 255, shape).astype(np.uint8) for _ in range(10)]
+    rows.append(_believed(localizer, "blank", [(np.full(shape, 128, np.uint8), size)]))
+    noise = [(rng.integers(0, 255, shape).astype(np.uint8), size) for _ in range(10)]
     rows.append(_believed(localizer, "noise", noise))
-    rows.append(_believed(localizer, "hand before the lens", [hand]))
+    rows.append(_believed(localizer, "hand before the lens", [(hand, size)]))
     _write(out / "strangers.json", rows, memory)
     return rows
 
 
-def _believed(localizer: Localizer, name: str, images: Sequence[np.ndarray]) -> dict[str, object]:
-    own = localizer.maps.scenes[0].camera
-    found = []
-    for image in images:
-        height, width = image.shape[:2]
-        fits = abs(own.width * height / (own.height * width) - 1) < 0.01
-        middle = (width - 1) / 2, (height - 1) / 2
-        camera = None if fits else Camera(width, height, width, width, *middle)
-        found.append(localizer.localize(image, camera))
-    support = [estimate.support for estimate in found]
+def _believed(
+    localizer: Localizer, name: str, images: Iterable[tuple[np.ndarray, Camera]]
+) -> dict[str, object]:
+    found = [localizer.localize(image, camera) for image, camera in images]
     return {
         "images": name,
         "count": len(found),
         "believed": sum(estimate.status == "ok" for estimate in found),
-        "most_support": max(support),
+        "most_support": max(estimate.support for estimate in found),
     }
 
 

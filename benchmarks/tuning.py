@@ -67,8 +67,10 @@ def run(
         steps: optimiser steps of a stage; those of preset `bench` when None.
 
     Raises:
-        InputError: a method that has no setting to tune.
+        InputError: a method that has no setting to tune, or fewer than two scenes.
     """
+    if scenes < 2:
+        raise InputError(f"--scenes {scenes}: give 2 or more; an earlier one must be forgotten")
     unknown = [name for name in methods if name not in TRIALS]
     if unknown:
         raise InputError(f"--methods {' '.join(unknown)}: choose of {', '.join(TRIALS)}")

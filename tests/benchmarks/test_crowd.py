@@ -89,6 +89,15 @@ def test_a_scene_that_the_store_does_not_know_is_named(
         crowd.run(tmp_path, [Path("attic")], 10, 1, tmp_path / "crowd.json")
 
 
+@pytest.mark.parametrize("rooms", [0, 11])
+def test_every_room_of_the_crowd_has_a_keyframe(
+    rooms: int, tmp_path: Path, calls: list[str]
+) -> None:
+    with pytest.raises(InputError, match=f"--rooms {rooms}: give 1 to 10"):
+        crowd.run(tmp_path, [Path("room")], 10, rooms, tmp_path / "crowd.json")
+    assert not calls
+
+
 @pytest.mark.parametrize(("platform", "unit"), [("linux", 1024), ("darwin", 1)])
 def test_peak_memory_is_told_in_bytes_of_the_platform(
     platform: str, unit: int, monkeypatch: pytest.MonkeyPatch

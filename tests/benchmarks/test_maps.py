@@ -31,8 +31,10 @@ class Answers:
         self.maps = SimpleNamespace(scenes=[SimpleNamespace(camera=CAMERA)], keyframes=[None])
         self.scenes = ["room"]
         self.metres, self.sigma_m = metres, sigma_m
+        self.cameras: list[object] = []
 
     def localize(self, image: np.ndarray, camera: object = None) -> PoseEstimate:
+        self.cameras.append(camera)
         off = self.metres.pop(0) if self.metres else None
         if off is None:
             return PoseEstimate("unknown_scene", "", None, None, None, 0, 0.0, 1.0)
@@ -89,3 +91,23 @@ def test_strangers_without_images_are_named(
     monkeypatch.setattr(maps, "load_scene", lambda folder: Scene("a", frames(3), ()))
     with pytest.raises(InputError, match="b: has no test images"):
         maps.run("strangers", [Path("a"), Path("b")], tmp_path / "out", 0.1)
+
+
+def test_strangers_are_shown_with_the_camera_that_took_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = default_camera(32, 24)
+    image = np.zeros((24, 32, 3), np.uint8)
+    taken = tuple(Frame(str(i), image, other, SE3.identity()) for i in range(2))
+    scenes = {"a": Scene("a", frames(3), ()), "b": Scene("b", frames(3), taken)}
+    answers = Answers([0.001], 0.01)
+    monkeypatch.setattr(maps, "learn_scene", lambda *_: None)
+    monkeypatch.setattr(maps, "load_scene", lambda folder: scenes[folder.name])
+    monkeypatch.setattr(maps.Localizer, "open", lambda *_: answers)
+    maps.run("strangers", [Path("a"), Path("b")], tmp_path / "out", 0.1)
+    rows = json.loads((tmp_path / "out" / "strangers.json").read_text())["rows"]
+    assert [(row["images"], row["count"], row["believed"]) for row in rows[:2]] == [
+        ("b", 2, 1),
+        ("blank", 1, 0),
+    ]
+    assert answers.cameras[:3] == [other, other, CAMERA]

@@ -119,3 +119,5 @@ def test_what_is_trained_can_be_the_papers_network_and_a_few_methods(
     assert names == ["er", "sars_spdd", "sars_spdd_filled", "sars_reprojection", "reservoir_spdd"]
     with pytest.raises(InputError, match="--methods joint: choose of er, "):
         tuning.run(*where, methods=("joint",))
+    with pytest.raises(InputError, match="--scenes 1: give 2 or more"):
+        tuning.run("sim-mini", None, 1, tmp_path / "out", tmp_path / "tuned.json")
