@@ -15,7 +15,9 @@ from functools import lru_cache
 import numpy as np
 
 from evercal.datasets.frame import Frame
+from evercal.evaluation.metrics import COARSE
 from evercal.geometry import pose_distance, squared_mahalanobis
+from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord, with_fit
 from evercal.simulation.box_room import BoxRoom, default_camera
@@ -26,8 +28,9 @@ ACCEPTANCE_FRACTION = 1 / 6
 """Where the threshold lies between the inlier ratios of negative and of positive images."""
 
 
-MAX_SUPPORT = 0.36
-"""Support that no image of another room reached (docs/experiments/map.md)."""
+MAX_SUPPORT = 0.5
+"""Support that no wrong pose reached, of another room or of the right one with few keyframes
+(docs/experiments/map.md)."""
 MIN_SUPPORT = 0.14
 """Where the stated poses of a recording fit the images badly, right poses have little support: the
 threshold then falls to half of what held-out frames have, but not below this."""
@@ -46,11 +49,25 @@ def fitted_record(maps: SceneMaps, held_out: Sequence[Frame], scene: int = -1) -
     record, keyframes = maps.scenes[scene], maps.keyframes[scene]
     if keyframes is None or not keyframes.landmarks:
         return with_fit(record, *fit_threshold(maps, held_out, scene))
-    localizer = Localizer(maps)
-    support = [localizer.localize(f.read_image(), f.camera).support for f in held_out]
+    scenes = list(maps.scenes)
+    scenes[scene] = replace(record, min_support=MIN_SUPPORT)
+    localizer = Localizer(replace(maps, scenes=scenes))
+    support = [
+        found.support
+        for frame in held_out
+        if _right(found := localizer.localize(frame.read_image(), frame.camera), frame)
+    ]
     low = float(np.quantile(support, 0.05)) if support else 2 * MAX_SUPPORT
     least = min(max(low / 2, MIN_SUPPORT), MAX_SUPPORT)
     return replace(record, min_support=least, covariance_scale=MAP_COVARIANCE_SCALE)
+
+
+def _right(found: PoseEstimate, frame: Frame) -> bool:
+    """Whether a frame was located, and not far from where it is said to be."""
+    if found.base_from_camera is None or frame.base_from_camera is None:
+        return False
+    metres, radians = pose_distance(found.base_from_camera, frame.base_from_camera)
+    return bool(metres < COARSE[0] and radians < COARSE[1])
 
 
 def fit_threshold(

@@ -1,8 +1,9 @@
 """`Localizer`: an image in, a `PoseEstimate` out.
 
 The way of an image: prepare, encode, retrieve scenes and keyframes, match (and ask the network,
-where a scene has one), PnP, align landmarks, refine the pose, accept. Whatever a store holds, every
-source gives 2D-3D correspondences and one solver takes them all.
+where a scene has one), PnP, align landmarks, refine the pose, match again near a doubtful one,
+accept. Whatever a store holds, every source gives 2D-3D correspondences and one solver takes them
+all.
 """
 
 import os
@@ -21,6 +22,7 @@ from evercal.features.device import device_of
 from evercal.features.encode import encode_features
 from evercal.features.views import View, ViewOptions, plain_view
 from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3
 from evercal.localization.alignment import Alignment, align_pose
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.keyframe_bank import KeyframeBank
@@ -142,11 +144,12 @@ class Localizer:
                     continue  # in a small store a wider attempt often asks the same
                 tried.add(same)
                 trial = self._hypothesis(query, candidate, cameras)
+                trial = self._guided(query, trial, candidate, cameras)
                 if best is None or trial.support > best.support:
                     best = trial
                 if trial.aligned and self._accepted(trial, self.options.sure):
                     return self._answer(trial, began)
-            # A pose that is only just good enough may be beaten by another look.
+            # A pose that is only just good enough may be beaten by another attempt.
             if number and best is not None and best.aligned and self._accepted(best):
                 break
         assert best is not None, "at least one scene is tried"
@@ -175,13 +178,31 @@ class Localizer:
         heads = self.maps.heads
         return len(heads) == 1 and heads[0].options.condition == "descriptor"
 
+    def _guided(
+        self, query: Query, found: Hypothesis, candidate: Candidate, cameras: list[Camera | None]
+    ) -> Hypothesis:
+        """What guided matching finds near a pose of little support; see `clear`."""
+        whole = replace(candidate, match_stride=1)
+        while found.aligned and found.inliers and found.scene == candidate.scene:
+            if found.support >= self.options.clear:
+                break
+            again = self._hypothesis(query, whole, cameras, found.pose)
+            if again.support < self.options.gain * found.support:
+                break
+            found = again
+        return found
+
     def _hypothesis(
-        self, query: Query, candidate: Candidate, cameras: list[Camera | None]
+        self,
+        query: Query,
+        candidate: Candidate,
+        cameras: list[Camera | None],
+        near: SE3 | None = None,
     ) -> Hypothesis:
         """A pose in one scene: match, PnP, align."""
         scene, camera = candidate.scene, cameras[candidate.scene]
         assert camera is not None, "only scenes whose camera fits are tried"
-        pixels, points, cells = self._matcher.correspondences(query, candidate, camera)
+        pixels, points, cells = self._matcher.correspondences(query, candidate, camera, near)
         small = camera.short_side_resized(self.maps.short_side)
         intrinsics = np.array([small.fx, small.fy, small.cx, small.cy])
         rough = solve_pnp(pixels, points, intrinsics, self.options.pnp)
@@ -276,7 +297,8 @@ class Localizer:
             return refused("failed", "the pose lies outside the cell of its scene")
         if not self._accepted(best):
             return refused("unknown_scene", _why(best, record))
-        pose, covariance = record.stated(best.pose, best.covariance)
+        assert best.covariance is not None
+        pose, covariance = record.stated(best.pose, best.doubt * best.covariance)
         return PoseEstimate(
             "ok",
             "",

@@ -8,6 +8,7 @@ from torch import Tensor
 from evercal.features.precision import autocast
 from evercal.features.views import ideal_cell_pixels
 from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.query import Attempt, Candidate, LocalizeOptions, Query
 from evercal.mapping.scene_maps import SceneMaps
@@ -87,9 +88,16 @@ class Matcher:
 
     @torch.inference_mode()
     def correspondences(
-        self, query: Query, candidate: Candidate, camera: Camera
+        self, query: Query, candidate: Candidate, camera: Camera, near: SE3 | None = None
     ) -> tuple[np.ndarray, np.ndarray, int]:
         """What is matched to points of a scene.
+
+        Args:
+            query: the image.
+            candidate: the scene and its keyframes.
+            camera: intrinsics of the image.
+            near: base_from_camera, roughly: a patch is then matched only to points that it would
+                show within `LocalizeOptions.guided_px` of itself.
 
         Returns:
             Pixels (m, 2) at the encoder's working size, points (m, 3) in the scene's base frame,
@@ -102,10 +110,13 @@ class Matcher:
         some = some[np.isfinite(pixels[some]).all(1)]
         points = []
         if len(candidate.keyframes):
-            points.append(self._matched(features[some], candidate.keyframes))
+            matched = self._matched(features[some], candidate.keyframes, pixels[some], small, near)
+            points.append(matched)
         if self._maps.heads:
             points.append(self._predicted(query, candidate.scene)[some])
-        return np.tile(pixels[some], (len(points), 1)), np.concatenate(points), len(some)
+        told = np.concatenate(points)
+        known = np.isfinite(told).all(1)
+        return np.tile(pixels[some], (len(points), 1))[known], told[known], len(some)
 
     def _strided(self, query: Query, candidate: Candidate) -> NDArray[np.int64]:
         """The patches of the image that are matched to keyframes."""
@@ -113,19 +124,46 @@ class Matcher:
         step = candidate.match_stride if self._options.align else 1
         return np.arange(rows * columns).reshape(rows, columns)[::step, ::step].ravel()
 
-    def _matched(self, features: Tensor, keyframes: NDArray[np.int64]) -> np.ndarray:
-        """(n, 3) points of the keyframes' patches that are most similar to (n, channels)."""
+    def _matched(
+        self,
+        features: Tensor,
+        keyframes: NDArray[np.int64],
+        pixels: np.ndarray,
+        camera: Camera,
+        near: SE3 | None,
+    ) -> np.ndarray:
+        """(n, 3) points of the keyframes' patches that are most similar to (n, channels).
+
+        NaN where no patch of a keyframe is `near`.
+        """
         loaded = [self._bank.load(int(index)).cells for index in keyframes]
         features = features.to(loaded[0].features.dtype)
         # One keyframe after the other: the products of all would not fit the processor's cache.
         likeness = [_bits(features @ keyframe.features.T) for keyframe in loaded]
+        if near is not None:
+            for some, keyframe in zip(likeness, loaded, strict=True):
+                some[~self._within(pixels, keyframe.points_m, camera, near)] = 0
         nearest = np.array([some.argmax(1) for some in likeness])
         rows = np.arange(len(features))
-        best = np.argmax([some[rows, k] for some, k in zip(likeness, nearest, strict=True)], 0)
+        height = np.array([some[rows, k] for some, k in zip(likeness, nearest, strict=True)])
+        best = height.argmax(0)
         points = np.empty((len(features), 3))
         for number, keyframe in enumerate(loaded):
             points[best == number] = keyframe.points_m[nearest[number, best == number]]
+        if near is not None:
+            points[height.max(0) <= 0] = np.nan
         return points
+
+    def _within(
+        self, pixels: np.ndarray, points_m: np.ndarray, camera: Camera, near: SE3
+    ) -> NDArray[np.bool_]:
+        """(n, m) which of m points a camera would show within reach of n pixels."""
+        local = near.inverse().apply(points_m)
+        focal, centre = [camera.fx, camera.fy], [camera.cx, camera.cy]
+        shown = local[:, :2] / np.maximum(local[:, 2:], 1e-3) * focal + centre
+        shown = np.where(local[:, 2:] > 0, shown, np.inf).astype(np.float32)
+        away = pixels.astype(np.float32)[:, None] - shown
+        return np.einsum("nmi,nmi->nm", away, away) < self._options.guided_px**2
 
     def _predicted(self, query: Query, scene: int) -> np.ndarray:
         """(cells, 3) points that the network predicts, in the scene's base frame."""

@@ -14,6 +14,9 @@ from evercal.localization.alignment import AlignmentOptions
 from evercal.localization.pnp import PnpOptions
 from evercal.mapping.patches import image_pyramid
 
+FULL_SUPPORT = 4.0
+"""From here on the residuals alone tell the covariance (docs/experiments/map.md)."""
+
 
 @dataclass(frozen=True)
 class Attempt:
@@ -36,6 +39,14 @@ class LocalizeOptions:
     sure: float = 2.0
     """After the first attempt a pose is taken at once where its support is so many times what is
     needed; else the second attempt follows, and the better pose is taken."""
+    clear: float = 1.5
+    """Poses with less support are looked for again by guided matching: alignment may have settled
+    beside the true pose, so patches are matched only to points that they would show near
+    themselves from the pose found so far; PnP and alignment follow,"""
+    gain: float = 1.1
+    """as long as the support rises by this factor."""
+    guided_px: float = 32.0
+    """How near: pixels at the encoder's working size."""
     keyframes: int = 6
     """Keyframes of a scene that an image is matched to and aligned with."""
     retrieval_stride: int = 16
@@ -113,3 +124,12 @@ class Hypothesis:
             return self.ratio * self.inliers**0.5
         exact = self.inliers / max(1, self.matched)
         return self.ratio * exact**2 * (self.ratio * self.planned) ** 0.5
+
+    @property
+    def doubt(self) -> float:
+        """Factor on the covariance of an aligned pose.
+
+        The fewer landmarks support it, the more their errors go together: they lie on few surfaces,
+        seen from afar.
+        """
+        return max(1.0, FULL_SUPPORT / self.support) if self.aligned and self.inliers else 1.0
