@@ -15,7 +15,6 @@ from functools import lru_cache
 import numpy as np
 
 from evercal.datasets.frame import Frame
-from evercal.evaluation.metrics import COARSE
 from evercal.geometry import pose_distance, squared_mahalanobis
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
@@ -34,6 +33,8 @@ MAX_SUPPORT = 0.5
 MIN_SUPPORT = 0.14
 """Where the stated poses of a recording fit the images badly, right poses have little support: the
 threshold then falls to half of what held-out frames have, but not below this."""
+RIGHT_WITHIN_M, RIGHT_WITHIN_DEG = 0.05, 5.0
+"""A held-out frame counts when it is found this close to its stated pose."""
 MAP_COVARIANCE_SCALE = 1.3
 """Alignment errors of neighbouring patches go together, so errors are larger than residuals say."""
 
@@ -67,7 +68,7 @@ def _right(found: PoseEstimate, frame: Frame) -> bool:
     if found.base_from_camera is None or frame.base_from_camera is None:
         return False
     metres, radians = pose_distance(found.base_from_camera, frame.base_from_camera)
-    return bool(metres < COARSE[0] and radians < COARSE[1])
+    return bool(metres < RIGHT_WITHIN_M and radians < np.deg2rad(RIGHT_WITHIN_DEG))
 
 
 def fit_threshold(
