@@ -89,7 +89,7 @@ class Both(TrainingHooks):
             return None
         return (output.points - rows.features[:, 6:].float()).abs().mean()
 
-    def constraints(self, output: HeadOutput, rows: Rows, tau_px: float) -> list[Tensor]:
+    def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:
         if self.rule != "constraints":
             return []
         each = len(rows.scene) // 2

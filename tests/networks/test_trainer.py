@@ -373,7 +373,7 @@ class Watching(Replayed):
         self.last: ProposedStep | None = None
         self.schedules: list[float] = []
 
-    def constraints(self, output: HeadOutput, rows: Rows, tau_px: float) -> list[Tensor]:
+    def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:
         return [output.points[:30].square().mean(), output.points[30:].square().mean()]
 
     def edit_step(self, proposed: ProposedStep) -> None:

@@ -61,7 +61,7 @@ class TrainingHooks:
         """
         return None
 
-    def constraints(self, output: HeadOutput, rows: Rows, tau_px: float) -> list[Tensor]:
+    def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:
         """Losses on replayed rows that are not minimised but whose gradients `edit_step` needs."""
         return []
 

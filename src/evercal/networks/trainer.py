@@ -140,7 +140,7 @@ class HeadTrainer:
             more.append(self.hooks.cost(held, remembered, tau_px))
         for cost in more:
             loss = loss if cost is None else loss + cost
-        losses = self.hooks.constraints(held, remembered, tau_px)
+        losses = self.hooks.constraints(held, remembered)
         constraints = [self._gradients(one) for one in losses]
         loss.backward()
         every = [*self.head.parameters(), self.correction]

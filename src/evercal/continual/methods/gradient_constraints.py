@@ -73,7 +73,7 @@ class ConstraintHooks(MemoryHooks):
         kept = [start.states[memory.scene].get("reference", unknown) for memory in self.memories]
         self._references = torch.stack(kept)
 
-    def constraints(self, output: HeadOutput, rows: Rows, tau_px: float) -> list[Tensor]:
+    def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:
         """The losses that may not rise."""
         parts = by_scene(output, rows, self.memories)
         return self._rule.constrained([self._rule.loss(o, r) for o, r in parts])
