@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from evercal.features.precision import autocast
@@ -141,8 +142,10 @@ class Matcher:
         # One keyframe after the other: the products of all would not fit the processor's cache.
         likeness = [_bits(features @ keyframe.features.T) for keyframe in loaded]
         if near is not None:
-            for some, keyframe in zip(likeness, loaded, strict=True):
-                some[~self._within(pixels, keyframe.points_m, camera, near)] = 0
+            likeness = [
+                some * self._within(pixels, keyframe.points_m, camera, near)
+                for some, keyframe in zip(likeness, loaded, strict=True)
+            ]
         nearest = np.array([some.argmax(1) for some in likeness])
         rows = np.arange(len(features))
         height = np.array([some[rows, k] for some, k in zip(likeness, nearest, strict=True)])
@@ -161,9 +164,8 @@ class Matcher:
         local = near.inverse().apply(points_m)
         focal, centre = [camera.fx, camera.fy], [camera.cx, camera.cy]
         shown = local[:, :2] / np.maximum(local[:, 2:], 1e-3) * focal + centre
-        shown = np.where(local[:, 2:] > 0, shown, np.inf).astype(np.float32)
-        away = pixels.astype(np.float32)[:, None] - shown
-        return np.einsum("nmi,nmi->nm", away, away) < self._options.guided_px**2
+        shown = np.where(local[:, 2:] > 0, shown, np.inf)
+        return cdist(pixels, shown, "sqeuclidean") < self._options.guided_px**2
 
     def _predicted(self, query: Query, scene: int) -> np.ndarray:
         """(cells, 3) points that the network predicts, in the scene's base frame."""
