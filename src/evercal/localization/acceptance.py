@@ -16,6 +16,7 @@ import numpy as np
 
 from evercal.datasets.frame import Frame
 from evercal.geometry import pose_distance, squared_mahalanobis
+from evercal.geometry.near import NEAR_M, NEAR_RAD
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord, with_fit
@@ -33,8 +34,6 @@ MAX_SUPPORT = 0.5
 MIN_SUPPORT = 0.14
 """Where the stated poses of a recording fit the images badly, right poses have little support: the
 threshold then falls to half of what held-out frames have, but not below this."""
-RIGHT_WITHIN_M, RIGHT_WITHIN_DEG = 0.05, 5.0
-"""A held-out frame counts when it is found this close to its stated pose."""
 MAP_COVARIANCE_SCALE = 1.3
 """Alignment errors of neighbouring patches go together, so errors are larger than residuals say."""
 
@@ -68,7 +67,7 @@ def _right(found: PoseEstimate, frame: Frame) -> bool:
     if found.base_from_camera is None or frame.base_from_camera is None:
         return False
     metres, radians = pose_distance(found.base_from_camera, frame.base_from_camera)
-    return bool(metres < RIGHT_WITHIN_M and radians < np.deg2rad(RIGHT_WITHIN_DEG))
+    return bool(metres < NEAR_M and radians < NEAR_RAD)
 
 
 def fit_threshold(
