@@ -16,12 +16,12 @@ from evercal.calibration.drift import check
 from evercal.calibration.from_images import Images, calibrate
 from evercal.continual.learn_scene import LearnOptions, learn_scene
 from evercal.continual.presets import preset
-from evercal.datasets import Scene, load_scene
 from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside
 from evercal.geometry import SE3, pose_distance, squared_mahalanobis
 from evercal.localization.localizer import Localizer
-from evercal.simulation.mini import FOLDER
+from evercal.recordings import Recording, load_recording
+from evercal.recordings.samples import FOLDER
 
 ROBOT_NOISE_M, ROBOT_NOISE_DEG = 2e-4, 0.02
 
@@ -52,7 +52,7 @@ def wrist(rooms: Sequence[Path], out: Path, draws: int) -> list[dict[str, object
     """Training frames of a room seen as a wrist recording through a random hand-eye transform."""
     rows = []
     for room in rooms:
-        scene = load_scene(room)
+        scene = load_recording(room)
         for draw in tqdm(range(draws), room.name, unit="draw"):
             done = out / f"wrist-{room.name}-{draw}.json"
             if not done.exists():
@@ -62,7 +62,7 @@ def wrist(rooms: Sequence[Path], out: Path, draws: int) -> list[dict[str, object
     return rows
 
 
-def as_wrist_recording(scene: Scene, draw: int) -> tuple[Scene, SE3]:
+def as_wrist_recording(scene: Recording, draw: int) -> tuple[Recording, SE3]:
     """A recording that states gripper poses only, and the true `gripper_from_camera`."""
     rng = np.random.default_rng(draw)
     turn = Rotation.random(rng=rng).as_quat(canonical=True, scalar_first=True)
@@ -77,7 +77,7 @@ def as_wrist_recording(scene: Scene, draw: int) -> tuple[Scene, SE3]:
     return replace(scene, train=tuple(train), test=()), truth
 
 
-def _wrist_draw(scene: Scene, room: Path, store: Path, draw: int) -> dict[str, object]:
+def _wrist_draw(scene: Recording, room: Path, store: Path, draw: int) -> dict[str, object]:
     recording, truth = as_wrist_recording(scene, draw)
     began = time.perf_counter()
     report = learn_scene(store, recording, LearnOptions(preset("fast")))
@@ -158,12 +158,12 @@ def _moves(reference: Calibration, rng: np.random.Generator) -> dict[str, Calibr
 def _learned(rooms: Sequence[Path], store: Path) -> Path:
     if not store.exists():
         for room in tqdm(rooms, "learning"):
-            learn_scene(store, load_scene(room), LearnOptions(preset("fast")))
+            learn_scene(store, load_recording(room), LearnOptions(preset("fast")))
     return store
 
 
 def _images(folder: Path) -> tuple[Images, SE3]:
-    scene = load_scene(folder)
+    scene = load_recording(folder)
     truth = scene.test[0].base_from_camera
     if truth is None:
         raise InputError(f"{folder}: states no camera pose to compare with")

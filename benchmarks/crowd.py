@@ -17,7 +17,6 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from benchmarks.peak_memory import peak_gb
-from evercal.datasets import Frame, load_scene, posed
 from evercal.errors import InputError
 from evercal.evaluation.metrics import FINE
 from evercal.features.encode import encode_features
@@ -30,6 +29,7 @@ from evercal.localization.query import Query
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.landmarks import Landmarks, detect
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord
+from evercal.recordings import Frame, load_recording, posed_frames
 from evercal.simulation.box_room import BoxRoom, default_camera
 
 FIRST_SEED = 5_000
@@ -73,10 +73,10 @@ def _tests(folders: Sequence[Path], known: Sequence[str]) -> dict[str, Sequence[
     tests: dict[str, Sequence[Frame]] = {}
     for folder in folders:
         name, _, path = str(folder).rpartition("=")
-        scene = load_scene(path, name=name or None)
+        scene = load_recording(path, name=name or None)
         if scene.name not in known:
             raise InputError(f"{folder}: {scene.name!r} is not in the store: {', '.join(known)}")
-        tests[scene.name] = posed(scene.test)
+        tests[scene.name] = posed_frames(scene.test)
         if not tests[scene.name]:
             raise InputError(f"{folder}: has no test frames with a known pose")
     if not tests:

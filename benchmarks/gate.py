@@ -16,17 +16,17 @@ from typing import Literal
 import numpy as np
 import torch
 
-from evercal.benchmark.tables import table
 from evercal.continual.learn_scene import LearnOptions, learn_scene
 from evercal.continual.presets import preset
 from evercal.continual.strategies import strategy_named
 from evercal.evaluation import evaluate, scores
 from evercal.evaluation.metrics import FINEST, correct
+from evercal.evaluation.tables import table
 from evercal.features.encode import encode
 from evercal.features.views import ViewOptions, frame_view
 from evercal.localization.localizer import Localizer
 from evercal.mapping.selection import SarsOptions, select_sars
-from evercal.simulation.mini import mini_rooms
+from evercal.recordings.samples import sample_rooms
 
 BASELINE = Path(__file__).parent / "baseline.json"
 
@@ -64,7 +64,7 @@ CONTRACT: dict[str, Metric] = {
 
 def measure() -> dict[str, float]:
     """All numbers of the contract; about a minute on two cores."""
-    room = mini_rooms()[0].scene
+    room = sample_rooms()[0].scene
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
         report = learn_scene(Path(folder) / "store", room, LearnOptions(preset("bench")))

@@ -9,9 +9,9 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from evercal.calibration.calibration import Mount
-from evercal.calibration.closed_form import daniilidis, motions, park, shah
-from evercal.calibration.pairs import PosePairs
-from evercal.calibration.solve import solve
+from evercal.calibration.pose_pairs.closed_form import daniilidis, motions, park, shah
+from evercal.calibration.pose_pairs.pairs import PosePairs
+from evercal.calibration.pose_pairs.solve import solve
 from evercal.evaluation.metrics import share_inside
 from evercal.geometry import SE3, pose_distance, squared_mahalanobis
 
@@ -42,7 +42,7 @@ class Setting:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class SimulatedPairs:
     """Simulated pairs and what is true."""
 
     pairs: PosePairs
@@ -54,7 +54,7 @@ class Recording:
     """Outliers."""
 
 
-def recording(setting: Setting, seed: int) -> Recording:
+def recording(setting: Setting, seed: int) -> SimulatedPairs:
     """Draws one recording."""
     rng, n = np.random.default_rng(seed), setting.poses
     on_arm = setting.mount == "eye_in_hand"
@@ -81,7 +81,7 @@ def recording(setting: Setting, seed: int) -> Recording:
         rotation[i], translation[i] = off.as_quat(scalar_first=True), translation[i] + 0.05 * way
     seen = SE3(rotation, translation / (setting.scale or 1.0))
     pairs = PosePairs(tuple(f"row {i + 1}" for i in range(n)), robot, seen)
-    return Recording(pairs, camera_in, board_in, tuple(int(i) for i in spoiled))
+    return SimulatedPairs(pairs, camera_in, board_in, tuple(int(i) for i in spoiled))
 
 
 def pose(rotation: Rotation, translation: np.ndarray) -> SE3:

@@ -9,7 +9,7 @@ from scipy.stats import bootstrap, norm, t
 from tabulate import tabulate
 from tqdm import tqdm
 
-from evercal.evaluation.statistics import blocks, paired_difference
+from evercal.continual.benchmark.statistics import blocks, paired_difference
 
 Scenes = list[np.ndarray]
 """(seeds, frames) correctness of each scene."""

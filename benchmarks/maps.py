@@ -16,18 +16,18 @@ from evercal.calibration.from_images import Images, calibrate
 from evercal.continual.learn_scene import LearnOptions, LearnReport, learn_scene
 from evercal.continual.presets import preset
 from evercal.continual.stage import StageOptions
-from evercal.datasets import Frame, Scene, load_scene, posed
 from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside
 from evercal.geometry import SE3, Camera, pose_distance, squared_mahalanobis
 from evercal.localization.localizer import LocalizeOptions, Localizer
-from evercal.simulation.mini import mini_rooms
+from evercal.recordings import Frame, Recording, load_recording, posed_frames
+from evercal.recordings.samples import sample_rooms
 
 BOUNDS = ((0.05, 5.0), (0.02, 2.0), (0.01, 1.0), (0.005, 0.5))
 
 
 def learned(
-    store: Path, scenes: Sequence[Scene], memory: float, seed: int = 0
+    store: Path, scenes: Sequence[Recording], memory: float, seed: int = 0
 ) -> list[LearnReport]:
     """Learns scenes one after the other into a store with the default strategy."""
     options = LearnOptions(_stage(memory, seed))
@@ -89,19 +89,19 @@ def _bound(metres: float, degrees: float) -> str:
     return f"{100 * metres:g} cm/{degrees:g} deg"
 
 
-def sequence(scenes: Sequence[Scene], out: Path, memory: float) -> list[dict[str, object]]:
+def sequence(scenes: Sequence[Recording], out: Path, memory: float) -> list[dict[str, object]]:
     """Learns scenes in turn; every scene just after it was learned, and all at the end."""
     store, rows, first, before = out / "store.evercal", [], {}, 0
     for scene in tqdm(scenes, "learning", unit="scene"):
         report = learned(store, [scene], memory)[0]
         localizer = Localizer.open(store)
-        first[scene.name] = errors(localizer, posed(scene.test), scene.name)
+        first[scene.name] = errors(localizer, posed_frames(scene.test), scene.name)
         first[scene.name]["seconds"] = report.seconds
         first[scene.name]["bytes"] = report.memory_bytes - before  # it counts all scenes
         before = report.memory_bytes
     localizer = Localizer.open(store)
     for scene in tqdm(scenes, "evaluating", unit="scene"):
-        row = errors(localizer, posed(scene.test), scene.name)
+        row = errors(localizer, posed_frames(scene.test), scene.name)
         new = first[scene.name]
         rows.append(
             row
@@ -148,17 +148,17 @@ def _jpeg(image: np.ndarray, quality: int) -> np.ndarray:
 
 def mini(out: Path, memory: float) -> list[dict[str, object]]:
     """The packaged rooms: accuracy, degraded images, changed rooms."""
-    rooms, store = mini_rooms(), out / "store.evercal"
+    rooms, store = sample_rooms(), out / "store.evercal"
     learned(store, [room.scene for room in rooms], memory)
     localizer, rows = Localizer.open(store), []
-    tests = [(room.scene.name, posed(room.scene.test)) for room in rooms]
+    tests = [(room.scene.name, posed_frames(room.scene.test)) for room in rooms]
     plain = [errors(localizer, frames, name) for name, frames in tests]
     rows += [*plain, _mean("mean", plain)]
     for title, change in DEGRADED.items():
         found = [errors(localizer, frames, name, change) for name, frames in tests]
         rows.append(_mean(title, found))
     changed = [
-        errors(localizer, posed(room.changed.test), room.scene.name)
+        errors(localizer, posed_frames(room.changed.test), room.scene.name)
         for room in rooms
         if room.changed is not None
     ]
@@ -169,7 +169,7 @@ def mini(out: Path, memory: float) -> list[dict[str, object]]:
 
 def fixed(out: Path, memory: float) -> list[dict[str, object]]:
     """Fixed cameras of the packaged rooms, 25 images each, before and after a bump."""
-    rooms, store, rows = mini_rooms(), out / "store.evercal", []
+    rooms, store, rows = sample_rooms(), out / "store.evercal", []
     learned(store, [room.scene for room in rooms], memory)
     localizer = Localizer.open(store)
     for room in rooms:
@@ -240,7 +240,7 @@ def bad_poses(
     out: Path, memory: float, seeds: Sequence[int] = (0, 1, 2)
 ) -> list[dict[str, object]]:
     """The packaged bedroom with spoiled training poses; test frames stay true."""
-    scene, rows = mini_rooms()[0].scene, []
+    scene, rows = sample_rooms()[0].scene, []
     for how in ("none", "noise", "offset", "focal", "gross"):
         for seed in seeds if how in ("noise", "gross") else (0,):
             store = out / f"{how}-{seed}.evercal"
@@ -248,7 +248,7 @@ def bad_poses(
             report = learned(store, [replace(scene, train=frames)], memory, seed)[0]
             localizer, adjusted = Localizer.open(store), report.adjusted
             assert adjusted is not None
-            row = errors(localizer, [_stated(f, how) for f in posed(scene.test)], scene.name)
+            row = errors(localizer, [_stated(f, how) for f in posed_frames(scene.test)], scene.name)
             common = localizer.maps.scenes[0].common
             m, r = pose_distance(OFFSET.inverse() if how == "offset" else SE3.identity(), common)
             far = [f.name for f, g in zip(scene.train, frames, strict=True) if _moved(f, g, how)]
@@ -286,7 +286,7 @@ def _moved(frame: Frame, spoiled_frame: Frame, how: str) -> bool:
 
 def strangers(out: Path, folders: Sequence[Path], memory: float) -> list[dict[str, object]]:
     """How many images get a pose in the first scene's map: of other scenes, and hard ones."""
-    known, *others = [load_scene(folder) for folder in folders]
+    known, *others = [load_recording(folder) for folder in folders]
     for folder, scene in zip(folders[1:], others, strict=True):
         if not scene.test:
             raise InputError(f"{folder}: has no test images")
@@ -319,7 +319,7 @@ def _believed(
     }
 
 
-def ablation(out: Path, scenes: Sequence[Scene], memory: float) -> list[dict[str, object]]:
+def ablation(out: Path, scenes: Sequence[Recording], memory: float) -> list[dict[str, object]]:
     """What alignment gives: the first pose, from matched patches, beside the refined one."""
     store, rows = out / "store.evercal", []
     learned(store, scenes, memory)
@@ -328,7 +328,7 @@ def ablation(out: Path, scenes: Sequence[Scene], memory: float) -> list[dict[str
         ("matched patches, no alignment", LocalizeOptions(align=False)),
     ):
         localizer = Localizer.open(store, options)
-        found = [errors(localizer, posed(s.test), s.name) for s in scenes]
+        found = [errors(localizer, posed_frames(s.test), s.name) for s in scenes]
         rows.append(_mean(title, found))
     _write(out / "ablation.json", rows, memory)
     return rows
@@ -362,9 +362,9 @@ def run(what: str, folders: Sequence[Path], out: Path, memory: float) -> None:
     if what == "strangers":
         rows = strangers(out, folders, memory)
     elif what == "sequence":
-        rows = sequence([load_scene(folder) for folder in folders], out, memory)
+        rows = sequence([load_recording(folder) for folder in folders], out, memory)
     elif what == "ablation":
-        rows = ablation(out, [load_scene(folder) for folder in folders], memory)
+        rows = ablation(out, [load_recording(folder) for folder in folders], memory)
     else:
         rows = {"mini": mini, "fixed": fixed, "badposes": bad_poses}[what](out, memory)
     print_rows(rows)

@@ -6,19 +6,19 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.peak_memory import peak_gb
-from evercal.benchmark.suites import load_suite
+from evercal.continual.benchmark.suites import load_suite
 from evercal.continual.learn import learn
 from evercal.continual.learn_scene import validation_split
+from evercal.continual.networks.atlas import combined_centres
+from evercal.continual.networks.descriptor import load_descriptor
+from evercal.continual.networks.trainer import Progress
 from evercal.continual.presets import PAPER_SIM_STEPS, on_paper_backbone, preset, short_side
 from evercal.continual.stage import Encoding
 from evercal.continual.strategies import strategy_named
-from evercal.datasets import known_poses
-from evercal.features.descriptor import load_descriptor
 from evercal.features.device import device_of
 from evercal.features.encoder import load_encoder
-from evercal.mapping.atlas import combined_centres
 from evercal.mapping.scene_maps import SceneMaps
-from evercal.networks.trainer import Progress
+from evercal.recordings import stated_poses
 
 TOLD_EVERY = 10
 
@@ -28,7 +28,7 @@ def run(suite: str, data: Path | None, steps: int, device: str, out: Path) -> No
     scenes = load_suite(suite, data, (), None)
     train = validation_split(scenes[0].train)[0]
     stage = on_paper_backbone(preset("paper"))
-    places = [known_poses(validation_split(scene.train)[0]).translation_m for scene in scenes]
+    places = [stated_poses(validation_split(scene.train)[0]).translation_m for scene in scenes]
     centres = combined_centres(places, stage.head.centres_per_scene, 0)
     fit = replace(stage.fit, iterations=PAPER_SIM_STEPS)
     stage = replace(stage, fit=fit, grid_scenes=len(scenes), fixed_centres_m=centres)

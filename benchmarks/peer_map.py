@@ -15,15 +15,15 @@ import numpy as np
 
 from benchmarks.peer_features import Detector, Features, detect, mutual_matches
 from benchmarks.peer_triangulation import Tracks, TriangulationOptions, triangulate
-from evercal.datasets.frame import Frame, Scene, known_poses
+from evercal.continual.networks.descriptor import load_descriptor
 from evercal.evaluation.metrics import Status
-from evercal.features.descriptor import load_descriptor
 from evercal.features.encode import encode
 from evercal.features.encoder import load_encoder
 from evercal.features.views import ViewOptions, plain_view
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.localization.pnp import PnpOptions, solve_pnp
+from evercal.recordings.frame import Frame, Recording, stated_poses
 
 Progress = Callable[[str, Sequence[Frame] | Sequence[int]], Iterable]
 """Wraps what is gone through in a progress bar of a title."""
@@ -120,7 +120,7 @@ def describe(
         image = frame.read_image()
         features.append(detect(image, frame.camera, detector, short_side))
         places.append(place(image, frame.camera))
-    poses = known_poses(frames)
+    poses = stated_poses(frames)
     return Described(features, np.stack(places), poses, time.perf_counter() - began)
 
 
@@ -209,7 +209,7 @@ class PeerLocalizer:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Recording,
         built: PeerMap,
         detector: Detector,
         short_side: int,

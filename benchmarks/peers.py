@@ -26,16 +26,23 @@ from tqdm import tqdm
 from benchmarks.peer_features import DETECTORS, Detector, FeatureOptions
 from benchmarks.peer_map import PeerLocalizer, Place, QueryOptions, build, describe
 from benchmarks.peer_triangulation import TriangulationOptions
-from evercal.benchmark.tables import table
 from evercal.continual.learn_scene import LearnOptions, learn_scene
 from evercal.continual.presets import preset
-from evercal.datasets import MIN_TRAIN_FRAMES, Scene, known_poses, load_scene, posed, posed_scene
 from evercal.errors import InputError
 from evercal.evaluation import evaluate
 from evercal.evaluation.metrics import FrameResult, correct
 from evercal.evaluation.protocol import SceneLocalizer
+from evercal.evaluation.tables import table
 from evercal.localization.localizer import Localizer
 from evercal.mapping.selection import SarsOptions, select_sars
+from evercal.recordings import (
+    MIN_TRAIN_FRAMES,
+    Recording,
+    load_recording,
+    posed_frames,
+    posed_recording,
+    stated_poses,
+)
 
 Method = Literal["evercal", "sift", "xfeat"]
 BOUNDS: dict[str, tuple[float, float]] = {
@@ -130,7 +137,7 @@ def run(
 
 
 def compare(
-    scene: Scene, with_evercal: bool, detectors: dict[str, Detector], options: PeerOptions
+    scene: Recording, with_evercal: bool, detectors: dict[str, Detector], options: PeerOptions
 ) -> Iterator[Row]:
     """One row per method, as soon as it is measured.
 
@@ -151,7 +158,7 @@ def compare(
             yield _examined(entry, scene)
 
 
-def evercal_entry(scene: Scene, store: Path, options: PeerOptions) -> Entry:
+def evercal_entry(scene: Recording, store: Path, options: PeerOptions) -> Entry:
     """Learns the scene into a new store, opens it and answers once: the one place to adapt."""
     print(f"{scene.name}: evercal learns", file=sys.stderr)
     began = time.perf_counter()
@@ -166,7 +173,7 @@ def evercal_entry(scene: Scene, store: Path, options: PeerOptions) -> Entry:
 
 
 def peer_entries(
-    scene: Scene, name: str, detector: Detector, options: PeerOptions
+    scene: Recording, name: str, detector: Detector, options: PeerOptions
 ) -> Iterator[Entry]:
     """The peer with all training frames, then with a share of them chosen by SARS."""
 
@@ -177,7 +184,7 @@ def peer_entries(
     retrieved = options.query.retrieved
     described = describe(scene.train, detector, side, place, bar)
     every = np.arange(len(scene.train))
-    poses = known_poses(scene.train)
+    poses = stated_poses(scene.train)
     few = select_sars(
         poses.translation_m,
         poses.rotation_wxyz,
@@ -220,8 +227,8 @@ def row_table(rows: Sequence[Row]) -> str:
     return table(header, cells, "terminal")
 
 
-def _examined(entry: Entry, scene: Scene) -> Row:
-    title, total = f"{scene.name}: {entry.name}", len(posed(scene.test))
+def _examined(entry: Entry, scene: Recording) -> Row:
+    title, total = f"{scene.name}: {entry.name}", len(posed_frames(scene.test))
     with tqdm(total=total, desc=title, leave=False, mininterval=0.5) as bar:
 
         def advance(done: int, total: int) -> None:
@@ -278,15 +285,15 @@ def _detectors(methods: Sequence[Method], options: PeerOptions) -> dict[str, Det
     return found
 
 
-def _load(path: Path, limit: int | None) -> Scene:
+def _load(path: Path, limit: int | None) -> Recording:
     """A scene with posed frames only and at most `limit` test frames, evenly spread."""
-    scene = posed_scene(load_scene(path))
+    scene = posed_recording(load_recording(path))
     if len(scene.train) < MIN_TRAIN_FRAMES:
         raise InputError(
             f"{path}: {len(scene.train)} posed training frames are too few; "
             f"give at least {MIN_TRAIN_FRAMES}"
         )
-    test = posed(scene.test)
+    test = posed_frames(scene.test)
     if not test:
         raise InputError(f"{path}: no test frame with a known pose; give a scene that has some")
     if limit is not None and limit < len(test):

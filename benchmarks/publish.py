@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from evercal.benchmark.published import Published, Row, from_bench, write_published
+from evercal.continual.benchmark.published import Published, Row, from_bench, write_published
 from evercal.errors import InputError
 
 FOLDER = Path(__file__).resolve().parent.parent / "results"

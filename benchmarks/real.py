@@ -10,10 +10,10 @@ from tabulate import tabulate
 
 from evercal.continual.learn_scene import LearnOptions, learn_scene
 from evercal.continual.presets import preset
-from evercal.datasets import load_scene
 from evercal.evaluation.metrics import scores
 from evercal.evaluation.protocol import evaluate
 from evercal.localization.localizer import Localizer
+from evercal.recordings import load_recording
 
 REAL = ("redkitchen", "fr1_rpy")
 COLUMNS = (
@@ -33,7 +33,7 @@ def run(data: Path, out: Path, seed: int) -> None:
     out.mkdir(parents=True, exist_ok=True)
     rows = []
     for name in REAL:
-        scene = load_scene(data / name)
+        scene = load_recording(data / name)
         store, record = out / f"fast-{name}-{seed}", out / f"fast-{name}-{seed}.json"
         if not record.exists():
             began = time.perf_counter()

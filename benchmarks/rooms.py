@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from tabulate import tabulate
 
-from evercal.drawing import contact_sheet, encode_image
+from evercal.reports import contact_sheet, encode_image
 from evercal.simulation.box_room import default_camera
 from evercal.simulation.cell import SUITES
 from evercal.simulation.cell_paths import sweep_shots

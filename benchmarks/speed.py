@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from evercal.datasets.images import read_image
 from evercal.features.encode import encode
 from evercal.features.views import ViewOptions, plain_view
 from evercal.localization.localizer import Localizer
 from evercal.localization.parallel import in_parallel
 from evercal.mapping.selection import SarsOptions, select_sars
+from evercal.recordings.images import read_image
 from evercal.simulation.box_room import default_camera
 
 

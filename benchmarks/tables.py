@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.publish import FOLDER
-from evercal.benchmark.ablation import ablation_rows
-from evercal.benchmark.comparison import (
+from evercal.continual.benchmark.ablation import ablation_rows
+from evercal.continual.benchmark.comparison import (
     Run,
     TableRows,
     by_strategy,
@@ -27,7 +27,7 @@ from evercal.benchmark.comparison import (
     selector_rows,
     threshold_rows,
 )
-from evercal.benchmark.published import Published, Row, read_published
+from evercal.continual.benchmark.published import Published, Row, read_published
 from evercal.errors import InputError
 from evercal.evaluation.metrics import CHI2_6, COARSE, FINE, FINEST
 

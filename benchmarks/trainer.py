@@ -6,14 +6,14 @@ from collections.abc import Callable
 import torch
 from tabulate import tabulate
 
-from evercal.features.descriptor import load_descriptor
+from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.continual.networks.descriptor import load_descriptor
+from evercal.continual.networks.head import Head, HeadOptions
+from evercal.continual.networks.muon import MUON_STEPS
+from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 from evercal.features.encoder import load_encoder
 from evercal.features.precision import fast_bfloat16
 from evercal.geometry import SE3
-from evercal.networks.buffer import FeatureBuffer
-from evercal.networks.head import Head, HeadOptions
-from evercal.networks.muon import MUON_STEPS
-from evercal.networks.trainer import FitOptions, HeadTrainer
 
 ROWS, VIEWS = 60_000, 100
 

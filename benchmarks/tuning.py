@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from tabulate import tabulate
 
-from evercal.benchmark import results
-from evercal.benchmark.bench import BenchOptions, run_bench
-from evercal.benchmark.rows import read_rows, strategy_from_row
-from evercal.benchmark.suites import load_suite, tuning_split
+from evercal.continual.benchmark import results
+from evercal.continual.benchmark.bench import BenchOptions, run_bench
+from evercal.continual.benchmark.rows import read_rows, strategy_from_row
+from evercal.continual.benchmark.suites import load_suite, tuning_split
 from evercal.continual.presets import on_paper_backbone, preset
 from evercal.continual.stage import StageOptions
 from evercal.continual.strategies import Strategy

@@ -14,12 +14,12 @@ import numpy as np
 
 import evercal
 from evercal.geometry import pose_distance
-from evercal.simulation.mini import FOLDER
+from evercal.recordings.samples import FOLDER
 
 
 def main(recording: Path) -> None:
     """Learns a recording into a store, and locates one of its test images."""
-    scene = evercal.load_scene(recording)
+    scene = evercal.load_recording(recording)
     with tempfile.TemporaryDirectory() as folder:
         store = Path(folder) / "robot.evercal"
         report = evercal.learn(store, scene)

@@ -11,7 +11,7 @@ from pathlib import Path
 import evercal
 from evercal.calibration.export.formats import FORMATS, write_content
 from evercal.calibration.export.request import Export
-from evercal.simulation.mini import FOLDER
+from evercal.recordings.samples import FOLDER
 
 
 def main(out: Path) -> None:

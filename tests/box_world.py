@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from evercal.datasets.frame import Frame
-from evercal.features.descriptor import GlobalDescriptor
+from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.continual.networks.descriptor import GlobalDescriptor
 from evercal.features.views import View, cell_centres
 from evercal.geometry import SE3, Camera
-from evercal.networks.buffer import FeatureBuffer
+from evercal.recordings.frame import Frame
 from evercal.simulation.box_room import BoxRoom
 
 Shoot = Callable[[Camera, SE3], Frame]

@@ -24,22 +24,22 @@ if TYPE_CHECKING:
     import torch
 
     from evercal.continual.stage import Stage, StageOptions
-    from evercal.datasets.frame import Scene
     from evercal.mapping.scene_maps import SceneMaps
     from evercal.mapping.store import Store
+    from evercal.recordings.frame import Recording
     from evercal.simulation.box_room import BoxRoom
 
 
 def _room(
     seed: int, name: str, size: tuple[int, int], span: int, every: int = 1, texture_px: int = 96
-) -> Scene:
+) -> Recording:
     """A walk of half a metre, turning by 50 degrees; every `every`-th view of `span` is learned.
 
     The other views are there to test.
     """
     import numpy as np
 
-    from evercal.datasets.frame import Frame, Scene
+    from evercal.recordings.frame import Frame, Recording
     from evercal.simulation.box_room import BoxRoom, default_camera, look_at
 
     room, camera = BoxRoom(seed, texture_px=texture_px), default_camera(*size)
@@ -51,7 +51,7 @@ def _room(
         pose = look_at(eye, eye + ahead, 0.1 * sway)
         frames.append(Frame(f"{name}-{i:03d}", room.render(camera, pose), camera, pose))
     train = tuple(frames[::every])
-    return Scene(name, train, tuple(f for i, f in enumerate(frames) if i % every))
+    return Recording(name, train, tuple(f for i, f in enumerate(frames) if i % every))
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
@@ -67,7 +67,7 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 
 
 @pytest.fixture(scope="session")
-def rooms() -> tuple[Scene, Scene, Scene]:
+def rooms() -> tuple[Recording, Recording, Recording]:
     """Three scenes of 30 frames, 64x48 pixels."""
     alpha, beta, gamma = (
         _room(seed, name, (64, 48), 30)
@@ -79,11 +79,11 @@ def rooms() -> tuple[Scene, Scene, Scene]:
 @pytest.fixture(scope="session")
 def quick() -> StageOptions:
     """A stage of eight steps for `rooms`."""
+    from evercal.continual.networks.buffer import EncodePlan
+    from evercal.continual.networks.head import HeadOptions
+    from evercal.continual.networks.trainer import FitOptions
     from evercal.continual.stage import StageOptions
     from evercal.features.views import ViewOptions
-    from evercal.networks.buffer import EncodePlan
-    from evercal.networks.head import HeadOptions
-    from evercal.networks.trainer import FitOptions
 
     return StageOptions(
         head=HeadOptions(width=16, centres_per_scene=3),
@@ -119,7 +119,7 @@ def blank(quick_vlad: None) -> Callable[[str], SceneMaps]:
     """Makes a robot that knows nothing, with tiny random networks, given its strategy."""
     import torch
 
-    from evercal.features.descriptor import GlobalDescriptor
+    from evercal.continual.networks.descriptor import GlobalDescriptor
     from evercal.features.encoder import LocalEncoder
     from evercal.mapping.scene_maps import SceneMaps
 
@@ -133,7 +133,9 @@ def blank(quick_vlad: None) -> Callable[[str], SceneMaps]:
 
 @pytest.fixture(scope="session")
 def taught(
-    blank: Callable[[str], SceneMaps], rooms: tuple[Scene, Scene, Scene], quick: StageOptions
+    blank: Callable[[str], SceneMaps],
+    rooms: tuple[Recording, Recording, Recording],
+    quick: StageOptions,
 ) -> dict[str, list[SceneMaps]]:
     """By strategy: what is known after one, two and three rooms."""
     from evercal.continual.learn import learn
@@ -174,7 +176,7 @@ def make() -> Callable[[Path, list[SceneMaps]], Store]:
 
 
 @pytest.fixture(scope="session")
-def answers(rooms: tuple[Scene, Scene, Scene]) -> Callable[..., list[bytes]]:
+def answers(rooms: tuple[Recording, Recording, Recording]) -> Callable[..., list[bytes]]:
     """Tells what a robot says to an image of each room and keeps of it, to the last bit."""
     from evercal.localization.localizer import LocalizeOptions, Localizer
     from evercal.localization.pnp import PnpOptions
@@ -203,7 +205,7 @@ def answers(rooms: tuple[Scene, Scene, Scene]) -> Callable[..., list[bytes]]:
 
 
 @pytest.fixture(scope="session")
-def arcs() -> tuple[Scene, Scene]:
+def arcs() -> tuple[Recording, Recording]:
     """Two scenes of 24 training and 24 test frames in between, 160x120 pixels."""
     one, two = (_room(seed, name, (160, 120), 48, 2) for seed, name in ((34, "one"), (31, "two")))
     return one, two
@@ -212,11 +214,11 @@ def arcs() -> tuple[Scene, Scene]:
 @pytest.fixture(scope="session")
 def arc_stage() -> StageOptions:
     """Enough training for `arcs`."""
+    from evercal.continual.networks.buffer import EncodePlan
+    from evercal.continual.networks.head import HeadOptions
+    from evercal.continual.networks.trainer import FitOptions
     from evercal.continual.stage import StageOptions
     from evercal.features.views import ViewOptions
-    from evercal.networks.buffer import EncodePlan
-    from evercal.networks.head import HeadOptions
-    from evercal.networks.trainer import FitOptions
 
     return StageOptions(
         head=HeadOptions(width=64),
@@ -226,12 +228,14 @@ def arc_stage() -> StageOptions:
 
 
 @pytest.fixture(scope="session")
-def arc_maps(arcs: tuple[Scene, Scene], arc_stage: StageOptions) -> tuple[SceneMaps, SceneMaps]:
+def arc_maps(
+    arcs: tuple[Recording, Recording], arc_stage: StageOptions
+) -> tuple[SceneMaps, SceneMaps]:
     """What is known after the first arc, and after both."""
     from evercal.continual.learn import learn
+    from evercal.continual.networks.descriptor import load_descriptor
     from evercal.continual.stage import Stage
     from evercal.continual.strategies import STRATEGIES
-    from evercal.features.descriptor import load_descriptor
     from evercal.features.encoder import load_encoder
     from evercal.mapping.scene_maps import SceneMaps
 
@@ -247,7 +251,7 @@ HALL_SEED = 34
 
 
 @pytest.fixture(scope="session")
-def hall() -> Scene:
+def hall() -> Recording:
     """A scene of 30 training and 30 test frames in between, 320x240 pixels, fine textures."""
     return _room(HALL_SEED, "hall", (320, 240), 60, 2, 256)
 
@@ -261,12 +265,12 @@ def hall_room() -> BoxRoom:
 
 
 @pytest.fixture(scope="session")
-def hall_stage(hall: Scene) -> Stage:
+def hall_stage(hall: Recording) -> Stage:
     """The map of `hall` with 7 keyframes; the thresholds of its record are fitted."""
     from evercal.continual.learn import learn
+    from evercal.continual.networks.descriptor import load_descriptor
     from evercal.continual.stage import Stage, StageOptions
     from evercal.continual.strategies import STRATEGIES
-    from evercal.features.descriptor import load_descriptor
     from evercal.features.encoder import load_encoder
     from evercal.localization.acceptance import fitted_record
     from evercal.mapping.scene_maps import SceneMaps

@@ -27,7 +27,7 @@ def test_import_is_fast_and_loads_nothing_heavy() -> None:
 
 
 def test_geometry_and_datasets_do_without_torch_and_opencv() -> None:
-    code = "import sys, evercal.geometry, evercal.storage, evercal.datasets; print(*sys.modules)"
+    code = "import sys, evercal.geometry, evercal.storage, evercal.recordings; print(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )

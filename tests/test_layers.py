@@ -14,23 +14,20 @@ import evercal
 
 ORDER = (
     "geometry",
-    "drawing",
     "storage",
-    "datasets",
-    "simulation",
+    "recordings",
     "features",
-    "networks",
     "mapping",
     "localization",
-    "continual",
     "calibration",
     "evaluation",
-    "benchmark",
     "reports",
+    "simulation",
+    "continual",
     "cli",
 )
 FOR_ALL = ("errors",)
-HEAD = "evercal.networks.head"
+HEAD = "evercal.continual.networks.head"
 
 
 def imported(tree: ast.AST, package: tuple[str, ...]) -> Iterator[tuple[int, tuple[str, ...]]]:
@@ -113,13 +110,13 @@ def chains(
 
 def learns(module: str) -> bool:
     """Whether a module is there to learn, which finding a camera must not need."""
-    in_networks = module.startswith("evercal.networks.") and module != HEAD
+    in_networks = module.startswith("evercal.continual.networks.") and module != HEAD
     return module.startswith("evercal.continual") or in_networks
 
 
 def fits_networks(module: str) -> bool:
     """Whether a module is of the networks and not the head."""
-    return module.startswith("evercal.networks.") and module != HEAD
+    return module.startswith("evercal.continual.networks.") and module != HEAD
 
 
 def test_folders_import_only_from_folders_above() -> None:
@@ -160,7 +157,7 @@ def test_planted_violations_are_found(tmp_path: Path) -> None:
         "geometry/plain.py": "import evercal.features.encoder",
         "geometry/from_package.py": "from evercal import features",
         "geometry/root.py": "import evercal",
-        "storage/lazy.py": "def f():\n    from evercal.datasets import load_scene",
+        "storage/lazy.py": "def f():\n    from evercal.recordings import load_recording",
         "datasets/relative.py": "from ..features import encoder",
         "datasets/bare_relative.py": "from .. import cli",
         "datasets/deep/relative.py": "from ...networks import trainer",
@@ -193,13 +190,13 @@ def test_planted_ways_to_what_learns_are_found(tmp_path: Path) -> None:
             "__init__.py": "from evercal.continual.learn import learn",
             "networks/__init__.py": "",
             "networks/head.py": "import torch",
-            "networks/trainer.py": "from evercal.networks.head import Head",
+            "networks/trainer.py": "from evercal.continual.networks.head import Head",
             "networks/loss.py": "",
             "features/__init__.py": "",
-            "features/innocent.py": "def f():\n    from evercal.networks import loss",
+            "features/innocent.py": "def f():\n    from evercal.continual.networks import loss",
             "mapping/__init__.py": "",
-            "mapping/good.py": "from evercal.networks.head import Head\nimport evercal.errors",
-            "mapping/direct.py": "from evercal.networks import trainer",
+            "mapping/good.py": "from evercal.continual.networks.head import Head\nimport evercal.errors",
+            "mapping/direct.py": "from evercal.continual.networks import trainer",
             "mapping/far.py": "from evercal.mapping import near",
             "mapping/near.py": "from ..features import innocent",
             "localization/__init__.py": "",
@@ -211,8 +208,8 @@ def test_planted_ways_to_what_learns_are_found(tmp_path: Path) -> None:
     )
     graph = import_graph(tmp_path)
     found = chains(graph, "mapping", fits_networks)
-    assert found.keys() == {"evercal.networks.trainer", "evercal.networks.loss"}
-    assert found["evercal.networks.loss"][-2] == "evercal.features.innocent"
+    assert found.keys() == {"evercal.continual.networks.trainer", "evercal.continual.networks.loss"}
+    assert found["evercal.continual.networks.loss"][-2] == "evercal.features.innocent"
     assert chains(graph, "localization", learns).keys() == {
         "evercal.continual",
         "evercal.continual.learn",

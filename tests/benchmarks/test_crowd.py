@@ -10,11 +10,11 @@ import torch
 
 from benchmarks import crowd, peak_memory
 from benchmarks.publish import publish
-from evercal.benchmark.published import read_published
-from evercal.datasets import Frame, Scene
+from evercal.continual.benchmark.published import read_published
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.localization.localizer import LocalizeOptions
+from evercal.recordings import Frame, Recording
 from evercal.simulation.box_room import default_camera
 
 CAMERA = default_camera(16, 12)
@@ -57,8 +57,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(crowd, "Matcher", lambda *_: matcher)
     monkeypatch.setattr(crowd, "Query", lambda *_: None)
     monkeypatch.setattr(crowd, "add_room", lambda *_: None)
-    scene = Scene("room", FRAMES, (*FRAMES, UNPOSED))
-    monkeypatch.setattr(crowd, "load_scene", lambda path, name: scene)
+    scene = Recording("room", FRAMES, (*FRAMES, UNPOSED))
+    monkeypatch.setattr(crowd, "load_recording", lambda path, name: scene)
     return done
 
 
@@ -84,7 +84,9 @@ def test_times_are_taken_before_anything_else_loads_keyframes(
 def test_a_scene_that_the_store_does_not_know_is_named(
     tmp_path: Path, calls: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(crowd, "load_scene", lambda path, name: Scene("attic", FRAMES, FRAMES))
+    monkeypatch.setattr(
+        crowd, "load_recording", lambda path, name: Recording("attic", FRAMES, FRAMES)
+    )
     with pytest.raises(InputError, match="'attic' is not in the store"):
         crowd.run(tmp_path, [Path("attic")], 10, 1, tmp_path / "crowd.json")
 

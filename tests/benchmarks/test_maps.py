@@ -9,11 +9,11 @@ import pytest
 
 from benchmarks import maps
 from benchmarks.publish import publish
-from evercal.benchmark.published import read_published
-from evercal.datasets import Frame, Scene
+from evercal.continual.benchmark.published import read_published
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.localization.estimate import PoseEstimate
+from evercal.recordings import Frame, Recording
 from evercal.simulation.box_room import default_camera
 
 CAMERA = default_camera(16, 12)
@@ -59,12 +59,12 @@ def test_the_share_of_keyframes_is_used_and_written(
 ) -> None:
     used = []
 
-    def learn(store: Path, scene: Scene, options: maps.LearnOptions) -> None:
+    def learn(store: Path, scene: Recording, options: maps.LearnOptions) -> None:
         used.append(options.stage.memory_share)
 
-    scene = Scene("room", frames(3), frames(2))
+    scene = Recording("room", frames(3), frames(2))
     monkeypatch.setattr(maps, "learn_scene", learn)
-    monkeypatch.setattr(maps, "load_scene", lambda folder: scene)
+    monkeypatch.setattr(maps, "load_recording", lambda folder: scene)
     monkeypatch.setattr(maps.Localizer, "open", lambda *_: Answers([0.001] * 1000, 0.01))
     maps.run(what, [Path("a"), Path("b")], tmp_path / what, 0.03)
     source = tmp_path / what / f"{what}.json"
@@ -80,7 +80,7 @@ def test_a_scene_of_a_sequence_counts_its_own_bytes(
     reports = [SimpleNamespace(seconds=1.0, memory_bytes=n) for n in (300, 500, 900)]
     monkeypatch.setattr(maps, "learn_scene", lambda *_: reports.pop(0))
     monkeypatch.setattr(maps.Localizer, "open", lambda *_: Answers([0.001] * 10, 0.01))
-    scenes = [Scene(name, frames(3), frames(1)) for name in ("room", "hall", "attic")]
+    scenes = [Recording(name, frames(3), frames(1)) for name in ("room", "hall", "attic")]
     rows = maps.sequence(scenes, tmp_path, 0.1)
     assert [row["bytes"] for row in rows] == [300, 200, 400, 300]
 
@@ -88,7 +88,7 @@ def test_a_scene_of_a_sequence_counts_its_own_bytes(
 def test_strangers_without_images_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(maps, "load_scene", lambda folder: Scene("a", frames(3), ()))
+    monkeypatch.setattr(maps, "load_recording", lambda folder: Recording("a", frames(3), ()))
     with pytest.raises(InputError, match="b: has no test images"):
         maps.run("strangers", [Path("a"), Path("b")], tmp_path / "out", 0.1)
 
@@ -99,10 +99,10 @@ def test_strangers_are_shown_with_the_camera_that_took_them(
     other = default_camera(32, 24)
     image = np.zeros((24, 32, 3), np.uint8)
     taken = tuple(Frame(str(i), image, other, SE3.identity()) for i in range(2))
-    scenes = {"a": Scene("a", frames(3), ()), "b": Scene("b", frames(3), taken)}
+    scenes = {"a": Recording("a", frames(3), ()), "b": Recording("b", frames(3), taken)}
     answers = Answers([0.001], 0.01)
     monkeypatch.setattr(maps, "learn_scene", lambda *_: None)
-    monkeypatch.setattr(maps, "load_scene", lambda folder: scenes[folder.name])
+    monkeypatch.setattr(maps, "load_recording", lambda folder: scenes[folder.name])
     monkeypatch.setattr(maps.Localizer, "open", lambda *_: answers)
     maps.run("strangers", [Path("a"), Path("b")], tmp_path / "out", 0.1)
     rows = json.loads((tmp_path / "out" / "strangers.json").read_text())["rows"]

@@ -12,19 +12,19 @@ from benchmarks import peers
 from benchmarks.peer_features import FeatureOptions, detect, mutual_matches, sift, xfeat
 from benchmarks.peer_map import QueryOptions
 from benchmarks.peer_triangulation import Tracks, TriangulationOptions, triangulate
-from evercal.datasets.frame import Scene
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
+from evercal.recordings.frame import Recording
 from evercal.simulation.box_room import default_camera, look_at
 
 
 @pytest.fixture(scope="module")
-def scene(arcs: tuple[Scene, Scene]) -> Scene:
+def scene(arcs: tuple[Recording, Recording]) -> Recording:
     return replace(arcs[0], test=arcs[0].test[2::4])
 
 
 @pytest.fixture(scope="module")
-def rows(scene: Scene) -> list[peers.Row]:
+def rows(scene: Recording) -> list[peers.Row]:
     options = peers.PeerOptions(query=QueryOptions(retrieved=5))
     return list(peers.compare(scene, False, {"sift": sift(options.features)}, options))
 
@@ -76,7 +76,7 @@ def test_matches_are_mutual() -> None:
     assert len(mutual_matches(a, b[:0])[0]) == 0
 
 
-def test_features_lie_in_the_pinhole_and_are_128_bytes(scene: Scene) -> None:
+def test_features_lie_in_the_pinhole_and_are_128_bytes(scene: Recording) -> None:
     frame = scene.train[0]
     bent = replace(frame.camera, distortion=(0.1, 0.0, 0.0, 0.0))
     options = FeatureOptions(features=50)
@@ -92,7 +92,7 @@ def _rays(pixels: np.ndarray, camera: Camera) -> np.ndarray:
     return np.concatenate([plane, np.ones((len(plane), 1))], 1)
 
 
-def test_sift_locates_most_frames(scene: Scene, rows: list[peers.Row]) -> None:
+def test_sift_locates_most_frames(scene: Recording, rows: list[peers.Row]) -> None:
     whole, small = rows
     assert (whole.method, small.method) == ("sift all", "sift 10 %")
     assert (whole.frames, whole.frames_kept, small.frames_kept) == (6, 24, 2)
@@ -105,7 +105,7 @@ def test_sift_locates_most_frames(scene: Scene, rows: list[peers.Row]) -> None:
     assert whole.build_seconds > small.build_seconds > 0
 
 
-def test_blank_images_count_as_wrong(scene: Scene) -> None:
+def test_blank_images_count_as_wrong(scene: Recording) -> None:
     blank = [replace(f, image=np.full_like(f.read_image(), 90)) for f in scene.test[:2]]
     options = peers.PeerOptions(share=0.5, query=QueryOptions(retrieved=5))
     broken = replace(scene, train=scene.train[:16], test=(*blank, scene.test[0]))

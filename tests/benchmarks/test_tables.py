@@ -8,11 +8,11 @@ import pytest
 
 from benchmarks import tables
 from benchmarks.publish import FOLDER, groups_of, publish
-from evercal.benchmark import results
-from evercal.benchmark.published import read_published
+from evercal.continual.benchmark import results
+from evercal.continual.benchmark.published import read_published
 from evercal.errors import InputError
 from evercal.storage import write_json
-from tests.benchmark.test_comparison import lines
+from tests.continual.benchmark.test_comparison import lines
 
 
 def test_every_table_of_the_docs_is_what_its_data_say() -> None:

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from benchmarks import tuning
-from evercal.benchmark import results
-from evercal.benchmark.bench import BenchOptions
-from evercal.benchmark.results import SceneResult
-from evercal.benchmark.rows import load_rows, strategy_from_row
+from evercal.continual.benchmark import results
+from evercal.continual.benchmark.bench import BenchOptions
+from evercal.continual.benchmark.results import SceneResult
+from evercal.continual.benchmark.rows import load_rows, strategy_from_row
 from evercal.errors import InputError
 from evercal.storage import write_json
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from evercal.calibration.align import align_by_gripper
-from evercal.datasets import write_image
-from evercal.datasets.frame import Scene
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import Alignment, SceneMaps, moved_by_frame
 from evercal.mapping.store import Store
+from evercal.recordings import write_image
+from evercal.recordings.frame import Recording
 from evercal.simulation.box_room import BoxRoom
 
 Make = Callable[[Path, list[SceneMaps]], Store]
@@ -25,7 +25,7 @@ GRIPPER_FROM_CAMERA = SE3.exp([0.05, 0.02, 0.08, 0.1, 0.2, -0.4])
 
 
 @pytest.fixture(scope="module")
-def arm_views(hall: Scene, hall_room: BoxRoom) -> tuple[list[tuple[str, np.ndarray]], SE3]:
+def arm_views(hall: Recording, hall_room: BoxRoom) -> tuple[list[tuple[str, np.ndarray]], SE3]:
     """Ten images that tilt and turn about the walk of the hall, and map_from_camera of each."""
     rng, poses, images = np.random.default_rng(3), [], []
     camera = hall.train[0].camera

@@ -14,13 +14,13 @@ from evercal.calibration.drift import check, shift_between
 from evercal.calibration.from_images import Images, calibrate
 from evercal.calibration.located import Located, fuse, halves_apart
 from evercal.calibration.rig import rig_of
-from evercal.datasets import write_image
-from evercal.datasets.frame import Frame, Scene
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import SceneMaps
+from evercal.recordings import write_image
+from evercal.recordings.frame import Frame, Recording
 
 Draw = Callable[[Frame, int, int], list[tuple[str, np.ndarray]]]
 
@@ -121,7 +121,7 @@ def truth_of(frame: Frame) -> SE3:
 
 
 def test_a_fixed_camera_is_found_within_its_uncertainty(
-    localizer: Localizer, hall: Scene, noisy: Draw
+    localizer: Localizer, hall: Recording, noisy: Draw
 ) -> None:
     frame = hall.test[3]
     found = calibrate(localizer, Images(noisy(frame, 6, 0), frame.camera))
@@ -135,7 +135,7 @@ def test_a_fixed_camera_is_found_within_its_uncertainty(
 
 
 def test_many_images_from_one_spot_are_hardly_better_than_few(
-    localizer: Localizer, hall: Scene, noisy: Draw
+    localizer: Localizer, hall: Recording, noisy: Draw
 ) -> None:
     frame = hall.test[3]
     few = calibrate(localizer, Images(noisy(frame, 2, 0), frame.camera))
@@ -143,7 +143,9 @@ def test_many_images_from_one_spot_are_hardly_better_than_few(
     assert many.sigma_mm > 0.7 * few.sigma_mm
 
 
-def test_a_camera_on_the_gripper_is_told_from_its_motion(localizer: Localizer, hall: Scene) -> None:
+def test_a_camera_on_the_gripper_is_told_from_its_motion(
+    localizer: Localizer, hall: Recording
+) -> None:
     gripper_from_camera = SE3.exp([0.05, -0.02, 0.1, 0.3, 0.2, -1.0])
     frames = hall.test[::3]
     grippers = SE3.stack([truth_of(f) @ gripper_from_camera.inverse() for f in frames])
@@ -156,7 +158,7 @@ def test_a_camera_on_the_gripper_is_told_from_its_motion(localizer: Localizer, h
     assert metres < 4 * found.sigma_mm / 1000
 
 
-def test_eye_in_hand_needs_a_pose_for_every_image(localizer: Localizer, hall: Scene) -> None:
+def test_eye_in_hand_needs_a_pose_for_every_image(localizer: Localizer, hall: Recording) -> None:
     images = [("a", hall.test[0].read_image())]
     with pytest.raises(InputError, match="--robot-poses"):
         calibrate(localizer, Images(images), "eye_in_hand")
@@ -164,7 +166,7 @@ def test_eye_in_hand_needs_a_pose_for_every_image(localizer: Localizer, hall: Sc
         calibrate(localizer, Images(images, base_from_gripper=SE3.identity((2,))))
 
 
-def test_drift_is_seen_and_rest_is_not(localizer: Localizer, hall: Scene, noisy: Draw) -> None:
+def test_drift_is_seen_and_rest_is_not(localizer: Localizer, hall: Recording, noisy: Draw) -> None:
     frame = hall.test[3]
     reference = calibrate(localizer, Images(noisy(frame, 10, 0), frame.camera))
     now = noisy(frame, 5, 1)
@@ -180,7 +182,7 @@ def test_drift_is_seen_and_rest_is_not(localizer: Localizer, hall: Scene, noisy:
 
 
 def test_a_reference_of_another_map_counts_with_its_whole_uncertainty(
-    localizer: Localizer, hall: Scene, noisy: Draw
+    localizer: Localizer, hall: Recording, noisy: Draw
 ) -> None:
     frame = hall.test[3]
     reference = calibrate(localizer, Images(noisy(frame, 5, 0), frame.camera))
@@ -199,7 +201,7 @@ def test_a_reference_of_another_map_counts_with_its_whole_uncertainty(
 
 
 def test_a_rig_knows_its_cameras_relative_to_each_other(
-    localizer: Localizer, hall: Scene, noisy: Draw
+    localizer: Localizer, hall: Recording, noisy: Draw
 ) -> None:
     frames = {"left": hall.test[2], "right": hall.test[5]}
     rig = rig_of({name: calibrate(localizer, Images(noisy(f, 2, 0))) for name, f in frames.items()})
@@ -214,7 +216,7 @@ def test_a_rig_knows_its_cameras_relative_to_each_other(
 
 
 def test_episodes_with_wrong_poses_are_listed(
-    localizer: Localizer, hall: Scene, tmp_path: Path
+    localizer: Localizer, hall: Recording, tmp_path: Path
 ) -> None:
     frame = hall.test[3]
     for name, offset in (("good", 0.0), ("moved", 0.03)):
@@ -239,10 +241,12 @@ def test_episodes_with_wrong_poses_are_listed(
 
 
 def test_an_episode_inside_a_bag_is_audited_too(
-    localizer: Localizer, hall: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    localizer: Localizer, hall: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "bag").mkdir()
     frames = tuple(replace(frame, image=frame.read_image()) for frame in hall.test[3:4])
-    monkeypatch.setattr("evercal.calibration.audit.load_scene", lambda _: Scene("bag", frames, ()))
+    monkeypatch.setattr(
+        "evercal.calibration.audit.load_recording", lambda _: Recording("bag", frames, ())
+    )
     [episode] = audit(localizer, tmp_path)
     assert episode.verdict == "right"

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.hand_eye import Setting, error, pose, recording, rotations, shaken
 from evercal.calibration.calibration import Mount
-from evercal.calibration.pairs import PosePairs
-from evercal.calibration.solve import solve
+from evercal.calibration.pose_pairs.pairs import PosePairs
+from evercal.calibration.pose_pairs.solve import solve
 from evercal.errors import InputError
 from evercal.geometry import SE3
 

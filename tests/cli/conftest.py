@@ -60,7 +60,7 @@ def tiny() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Folders of the scenes `box-room-41` and `box-room-42`, 24 training and 6 test frames each."""
-    from evercal.datasets import generic
+    from evercal.recordings import generic
     from evercal.simulation.box_room import box_room_scene
 
     root = tmp_path_factory.mktemp("rooms")

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from evercal.benchmark.results import RESULTS, STRATEGIES
 from evercal.cli import bench as verb
-from evercal.datasets import generic
+from evercal.continual.benchmark.results import RESULTS, STRATEGIES
+from evercal.recordings import generic
 
 if TYPE_CHECKING:
     from evercal.continual.stage import StageOptions
-    from evercal.datasets import Scene
+    from evercal.recordings import Recording
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def small(monkeypatch: pytest.MonkeyPatch, quick: StageOptions) -> None:
 
 
 def test_bench_and_its_report(
-    run: Any, small: None, arcs: tuple[Scene, Scene], tmp_path: Path
+    run: Any, small: None, arcs: tuple[Recording, Recording], tmp_path: Path
 ) -> None:
     folders = []
     for scene in arcs:
@@ -84,7 +84,7 @@ def test_a_folder_without_results(run: Any, tmp_path: Path) -> None:
 
 
 def test_settings_are_chosen_on_training_frames(
-    run: Any, small: None, arcs: tuple[Scene, Scene], tmp_path: Path
+    run: Any, small: None, arcs: tuple[Recording, Recording], tmp_path: Path
 ) -> None:
     folders = []
     for scene in arcs:

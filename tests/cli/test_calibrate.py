@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from evercal.calibration.calibration import read_calibration
-from evercal.datasets import write_image
-from evercal.datasets.frame import Scene
 from evercal.geometry import SE3, pose_distance
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Store
+from evercal.recordings import write_image
+from evercal.recordings.frame import Recording
 
 Make = Callable[[Path, list[SceneMaps]], Store]
 
@@ -27,7 +27,7 @@ def hall_store(make: Make, hall_maps: SceneMaps, tmp_path_factory: pytest.TempPa
 
 
 @pytest.fixture(scope="module")
-def images(hall: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def images(hall: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four images of a camera that stands still."""
     folder, rng = tmp_path_factory.mktemp("images"), np.random.default_rng(0)
     still = hall.test[3].read_image().astype(float)
@@ -38,7 +38,7 @@ def images(hall: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_from_images_to_a_file_and_an_alarm(
-    run: Callable, hall_store: Path, images: Path, hall: Scene, tmp_path: Path
+    run: Callable, hall_store: Path, images: Path, hall: Recording, tmp_path: Path
 ) -> None:
     out = tmp_path / "calibration.json"
     done = run("calibrate", hall_store, images, "--out", out)
@@ -56,7 +56,7 @@ def test_from_images_to_a_file_and_an_alarm(
 
 
 def test_watch_stops_with_one_when_the_camera_moves(
-    run: Callable, hall_store: Path, images: Path, hall: Scene, tmp_path: Path
+    run: Callable, hall_store: Path, images: Path, hall: Recording, tmp_path: Path
 ) -> None:
     out, folder = tmp_path / "calibration.json", tmp_path / "arriving"
     assert run("calibrate", hall_store, images, "--out", out).code == 0
@@ -71,7 +71,7 @@ def test_watch_stops_with_one_when_the_camera_moves(
 
 
 def test_audit_lists_what_disagrees(
-    run: Callable, hall_store: Path, hall: Scene, tmp_path: Path
+    run: Callable, hall_store: Path, hall: Recording, tmp_path: Path
 ) -> None:
     frame = hall.test[3]
     assert frame.base_from_camera is not None

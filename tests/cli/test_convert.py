@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from evercal.cli.reading import Reading
-from evercal.datasets import FORMATS, ReadOptions, generic, load_scene, write_image
 from evercal.geometry import SE3, pose_distance
+from evercal.recordings import FORMATS, ReadOptions, generic, load_recording, write_image
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_a_recording_becomes_a_scene_folder(
     told = json.loads(ran.out)
     assert (told["name"], told["train"], told["test"], told["untracked"]) == ("cell", 4, 0, 0)
     assert (told["with_base_from_camera"], told["with_base_from_gripper"]) == (0, 4)
-    scene = load_scene(out)
+    scene = load_recording(out)
     assert scene.name == "cell"
     assert scene.notes == tuple(told["notes"])
     assert "in order" in scene.notes[0]
@@ -85,7 +85,7 @@ def test_misuse_is_one_line(run: Any, wave: Path, tmp_path: Path, verb: str) -> 
     lens = tmp_path / "lens.txt"
     (tmp_path / "file").write_text("x")
     room = tmp_path / "room"
-    generic.write(room, load_scene(wave, options=ReadOptions(camera=lens)))
+    generic.write(room, load_recording(wave, options=ReadOptions(camera=lens)))
     before, after = {
         "convert": ([], [tmp_path / "new"]),
         "inspect": ([], []),

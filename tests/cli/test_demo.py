@@ -13,25 +13,23 @@ import pytest
 
 from evercal.cli import demo
 from evercal.cli.demo import DemoOptions
-from evercal.datasets import Frame, Scene, read_image
 from evercal.geometry import SE3
 from evercal.localization.estimate import PoseEstimate
-from evercal.reports import demo_page
+from evercal.recordings import Recording, read_image
+from evercal.recordings.samples import SampleRoom
 from evercal.reports.demo_measurements import Look
 from evercal.reports.demo_outcome import DemoOutcome, FixedCamera
 from evercal.reports.demo_sentences import about_fixed_cameras
-from evercal.simulation import mini
 from evercal.simulation.box_room import box_room_scene
-from evercal.simulation.mini import CellRoom
 
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     scenes = [box_room_scene(seed, 24, 4) for seed in (41, 42)]
     still = replace(scenes[1].test[0], name="again")
-    fixed = Scene("still", (), (scenes[1].test[0], still))
+    fixed = Recording("still", (), (scenes[1].test[0], still))
     changed = replace(scenes[1], name="later", train=())
-    rooms = CellRoom(scenes[0]), CellRoom(scenes[1], fixed, None, fixed, changed)
+    rooms = SampleRoom(scenes[0]), SampleRoom(scenes[1], fixed, fixed, changed)
     monkeypatch.setattr(demo, "DemoOptions", functools.partial(DemoOptions, rooms=rooms))
 
 
@@ -78,29 +76,6 @@ def test_networks_are_compared_on_request(run: Any, tmp_path: Path) -> None:
     assert not [path for path in out.iterdir() if path.name.startswith(".")]
 
 
-def test_bare_shapes_lie_over_located_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = box_room_scene(7, 1, 6)
-    asked: list[tuple[object, list[Frame], list[SE3]]] = []
-
-    def clay(model: object, frames: list[Frame], poses: list[SE3]) -> list[np.ndarray]:
-        asked.append((model, frames, poses))
-        return [np.full_like(frame.read_image(), 250) for frame in frames]
-
-    monkeypatch.setattr(mini, "untextured_renders", clay)
-    pose = SE3.identity()
-    answers = [(scene.name, pose), ("elsewhere", pose), (scene.name, None)]
-    room = CellRoom(scene, model=("living", 3))
-    monkeypatch.setattr(demo_page, "draw_landmarks", lambda image, *_: image)
-    overlays = demo_page._overlays(Answers(scene.name, answers), scene)  # pyright: ignore[reportArgumentType]
-    (drawn,) = demo_page._untextured_overlays(room, overlays)
-    ((model, frames, poses),) = asked
-    assert (model, frames, poses) == (("living", 3), [scene.test[1]], [pose])
-    expected = (frames[0].read_image().astype(int) + 250) // 2
-    np.testing.assert_array_equal(drawn, expected)
-    assert demo_page._untextured_overlays(CellRoom(scene), overlays) == []
-
-
-@pytest.mark.usefixtures("small")
 def test_what_is_in_the_way_stays(run: Any, tmp_path: Path, snapshot: Any) -> None:
     (tmp_path / "store").mkdir()
     (tmp_path / "store/letter.txt").write_text("dear")
@@ -133,20 +108,20 @@ class Answers:
         return PoseEstimate("ok", "", scene, pose, np.eye(6) * 1e-8, 100, 0.5, 1.0)
 
 
-def still_camera() -> tuple[CellRoom, SE3]:
+def still_camera() -> tuple[SampleRoom, SE3]:
     """A room with a camera that takes five images before and five after a bump of 3 mm."""
     scene = box_room_scene(7, 1, 1)
     frame = scene.test[0]
     truth = frame.base_from_camera
     assert truth is not None
     moved = replace(frame, base_from_camera=truth @ SE3.exp([0.003, 0, 0, 0, 0, 0]))
-    room = CellRoom(
-        scene, Scene("still", (), (frame,) * 5), None, Scene("bumped", (), (moved,) * 5)
+    room = SampleRoom(
+        scene, Recording("still", (), (frame,) * 5), None, Recording("bumped", (), (moved,) * 5)
     )
     return room, truth
 
 
-def looked(room: CellRoom, answers: list[tuple[str, SE3 | None]]) -> DemoOutcome:
+def looked(room: SampleRoom, answers: list[tuple[str, SE3 | None]]) -> DemoOutcome:
     outcome = DemoOutcome([room.scene.name])
     localizer: Any = Answers(room.scene.name, answers)
     shown: list[int] = []

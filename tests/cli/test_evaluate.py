@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from evercal.cli.evaluate import load_named
-from evercal.datasets import load_scene
 from evercal.errors import InputError
 from evercal.evaluation import evaluate
 from evercal.localization.localizer import Localizer
+from evercal.recordings import load_recording
 from evercal.reports.evaluate_page import Watch
 
 
@@ -52,7 +52,7 @@ def test_table_and_report(run: Any, store: Path, rooms: Any, tmp_path: Path) -> 
 
 
 def test_the_watch_keeps_the_pose_of_every_frame(store: Path, rooms: Any) -> None:
-    localizer, scene = Localizer.open(store), load_scene(rooms[0])
+    localizer, scene = Localizer.open(store), load_recording(rooms[0])
     watch = Watch(localizer, {"box-room-41": scene})
     results = evaluate(watch, watch.watched)
     assert [r.frame for r in results] == [f.name for f in scene.test]

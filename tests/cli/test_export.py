@@ -12,8 +12,8 @@ import yaml
 from evercal.calibration.calibration import Calibration, ImageUse, Mount
 from evercal.calibration.export.driver_frame import standard_link_from_optical
 from evercal.calibration.export.formats import FORMATS
-from evercal.datasets.robot_poses import read_robot_poses
 from evercal.geometry import SE3, Camera, pose_distance
+from evercal.recordings.poses.robot_poses import read_robot_poses
 
 POSE = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
 PRINTED = sorted(set(FORMATS) - {"npy", "colmap", "moveit_samples"})

@@ -5,8 +5,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from evercal.datasets import load_scene
-from evercal.datasets.inspection import Inspection, inspect_scene
+from evercal.recordings import load_recording
+from evercal.recordings.inspection import Inspection, inspect_scene
 
 
 def test_a_sound_scene_is_described_without_a_warning(run: Any, rooms: Any) -> None:
@@ -21,7 +21,7 @@ def test_a_sound_scene_is_described_without_a_warning(run: Any, rooms: Any) -> N
 
 
 def test_the_same_files_in_both_splits_are_found(rooms: Any) -> None:
-    recorded = load_scene(rooms[0])
+    recorded = load_recording(rooms[0])
     both = dataclasses.replace(recorded, test=recorded.train[:6])
     assert "test frames have the pose or the file" in "\n".join(inspect_scene(both).warnings)
 

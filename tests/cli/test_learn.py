@@ -11,8 +11,8 @@ import pytest
 
 from evercal.cli.learn import check_name, parse_memory
 from evercal.cli.learn_bars import LearnBars
-from evercal.datasets import Scene, load_scene, posed_scene
 from evercal.errors import InputError
+from evercal.recordings import Recording, load_recording, posed_recording
 
 
 def test_first_and_last_line_and_the_report(run: Any, tmp_path: Path, rooms: Any) -> None:
@@ -228,8 +228,8 @@ def test_names_that_are_no_single_word_of_a_path_are_refused(name: str) -> None:
 
 
 def test_frames_without_a_pose_count_as_untracked(rooms: Any) -> None:
-    scene = load_scene(rooms[0])
+    scene = load_recording(rooms[0])
     lost = tuple(dataclasses.replace(frame, base_from_camera=None) for frame in scene.train[:3])
-    mixed = Scene("mixed", lost + scene.train[3:], scene.test, untracked=4)
-    assert posed_scene(mixed).train == scene.train[3:]
-    assert posed_scene(mixed).untracked == 7
+    mixed = Recording("mixed", lost + scene.train[3:], scene.test, untracked=4)
+    assert posed_recording(mixed).train == scene.train[3:]
+    assert posed_recording(mixed).untracked == 7

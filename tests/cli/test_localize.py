@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evercal.datasets import load_scene, read_image, write_image
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
+from evercal.recordings import load_recording, read_image, write_image
 
 KEYS = {"path", "status", "reason", "scene", "base_from_camera", "covariance", "inliers"}
 KEYS |= {"inlier_ratio", "ms"}
@@ -29,7 +29,7 @@ def answer(points_camera: np.ndarray) -> PoseEstimate:
 
 @pytest.fixture
 def images(rooms: Any) -> list[Path]:
-    found = [frame.image for frame in load_scene(rooms[0]).test[:2]]
+    found = [frame.image for frame in load_recording(rooms[0]).test[:2]]
     return [path for path in found if isinstance(path, Path)]
 
 
@@ -117,7 +117,7 @@ def test_overlay_draws_scene_points_where_the_camera_sees_them(
     assert names == [f"{stem}-1-overlay.png", f"{stem}-3-overlay.png"]  # none without a pose
     drawn = read_image(tmp_path / "o" / names[0])
     assert drawn.shape == (480, 640, 3)
-    lens = load_scene(Path(images[0]).parents[1]).train[0].camera.resized(640, 480)
+    lens = load_recording(Path(images[0]).parents[1]).train[0].camera.resized(640, 480)
     for x, y in lens.project(np.array([[0.5, -0.25, 2.0], [0.0, 0.0, 1.0]])).round().astype(int):
         assert np.ptp(drawn[y, x].astype(int)) > 30  # coloured on a grey picture
     assert (drawn[40:60, 40:60] == 255).all()

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from evercal.features.pretraining import make
-from evercal.features.pretraining.contrastive import PretrainOptions
+from evercal.continual.pretraining import make
+from evercal.continual.pretraining.contrastive import PretrainOptions
 
 
 def test_options_reach_the_training(

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import ArrayLike
 
 from evercal.calibration.calibration import Calibration, ImageUse
-from evercal.datasets.images import write_image
 from evercal.geometry import SE3, Camera
+from evercal.recordings.images import write_image
 
 
 def placed(quaternion: ArrayLike, translation: ArrayLike) -> SE3:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from evercal.datasets import load_scene
+from evercal.recordings import load_recording
 from evercal.simulation import cell
 from evercal.simulation.cell import Suite
 
@@ -49,7 +49,7 @@ def test_a_suite_is_rendered_and_taken_up_again(
     assert first.code == 0, first.err
     said = json.loads(first.out)
     assert (said["scenes"], said["frames"]) == ([str(out / "den")], 6)
-    scene = load_scene(out / "den")
+    scene = load_recording(out / "den")
     assert (len(scene.train), len(scene.test)) == (2, 1)
     assert scene.train[0].read_image().shape == (24, 32, 3)
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*.jpg")}

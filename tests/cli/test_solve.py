@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.hand_eye import Recording, Setting, error, recording, rotations
+from benchmarks.hand_eye import Setting, SimulatedPairs, error, recording, rotations
 from evercal.calibration.calibration import read_calibration
-from evercal.datasets import write_image
 from evercal.geometry import SE3
+from evercal.recordings import write_image
 
-from ..calibration.printed import CAMERA, CHESSBOARD, photographed, view_of
+from ..calibration.boards.printed import CAMERA, CHESSBOARD, photographed, view_of
 
 
 @pytest.fixture(autouse=True)
@@ -29,7 +29,7 @@ def write_poses(path: Path, poses: SE3, names: list[str] | None = None) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def files(folder: Path, drawn: Recording, names: list[str] | None = None) -> list[Any]:
+def files(folder: Path, drawn: SimulatedPairs, names: list[str] | None = None) -> list[Any]:
     write_poses(folder / "robot.csv", drawn.pairs.base_from_gripper, names)
     write_poses(folder / "camera.csv", drawn.pairs.camera_from_board, names)
     found = ["--robot-poses", folder / "robot.csv", "--camera-poses", folder / "camera.csv"]

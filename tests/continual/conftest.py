@@ -9,11 +9,11 @@ import pytest
 
 if TYPE_CHECKING:
     from evercal.continual.stage import StageOptions
-    from evercal.datasets.frame import Scene
     from evercal.mapping.scene_maps import SceneMaps
+    from evercal.recordings.frame import Recording
 
     Blank = Callable[[str], SceneMaps]
-    Rooms = tuple[Scene, Scene, Scene]
+    Rooms = tuple[Recording, Recording, Recording]
 
 
 @pytest.fixture(scope="session")

@@ -6,15 +6,15 @@ import torch
 from torch import Tensor
 
 from evercal.continual.learn import learn
+from evercal.continual.networks.head import Head
 from evercal.continual.stage import Event, Stage, StageOptions
 from evercal.continual.strategies import STRATEGIES
-from evercal.datasets.frame import Scene
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Resume
-from evercal.networks.head import Head
+from evercal.recordings.frame import Recording
 
 Blank = Callable[[str], SceneMaps]
-Rooms = tuple[Scene, Scene, Scene]
+Rooms = tuple[Recording, Recording, Recording]
 
 
 def outcome(events: Iterable[Event]) -> SceneMaps:

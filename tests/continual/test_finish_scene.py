@@ -16,11 +16,11 @@ from evercal.continual.finish_scene import memory_bytes
 from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.learn import learn
 from evercal.continual.methods.method import FinishedScene, Method, StageStart
+from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.stage import Stage, StageOptions
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Store
-from evercal.networks.hooks import TrainingHooks
 
 from .stages import Blank, Rooms, assert_same, continued, outcome, weights
 

@@ -8,12 +8,12 @@ import torch
 
 from evercal.continual.frame_statistics import PARTS, FrameStatistics
 from evercal.continual.learn import learn
+from evercal.continual.networks.buffer import FeatureBuffer, encode_frames
+from evercal.continual.networks.head import Head, HeadOptions
+from evercal.continual.networks.loss import LossOptions, reprojection_loss
 from evercal.continual.stage import Stage, StageOptions
 from evercal.continual.strategies import STRATEGIES
 from evercal.geometry import SE3
-from evercal.networks.buffer import FeatureBuffer, encode_frames
-from evercal.networks.head import Head, HeadOptions
-from evercal.networks.loss import LossOptions, reprojection_loss
 
 from .stages import Blank, Rooms
 

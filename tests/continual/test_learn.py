@@ -15,19 +15,19 @@ from torch import Tensor
 from evercal.continual.learn import learn
 from evercal.continual.methods.penalties import Penalty
 from evercal.continual.methods.replay import Replay
+from evercal.continual.networks.buffer import Rows
+from evercal.continual.networks.head import HeadOutput
+from evercal.continual.networks.loss import LossOptions, clamp_px
+from evercal.continual.networks.trainer import Progress
 from evercal.continual.stage import Encoding, Stage, StageOptions
 from evercal.continual.strategies import STRATEGIES, Strategy
-from evercal.datasets.frame import Frame, Scene
 from evercal.features.precision import autocast
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.acceptance import fitted_record
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Checkpoint
-from evercal.networks.buffer import Rows
-from evercal.networks.head import HeadOutput
-from evercal.networks.loss import LossOptions, clamp_px
-from evercal.networks.trainer import Progress
+from evercal.recordings.frame import Frame, Recording
 
 from .stages import Blank, Rooms, assert_same, continued, outcome, weights
 
@@ -292,9 +292,11 @@ def test_a_camera_that_stands_still(
 
 
 def test_replay_keeps_an_old_scene(
-    arcs: tuple[Scene, Scene], arc_stage: StageOptions, arc_maps: tuple[SceneMaps, SceneMaps]
+    arcs: tuple[Recording, Recording],
+    arc_stage: StageOptions,
+    arc_maps: tuple[SceneMaps, SceneMaps],
 ) -> None:
-    def median_error_m(maps: SceneMaps, scene: Scene) -> float:
+    def median_error_m(maps: SceneMaps, scene: Recording) -> float:
         localizer, errors = Localizer(maps), []
         for frame in scene.test[::3]:
             found = localizer.localize(frame.read_image(), frame.camera)
@@ -318,7 +320,7 @@ def test_replay_keeps_an_old_scene(
 
 
 def test_memory_auto_keeps_few_keyframes_that_locate_the_other_frames(
-    hall: Scene, hall_maps: SceneMaps
+    hall: Recording, hall_maps: SceneMaps
 ) -> None:
     nothing = replace(hall_maps, heads=[], scenes=[], keyframes=[], method_states=[])
     *_, stage = learn(nothing, STRATEGIES["evercal"], hall, StageOptions(memory_auto=True))

@@ -10,11 +10,11 @@ import torch
 from safetensors.torch import load, save
 
 from evercal.continual import stage_rows
+from evercal.continual.networks.trainer import Progress
 from evercal.continual.stage import Encoding, Event, StageOptions
 from evercal.continual.strategies import STRATEGIES
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Checkpoint, Resume
-from evercal.networks.trainer import Progress
 
 from .stages import Rooms, assert_same, continued, outcome, weights
 

@@ -12,16 +12,16 @@ from evercal.continual import learn_into_store
 from evercal.continual.learn_into_store import learn
 from evercal.continual.learn_scene import LearnOptions
 from evercal.continual.presets import preset
-from evercal.datasets import Scene, generic
 from evercal.errors import InputError
+from evercal.recordings import Recording, generic
 from evercal.simulation.box_room import box_room_scene
 from evercal.storage import write_manifest
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, Scene, LearnOptions]]:
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, Recording, LearnOptions]]:
     """What `learn_scene` was called with."""
-    calls: list[tuple[Path, Scene, LearnOptions]] = []
+    calls: list[tuple[Path, Recording, LearnOptions]] = []
     monkeypatch.setattr(learn_into_store, "learn_scene", lambda *words: calls.append(words[:3]))
     return calls
 

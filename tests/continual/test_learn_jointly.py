@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from evercal.continual.learn_jointly import learn_jointly
+from evercal.continual.networks.head import Head
+from evercal.continual.networks.trainer import Progress
 from evercal.continual.stage import Encoding, Stage, StageOptions
 from evercal.continual.strategies import STRATEGIES
 from evercal.mapping.build import Mapping
 from evercal.mapping.scene_maps import SceneMaps
-from evercal.networks.head import Head
-from evercal.networks.trainer import Progress
 
 from .stages import Blank, Rooms, outcome, weights
 

@@ -17,10 +17,9 @@ import torch
 
 from evercal.continual import stage_rows
 from evercal.continual.learn_scene import LearnOptions, LearnReport, learn_scene, validation_split
+from evercal.continual.networks.trainer import Progress
 from evercal.continual.stage import Encoding, StageOptions
 from evercal.continual.strategies import STRATEGIES
-from evercal.datasets import generic
-from evercal.datasets.frame import Scene
 from evercal.errors import InputError
 from evercal.geometry.se3 import SE3
 from evercal.localization import acceptance
@@ -30,10 +29,11 @@ from evercal.mapping.build import Mapping
 from evercal.mapping.scene_maps import Alignment
 from evercal.mapping.stage_files import head_bytes
 from evercal.mapping.store import Checkpoint, Store
-from evercal.networks.trainer import Progress
+from evercal.recordings import generic
+from evercal.recordings.frame import Recording
 from evercal.storage import MANIFEST, write_manifest
 
-Rooms = tuple[Scene, Scene, Scene]
+Rooms = tuple[Recording, Recording, Recording]
 Tree = Callable[[Path], dict[str, str]]
 
 
@@ -280,11 +280,11 @@ from pathlib import Path
 from evercal.continual import stage_rows
 from evercal.continual.stage import StageOptions
 from evercal.continual.strategies import STRATEGIES
-from evercal.datasets import generic
+from evercal.recordings import generic
 from evercal.continual.learn_scene import LearnOptions, learn_scene
-from evercal.networks.head import HeadOptions
-from evercal.networks.buffer import EncodePlan
-from evercal.networks.trainer import FitOptions, Progress
+from evercal.continual.networks.head import HeadOptions
+from evercal.continual.networks.buffer import EncodePlan
+from evercal.continual.networks.trainer import FitOptions, Progress
 from evercal.features.views import ViewOptions
 stage_rows.CHECKPOINT_SECONDS = 0.0
 stage = StageOptions(
@@ -307,7 +307,7 @@ MAP_CHILD = """
 import sys, time
 from pathlib import Path
 from evercal.continual.learn_scene import LearnOptions, learn_scene
-from evercal.datasets import generic
+from evercal.recordings import generic
 from evercal.mapping.build import Mapping
 def linger(event):
     if isinstance(event, Mapping) and event.what == sys.argv[3]:

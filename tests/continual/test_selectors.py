@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from evercal.continual.frame_statistics import FrameStatistics
+from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.continual.networks.head import Head, HeadOptions
 from evercal.continual.selectors import SELECTORS
-from evercal.datasets.frame import Frame
 from evercal.geometry import SE3, Camera
-from evercal.networks.buffer import FeatureBuffer
-from evercal.networks.head import Head, HeadOptions
+from evercal.recordings.frame import Frame
 
 
 class Known(FrameStatistics):

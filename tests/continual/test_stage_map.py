@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from evercal.continual.learn import learn
+from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.stage import Stage, StageOptions
 from evercal.continual.stage_map import fitting
 from evercal.continual.strategies import STRATEGIES
-from evercal.datasets.frame import Frame, Scene
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.mapping.scene_maps import SceneMaps
-from evercal.networks.buffer import FeatureBuffer
+from evercal.recordings.frame import Frame, Recording
 
 from .stages import Blank, Rooms
 
 
-def shifted(scene: Scene, change: SE3) -> Scene:
+def shifted(scene: Recording, change: SE3) -> Recording:
     """The scene with stated poses that are off by a motion of the camera."""
     frames = []
     for frame in scene.train:
@@ -32,7 +32,7 @@ def shifted(scene: Scene, change: SE3) -> Scene:
 def test_a_network_beside_a_map_learns_the_frames_of_the_map(
     name: str,
     blank: Blank,
-    arcs: tuple[Scene, Scene],
+    arcs: tuple[Recording, Recording],
     quick: StageOptions,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

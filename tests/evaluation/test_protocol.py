@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from evercal.datasets import Frame, Scene
 from evercal.errors import InputError
 from evercal.evaluation import evaluate
 from evercal.evaluation.metrics import Status
 from evercal.geometry import SE3, Camera
+from evercal.recordings import Frame, Recording
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 
@@ -51,8 +51,8 @@ def frame(number: int, base_from_camera: SE3 | None) -> Frame:
     return Frame(f"f{number}", image, CAMERA, base_from_camera)
 
 
-def scene(name: str, *test: Frame, train: tuple[Frame, ...] = ()) -> Scene:
-    return Scene(name, train, test)
+def scene(name: str, *test: Frame, train: tuple[Frame, ...] = ()) -> Recording:
+    return Recording(name, train, test)
 
 
 def test_a_pose_in_a_scene_of_the_same_base_frame_is_measured_too() -> None:
@@ -160,7 +160,7 @@ def test_frames_without_a_known_pose_are_left_out() -> None:
         ({"b": scene("b", frame(0, None))}, r"'b' has 1 test frames, none with a known pose"),
     ],
 )
-def test_misuse_is_named_before_any_work(scenes: dict[str, Scene], message: str) -> None:
+def test_misuse_is_named_before_any_work(scenes: dict[str, Recording], message: str) -> None:
     fake = Fake({})
     with pytest.raises(InputError, match=message):
         evaluate(fake, scenes)

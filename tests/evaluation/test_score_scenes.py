@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 import evercal
-from evercal.datasets import generic
 from evercal.errors import InputError
 from evercal.evaluation.score_scenes import evaluate
 from evercal.geometry import SE3
+from evercal.recordings import generic
 from evercal.simulation.box_room import box_room_scene
 
 

@@ -17,13 +17,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from evercal.features.descriptor import GlobalDescriptor
+from evercal.continual.networks.atlas import Atlas
+from evercal.continual.networks.descriptor import GlobalDescriptor
+from evercal.continual.networks.head import Head, HeadOptions, HeadOutput
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.estimate import PoseEstimate
-from evercal.mapping.atlas import Atlas
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord
-from evercal.networks.head import Head, HeadOptions, HeadOutput
 from evercal.simulation.box_room import BoxRoom, default_camera
 
 SHORT = 120

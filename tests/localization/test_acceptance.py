@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from evercal.datasets.frame import Frame, Scene
+from evercal.continual.networks.atlas import Atlas
 from evercal.geometry.se3 import SE3
 from evercal.localization import acceptance
 from evercal.localization.acceptance import MAX_SUPPORT, MIN_SUPPORT
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
-from evercal.mapping.atlas import Atlas
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord, with_fit
+from evercal.recordings.frame import Frame, Recording
 from evercal.simulation.box_room import BoxRoom, default_camera
 
 
@@ -113,7 +113,7 @@ def test_the_scale_turns_claimed_covariance_into_found_errors(
 
 def test_unknown_places_are_told_from_known_ones(
     arc_maps: tuple[SceneMaps, SceneMaps],
-    arcs: tuple[Scene, Scene],
+    arcs: tuple[Recording, Recording],
 ) -> None:
     maps = replace(arc_maps[0], scenes=list(arc_maps[0].scenes))
     fitted = acceptance.fit_threshold(maps, arcs[0].test[:8])
@@ -133,7 +133,7 @@ def test_unknown_places_are_told_from_known_ones(
     [(0, MAX_SUPPORT), (3, 0.4), (4, MAX_SUPPORT)],  # without a right one nothing is known
 )
 def test_frames_that_are_found_elsewhere_do_not_lower_the_bound(
-    wrong: int, bound: float, hall: Scene, hall_maps: SceneMaps, monkeypatch: pytest.MonkeyPatch
+    wrong: int, bound: float, hall: Recording, hall_maps: SceneMaps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of four frames the first are found a metre off, with little support."""
     frames = hall.test[:4]

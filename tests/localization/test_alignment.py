@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from evercal.datasets.frame import Scene
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization import alignment as module
@@ -19,6 +18,7 @@ from evercal.localization.pose_refinement import refine_pose
 from evercal.localization.query import Hypothesis
 from evercal.mapping.patches import whitening
 from evercal.mapping.scene_maps import SceneMaps
+from evercal.recordings.frame import Recording
 
 Array = NDArray[np.floating]
 
@@ -86,7 +86,7 @@ def test_without_distortion_nothing_is_calculated() -> None:
 
 
 def test_depths_move_landmarks_in_the_image_of_a_distorted_lens(
-    hall: Scene, hall_maps: SceneMaps, monkeypatch: pytest.MonkeyPatch
+    hall: Recording, hall_maps: SceneMaps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frame = hall.test[1]
     lens = replace(frame.camera, distortion=(-0.25, 0.0, 0.0, 0.0))

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 import torch
 
-from evercal.datasets.frame import Scene
 from evercal.errors import InputError
 from evercal.features.vlad import Vlad
 from evercal.geometry.se3 import pose_distance
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import SceneMaps
+from evercal.recordings.frame import Recording
 
 from ..one_device import META, OneDevice, made_where_inputs_lie
 
@@ -41,14 +41,16 @@ def numbers(found: PoseEstimate) -> list[object]:
 
 
 @pytest.fixture(params=["map", "network"])
-def known(request: pytest.FixtureRequest) -> tuple[SceneMaps, Scene]:
+def known(request: pytest.FixtureRequest) -> tuple[SceneMaps, Recording]:
     """A map, and networks of two scenes, with a scene that they know."""
     if request.param == "map":
         return request.getfixturevalue("hall_maps"), request.getfixturevalue("hall")
     return request.getfixturevalue("arc_maps")[1], request.getfixturevalue("arcs")[0]
 
 
-def test_poses_are_those_of_the_cpu(known: tuple[SceneMaps, Scene], device: torch.device) -> None:
+def test_poses_are_those_of_the_cpu(
+    known: tuple[SceneMaps, Recording], device: torch.device
+) -> None:
     """Features are rounded otherwise on another device, so poses differ by less than they err."""
     maps, scene = known
     frames = scene.test[2:20:4]
@@ -66,7 +68,7 @@ def test_poses_are_those_of_the_cpu(known: tuple[SceneMaps, Scene], device: torc
             assert metres < tolerance
 
 
-def test_nothing_is_made_on_the_default_device(known: tuple[SceneMaps, Scene]) -> None:
+def test_nothing_is_made_on_the_default_device(known: tuple[SceneMaps, Recording]) -> None:
     maps, scene = known
     frame = scene.test[7]
     expected = numbers(Localizer(maps).localize(frame.read_image(), frame.camera))

@@ -8,23 +8,23 @@ import cv2
 import numpy as np
 
 from evercal.continual.learn import learn
+from evercal.continual.networks.descriptor import load_descriptor
 from evercal.continual.stage import Stage, StageOptions
 from evercal.continual.strategies import STRATEGIES
-from evercal.datasets.frame import Scene
-from evercal.features.descriptor import load_descriptor
 from evercal.features.encoder import load_encoder
 from evercal.features.views import ViewOptions, plain_view
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import pose_distance
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import SceneMaps
+from evercal.recordings.frame import Recording
 from evercal.simulation.box_room import BoxRoom
 
 LENS = Camera(160, 120, 118.0, 118.0, 79.5, 59.5, (-0.4, 0.0, 0.0, 0.0))
 """Its rays end 72 pixels from the middle, its corners lie at 99."""
 
 
-def _bent(scene: Scene, room: BoxRoom) -> Scene:
+def _bent(scene: Recording, room: BoxRoom) -> Recording:
     """The scene as the lens sees it; what it has no rays for shows the noise of a dark sensor."""
     ideal, v_u = Camera(480, 480, 240.0, 240.0, 239.5, 239.5), np.mgrid[0:120, 0:160]
     rays = LENS.unproject(np.moveaxis(v_u[::-1], 0, -1).astype(float))
@@ -37,10 +37,10 @@ def _bent(scene: Scene, room: BoxRoom) -> Scene:
         image = cv2.remap(image, where, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
         image[dark] = rng.integers(0, 60, (dark.sum(), 3))
         frames.append(replace(frame, image=image, camera=LENS))
-    return Scene("bent", tuple(frames[:16]), tuple(frames[16:]))
+    return Recording("bent", tuple(frames[:16]), tuple(frames[16:]))
 
 
-def test_a_lens_that_folds_is_learned_and_located(arcs: tuple[Scene, Scene]) -> None:
+def test_a_lens_that_folds_is_learned_and_located(arcs: tuple[Recording, Recording]) -> None:
     scene = _bent(arcs[0], BoxRoom(34, texture_px=96))
     maps = SceneMaps(load_encoder(), load_descriptor(), "evercal", 120)
     *_, stage = learn(maps, STRATEGIES["evercal"], scene, StageOptions(memory_share=0.25))

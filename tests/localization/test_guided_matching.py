@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evercal.datasets import Scene
 from evercal.geometry import SE3, pose_distance
 from evercal.localization.localizer import LocalizeOptions, Localizer
 from evercal.localization.query import Candidate, Hypothesis, Query
 from evercal.mapping.scene_maps import SceneMaps
+from evercal.recordings import Recording
 
 KEYFRAMES = Candidate(0, np.arange(3), 2)
 
@@ -55,7 +55,7 @@ def test_it_is_looked_at_as_long_as_that_helps(
 
 
 @pytest.fixture(scope="module")
-def asked(hall: Scene, hall_maps: SceneMaps) -> tuple[Localizer, Query, Any, SE3]:
+def asked(hall: Recording, hall_maps: SceneMaps) -> tuple[Localizer, Query, Any, SE3]:
     """A localizer, an image on its way, its camera and its pose."""
     frame, localizer = hall.test[7], Localizer(hall_maps)
     image, truth = frame.read_image(), frame.base_from_camera

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from evercal.datasets.frame import Scene
 from evercal.errors import InputError
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import pose_distance
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import SceneMaps
+from evercal.recordings.frame import Recording
 from evercal.simulation.box_room import default_camera
 
 CAMERA = default_camera(160, 120)
@@ -145,7 +145,7 @@ def test_a_batch_says_what_single_images_say(two_threads: None, world: Any) -> N
 
 
 def test_a_batch_of_real_images(
-    two_threads: None, arc_maps: tuple[SceneMaps, SceneMaps], arcs: tuple[Scene, Scene]
+    two_threads: None, arc_maps: tuple[SceneMaps, SceneMaps], arcs: tuple[Recording, Recording]
 ) -> None:
     localizer = Localizer(arc_maps[1])
     frames = [*arcs[0].test[::4], *arcs[1].test[1::4]]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from evercal.continual.learn import learn
+from evercal.continual.networks.descriptor import load_descriptor
 from evercal.continual.stage import Stage
 from evercal.continual.strategies import STRATEGIES
-from evercal.features.descriptor import load_descriptor
 from evercal.features.encoder import load_encoder
 from evercal.localization.localizer import LocalizeOptions, Localizer
 from evercal.mapping.keyframes import Keyframes
@@ -19,12 +19,12 @@ from evercal.mapping.scene_maps import SceneMaps
 
 if TYPE_CHECKING:
     from evercal.continual.stage import StageOptions
-    from evercal.datasets import Scene
     from evercal.localization.estimate import PoseEstimate
+    from evercal.recordings import Recording
 
 
 @pytest.fixture(scope="module")
-def unlearned(arcs: tuple[Scene, Scene], arc_stage: StageOptions) -> SceneMaps:
+def unlearned(arcs: tuple[Recording, Recording], arc_stage: StageOptions) -> SceneMaps:
     """The first arc after a dozen steps; half of its frames are remembered."""
     fit = replace(arc_stage.fit, iterations=12)
     options = replace(arc_stage, fit=fit, memory_share=0.5)
@@ -39,7 +39,7 @@ def without_map(keyframes: Keyframes) -> Keyframes:
     return replace(keyframes, inverse_depth=(), landmarks=(), descriptors=None)
 
 
-def located(maps: SceneMaps, scene: Scene) -> tuple[list[PoseEstimate], float]:
+def located(maps: SceneMaps, scene: Recording) -> tuple[list[PoseEstimate], float]:
     """Answers for every third test frame, and their median error in metres."""
     localizer, answers, errors = Localizer(maps), [], []
     for frame in scene.test[::3]:
@@ -53,7 +53,7 @@ def located(maps: SceneMaps, scene: Scene) -> tuple[list[PoseEstimate], float]:
 
 
 def test_remembered_frames_answer_where_the_network_cannot(
-    unlearned: SceneMaps, arcs: tuple[Scene, Scene]
+    unlearned: SceneMaps, arcs: tuple[Recording, Recording]
 ) -> None:
     keyframes = unlearned.keyframes[0]
     assert keyframes is not None
@@ -73,7 +73,7 @@ def test_remembered_frames_answer_where_the_network_cannot(
     assert located(plain, arcs[0])[1] == located(alone, arcs[0])[1]
 
 
-def test_a_batch_says_the_same(unlearned: SceneMaps, arcs: tuple[Scene, Scene]) -> None:
+def test_a_batch_says_the_same(unlearned: SceneMaps, arcs: tuple[Recording, Recording]) -> None:
     frames = arcs[0].test[:4]
     localizer = Localizer(unlearned)
     batch = localizer.localize_batch([f.read_image() for f in frames], [f.camera for f in frames])
@@ -83,7 +83,7 @@ def test_a_batch_says_the_same(unlearned: SceneMaps, arcs: tuple[Scene, Scene]) 
 
 
 def test_remembered_cells_vote_for_the_scene(
-    unlearned: SceneMaps, arcs: tuple[Scene, Scene], arc_stage: StageOptions
+    unlearned: SceneMaps, arcs: tuple[Recording, Recording], arc_stage: StageOptions
 ) -> None:
     options = replace(
         arc_stage,

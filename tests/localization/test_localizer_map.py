@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evercal.datasets.frame import Scene
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import LocalizeOptions, Localizer
 from evercal.localization.query import Candidate
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Store
+from evercal.recordings.frame import Recording
 from evercal.simulation.box_room import BoxRoom, default_camera
 
 CAMERA = default_camera(320, 240)
@@ -32,13 +32,13 @@ def everything(found: PoseEstimate) -> list[bytes | object]:
 
 
 @pytest.fixture(scope="module")
-def answers(hall: Scene, hall_maps: SceneMaps) -> list[PoseEstimate]:
+def answers(hall: Recording, hall_maps: SceneMaps) -> list[PoseEstimate]:
     """For every second test frame, none of which was learned."""
     localizer = Localizer(hall_maps)
     return [localizer.localize(f.read_image(), f.camera) for f in hall.test[1::2]]
 
 
-def errors(found: list[PoseEstimate], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def errors(found: list[PoseEstimate], scene: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Metres and radians for every second test frame; infinite where there is no pose."""
     both = []
     for a, frame in zip(found, scene.test[1::2], strict=True):
@@ -50,7 +50,7 @@ def errors(found: list[PoseEstimate], scene: Scene) -> tuple[np.ndarray, np.ndar
 
 
 def test_views_that_were_not_learned_are_located_to_millimetres(
-    answers: list[PoseEstimate], hall: Scene
+    answers: list[PoseEstimate], hall: Recording
 ) -> None:
     metres, radians = errors(answers, hall)
     assert np.median(metres) < 0.003
@@ -80,7 +80,7 @@ def test_landmarks_lie_on_the_surfaces_of_the_room(answers: list[PoseEstimate]) 
 
 
 def test_without_alignment_answers_are_rough(
-    answers: list[PoseEstimate], hall: Scene, hall_maps: SceneMaps
+    answers: list[PoseEstimate], hall: Recording, hall_maps: SceneMaps
 ) -> None:
     rough = Localizer(hall_maps, LocalizeOptions(align=False))
     found = [rough.localize(f.read_image(), f.camera) for f in hall.test[1::2]]
@@ -88,7 +88,7 @@ def test_without_alignment_answers_are_rough(
 
 
 def test_errors_are_as_large_as_the_covariance_says(
-    answers: list[PoseEstimate], hall: Scene
+    answers: list[PoseEstimate], hall: Recording
 ) -> None:
     squares = []
     for found, frame in zip(answers, hall.test[1::2], strict=True):
@@ -143,7 +143,7 @@ def test_nothing_is_tried_twice(hall_maps: SceneMaps, monkeypatch: pytest.Monkey
 
 
 def test_the_same_image_gives_the_same_answer_twice(
-    answers: list[PoseEstimate], hall: Scene, hall_maps: SceneMaps
+    answers: list[PoseEstimate], hall: Recording, hall_maps: SceneMaps
 ) -> None:
     localizer, few = Localizer(hall_maps), Localizer(hall_maps, LocalizeOptions(loaded_keyframes=1))
     for frame, first in list(zip(hall.test[1::2], answers, strict=True))[::6]:
@@ -155,7 +155,7 @@ def test_the_same_image_gives_the_same_answer_twice(
 
 
 def test_a_store_answers_as_what_it_was_made_of(
-    answers: list[PoseEstimate], hall: Scene, hall_maps: SceneMaps, tmp_path: Path, make: Make
+    answers: list[PoseEstimate], hall: Recording, hall_maps: SceneMaps, tmp_path: Path, make: Make
 ) -> None:
     make(tmp_path / "store", [hall_maps])
     opened = [Localizer.open(tmp_path / "store") for _ in range(2)]
@@ -173,7 +173,7 @@ def test_a_store_answers_as_what_it_was_made_of(
 
 
 def test_answers_are_in_the_frame_that_the_recording_states(
-    answers: list[PoseEstimate], hall: Scene, hall_maps: SceneMaps
+    answers: list[PoseEstimate], hall: Recording, hall_maps: SceneMaps
 ) -> None:
     record = hall_maps.scenes[0]
     more = SE3.exp(np.array([0.01, -0.02, 0.03, 0.02, -0.01, 0.03]))
@@ -191,7 +191,7 @@ def test_answers_are_in_the_frame_that_the_recording_states(
 
 @pytest.mark.parametrize("align", [True, False])
 def test_a_map_answers_far_from_where_it_was_recorded(
-    align: bool, hall: Scene, hall_maps: SceneMaps
+    align: bool, hall: Recording, hall_maps: SceneMaps
 ) -> None:
     record = hall_maps.scenes[0]
     away = replace(record, cell=replace(record.cell, origin_m=(9.0, 9.0, 0.0)))
@@ -199,7 +199,9 @@ def test_a_map_answers_far_from_where_it_was_recorded(
     assert localizer.localize(hall.test[1].read_image(), hall.test[1].camera).status == "ok"
 
 
-def test_support_decides(hall: Scene, hall_maps: SceneMaps, answers: list[PoseEstimate]) -> None:
+def test_support_decides(
+    hall: Recording, hall_maps: SceneMaps, answers: list[PoseEstimate]
+) -> None:
     frame, first = hall.test[1], answers[0]
     for factor, status in ((0.9, "ok"), (1.1, "unknown_scene")):
         need = factor * first.support
@@ -212,7 +214,7 @@ def test_support_decides(hall: Scene, hall_maps: SceneMaps, answers: list[PoseEs
 
 
 def test_a_batch_says_the_same_to_the_last_bit(
-    two_threads: None, hall: Scene, hall_maps: SceneMaps
+    two_threads: None, hall: Recording, hall_maps: SceneMaps
 ) -> None:
     frames, localizer = hall.test[1:13:2], Localizer(hall_maps)
     alone = [localizer.localize(f.read_image(), f.camera) for f in frames]

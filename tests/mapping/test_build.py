@@ -10,12 +10,11 @@ import pytest
 import torch
 
 from evercal.continual.finish_scene import mapped_record
-from evercal.datasets.frame import Frame, Scene
+from evercal.continual.networks.atlas import Cell
 from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3, pose_distance
-from evercal.mapping.atlas import Cell
 from evercal.mapping.build import (
     MapOptions,
     Mapping,
@@ -26,8 +25,9 @@ from evercal.mapping.build import (
     spread_frames,
 )
 from evercal.mapping.bundle_adjustment import Adjustment
-from evercal.mapping.recording import WorkingSize
+from evercal.mapping.prepared_frames import WorkingSize
 from evercal.mapping.scene_maps import SceneRecord
+from evercal.recordings.frame import Frame, Recording
 from evercal.simulation.box_room import BoxRoom
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def test_slants_are_those_of_the_surfaces(found: SceneMap) -> None:
     assert np.median(error) < np.median(np.linalg.norm(truth, axis=1))
 
 
-def test_right_poses_and_a_right_lens_stay(found: SceneMap, hall: Scene) -> None:
+def test_right_poses_and_a_right_lens_stay(found: SceneMap, hall: Recording) -> None:
     truth = {f.name: f.base_from_camera for f in hall.train}
     keyframes, stated = found.keyframes, [f for f in hall.train if f.base_from_camera]
     assert len(keyframes) == 7
@@ -110,7 +110,7 @@ def test_right_poses_and_a_right_lens_stay(found: SceneMap, hall: Scene) -> None
     assert 0 < found.pose_sigma[1] < 0.003
 
 
-def test_steps_are_told_in_order(arcs: tuple[Scene, Scene]) -> None:
+def test_steps_are_told_in_order(arcs: tuple[Recording, Recording]) -> None:
     steps = []
     chosen = spread_frames(arcs[0].train, 3)
     work = map_steps(arcs[0].train[:16], load_encoder(), chosen[chosen < 16], SMALL)
@@ -124,7 +124,7 @@ def test_steps_are_told_in_order(arcs: tuple[Scene, Scene]) -> None:
     assert steps[-1].done == steps[-1].total
 
 
-def test_a_transform_common_to_all_poses_is_found(arcs: tuple[Scene, Scene]) -> None:
+def test_a_transform_common_to_all_poses_is_found(arcs: tuple[Recording, Recording]) -> None:
     frames, encoder = arcs[0].train[:18], load_encoder()
     off = SE3.exp(np.array([0, 0, 0, 0.012, -0.02, 0.015]))
     chosen = spread_frames(frames, 4)
@@ -144,7 +144,7 @@ def test_a_transform_common_to_all_poses_is_found(arcs: tuple[Scene, Scene]) -> 
         assert frame.camera == found.camera
 
 
-def test_a_wrong_clock_bends_no_frame(arcs: tuple[Scene, Scene]) -> None:
+def test_a_wrong_clock_bends_no_frame(arcs: tuple[Recording, Recording]) -> None:
     """Answers are true poses, though poses are stated half a frame after their images."""
     true = [frame.base_from_camera for frame in arcs[0].train]
     frames = [
@@ -208,7 +208,7 @@ def test_what_landmarks_would_notice(
     assert _moved(stated, LENS, Adjustment(poses, camera, common, *fixed)) == noticed
 
 
-def test_poses_and_lens_may_be_taken_as_stated(arcs: tuple[Scene, Scene]) -> None:
+def test_poses_and_lens_may_be_taken_as_stated(arcs: tuple[Recording, Recording]) -> None:
     frames = arcs[0].train[:10]
     found = build_map(frames, load_encoder(), [2, 7], replace(SMALL, adjust=False))
     assert np.abs(found.common.log()).max() == 0
@@ -220,7 +220,7 @@ def test_poses_and_lens_may_be_taken_as_stated(arcs: tuple[Scene, Scene]) -> Non
         assert pose_distance(pose, frame.base_from_camera)[0] < 1e-9
 
 
-def test_a_frame_in_the_wrong_place_is_named_and_left_out(hall: Scene) -> None:
+def test_a_frame_in_the_wrong_place_is_named_and_left_out(hall: Recording) -> None:
     frames = list(hall.train[::2])
     (frames[6],) = moved((frames[6],), SE3.exp(np.array([0, 0.3, 0, 0, 0, 0])))
     chosen = [0, 6, 12]
@@ -240,7 +240,7 @@ def test_a_frame_in_the_wrong_place_is_named_and_left_out(hall: Scene) -> None:
         assert min(pose_distance(places[i], right)[0] for i in range(3)) < 0.003
 
 
-def test_frames_from_one_spot_are_refused(arcs: tuple[Scene, Scene]) -> None:
+def test_frames_from_one_spot_are_refused(arcs: tuple[Recording, Recording]) -> None:
     frames = tuple(
         replace(f, base_from_camera=SE3(f.base_from_camera.rotation_wxyz, np.ones(3)))
         for f in arcs[0].train[:16]
@@ -251,7 +251,7 @@ def test_frames_from_one_spot_are_refused(arcs: tuple[Scene, Scene]) -> None:
 
 
 @pytest.mark.parametrize("scale", [0.05, 10.0])
-def test_maps_are_alike_at_other_scales(scale: float, arcs: tuple[Scene, Scene]) -> None:
+def test_maps_are_alike_at_other_scales(scale: float, arcs: tuple[Recording, Recording]) -> None:
     frames, encoder = arcs[0].train[:10], load_encoder()
     scaled = [
         replace(f, base_from_camera=SE3(p.rotation_wxyz, scale * p.translation_m))
@@ -267,7 +267,7 @@ def test_maps_are_alike_at_other_scales(scale: float, arcs: tuple[Scene, Scene])
     assert np.median(depths[1]) == pytest.approx(scale * np.median(depths[0]), rel=0.03)
 
 
-def test_the_same_frames_give_the_same_map(arcs: tuple[Scene, Scene]) -> None:
+def test_the_same_frames_give_the_same_map(arcs: tuple[Recording, Recording]) -> None:
     frames, encoder = arcs[1].train[:10], load_encoder()
     one, two = (build_map(frames, encoder, [2, 7], SMALL) for _ in range(2))
     a, b = one.keyframes.to_tensors(), two.keyframes.to_tensors()
@@ -278,7 +278,7 @@ def test_the_same_frames_give_the_same_map(arcs: tuple[Scene, Scene]) -> None:
 
 
 @pytest.mark.parametrize("capacity", [1, 5, 24, 100])
-def test_frames_are_spread(capacity: int, arcs: tuple[Scene, Scene]) -> None:
+def test_frames_are_spread(capacity: int, arcs: tuple[Recording, Recording]) -> None:
     chosen = spread_frames(arcs[0].train, capacity).tolist()
     assert len(chosen) == min(capacity, 24)
     assert chosen == sorted(set(chosen))

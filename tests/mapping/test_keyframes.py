@@ -7,12 +7,12 @@ import pytest
 import torch
 from safetensors.torch import load, save
 
-from evercal.datasets.frame import Frame, Scene
 from evercal.features.views import working_image
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.mapping.keyframes import Keyframes, store_keyframes
 from evercal.mapping.landmarks import Landmarks
+from evercal.recordings.frame import Frame, Recording
 
 DISTORTIONS = ((), (0.1, -0.05, 0.001, 0.002), (0.1, -0.05, 0.001, 0.002, 0.01),
                (0.1, -0.05, 0.001, 0.002, 0.01, 0.02, -0.03, 0.004))  # fmt: skip
@@ -22,7 +22,7 @@ def through_a_file(keyframes: Keyframes) -> Keyframes:
     return Keyframes.from_tensors(load(save(keyframes.to_tensors())))
 
 
-def test_images_come_back_nearly(rooms: tuple[Scene, ...]) -> None:
+def test_images_come_back_nearly(rooms: tuple[Recording, ...]) -> None:
     frames = rooms[0].train[:5]
     back = store_keyframes(frames, 48).frames()
     assert len(back) == 5
@@ -61,7 +61,7 @@ def test_poses_and_cameras_come_back_exactly() -> None:
                 )
 
 
-def test_every_byte_is_counted(rooms: tuple[Scene, ...]) -> None:
+def test_every_byte_is_counted(rooms: tuple[Recording, ...]) -> None:
     for count in (1, 4):
         keyframes = store_keyframes(rooms[1].train[:count], 48)
         tensors = keyframes.to_tensors()
@@ -71,7 +71,7 @@ def test_every_byte_is_counted(rooms: tuple[Scene, ...]) -> None:
         assert keyframes.bytes < len(save(tensors)) < keyframes.bytes + 1000
 
 
-def test_a_remembered_frame_can_be_remembered_again(rooms: tuple[Scene, ...]) -> None:
+def test_a_remembered_frame_can_be_remembered_again(rooms: tuple[Recording, ...]) -> None:
     once = store_keyframes(rooms[2].train[:3], 48)
     twice = store_keyframes(once.frames(), 48)
     assert twice.cameras == once.cameras
@@ -119,7 +119,7 @@ def mapped(frames: tuple[Frame, ...], counts: tuple[int, ...]) -> Keyframes:
 
 @pytest.mark.parametrize("counts", [(7, 0, 12), (0, 0), (5,)])
 def test_a_map_comes_back_exactly_and_counts(
-    counts: tuple[int, ...], rooms: tuple[Scene, ...]
+    counts: tuple[int, ...], rooms: tuple[Recording, ...]
 ) -> None:
     keyframes = mapped(rooms[0].train, counts)
     back = through_a_file(keyframes)
@@ -140,7 +140,7 @@ def test_a_map_comes_back_exactly_and_counts(
     assert (nothing.landmarks, nothing.descriptors, nothing.inverse_depth) == ((), None, ())
 
 
-def test_pixels_beyond_single_bytes_survive(rooms: tuple[Scene, ...]) -> None:
+def test_pixels_beyond_single_bytes_survive(rooms: tuple[Recording, ...]) -> None:
     keyframes = mapped(rooms[0].train, (2,))
     far = replace(keyframes.landmarks[0], pixels=np.array([[32767.0, 0], [1919, 1079]]))
     back = through_a_file(replace(keyframes, landmarks=(far,)))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evercal.datasets.frame import Scene
 from evercal.features.encoder import load_encoder
 from evercal.features.vlad import vlad_for
 from evercal.geometry.se3 import SE3
@@ -16,16 +15,17 @@ from evercal.mapping.pose_check import (
     depth_scale,
     matched_pairs,
 )
-from evercal.mapping.recording import Recording, WorkingSize
+from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
+from evercal.recordings.frame import Recording
 
 
 @pytest.fixture(scope="module")
-def recording(hall: Scene) -> Recording:
+def recording(hall: Recording) -> PreparedFrames:
     """Every second training frame of the hall."""
-    return Recording(hall.train[::2], load_encoder(), WorkingSize())
+    return PreparedFrames(hall.train[::2], load_encoder(), WorkingSize())
 
 
-def moved(recording: Recording, changes: dict[int, SE3]) -> Recording:
+def moved(recording: PreparedFrames, changes: dict[int, SE3]) -> PreparedFrames:
     """The same images with other stated poses."""
     changed = recording.without(np.zeros(0, np.int64))
     poses = [recording.poses[i] for i in range(len(recording))]
@@ -35,13 +35,13 @@ def moved(recording: Recording, changes: dict[int, SE3]) -> Recording:
     return changed
 
 
-def named(recording: Recording) -> list[int]:
+def named(recording: PreparedFrames) -> list[int]:
     options = PoseCheckOptions()
     pairs = matched_pairs(recording, vlad_for(recording.encoder), options)
     return contradicting_frames(recording, pairs, options).tolist()
 
 
-def test_right_poses_contradict_nothing(recording: Recording) -> None:
+def test_right_poses_contradict_nothing(recording: PreparedFrames) -> None:
     assert named(recording) == []
 
 
@@ -50,20 +50,20 @@ def test_right_poses_contradict_nothing(recording: Recording) -> None:
     ("frame", "direction"), [(0, (0, 1, 0)), (6, (0, 1, 0)), (14, (0, 1, 0)), (6, (1, 0, 0))]
 )
 def test_one_frame_30_cm_away_is_named(
-    frame: int, direction: tuple[float, ...], recording: Recording
+    frame: int, direction: tuple[float, ...], recording: PreparedFrames
 ) -> None:
     shift = SE3.exp(np.array([*(0.3 * np.array(direction)), 0, 0, 0]))
     assert named(moved(recording, {frame: shift})) == [frame]
 
 
-def test_two_wrong_frames_and_a_turned_one_are_named(recording: Recording) -> None:
+def test_two_wrong_frames_and_a_turned_one_are_named(recording: PreparedFrames) -> None:
     up, turned = SE3.exp(np.array([0, 0.3, 0, 0, 0, 0])), SE3.exp(np.array([0, 0, 0, 0, 0.2, 0]))
     assert named(moved(recording, {3: up, 10: turned})) == [3, 10]
 
 
 @pytest.mark.parametrize("scale", [0.1, 8.0])
 def test_depths_are_looked_for_at_the_scale_of_the_recording(
-    scale: float, recording: Recording
+    scale: float, recording: PreparedFrames
 ) -> None:
     options, vlad = PoseCheckOptions(), vlad_for(recording.encoder)
     pairs, scaled = matched_pairs(recording, vlad, options), moved(recording, {})
@@ -75,13 +75,15 @@ def test_depths_are_looked_for_at_the_scale_of_the_recording(
     assert contradicting_frames(scaled, pairs, options).tolist() == []
 
 
-def test_errors_that_bundle_adjustment_corrects_are_left_to_it(recording: Recording) -> None:
+def test_errors_that_bundle_adjustment_corrects_are_left_to_it(recording: PreparedFrames) -> None:
     rng = np.random.default_rng(0)
     noise = rng.normal(size=(len(recording), 6)) * ([0.005] * 3 + [0.004] * 3)
     assert named(moved(recording, {i: SE3.exp(n) for i, n in enumerate(noise)})) == []
 
 
-def test_a_recording_less_some_frames_keeps_the_others_as_they_are(recording: Recording) -> None:
+def test_a_recording_less_some_frames_keeps_the_others_as_they_are(
+    recording: PreparedFrames,
+) -> None:
     rest = recording.without(np.array([0, 5]))
     keep = [i for i in range(len(recording)) if i not in (0, 5)]
     assert [f.name for f in rest.frames] == [recording.frames[i].name for i in keep]

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evercal.continual.networks.atlas import Cell
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.mapping.atlas import Cell
 from evercal.mapping.frame_correction import FrameCorrection
 from evercal.mapping.scene_maps import Alignment, SceneRecord
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.datasets.frame import Scene
+from evercal.continual.networks.head import Head
 from evercal.errors import InputError
 from evercal.features import vlad
 from evercal.features.encoder import load_encoder
@@ -22,7 +22,7 @@ from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import Alignment, SceneMaps
 from evercal.mapping.stage_files import head_bytes
 from evercal.mapping.store import Checkpoint, Store
-from evercal.networks.head import Head
+from evercal.recordings.frame import Recording
 from evercal.storage.manifest import MANIFEST, verify, write_manifest
 
 Stages = dict[str, list[SceneMaps]]
@@ -94,7 +94,10 @@ def test_everything_can_be_opened_and_written_again_without_a_change(
 
 
 def test_poses_survive_the_disk(
-    arc_maps: tuple[SceneMaps, SceneMaps], arcs: tuple[Scene, Scene], tmp_path: Path, make: Make
+    arc_maps: tuple[SceneMaps, SceneMaps],
+    arcs: tuple[Recording, Recording],
+    tmp_path: Path,
+    make: Make,
 ) -> None:
     make(tmp_path / "store", list(arc_maps))
     before, after = Localizer(arc_maps[1]), Localizer.open(tmp_path / "store")

@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import ArrayLike
 
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse
-from evercal.drawing import encode_image
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.reports import calibration_page as calibration_page_module
+from evercal.reports import encode_image
 from evercal.reports.calibration_comparison import Older, difference
 from evercal.reports.calibration_page import Page, Subject, calibration_page
 from evercal.reports.calibration_views import View, Views

@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import ArrayLike
 
 from evercal.calibration.calibration import Calibration, ImageUse
-from evercal.datasets.images import write_image
+from evercal.continual.networks.atlas import Cell
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
-from evercal.mapping.atlas import Cell
 from evercal.mapping.scene_maps import SceneRecord
+from evercal.recordings.images import write_image
 from evercal.reports.calibration_views import readable_images, views_of
 
 

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from evercal.continual.networks.atlas import Cell
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
-from evercal.mapping.atlas import Cell
 from evercal.mapping.scene_maps import SceneRecord
 from evercal.reports.pictures import draw_landmarks
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from evercal.datasets import generic, load_scene
 from evercal.geometry import SE3, Camera, pose_distance
+from evercal.recordings import generic, load_recording
 from evercal.simulation import box_room
 from evercal.simulation.box_room import (
     BoxRoom,
@@ -284,7 +284,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_scene_survives_the_disk(tmp_path: Path) -> None:
     memory = box_room_scene(21, 3, 2)
     generic.write(tmp_path / "room", memory)
-    for loaded in (generic.load(tmp_path / "room"), load_scene(tmp_path / "room")):
+    for loaded in (generic.load(tmp_path / "room"), load_recording(tmp_path / "room")):
         assert loaded.name == memory.name == "box-room-21"
         for split in ("train", "test"):
             frames, expected = getattr(loaded, split), getattr(memory, split)

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from evercal.datasets import load_scene
 from evercal.errors import InputError
+from evercal.recordings import load_recording
 from evercal.simulation import cell
 from evercal.simulation.cell import SimulateOptions, Suite, simulate
 from evercal.simulation.furnished import renderer
@@ -35,13 +35,13 @@ def test_a_run_cut_off_goes_on_and_ends_the_same(tmp_path: Path) -> None:
         next(run)
     run.close()
     with pytest.raises(InputError, match="no known scene format"):
-        load_scene(cut / "kitchen")
+        load_recording(cut / "kitchen")
     # Half-written: an image without its depth is rendered again.
     (cut / "kitchen/depth/000001.png").unlink()
     (cut / "kitchen/images/000002.jpg").unlink()
     list(simulate("sim", cut, TINY))
     for part in ("", "calibration/fixed", "calibration/bumped", "calibration/hand"):
-        a, b = load_scene(whole / "kitchen" / part), load_scene(cut / "kitchen" / part)
+        a, b = load_recording(whole / "kitchen" / part), load_recording(cut / "kitchen" / part)
         assert len(a.train) + len(a.test) == (2 if part else 4)
         for x, y in zip(a.train + a.test, b.train + b.test, strict=True):
             np.testing.assert_array_equal(x.read_image(), y.read_image())
@@ -53,7 +53,7 @@ def test_a_run_cut_off_goes_on_and_ends_the_same(tmp_path: Path) -> None:
             assert (depth.dtype, depth.shape) == (np.uint16, (24, 32))
             assert x.joints_rad is not None
             assert x.base_from_gripper is not None
-    hand = load_scene(whole / "kitchen/calibration/hand").test
+    hand = load_recording(whole / "kitchen/calibration/hand").test
     truth = cell.hand_camera(0).matrix()
     for frame in hand:
         assert frame.base_from_gripper is not None
@@ -77,7 +77,7 @@ def test_a_change_is_recorded_after_the_rest(
     assert (steps[-1].done, steps[-1].total) == (12, 12)
     assert steps[-1].scene == out / "kitchen/changed"
     assert {path: path.read_bytes() for path in before} == before
-    scene = load_scene(out / "kitchen/changed")
+    scene = load_recording(out / "kitchen/changed")
     assert (scene.name, len(scene.train)) == ("kitchen-changed", 0)
     assert [frame.name for frame in scene.test] == ["changed-000000", "changed-000001"]
     for frame in scene.test:

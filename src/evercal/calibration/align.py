@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.align_points import Picks, align_by_points
-from evercal.calibration.disagreement import require_agreement
-from evercal.calibration.hand_eye import HandEyeFit, agreement, robust_fit
 from evercal.calibration.located import Located, locate
-from evercal.calibration.observability import require_observable
-from evercal.calibration.pairs import PosePairs
+from evercal.calibration.pose_pairs.disagreement import require_agreement
+from evercal.calibration.pose_pairs.hand_eye import HandEyeFit, agreement, robust_fit
+from evercal.calibration.pose_pairs.observability import require_observable
+from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, axis_deviation, cross_matrix
 from evercal.mapping.scene_maps import Alignment, SceneRecord

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from evercal.calibration.calibration import read_transform
 from evercal.calibration.located import Located, deviations, fuse, length_mm_deg, locate
-from evercal.datasets import load_scene, read_image
-from evercal.datasets.images import IMAGE_ENDINGS
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
+from evercal.recordings import load_recording, read_image
+from evercal.recordings.images import IMAGE_ENDINGS
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
@@ -131,7 +131,7 @@ def _shots(episode: Path, stated: SE3 | None) -> list[_Shot]:
     pose_file = next((episode / name for name in POSE_FILES if (episode / name).is_file()), None)
     pose = stated if pose_file is None else read_transform(pose_file)
     try:
-        scene = load_scene(episode)
+        scene = load_recording(episode)
     except InputError:
         files = sorted(p for p in episode.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS)
         if files and pose is None:

@@ -29,9 +29,9 @@ from evercal.calibration.located import (
     locate,
 )
 from evercal.calibration.verdict import verdict
-from evercal.datasets import read_image
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, axis_deviation
+from evercal.recordings import read_image
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer

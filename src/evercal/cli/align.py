@@ -76,14 +76,14 @@ class Align:
 
     def _by_gripper(self, localizer: "Localizer") -> "MapAlignment":
         from evercal.calibration.align import align_by_gripper
-        from evercal.datasets.pairing import poses_of_images
+        from evercal.recordings.poses.pairing import poses_of_images
 
         files = image_files(self.images)
         assert self.robot_poses is not None
         poses = poses_of_images(self.robot_poses, files, self.convention)
         images, known, boards = read_images(files), not self.unknown_scale, None
         if self.board_poses is not None:
-            from evercal.calibration.board_poses import read_board_poses
+            from evercal.calibration.boards.board_poses import read_board_poses
 
             found = read_board_poses(self.board_poses).found
             seen = {image.name: image.camera_from_board for image in found}
@@ -92,7 +92,7 @@ class Align:
 
     def _by_points(self, localizer: "Localizer") -> "MapAlignment":
         from evercal.calibration.align import aligned_by_points
-        from evercal.datasets import read_image
+        from evercal.recordings import read_image
 
         if self.points is None or self.picks is None:
             raise InputError("--points and --picks belong together; give both")

@@ -15,10 +15,10 @@ from evercal.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from evercal.benchmark.bench import BenchOptions, Step
+    from evercal.continual.benchmark.bench import BenchOptions, Step
     from evercal.continual.stage import StageOptions
     from evercal.continual.strategies import Strategy
-    from evercal.datasets import Scene
+    from evercal.recordings import Recording
 
 
 LEAST_BATCH = 64
@@ -37,13 +37,13 @@ class Bench:
     recordings: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="")
     ] = ()
-    """Scene folders of the suite custom, in order of learning; a single one for regions."""
+    """Recording folders of the suite custom, in order of learning; a single one for regions."""
     strategies: Annotated[str | None, arg(metavar="A,B", help_behavior_hint="")] = None
     """Strategies with commas between; the others are compared with the first. When left out, those
     of --rows alone, or evercal,joint,finetune,er,sars_spdd."""
     rows: Annotated[str | None, arg(metavar="NAME|FILE.json", help_behavior_hint="")] = None
     """More strategies, made from others: table4, spdd-sweep, with-map, or a file of one's own (see
-    `evercal.benchmark.rows`)."""
+    `evercal.continual.benchmark.rows`)."""
     seeds: Annotated[str, arg(metavar="0,1")] = "0,1,2"
     """Seeds with commas between; every strategy is run once with each."""
     order: Literal["given", "reversed", "shuffled"] = "given"
@@ -85,10 +85,10 @@ class Bench:
     def run(self) -> int:
         """Runs what is missing and prints the tables."""
         seeds = _numbers(self.seeds)
-        from evercal.benchmark.bench import BenchOptions
+        from evercal.continual.benchmark.bench import BenchOptions
+        from evercal.continual.networks.distributed import join_processes, rank, wait_for_all
         from evercal.continual.plugin import load_plugin
         from evercal.continual.presets import short_side
-        from evercal.networks.distributed import join_processes, rank, wait_for_all
 
         if self.plugin is not None:
             load_plugin(self.plugin)
@@ -121,7 +121,7 @@ class Bench:
         return 0 if rank() else show_report(self.out, options.strategies[0].name, self.json)
 
     def _strategies(self) -> "tuple[Strategy, ...]":
-        from evercal.benchmark.rows import load_rows
+        from evercal.continual.benchmark.rows import load_rows
         from evercal.continual.strategies import strategy_named
 
         names = self.strategies
@@ -132,22 +132,22 @@ class Bench:
         return tuple(dict.fromkeys((*named, *(load_rows(self.rows) if self.rows else ()))))
 
     def _steps(self, options: "BenchOptions", out: Path) -> "Iterator[Step]":
-        from evercal.benchmark.bench import run_bench
-        from evercal.benchmark.ray_runs import run_on_ray
+        from evercal.continual.benchmark.bench import run_bench
+        from evercal.continual.benchmark.ray_runs import run_on_ray
 
         if self.ray is None:
             return run_bench(self._scenes(), options, out)
         return run_on_ray(self._scenes(), options, out, self.ray, self.plugin)
 
-    def _scenes(self) -> "list[Scene]":
-        from evercal.benchmark.suites import tuning_split
+    def _scenes(self) -> "list[Recording]":
+        from evercal.continual.benchmark.suites import tuning_split
 
         scenes = self._recorded()
         return [tuning_split(scene) for scene in scenes] if self.held_out else scenes
 
-    def _recorded(self) -> "list[Scene]":
-        from evercal.benchmark.suites import load_suite, regions
-        from evercal.datasets import load_scene
+    def _recorded(self) -> "list[Recording]":
+        from evercal.continual.benchmark.suites import load_suite, regions
+        from evercal.recordings import load_recording
 
         if (self.suite in ("custom", "regions")) != bool(self.recordings):
             raise InputError(
@@ -155,18 +155,18 @@ class Bench:
                 "these need them"
             )
         if self.suite == "regions":
-            scenes = [load_scene(path) for path in self.recordings]
+            scenes = [load_recording(path) for path in self.recordings]
             if len(scenes) > 1:
                 raise InputError(f"suite regions: one scene, got {len(scenes)}")
             return regions(scenes[0], self.parts)
         if self.suite == "custom":
-            return [load_scene(path) for path in self.recordings]
+            return [load_recording(path) for path in self.recordings]
         return load_suite(self.suite, self.data, _words(self.scenes), self.poses)
 
     def _stage(self, seed: int) -> "StageOptions":
         from evercal.cli.learn import parse_memory
-        from evercal.continual.memory_budget import with_memory
         from evercal.continual.presets import PAPER_SIM_STEPS, on_paper_backbone, preset
+        from evercal.mapping.memory_budget import with_memory
 
         parse_memory(self.memory)
         stage = with_memory(preset(self.preset, seed), self.memory)
@@ -197,7 +197,7 @@ def _mirror(out: Path) -> Path:
     import shutil
     import tempfile
 
-    from evercal.benchmark.results import RESULTS, SETTINGS
+    from evercal.continual.benchmark.results import RESULTS, SETTINGS
 
     folder = Path(tempfile.mkdtemp(prefix="evercal-bench-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)

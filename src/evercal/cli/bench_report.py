@@ -41,11 +41,11 @@ def show_report(
         as_json: print one JSON object instead.
         compare_with: other folders of results to show in the page.
     """
-    from evercal.benchmark.comparison import as_text, summary
-    from evercal.benchmark.latex import paper_tables
-    from evercal.benchmark.report_data import read_report
-    from evercal.reports.bench_page import bench_page
-    from evercal.reports.bench_views import view_pictures
+    from evercal.continual.benchmark.bench_page import bench_page
+    from evercal.continual.benchmark.bench_views import view_pictures
+    from evercal.continual.benchmark.comparison import as_text, summary
+    from evercal.continual.benchmark.latex import paper_tables
+    from evercal.continual.benchmark.report_data import read_report
     from evercal.simulation.cell import SUITES
     from evercal.storage import write_bytes
 

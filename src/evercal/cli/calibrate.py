@@ -87,7 +87,7 @@ class Calibrate:
 
         poses = None
         if self.robot_poses is not None:
-            from evercal.datasets.pairing import poses_of_images
+            from evercal.recordings.poses.pairing import poses_of_images
 
             poses = poses_of_images(self.robot_poses, files, self.convention)
         return Images(read_images(files), camera_for(self.camera, files), poses)

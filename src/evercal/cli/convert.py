@@ -30,7 +30,7 @@ class Convert:
 
     def run(self) -> int:
         """Reads, writes, and says what came along."""
-        from evercal.datasets import generic
+        from evercal.recordings import generic
 
         if self.out.exists() and not self.out.is_dir():
             raise InputError(f"{self.out}: is a file; give a folder to write to")

@@ -17,10 +17,10 @@ from evercal.errors import InputError
 if TYPE_CHECKING:
     from evercal.continual.learn_scene import LearnReport
     from evercal.continual.stage import StageOptions
-    from evercal.datasets import Scene
     from evercal.localization.localizer import Localizer
+    from evercal.recordings import Recording
+    from evercal.recordings.samples import SampleRoom
     from evercal.reports.demo_outcome import DemoOutcome
-    from evercal.simulation.mini import CellRoom
 
 STORE = "store"
 QUERY = "query.png"
@@ -59,7 +59,7 @@ class DemoOptions:
 
     compare: bool = False
     """Train the networks of fine-tuning and of SARS + SPDD as well."""
-    rooms: "tuple[CellRoom, ...] | None" = None
+    rooms: "tuple[SampleRoom, ...] | None" = None
     """Two or more; those that come with the package when None."""
     device: str = "auto"
     """What networks run on, see `features.device.device_of`."""
@@ -84,12 +84,12 @@ def run_demo(out: Path, options: DemoOptions, say: Say = _quiet) -> "DemoOutcome
     Raises:
         InputError: `out` holds something else under a name that the demo needs, or no such device.
     """
-    from evercal.datasets import write_image
     from evercal.features.device import device_of
     from evercal.localization.localizer import Localizer
+    from evercal.recordings import write_image
+    from evercal.recordings.samples import sample_rooms
     from evercal.reports.demo_outcome import MAP, METHODS, DemoOutcome
     from evercal.reports.demo_page import write_pictures
-    from evercal.simulation.mini import mini_rooms
     from evercal.storage import MANIFEST, replace_folder
 
     began, store = time.perf_counter(), out / STORE
@@ -97,7 +97,7 @@ def run_demo(out: Path, options: DemoOptions, say: Say = _quiet) -> "DemoOutcome
         raise InputError(f"{store}: exists and is not an evercal store; give another --out")
     device_of(options.device)  # refused before anything is learned
     out.mkdir(parents=True, exist_ok=True)
-    rooms = options.rooms or mini_rooms()
+    rooms = options.rooms or sample_rooms()
     scenes = [room.scene for room in rooms]
     outcome = DemoOutcome([scene.name for scene in scenes])
     work = Path(tempfile.mkdtemp(prefix=".demo-", dir=out))
@@ -126,7 +126,7 @@ class _Teller:
     options: DemoOptions
 
 
-def _learn_rooms(store: Path, method: str, scenes: "Sequence[Scene]", teller: _Teller) -> None:
+def _learn_rooms(store: Path, method: str, scenes: "Sequence[Recording]", teller: _Teller) -> None:
     """Learns the rooms one after the other; where methods are compared, evaluates after each."""
     from evercal.cli.learn_bars import LearnBars
     from evercal.continual.learn_scene import LearnOptions, learn_scene
@@ -176,7 +176,7 @@ def _note_map(report: "LearnReport", outcome: "DemoOutcome", say: Say) -> None:
     )
 
 
-def _accuracies(localizer: "Localizer", scenes: "Sequence[Scene]") -> list[float]:
+def _accuracies(localizer: "Localizer", scenes: "Sequence[Recording]") -> list[float]:
     """Per cent of test images within 5 cm and 5 deg, for each scene."""
     from evercal.evaluation import evaluate, scores
 
@@ -193,7 +193,7 @@ def _accuracies(localizer: "Localizer", scenes: "Sequence[Scene]") -> list[float
 
 
 def _measure(
-    localizer: "Localizer", rooms: "Sequence[CellRoom]", outcome: "DemoOutcome", say: Say
+    localizer: "Localizer", rooms: "Sequence[SampleRoom]", outcome: "DemoOutcome", say: Say
 ) -> None:
     """Asks the map everything that the report shows, and says it in sentences."""
     from evercal.reports import demo_sentences as told

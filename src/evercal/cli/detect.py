@@ -12,9 +12,9 @@ from evercal.cli.image_words import image_files
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.calibration.board_poses import BoardPoses
-    from evercal.calibration.boards import Board
-    from evercal.calibration.corners import BoardView
+    from evercal.calibration.boards.board_poses import BoardPoses
+    from evercal.calibration.boards.corners import BoardView
+    from evercal.calibration.boards.detection import Board
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class Detect:
     def run(self) -> int:
         """Looks at every image and writes what was found."""
         board, files = self._board(), image_files(self.images)
-        from evercal.calibration.board_poses import board_poses
-        from evercal.calibration.boards import find_board
-        from evercal.calibration.intrinsics import calibrate_camera
-        from evercal.datasets import image_size, read_image
-        from evercal.datasets.camera_file import read_camera
+        from evercal.calibration.boards.board_poses import board_poses
+        from evercal.calibration.boards.detection import find_board
+        from evercal.calibration.boards.intrinsics import calibrate_camera
+        from evercal.recordings import image_size, read_image
+        from evercal.recordings.poses.camera_file import read_camera
 
         names = [path.name for path in files]
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -90,7 +90,7 @@ class Detect:
         return 0
 
     def _board(self) -> "Board":
-        from evercal.calibration.boards import Board
+        from evercal.calibration.boards.detection import Board
 
         if self.square_mm is None:
             raise InputError("--square-mm: give the side of a square, or of the tag, millimetres")

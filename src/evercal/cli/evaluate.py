@@ -11,7 +11,7 @@ from evercal.cli.device import Device
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.datasets import Scene
+    from evercal.recordings import Recording
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Evaluate:
         scenes = load_named(self.scenes)
         if self.report is not None and not self.report.absolute().parent.is_dir():
             raise InputError(f"--report {self.report}: its folder does not exist; make it first")
-        from evercal.benchmark.tables import score_table
         from evercal.evaluation import evaluate, scores
+        from evercal.evaluation.tables import score_table
         from evercal.localization.localizer import Localizer
         from evercal.reports.evaluate_page import Watch, evaluation_page
         from evercal.storage import write_bytes
@@ -69,21 +69,21 @@ class Evaluate:
         return 0
 
 
-def load_named(words: tuple[str, ...]) -> "dict[str, Scene]":
+def load_named(words: tuple[str, ...]) -> "dict[str, Recording]":
     """Scenes by name, from `SCENE` and `NAME=SCENE` words.
 
     Raises:
         InputError: A scene that cannot be read, or one name twice.
     """
-    from evercal.datasets import load_scene
+    from evercal.recordings import load_recording
 
-    scenes: dict[str, Scene] = {}
+    scenes: dict[str, Recording] = {}
     for word in words:
         name, sign, path = word.partition("=")
         # A folder whose own name holds '=' is still a folder.
         if not sign or not name or Path(word).is_dir():
             name, path = "", word
-        scene = load_scene(path, name=name or None)
+        scene = load_recording(path, name=name or None)
         if scene.name in scenes:
             raise InputError(
                 f"scene {scene.name!r}: given twice; tell them apart as NAME={path}, with the name"

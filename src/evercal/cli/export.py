@@ -117,7 +117,7 @@ class ExportCalibration:
     def _export(self, path: Path) -> "Export":
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.export.request import Export, renamed
-        from evercal.datasets.robot_poses import read_robot_poses
+        from evercal.recordings.poses.robot_poses import read_robot_poses
 
         calibration = renamed(read_calibration(path), self.parent, self.child)
         robot, target = (

@@ -20,8 +20,8 @@ def image_files(words: Sequence[Path]) -> list[Path]:
     """
     if not words:
         raise InputError("no image given; name one or more image files after the store")
-    from evercal.datasets.images import IMAGE_ENDINGS
-    from evercal.datasets.row_files import natural_key
+    from evercal.recordings.images import IMAGE_ENDINGS
+    from evercal.recordings.poses.row_files import natural_key
 
     files: list[Path] = []
     for word in words:
@@ -40,7 +40,7 @@ def image_files(words: Sequence[Path]) -> list[Path]:
 
 def read_images(files: Sequence[Path]) -> "list[tuple[str, np.ndarray]]":
     """(path, pixels) of image files."""
-    from evercal.datasets import read_image
+    from evercal.recordings import read_image
 
     return [(str(path), read_image(path)) for path in files]
 
@@ -49,7 +49,7 @@ def camera_for(file: Path | None, images: Sequence[Path]) -> "Camera | None":
     """The camera that --camera names, for the size of the first image."""
     if file is None:
         return None
-    from evercal.datasets import image_size
-    from evercal.datasets.camera_file import read_camera
+    from evercal.recordings import image_size
+    from evercal.recordings.poses.camera_file import read_camera
 
     return read_camera(file, image_size(images[0]))

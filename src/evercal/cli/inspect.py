@@ -23,7 +23,7 @@ class Inspect:
 
     def run(self) -> int:
         """Reads the scene and some of its images."""
-        from evercal.datasets.inspection import inspect_scene
+        from evercal.recordings.inspection import inspect_scene
 
         found = inspect_scene(self.reading.scene(self.scene))
         if self.json:

@@ -13,12 +13,12 @@ from evercal.cli.console import print_json, print_next, size
 from evercal.cli.device import Device
 from evercal.cli.learn_bars import LearnBars
 from evercal.cli.reading import Reading
-from evercal.continual import memory_budget
 from evercal.errors import InputError
+from evercal.mapping import memory_budget
 
 if TYPE_CHECKING:
+    from evercal.calibration.eye_in_hand import HandEyeReport
     from evercal.continual.learn_scene import LearnOptions, LearnReport
-    from evercal.continual.wrist_camera import HandEyeReport
     from evercal.geometry import Camera
     from evercal.mapping.build import Adjusted
 
@@ -70,15 +70,15 @@ class Learn:
             raise InputError(f"--centres {self.centres}: give a number >= 1")
         if self.seed < 0:
             raise InputError(f"--seed {self.seed}: give a number >= 0")
+        from evercal.calibration.eye_in_hand import lacks_camera_poses
         from evercal.continual.learn_scene import learn_scene, validation_split
-        from evercal.continual.wrist_camera import lacks_camera_poses
-        from evercal.datasets import posed_scene
+        from evercal.recordings import posed_recording
 
         scene = self.reading.scene(self.scene, self.name)
         wrist = lacks_camera_poses(scene)
         if not wrist:
             self._refuse_hand_eye(scene.name)
-            scene = posed_scene(scene)
+            scene = posed_recording(scene)
         check_name(scene.name)
         options = self._options()
         held_out = len(validation_split(scene.train)[1])

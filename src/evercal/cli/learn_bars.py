@@ -9,10 +9,10 @@ if TYPE_CHECKING:
 
     from tqdm import tqdm
 
+    from evercal.continual.networks.trainer import Progress
     from evercal.continual.stage import Encoding
     from evercal.mapping.build import Mapping
     from evercal.mapping.store import Checkpoint
-    from evercal.networks.trainer import Progress
 
 
 _UNITS = {
@@ -54,9 +54,9 @@ class LearnBars:
 
     def __call__(self, event: "Encoding | Mapping | Progress | Checkpoint") -> None:
         """Takes one event."""
+        from evercal.continual.networks.trainer import Progress
         from evercal.continual.stage import Encoding
         from evercal.mapping.build import Mapping
-        from evercal.networks.trainer import Progress
 
         if self._start:
             print(self._start, file=self._stream, flush=True)

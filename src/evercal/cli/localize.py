@@ -64,8 +64,8 @@ class Localize:
         self, localizer: "Localizer", camera: "Camera | None"
     ) -> list[tuple[Path, "PoseEstimate", float]]:
         """Per image its path, the answer and the milliseconds that it took, decoding included."""
-        from evercal.datasets import read_image, write_image
         from evercal.localization.parallel import in_parallel
+        from evercal.recordings import read_image, write_image
         from evercal.reports.pictures import draw_estimate, scene_camera
 
         def answer(number: int) -> tuple[Path, "PoseEstimate", float]:
@@ -105,7 +105,7 @@ def as_dict(path: Path, estimate: "PoseEstimate", milliseconds: float) -> dict[s
     """One image's entry in the JSON answer; null where there is no pose."""
     import numpy as np
 
-    from evercal.datasets.generic import pose_to_dict
+    from evercal.recordings.formats.generic import pose_to_dict
 
     pose, covariance = pose_to_dict(estimate.base_from_camera), estimate.covariance
     if pose is not None and estimate.base_from_camera is not None:

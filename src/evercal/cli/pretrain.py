@@ -24,7 +24,7 @@ class Pretrain:
 
 def pretrain_with_options() -> type:
     """The verb with the options of the training, whose module imports torch."""
-    from evercal.features.pretraining.contrastive import PretrainOptions
+    from evercal.continual.pretraining.contrastive import PretrainOptions
 
     @dataclass(frozen=True)
     class PretrainWithOptions(Pretrain):
@@ -33,7 +33,7 @@ def pretrain_with_options() -> type:
 
         def run(self) -> int:
             """Trains; the log goes to stderr."""
-            from evercal.features.pretraining.make import pretrain
+            from evercal.continual.pretraining.make import pretrain
 
             began = time.perf_counter()
             pretrain(self.out, self.work or self.out / "work", self.options)

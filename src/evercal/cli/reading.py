@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 if TYPE_CHECKING:
-    from evercal.datasets import Scene
+    from evercal.recordings import Recording
 
 
 @dataclass(frozen=True)
@@ -37,16 +37,16 @@ class Reading:
     every: Annotated[int, arg(metavar="N", help_behavior_hint="")] = 1
     """Take every N-th image only."""
 
-    def scene(self, path: Path, name: str | None = None) -> "Scene":
+    def scene(self, path: Path, name: str | None = None) -> "Recording":
         """Reads the recording.
 
         Raises:
             InputError: It cannot be read, or a flag means nothing to its format.
         """
-        from evercal.datasets import ReadOptions, load_scene
+        from evercal.recordings import ReadOptions, load_recording
 
         given = {field.name: getattr(self, field.name) for field in fields(ReadOptions)}
-        return load_scene(path, self.format, name, ReadOptions(**given))
+        return load_recording(path, self.format, name, ReadOptions(**given))
 
     def words(self) -> list[str]:
         """The flags that were given, as words of a command."""

@@ -72,9 +72,9 @@ class Solve:
         return 0 if tier(found) else 1
 
     def _solved(self) -> "Calibration":
-        from evercal.calibration.pair_files import PairFiles, read_pairs, read_streams
-        from evercal.calibration.solve import solve
-        from evercal.calibration.time_offset import solve_with_offset
+        from evercal.calibration.pose_pairs.pair_files import PairFiles, read_pairs, read_streams
+        from evercal.calibration.pose_pairs.solve import solve
+        from evercal.calibration.pose_pairs.time_offset import solve_with_offset
 
         files = PairFiles(
             self.robot_poses,

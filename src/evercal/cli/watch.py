@@ -50,8 +50,8 @@ class Watch:
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.drift import shift_between
         from evercal.calibration.located import Located, fuse, locate
-        from evercal.datasets import read_image
         from evercal.localization.localizer import Localizer
+        from evercal.recordings import read_image
 
         reference = read_calibration(self.reference)
         localizer = Localizer.open(self.store, device=self.device)
@@ -80,7 +80,7 @@ class Watch:
 
     def _new(self, seen: set[Path]) -> list[Path]:
         """Images that were not looked at yet, oldest first."""
-        from evercal.datasets.images import IMAGE_ENDINGS
+        from evercal.recordings.images import IMAGE_ENDINGS
 
         found = [
             path

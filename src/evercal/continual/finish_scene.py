@@ -5,12 +5,14 @@ from dataclasses import dataclass, replace
 
 from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.methods.method import FinishedScene, Method, MethodState
+from evercal.continual.networks.atlas import Cell
+from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.continual.networks.hooks import TrainingHooks
+from evercal.continual.networks.trainer import HeadTrainer
 from evercal.continual.stage import Stage, StageOptions
 from evercal.continual.stage_map import fitting
 from evercal.continual.stage_rows import keyframe_rows
 from evercal.continual.strategies import Strategy
-from evercal.datasets.frame import Frame, Scene
-from evercal.mapping.atlas import Cell
 from evercal.mapping.build import SceneMap, finished
 from evercal.mapping.keyframes import Keyframes, store_keyframes
 from evercal.mapping.scene_maps import (
@@ -20,9 +22,7 @@ from evercal.mapping.scene_maps import (
     correction_between,
     prototypes,
 )
-from evercal.networks.buffer import FeatureBuffer
-from evercal.networks.hooks import TrainingHooks
-from evercal.networks.trainer import HeadTrainer
+from evercal.recordings.frame import Frame, Recording
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def memory_bytes(maps: SceneMaps, strategy: Strategy) -> int:
 
 
 def trained_record(
-    scene: Scene, cell: Cell, trainer: HeadTrainer, number: int, frames: int
+    scene: Recording, cell: Cell, trainer: HeadTrainer, number: int, frames: int
 ) -> SceneRecord:
     """The record of a scene that was trained on, without its map.
 

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evercal.datasets.frame import Frame, known_poses
-from evercal.networks.buffer import FeatureBuffer, Rows
-from evercal.networks.head import Head
-from evercal.networks.loss import fixed_clamp_loss
+from evercal.continual.networks.buffer import FeatureBuffer, Rows
+from evercal.continual.networks.head import Head
+from evercal.continual.networks.loss import fixed_clamp_loss
+from evercal.recordings.frame import Frame, stated_poses
 
 RELIABLE_PX = 10.0
 PARTS = 625
@@ -32,7 +32,7 @@ class FrameStatistics:
     def __init__(
         self, frames: Sequence[Frame], head: Head, rows: Callable[[], FeatureBuffer], seed: int
     ):
-        poses = known_poses(frames)
+        poses = stated_poses(frames)
         self.positions_m = poses.translation_m
         """(n, 3) camera positions in the base frame."""
         self.quaternions_wxyz = poses.rotation_wxyz

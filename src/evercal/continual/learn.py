@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import torch
 
-from evercal.continual.fewest_keyframes import AutoMemoryOptions, fewest_keyframes
 from evercal.continual.finish_scene import (
     Learned,
     correct_lens,
@@ -15,21 +14,22 @@ from evercal.continual.finish_scene import (
     trained_record,
 )
 from evercal.continual.methods.method import StageStart
+from evercal.continual.networks.trainer import HeadTrainer
 from evercal.continual.stage import Event, Stage, StageOptions
 from evercal.continual.stage_head import head_for_scene, whiten
 from evercal.continual.stage_map import stage_map
 from evercal.continual.stage_rows import Pacer, encoded, remembered, scene_buffer, view_plan
 from evercal.continual.strategies import Strategy
-from evercal.datasets.frame import Scene, known_poses
+from evercal.localization.fewest_keyframes import AutoMemoryOptions, fewest_keyframes
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 from evercal.mapping.store import Checkpoint, Resume
-from evercal.networks.trainer import HeadTrainer
+from evercal.recordings.frame import Recording, stated_poses
 
 
 def learn(
     maps: SceneMaps,
     strategy: Strategy,
-    scene: Scene,
+    scene: Recording,
     options: StageOptions,
     resume: Resume | None = None,
 ) -> Iterator[Event]:
@@ -54,7 +54,7 @@ def learn(
         scene_map = yield from stage_map(after, frames, options)
         frames = scene_map.adjusted_frames(frames)
     teacher = copy.deepcopy(after.heads[-1]).eval() if after.heads else None
-    positions = known_poses(frames).translation_m
+    positions = stated_poses(frames).translation_m
     cell = after.atlas(options.grid_scenes).place(positions)
     in_atlas = cell.atlas_from_base.apply(positions)
     head, local = head_for_scene(after, method.head_per_scene, options, in_atlas)
@@ -80,10 +80,10 @@ def learn(
     yield finished_stage(after, method, done, options)
 
 
-def _learn_map(maps: SceneMaps, scene: Scene, options: StageOptions) -> Iterator[Event]:
+def _learn_map(maps: SceneMaps, scene: Recording, options: StageOptions) -> Iterator[Event]:
     """Learns a scene by building its map; nothing is trained."""
     after, frames = maps.copy_for_training(), scene.train
-    cell = after.atlas(options.grid_scenes).place(known_poses(frames).translation_m)
+    cell = after.atlas(options.grid_scenes).place(stated_poses(frames).translation_m)
     if options.memory_auto:
         options = replace(options, memory_share=AutoMemoryOptions().most, memory_bytes=None)
     scene_map = yield from stage_map(after, frames, options)

@@ -4,18 +4,18 @@ import os
 from pathlib import Path
 
 from evercal.continual.learn_scene import LearnOptions, LearnReport, OnEvent, learn_scene
-from evercal.continual.memory_budget import with_memory
 from evercal.continual.presets import PRESETS, Preset, short_side
 from evercal.continual.presets import preset as stage_options
 from evercal.continual.strategies import strategy_named
-from evercal.datasets import Scene, load_scene
 from evercal.errors import InputError
+from evercal.mapping.memory_budget import with_memory
+from evercal.recordings import Recording, load_recording
 from evercal.storage import MANIFEST, read_manifest
 
 
 def learn(
     store: str | os.PathLike[str],
-    scene: str | os.PathLike[str] | Scene,
+    scene: str | os.PathLike[str] | Recording,
     *,
     preset: Preset = "fast",
     memory: str | int = "10%",
@@ -48,7 +48,7 @@ def learn(
         raise InputError(f"preset {preset!r}: unknown; use one of {', '.join(PRESETS)}")
     stage = with_memory(stage_options(preset), memory)
     root = Path(store)
-    recorded = scene if isinstance(scene, Scene) else load_scene(scene)
+    recorded = scene if isinstance(scene, Recording) else load_recording(scene)
     options = LearnOptions(
         stage,
         strategy_named(strategy or _made_with(root)),

@@ -6,18 +6,18 @@ from functools import partial
 
 from evercal.continual.finish_scene import Learned, finished_stage, trained_record
 from evercal.continual.methods.method import Method
+from evercal.continual.networks.trainer import HeadTrainer
 from evercal.continual.stage import Event, Stage, StageOptions
 from evercal.continual.stage_head import head_for_all, whiten
 from evercal.continual.stage_map import stage_map
 from evercal.continual.stage_rows import encoded, scene_buffer, view_plan
 from evercal.continual.strategies import Strategy
-from evercal.datasets.frame import Scene, known_poses
 from evercal.mapping.scene_maps import SceneMaps
-from evercal.networks.trainer import HeadTrainer
+from evercal.recordings.frame import Recording, stated_poses
 
 
 def learn_jointly(
-    maps: SceneMaps, strategy: Strategy, scenes: Sequence[Scene], options: StageOptions
+    maps: SceneMaps, strategy: Strategy, scenes: Sequence[Recording], options: StageOptions
 ) -> Iterator[Event]:
     """Trains one head on several scenes, with the steps and the rows of as many stages.
 
@@ -43,7 +43,7 @@ def learn_jointly(
             frames, fit = scene_map.adjusted_frames(frames), fit.with_known_lens()
         learned.append(frames)
         scene_maps.append(scene_map)
-        positions = known_poses(frames).translation_m
+        positions = stated_poses(frames).translation_m
         cells.append(atlas.place(positions))
         places.append(cells[-1].atlas_from_base.apply(positions))
         buffers.append(scene_buffer(number, cells[-1], frames, maps.device))

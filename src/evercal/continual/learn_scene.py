@@ -9,27 +9,27 @@ from pathlib import Path
 
 import torch
 
-from evercal.continual.finish_scene import memory_bytes
-from evercal.continual.learn import learn
-from evercal.continual.stage import Encoding, Stage, StageOptions
-from evercal.continual.strategies import STRATEGIES, Strategy
-from evercal.continual.wrist_camera import (
+from evercal.calibration.eye_in_hand import (
     HandEyeReport,
     hand_eye_report,
     lacks_camera_poses,
     posed_by_gripper,
 )
-from evercal.datasets.frame import MIN_TRAIN_FRAMES, Frame, Scene, posed_scene
+from evercal.continual.finish_scene import memory_bytes
+from evercal.continual.learn import learn
+from evercal.continual.networks.feature_cache import cache_features
+from evercal.continual.networks.trainer import Progress
+from evercal.continual.stage import Encoding, Stage, StageOptions
+from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.errors import InputError
 from evercal.features.device import device_of
-from evercal.features.feature_cache import cache_features
 from evercal.features.weights_file import network_bytes
 from evercal.geometry.se3 import SE3
 from evercal.localization.acceptance import fitted_record
 from evercal.mapping.build import Adjusted, Mapping
 from evercal.mapping.stage_files import head_bytes
 from evercal.mapping.store import Checkpoint, Resume, Store
-from evercal.networks.trainer import Progress
+from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording, posed_recording
 from evercal.storage.manifest import MANIFEST
 
 HELD_OUT_EVERY = 100
@@ -93,7 +93,7 @@ OnEvent = Callable[[Encoding | Mapping | Progress | Checkpoint], None]
 
 
 def learn_scene(
-    store: Path, scene: Scene, options: LearnOptions, on_event: OnEvent | None = None
+    store: Path, scene: Recording, options: LearnOptions, on_event: OnEvent | None = None
 ) -> LearnReport:
     """Learns a scene into a store, or goes on where an interrupted call of the same kind stopped.
 
@@ -116,10 +116,10 @@ def learn_scene(
 
 
 def _learn_scene(
-    opened: Store, scene: Scene, options: LearnOptions, on_event: OnEvent | None, began: float
+    opened: Store, scene: Recording, options: LearnOptions, on_event: OnEvent | None, began: float
 ) -> LearnReport:
     wrist = lacks_camera_poses(scene)
-    scene = scene if wrist else posed_scene(scene)
+    scene = scene if wrist else posed_recording(scene)
     device = device_of(options.device)
     _check(opened, scene, options)
     opened.maps.to(device)
@@ -175,7 +175,7 @@ def open_or_create(store: Path, options: LearnOptions) -> Store:
     return Store.create(store, options.strategy.name, options.short_side, options.encoder)
 
 
-def _check(opened: Store, scene: Scene, options: LearnOptions) -> None:
+def _check(opened: Store, scene: Recording, options: LearnOptions) -> None:
     names = [record.name for record in opened.maps.scenes]
     if scene.name in names:
         raise InputError(
@@ -213,7 +213,7 @@ def _check(opened: Store, scene: Scene, options: LearnOptions) -> None:
         )
 
 
-def _identity(opened: Store, scene: Scene, options: LearnOptions) -> dict[str, object]:
+def _identity(opened: Store, scene: Recording, options: LearnOptions) -> dict[str, object]:
     """Whatever changes the outcome of a stage: only the same identity may be resumed."""
     poses = hashlib.sha256()
     for frame in scene.train:
@@ -240,7 +240,7 @@ def _identity(opened: Store, scene: Scene, options: LearnOptions) -> dict[str, o
 
 def run_stage(
     opened: Store,
-    train_split: Scene,
+    train_split: Recording,
     options: LearnOptions,
     resume: Resume | None,
     on_event: OnEvent | None,

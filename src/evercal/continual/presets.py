@@ -3,11 +3,11 @@
 from dataclasses import replace
 from typing import Literal
 
+from evercal.continual.networks.buffer import EncodePlan
+from evercal.continual.networks.head import HeadOptions
+from evercal.continual.networks.loss import LossOptions
+from evercal.continual.networks.trainer import FitOptions
 from evercal.continual.stage import StageOptions
-from evercal.networks.buffer import EncodePlan
-from evercal.networks.head import HeadOptions
-from evercal.networks.loss import LossOptions
-from evercal.networks.trainer import FitOptions
 
 Preset = Literal["fast", "demo", "bench", "paper"]
 

@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from evercal.datasets.frame import Frame
+from evercal.continual.networks.buffer import EncodePlan
+from evercal.continual.networks.head import HeadOptions
+from evercal.continual.networks.trainer import FitOptions, Progress
 from evercal.mapping.build import MapOptions, Mapping, SceneMap
 from evercal.mapping.keyframes import store_keyframes
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Checkpoint
-from evercal.networks.buffer import EncodePlan
-from evercal.networks.head import HeadOptions
-from evercal.networks.trainer import FitOptions, Progress
+from evercal.recordings.frame import Frame
 
 SAMPLED_FRAMES = 8
 """Frames whose size as keyframes is measured, where memory is given in bytes."""

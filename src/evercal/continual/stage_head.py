@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from evercal.continual.networks.atlas import camera_clusters
+from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.continual.networks.head import Head
 from evercal.continual.stage import StageOptions
-from evercal.mapping.atlas import camera_clusters
 from evercal.mapping.scene_maps import SceneMaps
-from evercal.networks.buffer import FeatureBuffer
-from evercal.networks.head import Head
 
 WHITENING_ROWS = 20_000
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from evercal.continual.stage import StageOptions
-from evercal.datasets.frame import Frame
 from evercal.mapping.build import Mapping, SceneMap, map_steps, spread_frames
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.selection import spread_poses
+from evercal.recordings.frame import Frame
 
 
 def stage_map(

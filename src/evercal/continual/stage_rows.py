@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import torch
 
+from evercal.continual.networks.atlas import Cell
+from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, encode_frames
 from evercal.continual.stage import Encoding, Event, StageOptions
-from evercal.datasets.frame import Frame
-from evercal.mapping.atlas import Cell
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Checkpoint, Resume
-from evercal.networks.buffer import EncodePlan, FeatureBuffer, encode_frames
+from evercal.recordings.frame import Frame
 
 CHECKPOINT_SECONDS = 10.0
 

@@ -7,10 +7,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.datasets import Frame, Scene, known_poses, posed
 from evercal.errors import InputError
 from evercal.evaluation.metrics import FrameResult, Status
 from evercal.geometry import SE3, Camera, near_training, pose_distance, squared_mahalanobis
+from evercal.recordings import Frame, Recording, posed_frames, stated_poses
 
 
 class Estimate(Protocol):
@@ -57,14 +57,14 @@ class SceneLocalizer(Protocol):
 
 def evaluate(
     localizer: SceneLocalizer,
-    scenes: Mapping[str, Scene],
+    scenes: Mapping[str, Recording],
     seed: int = 0,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> list[FrameResult]:
     """Localizes every test image of all scenes, one at a time and in random order, and scores it.
 
     The localizer sees an image and its camera only. Names are used afterwards: errors count if
-    the scene that was found is the frame's, or has the same base frame (`Scene.base`), and are
+    the scene that was found is the frame's, or has the same base frame (`Recording.base`), and are
     infinite otherwise. Test frames whose pose is
     not known cannot be scored and are left out.
 
@@ -95,13 +95,13 @@ def evaluate(
     return [results[index] for index in range(len(jobs))]
 
 
-def _test_frames(localizer: SceneLocalizer, name: str, scene: Scene) -> tuple[Frame, ...]:
+def _test_frames(localizer: SceneLocalizer, name: str, scene: Recording) -> tuple[Frame, ...]:
     if name not in localizer.scenes:
         raise InputError(
             f"scene {name!r} is not in the store, which knows {_listed(localizer.scenes)};"
             f" give it as NAME=SCENE with the name under which it was learned"
         )
-    frames = posed(scene.test)
+    frames = posed_frames(scene.test)
     if not frames:
         raise InputError(
             f"scene {name!r} has {len(scene.test)} test frames, none with a known pose;"
@@ -110,7 +110,7 @@ def _test_frames(localizer: SceneLocalizer, name: str, scene: Scene) -> tuple[Fr
     return frames
 
 
-def _alike(name: str, scenes: Mapping[str, Scene]) -> set[str]:
+def _alike(name: str, scenes: Mapping[str, Recording]) -> set[str]:
     """The scenes in whose base frame a scene's poses are told."""
     base = scenes[name].base
     return {name} | {n for n, scene in scenes.items() if base is not None and scene.base == base}
@@ -148,8 +148,8 @@ def _result(
     )
 
 
-def _near(scene: Scene, frames: Sequence[Frame]) -> list[bool]:
-    return near_training(known_poses(scene.train), known_poses(frames)).tolist()
+def _near(scene: Recording, frames: Sequence[Frame]) -> list[bool]:
+    return near_training(stated_poses(scene.train), stated_poses(frames)).tolist()
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -3,13 +3,13 @@
 import os
 from collections.abc import Mapping, Sequence
 
-from evercal.datasets import Scene, load_scene
 from evercal.errors import InputError
 from evercal.evaluation.metrics import Scores, scores
 from evercal.evaluation.protocol import SceneLocalizer
 from evercal.evaluation.protocol import evaluate as frame_results
+from evercal.recordings import Recording, load_recording
 
-Recorded = str | os.PathLike[str] | Scene
+Recorded = str | os.PathLike[str] | Recording
 """The folder of a recorded scene, or the scene itself."""
 
 
@@ -32,11 +32,11 @@ def evaluate(
     return scores(frame_results(localizer, _named(scenes)))
 
 
-def _named(scenes: Recorded | Sequence[Recorded] | Mapping[str, Recorded]) -> dict[str, Scene]:
+def _named(scenes: Recorded | Sequence[Recorded] | Mapping[str, Recorded]) -> dict[str, Recording]:
     if isinstance(scenes, Mapping):
         return {name: _loaded(scene) for name, scene in scenes.items()}
-    given = [scenes] if isinstance(scenes, str | os.PathLike | Scene) else scenes
-    named: dict[str, Scene] = {}
+    given = [scenes] if isinstance(scenes, str | os.PathLike | Recording) else scenes
+    named: dict[str, Recording] = {}
     for recorded in given:
         scene = _loaded(recorded)
         if scene.name in named:
@@ -48,5 +48,5 @@ def _named(scenes: Recorded | Sequence[Recorded] | Mapping[str, Recorded]) -> di
     return named
 
 
-def _loaded(scene: Recorded) -> Scene:
-    return scene if isinstance(scene, Scene) else load_scene(scene)
+def _loaded(scene: Recorded) -> Recording:
+    return scene if isinstance(scene, Recording) else load_recording(scene)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evercal.features.descriptor import Descriptor
+from evercal.continual.networks.descriptor import Descriptor
 from evercal.features.device import device_of_network
 from evercal.features.encoder import Encoder
 from evercal.features.precision import autocast

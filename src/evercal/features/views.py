@@ -10,9 +10,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from evercal.datasets.frame import Frame
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
+from evercal.recordings.frame import Frame
 
 
 @dataclass(frozen=True)

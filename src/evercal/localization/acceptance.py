@@ -14,12 +14,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from evercal.datasets.frame import Frame
 from evercal.geometry import pose_distance, squared_mahalanobis
 from evercal.geometry.near import NEAR_M, NEAR_RAD
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord, with_fit
+from evercal.recordings.frame import Frame
 from evercal.simulation.box_room import BoxRoom, default_camera
 
 NEGATIVE_ROOM_SEED = 8_990

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evercal.datasets.frame import Frame, known_poses
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.features.vlad import vlad_for
@@ -30,7 +29,7 @@ from evercal.mapping.pose_check import (
     depth_scale,
     matched_pairs,
 )
-from evercal.mapping.recording import Recording, WorkingSize
+from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
 from evercal.mapping.scene_maps import frame_moved_by_cameras
 from evercal.mapping.selection import select_farthest, spread_poses
 from evercal.mapping.tracks import (
@@ -39,6 +38,7 @@ from evercal.mapping.tracks import (
     open_keyframe,
     refine_depths,
 )
+from evercal.recordings.frame import Frame, stated_poses
 
 Result = TypeVar("Result")
 
@@ -161,7 +161,7 @@ class SceneMap:
         """
         common = self.hand_eye.start_camera_from_camera if self.hand_eye else self.common
         moved = SE3.exp(self.adjusted.time_shift_frames * _velocity(frames))
-        poses = known_poses(frames) @ moved
+        poses = stated_poses(frames) @ moved
         nominal, found = frames[0].camera, []
         for i, frame in enumerate(frames):
             if frame.name in self.adjusted.wrong_poses:
@@ -258,11 +258,11 @@ def _open(
     encoder: Encoder,
     chosen: Sequence[int] | NDArray[np.int64],
     options: MapOptions,
-) -> Generator[Mapping, None, tuple[Recording, list[int], tuple[str, ...]]]:
+) -> Generator[Mapping, None, tuple[PreparedFrames, list[int], tuple[str, ...]]]:
     """Frames that take part, which of them are keyframes, and names of those left out."""
     wanted = {int(i) for i in chosen}
     support = sorted({*spread_frames(frames, options.support_frames).tolist(), *wanted})
-    recording = Recording([frames[i] for i in support], encoder, options.size)
+    recording = PreparedFrames([frames[i] for i in support], encoder, options.size)
     for i in range(len(recording)):
         recording.features(i)
         yield Mapping("encoding", i + 1, len(recording))
@@ -282,7 +282,7 @@ def _open(
 
 def spread_frames(frames: Sequence[Frame], capacity: int) -> NDArray[np.int64]:
     """Posed frames spread over their poses, see `spread_poses`."""
-    return spread_poses(known_poses(frames), capacity)
+    return spread_poses(stated_poses(frames), capacity)
 
 
 def _velocity(frames: Sequence[Frame]) -> np.ndarray:
@@ -290,7 +290,7 @@ def _velocity(frames: Sequence[Frame]) -> np.ndarray:
 
     Jumps of the recording (blocks left out) are told by steps much longer than the median one.
     """
-    poses = known_poses(frames)
+    poses = stated_poses(frames)
     if len(frames) < 3:
         return np.zeros((len(frames), 6))
     steps = (poses[:-1].inverse() @ poses[1:]).log()
@@ -303,7 +303,7 @@ def _velocity(frames: Sequence[Frame]) -> np.ndarray:
 
 
 def _adjust(
-    recording: Recording,
+    recording: PreparedFrames,
     keyframes: list[KeyframeTracks],
     velocity: np.ndarray,
     options: MapOptions,
@@ -325,7 +325,9 @@ def _adjust(
     return adjustment
 
 
-def _refined_again(recording: Recording, options: TrackOptions, keyframe: KeyframeTracks) -> None:
+def _refined_again(
+    recording: PreparedFrames, options: TrackOptions, keyframe: KeyframeTracks
+) -> None:
     refine_depths(recording, keyframe, options, again=True)
 
 
@@ -349,7 +351,7 @@ def _moved(stated: SE3, camera: Camera, adjustment: Adjustment) -> bool:
 
 
 def _finished(
-    recording: Recording,
+    recording: PreparedFrames,
     keyframes: list[KeyframeTracks],
     adjustment: Adjustment | None,
     wrong: tuple[str, ...],
@@ -397,7 +399,7 @@ def _finished(
 
 
 def _adjusted(
-    recording: Recording, adjustment: Adjustment | None, camera: Camera, wrong: tuple[str, ...]
+    recording: PreparedFrames, adjustment: Adjustment | None, camera: Camera, wrong: tuple[str, ...]
 ) -> Adjusted:
     if adjustment is None:
         zero = (0.0, 0.0, 0.0)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from evercal.mapping.bundle_adjustment import BundleTracks
-from evercal.mapping.recording import Recording
+from evercal.mapping.prepared_frames import PreparedFrames
 from evercal.mapping.tracks import KeyframeTracks, Observations, TrackOptions, joined, observe
 
 _WIDE_STEPS = ((2, 4), (1, 4), (0, 4))
@@ -11,7 +11,7 @@ _PROBES = 64
 
 
 def bundle_tracks(
-    recording: Recording, keyframes: list[KeyframeTracks], options: TrackOptions
+    recording: PreparedFrames, keyframes: list[KeyframeTracks], options: TrackOptions
 ) -> BundleTracks:
     """A spread subset of the landmarks, in all frames that see enough of their keyframe."""
     o = options
@@ -53,7 +53,7 @@ def bundle_tracks(
 
 
 def _tied_frames(
-    recording: Recording, keyframes: list[KeyframeTracks], options: TrackOptions
+    recording: PreparedFrames, keyframes: list[KeyframeTracks], options: TrackOptions
 ) -> list[list[int]]:
     """Frames in which each keyframe's landmarks are looked for."""
     shared = np.stack([_shared(recording, keyframe) for keyframe in keyframes])
@@ -67,7 +67,7 @@ def _tied_frames(
     ]
 
 
-def _shared(recording: Recording, keyframe: KeyframeTracks) -> np.ndarray:
+def _shared(recording: PreparedFrames, keyframe: KeyframeTracks) -> np.ndarray:
     """(n,) how much of a keyframe's view every frame sees from a similar direction, 0 to 1."""
     cells = recording.posed_cells(keyframe.frame)
     some = np.linspace(0, len(keyframe.cell_inverse_depth) - 1, _PROBES).astype(int)

@@ -14,11 +14,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from evercal.datasets.frame import Frame
 from evercal.features.views import working_image
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.mapping.landmarks import Landmarks
+from evercal.recordings.frame import Frame
 
 JPEG_QUALITY = 95
 _LANDMARK_FIELDS = {

@@ -15,7 +15,7 @@ from evercal.features.precision import fast_bfloat16
 from evercal.features.views import ideal_cell_pixels
 from evercal.features.vlad import Vlad
 from evercal.mapping.plane_sweep import FAR_M, NEAR_M, USUAL_M
-from evercal.mapping.recording import Recording
+from evercal.mapping.prepared_frames import PreparedFrames
 
 Array = NDArray[np.floating]
 
@@ -56,7 +56,9 @@ class MatchedPair:
     """(n, 2) pixels at working size in the second one."""
 
 
-def matched_pairs(recording: Recording, vlad: Vlad, options: PoseCheckOptions) -> list[MatchedPair]:
+def matched_pairs(
+    recording: PreparedFrames, vlad: Vlad, options: PoseCheckOptions
+) -> list[MatchedPair]:
     """Every frame with those that look most alike, where enough of their patches match."""
     count = len(recording)
     whole = torch.stack([vlad(recording.features(i)) for i in range(count)])
@@ -67,7 +69,7 @@ def matched_pairs(recording: Recording, vlad: Vlad, options: PoseCheckOptions) -
 
 
 def contradicting_frames(
-    recording: Recording, pairs: list[MatchedPair], options: PoseCheckOptions
+    recording: PreparedFrames, pairs: list[MatchedPair], options: PoseCheckOptions
 ) -> NDArray[np.int64]:
     """Frames whose stated pose disagrees with most of the frames that look alike."""
     count = len(recording)
@@ -88,7 +90,7 @@ def contradicting_frames(
     return np.array(sorted(bad), np.int64)
 
 
-def depth_scale(recording: Recording, pairs: list[MatchedPair]) -> float:
+def depth_scale(recording: PreparedFrames, pairs: list[MatchedPair]) -> float:
     """How far away surfaces are, in parts of what is usual in a room; 1 where that range fits.
 
     Recordings have other scales where their unit of length is unknown, and seen from a wrist or in
@@ -103,7 +105,7 @@ def depth_scale(recording: Recording, pairs: list[MatchedPair]) -> float:
     return 1.0 if usual else float(middle / USUAL_M)
 
 
-def _matched(recording: Recording, i: int, j: int, options: PoseCheckOptions) -> MatchedPair:
+def _matched(recording: PreparedFrames, i: int, j: int, options: PoseCheckOptions) -> MatchedPair:
     """Patches that are most alike both ways."""
     a, b = recording.features(i)[:: options.stride], recording.features(j)
     if fast_bfloat16(a.device):
@@ -123,7 +125,7 @@ def _matched(recording: Recording, i: int, j: int, options: PoseCheckOptions) ->
     return MatchedPair(i, j, ray[known], seen[known])
 
 
-def _distance(recording: Recording, pair: MatchedPair) -> float:
+def _distance(recording: PreparedFrames, pair: MatchedPair) -> float:
     """Median distance of matches from their segments."""
     other, scale = recording.cell_camera(pair.second), recording.depth_scale
     turn, shift = recording.relative(pair.second, pair.first)
@@ -133,7 +135,7 @@ def _distance(recording: Recording, pair: MatchedPair) -> float:
     return float(np.median(_segment_distance(pair.seen, *ends)))
 
 
-def _triangulated(recording: Recording, pair: MatchedPair) -> Array:
+def _triangulated(recording: PreparedFrames, pair: MatchedPair) -> Array:
     """Depths of the matches that parallax moves far along their lines and that lie near them."""
     other = recording.cell_camera(pair.second)
     turn, shift = recording.relative(pair.second, pair.first)

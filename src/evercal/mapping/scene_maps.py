@@ -9,16 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from evercal.features.descriptor import Descriptor
+from evercal.continual.networks.atlas import Atlas, Cell
+from evercal.continual.networks.descriptor import Descriptor
+from evercal.continual.networks.head import Head
 from evercal.features.device import device_of_network
 from evercal.features.encoder import Encoder
 from evercal.geometry.camera import Camera
 from evercal.geometry.pose_covariance import cross_matrix, with_translation_by
 from evercal.geometry.se3 import SE3
-from evercal.mapping.atlas import Atlas, Cell
 from evercal.mapping.frame_correction import FrameCorrection
 from evercal.mapping.keyframes import Keyframes
-from evercal.networks.head import Head
 
 MAX_PROTOTYPES = 256
 

@@ -10,14 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from evercal.continual.networks.atlas import Cell
+from evercal.continual.networks.head import Head, HeadOptions
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder, checked_encoder
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
-from evercal.mapping.atlas import Cell
 from evercal.mapping.frame_correction import FrameCorrection
 from evercal.mapping.scene_maps import Alignment, SceneRecord
-from evercal.networks.head import Head, HeadOptions
 from evercal.storage.atomic import write_bytes, write_json
 
 HEAD = "head.safetensors"

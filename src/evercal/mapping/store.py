@@ -33,8 +33,8 @@ import torch
 from filelock import FileLock, Timeout
 from torch import Tensor, nn
 
+from evercal.continual.networks.descriptor import PooledDescriptor, descriptor_for, load_descriptor
 from evercal.errors import InputError
-from evercal.features.descriptor import PooledDescriptor, descriptor_for, load_descriptor
 from evercal.features.encoder import Encoder, checked_encoder, load_encoder
 from evercal.features.vlad import load_centroids, save_centroids, shipped_centroids
 from evercal.features.weights_file import network_bytes

@@ -15,7 +15,7 @@ from evercal.mapping.plane_sweep import (
     inverse_depths,
     select_source_views,
 )
-from evercal.mapping.recording import PYRAMID_LEVELS, Recording
+from evercal.mapping.prepared_frames import PYRAMID_LEVELS, PreparedFrames
 
 Array = NDArray[np.floating]
 
@@ -85,7 +85,7 @@ class Observations:
     """(m, 2, 2) see `patches.whitening`."""
 
 
-def open_keyframe(recording: Recording, frame: int, options: TrackOptions) -> KeyframeTracks:
+def open_keyframe(recording: PreparedFrames, frame: int, options: TrackOptions) -> KeyframeTracks:
     """Landmarks of a keyframe with depths from a plane sweep over other frames."""
     view, poses = recording.posed_cells(frame), recording.poses
     cameras = [recording.cell_camera(i) for i in range(len(recording))]
@@ -111,7 +111,7 @@ def open_keyframe(recording: Recording, frame: int, options: TrackOptions) -> Ke
 
 
 def observe(
-    recording: Recording,
+    recording: PreparedFrames,
     keyframe: KeyframeTracks,
     frame: int,
     which: NDArray[np.int64],
@@ -149,7 +149,7 @@ _DEPTH_ROUNDS = ((((1, 6),), 1), (((1, 3), (0, 5)), 2), (((0, 4),), 2))
 
 
 def refine_depths(
-    recording: Recording, keyframe: KeyframeTracks, options: TrackOptions, again: bool = False
+    recording: PreparedFrames, keyframe: KeyframeTracks, options: TrackOptions, again: bool = False
 ) -> None:
     """Gauss-Newton on the inverse depths of a keyframe's landmarks; poses stay.
 
@@ -192,7 +192,7 @@ _FAR_OFF_PX = 1e3
 
 
 def _residuals(
-    recording: Recording, keyframe: KeyframeTracks, seen: Observations
+    recording: PreparedFrames, keyframe: KeyframeTracks, seen: Observations
 ) -> tuple[Array, Array]:
     """Residuals (m, 2) in pixels and their derivatives (m, 2) by the inverse depth."""
     rays = recording.cameras[keyframe.frame].unproject(keyframe.landmarks.pixels)
@@ -216,7 +216,7 @@ def _ahead(points: Array) -> Array:
 
 
 def _weighted(
-    recording: Recording, keyframe: KeyframeTracks, seen: Observations
+    recording: PreparedFrames, keyframe: KeyframeTracks, seen: Observations
 ) -> tuple[Array, Array, Array, Array]:
     """Residuals (m, 2) in pixels, whitened residuals and slopes (m, 2), robust weights (m,)."""
     raw, slope = _residuals(recording, keyframe, seen)
@@ -225,7 +225,7 @@ def _weighted(
     return raw, residual, slope, 1 / (1 + (residual**2).sum(1))
 
 
-def _depth_step(recording: Recording, keyframe: KeyframeTracks, seen: Observations) -> None:
+def _depth_step(recording: PreparedFrames, keyframe: KeyframeTracks, seen: Observations) -> None:
     marks, n = keyframe.landmarks, len(keyframe.landmarks)
     _, residual, slope, weight = _weighted(recording, keyframe, seen)
     pull = np.bincount(seen.landmark, weight * (slope * residual).sum(1), n)
@@ -239,7 +239,7 @@ def _depth_step(recording: Recording, keyframe: KeyframeTracks, seen: Observatio
 
 
 def _judge(
-    recording: Recording, keyframe: KeyframeTracks, seen: Observations, options: TrackOptions
+    recording: PreparedFrames, keyframe: KeyframeTracks, seen: Observations, options: TrackOptions
 ) -> None:
     """Which landmarks are kept, and the uncertainty of their inverse depths."""
     marks, n = keyframe.landmarks, len(keyframe.landmarks)

@@ -1,1 +1,20 @@
-"""HTML pages and pictures of what the other folders found out."""
+"""Reports: HTML pages, charts and overlays."""
+
+from evercal.reports.charts import accuracy_against_size as accuracy_against_size
+from evercal.reports.charts import error_curve as error_curve
+from evercal.reports.charts import error_histogram as error_histogram
+from evercal.reports.charts import forgetting_curves as forgetting_curves
+from evercal.reports.charts import kept_places as kept_places
+from evercal.reports.charts import scene_bars as scene_bars
+from evercal.reports.charts import trajectory as trajectory
+from evercal.reports.overlay import contact_sheet as contact_sheet
+from evercal.reports.overlay import encode_image as encode_image
+from evercal.reports.overlay import overlay_lines as overlay_lines
+from evercal.reports.overlay import overlay_points as overlay_points
+from evercal.reports.page import Picture as Picture
+from evercal.reports.page import Section as Section
+from evercal.reports.page import Table as Table
+from evercal.reports.page import html_page as html_page
+from evercal.reports.uncertainty import ellipsoid_shadows as ellipsoid_shadows
+from evercal.reports.uncertainty import error_terms as error_terms
+from evercal.reports.uncertainty import residual_bars as residual_bars

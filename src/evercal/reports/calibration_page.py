@@ -11,7 +11,7 @@ import numpy as np
 
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.verdict import TIERS, expected_error, tier, verdict
-from evercal.drawing import (
+from evercal.reports import (
     Picture,
     Section,
     Table,

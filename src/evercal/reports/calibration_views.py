@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.calibration.from_images import map_digest
-from evercal.datasets.images import read_image
-from evercal.drawing import overlay_points
 from evercal.errors import InputError
+from evercal.recordings.images import read_image
+from evercal.reports import overlay_points
 from evercal.reports.frame_axes import (
     AxesInView,
     axes_in_view,

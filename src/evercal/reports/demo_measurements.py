@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.drift import Shift, check
 from evercal.calibration.from_images import Images, calibrate
-from evercal.datasets import Scene
 from evercal.errors import InputError
 from evercal.evaluation import FrameResult, evaluate, scores
 from evercal.geometry import SE3, pose_distance_mm_deg
+from evercal.recordings import Recording
 from evercal.reports.demo_outcome import Bump, DemoOutcome, FixedCamera, UnknownRoom
 from evercal.simulation.box_room import BoxRoom
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
-    from evercal.simulation.mini import CellRoom
+    from evercal.recordings.samples import SampleRoom
 
 UNKNOWN_ROOM_SEED = 4_711
 UNKNOWN_IMAGES = 20
@@ -32,7 +32,7 @@ class Look:
 
     localizer: "Localizer"
     """Answers."""
-    rooms: "Sequence[CellRoom]"
+    rooms: "Sequence[SampleRoom]"
     """In order of learning."""
     on_image: Callable[[], object] = lambda: None
     """Called after every image."""
@@ -99,7 +99,7 @@ class Look:
             self.on_image()
         outcome.unknown = UnknownRoom(UNKNOWN_IMAGES, refused)
 
-    def _calibrated(self, recording: Scene, name: str) -> Calibration | None:
+    def _calibrated(self, recording: Recording, name: str) -> Calibration | None:
         """The camera of a recording, if it was found in the room of this name."""
         given = Images(_images(recording), recording.test[0].camera)
         try:
@@ -112,11 +112,11 @@ class Look:
         self.on_image()
 
 
-def _images(recording: Scene) -> list[tuple[str, NDArray[np.uint8]]]:
+def _images(recording: Recording) -> list[tuple[str, NDArray[np.uint8]]]:
     return [(frame.name, frame.read_image()) for frame in recording.test]
 
 
-def _fixed_camera(name: str, recording: Scene, found: Calibration | None) -> FixedCamera:
+def _fixed_camera(name: str, recording: Recording, found: Calibration | None) -> FixedCamera:
     """What was found, compared with the truth."""
     count = len(recording.test)
     if found is None:
@@ -127,13 +127,13 @@ def _fixed_camera(name: str, recording: Scene, found: Calibration | None) -> Fix
     )
 
 
-def _bump(name: str, recordings: tuple[Scene, Scene], shift: Shift) -> Bump:
+def _bump(name: str, recordings: tuple[Recording, Recording], shift: Shift) -> Bump:
     true = pose_distance_mm_deg(*(_truth(recording) for recording in recordings))
     found = (shift.translation_mm, shift.rotation_deg)
     return Bump(name, *found, *true, shift.sigma_mm, shift.moved)
 
 
-def _truth(recording: Scene) -> SE3:
+def _truth(recording: Recording) -> SE3:
     truth = recording.test[0].base_from_camera
     assert truth is not None, "the simulator knows every pose"
     return truth

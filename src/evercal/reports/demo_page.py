@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evercal.benchmark.tables import SCENE_HEADER, scene_rows
-from evercal.drawing import (
+from evercal.evaluation.tables import SCENE_HEADER, scene_rows
+from evercal.reports import (
     Picture,
     Section,
     Table,
@@ -30,10 +30,10 @@ from evercal.reports.demo_outcome import (
 from evercal.reports.pictures import draw_landmarks
 
 if TYPE_CHECKING:
-    from evercal.datasets import Frame, Scene
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import Localizer
-    from evercal.simulation.mini import CellRoom
+    from evercal.recordings import Frame, Recording
+    from evercal.recordings.samples import SampleRoom
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73")
 _OVERLAYS_PER_ROOM = 3
@@ -41,7 +41,7 @@ _HISTOGRAM_MM = 5.0
 
 
 def write_pictures(
-    out: Path, localizer: "Localizer", places: "Sequence[CellRoom]", outcome: DemoOutcome
+    out: Path, localizer: "Localizer", places: "Sequence[SampleRoom]", outcome: DemoOutcome
 ) -> None:
     """Writes `overview.png` and `report.html`.
 
@@ -81,7 +81,7 @@ def _learning(overview: bytes, outcome: DemoOutcome) -> list[Section]:
 
 
 def _test_images(
-    places: "Sequence[CellRoom]", overlays: "list[list[_Overlay]]", outcome: DemoOutcome
+    places: "Sequence[SampleRoom]", overlays: "list[list[_Overlay]]", outcome: DemoOutcome
 ) -> list[Section]:
     """How well the test images were located, and with which landmarks."""
     assert outcome.test is not None, "test images are located before a report is made"
@@ -98,20 +98,11 @@ def _test_images(
             ],
         )
     ]
-    pairs = zip(places, overlays, strict=True)
-    # One image a room: a second of rendering is most of what the page costs.
-    rendered = [
-        image for place, found in pairs for image in _untextured_overlays(place, found[1:2])
-    ]
-    if rendered:
-        sheet = encode_image(contact_sheet(rendered, _OVERLAYS_PER_ROOM), "jpg")
-        said = "A room's bare shapes, rendered at the estimated pose, laid over the test image."
-        sections.append(Section("Rendered at the estimated pose", [said, Picture(sheet)]))
     return sections
 
 
 def _changed_rooms(
-    localizer: "Localizer", places: "Sequence[CellRoom]", outcome: DemoOutcome
+    localizer: "Localizer", places: "Sequence[SampleRoom]", outcome: DemoOutcome
 ) -> list[Section]:
     """How well images were located after the rooms had changed."""
     if outcome.changed is None:
@@ -200,7 +191,7 @@ class _Overlay:
         return self.estimate.inliers if self.estimate.status == "ok" else 0
 
 
-def _overlays(localizer: "Localizer", scene: "Scene") -> list[_Overlay]:
+def _overlays(localizer: "Localizer", scene: "Recording") -> list[_Overlay]:
     """Of test frames spread over the recording."""
     found = []
     for frame in _spread(scene):
@@ -210,26 +201,7 @@ def _overlays(localizer: "Localizer", scene: "Scene") -> list[_Overlay]:
     return found
 
 
-def _untextured_overlays(place: "CellRoom", overlays: list[_Overlay]) -> list[np.ndarray]:
-    """Test images of a room with its bare shapes over them; none where they cannot be rendered."""
-    from evercal.simulation.mini import untextured_renders
-
-    frames, poses = [], []
-    for overlay in overlays:
-        pose = overlay.estimate.base_from_camera
-        if overlay.estimate.scene == place.scene.name and pose is not None:
-            frames.append(overlay.frame)
-            poses.append(pose)
-    if place.model is None or not frames:
-        return []
-    views = untextured_renders(place.model, frames, poses)
-    return [
-        ((frame.read_image().astype(int) + view) // 2).astype(np.uint8)
-        for frame, view in zip(frames, views, strict=False)
-    ]
-
-
-def _spread(scene: "Scene") -> "list[Frame]":
+def _spread(scene: "Recording") -> "list[Frame]":
     """Test frames spread over the recording."""
     places = np.linspace(0, len(scene.test), _OVERLAYS_PER_ROOM, endpoint=False)
     half = len(scene.test) / (2 * _OVERLAYS_PER_ROOM)

@@ -3,7 +3,7 @@
 import statistics
 from typing import TYPE_CHECKING
 
-from evercal.benchmark.tables import distance
+from evercal.evaluation.tables import distance
 from evercal.reports.demo_outcome import DemoOutcome, located
 
 if TYPE_CHECKING:

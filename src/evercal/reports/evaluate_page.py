@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from evercal.reports.pictures import draw_estimate
 
 if TYPE_CHECKING:
-    from evercal.datasets import Frame, Scene
-    from evercal.drawing import Section, Table
     from evercal.evaluation import FrameResult, Scores
     from evercal.geometry import SE3, Camera
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import Localizer
+    from evercal.recordings import Frame, Recording
+    from evercal.reports import Section, Table
 
 _WORST = 12
 _AXES_CM = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
@@ -33,7 +33,7 @@ class Watch:
         scenes: by name; their frames stay as they are.
     """
 
-    def __init__(self, localizer: "Localizer", scenes: "Mapping[str, Scene]"):
+    def __init__(self, localizer: "Localizer", scenes: "Mapping[str, Recording]"):
         self.localizer = localizer
         self.watched = {name: _with_own_cameras(scene) for name, scene in scenes.items()}
         self._poses: dict[int, SE3] = {}
@@ -55,7 +55,7 @@ class Watch:
         return self._poses.get(id(frame.camera))
 
 
-def _with_own_cameras(scene: "Scene") -> "Scene":
+def _with_own_cameras(scene: "Recording") -> "Recording":
     frames = (dataclasses.replace(f, camera=dataclasses.replace(f.camera)) for f in scene.test)
     return dataclasses.replace(scene, test=tuple(frames))
 
@@ -71,7 +71,7 @@ def evaluation_page(
         summary: of the results.
         store: its path, for the title.
     """
-    from evercal.drawing import Picture, Section, html_page
+    from evercal.reports import Picture, Section, html_page
 
     errors: dict[str, list[float]] = {}
     for result in results:
@@ -89,7 +89,7 @@ def evaluation_page(
 
 def _curve(errors: "Mapping[str, Sequence[float]]") -> bytes:
     """The error curve, with an axis that shows 95 % of the errors."""
-    from evercal.drawing import error_curve
+    from evercal.reports import error_curve
 
     finite = [100 * e for values in errors.values() for e in values if math.isfinite(e)]
     most = float(np.quantile(finite, 0.95)) if finite else math.inf
@@ -109,14 +109,14 @@ def _summary(summary: "Scores") -> str:
 
 
 def _table(summary: "Scores") -> "Table":
-    from evercal.benchmark.tables import SCENE_HEADER, scene_rows
-    from evercal.drawing import Table
+    from evercal.evaluation.tables import SCENE_HEADER, scene_rows
+    from evercal.reports import Table
 
     return Table(SCENE_HEADER, scene_rows(summary))
 
 
 def _trajectory(watch: Watch, name: str, rows: "list[FrameResult]") -> "Section":
-    from evercal.drawing import Picture, Section, trajectory
+    from evercal.reports import Picture, Section, trajectory
 
     frames = {frame.name: frame for frame in watch.watched[name].test}
     truth, estimated, ok = [], [], []
@@ -135,7 +135,7 @@ def _trajectory(watch: Watch, name: str, rows: "list[FrameResult]") -> "Section"
 
 
 def _worst(watch: Watch, results: "Sequence[FrameResult]") -> "Section":
-    from evercal.drawing import Picture, Section, contact_sheet, encode_image
+    from evercal.reports import Picture, Section, contact_sheet, encode_image
 
     chosen = sorted(results, key=lambda r: (-r.translation_error_m, r.inlier_ratio))[:_WORST]
     images, captions = [], []
@@ -152,7 +152,7 @@ def _worst(watch: Watch, results: "Sequence[FrameResult]") -> "Section":
 
 
 def _verdict(result: "FrameResult") -> str:
-    from evercal.benchmark.tables import distance
+    from evercal.evaluation.tables import distance
 
     if math.isfinite(result.translation_error_m):
         degrees = math.degrees(result.rotation_error_rad)

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evercal.drawing import overlay_lines
 from evercal.geometry import SE3, Camera
+from evercal.reports import overlay_lines
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]

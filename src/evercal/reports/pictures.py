@@ -31,7 +31,7 @@ def draw_estimate(
     Returns:
         A new image of the same size.
     """
-    from evercal.drawing import overlay_points
+    from evercal.reports import overlay_points
 
     height, width = image.shape[:2]
     if estimate.base_from_camera is None or estimate.points_m is None:
@@ -64,7 +64,7 @@ def draw_landmarks(
     """
     import cv2
 
-    from evercal.drawing import overlay_points
+    from evercal.reports import overlay_points
 
     height, width = 2 * image.shape[0], 2 * image.shape[1]
     large = cv2.resize(image, (width, height), interpolation=cv2.INTER_CUBIC).astype(np.uint8)

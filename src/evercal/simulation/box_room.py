@@ -11,9 +11,9 @@ from functools import cached_property
 
 import numpy as np
 
-from evercal.datasets.frame import Frame, Scene
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
+from evercal.recordings.frame import Frame, Recording
 from evercal.simulation.furnished.textures import dead_leaves, one_over_f
 
 NEAR_M = 0.05
@@ -240,7 +240,7 @@ def default_camera(width: int = 320, height: int = 240) -> Camera:
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
-def box_room_scene(seed: int, train: int, test: int, camera: Camera | None = None) -> Scene:
+def box_room_scene(seed: int, train: int, test: int, camera: Camera | None = None) -> Recording:
     """A box room as a scene: two different sweeps, one to learn and one to be judged on.
 
     Args:
@@ -263,7 +263,7 @@ def box_room_scene(seed: int, train: int, test: int, camera: Camera | None = Non
         )
 
     name = f"box-room-{seed}"
-    return Scene(name, record("train", train, 1), record("test", test, 2))
+    return Recording(name, record("train", train, 1), record("test", test, 2))
 
 
 def _draw(

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from evercal.datasets import Frame, generic
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
+from evercal.recordings import Frame, generic
 from evercal.simulation.box_room import default_camera
 from evercal.simulation.cell_paths import (
     Shot,

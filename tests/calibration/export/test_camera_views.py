@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from evercal.calibration.export import camera_views
 from evercal.calibration.export.formats import write_content
 from evercal.calibration.export.request import Export
-from evercal.datasets.robot_poses import RobotPoses, read_robot_poses
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
+from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 
 from .drawn import CAMERA, arm, made, poses, quaternion_matrix
 

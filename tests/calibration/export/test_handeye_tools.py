@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from evercal.calibration.calibration import Mount
 from evercal.calibration.export import handeye_tools
 from evercal.calibration.export.request import Export
-from evercal.datasets.robot_poses import RobotPoses
 from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.recordings.poses.robot_poses import RobotPoses
 
 from .drawn import arm, made, poses, quaternion_matrix
 

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 
 from evercal.calibration.export import plain
 from evercal.calibration.export.request import Export
-from evercal.datasets.robot_poses import read_robot_poses
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
+from evercal.recordings.poses.robot_poses import read_robot_poses
 
 from .drawn import CAMERA, made, poses
 

@@ -20,9 +20,9 @@ from evercal.calibration.calibration import Mount
 from evercal.calibration.export import ros
 from evercal.calibration.export.request import Export
 from evercal.calibration.export.urdf import urdf
-from evercal.datasets.camera_file import read_camera
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
+from evercal.recordings.poses.camera_file import read_camera
 
 from .drawn import CAMERA, made, poses, quaternion_matrix
 

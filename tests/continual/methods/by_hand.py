@@ -5,10 +5,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from evercal.continual.methods.method import MethodState, StageStart
+from evercal.continual.networks.buffer import FeatureBuffer, Rows
+from evercal.continual.networks.head import Head, HeadOptions, HeadOutput
+from evercal.continual.networks.loss import Target
 from evercal.geometry import SE3
-from evercal.networks.buffer import FeatureBuffer, Rows
-from evercal.networks.head import Head, HeadOptions, HeadOutput
-from evercal.networks.loss import Target
 
 DEPTH_M, FOCAL_PX = 2.0, 100.0
 

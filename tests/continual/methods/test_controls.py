@@ -10,15 +10,15 @@ import pytest
 import torch
 
 from evercal.continual.methods.controls import FineTuning, Isolation
-from evercal.networks.hooks import TrainingHooks
+from evercal.continual.networks.hooks import TrainingHooks
 
 from ..stages import continued, outcome, weights
 from .by_hand import stage_start, wave_head
 
 if TYPE_CHECKING:
+    from evercal.continual.networks.head import Head
     from evercal.continual.stage import StageOptions
     from evercal.mapping.scene_maps import SceneMaps
-    from evercal.networks.head import Head
 
     from ..stages import Rooms
 

@@ -12,11 +12,11 @@ import torch
 
 from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.methods.method import FinishedScene, Method, MethodState
+from evercal.continual.networks.head import HeadOptions
+from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 from evercal.continual.strategies import STRATEGIES
-from evercal.datasets.frame import Frame
 from evercal.geometry import SE3, Camera
-from evercal.networks.head import HeadOptions
-from evercal.networks.trainer import FitOptions, HeadTrainer
+from evercal.recordings.frame import Frame
 
 from ...one_device import made_where_inputs_lie
 from .by_hand import stage_start, wave_buffer, wave_head

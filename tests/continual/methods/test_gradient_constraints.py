@@ -20,11 +20,11 @@ from evercal.continual.methods.gradient_constraints import (
     nearest_change,
 )
 from evercal.continual.methods.method import FinishedScene, MethodState
-from evercal.networks.buffer import diffused
-from evercal.networks.head import HeadOptions
-from evercal.networks.hooks import ProposedStep, TrainingHooks
-from evercal.networks.loss import LossOptions, fixed_clamp_loss, reprojection_loss
-from evercal.networks.trainer import FitOptions, HeadTrainer, one_cycle
+from evercal.continual.networks.buffer import diffused
+from evercal.continual.networks.head import HeadOptions
+from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
+from evercal.continual.networks.loss import LossOptions, fixed_clamp_loss, reprojection_loss
+from evercal.continual.networks.trainer import FitOptions, HeadTrainer, one_cycle
 
 from .by_hand import flat, flat_of, off_by, rows, says, stage_start, wave_buffer, wave_head
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from evercal.continual.methods.learning_without_forgetting import LearningWithoutForgetting
-from evercal.networks.buffer import join
-from evercal.networks.head import Head, HeadOutput
-from evercal.networks.hooks import TrainingHooks
-from evercal.networks.trainer import FitOptions, HeadTrainer
+from evercal.continual.networks.buffer import join
+from evercal.continual.networks.head import Head, HeadOutput
+from evercal.continual.networks.hooks import TrainingHooks
+from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 
 from .by_hand import stage_start, wave_buffer, wave_head
 

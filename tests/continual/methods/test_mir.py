@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from evercal.continual.methods.mir import MaximallyInterferedRetrieval, interfered_views
-from evercal.networks.buffer import FeatureBuffer, Rows
-from evercal.networks.head import Head, HeadOptions
-from evercal.networks.hooks import TrainingHooks
-from evercal.networks.trainer import FitOptions, HeadTrainer
+from evercal.continual.networks.buffer import FeatureBuffer, Rows
+from evercal.continual.networks.head import Head, HeadOptions
+from evercal.continual.networks.hooks import TrainingHooks
+from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 
 from .by_hand import stage_start
 

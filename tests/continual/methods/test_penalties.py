@@ -18,7 +18,7 @@ from evercal.continual.methods.penalties import (
     StoredOutput,
 )
 from evercal.continual.methods.spdd import SpddOptions, spdd_loss
-from evercal.networks.head import HeadOutput
+from evercal.continual.networks.head import HeadOutput
 
 from .by_hand import DEPTH_M, off_by, rows, says
 

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from evercal.continual.methods.penalties import Penalty
 from evercal.continual.methods.preconditioning import PreconditionedReplay, held_rows
-from evercal.networks.buffer import FeatureBuffer, Rows
-from evercal.networks.head import Head, HeadOptions, HeadOutput
-from evercal.networks.hooks import ProposedStep, TrainingHooks
-from evercal.networks.trainer import FitOptions, HeadTrainer
+from evercal.continual.networks.buffer import FeatureBuffer, Rows
+from evercal.continual.networks.head import Head, HeadOptions, HeadOutput
+from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
+from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 
 from .by_hand import stage_start, wave_buffer, wave_head
 

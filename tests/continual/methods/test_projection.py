@@ -13,10 +13,10 @@ from evercal.continual.methods.projection import (
     grown_basis,
     hidden_moment,
 )
-from evercal.networks.buffer import FeatureBuffer
-from evercal.networks.head import Head, HeadOptions
-from evercal.networks.hooks import TrainingHooks
-from evercal.networks.trainer import FitOptions, HeadTrainer
+from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.continual.networks.head import Head, HeadOptions
+from evercal.continual.networks.hooks import TrainingHooks
+from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 
 from .by_hand import stage_start, wave_buffer, wave_head
 

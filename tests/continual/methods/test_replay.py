@@ -16,9 +16,9 @@ from evercal.continual.methods.replay import (
     by_scene,
     teacher_output,
 )
-from evercal.networks.buffer import Rows, join
-from evercal.networks.head import HeadOutput
-from evercal.networks.hooks import TrainingHooks
+from evercal.continual.networks.buffer import Rows, join
+from evercal.continual.networks.head import HeadOutput
+from evercal.continual.networks.hooks import TrainingHooks
 
 from .by_hand import off_by, says, stage_start, wave_buffer, wave_head
 

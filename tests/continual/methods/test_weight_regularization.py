@@ -17,10 +17,10 @@ from evercal.continual.methods.weight_regularization import (
     scaled_to_mean_one,
     tie_cost,
 )
-from evercal.networks.head import Head, HeadOptions
-from evercal.networks.hooks import ProposedStep
-from evercal.networks.loss import LossOptions, reprojection_loss
-from evercal.networks.trainer import FitOptions, HeadTrainer
+from evercal.continual.networks.head import Head, HeadOptions
+from evercal.continual.networks.hooks import ProposedStep
+from evercal.continual.networks.loss import LossOptions, reprojection_loss
+from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 
 from .by_hand import flat, stage_start, wave_buffer, wave_head
 

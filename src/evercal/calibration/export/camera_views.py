@@ -12,7 +12,7 @@ import json
 from evercal.calibration.export.request import CameraViews, Export, camera_views
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.geometry.conventions import CONVENTIONS, numbers_from_poses, pose_convention
+from evercal.recordings.poses.conventions import CONVENTIONS, numbers_from_poses, pose_convention
 
 
 def tum(export: Export) -> str:

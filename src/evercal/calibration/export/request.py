@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration
-from evercal.datasets.robot_poses import RobotPoses
 from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.recordings.poses.robot_poses import RobotPoses
 
 Content: TypeAlias = str | bytes | dict[str, str]
 """Text, bytes, or a folder of texts by file name."""

@@ -1,6 +1,6 @@
 """Robot controllers and Zivid: poses as their programs write them.
 
-The conventions are those of `evercal.geometry.conventions`. The pose is parent_from_child, so that
+The conventions are in `evercal.recordings.poses.conventions`. The pose is parent_from_child: that
 of the camera in the robot's base or on its flange. Zivid's file was checked against the one that
 its Python samples write and its SDK loads: millimetres, under FloatMatrix.
 """
@@ -10,7 +10,7 @@ import json
 import yaml
 
 from evercal.calibration.export.request import Export
-from evercal.geometry.conventions import numbers_from_poses, pose_convention
+from evercal.recordings.poses.conventions import numbers_from_poses, pose_convention
 
 
 def zivid(export: Export) -> str:

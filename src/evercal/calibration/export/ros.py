@@ -15,7 +15,7 @@ import yaml
 from evercal.calibration.export.request import Export, require_optical
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.geometry.conventions import CONVENTIONS, numbers_from_poses
+from evercal.recordings.poses.conventions import CONVENTIONS, numbers_from_poses
 
 
 def static_transform_publisher(export: Export) -> str:

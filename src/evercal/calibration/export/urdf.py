@@ -8,7 +8,7 @@ import re
 from xml.sax.saxutils import quoteattr
 
 from evercal.calibration.export.request import Export
-from evercal.geometry.conventions import CONVENTIONS, numbers_from_poses
+from evercal.recordings.poses.conventions import CONVENTIONS, numbers_from_poses
 
 
 def urdf(export: Export) -> str:

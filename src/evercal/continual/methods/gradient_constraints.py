@@ -18,10 +18,10 @@ from torch.nn import functional as F
 from evercal.continual.methods.method import FinishedScene, StageStart
 from evercal.continual.methods.penalties import Reprojection
 from evercal.continual.methods.replay import EpisodicMemory, MemoryHooks, by_scene
-from evercal.networks.buffer import Rows, diffused
-from evercal.networks.head import HeadOutput
-from evercal.networks.hooks import ProposedStep, TrainingHooks
-from evercal.networks.loss import fixed_clamp_loss
+from evercal.continual.networks.buffer import Rows, diffused
+from evercal.continual.networks.head import HeadOutput
+from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
+from evercal.continual.networks.loss import fixed_clamp_loss
 
 REFERENCE_ROWS = 8192
 

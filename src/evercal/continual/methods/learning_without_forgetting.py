@@ -9,9 +9,9 @@ from torch import Tensor
 from evercal.continual.methods.method import Method, StageStart
 from evercal.continual.methods.penalties import PX_PER_M
 from evercal.continual.methods.replay import teacher_output
-from evercal.networks.buffer import Rows
-from evercal.networks.head import Head, HeadOutput
-from evercal.networks.hooks import TrainingHooks
+from evercal.continual.networks.buffer import Rows
+from evercal.continual.networks.head import Head, HeadOutput
+from evercal.continual.networks.hooks import TrainingHooks
 
 
 @dataclass(frozen=True)

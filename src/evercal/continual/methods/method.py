@@ -13,9 +13,9 @@ import numpy as np
 from torch import Tensor
 
 from evercal.continual.frame_statistics import FrameStatistics
-from evercal.networks.buffer import FeatureBuffer, Rows
-from evercal.networks.head import Head, HeadOutput
-from evercal.networks.hooks import TrainingHooks
+from evercal.continual.networks.buffer import FeatureBuffer, Rows
+from evercal.continual.networks.head import Head, HeadOutput
+from evercal.continual.networks.hooks import TrainingHooks
 
 MethodState = Mapping[str, Tensor]
 """What a method keeps of a finished scene beside its keyframes: named tensors, stored with the

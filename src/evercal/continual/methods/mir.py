@@ -10,10 +10,10 @@ from torch import Tensor
 
 from evercal.continual.methods.method import StageStart
 from evercal.continual.methods.replay import Replay, ReplayHooks
-from evercal.networks.buffer import FeatureBuffer, Rows
-from evercal.networks.head import Head
-from evercal.networks.hooks import TrainingHooks
-from evercal.networks.loss import fixed_clamp_loss
+from evercal.continual.networks.buffer import FeatureBuffer, Rows
+from evercal.continual.networks.head import Head
+from evercal.continual.networks.hooks import TrainingHooks
+from evercal.continual.networks.loss import fixed_clamp_loss
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from evercal.continual.methods.spdd import SpddOptions, spdd_loss
-from evercal.networks.buffer import Rows
-from evercal.networks.head import HeadOutput
-from evercal.networks.loss import LossOptions, fixed_clamp_loss, reprojection_loss
+from evercal.continual.networks.buffer import Rows
+from evercal.continual.networks.head import HeadOutput
+from evercal.continual.networks.loss import LossOptions, fixed_clamp_loss, reprojection_loss
 
 PX_PER_M = 50.0
 """Weight of a distance in scene coordinates, pixels per metre: about what a metre sideways is

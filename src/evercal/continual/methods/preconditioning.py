@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from evercal.continual.methods.method import StageStart
 from evercal.continual.methods.penalties import AnchoredReprojection, Penalty
 from evercal.continual.methods.replay import Replay, ReplayHooks
-from evercal.networks.buffer import FeatureBuffer
-from evercal.networks.head import Head
-from evercal.networks.hooks import ProposedStep, TrainingHooks
+from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.continual.networks.head import Head
+from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
 
 ROWS = 8192
 """Of every remembered scene."""

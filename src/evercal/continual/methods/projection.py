@@ -9,9 +9,9 @@ from torch import Tensor
 
 from evercal.continual.methods.method import FinishedScene, Method, MethodState, StageStart
 from evercal.continual.methods.preconditioning import ROWS, input_moments
-from evercal.networks.buffer import FeatureBuffer
-from evercal.networks.head import Head
-from evercal.networks.hooks import ProposedStep, TrainingHooks
+from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.continual.networks.head import Head
+from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
 
 OUTPUTS = "outputs"
 """Names the basis of the last hidden layer, from which logits and offsets are read."""

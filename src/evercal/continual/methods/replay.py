@@ -15,11 +15,11 @@ from torch import Tensor
 from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.methods.method import FinishedScene, Method, StageStart
 from evercal.continual.methods.penalties import Penalty, Reprojection, StoredOutput
+from evercal.continual.networks.buffer import FeatureBuffer, Rows
+from evercal.continual.networks.head import Head, HeadOutput
+from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.selectors import SELECTORS
 from evercal.features.precision import autocast
-from evercal.networks.buffer import FeatureBuffer, Rows
-from evercal.networks.head import Head, HeadOutput
-from evercal.networks.hooks import TrainingHooks
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from evercal.continual.methods.method import FinishedScene, Method, MethodState, StageStart
-from evercal.networks.buffer import FeatureBuffer, Rows
-from evercal.networks.head import Head
-from evercal.networks.hooks import ProposedStep, TrainingHooks
-from evercal.networks.loss import fixed_clamp_loss
+from evercal.continual.networks.buffer import FeatureBuffer, Rows
+from evercal.continual.networks.head import Head
+from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
+from evercal.continual.networks.loss import fixed_clamp_loss
 
 IMAGE_ROWS = 256
 """Of each image whose gradient is taken."""

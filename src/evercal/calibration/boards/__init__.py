@@ -1,0 +1,1 @@
+"""Calibration boards: corners, poses and intrinsics."""

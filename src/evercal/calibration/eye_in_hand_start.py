@@ -1,0 +1,353 @@
+"""Where the camera sits on the gripper, from images and gripper poses alone: a start for the map.
+
+Features of frames that look alike are matched, and an essential matrix gives every pair's rotation
+and the direction of its translation. With A the motion of the gripper, (R, d) that of the camera
+and X = gripper_from_camera, A X = X B gives the rotation of X from the axes of rotation (Park and
+Martin, IEEE T-RA 1994) and, since the length l of B's translation is unknown, the translation from
+
+    (R_A - I) t_X + t_A = l R_X d,   so   [R_X d]x ((R_A - I) t_X + t_A) = 0,
+
+which is linear in t_X. It is good to a few millimetres; bundle adjustment does the rest.
+"""
+
+from collections.abc import Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from evercal.errors import InputError
+from evercal.features.encode import encode_features
+from evercal.features.encoder import Encoder
+from evercal.features.views import ViewOptions, plain_view, working_image
+from evercal.features.vlad import vlad_for
+from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3
+from evercal.mapping.selection import spread_poses
+from evercal.recordings.frame import Frame
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HandEyeOptions:
+    """How a camera is found on its gripper."""
+
+    frames: int = 120
+    """Frames that take part, at most, spread over the gripper's poses."""
+    partners: int = 6
+    """Every frame is matched to this many frames that look most alike."""
+    features: int = 1500
+    """SIFT features of an image, at most."""
+    contrast: float = 0.01
+    """Smallest contrast of a feature, of OpenCV's SIFT."""
+    ratio: float = 0.85
+    """Largest ratio of the distances to the nearest and the second nearest feature."""
+    max_epipolar_px: float = 1.0
+    """Largest distance of a match from its epipolar line, pixels."""
+    min_inliers: int = 20
+    """Pairs with fewer matches on their epipolar lines say nothing."""
+    angle_tolerance_deg: float = 3.0
+    """Gripper and camera turn by the same angle; pairs that differ by more are left out."""
+    most_rotation_deg: float = 5.0
+    """A pair agrees when its rotation differs by less than this, degrees."""
+    most_direction_deg: float = 10.0
+    """And when the direction of its translation differs by less than this, degrees."""
+    least_rotation_deg: float = 4.0
+    """The gripper must turn by at least this much about a second axis, standard deviation."""
+    least_pairs: int = 12
+    """Fewer pairs that agree are not enough."""
+
+
+@dataclass(frozen=True)
+class PairMotion:
+    """Motion of the camera between two frames, from their images."""
+
+    first: int
+    second: int
+    """Numbers of the frames."""
+    rotation: Rotation
+    """second_camera_from_first_camera."""
+    direction: Array
+    """(3,) unit vector of its translation."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandEyeStart:
+    """A first `gripper_from_camera`."""
+
+    gripper_from_camera: SE3
+    """Single."""
+    pairs: int
+    """Pairs of frames that agree on it."""
+    of_pairs: int
+    """Pairs of frames whose motion was found."""
+    rotation_deg: float
+    """Median disagreement of the rotations."""
+    direction_deg: float
+    """Median disagreement of the directions of translation."""
+
+
+def rotation_spread_deg(base_from_gripper: SE3) -> Array:
+    """(3,) standard deviations of the rotations about their principal axes, largest first.
+
+    Args:
+        base_from_gripper: (n,).
+    """
+    rotations = Rotation.from_quat(base_from_gripper.rotation_wxyz, scalar_first=True)
+    away = (rotations.mean().inv() * rotations).as_rotvec()
+    return np.rad2deg(np.linalg.svd(away, compute_uv=False) / np.sqrt(len(away)))
+
+
+def refuse_poor_motion(base_from_gripper: SE3, options: HandEyeOptions) -> None:
+    """Says what motions a recording lacks, before any work is done.
+
+    Args:
+        base_from_gripper: (n,).
+        options: with the least rotation.
+
+    Raises:
+        InputError: hardly any rotation, or rotation about one axis only.
+    """
+    first, second, _ = rotation_spread_deg(base_from_gripper)
+    need = options.least_rotation_deg
+    advice = (
+        "record views that tilt the camera up and down and turn it left and right by 15 to 45 deg"
+    )
+    if first < need:
+        raise InputError(
+            f"the gripper turns by {first:.1f} deg (standard deviation): without rotation the"
+            f" position of the camera on it cannot be told; {advice}"
+        )
+    if second < need:
+        raise InputError(
+            f"the gripper turns about one axis only ({first:.1f} deg about it, {second:.1f} deg"
+            f" about the next): the camera's position along that axis cannot be told; {advice}"
+        )
+
+
+def hand_eye_start(
+    frames: Sequence[Frame], encoder: Encoder, options: HandEyeOptions | None = None
+) -> Generator[tuple[int, int], None, HandEyeStart]:
+    """Finds the camera on its gripper from images and gripper poses.
+
+    Args:
+        frames: with `base_from_gripper`; their `base_from_camera` is not looked at.
+        encoder: tells which frames look alike.
+        options: how.
+
+    Raises:
+        InputError: too little rotation, or too few frames that see the same.
+
+    Yields:
+        (pairs matched, pairs in all), for progress bars.
+
+    Returns:
+        The start, good to a few millimetres.
+    """
+    options = options or HandEyeOptions()
+    poses = gripper_poses(frames)
+    refuse_poor_motion(poses, options)
+    if len(frames) > options.frames:
+        some = spread_poses(poses, options.frames)
+        frames, poses = [frames[i] for i in some], poses[some]
+    motions = yield from _pair_motions(frames, encoder, options)
+    return solve_motions(poses, motions, options)
+
+
+def gripper_poses(frames: Sequence[Frame]) -> SE3:
+    """(n,) base_from_gripper of frames that all have one."""
+    return SE3.stack([f.base_from_gripper for f in frames if f.base_from_gripper is not None])
+
+
+def with_gripper(frames: Sequence[Frame], gripper_from_camera: SE3) -> tuple[Frame, ...]:
+    """Frames with the camera poses that the gripper's poses give."""
+    return tuple(
+        replace(f, base_from_camera=f.base_from_gripper @ gripper_from_camera)
+        for f in frames
+        if f.base_from_gripper is not None
+    )
+
+
+def solve_motions(
+    base_from_gripper: SE3, motions: Sequence[PairMotion], options: HandEyeOptions
+) -> HandEyeStart:
+    """`gripper_from_camera` from the motions of gripper and camera.
+
+    Args:
+        base_from_gripper: (n,).
+        motions: of pairs among the n frames.
+        options: how.
+
+    Raises:
+        InputError: too few pairs, or too few that agree.
+    """
+    if len(motions) < options.least_pairs:
+        raise InputError(
+            f"only {len(motions)} pairs of images show the same place from two sides, at least"
+            f" {options.least_pairs} are needed: record more views that overlap, of a place with"
+            " texture"
+        )
+    first, second = (np.array([getattr(m, w) for m in motions]) for w in ("first", "second"))
+    moved = base_from_gripper[second].inverse() @ base_from_gripper[first]
+    gripper_turn = Rotation.from_quat(moved.rotation_wxyz, scalar_first=True).as_rotvec()
+    camera_turn = np.array([m.rotation.as_rotvec() for m in motions])
+    off = np.linalg.norm(gripper_turn, axis=1) - np.linalg.norm(camera_turn, axis=1)
+    same_angle = np.abs(off) < np.deg2rad(options.angle_tolerance_deg)
+    _refuse_disagreement(same_angle, options)
+    rotation, distance = _robust_rotation(gripper_turn[same_angle], camera_turn[same_angle])
+    agree = np.zeros(len(motions), bool)
+    limit = 4 * max(1.48 * float(np.median(distance)), 1e-3)
+    limit = min(limit, np.deg2rad(options.most_rotation_deg))
+    agree[np.flatnonzero(same_angle)[distance < limit]] = True
+    _refuse_disagreement(agree, options)
+    towards = rotation.apply(np.array([m.direction for m in motions]))
+    place, apart = _robust_translation(moved, towards, agree)
+    # Where a camera hardly moves sideways, its direction is noise: few pairs may be enough.
+    agree &= apart < np.deg2rad(options.most_direction_deg)
+    if agree.sum() < options.least_pairs:
+        raise InputError(
+            f"the directions in which gripper and images moved agree in only {agree.sum()} of"
+            f" {len(agree)} pairs of frames: move the camera sideways by 10 cm or more as well as"
+            " turning it, and check that the poses are in metres"
+        )
+    start = SE3(rotation.as_quat(canonical=True, scalar_first=True), place)
+    return HandEyeStart(
+        start,
+        int(agree.sum()),
+        len(motions),
+        float(np.rad2deg(np.median(distance))),
+        float(np.rad2deg(np.median(apart[agree]))),
+    )
+
+
+def _refuse_disagreement(agree: NDArray[np.bool_], options: HandEyeOptions) -> None:
+    if agree.sum() < max(options.least_pairs, 0.2 * len(agree)):
+        raise InputError(
+            f"the gripper's motion and the images agree in only {agree.sum()} of {len(agree)} pairs"
+            " of frames: check that the poses belong to these images, that they are poses of the"
+            " gripper in the base (not the inverse), and the order of their quaternions or angles"
+        )
+
+
+def _robust_rotation(gripper: Array, camera: Array) -> tuple[Rotation, Array]:
+    """The rotation that takes camera axes to gripper axes, and the distances (n,) in radians."""
+    weight = np.ones(len(gripper))
+    rotation, distance = Rotation.identity(), weight
+    for _ in range(30):
+        rotation = Rotation.align_vectors(gripper, camera, weights=weight)[0]
+        distance = np.linalg.norm(gripper - rotation.apply(camera), axis=1)
+        spread = max(1.48 * float(np.median(distance)), 1e-5)
+        weight = 1 / (1 + (distance / spread) ** 2) ** 2
+    return rotation, distance
+
+
+def _robust_translation(
+    moved: SE3, towards: Array, agree: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """The translation (3,) and the angles (n,) between directions as seen and as predicted."""
+    across = np.cross(towards[:, None], np.eye(3)).transpose(0, 2, 1)
+    turn = moved.rotation_matrix() - np.eye(3)
+    rows, right = across @ turn, -np.einsum("nij,nj->ni", across, moved.translation_m)
+    weight = agree.astype(float)
+    place, angle = np.zeros(3), weight
+    for _ in range(50):
+        information = np.einsum("n,nji,njk->ik", weight, rows, rows)
+        place = np.linalg.solve(information, np.einsum("n,nji,nj->i", weight, rows, right))
+        predicted = turn @ place + moved.translation_m
+        length = np.linalg.norm(predicted, axis=1)
+        angle = np.arctan2(
+            np.linalg.norm(np.cross(towards, predicted), axis=1), (towards * predicted).sum(1)
+        )
+        spread = max(1.48 * float(np.median(angle[agree])), 1e-4)
+        # Rows are sines times the length of the motion; divided by it, all pairs weigh alike.
+        weight = agree / (1 + (angle / spread) ** 2) ** 2 / np.maximum(length, 0.01) ** 2
+    return place, angle
+
+
+def _pair_motions(
+    frames: Sequence[Frame], encoder: Encoder, options: HandEyeOptions
+) -> Generator[tuple[int, int], None, list[PairMotion]]:
+    """Motions of the pairs of frames that look alike and see the same."""
+    vlad, images, cameras, whole = vlad_for(encoder), [], [], []
+    for frame in frames:
+        image = frame.read_image()
+        short = min(480, *image.shape[:2])
+        grey, camera = working_image(image, frame.camera, short)
+        images.append(grey)
+        cameras.append(camera)
+        view = plain_view(grey, camera, encoder.stride, ViewOptions())
+        whole.append(vlad(encode_features([view], encoder, "cpu")[0].flatten(1).T))
+    like = torch.stack(whole) @ torch.stack(whole).T
+    like.fill_diagonal_(-1)
+    nearest = like.topk(min(options.partners, len(frames) - 1)).indices.tolist()
+    pairs = sorted({(min(i, j), max(i, j)) for i, row in enumerate(nearest) for j in row})
+    motions: list[PairMotion] = []
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        features = list(pool.map(lambda image: _sift(image, options), images))
+        jobs = pool.map(lambda pair: _motion(pair, features, cameras, options), pairs)
+        for done, motion in enumerate(jobs, start=1):
+            motions += [motion] if motion is not None else []
+            yield done, len(pairs)
+    return motions
+
+
+def _sift(image: NDArray[np.uint8], options: HandEyeOptions) -> tuple[Array, NDArray[np.float32]]:
+    """Pixels (n, 2) and descriptors (n, 128) of unit length, RootSIFT (Arandjelovic, CVPR 2012)."""
+    import cv2
+
+    sift = cv2.SIFT.create(nfeatures=options.features, contrastThreshold=options.contrast)
+    points, descriptors = sift.detectAndCompute(image, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    if not points:
+        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+    shares = descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
+    return np.array([point.pt for point in points]), np.sqrt(shares)
+
+
+def _ideal(camera: Camera) -> dict[str, object]:
+    """The camera without its distortion and principal point, as poselib takes it."""
+    return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [camera.fx, 0.0, 0.0]}
+
+
+def _motion(
+    pair: tuple[int, int],
+    features: list[tuple[Array, NDArray[np.float32]]],
+    cameras: list[Camera],
+    options: HandEyeOptions,
+) -> PairMotion | None:
+    import poselib
+
+    (pixels_a, a), (pixels_b, b) = (features[i] for i in pair)
+    if min(len(a), len(b)) < options.min_inliers:
+        return None
+    similar = a @ b.T
+    best = similar.argmax(1)
+    rows = np.arange(len(a))
+    top = similar[rows, best].copy()
+    mutual = similar.argmax(0)[best] == rows
+    similar[rows, best] = -1
+    second = similar.max(1)
+    clear = np.maximum(2 - 2 * top, 0) < options.ratio**2 * np.maximum(2 - 2 * second, 1e-9)
+    good = mutual & clear
+    if good.sum() < options.min_inliers:
+        return None
+    # Undistorted, so that poselib needs no camera model of its own.
+    first, second = (cameras[i] for i in pair)
+    ideal_a = first.unproject(pixels_a[good])[:, :2] * first.fx
+    ideal_b = second.unproject(pixels_b[best[good]])[:, :2] * second.fx
+    known = np.isfinite(ideal_a + ideal_b).all(1)
+    pose, told = poselib.estimate_relative_pose(
+        ideal_a[known],
+        ideal_b[known],
+        _ideal(first),
+        _ideal(second),
+        {"max_epipolar_error": options.max_epipolar_px},
+        {},
+    )
+    if told["num_inliers"] < options.min_inliers:
+        return None
+    direction = np.asarray(pose.t) / max(float(np.linalg.norm(pose.t)), 1e-12)
+    return PairMotion(*pair, Rotation.from_matrix(pose.R), direction)

@@ -1,0 +1,1 @@
+"""Hand-eye calibration from pairs of robot poses and camera poses."""

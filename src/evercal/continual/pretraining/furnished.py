@@ -1,0 +1,119 @@
+"""Views of furnished rooms for pretraining, path-traced with true depth (extra `sim`)."""
+
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from evercal.continual.pretraining.pairs import HEIGHT, PER_ANCHOR, WIDTH, pinhole
+from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import SE3
+from evercal.simulation.box_room import look_at
+from evercal.simulation.cell_paths import is_clear
+from evercal.simulation.furnished.panda import HOME_RAD, Panda
+from evercal.simulation.furnished.renderer import Renderer, RenderOptions
+from evercal.simulation.furnished.rooms import KINDS, Room, room
+from evercal.storage import lock_settings, write_bytes
+
+SAMPLES = 8
+HIDDEN = 0.02
+"""A point is hidden where the depth map differs by more than this share of its depth."""
+
+
+@dataclass(eq=False)
+class FurnishedViews:
+    """`Views` of a furnished room; surfaces are known through depth maps."""
+
+    images: np.ndarray
+    base_from_camera: SE3
+    cameras: tuple[Camera, ...]
+    depth_m: np.ndarray
+    """(n, HEIGHT, WIDTH) float16 metres along the optical axis, 0 where nothing was hit."""
+
+    def _depth(self, view: int, pixels: np.ndarray) -> np.ndarray:
+        u, v = np.rint(pixels).astype(int).T
+        return self.depth_m[view, v, u].astype(float)
+
+    def hit(self, view: int, pixels: np.ndarray) -> np.ndarray:
+        """See `Views`."""
+        depth = self._depth(view, pixels)
+        depth[depth == 0] = np.nan
+        points = self.cameras[view].unproject(pixels) * depth[:, None]
+        return self.base_from_camera[view].apply(points)
+
+    def sees(self, view: int, points_m: np.ndarray) -> np.ndarray:
+        """See `Views`."""
+        within = self.base_from_camera[view].inverse().apply(points_m)
+        depth = self._depth(view, self.cameras[view].project(within))
+        return np.abs(depth - within[:, 2]) < HIDDEN * within[:, 2]
+
+
+def furnished_views(seed: int, anchors: int = 5) -> FurnishedViews:
+    """Renders a furnished room from `anchors * PER_ANCHOR` cameras.
+
+    Cameras stand anywhere in free air and look at furniture from 0.7 to 3 m; those of one anchor
+    differ by parallax, scale and roll.
+
+    Args:
+        seed: of room, arm and cameras; FIRST_ROOM_SEED or later.
+        anchors: how many parts of the room are looked at.
+    """
+    import cv2
+
+    rng = np.random.default_rng([seed, 78])
+    place, panda = room(sorted(KINDS)[seed % len(KINDS)], seed), Panda()
+    joints = np.array(HOME_RAD) + rng.normal(0, 0.3, 7)
+    renderer = Renderer(place.meshes() + panda.meshes(joints), rng.uniform(1.2, 2.8))
+    poses, cameras, images, depths = [], [], [], []
+    for _ in range(anchors):
+        camera = pinhole(rng.uniform(0.65, 1.15) * WIDTH)
+        for pose in _anchor(place, rng):
+            image = renderer.render(camera, pose, RenderOptions(SAMPLES), int(rng.integers(2**31)))
+            poses.append(pose)
+            cameras.append(camera)
+            images.append(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+            depths.append(renderer.depth(camera, pose).astype(np.float16))
+    return FurnishedViews(np.stack(images), SE3.stack(poses), tuple(cameras), np.stack(depths))
+
+
+def _anchor(place: Room, rng: np.random.Generator) -> Iterator[SE3]:
+    """PER_ANCHOR poses that look at the same thing from places near each other."""
+    while True:
+        thing = place.items[rng.integers(len(place.items))].bounds_m()
+        target = rng.uniform(thing[0], thing[1])
+        way = rng.standard_normal(3) * (1, 1, 0.6)
+        eye = target + rng.uniform(0.7, 3.0) * way / np.linalg.norm(way)
+        spread = 0.25 * float(np.linalg.norm(eye - target))
+        eyes = eye + spread * rng.standard_normal((PER_ANCHOR, 3)) * (1, 1, 0.6)
+        if eye[2] > place.low_m[2] + 0.3 and is_clear(place, eyes).all():
+            break
+    for eye in eyes:
+        aim = target + 0.15 * rng.standard_normal(3)
+        yield look_at(eye, aim, rng.normal(0, 0.15))
+
+
+def kept_furnished_views(seed: int, folder: Path) -> FurnishedViews:
+    """The same from `folder`, rendered and put there when it is missing."""
+    # Raise the version when the rooms or the renderer change.
+    made = {"version": 1, "samples": SAMPLES, "size": [WIDTH, HEIGHT], "per_anchor": PER_ANCHOR}
+    lock_settings(folder / "rooms.json", made)
+    path = folder / f"room-{seed}.npz"
+    if not path.is_file():
+        views, buffer = furnished_views(seed), io.BytesIO()
+        focal = [camera.fx for camera in views.cameras]
+        pose = views.base_from_camera
+        np.savez_compressed(
+            buffer,
+            images=views.images,
+            depth_m=views.depth_m,
+            focal=focal,
+            rotation_wxyz=pose.rotation_wxyz,
+            translation_m=pose.translation_m,
+        )
+        write_bytes(path, buffer.getvalue())
+    with np.load(path) as found:
+        cameras = tuple(pinhole(focal) for focal in found["focal"].tolist())
+        poses = SE3(found["rotation_wxyz"], found["translation_m"])
+        return FurnishedViews(found["images"], poses, cameras, found["depth_m"])

@@ -1,0 +1,256 @@
+"""nerfstudio's `transforms.json`, as phone apps and `ns-process-data` write it.
+
+    {"camera_model": "OPENCV", "fl_x": 1450, "fl_y": 1450, "cx": 960, "cy": 540, "w": 1920,
+     "h": 1080, "k1": 0, "k2": 0, "p1": 0, "p2": 0, "applied_transform": [3][4],
+     "frames": [{"file_path": "images/frame_00001.png", "transform_matrix": [4][4]}, ...],
+     "test_filenames": [...]}
+
+`transform_matrix` is the camera in the world with OpenGL's axes (y up, looking along -z).
+Intrinsics stand at the top or in each frame; pixels count from the image's corner, as in COLMAP, so
+that the centre of the top-left pixel is (0.5, 0.5). `applied_transform` and `applied_scale` are
+undone: the base frame is that of the program that made the poses, and its scale is that program's.
+Files that `val_filenames` and `test_filenames` name are test frames. (Tancik et al., Nerfstudio,
+SIGGRAPH 2023; its documentation, Data conventions.)
+"""
+
+import json
+import math
+import os
+from collections import Counter
+from collections.abc import Container, Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.errors import InputError
+from evercal.geometry import SE3, Camera
+from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.images import IMAGE_ENDINGS, image_size
+
+FILE = "transforms.json"
+_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+# A camera's OpenGL axes (right, up, backward) from OpenCV's (right, down, forward).
+_GL_FROM_CV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
+_TOLERANCE = 1e-2
+NOTE = (
+    "the base frame and the unit of length are those of {file}; poses are in metres of a robot only"
+    " if that was so, see 'evercal align'"
+)
+
+
+def detect(root: Path) -> bool:
+    """Whether `root` holds, or is, a transforms.json."""
+    return (root / FILE).is_file() or (root.name == FILE and root.is_file())
+
+
+def load(root: str | os.PathLike[str]) -> Recording:
+    """Reads the poses and the size of one image of every camera; no other image is opened.
+
+    Where the file states no size, it is that of the first image.
+
+    Raises:
+        InputError: The file or an image is missing, or the file breaks the format; the message
+            names the entry.
+    """
+    root = Path(root)
+    file = root if root.is_file() else root / FILE
+    root = file.parent
+    data = _read(file)
+    try:
+        undo, scale = _applied(data)
+        entries = data.get("frames")
+        if not isinstance(entries, list) or not entries:
+            raise ValueError("'frames' is a list with at least one frame")
+        data = {**_first_size(root, data, entries), **data}
+        frames = [_frame(root, data, i, entry, undo, scale) for i, entry in enumerate(entries)]
+        test = _tested(root, data, {str(frame.image) for frame in frames})
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"{file}: {error}") from None
+    frames = _sized(file, frames)
+    (name, times), *_ = Counter(frame.name for frame in frames).most_common(1)
+    if times > 1:
+        raise InputError(f"{file}: {name!r} comes {times} times; keep one entry for each image")
+    return Recording(
+        root.resolve().name,
+        tuple(frame for frame in frames if frame.image not in test),
+        tuple(frame for frame in frames if frame.image in test),
+        notes=(NOTE.format(file=FILE),),
+    )
+
+
+def _read(file: Path) -> dict[str, object]:
+    try:
+        data = json.loads(file.read_bytes())
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        raise InputError(f"{file}: not valid JSON ({error}); write it anew") from None
+    if not isinstance(data, dict):
+        raise InputError(f"{file}: no JSON object; it has 'frames' in it")
+    return data
+
+
+def _first_size(root: Path, data: Mapping[str, object], entries: list[object]) -> dict[str, object]:
+    """The first image's w and h, where neither the file nor its first frame states one of them."""
+    first = entries[0]
+    if not isinstance(first, dict) or {"w", "h"} & {*data, *first}:
+        return {}
+    name = first.get("file_path")
+    if not isinstance(name, str):
+        return {}
+    width, height = image_size(_image(root, name))
+    return {"w": width, "h": height}
+
+
+def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
+    """What brings the file's world back to the one before it, and the scale to divide by first."""
+    scale = _number(data, "applied_scale", 1.0)
+    if not scale > 0:
+        raise ValueError(f"'applied_scale' is > 0, got {scale}")
+    if data.get("applied_transform") is None:
+        return SE3.identity(), scale
+    matrix = _matrix(data["applied_transform"], "applied_transform")
+    size = abs(np.linalg.det(matrix[:3, :3])) ** (1 / 3)
+    if not size > 0:
+        raise ValueError("'applied_transform' cannot be undone: its determinant is 0")
+    try:
+        applied = SE3.from_matrix(_scaled(matrix, size), _TOLERANCE)
+    except ValueError as error:
+        raise ValueError(f"'applied_transform': {error}") from None
+    return applied.inverse(), scale * size
+
+
+def _scaled(matrix: NDArray[np.float64], size: float) -> NDArray[np.float64]:
+    """A similarity's matrix divided by its scale."""
+    found = np.eye(4)
+    found[:3] = matrix[:3] / size
+    return found
+
+
+def _frame(
+    root: Path, data: Mapping[str, object], i: int, entry: object, undo: SE3, scale: float
+) -> Frame:
+    if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+        raise ValueError(f"frame {i}: an object with 'file_path' and 'transform_matrix'")
+    name = entry["file_path"]
+    try:
+        stated = SE3.from_matrix(
+            _matrix(entry.get("transform_matrix"), "transform_matrix"), _TOLERANCE
+        )
+        camera = _camera({**data, **entry})
+    except ValueError as error:
+        raise ValueError(f"frame {i} ({name}): {error}") from None
+    world_from_gl = undo @ SE3(stated.rotation_wxyz, stated.translation_m / scale)
+    return Frame(name, _image(root, name), camera, world_from_gl @ _GL_FROM_CV)
+
+
+def _image(root: Path, name: str) -> Path:
+    """The image of a frame; old files leave its ending out."""
+    image = root / name
+    if image.suffix:
+        return image
+    return next((f for e in IMAGE_ENDINGS if (f := image.with_suffix(e)).is_file()), image)
+
+
+def _camera(data: Mapping[str, object]) -> Camera:
+    model = data.get("camera_model", "OPENCV")
+    if model not in _MODELS:
+        raise ValueError(
+            f"camera_model {model!r} is not supported, only {', '.join(_MODELS)}; undistort the"
+            f" images first (for COLMAP: colmap image_undistorter)"
+        )
+    if data.get("is_fisheye"):
+        raise ValueError("fisheye images are not supported; undistort them first")
+    width, height = _number(data, "w"), _number(data, "h")
+    fx, fy = _focal(data, "x", width), _focal(data, "y", height)
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    if fx is None or fy is None:
+        raise ValueError("'fl_x' is missing, and so are 'fl_y' and 'camera_angle_x'")
+    lens = [_number(data, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
+    if _number(data, "k4", 0.0):
+        raise ValueError("k4 is not 0; only k1, k2, k3, p1 and p2 are supported")
+    # Half a pixel: the file counts from the image's corner.
+    return Camera(
+        width,  # pyright: ignore[reportArgumentType]  # checked when constructed
+        height,  # pyright: ignore[reportArgumentType]
+        fx,
+        fy,
+        _number(data, "cx", width / 2) - 0.5,
+        _number(data, "cy", height / 2) - 0.5,
+        tuple(lens) if any(lens) else (),
+    )
+
+
+def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:
+    """A focal length in pixels, of itself or from the angle of view; None if neither is there."""
+    if data.get(f"fl_{axis}") is not None:
+        return _number(data, f"fl_{axis}")
+    if data.get(f"camera_angle_{axis}") is None:
+        return None
+    angle = _number(data, f"camera_angle_{axis}")
+    if not 0 < angle < math.pi:
+        raise ValueError(f"'camera_angle_{axis}' is between 0 and pi radians, got {angle}")
+    return size / 2 / math.tan(angle / 2)
+
+
+def _sized(file: Path, frames: list[Frame]) -> list[Frame]:
+    """The frames with cameras of their images' size, judged by one image of every camera size.
+
+    Downscaled copies of the images have smaller cameras. Images that were turned have none.
+    """
+    sizes: dict[tuple[int, int], tuple[int, int]] = {}
+    for frame in frames:
+        camera, image = frame.camera, frame.image
+        if not isinstance(image, Path) or not image.is_file():
+            raise InputError(f"{image}: named in {file} but missing; restore or take the frame out")
+        stated = camera.width, camera.height
+        if stated in sizes:
+            continue
+        sizes[stated] = found = image_size(image)
+        if abs(found[0] / found[1] / (stated[0] / stated[1]) - 1) > 0.01:
+            turned = found == stated[::-1]
+            why = "the image was turned after the intrinsics were written" if turned else "cropped?"
+            raise InputError(
+                f"{image}: is {found[0]}x{found[1]}, {file.name} says {stated[0]}x{stated[1]}"
+                f" ({why}); give images of that shape"
+            )
+    return [_resized(frame, sizes[frame.camera.width, frame.camera.height]) for frame in frames]
+
+
+def _resized(frame: Frame, size: tuple[int, int]) -> Frame:
+    if (frame.camera.width, frame.camera.height) == size:
+        return frame
+    return Frame(frame.name, frame.image, frame.camera.resized(*size), frame.base_from_camera)
+
+
+def _tested(root: Path, data: Mapping[str, object], images: Container[str]) -> set[Path]:
+    found: set[Path] = set()
+    for key in ("val_filenames", "test_filenames"):
+        names = data.get(key, [])
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"{key!r} is a list of file names")
+        # A test frame under another name would be learned from.
+        other = [name for name in names if str(_image(root, name)) not in images]
+        if other:
+            raise ValueError(f"{key!r} names {other[0]!r}, which no frame does; mend the name")
+        found |= {_image(root, name) for name in names}
+    return found
+
+
+def _matrix(value: object, name: str) -> NDArray[np.float64]:
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
+        raise ValueError(f"{name!r} is 4x4 or 3x4 numbers, got {str(value)[:60]}")
+    return matrix
+
+
+def _number(data: Mapping[str, object], name: str, default: float | None = None) -> float:
+    value = data.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        what = "is missing" if value is None else f"is a number, got {value!r}"
+        raise ValueError(f"{name!r} {what}")
+    return float(value)

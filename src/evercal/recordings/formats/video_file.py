@@ -1,0 +1,125 @@
+"""Single frames of video files, decoded by PyAV (extra `lerobot`) when they are asked for."""
+
+import threading
+import weakref
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.errors import InputError
+from evercal.recordings.images import StoredImage
+
+_MOST_OPEN = 4
+# Decoding on is cheaper than seeking when the wanted frame is so near.
+_READ_ON_S = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class VideoFrame(StoredImage):
+    """One frame of a video."""
+
+    videos: "Videos"
+    path: Path
+    seconds: float
+    """From the video's first frame."""
+
+    def read(self) -> NDArray[np.uint8]:
+        """(H, W, 3) uint8 RGB.
+
+        Raises:
+            InputError: The video is missing, cannot be decoded, or has no frame at this time.
+        """
+        return self.videos.frame(self.path, self.seconds)
+
+
+class _Open:
+    """A video that is being decoded, and the last frame of it."""
+
+    def __init__(self, path: Path, container: Any) -> None:
+        self.path, self.container = path, container
+        self.stream = container.streams.video[0]
+        self.stream.thread_type = "AUTO"
+        self.frames: Any = None
+        self.last: tuple[float, Any] | None = None
+
+    def at(self, seconds: float, half: float) -> NDArray[np.uint8] | None:
+        """The frame within `half` seconds of a time, decoding on or from the key frame before."""
+        last = None if self.last is None else self.last[0]
+        if last is None or not last - half < seconds < last + _READ_ON_S:
+            self.container.seek(
+                max(0, round(seconds / self.stream.time_base)), stream=self.stream, backward=True
+            )
+            self.frames, self.last = self.container.decode(self.stream), None
+        while self.last is None or self.last[0] < seconds - half:
+            frame = next(self.frames, None)
+            if frame is None:
+                self.last = None
+                return None
+            self.last = (float(frame.time), frame)
+        if self.last[0] > seconds + half:
+            return None
+        return self.last[1].to_ndarray(format="rgb24")
+
+
+class Videos:
+    """Some open videos of one frame rate; threads may share it.
+
+    Args:
+        fps: Frames a second of all videos.
+
+    Raises:
+        InputError: The extra `lerobot` is not installed.
+    """
+
+    def __init__(self, fps: float) -> None:
+        try:
+            import av  # pyright: ignore[reportMissingImports]
+        except ImportError:
+            raise InputError(
+                "reading videos needs PyAV; run: pip install 'evercal[lerobot]'"
+            ) from None
+        self._av: Any = av
+        self._half = 0.5 / fps
+        self._open: OrderedDict[Path, _Open] = OrderedDict()
+        self._lock = threading.Lock()
+        weakref.finalize(self, _close, self._open)
+
+    def frame(self, path: Path, seconds: float) -> NDArray[np.uint8]:
+        """The frame shown at a time.
+
+        Returns:
+            (H, W, 3) uint8 RGB.
+
+        Raises:
+            InputError: The video is missing, cannot be decoded, or has no frame at this time.
+        """
+        with self._lock:
+            try:
+                image = self._opened(path).at(seconds, self._half)
+            except FileNotFoundError:
+                raise InputError(f"{path}: video is missing; download it too") from None
+            except (self._av.FFmpegError, IndexError, OSError) as error:
+                self._open.pop(path, None)
+                text = " ".join(str(error).split())[:200]
+                raise InputError(f"{path}: video cannot be decoded: {text}") from None
+        if image is None:
+            raise InputError(f"{path}: no frame at {seconds:.3f} s; the video is cut off")
+        return np.ascontiguousarray(image, dtype=np.uint8)
+
+    def _opened(self, path: Path) -> _Open:
+        if path not in self._open:
+            while len(self._open) >= _MOST_OPEN:
+                self._open.popitem(last=False)[1].container.close()
+            self._open[path] = _Open(path, self._av.open(str(path)))
+        self._open.move_to_end(path)
+        return self._open[path]
+
+
+def _close(videos: OrderedDict[Path, _Open]) -> None:
+    for video in videos.values():
+        video.container.close()
+    videos.clear()

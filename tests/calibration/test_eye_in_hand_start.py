@@ -1,0 +1,99 @@
+"""The start of `gripper_from_camera`: exact from exact motions, robust, refused with a reason."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from evercal.calibration.eye_in_hand_start import (
+    HandEyeOptions,
+    PairMotion,
+    refuse_poor_motion,
+    rotation_spread_deg,
+    solve_motions,
+)
+from evercal.errors import InputError
+from evercal.geometry import SE3, pose_distance
+
+OPTIONS = HandEyeOptions()
+TRUTH = SE3.exp([0.05, -0.08, 0.12, 0.4, -1.2, 2.0])
+
+
+def grippers(count: int, seed: int, size: tuple[float, float] = (0.3, 0.4)) -> SE3:
+    rng = np.random.default_rng(seed)
+    return SE3.exp(rng.normal(0, np.repeat(size, 3), (count, 6)))
+
+
+def motions(poses: SE3, truth: SE3, noise_rad: float = 0.0, wrong: int = 0) -> list[PairMotion]:
+    """Camera motions as two images give them: no length; some of them nonsense."""
+    rng, found = np.random.default_rng(1), []
+    cameras = poses @ truth
+    for i in range(len(poses)):
+        for j in range(i + 1, min(i + 4, len(poses))):
+            moved = cameras[j].inverse() @ cameras[i]
+            turn = Rotation.from_quat(moved.rotation_wxyz, scalar_first=True)
+            turn = turn * Rotation.from_rotvec(rng.normal(0, noise_rad, 3))
+            direction = moved.translation_m + rng.normal(0, noise_rad, 3) * np.linalg.norm(
+                moved.translation_m
+            )
+            found.append(PairMotion(i, j, turn, direction / np.linalg.norm(direction)))
+    for k in rng.choice(len(found), wrong, replace=False).tolist():
+        away = rng.normal(size=3)
+        turn = Rotation.random(rng=rng)
+        found[k] = PairMotion(found[k].first, found[k].second, turn, away / np.linalg.norm(away))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_exact_motions_give_the_exact_transform(seed: int) -> None:
+    poses = grippers(12, seed)
+    start = solve_motions(poses, motions(poses, TRUTH), OPTIONS)
+    metres, radians = pose_distance(start.gripper_from_camera, TRUTH)
+    assert metres < 1e-6
+    assert radians < 1e-6
+    assert start.pairs == start.of_pairs
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_wrong_pairs_are_left_out(seed: int) -> None:
+    poses = grippers(30, seed)
+    start = solve_motions(poses, motions(poses, TRUTH, 0.005, wrong=20), OPTIONS)
+    metres, radians = pose_distance(start.gripper_from_camera, TRUTH)
+    assert metres < 0.01
+    assert np.rad2deg(radians) < 0.3
+    assert start.pairs <= start.of_pairs - 15
+
+
+def test_the_inverse_of_the_poses_is_noticed() -> None:
+    poses = grippers(20, 0)
+    with pytest.raises(InputError, match=r"agree in only .*not the inverse"):
+        solve_motions(poses.inverse(), motions(poses, TRUTH), OPTIONS)
+
+
+def test_too_few_pairs_are_said() -> None:
+    poses = grippers(4, 0)
+    with pytest.raises(InputError, match="only 6 pairs"):
+        solve_motions(poses, motions(poses, TRUTH), OPTIONS)
+
+
+def test_the_spread_of_rotations_is_that_of_their_axes() -> None:
+    angles = np.deg2rad([-20, -10, 0, 10, 20])
+    six = np.zeros((5, 6))
+    six[:, 4] = angles
+    expected = np.rad2deg(np.sqrt((angles**2).mean()))
+    assert rotation_spread_deg(SE3.exp(six)) == pytest.approx([expected, 0, 0], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("axes", "said"),
+    [((0, 0, 0), "without rotation"), ((0, 20, 0), "about one axis only"), ((20, 20, 0), None)],
+)
+def test_what_a_recording_lacks_is_said(axes: tuple[float, ...], said: str | None) -> None:
+    rng = np.random.default_rng(0)
+    six = np.concatenate(
+        [rng.normal(0, 0.2, (30, 3)), rng.normal(0, 1, (30, 3)) * np.deg2rad(axes)], 1
+    )
+    if said is None:
+        refuse_poor_motion(SE3.exp(six), OPTIONS)
+        return
+    with pytest.raises(InputError, match=said):
+        refuse_poor_motion(SE3.exp(six), OPTIONS)

@@ -1,0 +1,168 @@
+"""What is published says what was measured: every frame stays right or wrong."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evercal.continual.benchmark.comparison import difference, method_rows, runs_of, threshold_rows
+from evercal.continual.benchmark.published import (
+    COUNTED,
+    Published,
+    PublishedScene,
+    from_bench,
+    read_published,
+    write_published,
+)
+from evercal.continual.benchmark.results import SETTINGS, SceneResult, append, read
+from evercal.errors import InputError
+from evercal.storage import write_json
+from tests.continual.benchmark.test_comparison import lines
+from tests.continual.benchmark.test_results import result
+
+
+def bench(folder: Path, found: list[SceneResult]) -> Path:
+    folder.mkdir(exist_ok=True)
+    write_json(folder / SETTINGS, {"suite": "two"})
+    append(folder, found)
+    return folder
+
+
+def published(tmp_path: Path, found: list[SceneResult]) -> Published:
+    made = from_bench(bench(tmp_path / "run", found), "two", "a note")
+    path = write_published(tmp_path, made)
+    assert read_published(path) == made
+    return made
+
+
+OURS = lines("ours", 0, [[16], [14, 12]]) + lines("ours", 1, [[18], [18, 10]])
+THEIRS = lines("theirs", 0, [[16], [4, 14]])
+
+
+def test_tables_are_those_of_the_bench(tmp_path: Path) -> None:
+    made = published(tmp_path, OURS + THEIRS)
+    runs, before = runs_of(made.results()), runs_of(read(tmp_path / "run"))
+    header, *rows = method_rows(runs)
+    medians = header.index("median cm, right scene")
+    for row, expected in zip(rows, method_rows(before)[1:], strict=True):
+        assert row[:medians] == expected[:medians]
+        assert row[medians + 1 :] == expected[medians + 1 :]
+        assert float(row[medians]) == pytest.approx(float(expected[medians]), abs=0.1)
+    for ours, theirs in zip(threshold_rows(runs)[1:], threshold_rows(before)[1:], strict=True):
+        assert ours[2:] == theirs[2:]
+        # Errors are published to a tenth of a millimetre: 0.05 % of 20 cm.
+        assert float(ours[1]) == pytest.approx(float(theirs[1]), abs=0.11)
+    assert difference(runs[:2], runs[2:]) == difference(before[:2], before[2:])
+
+
+def test_only_the_last_stage_is_kept_frame_by_frame(tmp_path: Path) -> None:
+    made = published(tmp_path, OURS)
+    kinds = {(type(of), of.stage) for of in made.results()}
+    assert kinds == {(PublishedScene, 0), (SceneResult, 1)}
+    first = made.results()[0]
+    assert isinstance(first, PublishedScene)
+    assert (first.frames, first.within) == (20, (16, 16, 0, 0, 0))
+    assert first.accuracy() == 0.8
+    with pytest.raises(KeyError):
+        first.accuracy((0.03, 0.1))
+
+
+ERRORS = st.floats(0, 0.12) | st.sampled_from([0.005, 0.01, 0.02, 0.05, 0.1, math.inf])
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(
+        st.tuples(ERRORS, ERRORS.map(lambda v: math.radians(100 * v)), st.booleans()),
+        min_size=2,
+        max_size=12,
+    )
+)
+def test_every_frame_stays_right_or_wrong(
+    tmp_path_factory: pytest.TempPathFactory, frames: list[tuple[float, float, bool]]
+) -> None:
+    posed = [math.isfinite(m) and math.isfinite(r) for m, r, _ in frames]
+    both = list(zip(frames, posed, strict=True))
+    one = result(
+        frames=tuple(f"f{i}" for i in range(len(frames))),
+        translation_m=tuple(f[0] if p else math.inf for f, p in both),
+        rotation_rad=tuple(f[1] if p else math.inf for f, p in both),
+        wrong_scene=tuple(f[2] and not p for f, p in both),
+        near_training_frame=(False,) * len(frames),
+        squared_mahalanobis=tuple(5.0 + 10 * f[2] if p else math.nan for f, p in both),
+    )
+    made = published(tmp_path_factory.mktemp("b"), [one])
+    (whole,) = made.results()
+    assert isinstance(whole, SceneResult)
+    # A result that was read has six digits; so have the counts.
+    six = replace(
+        one,
+        translation_m=tuple(round(v, 6) if math.isfinite(v) else v for v in one.translation_m),
+        rotation_rad=tuple(round(v, 6) if math.isfinite(v) else v for v in one.rotation_rad),
+    )
+    (counted,) = made.scenes
+    for bound, count in zip(COUNTED, counted.within, strict=True):
+        assert whole.correct(bound).tolist() == six.correct(bound).tolist()
+        assert count == six.correct(bound).sum() == round(counted.accuracy(bound) * len(frames))
+    assert whole.refused.tolist() == one.refused.tolist()
+    assert whole.wrong_scene == one.wrong_scene
+    assert counted.refused == one.refused.sum()
+    assert counted.stated_95 == sum(posed)
+    inside = np.array(one.squared_mahalanobis) < 12.59
+    assert (np.array(whole.squared_mahalanobis) < 12.59).tolist() == inside.tolist()
+    assert counted.inside_95 == inside.sum()
+    good = np.isfinite(six.translation_m)
+    gap = np.array(whole.translation_m)[good] - np.array(six.translation_m)[good]
+    assert (np.abs(gap) <= 0.51e-4).all()
+
+
+def test_what_is_under_way_or_broken_is_not_published(tmp_path: Path) -> None:
+    begun = lines("late", 0, [[16]])
+    made = published(tmp_path, OURS + begun)
+    assert {of.strategy for of in made.scenes} == {"ours"}
+    with pytest.raises(InputError, match="no run is done"):
+        from_bench(tmp_path / "nowhere", "x")
+    other = [replace(of, frames=tuple(f"x{i}" for i in range(20))) for of in THEIRS]
+    with pytest.raises(InputError, match=r"runs judge \w by different frames"):
+        from_bench(bench(tmp_path / "mixed", OURS + other), "x")
+
+
+def test_changed_settings_and_lines_are_named(tmp_path: Path) -> None:
+    published(tmp_path, OURS)
+    path = tmp_path / "two.jsonl"
+    good = path.read_text()
+    path.write_text(good.replace('"suite":"two"', '"suite":"three"'))
+    with pytest.raises(InputError, match="settings are not those"):
+        read_published(path)
+    path.write_text(good + '["ours", 1, 2]\n')
+    with pytest.raises(InputError, match=r"line 8 is not a published result"):
+        read_published(path)
+    path.write_text("")
+    with pytest.raises(InputError, match="line 1"):
+        read_published(path)
+
+
+def test_a_whole_suite_stays_small(tmp_path: Path) -> None:
+    """Seven scenes, 39 frames each, 25 strategies, three seeds; errors of up to 3 m."""
+    rng = np.random.default_rng(0)
+    frames = tuple(f"test-{i:06d}" for i in range(39))
+    made = []
+    for strategy in range(25):
+        for seed in range(3):
+            for stage in range(7):
+                for scene in range(stage + 1):
+                    errors = tuple(np.exp(rng.uniform(-7, 1, 39)).tolist())
+                    of = result(stage, f"bedroom-{scene}", strategy=f"a_strategy_{strategy}")
+                    near = (False,) * 39
+                    told = {"frames": frames, "wrong_scene": near, "near_training_frame": near}
+                    made.append(
+                        replace(of, seed=seed, translation_m=errors, rotation_rad=errors, **told)
+                    )
+    path = write_published(tmp_path, from_bench(bench(tmp_path / "run", made), "large"))
+    assert path.stat().st_size < 500_000
+    assert json.loads(path.read_text().splitlines()[0])["kind"] == "bench"

@@ -1,0 +1,155 @@
+"""Cells never overlap, never move, and hold their scene."""
+
+import math
+from fractions import Fraction
+from itertools import islice, pairwise
+
+import numpy as np
+import pytest
+
+from evercal.continual.networks.atlas import (
+    MIN_CELL_M,
+    Atlas,
+    Cell,
+    combined_centres,
+    paper_grid,
+    spiral,
+)
+from evercal.errors import InputError
+
+
+def random_scene(rng: np.random.Generator) -> np.ndarray:
+    """(n, 3) camera positions of a scene from hand size to a hall, anywhere in its base frame."""
+    span = 10.0 ** rng.uniform(-1.5, 1.7, 3)
+    return rng.uniform(-1, 1, (int(rng.integers(1, 40)), 3)) * span + rng.normal(0, 30, 3)
+
+
+def filled(seed: int, count: int) -> tuple[Atlas, list[np.ndarray]]:
+    rng = np.random.default_rng(seed)
+    atlas, scenes = Atlas(), [random_scene(rng) for _ in range(count)]
+    for scene in scenes:
+        atlas.place(scene)
+    return atlas, scenes
+
+
+def overlap(a: Cell, b: Cell) -> float:
+    """Area in square metres that two cells share."""
+    sides = [
+        min(a.centre_m[k] + a.side_m / 2, b.centre_m[k] + b.side_m / 2)
+        - max(a.centre_m[k] - a.side_m / 2, b.centre_m[k] - b.side_m / 2)
+        for k in range(2)
+    ]
+    return max(sides[0], 0.0) * max(sides[1], 0.0)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_cells_of_any_sizes_never_overlap(seed: int) -> None:
+    atlas, _ = filled(seed, 12)
+    for i, a in enumerate(atlas.cells):
+        assert a.side_m >= MIN_CELL_M
+        assert all(overlap(a, b) < 1e-9 for b in atlas.cells[:i])
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_every_learned_camera_lies_in_the_cell_of_its_scene(seed: int) -> None:
+    atlas, scenes = filled(seed, 8)
+    for i, (cell, scene) in enumerate(zip(atlas.cells, scenes, strict=True)):
+        in_atlas = cell.atlas_from_base.apply(scene)
+        assert {atlas.scene_at(position) for position in in_atlas} == {i}
+        # A pure shift that puts the mean camera into the middle.
+        np.testing.assert_array_equal(cell.atlas_from_base.rotation_wxyz, [1, 0, 0, 0])
+        np.testing.assert_allclose(in_atlas.mean(0), cell.centre_m, atol=1e-9)
+        np.testing.assert_allclose(in_atlas - in_atlas[0], scene - scene[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_comes_later_does_not_move_what_came_before(seed: int) -> None:
+    whole, scenes = filled(seed, 9)
+    for count in range(9):
+        part = Atlas()
+        for scene in scenes[:count]:
+            part.place(scene)
+        assert part.cells == whole.cells[:count]
+
+
+def test_a_scene_gets_the_first_free_place_of_the_spiral() -> None:
+    atlas, scenes = filled(3, 6)
+    for i, scene in enumerate(scenes):
+        side = max(5.0, 2 * max(scene[:, k].max() - scene[:, k].min() for k in range(3)))
+        places = (Cell((float(x), float(y), 0.0), side, (0.0, 0.0, 0.0)) for x, y, _ in spiral())
+        wanted = next(
+            place
+            for place in places
+            if all(overlap(place, cell) < 1e-9 for cell in atlas.cells[:i])
+        )
+        assert atlas.cells[i].centre_m == wanted.centre_m
+        assert atlas.cells[i].side_m == pytest.approx(side)
+
+
+def test_the_cell_of_a_place() -> None:
+    atlas = Atlas()
+    assert atlas.scene_at(np.zeros(3)) is None
+    atlas.place(np.zeros((1, 3)))  # 5 m around the origin
+    atlas.place(np.array([[0.0, 0, 0], [0, 8, 0]]))  # 16 m
+    near, far = atlas.cells
+    assert (near.side_m, far.side_m) == (5.0, 16.0)
+    for i, cell in enumerate(atlas.cells):
+        for corner in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+            step = np.array([*corner, 0]) * cell.side_m / 2
+            assert atlas.scene_at(np.array(cell.centre_m) + 0.999 * step) == i
+            assert atlas.scene_at(np.array(cell.centre_m) + 1.001 * step) != i
+    assert atlas.scene_at(np.array([0, 0, 40.0])) == 0  # height does not matter
+    assert atlas.scene_at(np.array([1000.0, 0, 0])) is None
+    assert atlas.scene_at(np.full(3, np.nan)) is None
+
+
+def test_the_spiral_fills_squares_one_after_another() -> None:
+    for half in range(5):
+        side = 2 * half + 1
+        points = np.array(list(islice(spiral(), side * side))) / 5.0
+        expected = {(x, y) for x in range(-half, half + 1) for y in range(-half, half + 1)}
+        assert {(int(x), int(y)) for x, y, _ in points} == expected
+        assert all(np.abs(b - a).sum() == 1 for a, b in pairwise(points))
+        assert not points[:, 2].any()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 7, 9, 10, 12, 16, 17, 19, 30])
+def test_the_paper_grid_is_glaces_rule(count: int) -> None:
+    g = next(g for g in range(1, 100) if g * g >= count)
+    expected = [(-5 * (math.ceil(Fraction(i + 1, g)) - 1), -5 * (i % g), 0) for i in range(count)]
+    grid = paper_grid(count)
+    assert [tuple(row) for row in grid] == expected
+    assert len(set(expected)) == count
+    atlas = Atlas("paper", count)
+    for i in range(count):
+        cell = atlas.place(np.array([[0.0, 0, 0], [3, 3, 3]]))
+        assert cell.centre_m == expected[i]
+        assert atlas.scene_at(np.array(cell.centre_m)) == i
+    with pytest.raises(InputError, match=f"{count} scenes"):
+        atlas.place(np.zeros((1, 3)))
+
+
+def test_seven_and_twelve_scenes_stand_in_rows_of_three_and_four() -> None:
+    assert paper_grid(7)[:, :2].tolist() == [
+        [0, 0], [0, -5], [0, -10], [-5, 0], [-5, -5], [-5, -10], [-10, 0]
+    ]  # fmt: skip
+    assert paper_grid(12)[11].tolist() == [-10, -15, 0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_centres_of_all_scenes_lie_where_their_cameras_will(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scenes = [rng.uniform(-1, 1, (n, 3)) + rng.normal(0, 30, 3) for n in (30, 3, 40, 25, 20)]
+    centres = np.array(combined_centres(scenes, 15, seed))
+    assert len(centres) == 15
+    assert combined_centres(scenes, 15, seed) == tuple(map(tuple, centres))
+    atlas = Atlas("paper", len(scenes))
+    shares = []
+    for positions in scenes:
+        in_atlas = atlas.place(positions).atlas_from_base.apply(positions)
+        # Scenes are 5 m apart and 2 m wide, so that each centre is the mean of one's cameras.
+        inside = (centres >= in_atlas.min(0) - 1e-9) & (centres <= in_atlas.max(0) + 1e-9)
+        shares.append(inside.all(1).sum())
+    assert sum(shares) == 15
+    assert min(shares) >= 1
+    np.testing.assert_array_equal([c.centre_m for c in atlas.cells], paper_grid(5))

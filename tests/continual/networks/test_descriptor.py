@@ -1,0 +1,90 @@
+"""The global descriptor: what it must not depend on, and the file it is read from."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from evercal.continual.networks.descriptor import GlobalDescriptor, load_descriptor
+from evercal.errors import InputError
+from evercal.features.encoder import load_encoder
+from evercal.features.weights_file import network_bytes
+
+
+def tiny() -> GlobalDescriptor:
+    torch.manual_seed(0)
+    return GlobalDescriptor(5, maps=3, hidden=4, width=6)
+
+
+def by_hand(descriptor: GlobalDescriptor, features: np.ndarray) -> np.ndarray:
+    """One image's (inputs, cells) features to (width,), cell by cell in double precision."""
+    w = {k: v.double().squeeze(-1).squeeze(-1).numpy() for k, v in descriptor.state_dict().items()}
+    weights, values = [], []
+    for cell in features.T:
+        lifted = np.maximum(w["lift.weight"] @ cell + w["lift.bias"], 0)
+        weights.append(np.exp(w["attention.weight"] @ lifted + w["attention.bias"]))
+        values.append(w["value.weight"] @ lifted + w["value.bias"])
+    share = np.array(weights) / np.sum(weights, axis=0)
+    pooled = share.T @ np.array(values)
+    pooled /= np.linalg.norm(pooled, axis=1, keepdims=True)
+    projection = descriptor.project.weight.detach().double().numpy()
+    whole = projection @ pooled.ravel() + descriptor.project.bias.detach().double().numpy()
+    return whole / np.linalg.norm(whole)
+
+
+def test_agrees_with_a_slow_twin() -> None:
+    descriptor = tiny()
+    features = torch.randn(2, 5, 3, 4, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        found = descriptor(features)
+    for vector, image in zip(found, features, strict=True):
+        twin = by_hand(descriptor, image.flatten(1).double().numpy())
+        np.testing.assert_allclose(vector.numpy(), twin, atol=1e-5)
+
+
+def test_the_order_of_cells_does_not_count() -> None:
+    features = torch.randn(1, 5, 4, 6)
+    shuffled = features.flatten(2)[:, :, torch.randperm(24)].unflatten(2, (4, 6))
+    with torch.no_grad():
+        torch.testing.assert_close(tiny()(features), tiny()(shuffled), atol=1e-6, rtol=0)
+
+
+def test_round_trip_through_a_file(tmp_path: Path) -> None:
+    descriptor = tiny()
+    path = tmp_path / "descriptor.safetensors"
+    path.write_bytes(network_bytes(descriptor, "descriptor"))
+    found = load_descriptor(path)
+    assert found.settings == descriptor.settings
+    for key, value in descriptor.state_dict().items():
+        assert torch.equal(found.state_dict()[key], value.half().float())
+
+
+def test_broken_files_are_refused_by_name(tmp_path: Path) -> None:
+    from safetensors.torch import save
+
+    good = network_bytes(tiny(), "descriptor")
+    broken = {
+        "cut": good[: len(good) // 2],
+        "other_kind": network_bytes(tiny(), "encoder"),
+        "bad_settings": save({"a": torch.zeros(1)}, {"descriptor": "{"}),
+        "strange_settings": save({"a": torch.zeros(1)}, {"descriptor": '{"depth": 3}'}),
+        "other_tensors": save({"a": torch.zeros(1)}, {"descriptor": '{"inputs": 5}'}),
+    }
+    for name, data in broken.items():
+        path = tmp_path / f"{name}.safetensors"
+        path.write_bytes(data)
+        with pytest.raises(InputError, match="not an evercal descriptor") as caught:
+            load_descriptor(path)
+        assert str(path) in str(caught.value)
+        assert len(str(caught.value).splitlines()) == 1
+    with pytest.raises(InputError, match="no such file"):
+        load_descriptor(tmp_path / "none.safetensors")
+
+
+def test_the_shipped_descriptor_fits_the_shipped_encoder() -> None:
+    encoder, descriptor = load_encoder(), load_descriptor()
+    with torch.no_grad():
+        vector = descriptor(encoder(torch.rand(1, 1, 64, 80)))
+    assert vector.shape == (1, descriptor.width)
+    assert float(vector.norm()) == pytest.approx(1.0, abs=1e-5)

@@ -1,0 +1,227 @@
+"""Head, buffer and loss on any device: the CPU's answers, and no tensor made elsewhere."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+
+import pytest
+import torch
+from torch import Tensor
+
+from evercal.continual.networks import buffer as module
+from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, Rows, encode_frames, join
+from evercal.continual.networks.descriptor import GlobalDescriptor
+from evercal.continual.networks.head import Head, HeadOptions
+from evercal.continual.networks.loss import LossOptions, reprojection_loss
+from evercal.features.encoder import LocalEncoder
+from evercal.features.views import ViewOptions
+from evercal.geometry import SE3
+from evercal.simulation.box_room import box_room_scene
+
+from ...one_device import META, OneDevice, made_where_inputs_lie
+
+SHAPES = [
+    HeadOptions(width=12, condition="code", offsets="per_centre"),
+    HeadOptions(width=12, condition="code", offsets="shared"),
+    HeadOptions(width=12, condition="descriptor", offsets="per_centre", centres="fixed"),
+]
+CPU = torch.device("cpu")
+FRAMES = box_room_scene(3, 10, 0).train
+PLAN = EncodePlan(views_per_frame=2, cells=20, view=ViewOptions(short_side=48))
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), device="cpu")
+
+
+def head_of(options: HeadOptions, device: torch.device) -> Head:
+    """A head for three scenes that was moved before it grew and was whitened there."""
+    torch.manual_seed(5)
+    head = Head(7, 4, options).to(device)
+    for scene in range(3):
+        head.grow(3 * random(2, 3, seed=scene), seed=scene)
+    head.whiten((random(60, 7, seed=9) + 1).to(device))
+    return head
+
+
+def buffer_of(device: torch.device, scene: int = 1) -> FeatureBuffer:
+    """Forty rows of two views; points were kept of the first thirty."""
+    buffer = FeatureBuffer(scene, SE3.identity(), device=device)
+    matrix = torch.eye(4, device="cpu")[None, :3] + 0.1 * random(2, 3, 4, seed=2)
+    matrix[:, 2, 3] += 8  # most points lie before the camera
+    buffer.restore(
+        {
+            "features": random(40, 7).half(),
+            "pixels": 20 * random(40, 2, seed=1) + 50,
+            "view": torch.arange(2, dtype=torch.int32, device="cpu").repeat_interleave(20),
+            "intrinsics": torch.tensor([[100.0, 100, 50, 50]] * 2, device="cpu"),
+            "camera_from_atlas": matrix,
+            "descriptors": torch.nn.functional.normalize(random(2, 4, seed=3)),
+        }
+    )
+    buffer.stored = random(30, 3, seed=4).half()
+    return buffer
+
+
+def drawn(buffers: list[FeatureBuffer]) -> Rows:
+    generator = torch.Generator().manual_seed(1)
+    plain = buffer_of(buffers[0].device)
+    plain.stored = None
+    return join([*(buffer.draw(16, generator) for buffer in buffers), plain.draw(8, generator)])
+
+
+def everything(rows: Rows) -> dict[str, Tensor]:
+    assert rows.stored is not None
+    fields = (rows.features, rows.scene, rows.descriptor, rows.index, rows.stored)
+    names = ("features", "scene", "descriptor", "index", "stored")
+    target = rows.target
+    return dict(zip(names, fields, strict=True)) | {
+        "pixels": target.pixels,
+        "intrinsics": target.intrinsics,
+        "camera_from_atlas": target.camera_from_atlas,
+    }
+
+
+def step(head: Head, rows: Rows, scene: Tensor | int) -> dict[str, Tensor]:
+    """Loss and error of rows, and the gradient of every parameter, in fp32."""
+    output = head(rows.features.float(), scene, rows.descriptor)
+    correction = 0.01 * rows.features[:, :5].float()
+    loss, error = reprojection_loss(output.points, rows.target, 7.0, LossOptions(), correction)
+    loss.mean().backward()
+    gradients = {name: p.grad for name, p in head.named_parameters() if p.grad is not None}
+    assert {"logit", "offset", "first.0.weight"} <= gradients.keys()
+    assert error.device == META or error.isfinite().float().mean() > 0.5
+    return gradients | {"loss": loss.detach(), "error": error, "points": output.points.detach()}
+
+
+def test_rows_are_the_same_on_every_device(device: torch.device) -> None:
+    expected = everything(drawn([buffer_of(CPU), buffer_of(CPU, 2)]))
+    for name, value in everything(drawn([buffer_of(device), buffer_of(device, 2)])).items():
+        assert value.device == device, name
+        assert torch.equal(value.cpu().nan_to_num(-7), expected[name].nan_to_num(-7)), name
+    assert torch.isnan(expected["stored"]).any()
+
+
+@pytest.mark.parametrize("options", SHAPES)
+def test_a_step_is_the_same_on_every_device(options: HeadOptions, device: torch.device) -> None:
+    for scene in (None, 1):
+        found = []
+        for where in (CPU, device):
+            rows = drawn([buffer_of(where), buffer_of(where, 2)])
+            found.append(step(head_of(options, where), rows, rows.scene if scene is None else 1))
+        for name, expected in found[0].items():
+            value = found[1][name]
+            assert value.device == device, name
+            size = float(expected[expected.isfinite()].abs().max()) + 1e-6
+            torch.testing.assert_close(value.cpu(), expected, atol=1e-3 * size, rtol=1e-3)
+
+
+def test_rows_that_a_device_has_no_room_for_are_the_same(
+    device: torch.device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = everything(drawn([buffer_of(device)]))
+    monkeypatch.setattr(module, "_fits", lambda *_: False)
+    buffer = buffer_of(device)
+    assert buffer.tensors["features"].device == CPU
+    for name, value in everything(drawn([buffer])).items():
+        assert value.device == device, name
+        assert torch.equal(value.nan_to_num(-7), expected[name].nan_to_num(-7)), name
+
+
+def test_a_quarter_of_a_gpu_is_spared_and_what_the_allocator_holds_is_free(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gpu, rows = torch.device("cuda", 0), {"a": torch.zeros(100, dtype=torch.uint8)}
+    free = [125, 400]
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: tuple(free))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda _: 90)
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda _: 15)
+    assert module._fits(rows, gpu)
+    free[0] -= 1
+    assert not module._fits(rows, gpu)
+    assert module._fits(rows, CPU)
+
+
+@pytest.mark.parametrize("options", SHAPES)
+@pytest.mark.parametrize("one_scene", [False, True])
+def test_nothing_is_made_on_the_default_device(options: HeadOptions, one_scene: bool) -> None:
+    """The default device is `meta`, the inputs lie on the CPU: both must give the same numbers."""
+
+    def whole() -> dict[str, Tensor]:
+        head, buffers = head_of(options, CPU), [buffer_of(CPU), buffer_of(CPU, 2)]
+        with made:
+            rows = drawn(buffers)
+            more = step(head, rows, 1 if one_scene else rows.scene)
+            head.grow(torch.ones(2, 3, device="cpu"), seed=8)
+            head.whiten(rows.features)
+        return everything(rows) | more | dict(head.state_dict())
+
+    made = nullcontext()
+    expected = whole()
+    made = made_where_inputs_lie()
+    found = whole()
+    assert found.keys() == expected.keys()
+    for name, value in found.items():
+        assert value.device == CPU, name
+        assert torch.equal(value.nan_to_num(-7), expected[name].nan_to_num(-7)), name
+
+
+@pytest.mark.parametrize("options", SHAPES)
+def test_nothing_is_left_on_the_cpu(options: HeadOptions, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Head and rows lie on `meta`, the default device is the CPU; no operation takes both."""
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # has none for meta
+    head, buffers = Head(7, 4, options).to(META), [buffer_of(META), buffer_of(META, 2)]
+    with OneDevice():
+        for scene in range(3):
+            head.grow(random(2, 3), seed=scene)
+        rows = drawn(buffers)
+        found = step(head, rows, rows.scene)
+    for name, value in (everything(rows) | found | dict(head.state_dict())).items():
+        assert value.device == META, name
+
+
+def test_the_guard_finds_what_it_is_for() -> None:
+    ones = torch.ones(3)
+    with pytest.raises(AssertionError, match="meta"), made_where_inputs_lie():
+        torch.nn.functional.linear(ones[None], torch.zeros(2, 3))
+    with pytest.raises(AssertionError, match="meta"), OneDevice():
+        torch.mm(torch.zeros(3, 3, device=META), ones[:, None])
+    with OneDevice():
+        assert torch.zeros(3, device=META).mul(torch.tensor(2.0)).device == META
+
+
+def networks(device: torch.device) -> tuple[LocalEncoder, GlobalDescriptor]:
+    torch.manual_seed(0)
+    encoder = LocalEncoder(stem=(4, 4), inner=8, blocks=1, width=8).eval()
+    return encoder.to(device), GlobalDescriptor(8, maps=2, hidden=4, width=8).eval().to(device)
+
+
+def encoded(device: torch.device, rows_on: torch.device) -> FeatureBuffer:
+    """A buffer that networks on a device filled; someone looked in between."""
+    buffer, taken = FeatureBuffer(0, SE3.identity(), device=rows_on), 0
+    for _ in encode_frames(buffer, FRAMES, PLAN, *networks(device)):
+        new = buffer.take_new()
+        assert all(value.device == CPU for value in new.values())
+        taken += len(new["features"])
+        assert len(buffer) == taken
+    return buffer
+
+
+@pytest.mark.parametrize("rows_on", ["cpu", "device"])
+def test_views_are_encoded_where_the_networks_lie(device: torch.device, rows_on: str) -> None:
+    expected = encoded(CPU, CPU).tensors
+    where = CPU if rows_on == "cpu" else device
+    for name, value in encoded(device, where).tensors.items():
+        assert value.device == where, name
+        # Features in half precision, made in bfloat16 where that is fast.
+        torch.testing.assert_close(value.cpu(), expected[name], atol=0.03, rtol=0.03)
+
+
+def test_encoding_makes_nothing_on_the_default_device() -> None:
+    expected = encoded(CPU, CPU).tensors
+    both, buffer = networks(CPU), FeatureBuffer(0, SE3.identity())
+    with made_where_inputs_lie():
+        for _ in encode_frames(buffer, FRAMES, PLAN, *both):
+            pass
+    for name, value in buffer.tensors.items():
+        assert torch.equal(value, expected[name]), name

@@ -1,0 +1,290 @@
+"""The scene-coordinate head against closed forms and a slow twin, and what growing may change."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from evercal.continual.networks.head import Head, HeadOptions, homogeneous_scale
+from evercal.continual.presets import PRESETS
+from evercal.errors import InputError
+
+FEATURES, DESCRIPTOR, CENTRES = 7, 5, 3
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def grown(options: HeadOptions, scenes: int, features: int = FEATURES) -> Head:
+    torch.manual_seed(5)
+    head = Head(features, DESCRIPTOR, options)
+    for scene in range(scenes):
+        head.grow(4 * random(CENTRES, 3, seed=scene), seed=scene)
+    with torch.no_grad():  # a new scene's biases are zero; a trained head's are not
+        head.logit_bias.copy_(random(*head.logit_bias.shape, seed=8))
+        head.offset_bias.copy_(random(*head.offset_bias.shape, seed=9))
+    head.whiten(random(50, features, seed=7) * torch.linspace(0.1, 3, features) + 1)
+    return head.eval()
+
+
+SHAPES = [
+    HeadOptions(width=12, condition="code", offsets="per_centre"),
+    HeadOptions(width=12, condition="code", offsets="shared", blocks=2),
+    HeadOptions(width=12, condition="descriptor", offsets="per_centre", blocks=0),
+    HeadOptions(width=12, condition="descriptor", offsets="shared"),
+    HeadOptions(width=FEATURES, condition="code"),  # the first skip is the identity
+    HeadOptions(width=12, whiten=False, activation="relu"),
+]
+CODED = [shape for shape in SHAPES if shape.condition == "code"]
+
+
+def test_whitening_centres_scales_and_half_decorrelates() -> None:
+    mixing = random(FEATURES, FEATURES, seed=3)
+    rows = random(4000, FEATURES, seed=4) @ mixing + 5
+    head = Head(FEATURES, DESCRIPTOR, HeadOptions(width=12))
+    head.whiten(rows)
+    white = ((rows - head.feature_mean) @ head.feature_map).double()
+    torch.testing.assert_close(white.mean(0), torch.zeros(FEATURES).double(), atol=1e-5, rtol=0)
+    assert abs(float(white.std()) - 1) < 1e-3
+
+    def condition(x: Tensor) -> float:
+        return float(torch.linalg.cond(torch.cov(x.double().T)))
+
+    # Standard deviations s become s^(1/2): condition numbers of covariances their root.
+    assert condition(white) == pytest.approx(math.sqrt(condition(rows)), rel=0.02)
+    assert condition(rows) > 50
+
+
+def test_whitening_leaves_alone_what_does_not_vary() -> None:
+    rows = random(500, FEATURES, seed=4)
+    rows[:, 0] = 2.0
+    head = Head(FEATURES, DESCRIPTOR, HeadOptions(width=12))
+    head.whiten(rows)
+    query = rows[:1].clone()
+    query[:, 0] += 1e-3
+    white = (torch.cat([rows[:1], query]) - head.feature_mean) @ head.feature_map
+    assert float((white[0] - white[1]).abs().max()) < 0.05
+
+
+def test_scale_in_closed_form() -> None:
+    raw = torch.tensor([-torch.inf, -60.0, 0.0, 200.0, torch.inf])
+    expected = torch.tensor([0.25, 0.25, 1.0, 100.0, 100.0])
+    torch.testing.assert_close(homogeneous_scale(raw), expected)
+
+
+def test_scale_agrees_with_the_formula_and_only_grows() -> None:
+    z = np.linspace(-20, 120, 2001)
+    beta = math.log(2) / (1 - 1 / 4)
+    twin = np.minimum(np.log(1 + np.exp(beta * z)) / beta + 1 / 4, 1 / 0.01)
+    found = homogeneous_scale(torch.from_numpy(z)).numpy()
+    np.testing.assert_allclose(found, twin, rtol=1e-6)
+    assert (np.diff(found) >= 0).all()
+    assert (np.diff(found)[z[1:] < 90] > 0).all()
+    assert found.min() > 0.25
+    assert found.max() == 100.0
+
+
+def by_hand(head: Head, feature: np.ndarray, scene: int, descriptor: np.ndarray) -> np.ndarray:
+    """One row's point (3,), layer by layer in double precision."""
+    w = {key: value.double().numpy() for key, value in head.state_dict().items()}
+    coded, layer = head.options.condition == "code", 0
+
+    def linear(name: str, x: np.ndarray) -> np.ndarray:
+        nonlocal layer
+        y = w[f"{name}.weight"] @ x + w[f"{name}.bias"]
+        if coded:
+            y = y + w["code"][scene, layer]
+        layer += 1
+        if head.options.activation == "relu":
+            return np.maximum(y, 0)
+        return np.array([v * (1 + math.erf(v / math.sqrt(2))) / 2 for v in y])
+
+    if head.options.whiten:
+        feature = (feature - w["feature_mean"]) @ w["feature_map"]
+    else:
+        feature = math.sqrt(len(feature)) * feature  # unit length to unit variance
+    x = feature if coded else np.concatenate([descriptor, feature])
+    y = x
+    for i in range(3):
+        y = linear(f"first.{i}", y)
+    y = y + (w["skip.weight"] @ x + w["skip.bias"] if "skip.weight" in w else x)
+    for block in range(head.options.blocks):
+        z = y
+        for i in range(3):
+            z = linear(f"blocks.{block}.{i}", z)
+        y = y + z
+    for i in range(2):
+        y = linear(f"last.{i}", y)
+    assert layer == head.layers
+
+    total, weight = np.zeros(3), 0.0
+    beta = math.log(2) / 0.75
+    for k, centre in enumerate(w["centres"]):
+        if coded and w["centre_scene"][k] != scene:
+            continue
+        share = math.exp(w["logit"][k] @ y + w["logit_bias"][k])
+        own = k if head.options.offsets == "per_centre" else 0
+        *offset, raw = w["offset"][own] @ y + w["offset_bias"][own]
+        scale = min(math.log(1 + math.exp(beta * raw)) / beta + 0.25, 100.0)
+        total += share * (centre + np.array(offset) / scale)
+        weight += share
+    return total / weight
+
+
+@pytest.mark.parametrize("options", SHAPES)
+def test_points_agree_with_a_slow_twin(options: HeadOptions) -> None:
+    head = grown(options, 3)
+    features, descriptors = random(9, FEATURES, seed=1), random(9, DESCRIPTOR, seed=2)
+    scene = torch.arange(9) % 3
+    with torch.no_grad():
+        points = head(features, scene, descriptors).points.numpy()
+    for i in range(9):
+        twin = by_hand(head, features[i].double().numpy(), i % 3, descriptors[i].double().numpy())
+        np.testing.assert_allclose(points[i], twin, atol=1e-5)
+
+
+@pytest.mark.parametrize("options", CODED)
+@pytest.mark.parametrize("rows", [1, 40, 1200])
+def test_new_scenes_change_not_one_bit_of_what_is_said_about_old_ones(
+    options: HeadOptions, rows: int
+) -> None:
+    head, features = grown(options, 2), random(rows, FEATURES, seed=1)
+    mixed = torch.arange(rows) % 2
+    with torch.no_grad():
+        before = [head(features, scene, None).points for scene in (0, 1)]
+        together = head(features, mixed, None).points
+        for more in range(3):
+            head.grow(20 * random(CENTRES + more, 3, seed=more), seed=more)
+            for scene in (0, 1):
+                assert torch.equal(head(features, scene, None).points, before[scene])
+            # With rows of several scenes the products get wider, and rounding with them.
+            close = head(features, mixed, None).points
+            torch.testing.assert_close(close, together, atol=1e-5, rtol=0)
+    assert head.scenes == 5
+    assert not torch.equal(before[0], before[1])
+
+
+@pytest.mark.parametrize("options", SHAPES)
+def test_growing_keeps_every_old_number(options: HeadOptions) -> None:
+    head = grown(options, 2)
+    before = {key: value.clone() for key, value in head.state_dict().items()}
+    head.grow(random(4, 3), seed=9)
+    after = head.state_dict()
+    assert set(after) == set(before)
+    for key, value in before.items():
+        assert torch.equal(after[key][: len(value)], value), key
+    assert torch.equal(after["centres"][-4:], random(4, 3))
+    assert all(parameter.requires_grad for parameter in head.parameters())
+
+
+@pytest.mark.parametrize("options", CODED)
+def test_a_number_and_a_tensor_of_scenes_agree(options: HeadOptions) -> None:
+    head, features = grown(options, 3), random(50, FEATURES, seed=1)
+    for scene in range(3):
+        own = head.centre_scene == scene
+        with torch.no_grad():
+            one = head(features, scene, None)
+            many = head(features, torch.full((50,), scene), None)
+        torch.testing.assert_close(one.points, many.points, atol=1e-5, rtol=0)
+        torch.testing.assert_close(one.logits, many.logits[:, own], atol=1e-5, rtol=0)
+        assert torch.isneginf(many.logits[:, ~own]).all()
+        assert (many.logits.softmax(-1)[:, ~own] == 0).all()
+
+
+@pytest.mark.parametrize("options", CODED)
+def test_other_scenes_centres_have_no_share_at_all(options: HeadOptions) -> None:
+    """Absurd weights there change nothing, and no gradient reaches them."""
+    head, features = grown(options, 3), random(30, FEATURES, seed=1)
+    scene = torch.full((30,), 1)
+    with torch.no_grad():
+        before = head(features, scene, None).points
+        foreign = head.centre_scene != 1
+        head.centres[foreign] = 1e30
+        head.logit_bias[foreign] = 1e30
+    output = head(features, scene, None)
+    assert torch.equal(output.points, before)
+    output.points.sum().backward()
+    assert head.logit.grad is not None
+    assert head.code.grad is not None
+    assert (head.logit.grad[foreign] == 0).all()
+    assert (head.code.grad[[0, 2]] == 0).all()
+    assert (head.code.grad[1] != 0).any()
+
+
+def test_with_a_descriptor_the_image_alone_decides() -> None:
+    head, features = grown(SHAPES[3], 3), random(30, FEATURES, seed=1)
+    first, second = random(30, DESCRIPTOR, seed=2), random(30, DESCRIPTOR, seed=3)
+    with torch.no_grad():
+        points = head(features, 0, first).points
+        assert torch.equal(head(features, 2, first).points, points)
+        assert torch.equal(head(features, torch.arange(30) % 3, first).points, points)
+        assert not torch.allclose(head(features, 0, second).points, points)
+        assert torch.isfinite(head(features, 0, first).logits).all()
+
+
+def test_centres_and_sum_stay_in_fp32_under_autocast() -> None:
+    """At 5 km bfloat16 steps by 32 m; only the offset may carry the error of mixed precision."""
+    head, features = grown(SHAPES[0], 1), random(30, FEATURES, seed=1)
+    head.centres += torch.tensor([5000.0, 0.0, 0.0])
+    with torch.no_grad():
+        exact = head(features, 0, None).points
+        with torch.autocast("cpu", torch.bfloat16):
+            mixed = head(features, 0, None)
+    assert mixed.points.dtype == mixed.logits.dtype == mixed.offsets.dtype == torch.float32
+    torch.testing.assert_close(mixed.points, exact, atol=0.2, rtol=0)
+
+
+def in_preset(name: str, scenes: int) -> Head:
+    options = PRESETS[name].head
+    torch.manual_seed(0)
+    head = Head(128, 128, options)
+    for scene in range(scenes):
+        head.grow(5 * random(options.centres_per_scene, 3, seed=scene), seed=scene)
+    return head
+
+
+def total_bytes(head: Head) -> int:
+    """In half precision, the centres in single."""
+    return 2 * sum(p.numel() for p in head.parameters()) + 4 * head.centres.numel()
+
+
+@pytest.mark.parametrize("name", ["fast", "demo", "bench"])
+def test_every_scene_trains_at_least_90_percent_of_the_head(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """Shared means shared, with seven scenes: no part of the head is set aside for one of them.
+
+    Which units a ReLU closes is a matter of weights, not of the layout, so here none is closed.
+    """
+    monkeypatch.setattr(torch.nn.functional, "relu", torch.nn.functional.softplus)
+    head = in_preset(name, 7)
+    total = sum(parameter.numel() for parameter in head.parameters())
+    for scene in range(7):
+        head.zero_grad()
+        features = torch.nn.functional.normalize(random(1500, 128, seed=scene), dim=-1)
+        head(features, torch.full((1500,), scene), None).points.abs().sum().backward()
+        touched = sum(int((p.grad != 0).sum()) for p in head.parameters() if p.grad is not None)
+        assert touched / total >= 0.90
+
+
+@pytest.mark.parametrize("name", ["fast", "demo", "bench"])
+def test_a_scene_adds_at_most_5_percent(name: str) -> None:
+    one, two = in_preset(name, 1), in_preset(name, 2)
+    added = total_bytes(two) - total_bytes(one)
+    assert 0 < added <= 0.05 * total_bytes(one)
+
+
+def test_centres_without_a_scene_need_the_descriptor() -> None:
+    options = HeadOptions(width=8, condition="descriptor", centres="fixed")
+    head = Head(FEATURES, DESCRIPTOR, options)
+    head.grow(random(6, 3), 0)
+    head.grow(torch.zeros(0, 3), 1)
+    assert head.centres.shape == (6, 3)
+    points = head(random(4, FEATURES), 1, random(4, DESCRIPTOR)).points
+    assert torch.isfinite(points).all()
+    with pytest.raises(InputError, match="condition 'code'"):
+        Head(FEATURES, DESCRIPTOR, replace(options, condition="code"))

@@ -1,5 +1,0 @@
-"""A box room and networks that need no training."""
-
-from ..box_world import block_mean, box, describe, learnable, shoot
-
-__all__ = ["block_mean", "box", "describe", "learnable", "shoot"]

@@ -1,0 +1,220 @@
+"""The generic folder format: round trips, and damage named."""
+
+import dataclasses
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evercal.errors import InputError
+from evercal.geometry import SE3, Camera
+from evercal.recordings import Frame, Recording, generic, load_recording
+from evercal.recordings.images import write_image
+
+WIDE = Camera(32, 24, 30.25, 31.5, 15.5, 11.5, (0.1, -0.02, 0.001, 0.002, 0.03))
+TALL = Camera(24, 32, 30.0, 30.0, 11.5, 15.5)
+
+
+def make_scene() -> Recording:
+    rng = np.random.default_rng(0)
+
+    def frame(i: int, camera: Camera, gripper: bool = False) -> Frame:
+        image = rng.integers(0, 255, (camera.height, camera.width, 3), np.uint8)
+        pose = SE3.exp(rng.normal(size=6))
+        arm = SE3.exp(rng.normal(size=6)) if gripper else None
+        return Frame(f"shot/{i}", image, camera, pose, arm)
+
+    train = (frame(0, WIDE), frame(1, TALL, gripper=True), frame(2, WIDE))
+    unposed = Frame("shot/3", train[0].image, WIDE, None)
+    return Recording("the café", train, (frame(4, TALL), unposed), untracked=7)
+
+
+def poses_equal(a: SE3 | None, b: SE3 | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    return np.allclose(a.matrix(), b.matrix(), rtol=0, atol=1e-15)
+
+
+def assert_same(a: Recording, b: Recording) -> None:
+    assert (a.name, a.untracked) == (b.name, b.untracked)
+    for ours, theirs in ((a.train, b.train), (a.test, b.test)):
+        assert [frame.name for frame in ours] == [frame.name for frame in theirs]
+        for x, y in zip(ours, theirs, strict=True):
+            assert x.camera == y.camera
+            assert poses_equal(x.base_from_camera, y.base_from_camera)
+            assert poses_equal(x.base_from_gripper, y.base_from_gripper)
+            np.testing.assert_array_equal(x.read_image(), y.read_image())
+
+
+def test_a_scene_comes_back_as_it_was_written(tmp_path: Path) -> None:
+    scene = make_scene()
+    generic.write(tmp_path / "a", scene)
+    read = load_recording(tmp_path / "a")
+    assert_same(scene, read)
+    # From files this time: images are copied, not encoded again.
+    generic.write(tmp_path / "b", read)
+    assert_same(scene, load_recording(tmp_path / "b"))
+    assert (tmp_path / "a/scene.json").read_bytes() == (tmp_path / "b/scene.json").read_bytes()
+
+
+def test_depth_and_joint_angles_travel_along(tmp_path: Path) -> None:
+    first = make_scene().train[0]
+    depth = tmp_path / "depth.png"
+    depth.write_bytes(b"any bytes: depth is copied, not decoded")
+    frame = dataclasses.replace(first, depth=depth, joints_rad=(0.1, -0.2, 0.3))
+    generic.write(tmp_path / "a", Recording("arm", (frame, make_scene().train[1]), ()))
+    read = load_recording(tmp_path / "a").train
+    copied = tmp_path / "a/depth/000000.png"
+    assert read[0].depth == copied
+    assert copied.read_bytes() == depth.read_bytes()
+    assert read[0].joints_rad == (0.1, -0.2, 0.3)
+    assert (read[1].depth, read[1].joints_rad) == (None, None)
+
+
+def test_an_interrupted_recording_is_no_scene(tmp_path: Path) -> None:
+    frame = make_scene().train[0]
+
+    def record() -> None:
+        with generic.SceneWriter(tmp_path, "x") as writer:
+            writer.add(frame, "train")
+            raise RuntimeError("plug pulled")
+
+    with pytest.raises(RuntimeError, match="pulled"):
+        record()
+    with pytest.raises(InputError, match="no known scene format"):
+        load_recording(tmp_path)
+
+
+def test_the_writer_neither_overwrites_nor_repeats(tmp_path: Path) -> None:
+    scene = make_scene()
+    generic.write(tmp_path, scene)
+    with pytest.raises(InputError, match=r"scene\.json: already there"):
+        generic.write(tmp_path, scene)
+    with generic.SceneWriter(tmp_path / "other", "x") as writer:
+        writer.add(scene.train[0], "train")
+        with pytest.raises(InputError, match="'shot/0': already written"):
+            writer.add(scene.train[0], "test")
+
+
+def numbered(folder: Path, count: int) -> Recording:
+    """Images that show their number, as files."""
+    folder.mkdir(parents=True)
+    frames = []
+    for i in range(count):
+        path = folder / f"{i:06d}.png"
+        write_image(path, np.full((3, 4, 3), i, np.uint8))
+        frames.append(Frame(str(i), path, Camera(4, 3, 4.0, 4.0, 1.5, 1.0), SE3.identity()))
+    return Recording("x", tuple(frames), ())
+
+
+def shown(scene: Recording) -> list[int]:
+    return [int(frame.read_image()[0, 0, 0]) for frame in scene.train]
+
+
+def test_images_of_the_source_are_never_written_to(tmp_path: Path) -> None:
+    scene = numbered(tmp_path / "source" / "images", 4)
+    fewer = replace(scene, train=scene.train[::2])
+    # In place, where image 1 would become image 2.
+    with pytest.raises(InputError, match=r"000001\.png: already there; give a new folder"):
+        generic.write(tmp_path / "source", fewer)
+    # Through hard links that an earlier copy left, whether its scene.json was removed ...
+    out = tmp_path / "out"
+    generic.write(out, scene, link=True)
+    (out / generic.FILE).unlink()
+    for _ in range(2):  # a refusal leaves nothing that would allow it afterwards
+        with pytest.raises(InputError, match=r"000001\.png: already there"):
+            generic.write(out, fewer)
+    # ... or it was cut off; then what it left is replaced.
+    other = tmp_path / "other"
+    writer = generic.SceneWriter(other, "x", link=True)
+    for frame in scene.train:
+        writer.add(frame, "train")
+    generic.write(other, fewer)
+    assert shown(generic.load(other)) == [0, 2]
+    assert shown(scene) == [0, 1, 2, 3]
+    assert {path.name for path in other.iterdir()} == {"images", "scene.json"}
+    assert not [path for path in (other / "images").iterdir() if path.name.startswith(".")]
+
+
+def test_unknown_keys_are_passed_over(tmp_path: Path) -> None:
+    scene = make_scene()
+    generic.write(tmp_path, scene)
+    file = tmp_path / "scene.json"
+    data = json.loads(file.read_text())
+    data["robot"] = "UR5e"
+    data["cameras"]["0"]["serial"] = 5
+    for entry in data["frames"]:
+        entry["exposure_ms"] = 4.5
+        entry["base_from_camera"] = entry["base_from_camera"] and {
+            **entry["base_from_camera"],
+            "covariance": [],
+        }
+    file.write_text(json.dumps(data))
+    assert_same(scene, load_recording(tmp_path))
+
+
+FIRST = ("frames", 0)
+BREAKS = [
+    (("format",), "other", "'format' is not 'evercal-scene'"),
+    (("version",), 2, "version 2, this evercal reads 1"),
+    (("frames",), [], "no frames"),
+    (("frames",), {}, "'frames' is a list"),
+    (("cameras",), [], "'cameras' is an object"),
+    (("cameras", "1", "fx"), -1, "camera '1': camera fx"),
+    (("untracked",), "many", "'untracked' is a count"),
+    ((*FIRST, "image"), "images/none.png", r"images/none\.png: named in .*scene\.json but missing"),
+    ((*FIRST, "image"), "../secret.png", "stays inside"),
+    ((*FIRST, "image"), "/etc/hosts", "relative"),
+    ((*FIRST, "camera"), "9", r"frame 0: 'camera' is one of \['0', '1'\], got '9'"),
+    ((*FIRST, "camera"), [], "frame 0: 'camera'"),
+    ((*FIRST, "split"), "val", "'train' or 'test', got 'val'"),
+    ((*FIRST, "name"), "shot/1", "'shot/1' comes twice"),
+    ((*FIRST, "base_from_camera"), [1, 2], "frame 0: 'base_from_camera'"),
+    ((*FIRST, "base_from_camera", "translation_m"), [1, 2], "'translation_m' is 3 numbers"),
+    ((*FIRST, "base_from_camera", "translation_m"), [1, 2, "3"], "'translation_m' is 3 numbers"),
+    ((*FIRST, "base_from_camera", "quaternion_wxyz"), [0, 0, 0, 0], "has length 1"),
+    ((*FIRST, "base_from_gripper"), {"translation_m": [0, 0, 0]}, "'quaternion_wxyz' is 4"),
+    ((*FIRST, "base_from_camera", "translation_m"), [10**400, 0, 0], "too large"),
+    (FIRST, "frame", "frame 0 is an object"),
+]
+
+
+@pytest.mark.parametrize(("where", "value", "message"), BREAKS)
+def test_damage_is_named_in_one_line(
+    tmp_path: Path, where: tuple[str | int, ...], value: object, message: str
+) -> None:
+    generic.write(tmp_path, make_scene())
+    file = tmp_path / "scene.json"
+    data = json.loads(file.read_text())
+    target = data
+    for key in where[:-1]:
+        target = target[key]
+    target[where[-1]] = value
+    file.write_text(json.dumps(data))
+    with pytest.raises(InputError, match=message) as caught:
+        load_recording(tmp_path)
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", "\x00"])
+def test_what_is_no_scene_file_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "scene.json").write_text(text)
+    with pytest.raises(InputError, match=r"scene\.json"):
+        load_recording(tmp_path)
+
+
+def test_formats_are_named_and_recognised(tmp_path: Path) -> None:
+    generic.write(tmp_path / "a", make_scene())
+    assert load_recording(tmp_path / "a", format="generic", name="lab").name == "lab"
+    with pytest.raises(InputError, match="use one of generic, 7scenes"):
+        load_recording(tmp_path / "a", format="gopro")
+    with pytest.raises(InputError, match="no such folder"):
+        load_recording(tmp_path / "b")
+    with pytest.raises(InputError, match="a file, not a folder"):
+        load_recording(tmp_path / "a/scene.json")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"no known scene format; expected scene\.json"):
+        load_recording(tmp_path / "empty")

@@ -1,0 +1,344 @@
+"""LeRobot datasets in the layouts of versions 2.1 and 3.0, videos and embedded images.
+
+The files are as the package lerobot 0.4 (version 3) and 0.3 (version 2) writes them.
+"""
+
+import json
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from evercal.errors import InputError
+from evercal.geometry import SE3, Camera, pose_distance
+from evercal.recordings import ReadOptions, generic, load_recording
+
+av: Any = pytest.importorskip("av", reason="the extra 'lerobot' is not installed")
+pa: Any = pytest.importorskip("pyarrow", reason="the extra 'lerobot' is not installed")
+pq: Any = pytest.importorskip("pyarrow.parquet", reason="the extra 'lerobot' is not installed")
+
+WRIST, FRONT = "observation.images.wrist", "observation.images.front"
+EPISODES, LENGTH, FPS = 3, 7, 10
+URDF = """<robot name="planar"><link name="base"/><link name="upper"/><link name="tip"/>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+  <joint name="reach" type="prismatic"><parent link="upper"/><child link="tip"/>
+    <origin xyz="0.5 0 0"/><axis xyz="1 0 0"/></joint></robot>"""
+
+
+def picture(episode: int, number: int) -> np.ndarray:
+    image = np.zeros((64, 96, 3), np.uint8)
+    image[:] = (200, 60, 20 + 10 * number + 70 * episode)
+    image[32:, 48:] = (20, 220, 60)
+    return image
+
+
+def pose(episode: int, number: int) -> SE3:
+    half = 0.05 * number
+    return SE3(np.array([np.cos(half), 0, 0, np.sin(half)]), np.array([0.1 * number, episode, 0.5]))
+
+
+def joints(episode: int, number: int) -> list[float]:
+    return [0.1 * number + 0.3 * episode, 0.05 * number]
+
+
+def write_video(path: Path, images: list[np.ndarray], codec: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=FPS, options={"crf": "10"})
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def write_rows(path: Path, episodes: range, images: bool) -> None:
+    rows = [(e, n) for e in episodes for n in range(LENGTH)]
+    state = [joints(e, n) for e, n in rows]
+    poses = [pose(e, n) for e, n in rows]
+    ee = [[*p.translation_m, *p.rotation_wxyz[1:], p.rotation_wxyz[0]] for p in poses]
+    columns: dict[str, Any] = {
+        "observation.state": pa.array(state, pa.list_(pa.float32(), 2)),
+        "observation.ee": pa.array([[float(v) for v in r] for r in ee], pa.list_(pa.float32(), 7)),
+        "timestamp": pa.array([n / FPS for _, n in rows], pa.float32()),
+        "frame_index": pa.array([n for _, n in rows]),
+        "episode_index": pa.array([e for e, _ in rows]),
+    }
+    if images:
+        for key in (WRIST, FRONT):
+            cells = []
+            for e, n in rows:
+                image = picture(e, n) if key == WRIST else 255 - picture(e, n)
+                data = cv2.imencode(".png", image[:, :, ::-1])[1].tobytes()
+                cells.append({"bytes": data, "path": f"frame-{n:06d}.png"})
+            columns[key] = pa.array(cells)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.table(columns), path, row_group_size=5)
+
+
+def make(root: Path, version: str, kind: str = "video", codec: str = "libx264") -> Path:
+    """A dataset of three episodes of seven frames with two cameras."""
+    image = {"dtype": kind, "shape": [64, 96, 3], "names": ["height", "width", "channels"]}
+    state, ee = ["shoulder.pos", "reach.pos"], ["x", "y", "z", "qx", "qy", "qz", "qw"]
+    features: dict[str, Any] = {
+        "observation.state": {"dtype": "float32", "shape": [2], "names": state},
+        "observation.ee": {"dtype": "float32", "shape": [7], "names": ee},
+        WRIST: image,
+        FRONT: image,
+        "timestamp": {"dtype": "float32", "shape": [1], "names": None},
+    }  # fmt: skip
+    info: dict[str, Any] = {
+        "codebase_version": version, "fps": FPS, "chunks_size": 2, "total_episodes": EPISODES,
+        "features": features,
+    }  # fmt: skip
+    if version == "v2.1":
+        info["video_path"] = (
+            "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+        )
+        for e in range(EPISODES):
+            chunk, name = f"chunk-{e // 2:03d}", f"episode_{e:06d}"
+            write_rows(root / "data" / chunk / f"{name}.parquet", range(e, e + 1), kind == "image")
+            if kind == "video":
+                shown = [picture(e, n) for n in range(LENGTH)]
+                write_video(root / "videos" / chunk / WRIST / f"{name}.mp4", shown, codec)
+    else:
+        info["video_path"] = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+        # Two episodes in the first file, one in the second.
+        for i, episodes in enumerate((range(2), range(2, 3))):
+            data = root / "data" / "chunk-000" / f"file-{i:03d}.parquet"
+            write_rows(data, episodes, kind == "image")
+            if kind == "video":
+                shown = [picture(e, n) for e in episodes for n in range(LENGTH)]
+                video = root / "videos" / WRIST / "chunk-000" / f"file-{i:03d}.mp4"
+                write_video(video, shown, codec)
+        listed = [
+            {
+                "episode_index": e,
+                f"videos/{WRIST}/chunk_index": 0,
+                f"videos/{WRIST}/file_index": e // 2,
+                f"videos/{WRIST}/from_timestamp": (e % 2) * LENGTH / FPS,
+            }
+            for e in range(EPISODES)
+        ]
+        (root / "meta/episodes/chunk-000").mkdir(parents=True)
+        pq.write_table(
+            pa.Table.from_pylist(listed), root / "meta/episodes/chunk-000/file-000.parquet"
+        )
+    (root / "meta").mkdir(exist_ok=True)
+    (root / "meta/info.json").write_text(json.dumps(info))
+    (root / "lens.txt").write_text("80 0 47.5\n0 80 31.5\n0 0 1\n")
+    return root
+
+
+def options(root: Path, **more: Any) -> ReadOptions:
+    return ReadOptions(camera=root / "lens.txt", **{"image_topic": WRIST, **more})
+
+
+@pytest.mark.parametrize(
+    ("version", "kind", "codec"),
+    [
+        ("v2.1", "video", "libx264"),
+        ("v2.1", "image", ""),
+        ("v3.0", "video", "libx264"),
+        ("v3.0", "video", "libsvtav1"),
+        ("v3.0", "image", ""),
+    ],
+)
+def test_a_dataset_comes_back(version: str, kind: str, codec: str, tmp_path: Path) -> None:
+    root = make(tmp_path / "wave", version, kind, codec)
+    scene = load_recording(root, options=options(root))
+    assert scene.name == "wave"
+    assert [frame.name for frame in scene.train[6:8]] == [
+        "episode_000000/000006",
+        "episode_000001/000000",
+    ]
+    where = [divmod(i, LENGTH) for i in range(EPISODES * LENGTH)]
+    with ThreadPoolExecutor(3) as pool:  # in any order
+        images = list(pool.map(lambda frame: frame.read_image(), scene.train[::-1]))[::-1]
+    for frame, image, (episode, number) in zip(scene.train, images, where, strict=True):
+        assert frame.camera == Camera(96, 64, 80, 80, 47.5, 31.5)
+        off = np.abs(image[8:24, 8:40].mean((0, 1)) - picture(episode, number)[16, 16])
+        assert off.max() < (5 if kind == "video" else 1e-9)  # frames differ by 10
+        assert frame.base_from_gripper is not None
+        assert max(pose_distance(frame.base_from_gripper, pose(episode, number))) < 1e-6
+    assert scene.notes[0].startswith("gripper poses are observation.ee: ")
+
+
+def test_joints_and_a_urdf_in_radians_or_degrees(tmp_path: Path) -> None:
+    pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
+    root = make(tmp_path / "wave", "v2.1", "image")
+    (root / "arm.urdf").write_text(URDF)
+    for convention, unit in ((None, 1.0), ("rad", 1.0), ("deg", np.pi / 180)):
+        read = options(root, urdf=root / "arm.urdf", pose_convention=convention, every=4)
+        scene = load_recording(root, options=read)
+        assert len(scene.train) == 6
+        for i, frame in enumerate(scene.train):
+            turn, reach = joints(*divmod(4 * i, LENGTH))
+            expected = SE3.exp([0, 0, 0, 0, 0, turn * unit]) @ SE3.exp([0.5 + reach, 0, 0, 0, 0, 0])
+            assert frame.base_from_gripper is not None
+            assert max(pose_distance(frame.base_from_gripper, expected)) < 1e-6
+    with pytest.raises(InputError, match="--pose-convention grad: joint angles are rad or deg"):
+        load_recording(root, options=options(root, urdf=root / "arm.urdf", pose_convention="grad"))
+    with pytest.raises(InputError, match="--base-frame goes with --urdf only"):
+        load_recording(root, options=options(root, base_frame="base"))
+
+
+def test_poses_in_a_given_convention(tmp_path: Path) -> None:
+    root = make(tmp_path / "wave", "v2.1", "image")
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"]["observation.ee"]["names"] = None
+    change(root, features=info["features"])
+    read = options(root, pose_convention="xyzw", gripper_frame="observation.ee")
+    for i, frame in enumerate(load_recording(root, options=read).train):
+        assert frame.base_from_gripper is not None
+        assert max(pose_distance(frame.base_from_gripper, pose(*divmod(i, LENGTH)))) < 1e-6
+    for convention, feature, message in (
+        ("xyzw", None, r"observation\.state: "),
+        ("martian", "observation.ee", "martian"),
+        ("xyzw", "observation.hand", r"no feature 'observation\.hand'; --gripper-frame names one"),
+    ):
+        read = options(root, pose_convention=convention, gripper_frame=feature)
+        with pytest.raises(InputError, match=message):
+            load_recording(root, options=read)
+
+
+def two_arms(root: Path, names: Any) -> None:
+    """The dataset with a second pose behind the first, 5 m above it."""
+    for file in root.glob("data/*/*.parquet"):
+        read = pq.read_table(file)
+        both = [[*r, *r[:2], r[2] + 5, *r[3:]] for r in read["observation.ee"].to_pylist()]
+        column = pa.array(both, pa.list_(pa.float32(), 14))
+        where = read.schema.get_field_index("observation.ee")
+        pq.write_table(read.set_column(where, "observation.ee", column), file)
+    features = json.loads((root / "meta/info.json").read_text())["features"]
+    features["observation.ee"] = {"dtype": "float32", "shape": [14], "names": names}
+    change(root, features=features)
+
+
+def test_of_two_arms_one_is_named(tmp_path: Path) -> None:
+    root, parts = make(tmp_path / "wave", "v2.1", "image"), ["x", "y", "z", "qx", "qy", "qz", "qw"]
+    two_arms(root, [f"{side}_ee.{part}" for side in ("left", "right") for part in parts])
+    said = r"observation\.ee: holds several poses .*--gripper-frame left_ee or right_ee"
+    with pytest.raises(InputError, match=said):
+        load_recording(root, options=options(root))
+    for arm, height in (("left_ee", 0.5), ("right_ee", 5.5)):
+        frame = load_recording(root, options=options(root, gripper_frame=arm)).train[0]
+        assert frame.base_from_gripper is not None
+        assert frame.base_from_gripper.translation_m[2] == pytest.approx(height)
+    change_names(root, {"left": parts, "right": parts})
+    with pytest.raises(InputError, match="--gripper-frame left or right"):
+        load_recording(root, options=options(root))
+    change_names(root, parts * 2)
+    with pytest.raises(
+        InputError, match=r"holds several poses .*; give names that tell them apart"
+    ):
+        load_recording(root, options=options(root))
+    change_names(root, parts)
+    with pytest.raises(InputError, match=r"observation\.ee: has 14 numbers and 7 names"):
+        load_recording(root, options=options(root))
+    read = options(root, pose_convention="xyzw", gripper_frame="observation.ee")
+    assert (
+        "the first 7 of its 14 numbers were taken (x, y,"
+        in load_recording(root, options=read).notes[1]
+    )
+
+
+def change_names(root: Path, names: Any, feature: str = "observation.ee") -> None:
+    features = json.loads((root / "meta/info.json").read_text())["features"]
+    features[feature]["names"] = names
+    change(root, features=features)
+
+
+def test_joints_of_one_name_are_refused(tmp_path: Path) -> None:
+    pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
+    root = make(tmp_path / "wave", "v2.1", "image")
+    (root / "arm.urdf").write_text(URDF)
+    read = options(root, urdf=root / "arm.urdf")
+    change_names(root, ["shoulder.pos", "shoulder"], "observation.state")
+    with pytest.raises(InputError, match=r"state: 'shoulder' names several numbers"):
+        load_recording(root, options=read)
+    change_names(root, {"left": ["shoulder"], "right": ["reach"]}, "observation.state")
+    with pytest.raises(InputError, match=r"no values for joint shoulder.*left\.shoulder"):
+        load_recording(root, options=read)
+
+
+def test_embedded_images_are_written_out(tmp_path: Path) -> None:
+    root = make(tmp_path / "wave", "v3.0", "image")
+    generic.write(tmp_path / "out", load_recording(root, options=options(root, every=5)))
+    image = load_recording(tmp_path / "out").train[3].read_image()
+    np.testing.assert_array_equal(image, picture(2, 1))
+
+
+def change(root: Path, **values: Any) -> None:
+    file = root / "meta/info.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **values}))
+
+
+def test_what_is_missing_is_named(tmp_path: Path) -> None:
+    root = make(tmp_path / "wave", "v2.1")
+    with pytest.raises(
+        InputError, match=r"2 cameras; name one with --image-topic: observation\.images\.w"
+    ):
+        load_recording(root, options=options(root, image_topic=None))
+    with pytest.raises(InputError, match="no camera 'top'"):
+        load_recording(root, options=options(root, image_topic="top"))
+    with pytest.raises(InputError, match="hold no intrinsics; give them with --camera"):
+        load_recording(root, options=ReadOptions(image_topic=WRIST))
+    with pytest.raises(InputError, match="video is missing; download it too"):
+        load_recording(root, options=options(root, image_topic=FRONT))
+    (root / "data/chunk-001/episode_000002.parquet").unlink()
+    assert (
+        load_recording(root, options=options(root)).notes[-1] == "2 of 3 episodes are in the folder"
+    )
+    video = root / "videos/chunk-000" / WRIST / "episode_000000.mp4"
+    video.write_bytes(video.read_bytes()[:200])
+    with pytest.raises(InputError, match="video cannot be decoded") as caught:
+        load_recording(root, options=options(root))
+    assert "\n" not in str(caught.value)
+    (root / "data/chunk-000/episode_000000.parquet").write_bytes(b"PAR1")
+    with pytest.raises(InputError, match=r"episode_000000\.parquet: cannot be read"):
+        load_recording(root, options=options(root))
+
+
+def test_a_video_that_ends_early_is_named(tmp_path: Path) -> None:
+    root = make(tmp_path / "wave", "v2.1")
+    video = root / "videos/chunk-000" / WRIST / "episode_000000.mp4"
+    write_video(video, [picture(0, n) for n in range(3)], "libx264")
+    scene = load_recording(root, options=options(root))
+    with pytest.raises(InputError, match=r"no frame at 0\.500 s; the video is cut off"):
+        scene.train[5].read_image()
+    # The others can still be read.
+    assert scene.train[2].read_image().shape == (64, 96, 3)
+    assert scene.train[9].read_image().shape == (64, 96, 3)
+
+
+def test_other_versions_and_features_are_refused(tmp_path: Path) -> None:
+    root = make(tmp_path / "wave", "v2.1", "image")
+    info = json.loads((root / "meta/info.json").read_text())
+    names = info["features"]["observation.ee"]["names"]
+    info["features"]["observation.ee"]["names"] = [*names[:3], "roll", "pitch", "yaw", "grip"]
+    change(root, features=info["features"])
+    with pytest.raises(
+        InputError, match=r"no feature holds a pose .*observation.state: shoulder, reach"
+    ):
+        load_recording(root, options=options(root))
+    change(root, codebase_version="v1.6")
+    with pytest.raises(InputError, match=r"version v1\.6; this evercal reads v2 and v3"):
+        load_recording(root, options=options(root))
+    change(root, codebase_version="v2.1", fps=0)
+    with pytest.raises(InputError, match="no LeRobot dataset"):
+        load_recording(root, options=options(root))
+
+
+@pytest.mark.parametrize("module", ["av", "pyarrow.parquet"])
+def test_without_the_extra_the_install_line_is_named(
+    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = make(tmp_path / "wave", "v2.1")
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=r"pip install 'evercal\[lerobot\]'"):
+        load_recording(root, options=options(root))

@@ -1,0 +1,215 @@
+"""nerfstudio's transforms.json: points land on the pixels that its own formulas say."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evercal.errors import InputError
+from evercal.geometry import SE3
+from evercal.recordings import Frame, load_recording, nerfstudio, write_image
+from evercal.recordings.inspection import inspect_scene
+
+LENS = {"fl_x": 40.0, "fl_y": 42.0, "cx": 13.0, "cy": 17.5, "w": 24, "h": 36,
+        "k1": 0.05, "k2": -0.02, "p1": 0.003, "p2": -0.002}  # fmt: skip
+
+
+def look(eye: np.ndarray, target: np.ndarray, up: tuple[float, float, float]) -> np.ndarray:
+    """OpenGL's camera in the world: columns right, up, backward and where it stands."""
+    back = (eye - target) / np.linalg.norm(eye - target)
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([right, np.cross(back, right), back, eye])
+    return matrix
+
+
+def gl_pixel(matrix: np.ndarray, lens: dict[str, float], point: np.ndarray) -> np.ndarray:
+    """Where a point is seen, x to the right and y down from the image's corner.
+
+    The camera looks along -z with y up; the lens is Brown's in the plane at distance one, y down.
+    """
+    x, y, z = np.linalg.solve(matrix, np.append(point, 1.0))[:3]
+    assert z < 0
+    u, v = x / -z, -y / -z
+    r2 = u * u + v * v
+    radial = 1 + lens["k1"] * r2 + lens["k2"] * r2 * r2 + lens.get("k3", 0.0) * r2**3
+    p1, p2 = lens["p1"], lens["p2"]
+    du = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+    dv = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
+    return np.array([lens["fl_x"] * du + lens["cx"], lens["fl_y"] * dv + lens["cy"]])
+
+
+def write(
+    root: Path, frames: list[dict[str, Any]], size: tuple[int, int] = (24, 36), **top: Any
+) -> Path:
+    for frame in frames:
+        image = root / frame["file_path"]
+        image.parent.mkdir(parents=True, exist_ok=True)
+        write_image(image, np.zeros((size[1], size[0], 3), np.uint8))
+    (root / "transforms.json").write_text(json.dumps({**top, "frames": frames}))
+    return root
+
+
+def ring(count: int = 5) -> list[np.ndarray]:
+    angles = np.linspace(0, 2, count)
+    eyes = [np.array([2 * np.cos(a), 2 * np.sin(a), 0.3 + 0.1 * a]) for a in angles]
+    return [look(eye, np.zeros(3), (0.1, 0.0, 1.0)) for eye in eyes]
+
+
+def entries(matrices: list[np.ndarray], **more: Any) -> list[dict[str, Any]]:
+    return [
+        {"file_path": f"images/frame_{i:05d}.png", "transform_matrix": m.tolist(), **more}
+        for i, m in enumerate(matrices)
+    ]
+
+
+def seen(frame: Frame, point: np.ndarray) -> np.ndarray:
+    """The pixel from the image's corner, by this program's own camera."""
+    assert frame.base_from_camera is not None
+    return frame.camera.project(frame.base_from_camera.inverse().apply(point)) + 0.5
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_points_land_where_the_files_own_formulas_say(shared: bool, tmp_path: Path) -> None:
+    matrices = ring()
+    if shared:
+        write(tmp_path, entries(matrices), camera_model="OPENCV", **LENS)
+    else:
+        write(tmp_path, entries(matrices, **LENS))
+    scene = load_recording(tmp_path)
+    assert (len(scene.train), scene.test) == (5, ())
+    points = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 3))
+    for frame, matrix in zip(scene.train, matrices, strict=True):
+        assert frame.read_image().shape == (36, 24, 3)  # portrait
+        for point in points:
+            np.testing.assert_allclose(seen(frame, point), gl_pixel(matrix, LENS, point), atol=1e-9)
+    assert "are those of transforms.json" in inspect_scene(scene).notes[0]
+
+
+@settings(max_examples=20)
+@given(
+    st.lists(st.floats(-2, 2), min_size=6, max_size=6),
+    st.floats(0.2, 5),
+    st.lists(st.floats(-0.4, 0.4), min_size=3, max_size=3),
+)
+def test_an_applied_transform_is_undone(
+    tangent: list[float], scale: float, point: list[float]
+) -> None:
+    # What ns-process-data does to its poses: a turn, a shift, then a scale.
+    applied = SE3.exp(tangent).matrix()
+    matrices = ring(3)
+    moved = []
+    for matrix in matrices:
+        new = applied @ matrix
+        new[:3, 3] *= scale
+        moved.append(new)
+    data = {**LENS, "applied_transform": applied[:3].tolist(), "applied_scale": scale}
+    undo, divide = nerfstudio._applied(data)
+    for matrix, new in zip(matrices, moved, strict=True):
+        entry = {"file_path": "a.png", "transform_matrix": new.tolist()}
+        frame = nerfstudio._frame(Path(), data, 0, entry, undo, divide)
+        expected = gl_pixel(matrix, LENS, np.array(point))
+        np.testing.assert_allclose(seen(frame, np.array(point)), expected, atol=1e-6)
+
+
+def test_named_test_files_are_test_frames(tmp_path: Path) -> None:
+    names = [f"images/frame_{i:05d}.png" for i in range(4)]
+    splits: dict[str, Any] = {"train_filenames": names[:1], "val_filenames": names[1:2]}
+    write(tmp_path, entries(ring()), **LENS, **splits, test_filenames=[f"./{names[3]}"])
+    scene = load_recording(tmp_path)
+    assert [f.name[-6:-4] for f in scene.train] == ["00", "02", "04"]
+    assert [f.name[-6:-4] for f in scene.test] == ["01", "03"]
+    assert load_recording(tmp_path / "transforms.json").name == tmp_path.name
+
+
+def test_smaller_copies_of_the_images_have_smaller_cameras(tmp_path: Path) -> None:
+    matrices = ring(2)
+    write(tmp_path, entries(matrices), (12, 18), **LENS)
+    frame = load_recording(tmp_path).train[1]
+    assert (frame.camera.width, frame.camera.height) == (12, 18)
+    point = np.array([0.2, -0.1, 0.3])
+    # From the corner, every pixel coordinate is simply half.
+    np.testing.assert_allclose(seen(frame, point), gl_pixel(matrices[1], LENS, point) / 2)
+
+
+def test_names_without_an_ending_and_an_angle_of_view(tmp_path: Path) -> None:
+    write(tmp_path, entries(ring(2)), camera_angle_x=0.5, w=24, h=36)
+    file = tmp_path / "transforms.json"
+    file.write_text(file.read_text().replace(".png", ""))
+    frame = load_recording(tmp_path).train[0]
+    assert frame.camera.fx == frame.camera.fy == pytest.approx(12 / np.tan(0.25))
+    assert (frame.camera.cx, frame.camera.cy) == (11.5, 17.5)
+    assert frame.read_image().shape == (36, 24, 3)
+
+
+def test_an_angle_of_view_upwards_and_a_size_that_is_not_stated(tmp_path: Path) -> None:
+    write(tmp_path, entries(ring(2)), camera_angle_y=0.5)
+    camera = load_recording(tmp_path).train[1].camera
+    assert (camera.width, camera.height) == (24, 36)
+    assert camera.fx == camera.fy == pytest.approx(18 / np.tan(0.25))
+    write(tmp_path, entries(ring(2)), camera_angle_x=0.4, camera_angle_y=0.5)
+    camera = load_recording(tmp_path).train[1].camera
+    assert (camera.fx, camera.fy) == pytest.approx((12 / np.tan(0.2), 18 / np.tan(0.25)))
+    write(tmp_path, entries(ring(2)), fl_x=40.0, camera_angle_y=0.5)
+    camera = load_recording(tmp_path).train[1].camera
+    assert (camera.fx, camera.fy) == pytest.approx((40.0, 18 / np.tan(0.25)))
+
+
+BREAKS: list[tuple[dict[str, Any], str]] = [
+    ({"camera_model": "OPENCV_FISHEYE"}, "camera_model 'OPENCV_FISHEYE' is not supported, only"),
+    ({"is_fisheye": True}, "fisheye images are not supported; undistort"),
+    ({"k4": 0.1}, "k4 is not 0"),
+    ({"fl_x": None, "fl_y": None}, "'fl_x' is missing, and so are"),
+    ({"fl_x": None, "camera_angle_x": 28.0}, "'camera_angle_x' is between 0 and pi radians"),
+    ({"fl_x": 0}, "fx is finite"),
+    ({"w": None}, "'w' is missing"),
+    ({"test_filenames": ["frame_00001.png"]}, "names 'frame_00001.png', which no frame does"),
+    ({"fl_x": "wide"}, "'fl_x' is a number"),
+    ({"fl_x": -3}, "fx is finite"),
+    ({"w": 36, "h": 24}, "is 24x36, transforms.json says 36x24 .the image was turned"),
+    ({"w": 30}, "is 24x36, transforms.json says 30x36 .cropped"),
+    ({"applied_scale": 0}, "'applied_scale' is > 0"),
+    ({"applied_transform": [[1, 0], [0, 1]]}, "'applied_transform' is 4x4 or 3x4"),
+    ({"applied_transform": np.diag([1.0, 1, -1, 1]).tolist()}, "'applied_transform': .*reflection"),
+    ({"applied_transform": np.diag([1.0, 0, 1, 1]).tolist()}, "cannot be undone"),
+    ({"frames": []}, "'frames' is a list with at least one frame"),
+    ({"frames": [3]}, "frame 0: an object with 'file_path'"),
+    ({"frames": [{"file_path": "a.png"}]}, "frame 0 .a.png.: 'transform_matrix' is 4x4"),
+    (
+        {"frames": [{"file_path": "a.png", "transform_matrix": (2 * np.eye(4)).tolist()}]},
+        "frame 0 .a.png.: the last row",
+    ),
+    (
+        {"frames": [{"file_path": "a.png", "transform_matrix": np.diag([2, 2, 2, 1.0]).tolist()}]},
+        "frame 0 .a.png.: .*is a rotation",
+    ),
+    ({"frames": entries(ring(1)) * 2}, "'images/frame_00000.png' comes 2 times"),
+    (
+        {"frames": [{"file_path": "no.png", "transform_matrix": np.eye(4).tolist()}]},
+        "no.png: named",
+    ),
+    ({"test_filenames": "all"}, "'test_filenames' is a list of file names"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BREAKS)
+def test_damage_is_named(change: dict[str, Any], message: str, tmp_path: Path) -> None:
+    write(tmp_path, entries(ring(2)), **LENS)
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
+    with pytest.raises(InputError, match=message) as caught:
+        load_recording(tmp_path)
+    assert "\n" not in str(caught.value)
+    assert "transforms.json" in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", "\x00"])
+def test_what_is_no_json_object_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(InputError, match=r"transforms\.json"):
+        load_recording(tmp_path)

@@ -1,0 +1,197 @@
+"""The 7-Scenes folder format: small folders written here, and the real ones where there are any."""
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evercal.errors import InputError
+from evercal.geometry import SE3, pose_distance
+from evercal.recordings import load_recording, seven_scenes, write_image
+
+
+def write_pose(file: Path, matrix: np.ndarray) -> None:
+    rows = ("\t ".join(f" {value: .7e}" for value in row) for row in matrix)
+    file.write_text("\n".join(rows) + "\n")
+
+
+@pytest.fixture
+def kitchen(tmp_path: Path) -> Path:
+    """Two training sequences and one test sequence of three frames, 64x48."""
+    root = tmp_path / "kitchen"
+    root.mkdir()
+    (root / "TrainSplit.txt").write_text("sequence2\r\nsequence1 \n\n")
+    (root / "TestSplit.txt").write_text("sequence3")
+    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    for sequence in (1, 2, 3):
+        folder = root / f"seq-{sequence:02d}"
+        folder.mkdir()
+        for i in range(3):
+            write_image(folder / f"frame-{i:06d}.color.png", image)
+            pose = SE3.exp([sequence, i, 0.0, 0.1 * i, 0.2, 0.3 * sequence])
+            write_pose(folder / f"frame-{i:06d}.pose.txt", pose.matrix())
+    return root
+
+
+def test_sequences_come_in_the_order_of_the_split_and_frames_as_recorded(kitchen: Path) -> None:
+    scene = seven_scenes.load(kitchen)
+    assert scene.name == "kitchen"
+    assert [frame.name for frame in scene.train] == [
+        f"seq-0{sequence}/frame-00000{i}" for sequence in (2, 1) for i in range(3)
+    ]
+    assert [frame.name for frame in scene.test] == [f"seq-03/frame-00000{i}" for i in range(3)]
+    assert scene.untracked == 0
+
+
+def test_poses_are_those_that_were_written(kitchen: Path) -> None:
+    frame = seven_scenes.load(kitchen).train[1]
+    assert frame.base_from_camera is not None
+    expected = SE3.exp([2, 1, 0.0, 0.1, 0.2, 0.6])
+    assert max(pose_distance(frame.base_from_camera, expected)) < 1e-6
+    assert frame.read_image().shape == (48, 64, 3)
+
+
+def test_without_a_file_the_camera_is_the_usual_one_at_this_size(kitchen: Path) -> None:
+    camera = seven_scenes.load(kitchen).train[0].camera
+    assert (camera.width, camera.height) == (64, 48)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (52.5, 52.5, 31.5, 23.5)
+
+
+def test_the_intrinsics_file_is_taken_as_it_is(kitchen: Path) -> None:
+    (kitchen / "camera-intrinsics.txt").write_text("51 0 30\n0 52 23.5\n0 0 1\n")
+    camera = seven_scenes.load(kitchen).test[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (51.0, 52.0, 30.0, 23.5)
+
+
+def test_untracked_frames_are_left_out_and_counted(kitchen: Path) -> None:
+    write_pose(kitchen / "seq-01/frame-000001.pose.txt", np.full((4, 4), np.inf))
+    write_pose(kitchen / "seq-03/frame-000000.pose.txt", np.full((4, 4), np.nan))
+    scene = seven_scenes.load(kitchen)
+    assert scene.untracked == 2
+    assert "seq-01/frame-000001" not in [frame.name for frame in scene.train]
+    assert [frame.name for frame in scene.test] == ["seq-03/frame-000001", "seq-03/frame-000002"]
+
+
+def test_a_rotation_with_few_digits_loads(kitchen: Path) -> None:
+    file = kitchen / "seq-01/frame-000001.pose.txt"
+    drifted = np.loadtxt(file)
+    drifted[:3, :3] *= 1.001
+    write_pose(file, drifted)
+    pose = seven_scenes.load(kitchen).train[4].base_from_camera
+    assert pose is not None
+    np.testing.assert_allclose(pose.rotation_matrix(), drifted[:3, :3] / 1.001, atol=1e-6)
+
+
+def test_jpeg_frames_load(kitchen: Path) -> None:
+    for file in list((kitchen / "seq-03").glob("*.png")):
+        image = np.zeros((48, 64, 3), np.uint8)
+        write_image(file.with_suffix(".jpg"), image)
+        file.unlink()
+    assert seven_scenes.load(kitchen).test[0].name == "seq-03/frame-000000"
+
+
+def break_pose(root: Path, text: str) -> None:
+    (root / "seq-02/frame-000002.pose.txt").write_text(text)
+
+
+def remove_folder(folder: Path) -> None:
+    for file in folder.iterdir():
+        file.unlink()
+    folder.rmdir()
+
+
+def keep_only_poses(root: Path) -> None:
+    for image in (root / "seq-02").glob("*.png"):
+        image.unlink()
+
+
+def empty_splits(root: Path) -> None:
+    for name in ("TrainSplit.txt", "TestSplit.txt"):
+        (root / name).write_text("\n")
+
+
+ROTATION_OF_TWO = "2 0 0 0\n0 2 0 0\n0 0 2 0\n0 0 0 1\n"
+BREAKS = [
+    (lambda root: (root / "TestSplit.txt").unlink(), r"TestSplit\.txt: split file is missing"),
+    (lambda root: (root / "TestSplit.txt").write_text("office"), r"TestSplit\.txt.*'office'"),
+    (lambda root: (root / "TestSplit.txt").write_text("sequence9"), r"TestSplit\.txt.*seq-09"),
+    (lambda root: (root / "TestSplit.txt").write_text("sequence1"), "seq-01 is in both"),
+    (lambda root: (root / "TestSplit.txt").write_bytes(b"\xff\xfe"), r"TestSplit\.txt: .*not text"),
+    (empty_splits, "are empty"),
+    (lambda root: remove_folder(root / "seq-02"), "seq-02"),
+    (keep_only_poses, "seq-02: no images"),
+    (
+        lambda root: (root / "seq-02/frame-000002.pose.txt").unlink(),
+        r"seq-02/frame-000002\.pose\.txt: missing",
+    ),
+    (lambda root: break_pose(root, "1 2 3"), r"frame-000002\.pose\.txt: expected.*got 3 words"),
+    (lambda root: break_pose(root, "x " * 16), r"frame-000002\.pose\.txt: expected"),
+    (lambda root: break_pose(root, ""), r"frame-000002\.pose\.txt: expected"),
+    (lambda root: break_pose(root, ROTATION_OF_TWO), r"frame-000002\.pose\.txt: broken pose"),
+    (
+        lambda root: (root / "seq-02/frame-000000.color.png").write_bytes(b"no image"),
+        r"frame-000000\.color\.png: not a readable image",
+    ),
+    (
+        lambda root: (root / "seq-02/frame-000000.color.jpg").write_bytes(b""),
+        r"frame-000000\.color is there as \.png and as \.jpg",
+    ),
+    (
+        lambda root: (root / "camera-intrinsics.txt").write_text("525 525"),
+        r"camera-intrinsics\.txt: expected a 3x3",
+    ),
+    (
+        lambda root: (root / "camera-intrinsics.txt").write_text("0 0 0 0 0 0 0 0 1"),
+        r"camera-intrinsics\.txt: camera fx",
+    ),
+]
+
+
+@pytest.mark.parametrize(("damage", "message"), BREAKS, ids=[text for _, text in BREAKS])
+def test_damage_is_named_in_one_line(kitchen: Path, damage, message: str) -> None:
+    damage(kitchen)
+    with pytest.raises(InputError, match=message) as caught:
+        load_recording(kitchen)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nowhere: no such folder"):
+        seven_scenes.load(tmp_path / "nowhere")
+
+
+def test_a_thousand_frames_load_in_well_under_a_second(kitchen: Path) -> None:
+    folder = kitchen / "seq-01"
+    image, pose = folder / "frame-000000.color.png", folder / "frame-000000.pose.txt"
+    for i in range(3, 1000):
+        os.link(image, folder / f"frame-{i:06d}.color.png")
+        os.link(pose, folder / f"frame-{i:06d}.pose.txt")
+    seconds = []
+    for _ in range(3):
+        start = time.process_time()
+        assert len(seven_scenes.load(kitchen).train) == 1003
+        seconds.append(time.process_time() - start)
+    assert min(seconds) < 1.0
+
+
+REAL = os.environ.get("EVERCAL_REAL_DATA", "")
+
+
+@pytest.mark.skipif(not REAL, reason="EVERCAL_REAL_DATA names no folder with real 7-Scenes data")
+@pytest.mark.parametrize(("name", "focal"), [("redkitchen", 525.0), ("fr1_rpy", 517.3)])
+def test_real_recordings_load(name: str, focal: float) -> None:
+    root = Path(REAL) / name
+    if not root.is_dir():
+        pytest.skip(f"{root} is not there")
+    scene = load_recording(root)
+    frames = [*scene.train, *scene.test]
+    assert len(frames) + scene.untracked == len(list(root.glob("seq-*/*.pose.txt")))
+    assert scene.test
+    assert frames[0].camera.fx == focal
+    poses = SE3.stack([frame.base_from_camera for frame in frames if frame.base_from_camera])
+    assert len(poses) == len(frames)
+    # A hand-held camera at 30 Hz, cut into blocks: hardly any step is long.
+    steps = pose_distance(poses[:-1], poses[1:])[0]
+    assert np.median(steps) < 0.05

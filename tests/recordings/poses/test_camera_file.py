@@ -1,0 +1,213 @@
+"""Intrinsics from text, JSON and ROS files: the same camera from each, and damage named."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from evercal.errors import InputError
+from evercal.geometry import Camera
+from evercal.recordings.poses.camera_file import read_camera
+
+LENS = Camera(640, 480, 525.25, 526.5, 319.5, 239.25, (0.1, -0.02, 0.001, 1e-5, 0.03))
+
+CALIBRATION = """\
+# made by camera_calibration
+image_width: 640
+image_height: 480
+camera_name: front
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [525.25, 0, 319.5, 0, 526.5, 239.25, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [0.1, -0.02, 0.001, 1e-05, 0.03]
+rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+projection_matrix: {rows: 3, cols: 4, data: [500, 0, 310, 0, 0, 500, 240, 0, 0, 0, 1, 0]}
+"""
+
+MESSAGE = """\
+header:
+  stamp: {sec: 1, nanosec: 2}
+  frame_id: front_optical
+height: 480
+width: 640
+distortion_model: rational_polynomial
+d:
+- 0.1
+- -0.02
+- 0.001
+- 1.0e-05
+- 0.03
+- 0.0
+- 0.0
+- 0.0
+k: [525.25, 0.0, 319.5, 0.0, 526.5, 239.25, 0.0, 0.0, 1.0]
+roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}
+---
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "camera.any"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_every_kind_gives_the_same_camera(tmp_path: Path) -> None:
+    ideal = Camera(640, 480, LENS.fx, LENS.fy, LENS.cx, LENS.cy)
+    matrix = tmp_path / "k.txt"
+    np.savetxt(matrix, LENS.matrix(), header="left camera")
+    assert read_camera(matrix, (640, 480)) == ideal
+    commas = written(tmp_path, "525.25, 0, 319.5\n0, 526.5, 239.25\n0, 0, 1  # pixels\n")
+    assert read_camera(commas, (640, 480)) == ideal
+    assert read_camera(written(tmp_path, json.dumps(LENS.to_dict()))) == LENS
+    assert read_camera(written(tmp_path, CALIBRATION)) == LENS
+    assert read_camera(written(tmp_path, MESSAGE)) == Camera(
+        640, 480, LENS.fx, LENS.fy, LENS.cx, LENS.cy, (*LENS.distortion, 0.0, 0.0, 0.0)
+    )
+
+
+def stored(folder: Path, ending: str = "yml", size: bool = True, **more: object) -> Path:
+    """What cv2.FileStorage writes of the camera."""
+    path = folder / f"stored.{ending}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    values = {"camera_matrix": LENS.matrix(), "dist_coeffs": np.array([LENS.distortion]), **more}
+    if size:
+        values |= {"image_Width": LENS.width, "image_Height": LENS.height}
+    for name, value in values.items():
+        storage.write(name, value)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    storage.release()
+    return path
+
+
+def test_the_storage_of_opencv_is_read(tmp_path: Path) -> None:
+    assert read_camera(stored(tmp_path, "xml")) == LENS
+    yaml = stored(tmp_path, fisheye_model=0, board="9x6")
+    assert read_camera(yaml, (320, 240)) == LENS
+    old = yaml.read_text().replace("%YAML 1.2", "%YAML:1.0")
+    assert read_camera(written(tmp_path, old)) == LENS
+    assert read_camera(stored(tmp_path, size=False), (640, 480)) == LENS
+    with pytest.raises(InputError, match="'image_width' is missing"):
+        read_camera(stored(tmp_path, size=False))
+    for more, said in (
+        ({"fisheye_model": 1}, "fisheye_model is set"),
+        ({"K": np.eye(3)}, "camera_matrix and K are the same; keep one"),
+        ({"camera_matrix": np.eye(2)}, "camera_matrix has 9 numbers, got 4"),
+    ):
+        with pytest.raises(InputError, match=said):
+            read_camera(stored(tmp_path, **more))  # pyright: ignore[reportArgumentType]
+    stereo = old.replace("camera_matrix", "M1").replace("dist_coeffs", "D1")
+    for text, said in (
+        (stereo, "'camera_matrix' is missing, there is M1, D1, fisheye_model"),
+        (old[:120], "OpenCV cannot read its storage"),
+        ("<opencv_storage><a>", "OpenCV cannot read its storage"),
+    ):
+        with pytest.raises(InputError, match=said) as caught:
+            read_camera(written(tmp_path, text), (640, 480))
+        assert "\n" not in str(caught.value)
+
+
+def test_a_byte_order_mark_is_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "camera.any"
+    for text in (json.dumps(LENS.to_dict()), CALIBRATION, MESSAGE, "525 0 319.5 0 525 239.5 0 0 1"):
+        path.write_text(text, encoding="utf-8-sig")
+        assert read_camera(path, (640, 480)).width == 640
+
+
+def test_a_lens_that_is_called_otherwise_is_not_passed_over(tmp_path: Path) -> None:
+    text = CALIBRATION.replace("distortion_coefficients", "dist_coeff")
+    with pytest.raises(InputError, match="'distortion_coefficients' is missing"):
+        read_camera(written(tmp_path, text))
+    assert read_camera(written(tmp_path, text + "d: [0, 0, 0, 0]\n")).distortion == ()
+
+
+def test_the_size_given_does_not_override_what_a_file_says(tmp_path: Path) -> None:
+    assert read_camera(written(tmp_path, CALIBRATION), (320, 240)) == LENS
+
+
+def test_the_message_of_ros_1_and_longer_models_are_read(tmp_path: Path) -> None:
+    old = MESSAGE.replace("d:\n", "D:\n").replace("k: [", "K: [")
+    assert read_camera(written(tmp_path, old)).fx == LENS.fx
+    longer = CALIBRATION.replace("1e-05, 0.03]", "1e-05, 0.03, 0, 0, 0, 0, 0, 0, 0]")
+    lens = read_camera(written(tmp_path, longer))
+    pixels = lens.project([[0.2, -0.3, 1.0]])
+    np.testing.assert_allclose(pixels, LENS.project([[0.2, -0.3, 1.0]]), atol=1e-12)
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.floats(1, 1e4),
+    st.floats(1, 1e4),
+    st.floats(-1e3, 1e3),
+    st.floats(-1e3, 1e3),
+    st.lists(st.floats(-1, 1), min_size=5, max_size=5),
+)
+def test_ros_numbers_survive_however_yaml_writes_them(
+    tmp_path: Path, fx: float, fy: float, cx: float, cy: float, distortion: list[float]
+) -> None:
+    lens = Camera(640, 480, fx, fy, cx, cy, tuple(distortion))
+    numbers = ", ".join(repr(v) for v in lens.matrix().ravel().tolist())
+    coefficients = ", ".join(repr(v) for v in distortion)
+    text = f"width: 640\nheight: 480\nk: [{numbers}]\nd: [{coefficients}]\n"
+    assert read_camera(written(tmp_path, text)) == lens
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1 2 3", "3 numbers, a 3x3 matrix has 9"),
+        ("", "0 numbers"),
+        ("1 2 3 4 5 6 7 8 9", "fx 0 cx"),
+        ("nan 0 0 0 1 0 0 0 1", "finite"),
+        ("hello world", "no camera in it"),
+        ("a: [1", "not valid YAML"),
+        ("{'single': 'quotes'}", "not valid JSON"),
+        ('{"width": 640}', "height"),
+        ('{"width": 1e999}', "height"),
+        (CALIBRATION.replace("image_width", "breadth"), "'image_width' is missing"),
+        (CALIBRATION.replace("640", "wide"), "image size"),
+        (CALIBRATION.replace("640", "0"), "width"),
+        (CALIBRATION.replace("plumb_bob", "equidistant"), "equidistant"),
+        (CALIBRATION.replace("[525.25, 0,", "[525.25,"), "9 numbers, got 8"),
+        (CALIBRATION.replace("[0.1, -0.02,", "[true, -0.02,"), "distortion_coefficients"),
+        (CALIBRATION.replace("0.03]", "0.03, 0.5, 0.5]"), "0, 4, 5 or 8"),
+        (MESSAGE.replace("x_offset: 0", "x_offset: 8"), "cut-out"),
+        (MESSAGE.replace("525.25", "0.0"), "fx"),
+    ],
+)
+def test_damage_is_named_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(InputError) as caught:
+        read_camera(path, (640, 480))
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert said in message
+    assert "\n" not in message
+
+
+def test_missing_binary_and_sizeless_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="missing"):
+        read_camera(tmp_path / "none.yaml")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_camera(tmp_path)
+    (tmp_path / "image.png").write_bytes(b"\x89PNG\xff\xfe")
+    with pytest.raises(InputError, match="not a text file"):
+        read_camera(tmp_path / "image.png")
+    with pytest.raises(InputError, match="does not tell the image size"):
+        read_camera(written(tmp_path, "1 0 0 0 1 0 0 0 1"))
+
+
+def test_yaml_runs_no_code(tmp_path: Path) -> None:
+    bait = tmp_path / "bait"
+    text = f"width: !!python/object/apply:os.mkdir ['{bait}']\n"
+    with pytest.raises(InputError, match="not valid YAML"):
+        read_camera(written(tmp_path, text))
+    assert not bait.exists()

@@ -1,0 +1,245 @@
+"""Every convention against elementary rotations, and numbers that do not look like their units."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from evercal.geometry import SE3, pose_distance
+from evercal.recordings.poses.conventions import (
+    CONVENTIONS,
+    doubt,
+    numbers_from_poses,
+    pose_convention,
+    poses_from_numbers,
+)
+
+Array = NDArray[np.float64]
+
+
+def turn(axis: str, angle: float) -> Array:
+    """About x, y or z, as a textbook has it."""
+    c, s = math.cos(angle), math.sin(angle)
+    return {
+        "x": np.array([[1, 0, 0], [0, c, -s], [0, s, c]]),
+        "y": np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]),
+        "z": np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]),
+    }[axis]
+
+
+def of_quaternion(w: float, x: float, y: float, z: float) -> Array:
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def of_vector(x: float, y: float, z: float) -> Array:
+    return np.asarray(expm(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])), dtype=np.float64)
+
+
+def fixed_xyz(unit: float) -> Callable[..., Array]:
+    return lambda a, b, c: turn("z", c * unit) @ turn("y", b * unit) @ turn("x", a * unit)
+
+
+DEGREE = math.pi / 180
+ROTATIONS: dict[str, Callable[..., Array]] = {
+    "wxyz": of_quaternion,
+    "xyzw": lambda x, y, z, w: of_quaternion(w, x, y, z),
+    "abb": of_quaternion,
+    "ur": of_vector,
+    "rpy": fixed_xyz(1.0),
+    "kuka": lambda a, b, c: turn("z", a * DEGREE) @ turn("y", b * DEGREE) @ turn("x", c * DEGREE),
+    "fanuc": fixed_xyz(DEGREE),
+    "yaskawa": fixed_xyz(DEGREE),
+    "staubli": lambda a, b, c: (
+        turn("x", a * DEGREE) @ turn("y", b * DEGREE) @ turn("z", c * DEGREE)
+    ),
+}
+MILLIMETRES = {"abb", "kuka", "fanuc", "yaskawa", "staubli"}
+
+
+def twin(name: str, numbers: Array) -> Array:
+    """The matrix that numbers mean, in metres."""
+    if name in ("matrix", "franka"):
+        return numbers.reshape(4, 4, order="C" if name == "matrix" else "F")
+    matrix = np.eye(4)
+    matrix[:3, :3] = ROTATIONS[name](*numbers[3:])
+    matrix[:3, 3] = numbers[:3] * (0.001 if name in MILLIMETRES else 1.0)
+    return matrix
+
+
+def drawn(seed: int) -> SE3:
+    rng = np.random.default_rng(seed)
+    return SE3(rng.normal(size=4), rng.normal(size=3))
+
+
+seeds = st.integers(0, 2**32 - 1)
+names = st.sampled_from(sorted(CONVENTIONS))
+
+
+@given(names, seeds)
+@settings(deadline=None, max_examples=200)
+def test_what_is_written_means_the_pose(name: str, seed: int) -> None:
+    pose = drawn(seed)
+    numbers = numbers_from_poses(pose, CONVENTIONS[name])
+    assert numbers.shape == (CONVENTIONS[name].count,)
+    np.testing.assert_allclose(twin(name, numbers), pose.matrix(), atol=1e-12)
+
+
+@given(st.sampled_from(sorted(ROTATIONS)), seeds)
+@settings(deadline=None, max_examples=200)
+def test_what_is_read_is_what_the_numbers_mean(name: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    convention = CONVENTIONS[name]
+    rotation = rng.normal(size=convention.count - 3)
+    if convention.has_angles:
+        rotation *= 90 if convention.degrees else 1.5
+    else:
+        rotation /= np.linalg.norm(rotation)
+    numbers = np.concatenate([rng.normal(size=3) * 100, rotation])
+    read = poses_from_numbers(numbers, convention)
+    np.testing.assert_allclose(read.matrix(), twin(name, numbers), atol=1e-12)
+
+
+@given(
+    names,
+    seeds,
+    st.sampled_from(["", ":m", ":mm"]),
+    st.sampled_from(["", ":inverse"]),
+    st.sampled_from(["", ":opengl"]),
+)
+@settings(deadline=None, max_examples=200)
+def test_modifiers_mean_what_they_say(
+    name: str, seed: int, unit: str, inverse: str, opengl: str
+) -> None:
+    convention = pose_convention(name + unit + inverse + opengl)
+    rng = np.random.default_rng(seed)
+    poses = SE3(rng.normal(size=(5, 4)), rng.normal(size=(5, 3)))
+    numbers = numbers_from_poses(poses, convention)
+    back = poses_from_numbers(numbers, convention)
+    assert np.max(pose_distance(back, poses)) < 1e-12
+    # A matrix twin: axes flipped first, then inverted, then scaled.
+    expected = poses[0].matrix() @ (np.diag([1, -1, -1, 1]) if opengl else np.eye(4))
+    expected = np.linalg.inv(expected) if inverse else expected
+    implied = 0.001 if name in MILLIMETRES else 1.0
+    scale = {"": implied, ":m": 1.0, ":mm": 0.001}[unit]
+    meant = numbers[0].copy()
+    meant[{"matrix": [3, 7, 11], "franka": [12, 13, 14]}.get(name, [0, 1, 2])] *= scale / implied
+    np.testing.assert_allclose(twin(name, meant), expected, atol=1e-12)
+
+
+def test_angles_that_are_known() -> None:
+    """rpy (0.3, 0.4, 0.5) of URDF; the same rotation about moved axes has other angles."""
+    pose = poses_from_numbers([0, 0, 0, 0.3, 0.4, 0.5], CONVENTIONS["rpy"])
+    moved = numbers_from_poses(pose, pose_convention("staubli:rad"))
+    np.testing.assert_allclose(moved[3:], [0.092, 0.487, 0.416], atol=1e-3)
+    optical = numbers_from_poses(
+        SE3(np.array([0.5, -0.5, 0.5, -0.5]), np.zeros(3)), CONVENTIONS["rpy"]
+    )
+    np.testing.assert_allclose(optical[3:], [-math.pi / 2, 0, -math.pi / 2], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["rpy", "kuka", "fanuc", "yaskawa", "staubli"])
+@pytest.mark.parametrize("middle", [90.0, -90.0, 90 - 1e-6, 90 - 1e-8])
+def test_gimbal_lock_keeps_the_rotation(name: str, middle: float) -> None:
+    convention = pose_convention(f"{name}:deg")
+    pose = poses_from_numbers([0, 0, 0, 20.0, middle, 50.0], convention)
+    again = poses_from_numbers(numbers_from_poses(pose, convention), convention)
+    assert pose_distance(again, pose)[1] < 3e-7
+
+
+def test_quaternions_are_written_with_positive_w() -> None:
+    pose = SE3(np.array([-0.5, 0.5, 0.5, 0.5]), np.zeros(3))
+    assert numbers_from_poses(pose, CONVENTIONS["xyzw"])[6] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("euler", "is not known; use one of wxyz, xyzw"),
+        ("kuka:cm", "modifier 'cm' is not known"),
+        ("wxyz:deg", "has no angles"),
+        ("kuka:m:mm", "says a thing twice"),
+        ("kuka:deg:rad", "says a thing twice"),
+        ("matrix:inverse:inverse", "says a thing twice"),
+    ],
+)
+def test_names_that_are_none(name: str, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        pose_convention(name)
+
+
+def rows(name: str) -> Array:
+    """Poses as of an arm: half a metre from its base."""
+    rng = np.random.default_rng(5)
+    translation = rng.uniform(0.2, 0.8, (6, 3))
+    return numbers_from_poses(SE3(rng.normal(size=(6, 4)), translation), pose_convention(name))
+
+
+@pytest.mark.parametrize("name", sorted(CONVENTIONS))
+def test_sound_numbers_raise_no_doubt(name: str) -> None:
+    assert doubt(rows(name), CONVENTIONS[name]) is None
+
+
+@pytest.mark.parametrize(
+    ("written", "read", "said"),
+    [
+        ("wxyz:mm", "wxyz", "look like millimetres; give --convention wxyz:mm"),
+        ("matrix:mm", "matrix", "look like millimetres; give --convention matrix:mm"),
+        ("franka:mm", "franka:inverse", "give --convention franka:inverse:mm"),
+        ("kuka:m", "kuka", "looks like metres; give --convention kuka:m"),
+        ("rpy:deg", "rpy", "looks like degrees; give --convention rpy:deg"),
+        ("ur:deg", "ur", "looks like degrees; give --convention ur:deg"),
+        ("fanuc:rad", "fanuc", "looks like radians; give --convention fanuc:rad"),
+    ],
+)
+def test_wrong_units_are_doubted_until_they_are_stated(written: str, read: str, said: str) -> None:
+    assert said in (doubt(rows(written), pose_convention(read)) or "")
+    stated = said.split("--convention ")[1]
+    assert doubt(rows(written), pose_convention(stated)) is None
+    # Who states the unit, even an odd one, is believed.
+    units = {"mm": ":m", "m": ":mm", "deg": ":rad", "rad": ":deg"}[stated.split(":")[-1]]
+    assert doubt(rows(written), pose_convention(read + units)) is None
+
+
+@pytest.mark.parametrize(("name", "factor"), [("xyzw", 1000.0), ("abb", 0.001)])
+def test_mixed_units_name_the_poses(name: str, factor: float) -> None:
+    numbers = rows(name)
+    numbers[[1, 4], :3] *= factor
+    found = doubt(numbers, CONVENTIONS[name]) or ""
+    assert "poses 2, 5" in found
+    assert "mix millimetres and metres" in found
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("wxyz", lambda n: n[:, :6], "has 7 numbers .* got 6"),
+        ("wxyz", lambda n: n * np.where(np.arange(7) > 2, 2, 1), "pose 1 .* not of length 1"),
+        ("ur", lambda n: np.where(np.arange(6) == 4, np.nan, n), "inf or nan"),
+        ("matrix", lambda n: n.reshape(-1, 4, 4).swapaxes(1, 2).reshape(-1, 16), "franka"),
+        ("franka", lambda n: n.reshape(-1, 4, 4).swapaxes(1, 2).reshape(-1, 16), "matrix"),
+        ("matrix", lambda n: n + np.eye(4).ravel() * 0.1, "last row"),
+        ("matrix", lambda n: n * np.where(np.arange(16) % 4 < 3, 1.1, 1), "is no rotation"),
+        ("matrix", lambda n: n * np.where(np.arange(16) % 4 == 0, -1, 1), "is no rotation"),
+    ],
+)
+def test_numbers_that_are_no_pose(name: str, change: Callable[[Array], Array], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        poses_from_numbers(change(rows(name)), CONVENTIONS[name])
+
+
+def test_the_first_broken_pose_is_named() -> None:
+    numbers = rows("wxyz")
+    numbers[[2, 3], 3:] *= 1.2
+    with pytest.raises(ValueError, match=r"pose 3 \(and 1 more\)"):
+        poses_from_numbers(numbers, CONVENTIONS["wxyz"])

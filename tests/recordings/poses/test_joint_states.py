@@ -1,0 +1,233 @@
+"""Gripper poses from joints: a planar arm's closed form, the Panda's published parameters."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evercal.errors import InputError
+from evercal.geometry import SE3, pose_distance
+from evercal.recordings import ReadOptions, load_recording, write_image
+from evercal.recordings.poses.joint_states import interpolate, read_joint_poses
+from evercal.recordings.poses.kinematics import RobotModel
+
+pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
+
+# Two links of 0.5 and 0.3 m in the plane, on a column of 0.2 m; a slide at the end moves along x.
+PLANAR = """<robot name="planar">
+  <link name="base"/><link name="upper"/><link name="lower"/><link name="slide"/><link name="tip"/>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+    <origin xyz="0 0 0.2"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/>
+  </joint>
+  <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>
+    <origin xyz="0.5 0 0"/><axis xyz="0 0 1"/></joint>
+  <joint name="reach" type="prismatic"><parent link="lower"/><child link="slide"/>
+    <origin xyz="0.3 0 0"/><axis xyz="1 0 0"/><limit lower="0" upper="1" effort="1" velocity="1"/>
+  </joint>
+  <joint name="fixed" type="fixed"><parent link="slide"/><child link="tip"/>
+    <origin xyz="0 0 -0.1" rpy="0 0 0"/></joint>
+</robot>"""
+ANGLES = st.floats(-2.9, 2.9)
+
+
+def planar(shoulder: float, elbow: float, reach: float) -> SE3:
+    """The tip in the base, from the drawing."""
+    a, b = shoulder, shoulder + elbow
+    far = 0.3 + reach
+    x, y = 0.5 * np.cos(a) + far * np.cos(b), 0.5 * np.sin(a) + far * np.sin(b)
+    return SE3(np.array([np.cos(b / 2), 0, 0, np.sin(b / 2)]), np.array([x, y, 0.1]))
+
+
+@pytest.fixture(scope="module")
+def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("urdf") / "planar.urdf"
+    file.write_text(PLANAR)
+    return file
+
+
+@pytest.fixture(scope="module")
+def model(urdf: Path) -> RobotModel:
+    return RobotModel(urdf)
+
+
+@given(ANGLES, ANGLES, st.floats(0, 1))
+def test_a_planar_arm_is_where_its_closed_form_says(
+    model: RobotModel, shoulder: float, elbow: float, reach: float
+) -> None:
+    # In another order than the chain's, with a joint that the arm has not.
+    values = np.array([[9.0, reach, shoulder, elbow]])
+    names = ["finger", "reach", "shoulder", "elbow"]
+    found = model.base_from_gripper(names, values, "base", "tip")
+    metres, radians = pose_distance(found[0], planar(shoulder, elbow, reach))
+    assert max(metres, radians) < 1e-7  # trimesh takes 1e-8 for nothing
+
+
+def test_frames_may_be_any_two_links(model: RobotModel) -> None:
+    assert (model.base_link, model.end_link()) == ("base", "tip")
+    assert model.joints_between("base", "tip") == ("shoulder", "elbow", "reach")
+    assert model.joints_between("upper", "lower") == ("elbow",)
+    assert model.joints_between("tip", "lower") == ("reach",)
+    turned = model.base_from_gripper(["elbow"], np.array([[0.7]]), "lower", "upper")[0]
+    expected = SE3.exp([0.5, 0, 0, 0, 0, 0]) @ SE3.exp([0, 0, 0, 0, 0, 0.7])
+    assert max(pose_distance(turned, expected.inverse())) < 1e-9
+
+
+def panda_flange(q: np.ndarray) -> SE3:
+    """Franka's documented Denavit-Hartenberg parameters (Craig's convention)."""
+    a = [0, 0, 0, 0.0825, -0.0825, 0, 0.088, 0]
+    d = [0.333, 0, 0.316, 0, 0.384, 0, 0, 0.107]
+    alpha = [0, -np.pi / 2, np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, np.pi / 2, 0]
+    base_from_joint = SE3.identity()
+    for i in range(8):
+        along_x = SE3.exp([0, 0, 0, alpha[i], 0, 0]).rotation_wxyz
+        before = SE3(along_x, np.array([a[i], 0.0, 0.0]))
+        about_z = SE3.exp([0, 0, 0, 0, 0, q[i] if i < 7 else 0.0])
+        base_from_joint = base_from_joint @ before @ about_z @ SE3.exp([0, 0, d[i], 0, 0, 0])
+    return base_from_joint
+
+
+def test_the_panda_is_where_its_published_parameters_say() -> None:
+    spec = pytest.importorskip("importlib.metadata")
+    try:
+        files = spec.files("example-robot-data") or []
+    except spec.PackageNotFoundError:
+        pytest.skip("example-robot-data is not installed")
+    file = next(f for f in files if str(f).endswith("panda_description/urdf/panda.urdf"))
+    model = RobotModel(Path(file.locate()))
+    with pytest.raises(InputError, match=r"has 3 ends; name the link with --gripper-frame"):
+        model.end_link()
+    joints = model.joints_between("panda_link0", "panda_link8")
+    assert joints == tuple(f"panda_joint{i}" for i in range(1, 8))
+    q = np.random.default_rng(1).uniform(-1.5, 0.0, (20, 7))
+    found = model.base_from_gripper(joints, q, "panda_link0", "panda_link8")
+    for row, pose in zip(q, found, strict=True):
+        assert max(pose_distance(pose, panda_flange(row))) < 1e-6
+    # The other way round, and from the hand, which is fixed to the flange.
+    back = model.base_from_gripper(joints, q, "panda_link8", "panda_link0")
+    assert max(pose_distance(back, found.inverse())[0]) < 1e-9
+
+
+def test_a_folder_with_joints_and_a_urdf_is_a_recording(tmp_path: Path, urdf: Path) -> None:
+    for i in range(3):
+        write_image(tmp_path / f"{i}.png", np.zeros((24, 32, 3), np.uint8))
+    (tmp_path / "camera.txt").write_text("30 0 15.5\n0 30 11.5\n0 0 1\n")
+    (tmp_path / "joints.csv").write_text(
+        "image,elbow_deg,shoulder,reach_m\n2.png,90,0.5,0.1\n0.png,-30,0.25,0.2\n1.png,5,1,0\n"
+    )
+    with pytest.raises(InputError, match="no URDF is beside it; give --urdf"):
+        load_recording(tmp_path)
+    options = ReadOptions(urdf=urdf)
+    scene = load_recording(tmp_path, options=options)
+    expected = [planar(0.25, np.deg2rad(-30), 0.2), planar(1, np.deg2rad(5), 0)]
+    expected.append(planar(0.5, np.pi / 2, 0.1))
+    for frame, pose in zip(scene.train, expected, strict=True):
+        assert frame.base_from_gripper is not None
+        assert max(pose_distance(frame.base_from_gripper, pose)) < 1e-9
+    degrees = ReadOptions(urdf=urdf, pose_convention="deg")  # of the column that does not say
+    turned = load_recording(tmp_path, options=degrees).train[0].base_from_gripper
+    assert turned is not None
+    expected = planar(np.deg2rad(0.25), np.deg2rad(-30), 0.2)
+    assert max(pose_distance(turned, expected)) < 1e-7
+    assert scene.notes[0] == "gripper poses are those of tip in base, from planar.urdf"
+    with pytest.raises(InputError, match="has no link 'hand'; its links are base, upper"):
+        load_recording(tmp_path, options=ReadOptions(urdf=urdf, gripper_frame="hand"))
+
+
+def test_json_and_csv_say_the_same(tmp_path: Path, model: RobotModel) -> None:
+    names, rows = ["shoulder", "elbow", "reach"], [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]
+    text = "stamp_s," + ",".join(names) + "\n"
+    text += "".join(f"{i},{','.join(map(str, row))}\n" for i, row in enumerate(rows))
+    (tmp_path / "joints.csv").write_text(text)
+    data = {"joint_names": names, "positions": rows, "stamps_s": [0, 1]}
+    (tmp_path / "joints.json").write_text(json.dumps(data))
+    one, two = (read_joint_poses(tmp_path / f"joints.{k}", model)[0] for k in ("csv", "json"))
+    assert one.stamps_s is not None
+    assert two.stamps_s is not None
+    assert one.stamps_s.tolist() == two.stamps_s.tolist() == [0, 1]
+    np.testing.assert_allclose(one.poses.matrix(), two.poses.matrix())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("shoulder,elbow\n0,0\n", "no values for joint reach, which tip depends on"),
+        ("shoulder,elbow,reach\n90,20,0\n", "joint shoulder is at 90.0.*shoulder_deg"),
+        ("shoulder,elbow,reach,elbow_deg\n0,1,0,90\n", "several columns are of joint elbow"),
+        ("shoulder,elbow,reach\n0,x,0\n", "column 'elbow': 'x' is not a number"),
+        ("shoulder,elbow,reach\n", "no rows"),
+    ],
+)
+def test_wrong_joint_tables_are_refused(
+    tmp_path: Path, model: RobotModel, text: str, message: str
+) -> None:
+    file = tmp_path / "joints.csv"
+    file.write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        read_joint_poses(file, model)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "data",
+    ["{", "[]", '{"joint_names": ["a"]}', '{"joint_names": ["a"], "positions": [[1, 2]]}',
+     '{"joint_names": ["shoulder"], "positions": [[1]], "images": ["a", "b"]}'],
+)  # fmt: skip
+def test_wrong_json_is_refused(tmp_path: Path, model: RobotModel, data: str) -> None:
+    file = tmp_path / "joints.json"
+    file.write_text(data)
+    with pytest.raises(InputError, match=r"joints\.json"):
+        read_joint_poses(file, model)
+
+
+def test_angles_beyond_the_limits_are_noted(tmp_path: Path, model: RobotModel) -> None:
+    file = tmp_path / "joints.csv"
+    file.write_text("shoulder,elbow,reach\n3.5,9,0\n")
+    _, notes = read_joint_poses(file, model)
+    assert len(notes) == 2
+    assert "shoulder goes from 3.50 to 3.50, the URDF allows -3.00 to 3.00" in notes[1]
+
+
+def test_turns_without_limits_that_look_like_degrees_are_noted(tmp_path: Path) -> None:
+    (tmp_path / "a.urdf").write_text(
+        '<robot name="a"><link name="base"/><link name="tip"/>'
+        '<joint name="turn" type="continuous"><parent link="base"/><child link="tip"/>'
+        '<axis xyz="0 0 1"/></joint></robot>'
+    )
+    file = tmp_path / "joints.csv"
+    for values, count in (((-170, 170), 1), ((100.0, 103.0), 0)):
+        file.write_text("turn\n" + "".join(f"{value}\n" for value in values))
+        _, notes = read_joint_poses(file, RobotModel(tmp_path / "a.urdf"))
+        assert len(notes) == 1 + count
+
+
+def test_joints_are_interpolated_but_not_over_a_turn_or_a_gap() -> None:
+    times = np.array([0.0, 0.1, 0.2, 9.0])
+    angles = np.array([3.0, -3.0, -2.9, -1.0])  # turns on through pi
+    values, known = interpolate(times, angles, np.array([-0.1, 0.05, 0.2, 5.0, 9.0, 9.1]))
+    assert known.tolist() == [False, True, True, False, True, False]
+    assert values[1] == pytest.approx((3.0 + (2 * np.pi - 3.0)) / 2)
+
+
+def test_files_that_are_no_urdf_are_refused(tmp_path: Path) -> None:
+    for name, text in (("a.urdf", "<robot"), ("b.urdf", "<house/>"), ("c.urdf", "")):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match=f"{name}: no usable URDF") as caught:
+            RobotModel(tmp_path / name)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="no such URDF"):
+        RobotModel(tmp_path / "d.urdf")
+    (tmp_path / "e.urdf.xacro").write_text("")
+    with pytest.raises(InputError, match="'xacro' first"):
+        RobotModel(tmp_path / "e.urdf.xacro")
+
+
+def test_without_the_extra_the_install_line_is_named(
+    urdf: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "yourdfpy", None)
+    with pytest.raises(InputError, match=r"pip install 'evercal\[urdf\]'"):
+        RobotModel(urdf)

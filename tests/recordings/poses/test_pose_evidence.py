@@ -1,0 +1,149 @@
+"""What images say of stated rotations: sound poses raise no doubt, spoiled ones are named."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from evercal.geometry import SE3, Camera, pose_distance
+from evercal.recordings import Frame, Recording, load_recording, write_image
+from evercal.recordings.inspection import inspect_scene
+from evercal.recordings.poses import pose_evidence
+from evercal.recordings.poses.pose_evidence import doubts
+from evercal.recordings.samples import FOLDER
+
+GRIPPER_FROM_CAMERA = SE3.exp([0.05, 0.02, 0.08, 0.4, -1.0, 0.7])
+FLIP = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
+
+
+def stated(frames: tuple[Frame, ...]) -> SE3:
+    return SE3.stack([f.base_from_camera for f in frames if f.base_from_camera is not None])
+
+
+@pytest.fixture(scope="module")
+def bedroom() -> tuple[Frame, ...]:
+    """Rendered frames with exact poses."""
+    return load_recording(FOLDER / "bedroom").train
+
+
+@pytest.fixture(scope="module", autouse=True)
+def matched_once() -> Iterator[None]:
+    """Every pair of images is matched once for all tests."""
+    real, known = pose_evidence.seen_turn, {}
+
+    def cached(first: Frame, second: Frame) -> np.ndarray | None:
+        key = first.image, second.image
+        if key not in known:
+            known[key] = real(first, second)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pose_evidence, "seen_turn", cached)
+        yield
+
+
+def test_turns_between_images_are_those_of_the_true_poses(bedroom: tuple[Frame, ...]) -> None:
+    turns = pose_evidence.measure(bedroom, stated(bedroom))
+    assert turns is not None
+    assert len(turns.seen) >= 8
+    off = Rotation.from_rotvec(turns.seen).inv() * Rotation.from_rotvec(turns.stated)
+    assert np.rad2deg(np.median(off.magnitude())) < 1.0
+    assert np.rad2deg(np.median(np.linalg.norm(turns.seen, axis=1))) > pose_evidence.TURN_DEG
+
+
+def reordered(poses: SE3) -> SE3:
+    """x y z w read as w x y z."""
+    return SE3(poses.rotation_wxyz[:, [1, 2, 3, 0]], poses.translation_m)
+
+
+def as_degrees(poses: SE3) -> SE3:
+    """Rotation vectors in degrees read as radians."""
+    rotvec = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True).as_rotvec(degrees=True)
+    turned = Rotation.from_rotvec(rotvec).as_quat(scalar_first=True)
+    return SE3(turned, poses.translation_m)
+
+
+SPOILED: dict[str, tuple[Callable[[SE3], SE3], str]] = {
+    "inverse": (lambda poses: poses.inverse(), "they are camera_from_base, the inverse"),
+    "opengl": (lambda poses: poses @ FLIP, "they are with OpenGL's camera axes"),
+    "both": (lambda poses: (poses @ FLIP).inverse(), "the inverse with OpenGL's camera axes"),
+    "order": (reordered, "they are with quaternions in another order"),
+    "body": (lambda poses: poses @ GRIPPER_FROM_CAMERA, "those of another frame, at a fixed angle"),
+    "degrees": (as_degrees, "are angles in the unit and Euler order that was said"),
+}
+
+
+@pytest.mark.parametrize("how", SPOILED)
+def test_spoiled_camera_poses_are_named(bedroom: tuple[Frame, ...], how: str) -> None:
+    spoil, message = SPOILED[how]
+    assert doubts(bedroom, stated(bedroom), True) == []
+    (said,) = doubts(bedroom, spoil(stated(bedroom)), True)
+    assert said.startswith("the camera turns otherwise than the images do, by ")
+    assert message in said
+
+
+def test_spoiled_gripper_poses_are_named(bedroom: tuple[Frame, ...]) -> None:
+    gripper = stated(bedroom) @ GRIPPER_FROM_CAMERA.inverse()
+    assert doubts(bedroom, gripper, False) == []
+    # Any frame that is fixed to the gripper is as good.
+    assert doubts(bedroom, gripper @ FLIP, False) == []
+    (said,) = doubts(bedroom, gripper.inverse(), False)
+    assert "they are gripper_from_base, the inverse" in said
+    (said,) = doubts(bedroom, reordered(gripper), False)
+    assert "with quaternions in another order" in said
+    (said,) = doubts(bedroom, as_degrees(gripper), False)
+    assert "are angles in the unit" in said or "the angles in another unit" in said
+
+
+def test_a_camera_that_stands_still_is_noticed(bedroom: tuple[Frame, ...]) -> None:
+    same = tuple(dataclasses.replace(f, image=bedroom[0].image) for f in bedroom)
+    gripper = stated(bedroom) @ GRIPPER_FROM_CAMERA.inverse()
+    (said,) = doubts(same, gripper, False)
+    assert said.startswith(
+        "the gripper turns and the images hardly do; does the camera stand still"
+    )
+
+
+def test_images_without_texture_say_nothing(tmp_path: Path) -> None:
+    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    poses = SE3.exp(np.linspace([0, 0, 0, 0, 0, 0], [1, 0, 0, 0, 2, 0], 20))
+    blank = tmp_path / "blank.png"
+    write_image(blank, np.full((48, 64, 3), 128, np.uint8))
+    frames = tuple(Frame(str(i), blank, camera, pose) for i, pose in enumerate(poses))
+    assert doubts(frames, poses, True) == []
+
+
+def test_a_wrist_recording_is_inspected_by_its_gripper(bedroom: tuple[Frame, ...]) -> None:
+    gripper = stated(bedroom) @ GRIPPER_FROM_CAMERA.inverse()
+
+    def warned(poses: SE3) -> tuple[str, ...]:
+        frames = tuple(
+            dataclasses.replace(f, base_from_camera=None, base_from_gripper=pose)
+            for f, pose in zip(bedroom, poses, strict=True)
+        )
+        found = inspect_scene(Recording("wave", frames, ()))
+        assert (found.poses, found.train) == ("gripper", len(frames))
+        return found.warnings
+
+    assert warned(gripper) == ()
+    (millimetres,) = warned(SE3(gripper.rotation_wxyz, 1000 * gripper.translation_m))[:1]
+    assert "farther than arms reach; are the poses in millimetres?" in millimetres
+    (nowhere,) = warned(SE3(gripper.rotation_wxyz, 1e-6 * gripper.translation_m))
+    assert "stand at one point, turning by" in nowhere
+    assert "in metres?" in nowhere
+    (inverse,) = warned(gripper.inverse())
+    assert "gripper_from_base, the inverse" in inverse
+
+
+def test_many_cameras_take_one_line(bedroom: tuple[Frame, ...]) -> None:
+    lens = bedroom[0].camera
+    frames = tuple(
+        dataclasses.replace(f, camera=dataclasses.replace(lens, fx=lens.fx + i / 10))
+        for i, f in enumerate(bedroom)
+    )
+    (line,) = inspect_scene(Recording("phone", frames, ())).cameras
+    assert f"{len(frames)} sets of intrinsics" in line
+    assert pose_distance(stated(frames), stated(bedroom))[0].max() == 0

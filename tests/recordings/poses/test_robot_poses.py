@@ -1,0 +1,320 @@
+"""Files of robot poses: each kind is read as it was written; what is left open is asked for."""
+
+import csv
+import io
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from evercal.errors import InputError
+from evercal.geometry import SE3, pose_distance
+from evercal.recordings.poses.conventions import CONVENTIONS, numbers_from_poses, pose_convention
+from evercal.recordings.poses.robot_poses import read_robot_poses
+
+COUNT = 6
+
+
+def arm(seed: int = 0) -> SE3:
+    """Poses of a gripper half a metre from its base."""
+    rng = np.random.default_rng(seed)
+    return SE3(rng.normal(size=(COUNT, 4)), rng.uniform(0.2, 0.8, (COUNT, 3)))
+
+
+def table(header: str, numbers: NDArray[np.float64], separator: str = ",") -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, delimiter=separator)
+    if header:
+        writer.writerow(header.split(","))
+    writer.writerows(numbers.tolist())
+    return text.getvalue()
+
+
+def same(found: SE3, poses: SE3, tolerance: float = 1e-12) -> bool:
+    return found.shape == poses.shape and bool(np.max(pose_distance(found, poses)) < tolerance)
+
+
+HEADERS = [
+    ("x,y,z,qw,qx,qy,qz", "wxyz", None),
+    ("tx,ty,tz,qx,qy,qz,qw", "xyzw", None),
+    ("X,Y,Z,Q_W,Q_X,Q_Y,Q_Z", "wxyz", None),
+    ("pose.position.x,pose.position.y,pose.position.z,pose.orientation.x,pose.orientation.y,"
+     "pose.orientation.z,pose.orientation.w", "xyzw", None),
+    ("translation_x,translation_y,translation_z,rotation_x,rotation_y,rotation_z,rotation_w",
+     "xyzw", None),
+    ("x_mm,y_mm,z_mm,qw,qx,qy,qz", "wxyz:mm", None),
+    ("x [mm],y [mm],z [mm],qw [],qx [],qy [],qz []", "wxyz:mm", None),
+    ("x_m,y_m,z_m,rotvec_x,rotvec_y,rotvec_z", "ur", None),
+    ("x,y,z,rvec_x_deg,rvec_y_deg,rvec_z_deg", "ur:deg", None),
+    ("x,y,z,roll_deg,pitch_deg,yaw_deg", "rpy:deg", None),
+    ("x(m),y(m),z(m),roll (rad),pitch (rad),yaw (rad)", "rpy", None),
+    ("X,Y,Z,W,P,R", "fanuc", None),
+    (",".join(f"m{i}{j}" for i in range(4) for j in range(4)), "matrix", None),
+    (",".join(f"m{i}{j}" for j in range(4) for i in range(4)), "franka", None),
+    ("x,y,z,rx,ry,rz", "ur", "ur"),
+    ("x,y,z,rx,ry,rz", "yaskawa", "yaskawa"),
+    ("x,y,z,rx,ry,rz", "staubli", "staubli"),
+    ("x,y,z,yaw,pitch,roll", "kuka", "kuka"),
+    ("x,y,z,roll,pitch,yaw", "rpy:deg", "rpy:deg"),
+    ("X,Y,Z,A,B,C", "kuka", "kuka"),
+    ("x,y,z,q1,q2,q3,q4", "abb", "abb"),
+    ("x,y,z,q1,q2,q3,q4", "xyzw", "xyzw"),
+    ("x,y,z,qw,qx,qy,qz", "wxyz:inverse", "wxyz:inverse"),
+    ("x_m,y_m,z_m,A,B,C", "kuka:m", "kuka:m"),
+    ("p1,p2,p3,o1,o2,o3", "staubli", "staubli"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("header", "written", "given"), HEADERS)
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_headers(
+    tmp_path: Path, header: str, written: str, given: str | None, separator: str
+) -> None:
+    numbers = numbers_from_poses(arm(), pose_convention(written))
+    file = tmp_path / "poses.csv"
+    file.write_text(table(header, numbers, separator))
+    read = read_robot_poses(file, given)
+    assert same(read.poses, arm())
+    assert (read.names, read.stamps_s) == (None, None)
+
+
+@given(st.permutations(range(9)), st.integers(0, 1000))
+@settings(deadline=None, max_examples=30)
+def test_columns_stand_in_any_order(
+    tmp_path_factory: pytest.TempPathFactory, order: list[int], seed: int
+) -> None:
+    header = ["x", "y", "z", "qw", "qx", "qy", "qz", "stamp", "image"]
+    numbers = numbers_from_poses(arm(seed), CONVENTIONS["wxyz"])
+    rows = [[*map(repr, row.tolist()), f"{i}.5", f"{i}.png"] for i, row in enumerate(numbers)]
+    lines = [",".join(row[k] for k in order) for row in [header, *rows]]
+    file = tmp_path_factory.getbasetemp() / "shuffled.csv"
+    file.write_text("\n".join(lines))
+    read = read_robot_poses(file)
+    assert same(read.poses, arm(seed))
+    assert read.names == tuple(f"{i}.png" for i in range(COUNT))
+    assert read.stamps_s is not None
+    np.testing.assert_array_equal(read.stamps_s, np.arange(COUNT) + 0.5)
+
+
+@pytest.mark.parametrize("name", sorted(CONVENTIONS))
+@pytest.mark.parametrize("extra", ["", "name", "stamp", "stamp name", "name stamp"])
+def test_tables_without_a_header(tmp_path: Path, name: str, extra: str) -> None:
+    lines = ["# made by a robot"]
+    for i, row in enumerate(numbers_from_poses(arm(), CONVENTIONS[name])):
+        before = {"": "", "name": f"{i}.png ", "stamp": f"{i}.5 "}.get(extra, f"{i}.5 {i}.png ")
+        lines.append(before + " ".join(map(repr, row.tolist())))
+    file = tmp_path / "poses.txt"
+    file.write_text("\n".join(lines))
+    read = read_robot_poses(file, name)
+    assert same(read.poses, arm())
+    assert (read.names is not None) == ("name" in extra)
+    assert (read.stamps_s is not None) == ("stamp" in extra)
+
+
+def test_tum_lines(tmp_path: Path) -> None:
+    numbers = numbers_from_poses(arm(), CONVENTIONS["xyzw"])
+    lines = [f"{1.7e9 + i} " + " ".join(map(repr, row.tolist())) for i, row in enumerate(numbers)]
+    (tmp_path / "a.tum").write_text("\n".join(lines))
+    (tmp_path / "b.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines))
+    (tmp_path / "c.txt").write_text("# ground truth\n" + "\n".join(lines))
+    for name, said in (("a.tum", None), ("b.txt", None), ("c.txt", "tum")):
+        read = read_robot_poses(tmp_path / name, said)
+        assert same(read.poses, arm())
+        assert read.stamps_s is not None
+        assert read.stamps_s[2] == 1.7e9 + 2
+    inverse = read_robot_poses(tmp_path / "c.txt", "tum:inverse")
+    assert same(inverse.poses, arm().inverse())
+    with pytest.raises(InputError, match=r"8 columns without a header .* or tum"):
+        read_robot_poses(tmp_path / "c.txt")
+
+
+def test_a_decimal_comma(tmp_path: Path) -> None:
+    text = table("image,x,y,z,qw,qx,qy,qz", np.array([[0]]), ";").splitlines()[0]
+    (tmp_path / "p.csv").write_text(text + "\na,b.png;0,5;0,25;0,1;1;0;0;0\n", encoding="utf-8-sig")
+    read = read_robot_poses(tmp_path / "p.csv")
+    np.testing.assert_array_equal(read.poses.translation_m, [[0.5, 0.25, 0.1]])
+    assert read.names == ("a,b.png",)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"), [("_s", 1), ("_ms", 1e3), (" [us]", 1e6), ("_ns", 1e9)]
+)
+def test_units_of_stamps(tmp_path: Path, unit: str, factor: float) -> None:
+    (tmp_path / "p.csv").write_text(f"t{unit},x,y,z,qw,qx,qy,qz\n{1.7e9 * factor},1,0,0,1,0,0,0\n")
+    read = read_robot_poses(tmp_path / "p.csv")
+    assert read.stamps_s == pytest.approx([1.7e9])
+
+
+def test_json_objects(tmp_path: Path) -> None:
+    objects = [
+        {
+            "translation_m": pose.translation_m.tolist(),
+            "quaternion_wxyz": pose.rotation_wxyz.tolist(),
+            "image": f"{i}.png",
+            "stamp_s": i / 4,
+        }
+        for i, pose in enumerate(arm())
+    ]
+    file = tmp_path / "p.json"
+    for data in (objects, {"poses": objects}):
+        file.write_text(json.dumps(data))
+        read = read_robot_poses(file)
+        assert same(read.poses, arm())
+        assert read.names == tuple(f"{i}.png" for i in range(COUNT))
+        assert read.stamps_s is not None
+        assert read.stamps_s.tolist() == [i / 4 for i in range(COUNT)]
+    assert same(read_robot_poses(file, "wxyz:inverse").poses, arm().inverse())
+    file.write_text(json.dumps(objects[0]))
+    assert same(read_robot_poses(file).poses, arm()[:1])
+
+
+def test_json_matrices_and_numbers(tmp_path: Path) -> None:
+    file = tmp_path / "p.json"
+    matrices = arm().matrix()
+    file.write_text(json.dumps([{"matrix": m.tolist()} for m in matrices]))
+    assert same(read_robot_poses(file).poses, arm())
+    file.write_text(json.dumps([{"matrix": m.T.ravel().tolist()} for m in matrices]))
+    assert same(read_robot_poses(file, "franka").poses, arm())
+    file.write_text(json.dumps(matrices.tolist()))
+    assert same(read_robot_poses(file).poses, arm())
+    file.write_text(json.dumps(numbers_from_poses(arm(), CONVENTIONS["kuka"]).tolist()))
+    assert same(read_robot_poses(file, "kuka").poses, arm())
+    with pytest.raises(InputError, match="6 numbers a pose do not say how they are meant"):
+        read_robot_poses(file)
+
+
+def test_npy(tmp_path: Path) -> None:
+    file = tmp_path / "p.npy"
+    np.save(file, arm().matrix())
+    assert same(read_robot_poses(file).poses, arm())
+    np.save(file, arm().matrix()[0])
+    assert same(read_robot_poses(file).poses, arm()[:1])
+    np.save(file, arm().matrix().swapaxes(1, 2))
+    assert same(read_robot_poses(file, "franka").poses, arm())
+    with pytest.raises(InputError, match="written column after column; give --convention franka"):
+        read_robot_poses(file)
+    for name in ("wxyz", "xyzw", "ur", "kuka", "franka"):
+        np.save(file, numbers_from_poses(arm(), CONVENTIONS[name]))
+        assert same(read_robot_poses(file, name).poses, arm())
+        with pytest.raises(InputError, match="do not say how they are meant"):
+            read_robot_poses(file)
+
+
+Q = "0.5,0.1,0.2,1,0,0,0"
+REFUSED = [
+    ("x,y,z,rx,ry,rz\n0.5,0,0,0.1,0.2,0.3", None, "give --convention ur .rotation vector., yask"),
+    ("x,y,z,roll,pitch,yaw\n0.5,0,0,0.1,0.2,0.3", None, "give --convention rpy:rad or rpy:deg"),
+    ("x,y,z,a,b,c\n500,0,0,10,20,30", None, "columns of a, b, c .* give --convention kuka"),
+    ("x,y,z,q1,q2,q3,q4\n" + Q, None, "give --convention abb, wxyz or xyzw"),
+    ("x,y,z,qw,qx,qy,qz,rotvec_x,rotvec_y,rotvec_z\n" + Q + ",0,0,0", None, "say which with"),
+    ("a1,a2,a3,a4,a5,a6,a7\n" + Q, None, "names no pose that is known"),
+    ("x,y,z,u,v\n0,0,0,0,0", "kuka", "its 5 columns are not the 6 of kuka"),
+    ("x,y,z,qw,qx,qy,qz\n" + Q, "kuka", "no columns for kuka"),
+    ("x,y,z,rx,ry,rz\n500,0,0,10,20,30", "kuka", "no columns for kuka .X Y Z A B C"),
+    (Q, None, "7 columns without a header"),
+    (Q + ",3,4", "wxyz", "row 1 has 9 columns; wxyz takes 7"),
+    (Q + "\n1,2", "wxyz", "row 2 has 2 columns"),
+    ("x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,1,0,0", None, "row 1 has 6 columns, the header 7"),
+    ("x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,1,0,0,none", None, "row 1 holds 'none'"),
+    ("x,y,z,qw,qx,qy,qz\n500,100,200,1,0,0,0", None, "look like millimetres.* wxyz:mm"),
+    ("x_m,y_m,z_m,qw,qx,qy,qz\n500,100,200,1,0,0,0", None, "look like millimetres.* wxyz:mm"),
+    ("x,y,z,rotvec_x,rotvec_y,rotvec_z\n0.5,0,0,100,20,3", None, "looks like degrees.* ur:deg"),
+    ("x_m,y_m,z_m,A,B,C\n0.5,0,0,100,20,3", "kuka", "header says m .* give --convention kuka:m"),
+    ("x,y,z,roll_rad,pitch_rad,yaw_rad\n0,0,0,1,1,1", "fanuc", "give --convention fanuc:rad"),
+    ("x_m,y,z,qw,qx,qy,qz\n" + Q, None, "x_m, y, z differ in unit"),
+    ("stamp,x,y,z,qw,qx,qy,qz\n1.7e18," + Q, None, "not in seconds; call the column stamp_ns"),
+    ("image,x,y,z,qw,qx,qy,qz\na," + Q + "\na," + Q, None, "'a' comes twice"),
+    ("x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,nan,0,0,0", None, "inf or nan"),
+    ("x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,1,1,0,0", None, "not of length 1"),
+    ("x,y,z,qw,qx,qy,qz,px,py,pz\n" + Q + ",1,2,3", None, "x and px may both be the position's"),
+    ("x,y,z,qw,qx,qy,qz,qw,qx,qy,qz\n" + Q + ",1,0,0,0", None, "qw and qw may both be"),
+    ("0.5,0.1,0.2,0,0,1,9\n0.4,0.1,0.2,0,0,1,9", "ur", "row 2 is smaller .* so it is no stamp"),
+    ("# nothing\n", None, "no line of numbers"),
+    ("x,y,z,qw,qx,qy,qz\n", None, "no line of numbers"),
+    (Q, "quaternion", "'quaternion' is not known"),
+]
+
+
+@pytest.mark.parametrize(("text", "given", "said"), REFUSED)
+def test_what_is_open_or_wrong_is_said(
+    tmp_path: Path, text: str, given: str | None, said: str
+) -> None:
+    (tmp_path / "p.csv").write_text(text)
+    with pytest.raises(InputError, match=said) as caught:
+        read_robot_poses(tmp_path / "p.csv", given)
+    assert str(caught.value).startswith(str(tmp_path / "p.csv"))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_header_that_lies_is_overruled_by_the_user(tmp_path: Path) -> None:
+    (tmp_path / "p.csv").write_text("x_m,y_m,z_m,qw,qx,qy,qz\n500,100,200,1,0,0,0")
+    read = read_robot_poses(tmp_path / "p.csv", "wxyz:mm")
+    np.testing.assert_allclose(read.poses.translation_m, [[0.5, 0.1, 0.2]])
+
+
+@pytest.mark.parametrize(
+    ("data", "given", "said"),
+    [
+        ([{"translation_m": [1, 2, 3]}], None, "'translation_m' and 'quaternion_wxyz'"),
+        ([{"translation_m": [1, 2], "quaternion_wxyz": [1, 0, 0, 0]}], None, "three numbers"),
+        ([{"translation_m": [1, 2, "x"], "quaternion_wxyz": [1, 0, 0, 0]}], None, "of numbers"),
+        ([{"translation_m": [1, 2, 3], "quaternion_wxyz": [1, 0, 0, 0]}], "xyzw", "wxyz:inverse"),
+        ([{"matrix": np.eye(4).tolist()}], "kuka", "holds 4x4 matrices"),
+        ([{"matrix": np.eye(3).tolist()}], None, "4x4, got 3 x 3"),
+        ([{"translation_m": [500, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}], None, "millimetres"),
+        ([], None, "a list of objects"),
+        ([1, 2], None, "not of both"),
+        ("text", None, "a list of objects"),
+    ],
+)
+def test_json_that_is_none(tmp_path: Path, data: object, given: str | None, said: str) -> None:
+    (tmp_path / "p.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match=said):
+        read_robot_poses(tmp_path / "p.json", given)
+
+
+def test_files_that_are_none(tmp_path: Path) -> None:
+    for name in ("no.csv", "no.json", "no.npy"):
+        with pytest.raises(InputError, match="missing; check the path"):
+            read_robot_poses(tmp_path / name)
+    (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(InputError, match="not a text file"):
+        read_robot_poses(tmp_path / "b.csv")
+    (tmp_path / "b.json").write_text("{")
+    with pytest.raises(InputError, match=r"b\.json: "):
+        read_robot_poses(tmp_path / "b.json")
+    (tmp_path / "b.npy").write_text("hello")
+    with pytest.raises(InputError, match=r"b\.npy: "):
+        read_robot_poses(tmp_path / "b.npy")
+    np.save(tmp_path / "o.npy", np.array([{}, {}], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match=r"o\.npy: "):
+        read_robot_poses(tmp_path / "o.npy")
+    np.save(tmp_path / "v.npy", np.zeros((2, 3, 4, 5)))
+    with pytest.raises(InputError, match="got shape"):
+        read_robot_poses(tmp_path / "v.npy")
+
+
+REAL = os.environ.get("EVERCAL_REAL_DATA", "")
+
+
+@pytest.mark.skipif(not REAL, reason="EVERCAL_REAL_DATA names no folder with real recordings")
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [("franka_eye_in_hand", 8), ("franka_eye_to_hand", 8), ("kuka_eye_in_hand", 28)],
+)
+def test_real_recordings(name: str, count: int) -> None:
+    file = Path(REAL) / "handeye" / name / "base_from_gripper.csv"
+    if not file.is_file():
+        pytest.skip(f"{file} is not there")
+    read = read_robot_poses(file)
+    assert len(read) == count
+    columns = np.loadtxt(file, delimiter=",", skiprows=1)
+    np.testing.assert_allclose(read.poses.translation_m, columns[:, :3])
+    expected = Rotation.from_rotvec(columns[:, 3:]).as_matrix()
+    np.testing.assert_allclose(read.poses.rotation_matrix(), expected, atol=1e-12)
