@@ -1,6 +1,6 @@
-"""evercal tells a robot where its camera is, from one ordinary image.
+"""evercal estimates the pose of a camera in the robot's base frame from one ordinary image.
 
-The names below are loaded when they are first used, so that `import evercal` costs nothing.
+The names below are loaded on first use, so that `import evercal` is fast.
 """
 
 import importlib
@@ -9,56 +9,56 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration as Calibration
     from evercal.calibration.calibration import read_calibration as read_calibration
-    from evercal.calibration.drift import check as check
-    from evercal.calibration.from_images import Images as Images
-    from evercal.calibration.from_images import calibrate as calibrate
+    from evercal.calibration.drift import Shift as Shift
     from evercal.calibration.pose_pairs.pairs import PosePairs as PosePairs
+    from evercal.calibration.pose_pairs.solve import SolveOptions as SolveOptions
     from evercal.calibration.pose_pairs.solve import solve as solve
-    from evercal.continual.learn_into_store import learn as learn
-    from evercal.continual.learn_scene import LearnOptions as LearnOptions
-    from evercal.continual.learn_scene import LearnReport as LearnReport
-    from evercal.continual.learn_scene import learn_scene as learn_scene
     from evercal.errors import InputError as InputError
-    from evercal.evaluation.score_scenes import evaluate as evaluate
+    from evercal.evaluation import Scores as Scores
     from evercal.geometry import SE3 as SE3
     from evercal.geometry import Camera as Camera
+    from evercal.geometry import UncertainPose as UncertainPose
     from evercal.localization.estimate import PoseEstimate as PoseEstimate
-    from evercal.localization.localizer import Localizer as Localizer
+    from evercal.localization.query import LocalizeOptions as LocalizeOptions
+    from evercal.map import LearnReport as LearnReport
+    from evercal.map import Map as Map
+    from evercal.mapping.build import MapOptions as MapOptions
     from evercal.recordings import Frame as Frame
+    from evercal.recordings import ReadOptions as ReadOptions
     from evercal.recordings import Recording as Recording
     from evercal.recordings import load_recording as load_recording
     from evercal.recordings import read_image as read_image
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
-# The public names and the module that holds each. A name enters here together with its module.
 _PUBLIC = {
     "Calibration": "evercal.calibration.calibration",
     "Camera": "evercal.geometry",
     "Frame": "evercal.recordings",
-    "Images": "evercal.calibration.from_images",
     "InputError": "evercal.errors",
-    "LearnOptions": "evercal.continual.learn_scene",
-    "LearnReport": "evercal.continual.learn_scene",
-    "Localizer": "evercal.localization.localizer",
-    "PosePairs": "evercal.calibration.pose_pairs.pairs",
+    "LearnReport": "evercal.map",
+    "LocalizeOptions": "evercal.localization.query",
+    "Map": "evercal.map",
+    "MapOptions": "evercal.mapping.build",
     "PoseEstimate": "evercal.localization.estimate",
-    "SE3": "evercal.geometry",
+    "PosePairs": "evercal.calibration.pose_pairs.pairs",
+    "ReadOptions": "evercal.recordings",
     "Recording": "evercal.recordings",
-    "calibrate": "evercal.calibration.from_images",
-    "check": "evercal.calibration.drift",
-    "evaluate": "evercal.evaluation.score_scenes",
-    "learn": "evercal.continual.learn_into_store",
-    "learn_scene": "evercal.continual.learn_scene",
+    "SE3": "evercal.geometry",
+    "Scores": "evercal.evaluation",
+    "Shift": "evercal.calibration.drift",
+    "SolveOptions": "evercal.calibration.pose_pairs.solve",
+    "UncertainPose": "evercal.geometry",
     "load_recording": "evercal.recordings",
     "read_calibration": "evercal.calibration.calibration",
     "read_image": "evercal.recordings",
     "solve": "evercal.calibration.pose_pairs.solve",
 }
+"""Public names and the modules that define them."""
 
 
 def __getattr__(name: str) -> object:
-    """Loads a public name on first use."""
+    """Load a public name on first use."""
     if name not in _PUBLIC:
         raise AttributeError(f"module 'evercal' has no attribute {name!r}")
     value = getattr(importlib.import_module(_PUBLIC[name]), name)

@@ -1,10 +1,10 @@
-"""`align`: brings a scene that was learned in a frame of its own into the robot's base frame.
+"""`align`: transform a scene that was learned in a frame of its own to the robot's base frame.
 
-A phone video with poses of structure from motion or SLAM gives a map whose frame, and perhaps
-scale, means nothing to a robot. A few images from a camera on the gripper tell where the base is:
-with gripper poses A, map poses B of the camera and X = gripper_from_camera, A X = Z B holds for
-Z = base_from_map, and both are found together. Or points that the tool has touched are picked in
-images. The error of Z stays with the scene: it is a part of every later answer.
+A phone video with poses from structure from motion or SLAM gives a map with an arbitrary frame, and
+perhaps an arbitrary scale. A few images from a camera on the gripper determine the base: with
+gripper poses A, map poses B of the camera and X = gripper_from_camera, A X = Z B holds for
+Z = base_from_map, and both are estimated together. Alternatively, points that the tool has touched
+are picked in images. The error of Z is part of every later answer.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,14 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.align_points import Picks, align_by_points
+from evercal.calibration.from_images import scene_named
 from evercal.calibration.located import Located, locate
 from evercal.calibration.pose_pairs.disagreement import require_agreement
 from evercal.calibration.pose_pairs.hand_eye import HandEyeFit, agreement, robust_fit
 from evercal.calibration.pose_pairs.observability import require_observable
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, axis_deviation, cross_matrix
-from evercal.mapping.scene_maps import Alignment, SceneRecord
+from evercal.geometry import SE3, axis_deviation, cross_matrix
+from evercal.mapping.map_frame import Similarity
+from evercal.mapping.scene_map import MapContents, SceneMap
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
@@ -33,37 +35,45 @@ LEAST_IMAGES = 5
 
 @dataclass(frozen=True, eq=False)
 class MapAlignment:
-    """Where a map lies in the base frame."""
+    """Pose and scale of a map in the base frame."""
 
-    alignment: Alignment
+    similarity: Similarity
     """From the map to the base frame."""
-    frame_covariance: Array
-    """(6, 6), see `SceneRecord.frame_covariance`."""
+    base_covariance: Array
+    """(6, 6), see `MapFrame.base_covariance`."""
     used: int
-    """Images or points that it rests on."""
-    of: int
-    """Images or points that were given."""
+    """Images or points used."""
+    given: int
+    """Images or points given."""
     residual: str
-    """How well they agree, for people."""
+    """Root mean square residual, with its unit."""
     gripper_from_camera: SE3 | None = None
-    """Found with it: of the camera on the gripper, or of the board that it holds."""
+    """Estimated with it: of the camera on the gripper, or of the board that it holds."""
     sigma: tuple[float, float] = (0.0, 0.0)
     """Standard deviation per axis in the middle of the scene, millimetres and degrees."""
 
+    def applied_to(self, scene: SceneMap) -> SceneMap:
+        """The scene with answers in the base frame."""
+        frame = replace(
+            scene.frame, similarity=self.similarity, base_covariance=self.base_covariance
+        )
+        return replace(scene, frame=frame)
 
-def in_own_frame(localizer: "Localizer", scene: str) -> SceneRecord:
-    """Makes a localizer answer in the frame that the scene was learned in; gives its record.
+
+def _in_own_frame(localizer: "Localizer", name: str) -> "Localizer":
+    """A localizer that answers in the frame that a scene was learned in.
 
     Raises:
-        InputError: no such scene.
+        InputError: No such scene.
     """
-    if scene not in localizer.scenes:
-        known = ", ".join(localizer.scenes)
-        raise InputError(f"scene {scene!r}: the store does not know it; it has {known}")
-    index = localizer.scenes.index(scene)
-    record = replace(localizer.maps.scenes[index], alignment=None, frame_covariance=None)
-    localizer.maps.scenes[index] = record
-    return record
+    from evercal.localization.localizer import Localizer
+
+    scene, contents = scene_named(localizer, name), localizer.contents
+    frame = replace(scene.frame, similarity=None, base_covariance=None)
+    own = replace(scene, frame=frame)
+    scenes = [own if other.name == name else other for other in contents.scenes]
+    own_contents = MapContents(contents.encoder, contents.short_side, scenes)
+    return Localizer(own_contents, localizer.options)
 
 
 def align_by_gripper(
@@ -89,8 +99,8 @@ def align_by_gripper(
         InputError: the scale is unknown and a board is given, too few images were located in the
             scene, or the motions leave the answer open.
     """
-    in_own_frame(localizer, scene)
-    located = [item for item in locate(localizer, images) if item.found]
+    localizer = _in_own_frame(localizer, scene)
+    located = [item for item in locate(localizer, images) if item.is_located]
     index = {name: i for i, (name, _) in enumerate(images)}
     located = [item for item in located if item.estimate.scene == scene]
     if camera_from_board is not None:
@@ -99,7 +109,7 @@ def align_by_gripper(
                 "a board in the gripper is seen in metres, the map is not: bring it into the base"
                 " frame by a camera on the gripper or by touched points"
             )
-        # The board takes the camera's place: it is what the gripper carries through the map.
+        # The gripper carries the board, so the board replaces the camera.
         located = [
             replace(item, pose=item.pose @ camera_from_board[item.name])
             for item in located
@@ -122,14 +132,14 @@ def _solved(
     pairs = PosePairs(names, base_from_gripper, map_from_camera.inverse())
     require_observable(pairs, scale_known)
     equation = pairs.equation("eye_in_hand", scale_known)
-    found = agreement(equation)
-    require_agreement(pairs, "eye_in_hand", scale_known, found)
-    fit = robust_fit(equation, found)
-    placed = Alignment(fit.at.fixed_from_board, fit.at.scale)
-    covariance, sigma = _frame_covariance(fit, placed, map_from_camera, scale_known)
+    start = agreement(equation)
+    require_agreement(pairs, "eye_in_hand", scale_known, start)
+    fit = robust_fit(equation, start)
+    similarity = Similarity(fit.at.fixed_from_board, fit.at.scale)
+    covariance, sigma = _frame_covariance(fit, similarity, map_from_camera, scale_known)
     rms = np.sqrt((fit.residual[fit.inliers].reshape(-1, 2, 3) ** 2).sum(2).mean(0))
     return MapAlignment(
-        placed,
+        similarity,
         covariance,
         int(fit.inliers.sum()),
         given,
@@ -140,27 +150,27 @@ def _solved(
 
 
 def _frame_covariance(
-    fit: HandEyeFit, placed: Alignment, map_from_camera: SE3, scale_known: bool
+    fit: HandEyeFit, similarity: Similarity, map_from_camera: SE3, scale_known: bool
 ) -> tuple[Array, tuple[float, float]]:
     """Covariance of the base frame as one motion of it, and sigmas in the middle of the cameras."""
     whole = fit.factor * fit.covariance
     picked = np.arange(6, 12 if scale_known else 13)
     own = whole[np.ix_(picked, picked)]
-    turn = placed.base_from_map.rotation_matrix()
+    rotation = similarity.base_from_map.rotation_matrix()
     centre = map_from_camera.translation_m.mean(0)
-    arm = placed.scale * turn @ centre
+    arm = similarity.scale * rotation @ centre
     slope = np.zeros((6, len(picked)))
     slope[:3, :3] = np.eye(3)
-    slope[:3, 3:6] = -cross_matrix(arm) @ turn
-    slope[3:, 3:6] = turn
+    slope[:3, 3:6] = -cross_matrix(arm) @ rotation
+    slope[3:, 3:6] = rotation
     if not scale_known:
         slope[:3, 6] = arm
     middle = slope @ own @ slope.T
     if not scale_known:
-        # Away from the middle of the cameras, a wrong scale is a wrong place.
+        # Away from the middle of the cameras, an error of scale is an error of position.
         radius = np.sqrt(((map_from_camera.translation_m - centre) ** 2).sum(1).mean() / 3)
-        middle[:3, :3] += np.eye(3) * own[6, 6] * (placed.scale * radius) ** 2
-    origin = arm + placed.base_from_map.translation_m
+        middle[:3, :3] += np.eye(3) * own[6, 6] * (similarity.scale * radius) ** 2
+    origin = arm + similarity.base_from_map.translation_m
     return _about(origin, middle), axis_deviation(middle)
 
 
@@ -183,40 +193,40 @@ def aligned_by_points(
     Raises:
         InputError: fewer than two images located, or too few points.
     """
-    record, images = in_own_frame(localizer, scene), []
+    localizer, images = _in_own_frame(localizer, scene), []
+    own = scene_named(localizer, scene)
     for name, image, pixels in picks:
         [item] = locate(localizer, [(name, image)])
-        if not item.found or item.estimate.scene != scene:
+        if not item.is_located or item.estimate.scene != scene:
             continue
-        lens: Camera = record.query_camera(None).resized(image.shape[1], image.shape[0])
-        seen = tuple(pixels)
-        known = np.stack([points[key] for key in seen])
-        pixel = np.stack([pixels[key] for key in seen])
-        # Landmarks are seen from where the camera is among them, which is what picks belong to.
-        images.append(Picks(record.camera_among_landmarks(item.pose), lens, known, seen, pixel))
+        camera = own.adjusted_camera.resized(image.shape[1], image.shape[0])
+        names = tuple(pixels)
+        touched = np.stack([points[key] for key in names])
+        picked = np.stack([pixels[key] for key in names])
+        # Picks are triangulated from the pose that observes the landmarks.
+        images.append(Picks(own.frame.from_base(item.pose), camera, touched, names, picked))
     if len(images) < 2:
         raise InputError(
             f"{len(images)} of {len(picks)} images with picks were located in {scene}; at least"
             " two are needed"
         )
-    found = align_by_points(images, scale_known)
+    fit = align_by_points(images, scale_known)
     middle = np.mean([points[name] for name in points], axis=0)
     radius = np.sqrt(np.mean([((p - middle) ** 2).sum() for p in points.values()]) / 3)
-    covariance = found.covariance[:6, :6].copy()
-    covariance[:3, :3] += np.eye(3) * found.covariance[6, 6] * radius**2
+    covariance = fit.covariance[:6, :6].copy()
+    covariance[:3, :3] += np.eye(3) * fit.covariance[6, 6] * radius**2
     return MapAlignment(
-        found.alignment,
+        fit.similarity,
         covariance,
         len(points),
         len(points),
-        f"{found.residual_px:.1f} px root mean square",
+        f"{fit.residual_px:.1f} px root mean square",
         None,
-        axis_deviation(_about(-middle, found.covariance[:6, :6])),
+        axis_deviation(_about(-middle, fit.covariance[:6, :6])),
     )
 
 
 def _about(point: Array, covariance: Array) -> Array:
-    """Covariance of a small motion about a point instead of the one at `point` (3,) from it."""
-    slope = np.eye(6)
-    slope[:3, 3:] = cross_matrix(point)
-    return slope @ covariance @ slope.T
+    """Covariance of a small motion about the origin, from that of one about a point (3,)."""
+    adjoint = SE3(np.array([1.0, 0, 0, 0]), point).adjoint()
+    return adjoint @ covariance @ adjoint.T

@@ -1,8 +1,8 @@
-"""A map's place in the robot's base frame from points that the tool has touched.
+"""Pose and scale of a map in the robot's base frame, from points that the tool has touched.
 
-Every point is known in the base frame and was picked in images that the map can locate. The pixels
-say where the points lie in the map; seven numbers (rotation, translation, scale) bring them
-together, found by least squares of the distances in the images.
+Every point has coordinates in the base frame and is picked in located images. Triangulated picks
+give its position in the map. A similarity (seven parameters) relates the two, by least squares of
+the reprojection errors.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, cross_matrix
-from evercal.mapping.scene_maps import Alignment
+from evercal.mapping.map_frame import Similarity
 
 Array = NDArray[np.float64]
 PICK_SIGMA_PX = 1.0
@@ -27,7 +27,7 @@ class Picks:
     """One image with the points that were picked in it."""
 
     map_from_camera: SE3
-    """Single: where the map has the image's camera."""
+    """Pose of the image's camera in the map."""
     camera: Camera
     """Intrinsics of the image."""
     points: Array
@@ -40,9 +40,9 @@ class Picks:
 
 @dataclass(frozen=True, eq=False)
 class PointAlignment:
-    """Where the map was found."""
+    """Pose and scale of the map in the base frame."""
 
-    alignment: Alignment
+    similarity: Similarity
     """From the map to the base frame."""
     covariance: Array
     """(7, 7) of a small motion (v, w) of the base frame, metres and radians, and of the logarithm
@@ -52,7 +52,7 @@ class PointAlignment:
 
 
 def align_by_points(images: Sequence[Picks], scale_known: bool) -> PointAlignment:
-    """Finds where a map lies in the base frame.
+    """Estimate the pose and scale of a map in the base frame.
 
     Args:
         images: with at least three named points that are not on one line; each point in two images
@@ -62,27 +62,27 @@ def align_by_points(images: Sequence[Picks], scale_known: bool) -> PointAlignmen
     Raises:
         InputError: too few points, or all on one line.
     """
-    found = _triangulated(images)
-    if len(found) < 3:
+    triangulated = _triangulated(images)
+    if len(triangulated) < 3:
         raise InputError(
-            f"{len(found)} points were picked in two or more images; give at least three, each in"
+            f"{len(triangulated)} points were picked in two or more images; give at least three, each in"
             " two images from different places"
         )
-    in_map, in_base = (np.stack(side) for side in zip(*found.values(), strict=True))
+    in_map, in_base = (np.stack(side) for side in zip(*triangulated.values(), strict=True))
     start = _umeyama(in_map, in_base, scale_known)
     centre = in_base.mean(0)
 
-    def placed(small: Array) -> Alignment:
+    def moved(small: Array) -> Similarity:
         grown = start.scale * (1.0 if scale_known else float(np.exp(small[6])))
-        turn = Rotation.from_rotvec(small[3:6])
-        place = start.base_from_map.translation_m - centre
-        kept = Rotation.from_quat(start.base_from_map.rotation_wxyz, scalar_first=True)
-        both = (turn * kept).as_quat(canonical=True, scalar_first=True)
+        rotation = Rotation.from_rotvec(small[3:6])
+        shift = start.base_from_map.translation_m - centre
+        before = Rotation.from_quat(start.base_from_map.rotation_wxyz, scalar_first=True)
+        both = (rotation * before).as_quat(canonical=True, scalar_first=True)
         growth = grown / start.scale
-        return Alignment(SE3(both, turn.apply(place) * growth + centre + small[:3]), grown)
+        return Similarity(SE3(both, rotation.apply(shift) * growth + centre + small[:3]), grown)
 
     def residuals(small: Array) -> Array:
-        return np.concatenate([_distances(image, placed(small)) for image in images])
+        return np.concatenate([_distances(image, moved(small)) for image in images])
 
     fit = least_squares(residuals, np.zeros(6 if scale_known else 7), loss="cauchy", f_scale=2.0)
     off = residuals(fit.x)
@@ -95,12 +95,12 @@ def align_by_points(images: Sequence[Picks], scale_known: bool) -> PointAlignmen
     slope = np.eye(7)
     slope[:3, 3:6] = cross_matrix(centre)
     rms = float(np.sqrt((off.reshape(-1, 2) ** 2).sum(1).mean()))
-    return PointAlignment(placed(fit.x), slope @ covariance @ slope.T, rms)
+    return PointAlignment(moved(fit.x), slope @ covariance @ slope.T, rms)
 
 
-def _distances(image: Picks, alignment: Alignment) -> Array:
+def _distances(image: Picks, similarity: Similarity) -> Array:
     """(2k,) pixels between picks and projections."""
-    back = alignment.base_from_map.inverse().apply(image.points) / alignment.scale
+    back = similarity.base_from_map.inverse().apply(image.points) / similarity.scale
     at = image.camera.project(image.map_from_camera.inverse().apply(back))
     return np.nan_to_num(at - image.pixels, nan=1e3).ravel()
 
@@ -110,27 +110,29 @@ def _triangulated(images: Sequence[Picks]) -> dict[str, tuple[Array, Array]]:
     rays: dict[str, list[tuple[Array, Array]]] = {}
     base: dict[str, Array] = {}
     for image in images:
-        turn = image.map_from_camera.rotation_matrix()
+        rotation = image.map_from_camera.rotation_matrix()
         for name, point, pixel in zip(image.names, image.points, image.pixels, strict=True):
-            ray = turn @ image.camera.unproject(pixel)
+            ray = rotation @ image.camera.unproject(pixel)
             if not np.isfinite(ray).all():
                 continue
             rays.setdefault(name, []).append(
                 (image.map_from_camera.translation_m, ray / np.linalg.norm(ray))
             )
             base[name] = point
-    found = {}
-    for name, seen in rays.items():
-        across = [np.eye(3) - np.outer(ray, ray) for _, ray in seen]
+    points = {}
+    for name, observed in rays.items():
+        across = [np.eye(3) - np.outer(ray, ray) for _, ray in observed]
         total = np.sum(across, axis=0)
-        if len(seen) < 2 or np.linalg.cond(total) > 1e6:
+        if len(observed) < 2 or np.linalg.cond(total) > 1e6:
             continue
-        right = np.sum([a @ place for a, (place, _) in zip(across, seen, strict=True)], axis=0)
-        found[name] = (np.linalg.solve(total, right), base[name])
-    return found
+        right = np.sum(
+            [a @ position for a, (position, _) in zip(across, observed, strict=True)], axis=0
+        )
+        points[name] = (np.linalg.solve(total, right), base[name])
+    return points
 
 
-def _umeyama(source: Array, target: Array, scale_known: bool) -> Alignment:
+def _umeyama(source: Array, target: Array, scale_known: bool) -> Similarity:
     """Least squares similarity (Umeyama, PAMI 1991).
 
     Raises:
@@ -146,4 +148,4 @@ def _umeyama(source: Array, target: Array, scale_known: bool) -> Alignment:
     rotation = Rotation.align_vectors(b, a)[0]
     scale = 1.0 if scale_known else float((b * rotation.apply(a)).sum() / (a**2).sum())
     shift = target.mean(0) - scale * rotation.apply(source.mean(0))
-    return Alignment(SE3(rotation.as_quat(canonical=True, scalar_first=True), shift), scale)
+    return Similarity(SE3(rotation.as_quat(canonical=True, scalar_first=True), shift), scale)

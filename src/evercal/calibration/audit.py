@@ -73,11 +73,11 @@ def audit(
     """
     options = options or AuditOptions()
     episodes = episode_folders(folder)
-    found = []
+    audited = []
     for episode in episodes:
-        found.append(_audited(localizer, episode, stated, options))
+        audited.append(_audited(localizer, episode, stated, options))
         on_episode()
-    return found
+    return audited
 
 
 def episode_folders(folder: Path) -> list[Path]:
@@ -111,12 +111,14 @@ def _audited(
     chosen = np.unique(np.linspace(0, len(shots) - 1, options.images).round().astype(int))
     differences, reason = [], ""
     for shot in (shots[i] for i in chosen):
-        [found] = locate(localizer, [(shot.name, shot.read())], shot.camera)
-        if found.found:
-            in_stated = shot.base_from_camera.inverse() @ found.pose
-            differences.append(Located(shot.name, found.estimate, in_stated, found.covariance))
+        [item] = locate(
+            localizer, [(shot.name, shot.read())], _camera_argument(localizer, shot.camera)
+        )
+        if item.is_located:
+            in_stated = shot.base_from_camera.inverse() @ item.pose
+            differences.append(Located(shot.name, item.estimate, in_stated, item.covariance))
         else:
-            reason = found.estimate.reason
+            reason = item.estimate.reason
     if not differences:
         return Episode(episode.name, "unknown", f"no image was located: {reason}")
     off = deviations(SE3.stack([fuse(differences).pose]), SE3.identity())[0]
@@ -124,6 +126,10 @@ def _audited(
     wrong = millimetres > options.most_mm or degrees > options.most_deg
     told = f"stated pose is {millimetres:.1f} mm and {degrees:.2f} deg from where it was found"
     return Episode(episode.name, "wrong" if wrong else "right", told, millimetres, degrees)
+
+
+def _camera_argument(localizer: "Localizer", stated: Camera | None) -> Camera | None:
+    return None if stated is None else localizer.camera_for(stated)
 
 
 def _shots(episode: Path, stated: SE3 | None) -> list[_Shot]:

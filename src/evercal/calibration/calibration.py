@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, axis_deviation, pose_distance
+from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation, pose_distance
 from evercal.storage import write_json
 
 FORMAT, VERSION = "evercal-calibration", 1
@@ -111,6 +111,11 @@ class Calibration:
         return f"pose of {child} in {parent}: takes points from {child} to {parent}"
 
     @property
+    def uncertain_pose(self) -> UncertainPose:
+        """`parent_from_child` with its covariance."""
+        return UncertainPose(self.parent_from_child, self.covariance)
+
+    @property
     def sigma_mm(self) -> float:
         """One standard deviation of the translation, root mean square of the axes."""
         return axis_deviation(self.covariance)[0]
@@ -189,8 +194,25 @@ class Calibration:
         return found
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Creates or replaces the file, whole or not at all."""
+        """Create or replace the file, whole or not at all."""
         write_json(path, self.to_dict())
+
+    def export(
+        self, format: str, path: str | os.PathLike[str] | None = None, **options: Any
+    ) -> str:
+        """Export to a format of other tools; see `evercal export --format list`.
+
+        Args:
+            format: name of the format, such as `easy_handeye2`, `ros2` or `urdf`.
+            path: file to write. Default: the text is only returned.
+            **options: of the format, see `calibration.export`.
+
+        Raises:
+            InputError: Unknown format, or one that does not fit this calibration.
+        """
+        from evercal.calibration.export import export_calibration
+
+        return export_calibration(self, format, path, **options)
 
 
 def read_calibration(path: str | os.PathLike[str]) -> Calibration:

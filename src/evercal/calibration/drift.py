@@ -1,8 +1,8 @@
-"""Has a camera been moved since it was calibrated?
+"""`check`: has a camera moved since it was calibrated?
 
-Images of one camera in one map share the map's errors, and they cancel between two answers from
-nearly one spot. A shift is therefore known better than either pose: to the scatter of the images
-and a floor for what changes with light and with the things in view.
+Two poses of one camera in one map share the map's errors, which cancel in their difference. So a
+shift is more accurate than either pose: to the scatter of the images, and a floor for changes of
+light and of objects in view.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,27 +31,27 @@ class DriftOptions:
     confidence: float = 0.99
     """Least confidence that it moved at all."""
     least_mm: float = 0.7
-    """Smaller shifts are never called a move, millimetres."""
+    """Shifts below this never count as a move, millimetres."""
     least_deg: float = 0.04
-    """And smaller turns, degrees; one of the two must be exceeded."""
+    """Rotations below this never count as a move, degrees. One of the two must be exceeded."""
     floor_mm: float = 0.2
-    """Standard deviation per axis of what light and moved things do to a pose, millimetres."""
+    """Standard deviation per axis from changes of light and objects, millimetres."""
     floor_deg: float = 0.008
     """The same for the rotation, degrees."""
     usual_scatter_mm: float = 0.4
-    """Scatter of a single image per axis where too few images tell it, millimetres."""
+    """Prior scatter of a single image per axis, millimetres."""
     usual_scatter_deg: float = 0.01
     """The same for the rotation, degrees."""
     usual_weight: float = 5.0
-    """How many images' worth that usual scatter counts."""
+    """Weight of the prior scatter, in images."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shift:
-    """How far a camera is from where it was."""
+    """Motion of a camera since its calibration."""
 
     reference_from_now: SE3
-    """Pose of the camera as it stands now in the camera frame of the reference."""
+    """Pose of the camera now, in its camera frame at the time of the calibration."""
     translation_mm: float
     """Length of its translation."""
     rotation_deg: float
@@ -61,11 +61,13 @@ class Shift:
     sigma_deg: float
     """The same for the rotation."""
     confidence: float
-    """That it moved at all, 0 to 1."""
+    """Probability that it moved at all, 0 to 1."""
     moved: bool
     """Whether it counts as moved."""
     same_map: bool
     """Whether both poses come from one map, so that its errors cancel."""
+    images: tuple[ImageUse, ...] = ()
+    """Use of every image."""
 
 
 def check(
@@ -74,25 +76,22 @@ def check(
     reference: Calibration,
     camera: Camera | None = None,
     on_image: Callable[[], object] = lambda: None,
-) -> tuple[Shift, tuple[ImageUse, ...]]:
-    """Whether a camera stands where its calibration says.
+) -> Shift:
+    """Test whether a camera has moved since its calibration.
 
     Args:
-        localizer: of a store that knows the scene.
+        localizer: of a map that holds the scene.
         images: (name, (h, w, 3) uint8 RGB) of the camera as it is now.
         reference: its calibration.
-        camera: intrinsics; those of the reference when left out.
+        camera: Intrinsics. Default: those of the reference.
         on_image: called after each image.
 
-    Returns:
-        The shift, and what became of every image.
-
     Raises:
-        InputError: no image was located, or the reference is a camera on the gripper.
+        InputError: No image was located, or the reference is a camera on the gripper.
     """
     located = locate(localizer, images, camera or reference.camera, on_image)
     fused = fuse(located)
-    return shift_between(reference, fused, located, localizer), fused.uses
+    return shift_between(reference, fused, located, localizer)
 
 
 def shift_between(
@@ -102,17 +101,17 @@ def shift_between(
     localizer: "Localizer",
     options: DriftOptions | None = None,
 ) -> Shift:
-    """Compares a camera with its reference.
+    """Compare a camera with its calibration.
 
     Args:
-        reference: base_from_camera as it was, from `calibrate` or from elsewhere.
-        fused: the camera now.
-        located: the images it was put together from.
+        reference: base_from_camera at the time of the calibration.
+        fused: pose of the camera now.
+        located: the images that were fused.
         localizer: that located them.
-        options: when it counts as moved.
+        options: when a shift counts as a move.
 
     Raises:
-        InputError: the reference is a camera on the gripper.
+        InputError: The reference is a camera on the gripper.
     """
     from scipy import stats
 
@@ -126,41 +125,44 @@ def shift_between(
     off = deviations(SE3.stack([fused.pose]), reference.parent_from_child)[0]
     count = int(fused.used.sum())
     floor = [(options.floor_mm / 1000) ** 2] * 3 + [np.deg2rad(options.floor_deg) ** 2] * 3
-    seen = [(fused.scatter, count)]
+    measured = [(fused.scatter, count)]
     if same:
-        # One camera in one map: its images scatter alike before and now.
+        # One camera in one map: the scatter of its images is the same before and now.
         before = int(reference.checks.get("images_used", 1))
-        seen.append((np.array(reference.checks.get("image_scatter", np.zeros((6, 6)))), before))
-        scatter = _scatter(seen, options)
+        measured.append((np.array(reference.checks.get("image_scatter", np.zeros((6, 6)))), before))
+        scatter = _scatter(measured, options)
         covariance = scatter / count + scatter / before + np.diag(floor)
     else:
-        kept = [item.covariance for item in fused.kept(located)]
-        covariance = _scatter(seen, options) / count + np.diag(floor)
-        covariance = covariance + reference.covariance + np.mean(kept, axis=0)
+        used = [item.covariance for item in fused.select(located)]
+        covariance = _scatter(measured, options) / count + np.diag(floor)
+        covariance = covariance + reference.covariance + np.mean(used, axis=0)
     confidence = float(stats.chi2.cdf(off @ np.linalg.solve(covariance, off), 6))
     millimetres, degrees = length_mm_deg(off)
     visible = millimetres > options.least_mm or degrees > options.least_deg
+    sigma_mm, sigma_deg = axis_deviation(covariance)
     return Shift(
-        reference.parent_from_child.inverse() @ fused.pose,
-        millimetres,
-        degrees,
-        *axis_deviation(covariance),
-        confidence,
-        bool(visible and confidence >= options.confidence),
-        same,
+        reference_from_now=reference.parent_from_child.inverse() @ fused.pose,
+        translation_mm=millimetres,
+        rotation_deg=degrees,
+        sigma_mm=sigma_mm,
+        sigma_deg=sigma_deg,
+        confidence=confidence,
+        moved=bool(visible and confidence >= options.confidence),
+        same_map=same,
+        images=fused.uses,
     )
 
 
-def _scatter(seen: Sequence[tuple[Array, int]], options: DriftOptions) -> Array:
-    """Scatter of one image: as measured, drawn to the usual one where few images measured it.
+def _scatter(measured: Sequence[tuple[Array, int]], options: DriftOptions) -> Array:
+    """Scatter of one image: the measured one, shrunk towards the prior for few images.
 
     Args:
-        seen: scatters (6, 6) with the number of images that each was measured on.
-        options: with the usual scatter.
+        measured: scatters (6, 6), each with its number of images.
+        options: with the prior.
     """
     usual = [(options.usual_scatter_mm / 1000) ** 2] * 3
     usual += [np.deg2rad(options.usual_scatter_deg) ** 2] * 3
     total, weight = options.usual_weight * np.diag(usual), options.usual_weight
-    for scatter, count in seen:
+    for scatter, count in measured:
         total, weight = total + (count - 1) * scatter, weight + count - 1
     return total / weight

@@ -1,26 +1,34 @@
-"""Recordings of a camera on the arm: gripper poses are known, `gripper_from_camera` is not."""
+"""A camera on the gripper, from nothing: images and gripper poses give `gripper_from_camera`.
 
-from collections.abc import Callable, Generator
+`eye_in_hand_start` estimates a first transform from pairs of images. The map's bundle adjustment
+refines it together with all poses and landmarks. This file connects the two and reports.
+"""
+
 from dataclasses import dataclass, replace
-from typing import Any
+from datetime import UTC, datetime
 
 import numpy as np
 
-from evercal.calibration.eye_in_hand_start import HandEyeStart, hand_eye_start, with_gripper
+from evercal.calibration.calibration import Calibration
+from evercal.calibration.eye_in_hand_start import (
+    HandEyeStart,
+    hand_eye_start,
+    with_gripper,
+)
+from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
-from evercal.geometry.pose_covariance import with_translation_by
-from evercal.geometry.se3 import SE3, pose_distance_mm_deg
-from evercal.mapping.build import Adjusted, Mapping, SceneMap
+from evercal.geometry import SE3, Camera, UncertainPose, pose_distance_mm_deg
+from evercal.mapping.build import Adjusted, BuiltMap, OnProgress
 from evercal.recordings.frame import Recording
 
 MOST_FOCAL_PERCENT, MOST_POSE_SIGMA_MM = 1.0, 5.0
-"""Beyond these, errors are systematic and the covariance says nothing about them."""
+"""Larger corrections indicate systematic errors, which the covariance does not contain."""
 
 
 @dataclass(frozen=True)
 class HandEyeReport:
-    """Where the camera was found on the gripper, as JSON values."""
+    """The estimated camera on the gripper, as JSON values."""
 
     translation_m: tuple[float, ...]
     """Of gripper_from_camera."""
@@ -30,101 +38,132 @@ class HandEyeReport:
     """(6, 6) of translation in the gripper frame, metres, and rotation about camera axes,
     radians."""
     pairs: int
-    """Pairs of frames whose motion agrees with it."""
+    """Pairs of frames whose motion agrees with the first estimate."""
     of_pairs: int
-    """Pairs of frames whose motion was found."""
+    """Pairs of frames whose motion was estimated."""
     start_mm: float
-    """How far bundle adjustment moved the start."""
+    """Change of the first estimate by bundle adjustment."""
     start_deg: float
     """The same for the rotation."""
     given_mm: float | None = None
-    """How far it lies from a `gripper_from_camera` that was given."""
+    """Distance from a given `gripper_from_camera`, such as from CAD."""
     given_deg: float | None = None
     """The same for the rotation."""
-    doubts: tuple[str, ...] = ()
-    """Why it should not be relied on; empty if nothing speaks against it."""
+    warnings: tuple[str, ...] = ()
+    """Reasons not to rely on the estimate."""
 
     @property
-    def gripper_from_camera(self) -> SE3:
-        """The transform."""
-        return SE3(np.array(self.quaternion_wxyz), np.array(self.translation_m))
+    def gripper_from_camera(self) -> UncertainPose:
+        """The transform with its covariance."""
+        pose = SE3(np.array(self.quaternion_wxyz), np.array(self.translation_m))
+        return UncertainPose(pose, np.array(self.covariance))
+
+    def calibration(self, camera: Camera, scene: str, frames: int) -> Calibration:
+        """The estimate as a calibration.
+
+        Args:
+            camera: intrinsics as adjusted by the map.
+            scene: name of the scene.
+            frames: number of frames that it rests on.
+        """
+        estimate = self.gripper_from_camera
+        calibration = Calibration(
+            "eye_in_hand",
+            estimate.pose,
+            estimate.covariance,
+            parent_frame="gripper",
+            camera=camera,
+            source={"command": "learn", "scene": scene, "frames": frames},
+            created=datetime.now(UTC).isoformat(timespec="seconds"),
+        )
+        warnings = [f"Do not rely on it: {warning}." for warning in self.warnings]
+        return replace(calibration, verdict=" ".join(warnings or [verdict(calibration)]))
 
 
-def lacks_camera_poses(scene: Recording) -> bool:
-    """Whether a recording states where the gripper was, but never where the camera was."""
-    stated = any(frame.base_from_camera is not None for frame in scene.train)
-    return not stated and any(frame.base_from_gripper is not None for frame in scene.train)
+def lacks_camera_poses(recording: Recording) -> bool:
+    """Whether a recording states gripper poses but no camera poses."""
+    stated = any(frame.base_from_camera is not None for frame in recording.train)
+    return not stated and any(frame.base_from_gripper is not None for frame in recording.train)
+
+
+@dataclass(frozen=True, eq=False)
+class PosedByGripper:
+    """A recording with rough camera poses."""
+
+    recording: Recording
+    """With camera poses from gripper poses and the first estimate."""
+    start: HandEyeStart
+    """The first estimate of `gripper_from_camera`."""
 
 
 def posed_by_gripper(
-    scene: Recording, encoder: Encoder, on_event: Callable[[Mapping], object]
-) -> tuple[Recording, HandEyeStart]:
-    """The recording with the camera poses that a first `gripper_from_camera` gives.
+    recording: Recording, encoder: Encoder, on_progress: OnProgress = lambda *_: None
+) -> PosedByGripper:
+    """Estimate rough camera poses of a recording that states gripper poses.
 
     Args:
-        scene: frames without a gripper pose count as untracked.
-        encoder: tells which frames look alike.
-        on_event: called as pairs of frames are matched.
+        recording: frames without a gripper pose count as untracked.
+        encoder: for the similarity of frames.
+        on_progress: called as pairs of frames are matched.
 
     Raises:
-        InputError: see `hand_eye_start`; the message begins with the scene's name.
+        InputError: see `hand_eye_start`; the message begins with the recording's name.
     """
-    frames = tuple(frame for frame in scene.train if frame.base_from_gripper is not None)
+    frames = tuple(frame for frame in recording.train if frame.base_from_gripper is not None)
     try:
-        start = _run(hand_eye_start(frames, encoder), on_event)
+        start = hand_eye_start(frames, encoder, on_progress=on_progress)
     except InputError as error:
-        raise InputError(f"{scene.name}: {error}") from None
-    lost = len(scene.train) - len(frames)
+        raise InputError(f"{recording.name}: {error}") from None
+    lost = len(recording.train) - len(frames)
     train = with_gripper(frames, start.gripper_from_camera)
-    return replace(scene, train=train, untracked=scene.untracked + lost), start
+    posed = replace(recording, train=train, untracked=recording.untracked + lost)
+    return PosedByGripper(posed, start)
 
 
 def hand_eye_report(
-    start: HandEyeStart, scene_map: SceneMap, given: SE3 | None = None
+    start: HandEyeStart, built: BuiltMap, given: SE3 | None = None
 ) -> HandEyeReport:
-    """What was found, once the map is adjusted."""
-    correction = scene_map.hand_eye
+    """The estimate after bundle adjustment.
+
+    Args:
+        start: the first estimate.
+        built: the map, built with `MapOptions.for_hand_eye`.
+        given: `gripper_from_camera` from elsewhere, to compare with.
+    """
+    correction = built.hand_eye
     assert correction is not None, "the map was built for a hand-eye calibration"
-    found = start.gripper_from_camera @ correction.start_camera_from_camera
-    axes = start.gripper_from_camera.rotation_matrix()
-    covariance = with_translation_by(axes, correction.covariance)
-    doubts = _doubts(scene_map.adjusted)
-    moved = pose_distance_mm_deg(found, start.gripper_from_camera)
-    off = (None, None) if given is None else pose_distance_mm_deg(found, given)
+    # The covariance of the correction is about camera axes, as that of a pose after an exact one.
+    start_from_camera = UncertainPose(correction.start_camera_from_camera, correction.covariance)
+    estimate = start.gripper_from_camera @ start_from_camera
+    start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.gripper_from_camera)
+    given_mm, given_deg = (None, None)
+    if given is not None:
+        given_mm, given_deg = pose_distance_mm_deg(estimate.pose, given)
     return HandEyeReport(
-        tuple(found.translation_m.tolist()),
-        tuple(found.rotation_wxyz.tolist()),
-        tuple(tuple(row) for row in ((covariance + covariance.T) / 2).tolist()),
-        start.pairs,
-        start.of_pairs,
-        *moved,
-        *off,
-        doubts,
+        translation_m=tuple(estimate.pose.translation_m.tolist()),
+        quaternion_wxyz=tuple(estimate.pose.rotation_wxyz.tolist()),
+        covariance=tuple(tuple(row) for row in estimate.covariance.tolist()),
+        pairs=start.pairs,
+        of_pairs=start.of_pairs,
+        start_mm=start_mm,
+        start_deg=start_deg,
+        given_mm=given_mm,
+        given_deg=given_deg,
+        warnings=_warnings(built.adjusted),
     )
 
 
-def _doubts(adjusted: Adjusted) -> tuple[str, ...]:
-    """What the covariance does not know: a wrong lens or wrong poses bend the answer."""
-    found = []
+def _warnings(adjusted: Adjusted) -> tuple[str, ...]:
+    """Errors that the covariance does not contain: wrong intrinsics or wrong poses."""
+    warnings = []
     if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
-        found.append(
-            f"the images ask for a focal length {adjusted.focal_percent:+.1f} % from the stated"
-            " one: calibrate the lens first ('evercal detect' on images of a board)"
+        warnings.append(
+            f"the images suggest a focal length {adjusted.focal_percent:+.1f} % from the stated"
+            " one: calibrate the intrinsics first ('evercal detect' on images of a board)"
         )
     if adjusted.pose_sigma_mm > MOST_POSE_SIGMA_MM:
-        found.append(
+        warnings.append(
             f"the gripper poses fit the images to {adjusted.pose_sigma_mm:.0f} mm only: let the arm"
             " stand still at every image, and check the clocks"
         )
-    return tuple(found)
-
-
-def _run(
-    steps: Generator[tuple[int, int], None, HandEyeStart], on_event: Callable[[Mapping], Any]
-) -> HandEyeStart:
-    while True:
-        try:
-            done, total = next(steps)
-        except StopIteration as end:
-            return end.value
-        on_event(Mapping("matching", done, total))
+    return tuple(warnings)

@@ -1,4 +1,4 @@
-"""Where the camera sits on the gripper, from images and gripper poses alone: a start for the map.
+"""A first `gripper_from_camera` from images and gripper poses; bundle adjustment refines it.
 
 Features of frames that look alike are matched, and an essential matrix gives every pair's rotation
 and the direction of its translation. With A the motion of the gripper, (R, d) that of the camera
@@ -7,10 +7,10 @@ Martin, IEEE T-RA 1994) and, since the length l of B's translation is unknown, t
 
     (R_A - I) t_X + t_A = l R_X d,   so   [R_X d]x ((R_A - I) t_X + t_A) = 0,
 
-which is linear in t_X. It is good to a few millimetres; bundle adjustment does the rest.
+which is linear in t_X. The estimate is accurate to a few millimetres.
 """
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -24,8 +24,8 @@ from evercal.features.encode import encode_features
 from evercal.features.encoder import Encoder
 from evercal.features.views import ViewOptions, plain_view, working_image
 from evercal.features.vlad import vlad_for
-from evercal.geometry.camera import Camera
-from evercal.geometry.se3 import SE3
+from evercal.geometry import SE3, Camera
+from evercal.mapping.build import OnProgress
 from evercal.mapping.selection import spread_poses
 from evercal.recordings.frame import Frame
 
@@ -34,12 +34,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class HandEyeOptions:
-    """How a camera is found on its gripper."""
+    """Matching of frames and agreement of their motions."""
 
     frames: int = 120
-    """Frames that take part, at most, spread over the gripper's poses."""
+    """Frames used, at most, spread over the gripper's poses."""
     partners: int = 6
-    """Every frame is matched to this many frames that look most alike."""
+    """Number of most similar frames that every frame is matched to."""
     features: int = 1500
     """SIFT features of an image, at most."""
     contrast: float = 0.01
@@ -49,9 +49,9 @@ class HandEyeOptions:
     max_epipolar_px: float = 1.0
     """Largest distance of a match from its epipolar line, pixels."""
     min_inliers: int = 20
-    """Pairs with fewer matches on their epipolar lines say nothing."""
+    """Pairs with fewer inliers of the essential matrix are ignored."""
     angle_tolerance_deg: float = 3.0
-    """Gripper and camera turn by the same angle; pairs that differ by more are left out."""
+    """Largest difference of the rotation angles of gripper and camera; they are equal in theory."""
     most_rotation_deg: float = 5.0
     """A pair agrees when its rotation differs by less than this, degrees."""
     most_direction_deg: float = 10.0
@@ -59,7 +59,7 @@ class HandEyeOptions:
     least_rotation_deg: float = 4.0
     """The gripper must turn by at least this much about a second axis, standard deviation."""
     least_pairs: int = 12
-    """Fewer pairs that agree are not enough."""
+    """Pairs that must agree."""
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,9 @@ class HandEyeStart:
     gripper_from_camera: SE3
     """Single."""
     pairs: int
-    """Pairs of frames that agree on it."""
+    """Pairs of frames that agree with it."""
     of_pairs: int
-    """Pairs of frames whose motion was found."""
+    """Pairs of frames whose motion was estimated."""
     rotation_deg: float
     """Median disagreement of the rotations."""
     direction_deg: float
@@ -103,7 +103,7 @@ def rotation_spread_deg(base_from_gripper: SE3) -> Array:
 
 
 def refuse_poor_motion(base_from_gripper: SE3, options: HandEyeOptions) -> None:
-    """Says what motions a recording lacks, before any work is done.
+    """Refuse a recording whose motions cannot determine the transform, before any work.
 
     Args:
         base_from_gripper: (n,).
@@ -120,33 +120,34 @@ def refuse_poor_motion(base_from_gripper: SE3, options: HandEyeOptions) -> None:
     if first < need:
         raise InputError(
             f"the gripper turns by {first:.1f} deg (standard deviation): without rotation the"
-            f" position of the camera on it cannot be told; {advice}"
+            f" position of the camera on it is undetermined; {advice}"
         )
     if second < need:
         raise InputError(
             f"the gripper turns about one axis only ({first:.1f} deg about it, {second:.1f} deg"
-            f" about the next): the camera's position along that axis cannot be told; {advice}"
+            f" about the next): the camera's position along that axis is undetermined; {advice}"
         )
 
 
 def hand_eye_start(
-    frames: Sequence[Frame], encoder: Encoder, options: HandEyeOptions | None = None
-) -> Generator[tuple[int, int], None, HandEyeStart]:
-    """Finds the camera on its gripper from images and gripper poses.
+    frames: Sequence[Frame],
+    encoder: Encoder,
+    options: HandEyeOptions | None = None,
+    on_progress: OnProgress = lambda *_: None,
+) -> HandEyeStart:
+    """Estimate `gripper_from_camera` from images and gripper poses.
 
     Args:
-        frames: with `base_from_gripper`; their `base_from_camera` is not looked at.
-        encoder: tells which frames look alike.
-        options: how.
+        frames: with `base_from_gripper`; their `base_from_camera` is ignored.
+        encoder: for the similarity of frames.
+        options: matching and agreement.
+        on_progress: called as pairs of frames are matched.
 
     Raises:
-        InputError: too little rotation, or too few frames that see the same.
-
-    Yields:
-        (pairs matched, pairs in all), for progress bars.
+        InputError: Too little rotation, or too few frames that show the same place.
 
     Returns:
-        The start, good to a few millimetres.
+        An estimate accurate to a few millimetres.
     """
     options = options or HandEyeOptions()
     poses = gripper_poses(frames)
@@ -154,17 +155,17 @@ def hand_eye_start(
     if len(frames) > options.frames:
         some = spread_poses(poses, options.frames)
         frames, poses = [frames[i] for i in some], poses[some]
-    motions = yield from _pair_motions(frames, encoder, options)
+    motions = _pair_motions(frames, encoder, options, on_progress)
     return solve_motions(poses, motions, options)
 
 
 def gripper_poses(frames: Sequence[Frame]) -> SE3:
-    """(n,) base_from_gripper of frames that all have one."""
+    """(n,) base_from_gripper of the frames."""
     return SE3.stack([f.base_from_gripper for f in frames if f.base_from_gripper is not None])
 
 
 def with_gripper(frames: Sequence[Frame], gripper_from_camera: SE3) -> tuple[Frame, ...]:
-    """Frames with the camera poses that the gripper's poses give."""
+    """Frames with camera poses from their gripper poses."""
     return tuple(
         replace(f, base_from_camera=f.base_from_gripper @ gripper_from_camera)
         for f in frames
@@ -175,15 +176,15 @@ def with_gripper(frames: Sequence[Frame], gripper_from_camera: SE3) -> tuple[Fra
 def solve_motions(
     base_from_gripper: SE3, motions: Sequence[PairMotion], options: HandEyeOptions
 ) -> HandEyeStart:
-    """`gripper_from_camera` from the motions of gripper and camera.
+    """Solve A X = X B for `gripper_from_camera`.
 
     Args:
         base_from_gripper: (n,).
         motions: of pairs among the n frames.
-        options: how.
+        options: agreement.
 
     Raises:
-        InputError: too few pairs, or too few that agree.
+        InputError: Too few pairs, or too few that agree.
     """
     if len(motions) < options.least_pairs:
         raise InputError(
@@ -193,20 +194,20 @@ def solve_motions(
         )
     first, second = (np.array([getattr(m, w) for m in motions]) for w in ("first", "second"))
     moved = base_from_gripper[second].inverse() @ base_from_gripper[first]
-    gripper_turn = Rotation.from_quat(moved.rotation_wxyz, scalar_first=True).as_rotvec()
-    camera_turn = np.array([m.rotation.as_rotvec() for m in motions])
-    off = np.linalg.norm(gripper_turn, axis=1) - np.linalg.norm(camera_turn, axis=1)
-    same_angle = np.abs(off) < np.deg2rad(options.angle_tolerance_deg)
+    gripper_rotation = Rotation.from_quat(moved.rotation_wxyz, scalar_first=True).as_rotvec()
+    camera_rotation = np.array([m.rotation.as_rotvec() for m in motions])
+    difference = np.linalg.norm(gripper_rotation, axis=1) - np.linalg.norm(camera_rotation, axis=1)
+    same_angle = np.abs(difference) < np.deg2rad(options.angle_tolerance_deg)
     _refuse_disagreement(same_angle, options)
-    rotation, distance = _robust_rotation(gripper_turn[same_angle], camera_turn[same_angle])
+    rotation, distance = _robust_rotation(gripper_rotation[same_angle], camera_rotation[same_angle])
     agree = np.zeros(len(motions), bool)
     limit = 4 * max(1.48 * float(np.median(distance)), 1e-3)
     limit = min(limit, np.deg2rad(options.most_rotation_deg))
     agree[np.flatnonzero(same_angle)[distance < limit]] = True
     _refuse_disagreement(agree, options)
     towards = rotation.apply(np.array([m.direction for m in motions]))
-    place, apart = _robust_translation(moved, towards, agree)
-    # Where a camera hardly moves sideways, its direction is noise: few pairs may be enough.
+    translation, apart = _robust_translation(moved, towards, agree)
+    # The direction of a small sideways motion is noise, so few pairs may be enough.
     agree &= apart < np.deg2rad(options.most_direction_deg)
     if agree.sum() < options.least_pairs:
         raise InputError(
@@ -214,7 +215,7 @@ def solve_motions(
             f" {len(agree)} pairs of frames: move the camera sideways by 10 cm or more as well as"
             " turning it, and check that the poses are in metres"
         )
-    start = SE3(rotation.as_quat(canonical=True, scalar_first=True), place)
+    start = SE3(rotation.as_quat(canonical=True, scalar_first=True), translation)
     return HandEyeStart(
         start,
         int(agree.sum()),
@@ -248,31 +249,31 @@ def _robust_rotation(gripper: Array, camera: Array) -> tuple[Rotation, Array]:
 def _robust_translation(
     moved: SE3, towards: Array, agree: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """The translation (3,) and the angles (n,) between directions as seen and as predicted."""
+    """The translation (3,) and the angles (n,) between observed and predicted directions."""
     across = np.cross(towards[:, None], np.eye(3)).transpose(0, 2, 1)
-    turn = moved.rotation_matrix() - np.eye(3)
-    rows, right = across @ turn, -np.einsum("nij,nj->ni", across, moved.translation_m)
+    rotation = moved.rotation_matrix() - np.eye(3)
+    rows, right = across @ rotation, -np.einsum("nij,nj->ni", across, moved.translation_m)
     weight = agree.astype(float)
-    place, angle = np.zeros(3), weight
+    translation, angle = np.zeros(3), weight
     for _ in range(50):
         information = np.einsum("n,nji,njk->ik", weight, rows, rows)
-        place = np.linalg.solve(information, np.einsum("n,nji,nj->i", weight, rows, right))
-        predicted = turn @ place + moved.translation_m
+        translation = np.linalg.solve(information, np.einsum("n,nji,nj->i", weight, rows, right))
+        predicted = rotation @ translation + moved.translation_m
         length = np.linalg.norm(predicted, axis=1)
         angle = np.arctan2(
             np.linalg.norm(np.cross(towards, predicted), axis=1), (towards * predicted).sum(1)
         )
         spread = max(1.48 * float(np.median(angle[agree])), 1e-4)
-        # Rows are sines times the length of the motion; divided by it, all pairs weigh alike.
+        # Rows are sines times the length of the motion; dividing by it weights all pairs equally.
         weight = agree / (1 + (angle / spread) ** 2) ** 2 / np.maximum(length, 0.01) ** 2
-    return place, angle
+    return translation, angle
 
 
 def _pair_motions(
-    frames: Sequence[Frame], encoder: Encoder, options: HandEyeOptions
-) -> Generator[tuple[int, int], None, list[PairMotion]]:
-    """Motions of the pairs of frames that look alike and see the same."""
-    vlad, images, cameras, whole = vlad_for(encoder), [], [], []
+    frames: Sequence[Frame], encoder: Encoder, options: HandEyeOptions, on_progress: OnProgress
+) -> list[PairMotion]:
+    """Motions of similar frames with enough inliers."""
+    images, cameras, features = [], [], []
     for frame in frames:
         image = frame.read_image()
         short = min(480, *image.shape[:2])
@@ -280,18 +281,19 @@ def _pair_motions(
         images.append(grey)
         cameras.append(camera)
         view = plain_view(grey, camera, encoder.stride, ViewOptions())
-        whole.append(vlad(encode_features([view], encoder, "cpu")[0].flatten(1).T))
-    like = torch.stack(whole) @ torch.stack(whole).T
-    like.fill_diagonal_(-1)
-    nearest = like.topk(min(options.partners, len(frames) - 1)).indices.tolist()
+        features.append(encode_features([view], encoder, "cpu")[0].flatten(1).T)
+    vlad = vlad_for(encoder, features)
+    descriptors = torch.stack([vlad(rows) for rows in features])
+    similarity = (descriptors @ descriptors.T).fill_diagonal_(-1)
+    nearest = similarity.topk(min(options.partners, len(frames) - 1)).indices.tolist()
     pairs = sorted({(min(i, j), max(i, j)) for i, row in enumerate(nearest) for j in row})
     motions: list[PairMotion] = []
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        features = list(pool.map(lambda image: _sift(image, options), images))
-        jobs = pool.map(lambda pair: _motion(pair, features, cameras, options), pairs)
+        points = list(pool.map(lambda image: _sift(image, options), images))
+        jobs = pool.map(lambda pair: _motion(pair, points, cameras, options), pairs)
         for done, motion in enumerate(jobs, start=1):
             motions += [motion] if motion is not None else []
-            yield done, len(pairs)
+            on_progress("matching", done, len(pairs))
     return motions
 
 
@@ -308,7 +310,7 @@ def _sift(image: NDArray[np.uint8], options: HandEyeOptions) -> tuple[Array, NDA
 
 
 def _ideal(camera: Camera) -> dict[str, object]:
-    """The camera without its distortion and principal point, as poselib takes it."""
+    """The camera without distortion and principal point, for PoseLib."""
     return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [camera.fx, 0.0, 0.0]}
 
 
@@ -330,24 +332,24 @@ def _motion(
     mutual = similar.argmax(0)[best] == rows
     similar[rows, best] = -1
     second = similar.max(1)
-    clear = np.maximum(2 - 2 * top, 0) < options.ratio**2 * np.maximum(2 - 2 * second, 1e-9)
-    good = mutual & clear
+    distinct = np.maximum(2 - 2 * top, 0) < options.ratio**2 * np.maximum(2 - 2 * second, 1e-9)
+    good = mutual & distinct
     if good.sum() < options.min_inliers:
         return None
-    # Undistorted, so that poselib needs no camera model of its own.
+    # Undistorted here, so that PoseLib needs no camera model.
     first, second = (cameras[i] for i in pair)
     ideal_a = first.unproject(pixels_a[good])[:, :2] * first.fx
     ideal_b = second.unproject(pixels_b[best[good]])[:, :2] * second.fx
-    known = np.isfinite(ideal_a + ideal_b).all(1)
-    pose, told = poselib.estimate_relative_pose(
-        ideal_a[known],
-        ideal_b[known],
+    valid = np.isfinite(ideal_a + ideal_b).all(1)
+    pose, info = poselib.estimate_relative_pose(
+        ideal_a[valid],
+        ideal_b[valid],
         _ideal(first),
         _ideal(second),
         {"max_epipolar_error": options.max_epipolar_px},
         {},
     )
-    if told["num_inliers"] < options.min_inliers:
+    if info["num_inliers"] < options.min_inliers:
         return None
     direction = np.asarray(pose.t) / max(float(np.linalg.norm(pose.t)), 1e-12)
     return PairMotion(*pair, Rotation.from_matrix(pose.R), direction)

@@ -1,9 +1,8 @@
-"""`calibrate`: where a camera is, from images of a scene that a store knows.
+"""`calibrate`: the pose of a camera from images of a mapped scene.
 
-A camera that stands still (eye-to-hand) sees the scene from one spot. Its images share the errors
-of the landmarks they see, so many images are hardly better than a few: what the images have in
-common stays in the covariance, however many there are. A camera on the gripper (eye-in-hand) looks
-from many spots; there the errors average over the spots.
+A camera that stands still (eye-to-hand) observes the scene from one spot. Its images share the
+errors of their landmarks, so that part of the covariance does not fall with their number. A camera
+on the gripper (eye-in-hand) observes from many spots, and errors average over the spots.
 """
 
 import hashlib
@@ -31,14 +30,24 @@ from evercal.calibration.located import (
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, axis_deviation
+from evercal.mapping.scene_map import SceneMap
 from evercal.recordings import read_image
+from evercal.recordings.image_files import image_files
+from evercal.recordings.images import as_rgb
+from evercal.recordings.poses.pairing import poses_of_images
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
 
 Array = NDArray[np.float64]
 SPOT_M, SPOT_RAD = 0.1, np.deg2rad(10.0)
-"""Views closer than this see the same landmarks from the same side: they share their errors."""
+"""Views closer than this observe the same landmarks, so they share their errors."""
+
+
+ImageSource = (
+    str | os.PathLike[str] | np.ndarray | Sequence[str | os.PathLike[str]] | Sequence[np.ndarray]
+)
+"""A folder, an image file or an array (H, W, 3), or several files or arrays."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,29 +57,48 @@ class Images:
     images: Sequence[tuple[str, NDArray[np.uint8]]]
     """(name, (h, w, 3) uint8 RGB)."""
     camera: Camera | None = None
-    """Intrinsics; None takes those of the scene that is found, scaled."""
+    """Intrinsics. None: those of the camera that recorded the scene."""
     base_from_gripper: SE3 | None = None
-    """(n,) where the gripper was at each image."""
+    """(n,) gripper pose at each image."""
 
     @classmethod
-    def read(
+    def of(
         cls,
-        paths: Sequence[str | os.PathLike[str]],
+        source: ImageSource,
         camera: Camera | None = None,
-        base_from_gripper: SE3 | None = None,
+        robot_poses: str | os.PathLike[str] | SE3 | None = None,
+        convention: str | None = None,
     ) -> Self:
-        """Reads image files.
+        """Read images from files or take them from arrays.
 
         Args:
-            paths: of the images.
-            camera: see `camera`.
-            base_from_gripper: see `base_from_gripper`.
+            source: a folder, image files, or arrays.
+            camera: intrinsics at any size of the same aspect ratio.
+            robot_poses: base_from_gripper of every image: (n,) poses, or a file whose rows are
+                paired with image files by name, by time or in order.
+            convention: format of the file's numbers, if it does not state it.
 
         Raises:
-            InputError: a file is missing or no image.
+            InputError: A file is missing or no image, poses that do not fit the images, or a file
+                of poses for images from arrays.
         """
-        read = [(os.fspath(path), read_image(Path(path))) for path in paths]
-        return cls(read, camera, base_from_gripper)
+        single = isinstance(source, str | os.PathLike) or (
+            isinstance(source, np.ndarray) and source.ndim < 4
+        )
+        items: list[Any] = [source] if single else [*source]  # pyright: ignore[reportGeneralTypeIssues]
+        if not items or isinstance(items[0], str | os.PathLike):
+            files = image_files(items)
+            poses = robot_poses
+            if isinstance(poses, str | os.PathLike):
+                poses = poses_of_images(Path(poses), files, convention)
+            return cls([(str(path), read_image(path)) for path in files], camera, poses)
+        if isinstance(robot_poses, str | os.PathLike):
+            raise InputError(
+                f"{robot_poses}: a file of robot poses is paired with image files by name, time or"
+                " order; give poses (n,) with images from arrays"
+            )
+        arrays = [(f"image {i}", as_rgb(image)) for i, image in enumerate(items)]
+        return cls(arrays, camera, robot_poses)
 
 
 def calibrate(
@@ -80,20 +108,21 @@ def calibrate(
     options: FusionOptions | None = None,
     on_image: Callable[[], object] = lambda: None,
 ) -> Calibration:
-    """The pose of a camera from images.
+    """Estimate the pose of a camera from images of a mapped scene.
 
     Args:
-        localizer: of a store that knows the scene.
+        localizer: of a map that holds the scene.
         given: images and, for a camera on the gripper, the gripper's poses.
-        mount: None decides: with gripper poses and a camera that moves it is eye_in_hand.
-        options: when a pose belongs to the others.
+        mount: `eye_to_hand` or `eye_in_hand`. Default: eye_in_hand if there are gripper poses and
+            the camera moves.
+        options: when a pose counts as an outlier.
         on_image: called after each image.
 
     Returns:
         base_from_camera for eye_to_hand, gripper_from_camera for eye_in_hand.
 
     Raises:
-        InputError: no image was located, or eye_in_hand without gripper poses.
+        InputError: No image was located, or eye_in_hand without gripper poses.
     """
     grippers = given.base_from_gripper
     if grippers is not None and len(grippers) != len(given.images):
@@ -110,61 +139,78 @@ def calibrate(
     if mount == "eye_in_hand" and grippers is not None:
         moved = in_gripper_frame(located, grippers)
     fused = fuse(moved, options)
-    lens = given.camera
-    if lens is None:
-        record = next(r for r in localizer.maps.scenes if r.name == fused.scene)
-        height, width = given.images[0][1].shape[:2]
-        lens = record.query_camera(None).resized(width, height)
+    scene = scene_named(localizer, fused.scene)
+    camera = given.camera or scene.adjusted_camera
+    height, width = given.images[0][1].shape[:2]
     if mount == "eye_to_hand":
         covariance, terms = _from_one_spot(moved, fused)
     else:
         covariance, terms = _from_many_spots(located, moved, fused)
-    found = Calibration(
-        mount,
-        fused.pose,
-        covariance,
-        "base" if mount == "eye_to_hand" else "gripper",
-        "camera",
-        lens,
-        fused.uses,
-        terms,
-        _checks(moved, fused),
-        "",
-        {"command": "calibrate", "scene": fused.scene, "map": map_digest(localizer, fused.scene)},
-        datetime.now(UTC).isoformat(timespec="seconds"),
+    source = {
+        "command": "calibrate",
+        "scene": fused.scene,
+        "map": map_digest(localizer, fused.scene),
+        "intrinsics": "map" if given.camera is None else "given",
+    }
+    calibration = Calibration(
+        mount=mount,
+        parent_from_child=fused.pose,
+        covariance=covariance,
+        parent_frame="base" if mount == "eye_to_hand" else "gripper",
+        camera=camera.resized(width, height),
+        images=fused.uses,
+        error_terms=terms,
+        checks=_checks(moved, fused),
+        source=source,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-    return replace(found, verdict=" ".join([verdict(found), *_advice(found, fused)]))
+    sentences = [verdict(calibration), *_advice(calibration, fused)]
+    return replace(calibration, verdict=" ".join(sentences))
 
 
-def map_digest(localizer: "Localizer", scene: str) -> str:
-    """Names the map of a scene: two answers from one map share its errors."""
-    index = localizer.scenes.index(scene)
-    keyframes = localizer.maps.keyframes[index]
-    told = hashlib.sha256(scene.encode())
-    if keyframes is not None:
-        told.update(keyframes.base_from_camera.matrix().tobytes())
-    return told.hexdigest()[:16]
+def scene_named(localizer: "Localizer", name: str) -> SceneMap:
+    """The map of a scene.
+
+    Raises:
+        InputError: The map holds no such scene.
+    """
+    for scene in localizer.contents.scenes:
+        if scene.name == name:
+            return scene
+    raise InputError(f"scene {name!r}: the map has only {', '.join(localizer.scenes)}")
+
+
+def map_digest(localizer: "Localizer", name: str) -> str:
+    """Identifies a scene's map and base frame: two answers with one digest share their errors."""
+    scene = scene_named(localizer, name)
+    digest = hashlib.sha256(name.encode())
+    digest.update(scene.keyframes.base_from_camera.matrix().tobytes())
+    similarity = scene.frame.similarity
+    if similarity is not None:
+        digest.update(similarity.base_from_map.matrix().tobytes())
+        digest.update(np.float64(similarity.scale).tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _stands_still(located: Sequence[Located]) -> bool:
-    """Whether the camera did not move: no two thirds of its poses are further apart."""
-    poses = [item.pose for item in located if item.found]
-    if len(poses) < 2:
+    """Whether the median pose is within 10 mm and 1 deg of the mean."""
+    items = [item for item in located if item.is_located]
+    if len(items) < 2:
         return True
-    off = deviations(SE3.stack(poses), fuse([i for i in located if i.found]).pose)
+    off = deviations(SE3.stack([item.pose for item in items]), fuse(items).pose)
     distance = np.linalg.norm(off[:, :3], axis=1)
-    turn = np.linalg.norm(off[:, 3:], axis=1)
-    return bool(np.median(distance) < 0.01 and np.median(turn) < np.deg2rad(1.0))
+    angle = np.linalg.norm(off[:, 3:], axis=1)
+    return bool(np.median(distance) < 0.01 and np.median(angle) < np.deg2rad(1.0))
 
 
 def _from_one_spot(located: Sequence[Located], fused: Fused) -> tuple[Array, tuple[ErrorTerm, ...]]:
-    """Covariance of a camera that stands still: what one image has, plus the scatter's share."""
-    kept = fused.kept(located)
-    shared = np.mean([item.covariance for item in kept], axis=0)
-    own = fused.scatter / len(kept)
+    """Covariance of a fixed camera: that of one image, plus the scatter over their number."""
+    used = fused.select(located)
+    shared = np.mean([item.covariance for item in used], axis=0)
+    own = fused.scatter / len(used)
     terms = (
-        _term("landmarks and lens, shared by all images from this spot", shared),
-        _term(f"scatter of {len(kept)} images", own),
+        _term("landmarks and intrinsics, shared by all images from this spot", shared),
+        _term(f"scatter of {len(used)} images", own),
     )
     return shared + own, terms
 
@@ -172,14 +218,14 @@ def _from_one_spot(located: Sequence[Located], fused: Fused) -> tuple[Array, tup
 def _from_many_spots(
     located: Sequence[Located], moved: Sequence[Located], fused: Fused
 ) -> tuple[Array, tuple[ErrorTerm, ...]]:
-    """Covariance of a camera on the gripper: the scatter among spots, and what one spot has."""
-    kept = fused.kept(moved)
-    spots = _spots([item.pose for item in fused.kept(located)])
+    """Covariance of a camera on the gripper: the scatter among spots, and that of one spot."""
+    used = fused.select(moved)
+    spots = _spots([item.pose for item in fused.select(located)])
     count = int(spots.max()) + 1
-    own = np.mean([item.covariance for item in kept], axis=0) / count
-    off = deviations(SE3.stack([item.pose for item in kept]), fused.pose)
+    own = np.mean([item.covariance for item in used], axis=0) / count
+    off = deviations(SE3.stack([item.pose for item in used]), fused.pose)
     means = np.stack([off[spots == spot].mean(0) for spot in range(count)])
-    # The scatter holds errors of the robot's poses, which the images know nothing of.
+    # The scatter contains errors of the robot's poses, which the images do not show.
     scatter = means.T @ means / max(count - 1, 1) / count
     larger = np.maximum(np.diag(scatter), np.diag(own))
     scale = np.sqrt(larger / np.maximum(np.diag(own), 1e-18))
@@ -192,7 +238,7 @@ def _from_many_spots(
 
 
 def _small_sample(count: int) -> float:
-    """Widens a covariance estimated from few spots so that Gaussian ellipsoids hold (Student)."""
+    """Student factor on a covariance that was estimated from few spots."""
     from scipy import stats
 
     freedom = max(count - 1, 1)
@@ -200,7 +246,7 @@ def _small_sample(count: int) -> float:
 
 
 def _spots(poses: Sequence[SE3]) -> NDArray[np.int64]:
-    """(n,) number of the spot that each pose belongs to, in order of appearance."""
+    """(n,) index of the spot of each pose, in order of appearance."""
     centres: list[SE3] = []
     numbers = []
     for pose in poses:
@@ -222,33 +268,38 @@ def _term(name: str, covariance: Array) -> ErrorTerm:
 
 
 def _checks(moved: Sequence[Located], fused: Fused) -> Mapping[str, Any]:
-    """Repeatability, and what `check` needs to compare later images."""
-    kept = fused.kept(moved)
-    halves = halves_apart(SE3.stack([item.pose for item in kept]))
-    found: dict[str, Any] = {
+    """Repeatability, and the numbers that `check` compares later images with."""
+    used = fused.select(moved)
+    halves = halves_apart(SE3.stack([item.pose for item in used]))
+    checks: dict[str, Any] = {
         "images_given": len(moved),
-        "images_used": len(kept),
+        "images_used": len(used),
         "image_scatter": fused.scatter.tolist(),
     }
     if halves is not None:
-        found |= {"repeatability_mm": halves[0], "repeatability_deg": halves[1]}
-    return found
+        checks |= {"repeatability_mm": halves[0], "repeatability_deg": halves[1]}
+    return checks
 
 
-def _advice(found: Calibration, fused: Fused) -> list[str]:
-    """What would make the answer better."""
+def _advice(calibration: Calibration, fused: Fused) -> list[str]:
+    """How to improve the result."""
     used, lost = int(fused.used.sum()), int((~fused.used).sum())
-    told = []
+    advice = []
+    if calibration.source["intrinsics"] == "map":
+        advice.append(
+            f"The intrinsics are those of the camera that recorded {fused.scene}: give --camera if"
+            " another camera took these images."
+        )
     if lost > used:
-        told.append(
-            f"{lost} of {used + lost} images were left out: the camera may have been moved between"
-            " them, see the reasons."
+        advice.append(
+            f"{lost} of {used + lost} images were rejected: the camera may have moved between them,"
+            " see the reasons."
         )
     if used == 1:
-        told.append("It rests on one image: give five or more to see how well they agree.")
-    elif found.mount == "eye_to_hand" and used >= 5:
-        told.append(
-            "More images from this spot will not help: what remains is shared by all of them."
-            " Keyframes nearer to the camera's view would (learn a recording that comes closer)."
+        advice.append("It rests on one image: give five or more to measure their scatter.")
+    elif calibration.mount == "eye_to_hand" and used >= 5:
+        advice.append(
+            "More images from this spot will not help: the remaining error is common to all of"
+            " them. Keyframes nearer to the camera's view would."
         )
-    return told
+    return advice

@@ -1,4 +1,4 @@
-"""Images on their way to a calibration: located one by one, then put together robustly."""
+"""Images of a calibration: located one by one, then fused robustly."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from evercal.calibration.calibration import ImageUse
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, average_poses, pose_distance_mm_deg, with_translation_by
+from evercal.geometry import SE3, Camera, UncertainPose, average_poses, pose_distance_mm_deg
 
 if TYPE_CHECKING:
     from evercal.localization.estimate import PoseEstimate
@@ -22,53 +22,53 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class FusionOptions:
-    """When a pose belongs to the others."""
+    """When a pose is an outlier."""
 
     outlier_sigmas: float = 5.0
-    """A pose further from the others than this many robust standard deviations is left out."""
+    """Robust standard deviations from the mean beyond which a pose is an outlier."""
     least_mm: float = 2.0
-    """But none that is closer than this, millimetres."""
+    """Distances below this are never outliers, millimetres."""
     least_deg: float = 0.15
-    """And than this, degrees."""
+    """The same for rotations, degrees."""
 
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """One image and where its camera was found."""
+    """One image and its pose estimate."""
 
     name: str
     """Of the image."""
     estimate: "PoseEstimate"
-    """The answer of the localizer."""
+    """Of the localizer."""
     pose: SE3
-    """What is put together: base_from_camera, or gripper_from_camera. Identity where the estimate
-    is not ok."""
+    """The pose to fuse: base_from_camera or gripper_from_camera. Identity where the estimate is
+    not ok."""
     covariance: Array
     """(6, 6) of translation in the parent frame and rotation about camera axes."""
 
     @property
-    def found(self) -> bool:
+    def is_located(self) -> bool:
         """Whether there is a pose."""
         return self.estimate.base_from_camera is not None
 
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """Many poses of one transform, put together."""
+    """Robust mean of many poses of one transform."""
 
     pose: SE3
     """Single."""
     scatter: Array
     """(6, 6) covariance of one pose about the others."""
     used: NDArray[np.bool_]
-    """(n,) which of the images it rests on."""
+    """(n,) inliers among the images."""
     uses: tuple[ImageUse, ...]
-    """(n,) what became of every image."""
+    """(n,) use of every image, or the reason for rejecting it."""
     scene: str
     """Name of the scene."""
 
-    def kept(self, items: Sequence[Item]) -> list[Item]:
-        """Those of (n,) things, one for each image, that belong to the images used."""
+    def select(self, items: Sequence[Item]) -> list[Item]:
+        """The items (n,) of the images that were used."""
         return [item for item, used in zip(items, self.used, strict=True) if used]
 
 
@@ -78,22 +78,21 @@ def locate(
     camera: Camera | None = None,
     on_image: Callable[[], object] = lambda: None,
 ) -> list[Located]:
-    """Locates every image.
+    """Locate every image.
 
     Args:
-        localizer: of a store that knows the scene.
+        localizer: of a map.
         images: (name, (h, w, 3) uint8 RGB).
-        camera: intrinsics; None takes those of the scene that is found, scaled.
+        camera: Intrinsics. Default: those of the camera that recorded the scene.
         on_image: called after each.
     """
-    found = []
+    located = []
     for name, image in images:
         estimate = localizer.localize(image, camera)
-        pose, covariance = estimate.base_from_camera, estimate.covariance
-        known = np.eye(6) if covariance is None else covariance
-        found.append(Located(name, estimate, pose or SE3.identity(), known))
+        uncertain = estimate.uncertain_pose or UncertainPose(SE3.identity(), np.eye(6))
+        located.append(Located(name, estimate, uncertain.pose, uncertain.covariance))
         on_image()
-    return found
+    return located
 
 
 def in_gripper_frame(located: Sequence[Located], base_from_gripper: SE3) -> list[Located]:
@@ -101,72 +100,71 @@ def in_gripper_frame(located: Sequence[Located], base_from_gripper: SE3) -> list
 
     Args:
         located: n images.
-        base_from_gripper: (n,) where the gripper was.
+        base_from_gripper: (n,) gripper poses.
     """
     moved = []
     for item, gripper in zip(located, base_from_gripper, strict=True):
-        covariance = with_translation_by(gripper.rotation_matrix().T, item.covariance)
-        pose = gripper.inverse() @ item.pose
-        moved.append(Located(item.name, item.estimate, pose, covariance))
+        pose = gripper.inverse() @ UncertainPose(item.pose, item.covariance)
+        moved.append(Located(item.name, item.estimate, pose.pose, pose.covariance))
     return moved
 
 
 def fuse(located: Sequence[Located], options: FusionOptions | None = None) -> Fused:
-    """One pose from many, in any order, with a reason for every image that is left out.
+    """Fuse poses of one transform, with a reason for every image that is rejected.
 
     Args:
         located: images that should all give the same pose.
-        options: when a pose belongs to the others.
+        options: when a pose is an outlier.
 
     Raises:
         InputError: no image was located.
     """
     options = options or FusionOptions()
-    names = Counter(item.estimate.scene for item in located if item.found)
+    names = Counter(item.estimate.scene for item in located if item.is_located)
     if not names:
         first = located[0].estimate.reason if located else "no image was given"
         raise InputError(
-            f"none of {len(located)} images was located (the first: {first}); give images of a"
-            " place that the store knows, sharp and not too dark"
+            f"0 of {len(located)} images were located (the first: {first}); give sharp, well-lit"
+            " images of a mapped scene"
         )
     scene = max(names, key=lambda name: (names[name], str(name)))
     reasons = ["" for _ in located]
     for i, item in enumerate(located):
-        if not item.found:
+        if not item.is_located:
             reasons[i] = f"{item.estimate.status.replace('_', ' ')}: {item.estimate.reason}"
         elif item.estimate.scene != scene:
-            reasons[i] = f"shows scene {item.estimate.scene}, most images show {scene}"
+            reasons[i] = f"shows scene {item.estimate.scene}; most images show {scene}"
     usable = [i for i, reason in enumerate(reasons) if not reason]
     poses = SE3.stack([located[i].pose for i in usable])
-    middle = average_poses(poses)
-    off = deviations(poses, middle)
+    mean = average_poses(poses)
+    off = deviations(poses, mean)
     far = _far(off, options)
-    for place, i in enumerate(usable):
-        if far[place]:
-            millimetres, degrees = length_mm_deg(off[place])
+    for row, i in enumerate(usable):
+        if far[row]:
+            millimetres, degrees = length_mm_deg(off[row])
             reasons[i] = f"lies {millimetres:.1f} mm and {degrees:.2f} deg from the other images"
-    keep = ~far
-    if keep.sum() >= 2:
-        middle = average_poses(poses[keep])
-    off = deviations(poses, middle)
-    scatter = off[keep].T @ off[keep] / max(1, keep.sum() - 1)
+    near = ~far
+    if near.sum() >= 2:
+        mean = average_poses(poses[near])
+    off = deviations(poses, mean)
+    scatter = off[near].T @ off[near] / max(1, near.sum() - 1)
     uses, residual = [], dict(zip(usable, off, strict=True))
     for i, item in enumerate(located):
         size = length_mm_deg(residual[i]) if i in residual else (None, None)
         uses.append(ImageUse(item.name, not reasons[i], reasons[i], *size))
     used = np.array([not reason for reason in reasons])
-    return Fused(middle, scatter, used, tuple(uses), str(scene))
+    return Fused(mean, scatter, used, tuple(uses), str(scene))
 
 
-def deviations(poses: SE3, middle: SE3) -> Array:
-    """(n, 6) of poses from one: translation in the parent frame, rotation about child axes."""
-    shift = poses.translation_m - middle.translation_m
-    turn = (middle.inverse() @ poses).log()[:, 3:]
-    return np.concatenate([shift, turn], axis=1)
+def deviations(poses: SE3, mean: SE3) -> Array:
+    """(n, 6) deviations of poses: translation in the parent frame, rotation about child axes."""
+    shift = poses.translation_m - mean.translation_m
+    rotation = (mean.inverse() @ poses).log()[:, 3:]
+    return np.concatenate([shift, rotation], axis=1)
 
 
 def _far(off: Array, options: FusionOptions) -> NDArray[np.bool_]:
-    """Which poses lie far from the others: beyond robust deviations and a least distance."""
+    """(n,) outliers: beyond a number of robust deviations and beyond a least distance."""
     far = np.zeros(len(off), bool)
     for part, least in (
         (off[:, :3], options.least_mm / 1000),
@@ -180,15 +178,15 @@ def _far(off: Array, options: FusionOptions) -> NDArray[np.bool_]:
 
 
 def length_mm_deg(off: Array) -> tuple[float, float]:
-    """Millimetres and degrees of one deviation (6,)."""
+    """Length of one deviation (6,) in millimetres and degrees."""
     return 1000 * float(np.linalg.norm(off[:3])), float(np.rad2deg(np.linalg.norm(off[3:])))
 
 
 def halves_apart(poses: SE3) -> tuple[float, float] | None:
-    """Millimetres and degrees between the answers of every other pose and of the rest.
+    """Millimetres and degrees between the means of even and odd poses.
 
     Args:
-        poses: (n,); None is returned for fewer than four.
+        poses: (n,). The result is None for fewer than four.
     """
     if len(poses) < 4:
         return None

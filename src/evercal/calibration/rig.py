@@ -1,4 +1,4 @@
-"""Several cameras calibrated in one map, and where they are relative to each other."""
+"""Several cameras calibrated in one map, and their poses relative to each other."""
 
 import itertools
 import os
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
-from evercal.geometry import SE3, axis_deviation, cross_matrix
+from evercal.geometry import SE3, axis_deviation
 from evercal.storage import write_json
 
 
@@ -85,21 +85,15 @@ def rig_of(cameras: Mapping[str, Calibration]) -> Rig:
     if len(cameras) < 2:
         raise InputError("a rig has at least two cameras: give NAME=FOLDER for each")
     if len(set(scenes.values())) > 1:
-        told = ", ".join(f"{name} in {scene}" for name, scene in scenes.items())
-        raise InputError(f"the cameras were found in different scenes ({told}); a rig is in one")
+        listed = ", ".join(f"{name} in {scene}" for name, scene in scenes.items())
+        raise InputError(
+            f"the cameras were located in different scenes ({listed}); a rig is in one"
+        )
     return Rig(cameras, tuple(_pair(a, b, cameras) for a, b in itertools.combinations(cameras, 2)))
 
 
 def _pair(first: str, second: str, cameras: Mapping[str, Calibration]) -> RigPair:
-    """Errors of both are taken for independent, which is too much where they share landmarks."""
-    a, b = cameras[first], cameras[second]
-    first_from_second = a.parent_from_child.inverse() @ b.parent_from_child
-    back = a.parent_from_child.rotation_matrix().T
-    of_first = np.eye(6)
-    of_first[:3, :3] = -back
-    of_first[:3, 3:] = cross_matrix(first_from_second.translation_m)
-    of_first[3:, 3:] = -first_from_second.rotation_matrix().T
-    of_second = np.eye(6)
-    of_second[:3, :3] = back
-    covariance = of_first @ a.covariance @ of_first.T + of_second @ b.covariance @ of_second.T
-    return RigPair(first, second, first_from_second, (covariance + covariance.T) / 2)
+    """Errors of both are taken as independent, which overestimates them for common landmarks."""
+    a, b = cameras[first].uncertain_pose, cameras[second].uncertain_pose
+    first_from_second = a.inverse() @ b
+    return RigPair(first, second, first_from_second.pose, first_from_second.covariance)

@@ -15,6 +15,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from evercal.errors import InputError
 from evercal.features.device import device_of_network
 from evercal.features.weights_file import load_strictly
+from evercal.storage.tensors import load_tensors
 
 WEIGHTS = Path(__file__).parent / "weights"
 ENCODER_FILE = WEIGHTS / "encoder.safetensors"
@@ -203,6 +204,21 @@ def checked_encoder(module: nn.Module) -> Encoder:
             f"its stride {module.stride} and width {module.width} promise (1, {module.width}, 8, 8)"
         )
     return module
+
+
+def own_encoder(module: nn.Module, path: Path) -> Encoder:
+    """A user's module with the weights of a file.
+
+    Raises:
+        InputError: The weights belong to another module.
+    """
+    state = {name: value.float() for name, value in load_tensors(path).items()}
+    try:
+        module.load_state_dict(state, strict=True)
+    except RuntimeError as error:
+        first = str(error).splitlines()[-1].strip()
+        raise InputError(f"{path}: not the weights of the given encoder ({first})") from None
+    return checked_encoder(module)
 
 
 def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:

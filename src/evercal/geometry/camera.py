@@ -7,7 +7,7 @@ pixel, as in OpenCV and ROS, so an image covers -0.5 .. width - 0.5 and its midd
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -18,7 +18,20 @@ Array = NDArray[np.float64]
 
 _COEFFICIENT_COUNTS = (0, 4, 5, 8)
 _EXACT = 1e-10
-"""How near undistorted points of the plane z = 1 come to their pixels."""
+"""Tolerance of undistorted points on the plane z = 1."""
+_ASPECT_TOLERANCE = 0.01
+
+
+def resize_pixels(pixels: ArrayLike, scale: float | Array) -> Array:
+    """Pixel coordinates in a resized image.
+
+    Resizing scales about the corner of the image, which lies at -0.5 and not at 0.
+
+    Args:
+        pixels: (..., 2), x then y, or any coordinate along one axis.
+        scale: new size over old size; one number, or one for each axis.
+    """
+    return np.asarray((np.asarray(pixels) + 0.5) * scale - 0.5)
 
 
 @dataclass(frozen=True)
@@ -43,7 +56,7 @@ class Camera:
     cy: float
     """Principal point in pixels; 0 is the centre of the topmost pixel."""
     distortion: tuple[float, ...] = ()
-    """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty for none, also where all were given as 0."""
+    """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty without distortion. Zeros become empty."""
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
@@ -68,7 +81,7 @@ class Camera:
     def from_matrix(
         cls, matrix: ArrayLike, width: int, height: int, distortion: tuple[float, ...] = ()
     ) -> Self:
-        """From a 3x3 intrinsic matrix.
+        """Convert a 3x3 intrinsic matrix.
 
         Raises:
             ValueError: Not 3x3, skew, or a last row other than 0 0 1.
@@ -85,14 +98,14 @@ class Camera:
 
     @property
     def coefficients(self) -> tuple[float, ...]:
-        """All eight coefficients of the distortion; 0 where `distortion` has none."""
+        """All eight distortion coefficients; missing ones are 0."""
         return (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
 
     @cached_property
     def widest(self) -> float:
-        """Largest tangent of the angle to the optical axis that the distortion holds for.
+        """Largest tangent of the angle to the optical axis at which the distortion is valid.
 
-        Beyond it the polynomial turns round and places what lies far outside back in the image.
+        Beyond it the polynomial folds back, so points far outside the view land in the image.
         """
         k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
         squared = np.polynomial.Polynomial([0, 1])
@@ -103,6 +116,16 @@ class Camera:
         real = turns.real[(np.abs(turns.imag) < 1e-9) & (turns.real > 0)]
         return math.sqrt(min(real, default=math.inf))
 
+    @property
+    def pinhole(self) -> "Camera":
+        """The same camera without distortion."""
+        return replace(self, distortion=()) if self.distortion else self
+
+    def fits(self, width: int, height: int) -> bool:
+        """Whether an image has the aspect ratio of this camera, to 1 %."""
+        ratio = self.width * height / (self.height * width)
+        return abs(ratio - 1) < _ASPECT_TOLERANCE
+
     def matrix(self) -> Array:
         """(3, 3) intrinsic matrix."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
@@ -110,16 +133,8 @@ class Camera:
     def resized(self, width: int, height: int) -> "Camera":
         """The camera of the same image resized to `width` x `height` pixels."""
         sx, sy = width / self.width, height / self.height
-        # The half pixels: resizing scales about the image's corner, which lies at -0.5.
-        return Camera(
-            width,
-            height,
-            self.fx * sx,
-            self.fy * sy,
-            (self.cx + 0.5) * sx - 0.5,
-            (self.cy + 0.5) * sy - 0.5,
-            self.distortion,
-        )
+        cx, cy = resize_pixels((self.cx, self.cy), np.array([sx, sy])).tolist()
+        return Camera(width, height, self.fx * sx, self.fy * sy, cx, cy, self.distortion)
 
     def short_side_resized(self, short_side: int) -> "Camera":
         """The camera of the image resized so that its shorter side is `short_side` pixels."""
@@ -135,8 +150,8 @@ class Camera:
             points_camera: (..., 3) metres, camera frame.
 
         Returns:
-            (..., 2) pixels, x then y, not clipped to the image; nan for points that are not in
-            front of the camera or lie where the distortion no longer holds (`widest`).
+            (..., 2) pixels, x then y, not clipped to the image. NaN for points behind the camera
+            or beyond the valid range of the distortion (`widest`).
         """
         points = np.asarray(points_camera, dtype=np.float64)
         if points.shape[-1:] != (3,):
@@ -155,8 +170,8 @@ class Camera:
             pixels: (..., 2), x then y.
 
         Returns:
-            (..., 3) rays in the camera frame with z = 1; x and y are nan where the distortion
-            has no ray for a pixel.
+            (..., 3) rays in the camera frame with z = 1; x and y are NaN for pixels outside the
+            range of the distortion.
         """
         pixels = np.asarray(pixels, dtype=np.float64)
         if pixels.shape[-1:] != (2,):
@@ -167,7 +182,7 @@ class Camera:
         return np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
 
     def slopes(self, plane: ArrayLike) -> tuple[Array, Array]:
-        """How pixels move with points of the plane z = 1 and with the lens.
+        """Derivatives of pixels by points of the plane z = 1 and by the intrinsics.
 
         Args:
             plane: (..., 2) ideal points.
@@ -201,7 +216,7 @@ class Camera:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, object]) -> Self:
-        """From `to_dict`; keys it does not know are passed over, `distortion` may be missing.
+        """Inverse of `to_dict`; unknown keys are ignored, `distortion` is optional.
 
         Raises:
             ValueError: A key is missing or its value is not a number.
@@ -256,7 +271,7 @@ class Camera:
         return radial, steeper / below
 
     def _undistorted(self, distorted: Array) -> Array:
-        """(..., 2) distorted to ideal points of the plane z = 1; nan where there are none."""
+        """(..., 2) distorted to ideal points of the plane z = 1; NaN outside the range of the distortion."""
         plane, lost = distorted, np.ones(distorted.shape[:-1], bool)
         for _ in range(50):  # Newton's method: a few steps but close to `widest`
             far = np.sqrt((plane**2).sum(-1, keepdims=True))

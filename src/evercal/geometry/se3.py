@@ -50,18 +50,18 @@ class SE3:
 
     @classmethod
     def identity(cls, shape: tuple[int, ...] = ()) -> Self:
-        """The transform that changes nothing, repeated to the batch `shape`."""
+        """The identity transform, repeated to the batch `shape`."""
         quaternion = np.broadcast_to(np.array([1.0, 0.0, 0.0, 0.0]), (*shape, 4))
         return cls(quaternion, np.zeros((*shape, 3)))
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike, tolerance: float = 1e-3) -> Self:
-        """From homogeneous matrices.
+        """Convert homogeneous matrices.
 
         Args:
             matrix: (..., 4, 4) or (..., 3, 4).
-            tolerance: Largest entry of `R^T R - I` that is still taken for rounding; within it the
-                nearest rotation is used.
+            tolerance: Largest entry of `R^T R - I` that counts as rounding. The nearest rotation is
+                used.
 
         Raises:
             ValueError: Wrong shape, numbers that are not finite, a last row other than 0 0 0 1, or
@@ -88,7 +88,7 @@ class SE3:
 
     @classmethod
     def exp(cls, tangent: ArrayLike) -> Self:
-        """From tangents (..., 6) = (v, w): translation part in metres, rotation part in radians."""
+        """Exponential map of tangents (..., 6) = (v, w): v in metres, w in radians."""
         tangent = np.asarray(tangent, dtype=np.float64)
         if tangent.shape[-1:] != (6,):
             raise ValueError(f"a tangent is (..., 6) = (v, w), got {tangent.shape}")
@@ -100,7 +100,7 @@ class SE3:
 
     @classmethod
     def stack(cls, poses: Sequence["SE3"]) -> Self:
-        """Stacks transforms of one batch shape along a new first axis; none gives shape (0,)."""
+        """Stack transforms of one batch shape along a new first axis; an empty list gives (0,)."""
         if not poses:
             return cls(np.zeros((0, 4)), np.zeros((0, 3)))
         return cls(
@@ -162,13 +162,23 @@ class SE3:
         return type(self)(quaternion, self.apply(other.translation_m))
 
     def apply(self, points: ArrayLike) -> Array:
-        """Takes points (..., 3) to the other frame; the axes before the last broadcast."""
+        """Transform points (..., 3) to the parent frame; leading axes broadcast."""
         points = np.asarray(points, dtype=np.float64)
         if points.shape[-1:] != (3,):
             raise ValueError(f"points are (..., 3), got {points.shape}")
         if not self.shape:
             return points @ self.rotation_matrix().T + self.translation_m
         return (self.rotation_matrix() @ points[..., None])[..., 0] + self.translation_m
+
+    def adjoint(self) -> Array:
+        """(..., 6, 6) matrices A with `self @ exp(x) == exp(A x) @ self` for tangents x = (v, w)."""
+        rotation = self.rotation_matrix()
+        adjoint = np.zeros((*self.shape, 6, 6))
+        adjoint[..., :3, :3] = adjoint[..., 3:, 3:] = rotation
+        for axis in range(3):
+            column = np.cross(self.translation_m, rotation[..., :, axis])
+            adjoint[..., :3, 3 + axis] = column
+        return adjoint
 
     def log(self) -> Array:
         """(..., 6) = (v, w) with |w| <= pi, the inverse of `exp`."""
@@ -193,27 +203,26 @@ def pose_distance(a: SE3, b: SE3) -> tuple[Array, Array]:
     metres = np.linalg.norm(a.translation_m - b.translation_m, axis=-1)
     conjugate = a.rotation_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
     difference = _quaternion_product(conjugate, b.rotation_wxyz)
-    # atan2 keeps its digits near 0 and near pi, where arccos of the trace loses half of them.
+    # atan2 keeps full precision near 0 and pi, where arccos of the trace loses half the digits.
     sine = np.linalg.norm(difference[..., 1:], axis=-1)
     return np.asarray(metres), 2.0 * np.arctan2(sine, np.abs(difference[..., 0]))
 
 
 def pose_distance_mm_deg(a: SE3, b: SE3) -> tuple[float, float]:
-    """`pose_distance` of two single transforms for people: millimetres and degrees."""
+    """`pose_distance` of two single transforms, in millimetres and degrees."""
     metres, radians = pose_distance(a, b)
     return 1000 * float(metres), float(np.rad2deg(radians))
 
 
 def average_poses(poses: SE3, weights: ArrayLike | None = None) -> SE3:
-    """Robust mean: up to nearly half of the weight may be far off without moving the answer.
+    """Robust mean of poses; up to nearly half of the weight may be outliers.
 
-    Starts at the pose closest to all others and repeats a weighted mean in which a pose counts
-    less the farther it lies from the current answer, and not at all beyond four median distances
-    (Tukey's biweight), in metres or in radians.
+    Iteratively reweighted mean, started at the medoid. Weights are Tukey's biweight of the distance
+    to the current mean, cut at four median distances, in metres and in radians.
 
     Args:
         poses: (n,), n >= 1.
-        weights: (n,) not negative, with a positive sum; all equal when left out.
+        weights: (n,) not negative, with a positive sum. Default: equal weights.
 
     Raises:
         ValueError: No poses, or weights that do not fit.
@@ -229,7 +238,7 @@ def average_poses(poses: SE3, weights: ArrayLike | None = None) -> SE3:
     for _ in range(50):
         metres, radians = pose_distance(mean, poses)
         weight = given * _biweight(metres, given) * _biweight(radians, given)
-        if weight.sum() <= 0:  # those close in metres and those close in radians are disjoint
+        if weight.sum() <= 0:  # poses near in metres and poses near in radians are disjoint
             return mean
         translation = weight @ poses.translation_m / weight.sum()
         rotation = poses._rotation().mean(weight).as_quat(canonical=True, scalar_first=True)
@@ -240,7 +249,7 @@ def average_poses(poses: SE3, weights: ArrayLike | None = None) -> SE3:
 
 
 def _quaternion_product(a: Array, b: Array) -> Array:
-    """Hamilton product of (..., 4) wxyz; written out because it is the inner loop of everything."""
+    """Hamilton product of (..., 4) wxyz; written out because it is an inner loop."""
     aw, ax, ay, az = np.moveaxis(a, -1, 0)
     bw, bx, by, bz = np.moveaxis(b, -1, 0)
     return np.stack(
@@ -255,13 +264,13 @@ def _quaternion_product(a: Array, b: Array) -> Array:
 
 
 def _medoid(poses: SE3, weights: Array) -> SE3:
-    """The pose whose summed distance to the others is least; of many, only some are candidates."""
+    """The pose with the smallest summed distance to the others, among at most 200 candidates."""
     heavy = np.flatnonzero(weights > 0)
     candidates = heavy[np.unique(np.linspace(0, len(heavy) - 1, 200).round().astype(int))]
     metres, radians = pose_distance(poses[candidates[:, None]], poses[None])
     cost = np.zeros(len(candidates))
     for distance in (metres, radians):
-        # Each kind in its own unit of spread, so that metres and radians may be added.
+        # Scaled by their median, distances in metres and in radians can be added.
         cost += distance @ weights / max(float(np.median(distance)), 1e-9)
     return poses[candidates[np.argmin(cost)]]
 
@@ -269,7 +278,7 @@ def _medoid(poses: SE3, weights: Array) -> SE3:
 def _biweight(distance: Array, weights: Array) -> Array:
     """Tukey's biweight of (n,) distances, cut at four weighted medians."""
     order = np.argsort(distance)
-    # side="right": of two poses the farther one, so that they meet in the middle.
+    # side="right" takes the farther of two poses, so that their mean lies halfway.
     middle = np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2, side="right")
     cut = 4.0 * max(float(distance[order[min(middle, len(order) - 1)]]), 1e-9)
     return np.clip(1.0 - (distance / cut) ** 2, 0.0, None) ** 2

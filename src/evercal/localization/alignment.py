@@ -1,4 +1,4 @@
-"""Alignment: landmarks of keyframes are found in an image to a tenth of a pixel, then the pose."""
+"""Alignment: landmarks are searched in an image to a tenth of a pixel, then the pose is refined."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,11 +7,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.geometry.camera import Camera
-from evercal.geometry.se3 import SE3
+from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.pnp import PnpOptions, solve_pnp
-from evercal.localization.pose_refinement import RefinedPose, refine_pose
+from evercal.localization.pose_refinement import refine_pose
 from evercal.mapping.landmarks import project_surface
 from evercal.mapping.patches import Patches, align_patches, from_level, to_level, whitening
 
@@ -27,16 +26,16 @@ class AlignmentRound:
     iterations: int
     """Alignment steps of every patch."""
     landmarks: int
-    """Landmarks looked for, at most; more of them where few are found."""
+    """Landmarks that are searched, at most; more where few were matched before."""
     steps: int
-    """Steps of the pose, at most."""
+    """Gauss-Newton steps of the pose, at most."""
     reach_px: float
-    """How far from where it was expected a landmark may be found, pixels of the image."""
+    """Largest distance of a match from its expected position, pixels of the image."""
 
 
 @dataclass(frozen=True)
 class AlignmentOptions:
-    """How landmarks are looked for in an image."""
+    """How landmarks are searched in an image."""
 
     rounds: tuple[AlignmentRound, ...] = (
         AlignmentRound(1, 6, 300, 3, 24.0),
@@ -44,58 +43,55 @@ class AlignmentOptions:
         AlignmentRound(0, 3, 900, 10, 3.0),
     )
     """From coarse to fine."""
-    enough_found: float = 0.4
-    """Where a smaller share of the landmarks was found in one round, the next looks for as many
-    more,"""
+    enough_matched: float = 0.4
+    """If a smaller share of the landmarks was matched in one round, the next round searches
+    proportionally more. An occluded or distant view yields few matches per landmark."""
     most_more: float = 3.0
-    """but at most for so many times as many: of an image that is covered, or seen from far, the
-    precision lies in the few that can be found."""
+    """Largest factor on the number of landmarks."""
     min_correlation: float = 0.7
-    """Smallest normalised cross-correlation of a landmark that was found."""
-    min_found: int = 12
-    """Fewer landmarks make no pose."""
-    found_px: float = 1.0
-    """A landmark agrees with the pose when it was found this near to where it should be."""
+    """Smallest normalised cross-correlation of a match."""
+    min_matches: int = 12
+    """Fewer landmarks give no pose."""
+    inlier_px: float = 1.0
+    """Reprojection error below which a matched landmark is an inlier."""
     floor_px: float = 0.1
-    """Alignment error of a perfect patch where `noise` is 1, pixels: with 0.8, 0.08 px at level 0.
-    """
+    """Alignment error of a perfect patch for `noise` 1, pixels: with 0.8, 0.08 px at level 0."""
     noise: float = 0.8
-    """Standard deviation of intensities in aligned patches, in deviations of a patch."""
+    """Noise of aligned patches, in standard deviations of a patch's intensities."""
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """The pose that landmarks tell, and how many of them agree."""
+    """A pose refined by landmarks, and its inliers."""
 
-    pose: RefinedPose
-    """In the base frame of the scene."""
-    expected: int
-    """Landmarks that should be visible and were looked for."""
-    matched: int
-    """Landmarks whose patch was found near where it was expected."""
+    pose: UncertainPose
+    """map_from_camera."""
     pixels: Array
-    """(n, 2) landmarks that agree, pixels of the image."""
+    """(n, 2) inliers, pixels of the image."""
     points_m: Array
-    """(n, 3) the same in the base frame."""
+    """(n, 3) their landmarks in the map's frame."""
+    expected: int
+    """Landmarks that should be visible and were searched."""
+    matched: int
+    """Landmarks whose patch was found near the expected position."""
     planned: int
-    """Landmarks that the last round would have looked for, had enough of them been found before."""
-
-    @property
-    def share(self) -> float:
-        """Landmarks that agree as a share of those looked for."""
-        return len(self.pixels) / max(self.expected, 1)
+    """Landmarks that the last round would search in an unobstructed image."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class _Matched:
+    """Landmarks matched in one round."""
+
     expected: int
+    """Landmarks that were searched."""
     pixels: Array
     """(n, 2) of the image."""
     ideal: Array
-    """(n, 2) the same of the ideal pinhole."""
-    lens: Array | None
-    """(n, 2, 2) how the former move with the latter; None without distortion."""
+    """(n, 2) the same in the ideal pinhole."""
+    distortion: Array | None
+    """(n, 2, 2) derivatives of `pixels` by `ideal`; None without distortion."""
     points_m: Array
+    """(n, 3) in the map's frame."""
     whitening: Array
     """(n, 2, 2) of errors in the image."""
 
@@ -110,11 +106,11 @@ class _Target:
     surface_m: Array
     """(3, n, 3), see `AlignedLandmarks`."""
     depth_error_m: Array
-    """(n, 3) where a landmark may move for its depth is uncertain: one standard deviation."""
+    """(n, 3) displacement of a landmark by one standard deviation of its depth."""
 
     @classmethod
     def of(cls, keyframes: Sequence[AlignedLandmarks]) -> Self:
-        """Of keyframes in their order."""
+        """Join the landmarks of keyframes in their order."""
         surfaces = [keyframe.surface_m for keyframe in keyframes]
         counts = [surface.shape[1] for surface in surfaces]
         errors = [k.depth_noise[:, None] * (k.surface_m[0] - k.position_m) for k in keyframes]
@@ -122,7 +118,7 @@ class _Target:
         return cls(keyframes, starts, np.concatenate(surfaces, 1), np.concatenate(errors))
 
     def patches(self, level: int, which: NDArray[np.int64]) -> Patches:
-        """Templates of some landmarks in rising order."""
+        """Templates of landmarks, indices in rising order."""
         ends = np.searchsorted(which, self.starts)
         parts = [
             keyframe.patches[level].take(which[a:b] - start)
@@ -140,71 +136,77 @@ def align_pose(
     start: SE3,
     options: AlignmentOptions,
 ) -> Alignment | None:
-    """Refines a rough pose by the landmarks of keyframes.
+    """Refine a rough pose by the landmarks of keyframes.
 
     Args:
         pyramid: of the image, see `image_pyramid`.
         camera: intrinsics of its first level, distortion included.
-        keyframes: the landmarks of some that show the same place.
-        start: base_from_camera, roughly.
-        options: how.
+        keyframes: landmarks of keyframes that show the same place.
+        start: map_from_camera, roughly.
+        options: rounds and thresholds.
 
     Returns:
-        None where too few landmarks are found.
+        None if too few landmarks match.
     """
-    pose, refined, found = start, None, None
+    pose, refined, matched = start, None, None
     target = _Target.of(keyframes)
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     for number, step in enumerate(options.rounds):
-        share = 1.0 if found is None else len(found.pixels) / found.expected
-        more = min(max(1.0, options.enough_found / max(share, 1e-3)), options.most_more)
+        share = 1.0 if matched is None else len(matched.pixels) / matched.expected
+        more = min(max(1.0, options.enough_matched / max(share, 1e-3)), options.most_more)
         wider = replace(step, landmarks=int(more * step.landmarks))
-        found = _look(pyramid, camera, target, pose, wider, options)
-        if len(found.pixels) < options.min_found:
+        matched = _search(pyramid, camera, target, pose, wider, options)
+        if len(matched.pixels) < options.min_matches:
             return None
         if number == 0:
-            # Of the first round many are wrong: a sample consensus tells which agree.
+            # Many matches of the first round are wrong; RANSAC selects a consistent set.
             loose = PnpOptions(threshold_px=4.0, max_iterations=200, min_iterations=20)
-            rough = solve_pnp(found.ideal, found.points_m, intrinsics, loose)
+            rough = solve_pnp(matched.ideal, matched.points_m, camera, loose)
             if rough is None:
                 return None
-            pose = rough.world_from_camera
+            pose = rough.pose.pose
         refined = refine_pose(
-            found.ideal, found.points_m, found.whitening, intrinsics, pose, step.steps, found.lens
+            matched.ideal,
+            matched.points_m,
+            matched.whitening,
+            camera,
+            pose,
+            step.steps,
+            matched.distortion,
         )
-        pose = refined.base_from_camera
-    assert refined is not None
-    assert found is not None
-    agree = refined.residual_px < options.found_px
-    if agree.sum() < options.min_found:
+        pose = refined.pose.pose
+    assert refined is not None, "at least one round"
+    assert matched is not None, "at least one round"
+    inliers = refined.residual_px < options.inlier_px
+    if inliers.sum() < options.min_matches:
         return None
     return Alignment(
-        refined,
-        found.expected,
-        len(found.pixels),
-        found.pixels[agree],
-        found.points_m[agree],
-        min(found.expected, options.rounds[-1].landmarks),
+        refined.pose,
+        matched.pixels[inliers],
+        matched.points_m[inliers],
+        matched.expected,
+        len(matched.pixels),
+        min(matched.expected, options.rounds[-1].landmarks),
     )
 
 
-def _look(
+def _search(
     pyramid: Sequence[Array],
     camera: Camera,
     target: _Target,
     pose: SE3,
     step: AlignmentRound,
     options: AlignmentOptions,
-) -> _Found:
-    """Landmarks of all keyframes in one round."""
+) -> _Matched:
+    """Match the landmarks of all keyframes near their expected positions."""
     inverse = pose.inverse()
-    turn, shift = inverse.rotation_matrix(), inverse.translation_m
-    which, pixels, affines = project_surface(target.surface_m, turn, shift, camera)
-    every = max(1, -(-len(which) // step.landmarks))
-    which, pixels, affines = which[::every], pixels[::every], affines[::every]
+    rotation, shift = inverse.rotation_matrix(), inverse.translation_m
+    which, pixels, affines = project_surface(target.surface_m, rotation, shift, camera)
+    if len(which) > step.landmarks:
+        spread = np.linspace(0, len(which) - 1, step.landmarks).round().astype(int)
+        which, pixels, affines = which[spread], pixels[spread], affines[spread]
     if not len(which):
-        none = np.zeros((0, 2))
-        return _Found(0, none, none, None, np.zeros((0, 3)), np.zeros((0, 2, 2)))
+        empty = np.zeros((0, 2))
+        return _Matched(0, empty, empty, None, np.zeros((0, 3)), np.zeros((0, 2, 2)))
     patches = target.patches(step.level, which)
     at, correlation = align_patches(
         patches, pyramid[step.level], to_level(pixels, step.level), affines, step.iterations
@@ -212,30 +214,30 @@ def _look(
     at = from_level(at.astype(np.float64), step.level)
     good = correlation > options.min_correlation
     good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
-    ideal, lens = _through_lens(at, camera)
+    ideal, distortion = _undistorted(at, camera)
     good &= np.isfinite(ideal).all(1)
-    if lens is not None:
-        good &= np.isfinite(lens).all((1, 2))
-        lens = lens[good]
+    if distortion is not None:
+        good &= np.isfinite(distortion).all((1, 2))
+        distortion = distortion[good]
     spread = patches.inverse_hessian[good]
     which, noise = which[good], options.noise * 2**step.level
     points = target.surface_m[0, which]
-    error = _shift_px(points, target.depth_error_m[which], turn, shift, camera)
-    if lens is not None:
-        error = np.einsum("nij,nj->ni", lens, error)
+    error = _shift_px(points, target.depth_error_m[which], rotation, shift, camera)
+    if distortion is not None:
+        error = np.einsum("nij,nj->ni", distortion, error)
     white = whitening(affines[good], spread, options.floor_px, noise, error)
-    return _Found(len(good), at[good], ideal[good], lens, points, white)
+    return _Matched(len(good), at[good], ideal[good], distortion, points, white)
 
 
-def _shift_px(points: Array, moves: Array, turn: Array, shift: Array, camera: Camera) -> Array:
-    """(n, 2) how far points (n, 3) move in the ideal pinhole where they move by `moves` (n, 3)."""
-    local, move = points @ turn.T + shift, moves @ turn.T
+def _shift_px(points: Array, moves: Array, rotation: Array, shift: Array, camera: Camera) -> Array:
+    """(n, 2) displacement in the ideal pinhole of points (n, 3) that move by `moves` (n, 3)."""
+    local, move = points @ rotation.T + shift, moves @ rotation.T
     plane = move[:, :2] - local[:, :2] * (move[:, 2:] / local[:, 2:])
     return plane / local[:, 2:] * [camera.fx, camera.fy]
 
 
-def _through_lens(pixels: Array, camera: Camera) -> tuple[Array, Array | None]:
-    """(n, 2) pixels of the ideal pinhole, and (n, 2, 2) how pixels of the image move with them."""
+def _undistorted(pixels: Array, camera: Camera) -> tuple[Array, Array | None]:
+    """(n, 2) pixels of the ideal pinhole, and (n, 2, 2) derivatives of image pixels by them."""
     if not camera.distortion:
         return pixels, None
     plane, focal = camera.unproject(pixels)[:, :2], np.array([camera.fx, camera.fy])

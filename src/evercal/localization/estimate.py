@@ -1,11 +1,11 @@
-"""What localization answers."""
+"""`PoseEstimate`: the answer for one image."""
 
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from evercal.geometry.se3 import SE3
+from evercal.geometry import SE3, UncertainPose
 
 
 @dataclass(frozen=True, eq=False)
@@ -13,25 +13,32 @@ class PoseEstimate:
     """The answer for one image; failure is a value, not an exception."""
 
     status: Literal["ok", "unknown_scene", "failed"]
-    """`unknown_scene`: a pose was found but too little agrees with it. `failed`: none was found, or
-    a network gave one outside the cell of its scene."""
+    """`unknown_scene`: a pose without enough support. `failed`: no pose, or a network's pose
+    outside the cell of its scene."""
     reason: str
     """Why the status is not `ok`; empty otherwise."""
     scene: str | None
-    """Name of the scene that the pose lies in."""
+    """Name of the scene."""
     base_from_camera: SE3 | None
     """Camera pose in that scene's base frame, metres, OpenCV axes."""
     covariance: np.ndarray | None
     """(6, 6) of (translation in the base frame, metres; rotation about camera axes, radians)."""
     inliers: int
-    """Landmarks that were found where the pose puts them; without a map, patches that agree."""
+    """Landmarks that agree with the pose; for a network, patches that agree."""
     inlier_ratio: float
-    """The same as a share of those that should be visible; without a map, of all patches."""
+    """Inliers as a share of the landmarks that should be visible; for a network, of all patches."""
     milliseconds: float
-    """Time from image to answer, decoding not included."""
+    """Time from image to answer, without decoding."""
     pixels: np.ndarray | None = None
-    """(n, 2) what agrees, in pixels of the working image, for overlays."""
+    """(n, 2) inliers in pixels of the image at working size, for overlays."""
     points_m: np.ndarray | None = None
     """(n, 3) their scene points in the base frame, metres."""
     support: float = 0.0
-    """What the scene's threshold is compared with, see `localization.acceptance`."""
+    """Support of the pose, see `localization.acceptance`."""
+
+    @property
+    def uncertain_pose(self) -> UncertainPose | None:
+        """Pose with covariance; None if there is no pose."""
+        if self.base_from_camera is None or self.covariance is None:
+            return None
+        return UncertainPose(self.base_from_camera, self.covariance)

@@ -1,4 +1,4 @@
-"""All keyframes of a store: found by a global descriptor, decoded and encoded when needed."""
+"""All keyframes of a map: retrieved by a global descriptor, decoded and encoded on demand."""
 
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -11,55 +11,56 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evercal.features.encode import encode_features
+from evercal.features.encoder import Encoder
 from evercal.features.precision import fast_bfloat16
 from evercal.features.views import ViewOptions, plain_view
 from evercal.features.vlad import vlad_for
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.patches import Patches, cut_patches, image_pyramid, to_level
 from evercal.mapping.plane_sweep import PosedCells
-from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.scene_map import MapContents
 
 ALIGNED_LEVELS = 2
 
 
 @dataclass(frozen=True, eq=False)
 class MatchedCells:
-    """What an image is matched to; coordinates in the base frame of the scene."""
+    """Patches of a keyframe that an image is matched to, in the map's frame."""
 
     features: Tensor
     """(cells, channels) on the encoder's device, bfloat16 where that is fast."""
     points_m: np.ndarray
-    """(cells, 3) what the patches of the feature grid show."""
+    """(cells, 3) surface points of the patches."""
 
 
 @dataclass(frozen=True, eq=False)
 class AlignedLandmarks:
-    """What is looked for in an image; coordinates in the base frame of the scene."""
+    """Landmarks of a keyframe that are searched in an image, in the map's frame."""
 
     surface_m: np.ndarray
-    """(3, n, 3) landmarks and two points beside each, see `Landmarks.surface`."""
+    """(3, n, 3) landmarks and two surface points beside each, see `Landmarks.surface`."""
     depth_noise: np.ndarray
     """(n,) standard deviation of the landmarks' depths as a share of the depth."""
     position_m: np.ndarray
-    """(3,) where the keyframe was taken."""
+    """(3,) position of the keyframe's camera."""
     patches: tuple[Patches, ...]
     """Templates of the landmarks, one set for each pyramid level."""
 
 
 class LoadedKeyframe:
-    """A keyframe that is made ready to be matched, or to be aligned, when first asked for it.
+    """A keyframe that is prepared for matching, or for alignment, on first use.
 
-    Few of those that are matched are ever aligned.
+    Few of the keyframes that are matched are ever aligned.
 
     Args:
-        maps: whose encoder makes the features.
+        contents: whose encoder computes the features.
         keyframes: of a scene.
-        number: which of them.
+        number: index of the keyframe.
     """
 
-    def __init__(self, maps: SceneMaps, keyframes: Keyframes, number: int):
-        self._maps, self._keyframes, self._number = maps, keyframes, number
-        self._lock = Lock()  # other threads go on with other keyframes
+    def __init__(self, contents: MapContents, keyframes: Keyframes, number: int):
+        self._contents, self._keyframes, self._number = contents, keyframes, number
+        self._lock = Lock()  # one lock per keyframe, so that threads can load different ones
         self._cells: MatchedCells | None = None
         self._landmarks: AlignedLandmarks | None = None
 
@@ -78,18 +79,19 @@ class LoadedKeyframe:
             return self._landmarks
 
     def _encoded(self) -> MatchedCells:
-        maps, keyframes, number = self._maps, self._keyframes, self._number
+        contents, keyframes, number = self._contents, self._keyframes, self._number
         camera, pose = keyframes.cameras[number], keyframes.base_from_camera[number]
-        stride, view_options = maps.encoder.stride, ViewOptions(short_side=maps.short_side)
+        stride, view_options = contents.encoder.stride, ViewOptions(short_side=contents.short_side)
         view = plain_view(keyframes.grey(number), camera, stride, view_options)
-        features = encode_features([view], maps.encoder)[0].flatten(1).T
-        small = camera.short_side_resized(maps.short_side)
+        features = encode_features([view], contents.encoder)[0].flatten(1).T
+        small = camera.short_side_resized(contents.short_side)
         rays = PosedCells(features, small, pose, stride).rays()
         depth = 1 / keyframes.inverse_depth[number].double().numpy()
         kind = torch.bfloat16 if fast_bfloat16(features.device) else torch.float32
         points = rays * depth[:, None]
-        known = np.flatnonzero(np.isfinite(points).all(1))  # a strong lens has corners without rays
-        return MatchedCells(features[known].to(kind), pose.apply(points[known]))
+        # Corners of a strongly distorted image have no rays.
+        valid = np.flatnonzero(np.isfinite(points).all(1))
+        return MatchedCells(features[valid].to(kind), pose.apply(points[valid]))
 
     def _cut(self) -> AlignedLandmarks:
         keyframes, number = self._keyframes, self._number
@@ -107,43 +109,43 @@ class LoadedKeyframe:
 
 
 class KeyframeBank:
-    """The keyframes of all scenes that have a map.
+    """The keyframes of all scenes of a map.
 
     Args:
-        maps: with keyframes that have descriptors.
-        most_loaded: how many keyframes stay decoded in memory (up to 3 MB each).
+        contents: encoder and scenes, at least one.
+        most_loaded: keyframes that stay decoded in memory (up to 3 MB each).
     """
 
-    def __init__(self, maps: SceneMaps, most_loaded: int):
-        self._maps, self._most, self._lock = maps, most_loaded, Lock()
+    def __init__(self, contents: MapContents, most_loaded: int):
+        self._contents, self._most, self._lock = contents, most_loaded, Lock()
         self._loaded: OrderedDict[int, LoadedKeyframe] = OrderedDict()
-        scenes, numbers, descriptors = [], [], []
-        for scene, keyframes in enumerate(maps.keyframes):
-            if keyframes is None or keyframes.descriptors is None:
-                continue
-            scenes.append(np.full(len(keyframes), scene))
-            numbers.append(np.arange(len(keyframes)))
-            descriptors.append(keyframes.descriptors.float())
-        self.scene = np.concatenate([np.zeros(0, int), *scenes])
-        self._number = np.concatenate([np.zeros(0, int), *numbers])
-        self._descriptors = torch.cat(descriptors).to(maps.device) if descriptors else None
+        keyframes = [scene.keyframes for scene in contents.scenes]
+        counts = [len(k) for k in keyframes]
+        self.scene = np.repeat(np.arange(len(counts)), counts)
+        self._number = np.concatenate([np.arange(count) for count in counts])
+        descriptors = [k.descriptors for k in keyframes if k.descriptors is not None]
+        self._descriptors = torch.cat(descriptors).float().to(contents.device)
+
+    @property
+    def encoder(self) -> Encoder:
+        """The encoder of the map."""
+        return self._contents.encoder
 
     def __len__(self) -> int:
         return len(self.scene)
 
     def retrieve(self, features: Tensor, scenes: Sequence[int]) -> NDArray[np.int64]:
-        """The keyframes of some scenes, those whose descriptors are most alike first.
+        """Rank the keyframes of given scenes by the similarity of their descriptors.
 
-        One product of a matrix and a vector: 3 ms for 10,000 keyframes, so no index is needed.
+        One matrix-vector product: 3 ms for 10,000 keyframes, so no index is needed.
 
         Args:
             features: (cells, channels) of the query, on the encoder's device.
-            scenes: scenes in question.
+            scenes: indices of the scenes.
         """
-        if self._descriptors is None:
-            return np.zeros(0, np.int64)
-        likeness = (self._descriptors @ vlad_for(self._maps.encoder)(features)).cpu().numpy()
-        order = np.argsort(-likeness, kind="stable")
+        vlad = vlad_for(self._contents.encoder)(features)
+        similarity = (self._descriptors @ vlad).cpu().numpy()
+        order = np.argsort(-similarity, kind="stable")
         return order[np.isin(self.scene[order], scenes)]
 
     def load(self, index: int) -> LoadedKeyframe:
@@ -157,6 +159,4 @@ class KeyframeBank:
             return self._loaded[index]
 
     def _read(self, scene: int, number: int) -> LoadedKeyframe:
-        keyframes = self._maps.keyframes[scene]
-        assert keyframes is not None, "only keyframes are in the bank"
-        return LoadedKeyframe(self._maps, keyframes, number)
+        return LoadedKeyframe(self._contents, self._contents.scenes[scene].keyframes, number)

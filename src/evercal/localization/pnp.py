@@ -1,12 +1,13 @@
-"""Pose from 2D-3D matches: PoseLib's LO-RANSAC, capped, and the covariance of what it found."""
+"""Pose from 2D-3D matches: PoseLib's LO-RANSAC with a cap, and the covariance of the pose."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from evercal.geometry.pose_covariance import with_translation_by
-from evercal.geometry.se3 import SE3
-from evercal.localization.pose_refinement import linearised
+from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.localization.pose_refinement import in_parent_axes, linearise
+
+MIN_INLIERS = 6
 
 
 @dataclass(frozen=True)
@@ -14,76 +15,73 @@ class PnpOptions:
     """RANSAC settings."""
 
     threshold_px: float = 5.0
-    """Reprojection error up to which a match is an inlier, pixels at working size."""
+    """Reprojection error below which a match is an inlier, pixels at working size."""
     max_iterations: int = 1000
-    """Cap: on a forgotten scene no sample ever fits, and an uncapped search would crawl."""
+    """Cap on the iterations, for images without any consistent sample."""
     min_iterations: int = 100
-    """RANSAC iterations made in any case."""
+    """Iterations that always run."""
 
 
 @dataclass(frozen=True, eq=False)
 class PnpResult:
-    """A pose and what supports it."""
+    """A pose and its inliers."""
 
-    world_from_camera: SE3
-    """In the frame of the points."""
+    pose: UncertainPose
+    """From the frame of the points to the camera's: points_from_camera."""
     inliers: np.ndarray
     """(n,) bool."""
-    covariance: np.ndarray
-    """(6, 6), see `pose_covariance`."""
 
 
 def solve_pnp(
-    pixels: np.ndarray, points_m: np.ndarray, intrinsics: np.ndarray, options: PnpOptions
+    pixels: np.ndarray, points_m: np.ndarray, camera: Camera, options: PnpOptions
 ) -> PnpResult | None:
-    """Robust pose of a pinhole camera.
+    """Estimate the pose of a camera from 2D-3D matches.
 
     Args:
-        pixels: (n, 2) in the ideal pinhole.
+        pixels: (n, 2) in the ideal pinhole of the camera.
         points_m: (n, 3) matching points.
-        intrinsics: (4,) fx, fy, cx, cy.
+        camera: intrinsics; its distortion is ignored.
         options: RANSAC settings.
 
     Returns:
-        The pose, or None when no pose has at least 6 inliers.
+        The pose, or None for fewer than 6 inliers.
     """
     import poselib
 
-    fx, fy, cx, cy = (float(value) for value in intrinsics)
-    # The image size plays no part in PINHOLE; PoseLib only wants it there.
-    camera = {"model": "PINHOLE", "width": 0, "height": 0, "params": [fx, fy, cx, cy]}
+    # PoseLib does not use the image size of a PINHOLE camera.
+    parameters = [camera.fx, camera.fy, camera.cx, camera.cy]
+    pinhole = {"model": "PINHOLE", "width": 0, "height": 0, "params": parameters}
     ransac = {
         "max_reproj_error": options.threshold_px,
         "max_iterations": options.max_iterations,
         "min_iterations": options.min_iterations,
-        # The library would try three times as often as its own bound asks for.
+        # The default multiplies the number of iterations that the inlier ratio asks for by three.
         "dyn_num_trials_mult": 1.0,
     }
-    pose, info = poselib.estimate_absolute_pose(pixels, points_m, camera, ransac, {})
+    pose, info = poselib.estimate_absolute_pose(pixels, points_m, pinhole, ransac, {})
     inliers = np.asarray(info["inliers"], bool)
-    if len(inliers) != len(pixels) or inliers.sum() < 6 or not np.isfinite(pose.t).all():
+    enough = len(inliers) == len(pixels) and inliers.sum() >= MIN_INLIERS
+    if not enough or not np.isfinite(pose.t).all():
         return None
-    camera_from_world = SE3(np.asarray(pose.q, float), np.asarray(pose.t, float))
-    world_from_camera = camera_from_world.inverse()
-    covariance = pose_covariance(pixels[inliers], points_m[inliers], intrinsics, world_from_camera)
-    return PnpResult(world_from_camera, inliers, covariance)
+    points_from_camera = SE3(np.asarray(pose.q, float), np.asarray(pose.t, float)).inverse()
+    covariance = pose_covariance(pixels[inliers], points_m[inliers], camera, points_from_camera)
+    return PnpResult(UncertainPose(points_from_camera, covariance), inliers)
 
 
 def pose_covariance(
-    pixels: np.ndarray, points_m: np.ndarray, intrinsics: np.ndarray, world_from_camera: SE3
+    pixels: np.ndarray, points_m: np.ndarray, camera: Camera, points_from_camera: SE3
 ) -> np.ndarray:
     """First-order covariance from the reprojection Jacobian, sigma^2 (J^T J)^-1.
 
-    Perturbations: translation t + dt in the world frame, rotation R Exp(dr) in the camera frame.
     sigma^2 is the mean squared residual per coordinate.
 
     Returns:
-        (6, 6) of (dt in metres, dr in radians).
+        (6, 6), see `UncertainPose`.
     """
-    turn = world_from_camera.rotation_matrix()
-    place = world_from_camera.translation_m
-    residual, slope = linearised(pixels, points_m, turn, place, intrinsics)
+    rotation = points_from_camera.rotation_matrix()
+    position = points_from_camera.translation_m
+    residual, slope = linearise(pixels, points_m, rotation, position, camera)
     rows = slope.transpose(1, 0, 2).reshape(6, -1)
     variance = float((residual**2).mean()) + 1e-6
     covariance = variance * np.linalg.pinv(rows @ rows.T, hermitian=True)
-    return with_translation_by(turn, covariance)
+    return in_parent_axes(rotation, covariance)

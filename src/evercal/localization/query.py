@@ -1,4 +1,4 @@
-"""What travels through localization: options, the image, scenes to try and the poses found."""
+"""Options of localization, the prepared image, candidate scenes and pose hypotheses."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -8,24 +8,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evercal.features.views import working_image
-from evercal.geometry.camera import Camera
-from evercal.geometry.se3 import SE3
+from evercal.geometry import Camera, UncertainPose
 from evercal.localization.alignment import AlignmentOptions
 from evercal.localization.pnp import PnpOptions
 from evercal.mapping.patches import image_pyramid
 
-FULL_SUPPORT = 4.0
-"""From here on the residuals alone tell the covariance (docs/experiments/map.md)."""
-
 
 @dataclass(frozen=True)
 class Attempt:
-    """How much work an image gets."""
+    """Effort of one attempt to locate an image."""
 
     retrieved: int
     """Keyframes that the global descriptor proposes."""
     match_stride: int
-    """Every so many-th row and column of patches is matched to the keyframes."""
+    """Matches every n-th row and column of patches."""
 
 
 @dataclass(frozen=True)
@@ -33,55 +29,51 @@ class LocalizeOptions:
     """How an image is located."""
 
     candidates: int = 3
-    """At most this many scenes are tried for an image."""
+    """Scenes that are tried per image, at most."""
     attempts: tuple[Attempt, ...] = (Attempt(12, 2), Attempt(48, 1), Attempt(200, 1))
-    """Where no pose is accepted, the next attempt follows."""
-    sure: float = 2.0
-    """After the first attempt a pose is taken at once where its support is so many times what is
-    needed; else the second attempt follows, and the better pose is taken."""
-    clear: float = 1.5
-    """Poses with less support are looked for again by guided matching: alignment may have settled
-    beside the true pose, so patches are matched only to points that they would show near
-    themselves from the pose found so far; PnP and alignment follow,"""
-    gain: float = 1.1
-    """as long as the support rises by this factor."""
+    """Attempts in order; the next one runs while no pose is accepted."""
+    immediate: float = 2.0
+    """A pose of the first attempt is final if its support is this many times the threshold.
+    Otherwise the second attempt runs and the pose with more support is taken."""
+    guided_below: float = 1.5
+    """Poses with less support are matched again near the current pose. Alignment may have converged
+    beside the true pose: guided matching, PnP and alignment repeat while the support rises."""
+    guided_gain: float = 1.1
+    """Factor by which guided matching must raise the support to go on."""
     guided_px: float = 32.0
-    """How near: pixels at the encoder's working size."""
+    """Search radius of guided matching, pixels at the encoder's working size."""
     keyframes: int = 6
-    """Keyframes of a scene that an image is matched to and aligned with."""
+    """Keyframes of a scene that an image is matched and aligned to."""
     retrieval_stride: int = 16
-    """Every so many-th patch of the image votes for the proposed keyframes."""
+    """Every n-th patch of the image votes for the proposed keyframes."""
     votes: float = 0.2
     """Scenes with a smaller share of the best scene's votes are not tried."""
-    margin: float = 0.15
-    """Without keyframes: scenes whose best prototype is less similar than the best scene's by more
-    are not tried."""
     pnp: PnpOptions = field(default_factory=PnpOptions)
     """RANSAC settings of the first pose."""
     align: bool = True
-    """Refine the first pose by the landmarks of the map; else it is the answer."""
+    """Refine the first pose by alignment of landmarks. False returns the PnP pose."""
     alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
-    """How landmarks are looked for."""
+    """Alignment of landmarks."""
     patches_short_side: int = 480
-    """Landmarks are looked for in the image at this short side at most, pixels."""
+    """Short side of the image that landmarks are aligned in, pixels, at most."""
     loaded_keyframes: int = 256
     """Keyframes that stay decoded in memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """An image on its way."""
+    """An image to be located."""
 
     image: np.ndarray
     """(h, w, 3) or (h, w) uint8."""
     features: Tensor
     """(channels, rows, columns) on the encoder's device."""
     short_side: int
-    """Of `grey` at most, pixels."""
+    """Short side of `grey`, pixels, at most."""
 
     @cached_property
     def grey(self) -> np.ndarray:
-        """The image that landmarks are looked for in."""
+        """The image that landmarks are aligned in."""
         height, width = self.image.shape[:2]
         plain = Camera(width, height, 1, 1, 0, 0)
         return working_image(self.image, plain, min(self.short_side, height, width))[0]
@@ -94,42 +86,51 @@ class Query:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A scene to try, with its keyframes that look like the image, best first."""
+    """A scene to try."""
 
     scene: int
+    """Index of the scene."""
     keyframes: NDArray[np.int64]
+    """Its keyframes in the bank, most similar first."""
     match_stride: int = 1
+    """See `Attempt.match_stride`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """2D-3D matches of an image in one scene."""
+
+    pixels: np.ndarray
+    """(m, 2) in the ideal pinhole, at the encoder's working size."""
+    points_m: np.ndarray
+    """(m, 3) in the scene's frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A pose for one image under the assumption that it shows one scene."""
+    """A pose of the image, assuming that it shows one scene."""
 
     scene: int
-    pose: SE3 | None = None
-    """base_from_camera, as the map has it."""
-    covariance: np.ndarray | None = None
-    inliers: int = 0
-    ratio: float = 0.0
+    """Index of the scene."""
+    pose: UncertainPose | None = None
+    """map_from_camera; None where PnP failed."""
     pixels: np.ndarray | None = None
+    """(n, 2) inliers, pixels at the encoder's working size."""
     points_m: np.ndarray | None = None
-    aligned: bool = False
+    """(n, 3) their landmarks in the map's frame."""
+    expected: int = 0
+    """Landmarks that should be visible and were searched."""
     matched: int = 0
+    """Landmarks whose patch was found near the expected position."""
     planned: int = 0
+    """Landmarks that an unobstructed image would have been searched for."""
 
     @property
-    def support(self) -> float:
-        """What the scene's threshold is compared with, see `localization.acceptance`."""
-        if not self.aligned:
-            return self.ratio * self.inliers**0.5
-        exact = self.inliers / max(1, self.matched)
-        return self.ratio * exact**2 * (self.ratio * self.planned) ** 0.5
+    def inliers(self) -> int:
+        """Landmarks that agree with the pose."""
+        return 0 if self.pixels is None else len(self.pixels)
 
     @property
-    def doubt(self) -> float:
-        """Factor on the covariance of an aligned pose.
-
-        The fewer landmarks support it, the more their errors go together: they lie on few surfaces,
-        seen from afar.
-        """
-        return max(1.0, FULL_SUPPORT / self.support) if self.aligned and self.inliers else 1.0
+    def inlier_ratio(self) -> float:
+        """Inliers as a share of the landmarks that should be visible."""
+        return self.inliers / max(self.expected, 1)

@@ -18,7 +18,7 @@ from scipy.linalg import lapack
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry.camera import Camera
-from evercal.geometry.pose_covariance import cross_matrix
+from evercal.geometry import cross_matrix
 from evercal.geometry.se3 import SE3
 from evercal.mapping.jacobians import (
     COMMON,

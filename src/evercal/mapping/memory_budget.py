@@ -1,52 +1,78 @@
-"""How much of a scene is kept, as people write it: a share of its frames, or bytes."""
+"""How many keyframes a scene keeps: a share of its frames, a size in bytes, or the fewest needed."""
 
-import dataclasses
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from evercal.errors import InputError
-
-if TYPE_CHECKING:
-    from evercal.continual.stage import StageOptions
+from evercal.mapping.keyframes import Keyframes, store_keyframes
+from evercal.mapping.selection import spread_poses
+from evercal.recordings.frame import Frame
 
 AUTO = "auto"
-"""As few keyframes as locate the recording's other frames well."""
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
 _UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
+_SAMPLED_FRAMES = 8
+"""Frames whose size as keyframes is measured, for a budget in bytes."""
 
 
-def parse_memory(memory: str | int) -> tuple[float | None, int | None]:
-    """(share of the frames, None) of `10%`, or (None, bytes) of `5MB`, `512KiB`, `100000`.
+@dataclass(frozen=True)
+class MemoryBudget:
+    """Memory of one scene."""
 
-    Raises:
-        InputError: Neither, or nothing at all to keep keyframes in.
-    """
-    match = re.fullmatch(
-        r"\s*(\d+(?:\.\d+)?)\s*(%|[kmg]?i?b?)\s*", str(memory), re.IGNORECASE | re.ASCII
-    )
-    unit = match[2].upper() if match else ""
-    if match and unit == "%" and 0 < float(match[1]) <= 100:
-        return float(match[1]) / 100, None
-    if match and unit in _UNITS and float(match[1]) * _UNITS[unit] >= 1:
-        return None, int(float(match[1]) * _UNITS[unit])
-    raise InputError(
-        f"memory {memory}: give a share of the frames above 0% and up to 100%, or bytes such as"
-        f" 500kB, 5MB or 5MiB, or auto"
-    )
+    share: float = 0.10
+    """Keyframes as a share of the training frames."""
+    bytes: int | None = None
+    """Size of the keyframes instead, at most."""
+    auto: bool = False
+    """Keep the fewest keyframes that locate the recording's other frames well."""
 
+    @classmethod
+    def parse(cls, memory: str | int) -> "MemoryBudget":
+        """Read a budget as people write it: `10%`, `5MB`, `512KiB`, `100000` or `auto`.
 
-def with_memory(stage: "StageOptions", memory: str | int) -> "StageOptions":
-    """The options with as much memory.
+        Raises:
+            InputError: Another word, or a budget without room for a keyframe.
+        """
+        text = str(memory).strip()
+        if text.lower() == AUTO:
+            return cls(auto=True)
+        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(%|[kmg]?i?b?)", text, re.IGNORECASE | re.ASCII)
+        unit = match[2].upper() if match else ""
+        if match and unit == "%" and 0 < float(match[1]) <= 100:
+            return cls(share=float(match[1]) / 100)
+        if match and unit in _UNITS and float(match[1]) * _UNITS[unit] >= 1:
+            return cls(bytes=int(float(match[1]) * _UNITS[unit]))
+        raise InputError(
+            f"memory {memory}: give a share of the frames above 0% and up to 100%, a size such as"
+            " 500kB, 5MB or 5MiB, or auto"
+        )
 
-    Args:
-        stage: how a scene is learned.
-        memory: see `parse_memory`, or `auto`.
+    def capacity(self, frames: Sequence[Frame], short_side: int) -> int:
+        """Number of keyframes, at least 1.
 
-    Raises:
-        InputError: as `parse_memory`.
-    """
-    if str(memory).strip().lower() == AUTO:
-        return dataclasses.replace(stage, memory_auto=True, memory_bytes=None)
-    share, count = parse_memory(memory)
-    kept = stage.memory_share if share is None else share
-    return dataclasses.replace(stage, memory_share=kept, memory_bytes=count, memory_auto=False)
+        For a budget in bytes, as many as fit by the size of their images, from a sample.
+
+        Args:
+            frames: training frames of the scene.
+            short_side: shorter side of stored images, pixels.
+        """
+        if self.bytes is None:
+            return max(1, int(self.share * len(frames) + 1e-9))
+        sample = frames[:: -(-len(frames) // _SAMPLED_FRAMES)]
+        one = store_keyframes(sample, short_side).bytes / len(sample)
+        return min(len(frames), max(1, int(self.bytes / one)))
+
+    def fitting(self, keyframes: Keyframes) -> NDArray[np.int64]:
+        """Indices of the keyframes that fit into the budget: spread by pose, at least one."""
+        total = len(keyframes)
+        if self.bytes is None or keyframes.bytes <= self.bytes:
+            return np.arange(total)
+        for count in range(min(total - 1, total * self.bytes // keyframes.bytes + 1), 1, -1):
+            selected = spread_poses(keyframes.base_from_camera, count)
+            if keyframes.take(selected).bytes <= self.bytes:
+                return selected
+        return np.arange(1)

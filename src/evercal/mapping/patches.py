@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.geometry import resize_pixels
+
 Array = NDArray[np.floating]
 
 RADIUS = 5
@@ -43,13 +45,13 @@ def image_pyramid(grey: np.ndarray, levels: int) -> list[Array]:
 
 
 def to_level(pixels: Array, level: int) -> Array:
-    """Pixels (n, 2) of level 0 in another level of the pyramid; pixel centres are whole numbers."""
-    return (pixels + 0.5) / 2**level - 0.5
+    """Pixels (n, 2) of level 0 in another level of the pyramid."""
+    return resize_pixels(pixels, 0.5**level)
 
 
 def from_level(pixels: Array, level: int) -> Array:
     """The inverse of `to_level`."""
-    return (pixels + 0.5) * 2**level - 0.5
+    return resize_pixels(pixels, 2**level)
 
 
 @dataclass(frozen=True, eq=False)

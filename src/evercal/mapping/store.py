@@ -1,429 +1,265 @@
-"""`Store`: the only code that knows what a store contains. It opens without anything that learns.
+"""`MapStore`: a map on disk.
 
-    STORE/
-      manifest.json                 written last, by atomic replace; sha256 of every file
-      encoder-SHA.safetensors       the networks that the stages were made with
-      descriptor-SHA.safetensors
-      vlad-SHA.safetensors          where maps are made with another encoder than the shipped one
-      stages/0001-NAME/
-        scene.json                  camera, cell, thresholds
-        head.safetensors            weights (fp16, centres fp32); of a shared head only the
-                                    newest stage's remains
-        memory.safetensors          remembered frames
-        notes.safetensors           what else the strategy keeps of the scene
-        prototypes.safetensors
-        report.json
-      learning/                     checkpoints of an interrupted stage
-
-What the manifest does not list is no part of the store. One process at a time writes into it; a
-lock beside the folder keeps others out. Readers need none.
+stages/0001-NAME/
+  scene.json               cameras, acceptance thresholds, relation to the base frame
+  keyframes.safetensors    images, poses, depths, landmarks, descriptors
+  correction.safetensors   slowly varying corrections, where there are any
+  report.json
 """
 
 import hashlib
 import json
-import re
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
+import numpy as np
 import torch
-from filelock import FileLock, Timeout
-from torch import Tensor, nn
+from torch import nn
 
-from evercal.continual.networks.descriptor import PooledDescriptor, descriptor_for, load_descriptor
 from evercal.errors import InputError
-from evercal.features.encoder import Encoder, checked_encoder, load_encoder
+from evercal.features.encoder import Encoder, checked_encoder, load_encoder, own_encoder
 from evercal.features.vlad import load_centroids, save_centroids, shipped_centroids
 from evercal.features.weights_file import network_bytes
+from evercal.geometry import SE3, Camera
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord
-from evercal.mapping.stage_files import (
-    HEAD,
-    load_tensors,
-    own_encoder,
-    read_head,
-    read_record,
-    save_tensors,
-    write_head,
-    write_record,
-)
-from evercal.storage.atomic import replace_folder, write_bytes, write_json
-from evercal.storage.manifest import MANIFEST, Manifest, write_manifest
+from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity
+from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.storage.atomic import write_bytes, write_json
+from evercal.storage.manifest import Manifest
+from evercal.storage.stages import StageStore, is_store, read_store, write_report
+from evercal.storage.tensors import load_tensors, save_tensors
 
-SCHEMA = 3
-LEARNING = "learning"
-STAGES = "stages"
-MEMORY_FILES = ("memory.safetensors", "notes.safetensors")
-STAGE_FILES = (HEAD, *MEMORY_FILES, "prototypes.safetensors", "report.json", "scene.json")
+STRATEGY = "evercal"
+"""Name of the map among the strategies of `evercal learn`."""
+SCENE, KEYFRAMES, CORRECTION = "scene.json", "keyframes.safetensors", "correction.safetensors"
 
 
-@dataclass
-class Checkpoint:
-    """A state from which learning can go on; only what is new since the last one."""
-
-    rows: Mapping[str, Tensor]
-    """Feature rows encoded since the last checkpoint; empty when there are none."""
-    trainer: Mapping[str, Tensor]
-    """State of the training; empty while the encoder is at work."""
-
-
-@dataclass
-class Resume:
-    """What checkpoints left behind."""
-
-    rows: Sequence[Mapping[str, Tensor]]
-    """The `rows` of all checkpoints in order."""
-    trainer: Mapping[str, Tensor]
-    """The last non-empty `trainer`."""
-
-
-class Store:
-    """A store on disk and what it knows.
+class MapStore(StageStore):
+    """A map on disk and in memory.
 
     Args:
         root: folder of the store.
-        maps: what it knows.
-        stages: folder names of the stages, in order.
-        networks: file names of encoder and descriptor, and of centroids where there are some.
+        contents: encoder and scenes.
+        stages: folder names of the scenes, in order.
+        networks: file names of the encoder and, for an encoder that is not shipped, its centroids.
     """
 
     def __init__(
-        self, root: Path, maps: SceneMaps, stages: list[str], networks: tuple[str, ...] | None
-    ):
-        self.root, self.maps, self.stages, self.networks = root, maps, stages, networks
-        place = root.resolve()  # one lock, by whatever name the store is called
-        self._lock = FileLock(place.parent / f".{place.name}.lock")
-
-    @classmethod
-    def create(
-        cls,
+        self,
         root: Path,
-        strategy: str,
-        short_side: int = 240,
-        encoder: Path | nn.Module | None = None,
-    ) -> Self:
-        """An empty store; nothing is written before the first `commit`.
-
-        Args:
-            root: folder of the store to be.
-            strategy: name of how scenes are learned into it; code that learns knows what it means.
-            short_side: working size of images, pixels.
-            encoder: another encoder than the shipped one: a file (its sibling
-                `descriptor.safetensors` is taken too, if it fits), or any module that is an
-                `Encoder`; `open` then needs the module again.
-
-        Raises:
-            InputError: `root` holds something that is not a store, or a bad encoder.
-        """
-        if root.exists() and not _free(root):
-            raise InputError(f"store {root}: exists and is not an evercal store; give another path")
-        if encoder is None:
-            networks = load_encoder(), load_descriptor()
-        elif isinstance(encoder, Path):
-            found = load_encoder(encoder)
-            networks = found, descriptor_for(encoder, found.width)
-        else:
-            networks = checked_encoder(encoder), PooledDescriptor(checked_encoder(encoder).width)
-        return cls(root, SceneMaps(*networks, strategy, short_side), [], None)
+        contents: MapContents,
+        stages: list[str] | None = None,
+        networks: tuple[str, ...] = (),
+    ):
+        super().__init__(root, stages or [], networks)
+        self.contents = contents
 
     @classmethod
     def open(cls, root: Path, encoder: nn.Module | None = None) -> Self:
-        """Opens a store at its last complete stage.
+        """Open a map at its last complete scene.
 
         Args:
             root: folder of the store.
-            encoder: only for a store made with a module of one's own: that module; its weights are
-                replaced by those in the store.
+            encoder: the module of a store that was made with a module of the caller's own; its
+                weights are replaced by those in the store.
 
         Raises:
-            InputError: not a store, a file missing or not matching its checksum.
+            InputError: Not a map, or a file is missing or was changed.
         """
-        while True:
-            manifest = Manifest.read(root)
-            try:
-                return cls._opened(root, manifest, encoder)
-            except (InputError, OSError):
-                # Where a writer has replaced files meanwhile, nothing is wrong with the store.
-                if Manifest.read(root) == manifest:
-                    raise
+
+        def read(manifest: Manifest) -> Self:
+            payload = manifest.payload
+            if payload.get("strategy") != STRATEGY:
+                raise InputError(
+                    f"store {root}: holds networks of strategy {payload.get('strategy')!r}, not a"
+                    " map"
+                )
+            first, *centroids = (str(name) for name in payload["networks"])
+            path = root / first
+            local = load_encoder(path) if encoder is None else own_encoder(encoder, path)
+            for name in centroids:
+                load_centroids(local, root / name)
+            contents = MapContents(local, int(payload["short_side"]))
+            stages = [str(name) for name in payload["stages"]]
+            store = cls(root, contents, stages, (first, *centroids))
+            contents.scenes = [read_scene(store.folder(name)) for name in stages]
+            return store
+
+        return read_store(root, read)
 
     @classmethod
-    def _opened(cls, root: Path, manifest: Manifest, encoder: nn.Module | None) -> Self:
-        payload = manifest.payload
-        _check_files(root, manifest)
-        schema = payload.get("schema")
-        if isinstance(schema, int) and schema < SCHEMA:
-            raise InputError(
-                f"store {root}: schema {schema} is of an earlier evercal; learn the scenes again"
-                " into a new store"
-            )
-        if schema != SCHEMA:
-            raise InputError(f"store {root}: schema {schema!r} is not {SCHEMA}; update evercal")
-        local, descriptor = (str(name) for name in payload["networks"])
-        maps = SceneMaps(
-            load_encoder(root / local) if encoder is None else own_encoder(encoder, root / local),
-            load_descriptor(root / descriptor),
-            str(payload["strategy"]),
-            int(payload["short_side"]),
-        )
-        centroids = tuple(str(name) for name in payload.get("centroids", []))
-        for name in centroids:
-            load_centroids(maps.encoder, root / name)
-        stages = [str(name) for name in payload["stages"]]
-        for name in stages:
-            folder = root / STAGES / name
-            maps.scenes.append(read_record(folder))
-            kept, state = (
-                load_tensors(folder / file) if f"{STAGES}/{name}/{file}" in manifest.files else {}
-                for file in MEMORY_FILES
-            )
-            maps.keyframes.append(Keyframes.from_tensors(kept) if kept else None)
-            maps.method_states.append(state)
-            if f"{STAGES}/{name}/{HEAD}" in manifest.files:
-                maps.heads.append(read_head(folder, maps.encoder.width))
-        return cls(root, maps, stages, (local, descriptor, *centroids))
-
-    @contextmanager
-    def writing(self) -> Iterator[Manifest | None]:
-        """Keeps every other writer out, for as long as this store is being changed.
-
-        `commit` and `replace_record` do so by themselves; who works long for what they will write
-        does it before.
-
-        Yields:
-            The manifest that will be replaced; None where there is none yet.
-
-        Raises:
-            InputError: another process is writing into the store, or has done so since it was
-                opened; it cannot be written.
-        """
-        lock = Path(self._lock.lock_file)
-        try:
-            lock.parent.mkdir(parents=True, exist_ok=True)
-            self._lock.acquire(timeout=0)
-        except Timeout:
-            raise InputError(
-                f"store {self.root}: another process is learning into it or aligning it; wait until"
-                " it has finished"
-            ) from None
-        except OSError as error:
-            raise InputError(f"store {self.root}: cannot be written ({error.strerror})") from error
-        try:
-            known = (self.root / MANIFEST).exists()
-            before = Manifest.read(self.root) if known else None
-            if self.stages != (before.payload["stages"] if before else []):
-                raise InputError(
-                    f"store {self.root}: another process has changed it meanwhile; run this again"
-                )
-            yield before
-        finally:
-            if self._lock.lock_counter == 1:
-                lock.unlink(missing_ok=True)
-            self._lock.release()
-
-    def commit(self, maps: SceneMaps, report: Mapping[str, object]) -> None:
-        """Adds the newest scene of `maps` to the store: whole, or not at all.
+    def create(
+        cls, root: Path, encoder: Path | nn.Module | None = None, short_side: int = 240
+    ) -> Self:
+        """An empty map; nothing is written before the first `commit`.
 
         Args:
-            maps: the outcome of a stage.
-            report: what `report.json` says.
+            root: folder of the store to be; it must not exist or be empty.
+            encoder: a weights file or a module that is an `Encoder`. Default: the shipped weights.
+            short_side: shorter image side that the encoder works on, pixels.
 
         Raises:
-            InputError: as `writing`.
+            InputError: `root` holds something else, or a bad encoder.
         """
-        record, keyframes = maps.scenes[-1], maps.keyframes[-1]
-        # A scene may be called anything, a folder may not.
-        legal = re.sub(r"[^\w.-]", "_", record.name)[:60]
-        name = f"{len(self.stages) + 1:04d}-{legal}"
-        with self.writing() as before:
-            folder = self._fresh(name)
-            self.networks = self.networks or self._write_networks(maps)
-            if keyframes is not None and keyframes.descriptors is not None:
-                self.networks = self._with_centroids(maps.encoder, self.networks)
-            write_record(folder, record)
-            if maps.heads:
-                write_head(folder, maps.heads[-1])
-            if keyframes is not None:
-                save_tensors(folder / "memory.safetensors", keyframes.to_tensors())
-            if maps.method_states[-1]:
-                save_tensors(folder / "notes.safetensors", maps.method_states[-1])
-            write_json(folder / "report.json", report)
-            self._publish(maps, [*self.stages, name], name, before)
-            shutil.rmtree(self.root / LEARNING, ignore_errors=True)
+        if root.exists() and not is_free(root):
+            raise InputError(f"store {root}: exists and is not an evercal store; give another path")
+        if isinstance(encoder, nn.Module):
+            local: Encoder = checked_encoder(encoder)
+        else:
+            local = load_encoder() if encoder is None else load_encoder(encoder)
+        return cls(root, MapContents(local, short_side))
 
-    def replace_record(self, scene: str, record: SceneRecord) -> None:
-        """Puts another record in the place of a scene's: whole, or not at all.
-
-        Args:
-            scene: name of the scene.
-            record: its new record.
+    @classmethod
+    def open_or_create(cls, root: Path, encoder: Path | nn.Module | None = None) -> Self:
+        """The map at a path, or a new one.
 
         Raises:
-            InputError: as `writing`, and where a file is missing or was changed.
+            InputError: As `open` and `create`; an encoder file for a map that has one.
         """
-        index = [known.name for known in self.maps.scenes].index(scene)
-        old = self.stages[index]
-        number, _, name = old.partition("-")
-        plain, _, version = name.partition("~")
-        new = f"{number}-{plain}~{int(version or 1) + 1}"
-        with self.writing() as before:
-            assert before is not None, "a store with stages has a manifest"
-            _check_files(self.root, before)  # copies are listed with checksums of their own
-            folder = self._fresh(new)
-            for file in STAGE_FILES:
-                if f"{STAGES}/{old}/{file}" in before.files:
-                    shutil.copyfile(self.root / STAGES / old / file, folder / file)
-            write_record(folder, record)
-            stages = [*self.stages[:index], new, *self.stages[index + 1 :]]
-            self._publish(self.maps, stages, new, before)
-            self.maps.scenes[index] = record
+        if not is_store(root):
+            return cls.create(root, encoder)
+        if isinstance(encoder, Path):
+            raise InputError(f"encoder {encoder}: store {root} keeps the encoder it was made with")
+        return cls.open(root, encoder)
 
-    def _fresh(self, stage: str) -> Path:
-        """An empty folder in which a stage is made ready."""
-        folder = self.root / STAGES / f".{stage}"
-        shutil.rmtree(folder, ignore_errors=True)  # left by a commit that was killed
-        folder.mkdir(parents=True)
-        return folder
-
-    def _publish(
-        self, maps: SceneMaps, stages: list[str], new: str, before: Manifest | None
-    ) -> None:
-        """Puts a new stage in place and writes the manifest; from then on `stages` are the store.
-
-        The other stages keep the files that the manifest lists of them.
-        """
-        assert self.networks is not None, "a store with stages has its networks"
-        folder, shared = self.root / STAGES / new, len(maps.heads) == 1
-        replace_folder(self.root / STAGES / f".{new}", folder)
-        made = [file for file in STAGE_FILES if (folder / file).exists()]
-        listed = [*self.networks, *(f"{STAGES}/{new}/{file}" for file in made)]
-        for file in before.files if before else ():
-            stage, _, name = file.removeprefix(f"{STAGES}/").partition("/")
-            superseded = shared and stage != stages[-1] and name == HEAD
-            if stage in stages and not superseded:
-                listed.append(file)
-        payload = {
-            "schema": SCHEMA,
-            "strategy": maps.strategy,
-            "short_side": maps.short_side,
-            "networks": list(self.networks[:2]),
-            "centroids": list(self.networks[2:]),
-            "stages": stages,
-        }
-        write_manifest(self.root, payload, listed, before)
-        self.maps, self.stages = maps, stages
-        self._tidy(shared)
-
-    def _tidy(self, shared: bool) -> None:
-        """Removes what nothing refers to any more, also what killed commits left."""
-        if shared:
-            for stage in self.stages[:-1]:
-                (self.root / STAGES / stage / HEAD).unlink(missing_ok=True)
-        for folder in (self.root / STAGES).iterdir():
-            if folder.name not in self.stages and re.match(r"\.?\d{4}-", folder.name):
-                shutil.rmtree(folder, ignore_errors=True)
-        for unfinished in self.root.glob(".*.tmp"):
-            if unfinished.name.startswith((f".{MANIFEST}", ".encoder", ".descriptor", ".vlad")):
-                unfinished.unlink(missing_ok=True)
-
-    def _with_centroids(self, encoder: Encoder, networks: tuple[str, ...]) -> tuple[str, ...]:
-        """File names of the networks, with the centroids that descriptors are made with.
-
-        The shipped encoder's are at hand; others take seconds to fit, and from weights in half
-        precision come out a little different.
-        """
-        first, *others = networks
-        if len(others) > 1 or shipped_centroids(encoder) is not None:
-            return networks
-        name = first.replace("encoder", "vlad", 1)
-        save_centroids(encoder, self.root / name)
-        return *networks, name
-
-    def _write_networks(self, maps: SceneMaps) -> tuple[str, ...]:
-        names = []
-        for kind, module in (("encoder", maps.encoder), ("descriptor", maps.descriptor)):
-            assert isinstance(module, torch.nn.Module)
-            data = network_bytes(module, kind)
-            names.append(f"{kind}-{hashlib.sha256(data).hexdigest()[:12]}.safetensors")
-            write_bytes(self.root / names[-1], data)
-        return tuple(names)
-
-    def begin(self, identity: Mapping[str, object]) -> Resume | None:
-        """Starts or picks up a stage.
+    def commit(self, scene: SceneMap, report: Mapping[str, object]) -> None:
+        """Add a scene: whole, or not at all.
 
         Args:
-            identity: all that the stage depends on (scene, options, seed, stage number).
+            scene: its map.
+            report: content of its `report.json`.
 
-        Returns:
-            The checkpoints of an interrupted run of the same stage; None for a fresh start.
+        Raises:
+            InputError: Another process writes into the store, or it cannot be written.
         """
-        folder, asked = self.root / LEARNING, json.loads(json.dumps(identity))
-        try:
-            found = json.loads((folder / "stage.json").read_text())
-        except (OSError, ValueError):
-            found = None
-        if found != asked:
-            # First the name, so that half a removal is never taken for a stage to resume.
-            (folder / "stage.json").unlink(missing_ok=True)
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir(parents=True)
-            write_json(folder / "stage.json", asked)
-            return None
-        rows = [load_tensors(path) for path in sorted(folder.glob("rows-*.safetensors"))]
-        trainer = folder / "trainer.safetensors"
-        if not rows:
-            return None
-        return Resume(rows, load_tensors(trainer) if trainer.exists() else {})
 
-    def abandon(self) -> None:
-        """Drops the stage under way, and the folder too if nothing else was ever stored in it."""
-        shutil.rmtree(self.root / LEARNING, ignore_errors=True)
-        with suppress(OSError):  # it holds something, or is called `.`
-            self.root.rmdir()
+        def write(folder: Path) -> None:
+            if not self.networks:
+                self.networks = write_encoder(self.root, self.contents.encoder)
+            write_scene(folder, scene)
+            save_tensors(folder / KEYFRAMES, scene.keyframes.to_tensors())
+            write_report(folder, report)
 
-    def checkpoint(self, checkpoint: Checkpoint) -> None:
-        """Writes a checkpoint of the stage under way."""
-        folder = self.root / LEARNING
-        if checkpoint.rows:
-            number = len(list(folder.glob("rows-*.safetensors")))
-            save_tensors(folder / f"rows-{number:05d}.safetensors", checkpoint.rows)
-        if checkpoint.trainer:
-            save_tensors(folder / "trainer.safetensors", checkpoint.trainer)
+        self.add(scene.name, write, self._payload())
+        self.contents.scenes.append(scene)
 
-    def report(self) -> dict[str, Any]:
-        """What `commit` was told about the newest stage."""
-        return self.reports()[-1]
+    def update(self, scene: SceneMap) -> None:
+        """Replace what is stored of a scene beside its keyframes: whole, or not at all.
 
-    def reports(self) -> list[dict[str, Any]]:
-        """The same about every stage, in order."""
-        folders = [self.root / STAGES / name for name in self.stages]
-        return [json.loads((folder / "report.json").read_text()) for folder in folders]
+        Args:
+            scene: its map; the name says which scene is replaced.
 
-    def bytes(self) -> dict[str, int]:
-        """Size on disk: `memory` (what replay keeps) and `rest` (all else in the manifest)."""
-        files = [self.root / MANIFEST, *(self.root / name for name in self.networks or ())]
-        for stage in self.stages:
-            files += [self.root / STAGES / stage / file for file in STAGE_FILES]
-        sizes = {file: file.stat().st_size for file in files if file.exists()}
-        memory = sum(size for file, size in sizes.items() if file.name in MEMORY_FILES)
-        return {"memory": memory, "rest": sum(sizes.values()) - memory}
+        Raises:
+            InputError: As `commit`, and where a file of the store is missing or was changed.
+        """
+        index = [known.name for known in self.contents.scenes].index(scene.name)
+        self.replace(index, lambda folder: write_scene(folder, scene), self._payload())
+        self.contents.scenes[index] = scene
+
+    def _payload(self) -> dict[str, object]:
+        return {"strategy": STRATEGY, "short_side": self.contents.short_side}
 
 
-def _check_files(root: Path, manifest: Manifest) -> None:
-    problems = manifest.problems(root)
-    if problems:
-        raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
-
-
-def _free(root: Path) -> bool:
-    """Whether a store may be made here: nothing there, or a first stage that was interrupted."""
+def is_free(root: Path) -> bool:
+    """Whether a store can be made at a path: nothing there, or what a killed writer left."""
     if not root.is_dir():
         return False
-    names = [path.name for path in root.iterdir()]
-    ours = re.compile(
-        rf"{LEARNING}|{STAGES}|(encoder|descriptor|vlad)(-\w+)?\.safetensors|\..*\.tmp"
+    return all(
+        path.name == "stages" or path.name.startswith(("encoder-", "vlad-", "."))
+        for path in root.iterdir()
     )
-    return not names or (LEARNING in names and all(map(ours.fullmatch, names)))
+
+
+def write_encoder(root: Path, encoder: Encoder) -> tuple[str, ...]:
+    """Write an encoder and, if it is not the shipped one, its centroids; return the file names."""
+    assert isinstance(encoder, nn.Module), "only modules have weights"
+    data = network_bytes(encoder, "encoder")
+    name = f"encoder-{hashlib.sha256(data).hexdigest()[:12]}.safetensors"
+    write_bytes(root / name, data)
+    if shipped_centroids(encoder) is not None:
+        return (name,)
+    centroids = name.replace("encoder", "vlad", 1)
+    save_centroids(encoder, root / centroids)
+    return name, centroids
+
+
+def write_scene(folder: Path, scene: SceneMap) -> None:
+    """Write everything of a scene but its keyframes into its folder."""
+    frame = scene.frame
+    content: dict[str, object] = {
+        "name": scene.name,
+        "camera": scene.camera.to_dict(),
+        "adjusted_camera": scene.adjusted_camera.to_dict(),
+        "train_frames": scene.train_frames,
+        "min_support": scene.min_support,
+        "covariance_scale": scene.covariance_scale,
+        "frame": frame_to_dict(frame),
+    }
+    write_json(folder / SCENE, content)
+    if frame.correction is not None:
+        save_tensors(folder / CORRECTION, correction_tensors(frame.correction))
+
+
+def read_scene(folder: Path) -> SceneMap:
+    """Read a scene from its folder."""
+    content = json.loads((folder / SCENE).read_text())
+    correction = None
+    if (folder / CORRECTION).exists():
+        correction = correction_of(load_tensors(folder / CORRECTION))
+    return SceneMap(
+        name=content["name"],
+        camera=Camera.from_dict(content["camera"]),
+        adjusted_camera=Camera.from_dict(content["adjusted_camera"]),
+        keyframes=Keyframes.from_tensors(load_tensors(folder / KEYFRAMES)),
+        frame=frame_of(content["frame"], correction),
+        train_frames=content["train_frames"],
+        min_support=content["min_support"],
+        covariance_scale=content["covariance_scale"],
+    )
+
+
+def frame_to_dict(frame: MapFrame) -> dict[str, object]:
+    """A map's frame as JSON values, without its slowly varying corrections."""
+    similarity, covariance = frame.similarity, frame.base_covariance
+    return {
+        "stated_camera_from_camera": frame.common.matrix().tolist(),
+        "pose_sigma": list(frame.pose_sigma),
+        "base_from_map": None if similarity is None else similarity.base_from_map.matrix().tolist(),
+        "scale": 1.0 if similarity is None else similarity.scale,
+        "base_covariance": None if covariance is None else covariance.tolist(),
+    }
+
+
+def frame_of(content: Mapping[str, object], correction: FrameCorrection | None) -> MapFrame:
+    """The inverse of `frame_to_dict`."""
+    base, covariance = content["base_from_map"], content["base_covariance"]
+    metres, radians = np.asarray(content["pose_sigma"], np.float64).tolist()
+    similarity = None
+    if base is not None:
+        similarity = Similarity(SE3.from_matrix(np.asarray(base)), float(str(content["scale"])))
+    return MapFrame(
+        common=SE3.from_matrix(np.asarray(content["stated_camera_from_camera"])),
+        correction=correction,
+        pose_sigma=(metres, radians),
+        similarity=similarity,
+        base_covariance=None if covariance is None else np.asarray(covariance, np.float64),
+    )
+
+
+def correction_tensors(correction: FrameCorrection) -> dict[str, torch.Tensor]:
+    """Slowly varying corrections as named tensors."""
+    rows = [correction.poses.rotation_wxyz, correction.poses.translation_m]
+    return {
+        "poses": torch.from_numpy(np.concatenate(rows, -1)),
+        "correction": torch.from_numpy(np.asarray(correction.correction)),
+        "radius": torch.tensor(correction.radius, dtype=torch.float64),
+    }
+
+
+def correction_of(tensors: Mapping[str, torch.Tensor]) -> FrameCorrection:
+    """The inverse of `correction_tensors`."""
+    poses, (metres, radians) = tensors["poses"].numpy(), tensors["radius"].tolist()
+    return FrameCorrection(
+        SE3(poses[:, :4], poses[:, 4:]), tensors["correction"].numpy(), (metres, radians)
+    )

@@ -1,0 +1,134 @@
+"""A pose with its covariance.
+
+A covariance (6, 6) of `parent_from_child` is that of a small error (dt, dr): the translation is off
+by dt, metres, along the axes of the parent; the rotation R is R Exp(dr), radians, about the axes of
+the child.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evercal.geometry.se3 import SE3
+
+Array = NDArray[np.float64]
+
+
+def cross_matrix(v: ArrayLike) -> Array:
+    """(..., 3, 3) matrices of the cross product with vectors (..., 3)."""
+    v = np.asarray(v, dtype=np.float64)
+    matrix = np.zeros((*v.shape, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return matrix - np.swapaxes(matrix, -1, -2)
+
+
+@dataclass(frozen=True, eq=False)
+class UncertainPose:
+    """A rigid transform with a Gaussian error.
+
+    First-order propagation: Barfoot and Furgale, IEEE T-RO 2014, for this choice of axes.
+
+    Raises:
+        ValueError: A batch of poses, or a covariance that is not (6, 6).
+    """
+
+    pose: SE3
+    """parent_from_child, a single transform."""
+    covariance: NDArray[np.floating]
+    """(6, 6) of translation in the parent frame (m) and rotation about child axes (rad)."""
+
+    def __post_init__(self) -> None:
+        covariance = np.asarray(self.covariance, dtype=np.float64)
+        if self.pose.shape or covariance.shape != (6, 6):
+            raise ValueError(
+                f"an uncertain pose is one SE3 with a covariance (6, 6), got {self.pose.shape} and"
+                f" {covariance.shape}"
+            )
+        object.__setattr__(self, "covariance", (covariance + covariance.T) / 2)
+
+    @classmethod
+    def exact(cls, pose: SE3) -> "UncertainPose":
+        """A pose without error."""
+        return cls(pose, np.zeros((6, 6)))
+
+    def __matmul__(self, other: "UncertainPose | SE3") -> "UncertainPose":
+        """`a_from_b @ b_from_c` is `a_from_c`; the errors of both are independent."""
+        if isinstance(other, SE3):
+            other = UncertainPose.exact(other)
+        if not isinstance(other, UncertainPose):
+            return NotImplemented
+        rotation = self.pose.rotation_matrix()
+        by_first, by_second = np.eye(6), np.eye(6)
+        by_first[:3, 3:] = -rotation @ cross_matrix(other.pose.translation_m)
+        by_first[3:, 3:] = other.pose.rotation_matrix().T
+        by_second[:3, :3] = rotation
+        covariance = by_first @ self.covariance @ by_first.T
+        return UncertainPose(
+            self.pose @ other.pose, covariance + by_second @ other.covariance @ by_second.T
+        )
+
+    def __rmatmul__(self, other: SE3) -> "UncertainPose":
+        """An exact transform on the left."""
+        return UncertainPose.exact(other) @ self
+
+    def inverse(self) -> "UncertainPose":
+        """child_from_parent."""
+        inverse, rotation = self.pose.inverse(), self.pose.rotation_matrix()
+        slope = np.zeros((6, 6))
+        slope[:3, :3] = -rotation.T
+        slope[:3, 3:] = cross_matrix(inverse.translation_m)
+        slope[3:, 3:] = -rotation
+        return UncertainPose(inverse, slope @ self.covariance @ slope.T)
+
+    def widened(self, covariance: ArrayLike) -> "UncertainPose":
+        """The same pose with an independent error (6, 6) added."""
+        return UncertainPose(self.pose, self.covariance + np.asarray(covariance))
+
+    def squared_mahalanobis(self, truth: SE3) -> float:
+        """Squared distance of the true pose in units of the covariance.
+
+        It has a chi-squared distribution with six degrees of freedom if the covariance is right.
+        """
+        error = np.concatenate(
+            [
+                truth.translation_m - self.pose.translation_m,
+                (self.pose.inverse() @ truth).log()[3:],
+            ]
+        )
+        # A pose from few points can have a singular covariance; its null space is left out.
+        return float(error @ np.linalg.pinv(self.covariance) @ error)
+
+    @property
+    def sigma_mm(self) -> float:
+        """Standard deviation of the translation per axis, millimetres."""
+        return axis_deviation(self.covariance)[0]
+
+    @property
+    def sigma_deg(self) -> float:
+        """Standard deviation of the rotation per axis, degrees."""
+        return axis_deviation(self.covariance)[1]
+
+
+def axis_deviation(covariance: ArrayLike) -> tuple[float, float]:
+    """Standard deviation per axis, millimetres and degrees: root mean squares of three axes."""
+    variance = np.diag(np.asarray(covariance, dtype=np.float64))
+    metres, radians = np.sqrt(variance[:3].mean()), np.sqrt(variance[3:].mean())
+    return 1000 * float(metres), float(np.rad2deg(radians))
+
+
+def frame_covariance(base_from_camera: SE3, covariance: ArrayLike) -> Array:
+    """Covariance of the base frame from a motion that is common to all cameras of a map.
+
+    Landmarks move with the cameras that observe them, so an error of `gripper_from_camera` moves
+    the frame of the map by the mean over its cameras.
+
+    Args:
+        base_from_camera: (n,) poses that the map was built from.
+        covariance: (6, 6) of the common motion, camera frame, metres and radians.
+
+    Returns:
+        (6, 6) of a small motion of the base frame, metres and radians.
+    """
+    mean = base_from_camera.adjoint().mean(0)
+    return mean @ np.asarray(covariance) @ mean.T

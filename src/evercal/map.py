@@ -1,0 +1,280 @@
+"""`Map`: scenes that a robot has learned, and everything that is asked of them.
+
+Learning a scene reads through three files: `Map.learn` here, `mapping.build.build_map`, and
+`mapping.store.MapStore.commit`.
+"""
+
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from evercal.calibration.calibration import Calibration, Mount
+from evercal.calibration.drift import Shift, check
+from evercal.calibration.eye_in_hand import (
+    HandEyeReport,
+    hand_eye_report,
+    lacks_camera_poses,
+    posed_by_gripper,
+)
+from evercal.calibration.from_images import Images, ImageSource, calibrate
+from evercal.errors import InputError
+from evercal.features.device import device_of
+from evercal.geometry import SE3, Camera
+from evercal.localization.acceptance import fit_acceptance
+from evercal.localization.estimate import PoseEstimate
+from evercal.localization.fewest_keyframes import MOST_SHARE, fewest_keyframes
+from evercal.localization.localizer import Localizer
+from evercal.localization.query import LocalizeOptions
+from evercal.mapping.build import Adjusted, MapOptions, OnProgress, build_map
+from evercal.mapping.memory_budget import MemoryBudget
+from evercal.mapping.store import MapStore
+from evercal.recordings import Recording, load_recording, posed_recording
+from evercal.recordings.held_out import named_recording, require_frames, split_held_out
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from evercal.evaluation import Scores
+
+PathLike = str | os.PathLike[str]
+
+
+@dataclass(frozen=True)
+class LearnReport:
+    """Outcome of learning a scene, as JSON values."""
+
+    scene: str
+    """Name of the scene."""
+    seconds: float
+    """Wall time."""
+    memory_bytes: int
+    """Size of the keyframes of all scenes."""
+    frames_kept: int
+    """Keyframes of this scene."""
+    train_frames: int
+    """Frames that were learned."""
+    held_out_frames: int
+    """Frames that acceptance was fitted to."""
+    min_support: float = 0.0
+    """Support below which poses in this scene are rejected."""
+    landmarks: int = 0
+    """Landmarks of this scene."""
+    adjusted: Adjusted | None = None
+    """Changes by bundle adjustment; None for networks."""
+    hand_eye: HandEyeReport | None = None
+    """The estimated camera on the gripper; None where the recording states camera poses."""
+    iterations: int = 0
+    """Training steps; 0 for a map."""
+    head_bytes: int = 0
+    """Size of the networks; 0 for a map."""
+
+
+class Map:
+    """A map on disk: scenes are added by `learn`, images are located by `localize`.
+
+    Open one with `Map.open`.
+
+    Args:
+        store: the map's files.
+        options: effort and thresholds of localization.
+    """
+
+    def __init__(self, store: MapStore, options: LocalizeOptions | None = None):
+        self._store, self._options = store, options
+        self._localizer: Localizer | None = None
+
+    @classmethod
+    def open(
+        cls,
+        path: PathLike,
+        *,
+        device: str = "auto",
+        encoder: "Path | nn.Module | None" = None,
+        options: LocalizeOptions | None = None,
+    ) -> Self:
+        """Open a map, or prepare a new one that the first `learn` writes.
+
+        Args:
+            path: folder of the map.
+            device: `auto` (a CUDA device if there is one), `cpu` or `cuda`.
+            encoder: for a new map, a weights file of `evercal pretrain`; or a module of the
+                caller's own, which then must be given every time. Default: the shipped encoder.
+            options: effort and thresholds of localization.
+
+        Raises:
+            InputError: The folder holds something else, or a file is missing or was changed.
+        """
+        where = device_of(device)
+        store = MapStore.open_or_create(Path(path), encoder)
+        store.contents.to(where)
+        return cls(store, options)
+
+    @property
+    def path(self) -> Path:
+        """Folder of the map."""
+        return self._store.root
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Names of the scenes, in order of learning."""
+        return tuple(scene.name for scene in self._store.contents.scenes)
+
+    @property
+    def localizer(self) -> Localizer:
+        """The localizer of all scenes.
+
+        Raises:
+            InputError: No scene has been learned.
+        """
+        if self._localizer is None:
+            if not self.scenes:
+                raise InputError(f"map {self.path}: no scene learned yet; run 'evercal learn'")
+            self._localizer = Localizer(self._store.contents, self._options)
+        return self._localizer
+
+    def learn(
+        self,
+        recording: PathLike | Recording,
+        *,
+        name: str | None = None,
+        memory: str | int = "10%",
+        gripper_from_camera: SE3 | None = None,
+        options: MapOptions | None = None,
+        on_progress: OnProgress = lambda *_: None,
+    ) -> LearnReport:
+        """Learn a scene; the scenes learned before do not change.
+
+        A recording that states gripper poses and no camera poses also yields `gripper_from_camera`,
+        see `LearnReport.hand_eye`.
+
+        Args:
+            recording: a recording or its path. Training frames are learned; test frames are not
+                read.
+            name: of the scene. Default: the recording's name.
+            memory: keyframes to keep: a share of the frames ("10%"), a size ("5MB"), or "auto" for
+                the fewest that locate the recording's other frames well.
+            gripper_from_camera: a rough one, such as from CAD, that the estimate is compared with.
+            options: sizes and priors of the map; `memory` overrides theirs.
+            on_progress: called with the current step, how much of it is done, and its total.
+
+        Raises:
+            InputError: A recording that cannot be used, a name that is taken, or another process
+                is writing into the map.
+        """
+        began = time.perf_counter()
+        budget = MemoryBudget.parse(memory)
+        loaded = recording if isinstance(recording, Recording) else load_recording(recording)
+        loaded = named_recording(loaded, name, self.scenes)
+        with self._store.writing():
+            contents, start = self._store.contents, None
+            options = options or MapOptions()
+            if lacks_camera_poses(loaded):
+                posed = posed_by_gripper(loaded, contents.encoder, on_progress)
+                loaded, start, options = posed.recording, posed.start, options.for_hand_eye()
+            loaded = posed_recording(loaded)
+            require_frames(loaded)
+            split = split_held_out(loaded.train)
+            options = _sized(options, budget, contents.short_side)
+            built = build_map(loaded.name, split.train, contents.encoder, options, on_progress)
+            if budget.auto:
+                built = built.take(fewest_keyframes(contents, built, split.train, on_progress))
+            scene = fit_acceptance(contents.with_scene(built.scene), split.held_out)
+            report = LearnReport(
+                scene=scene.name,
+                seconds=time.perf_counter() - began,
+                memory_bytes=contents.with_scene(scene).memory_bytes,
+                frames_kept=len(scene.keyframes),
+                train_frames=len(split.train),
+                held_out_frames=len(split.held_out),
+                min_support=scene.min_support,
+                landmarks=scene.landmarks,
+                adjusted=built.adjusted,
+                hand_eye=hand_eye_report(start, built, gripper_from_camera) if start else None,
+            )
+            self._store.commit(scene, asdict(report))
+        self._localizer = None
+        return report
+
+    def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
+        """Estimate the camera pose of one image, see `Localizer.localize`."""
+        return self.localizer.localize(image, camera)
+
+    def calibrate(
+        self,
+        images: ImageSource,
+        *,
+        robot_poses: PathLike | SE3 | None = None,
+        camera: Camera | None = None,
+        mount: Mount | None = None,
+        on_image: Callable[[], object] = lambda: None,
+    ) -> Calibration:
+        """Calibrate a camera from its images; no marker is needed.
+
+        Args:
+            images: a folder, image files or arrays (H, W, 3), all from one camera.
+            robot_poses: base_from_gripper of every image, as a file or (n,) poses, for a camera on
+                the gripper.
+            camera: Intrinsics. Default: those of the camera that recorded the scene.
+            mount: `eye_to_hand` or `eye_in_hand`. Default: decided from the camera's motion.
+            on_image: called after each image.
+
+        Returns:
+            base_from_camera for eye_to_hand, gripper_from_camera for eye_in_hand.
+
+        Raises:
+            InputError: No image was located, or unusable images or poses.
+        """
+        given = Images.of(images, camera, robot_poses)
+        return calibrate(self.localizer, given, mount, on_image=on_image)
+
+    def check(
+        self,
+        images: ImageSource,
+        calibration: Calibration,
+        *,
+        camera: Camera | None = None,
+        on_image: Callable[[], object] = lambda: None,
+    ) -> Shift:
+        """Test whether a fixed camera has moved since it was calibrated.
+
+        Args:
+            images: of the camera as it stands now.
+            calibration: its calibration.
+            camera: Intrinsics. Default: those of the calibration.
+            on_image: called after each image.
+
+        Raises:
+            InputError: No image was located, or the calibration is of a camera on the gripper.
+        """
+        given = Images.of(images, camera)
+        return check(self.localizer, given.images, calibration, given.camera, on_image)
+
+    def evaluate(
+        self,
+        recordings: PathLike | Recording | Sequence[Recording] | Mapping[str, Recording],
+        on_frame: Callable[[], object] = lambda: None,
+    ) -> "Scores":
+        """Score the map on the test frames of recordings.
+
+        Args:
+            recordings: recordings or the path of one; a mapping gives the scenes' names.
+            on_frame: called after each frame.
+
+        Raises:
+            InputError: A recording that the map has not learned, or without test frames.
+        """
+        from evercal.evaluation.score_scenes import evaluate
+
+        return evaluate(self.localizer, recordings, lambda *_: on_frame())
+
+
+def _sized(options: MapOptions, budget: MemoryBudget, short_side: int) -> MapOptions:
+    """Options with the memory of a scene and the working size of a map."""
+    if budget.auto:
+        budget = MemoryBudget(share=MOST_SHARE)
+    return replace(options, memory=budget, size=replace(options.size, cells=short_side))

@@ -1,0 +1,170 @@
+"""`MapFrame`: from the frame that a map was adjusted in to the robot's base frame, and back.
+
+Bundle adjustment changes the stated poses of a recording. Three parts of that change are errors of
+the map's frame and not of single frames, so answers undo them: a transform common to all cameras
+(an error of `gripper_from_camera`, or of the sensor that stated the poses), corrections that vary
+slowly over the recording (a drifting depth fusion, an arm that sags), and the similarity of a map
+whose own frame is not the base frame.
+
+Corrections are undone only where they are correlated: each frame's correction is predicted from
+those of its neighbours. Noise cannot be predicted, so it is not undone.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.geometry import SE3, UncertainPose
+
+Array = NDArray[np.floating]
+
+RADII = ((0.1, 10.0), (0.2, 15.0), (0.4, 25.0))
+"""Candidate correlation lengths of corrections, metres and degrees."""
+LEAST_EXPLAINED = 0.3
+"""Share of the corrections' variance that neighbours must explain."""
+SHRINKAGE = 0.3
+"""Weight of a zero correction, in neighbours."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameCorrection:
+    """Slowly varying corrections of the stated poses."""
+
+    poses: SE3
+    """(n,) base_from_camera as adjusted, without the common transform."""
+    correction: Array
+    """(n, 6) in the camera frame, metres and radians."""
+    radius: tuple[float, float]
+    """Correlation length, metres and radians."""
+
+    def at(self, pose: SE3) -> Array:
+        """(6,) correction of a camera at a pose in the frame of `poses`."""
+        weight = _closeness(self.poses, pose, self.radius)
+        return (weight[:, None] * self.correction).sum(0) / (weight.sum() + SHRINKAGE)
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """Transform from a map with a frame and scale of its own to the robot's base frame."""
+
+    base_from_map: SE3
+    """Applied after scaling."""
+    scale: float = 1.0
+    """Metres per unit of length of the map."""
+
+    def pose(self, map_from_camera: SE3) -> SE3:
+        """Camera pose in the base frame."""
+        scaled = SE3(map_from_camera.rotation_wxyz, self.scale * map_from_camera.translation_m)
+        return self.base_from_map @ scaled
+
+    def inverse_pose(self, base_from_camera: SE3) -> SE3:
+        """Camera pose in the map's own frame."""
+        scaled = self.base_from_map.inverse() @ base_from_camera
+        return SE3(scaled.rotation_wxyz, scaled.translation_m / self.scale)
+
+    def points(self, points: Array) -> Array:
+        """Points (..., 3) in the base frame, metres."""
+        return self.base_from_map.apply(self.scale * points)
+
+
+@dataclass(frozen=True, eq=False)
+class MapFrame:
+    """Relation of a map's own frame to the robot's base frame."""
+
+    common: SE3 = field(default_factory=SE3.identity)
+    """stated_camera_from_camera: adjusted poses are stated poses times this."""
+    correction: FrameCorrection | None = None
+    """Slowly varying corrections; None where they are not correlated."""
+    pose_sigma: tuple[float, float] = (0.0, 0.0)
+    """Standard deviation of the adjusted poses per axis, metres and radians."""
+    similarity: Similarity | None = None
+    """From the frame that the recording states to the base frame; None if they are the same."""
+    base_covariance: Array | None = None
+    """(6, 6) of a small motion of the base frame that all answers share, metres and radians. None
+    where poses were stated in it."""
+
+    def to_base(self, map_from_camera: UncertainPose) -> UncertainPose:
+        """Transform a pose that was estimated from landmarks to the base frame.
+
+        The errors of the map's poses and of the base frame are added to the covariance.
+        """
+        own = np.diag(np.repeat(np.square(self.pose_sigma), 3))
+        covariance = map_from_camera.covariance + own
+        pose = self._undo(map_from_camera.pose)
+        if self.similarity is not None:
+            slope = np.eye(6)
+            slope[:3, :3] *= self.similarity.scale
+            slope[:3, :3] = slope[:3, :3] @ self.similarity.base_from_map.rotation_matrix()
+            pose, covariance = self.similarity.pose(pose), slope @ covariance @ slope.T
+        estimate = UncertainPose(pose, covariance)
+        if self.base_covariance is None:
+            return estimate
+        return UncertainPose(SE3.identity(), self.base_covariance) @ estimate
+
+    def from_base(self, base_from_camera: SE3) -> SE3:
+        """Camera pose among the landmarks: the inverse of `to_base`."""
+        stated = base_from_camera
+        if self.similarity is not None:
+            stated = self.similarity.inverse_pose(base_from_camera)
+        pose = stated @ self.common
+        if self.correction is not None:
+            # The correction depends on the pose that is sought, and varies little over its size.
+            for _ in range(3):
+                correction = self.correction.at(pose @ self.common.inverse())
+                pose = stated @ self.common @ SE3.exp(correction)
+        return pose
+
+    def points_to_base(self, points_m: Array) -> Array:
+        """Landmarks (n, 3) in the base frame."""
+        return points_m if self.similarity is None else self.similarity.points(points_m)
+
+    def camera_among_points(self, base_from_camera: SE3) -> SE3:
+        """The pose at which a located camera observes landmarks from `points_to_base`.
+
+        It differs from the answer by the corrections that `to_base` undoes.
+        """
+        pose = self.from_base(base_from_camera)
+        return pose if self.similarity is None else self.similarity.pose(pose)
+
+    def _undo(self, pose: SE3) -> SE3:
+        stated = pose @ self.common.inverse()
+        if self.correction is None:
+            return stated
+        return pose @ SE3.exp(-self.correction.at(stated)) @ self.common.inverse()
+
+
+def fit_correction(poses: SE3, correction: Array) -> FrameCorrection | None:
+    """Fit the correlation length of corrections.
+
+    Args:
+        poses: (n,) see `FrameCorrection`.
+        correction: (n, 6) of each pose, without the common transform and the time shift.
+
+    Returns:
+        None where neighbours explain too little of the corrections.
+    """
+    scale = np.repeat([np.abs(correction[:, :3]).mean(), np.abs(correction[:, 3:]).mean()], 3)
+    if (scale[[0, 3]] < [1e-4, 1e-5]).any():
+        return None
+    best: tuple[float, tuple[float, float]] = (LEAST_EXPLAINED, RADII[0])
+    total = float(((correction / scale) ** 2).sum())
+    for metres, degrees in RADII:
+        radius = (metres, float(np.deg2rad(degrees)))
+        weight = np.stack([_closeness(poses, poses[i], radius) for i in range(len(poses))])
+        np.fill_diagonal(weight, 0)
+        predicted = weight @ correction / (weight.sum(1, keepdims=True) + SHRINKAGE)
+        explained = 1 - float((((correction - predicted) / scale) ** 2).sum()) / total
+        if explained > best[0]:
+            best = (explained, radius)
+    if best[0] <= LEAST_EXPLAINED:
+        return None
+    return FrameCorrection(poses, correction, best[1])
+
+
+def _closeness(poses: SE3, pose: SE3, radius: tuple[float, float]) -> Array:
+    """(n,) Gaussian weights of poses by their distance to one pose."""
+    metres = np.linalg.norm(poses.translation_m - pose.translation_m, axis=-1)
+    cosine = np.abs(poses.rotation_wxyz @ pose.rotation_wxyz).clip(0, 1)
+    angle = 2 * np.arccos(cosine)
+    return np.exp(-0.5 * (metres / radius[0]) ** 2 - 0.5 * (angle / radius[1]) ** 2)

@@ -1,0 +1,72 @@
+"""`SceneMap`: the map of one scene as a robot keeps it, and the scenes of one map together."""
+
+from dataclasses import dataclass, field
+from typing import Self
+
+import torch
+from torch import nn
+
+from evercal.features.device import device_of_network
+from evercal.features.encoder import Encoder
+from evercal.geometry import Camera
+from evercal.mapping.keyframes import Keyframes
+from evercal.mapping.map_frame import MapFrame
+
+
+@dataclass(frozen=True, eq=False)
+class SceneMap:
+    """The map of one scene."""
+
+    name: str
+    """Unique in a map."""
+    camera: Camera
+    """Intrinsics that the recording states."""
+    adjusted_camera: Camera
+    """The same camera after bundle adjustment."""
+    keyframes: Keyframes
+    """With landmarks and descriptors."""
+    frame: MapFrame
+    """Relation of the landmarks' frame to the base frame."""
+    train_frames: int
+    """Frames that the map was built from."""
+    min_support: float = 0.0
+    """Poses with less support are rejected (`localization.acceptance`)."""
+    covariance_scale: float = 1.0
+    """Factor on covariances, fitted with `min_support`."""
+
+    @property
+    def landmarks(self) -> int:
+        """Number of landmarks."""
+        return sum(map(len, self.keyframes.landmarks))
+
+
+@dataclass
+class MapContents:
+    """The encoder and all scenes of a map, in memory."""
+
+    encoder: Encoder
+    """Frozen local encoder."""
+    short_side: int
+    """Shorter image side that the encoder works on, pixels."""
+    scenes: list[SceneMap] = field(default_factory=list)
+    """In order of learning."""
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the encoder's weights."""
+        return device_of_network(self.encoder)
+
+    def to(self, device: torch.device) -> Self:
+        """Move the encoder to a device, in place; keyframes stay on the CPU."""
+        if isinstance(self.encoder, nn.Module):
+            self.encoder.to(device)
+        return self
+
+    @property
+    def memory_bytes(self) -> int:
+        """Size of all keyframes as they are stored."""
+        return sum(scene.keyframes.bytes for scene in self.scenes)
+
+    def with_scene(self, scene: SceneMap) -> "MapContents":
+        """The same map with one more scene."""
+        return MapContents(self.encoder, self.short_side, [*self.scenes, scene])

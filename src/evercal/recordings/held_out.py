@@ -1,0 +1,66 @@
+"""Before a recording is learned: its name, its frames, and which of them are held out."""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from evercal.errors import InputError
+from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording
+
+EVERY, BLOCK = 100, 4
+
+
+@dataclass(frozen=True)
+class HeldOutSplit:
+    """Training frames of a recording in two parts."""
+
+    train: tuple[Frame, ...]
+    """Frames to learn."""
+    held_out: tuple[Frame, ...]
+    """Frames that acceptance is fitted to: blocks of 4 in every 100, at least one block."""
+
+
+def split_held_out(frames: Sequence[Frame]) -> HeldOutSplit:
+    """Hold out blocks of training frames, in recorded order."""
+    every = min(EVERY, len(frames))
+    middle = every // 2
+    held_out = [middle <= i % every < middle + BLOCK for i in range(len(frames))]
+    return HeldOutSplit(
+        tuple(f for f, out in zip(frames, held_out, strict=True) if not out),
+        tuple(f for f, out in zip(frames, held_out, strict=True) if out),
+    )
+
+
+def named_recording(recording: Recording, name: str | None, taken: Iterable[str]) -> Recording:
+    """A recording under the name that its scene will have.
+
+    Args:
+        recording: any recording.
+        name: of the scene; the recording's own name by default.
+        taken: names of the scenes learned before.
+
+    Raises:
+        InputError: A name that is taken, or that is no single word of a path.
+    """
+    name = recording.name if name is None else name
+    if not name.strip() or name.startswith(".") or re.search(r"[/\\=\x00-\x1f]", name):
+        raise InputError(
+            f"scene name {name!r}: give one with --name that is not empty, does not begin with a"
+            " dot and holds no slash, '=' or line break"
+        )
+    if name in taken:
+        raise InputError(f"scene {name!r}: a scene of this name exists; give another with --name")
+    return replace(recording, name=name)
+
+
+def require_frames(recording: Recording) -> None:
+    """Refuse a recording with too few training frames.
+
+    Raises:
+        InputError: Fewer than `MIN_TRAIN_FRAMES`.
+    """
+    if len(recording.train) < MIN_TRAIN_FRAMES:
+        raise InputError(
+            f"scene {recording.name!r}: {len(recording.train)} training frames are too few; give at"
+            f" least {MIN_TRAIN_FRAMES}"
+        )

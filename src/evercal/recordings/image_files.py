@@ -1,0 +1,32 @@
+"""Image files that a user names: files, or folders of them."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from evercal.errors import InputError
+from evercal.recordings.images import IMAGE_ENDINGS
+from evercal.recordings.poses.row_files import natural_key
+
+
+def image_files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
+    """Image files; a folder stands for its images, image-2 before image-10.
+
+    Raises:
+        InputError: No path, a file that is missing, or a folder without images.
+    """
+    if not paths:
+        raise InputError("no image given; name one or more image files or a folder")
+    files: list[Path] = []
+    for path in map(Path, paths):
+        if path.is_dir():
+            inside = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_ENDINGS]
+            inside.sort(key=lambda p: natural_key(p.name))
+            if not inside:
+                raise InputError(f"{path}: no images in this folder ({', '.join(IMAGE_ENDINGS)})")
+            files += inside
+        elif path.is_file():
+            files.append(path)
+        else:
+            raise InputError(f"{path}: image file is missing; check the path")
+    return files

@@ -1,0 +1,231 @@
+"""`StageStore`: a folder that grows by whole stages.
+
+    STORE/
+      manifest.json         written last, by atomic replace; sha256 of every file
+      NETWORK-SHA.safetensors
+      stages/0001-NAME/     files of one stage
+
+A file that the manifest does not list is not part of the store. One process writes at a time, under
+a lock beside the folder. Readers need no lock: they read again if a writer replaced files meanwhile.
+What the files mean is up to the kind of store: a map or networks.
+"""
+
+import json
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from filelock import FileLock, Timeout
+
+from evercal.errors import InputError
+from evercal.storage.atomic import replace_folder, write_json
+from evercal.storage.manifest import MANIFEST, Manifest, write_manifest
+
+SCHEMA = 4
+STAGES = "stages"
+REPORT = "report.json"
+_STAGE = re.compile(r"\d{4}-[\w.~-]+")
+Result = TypeVar("Result")
+
+
+def is_store(root: Path) -> bool:
+    """Whether a folder holds a store."""
+    return (root / MANIFEST).is_file()
+
+
+def read_store(root: Path, read: Callable[[Manifest], Result]) -> Result:
+    """Read a store; start over when a writer replaces files meanwhile.
+
+    Args:
+        root: folder of the store.
+        read: reads the files that the manifest lists.
+
+    Raises:
+        InputError: Not a store, a file missing or changed, or a store of another version.
+    """
+    while True:
+        manifest = Manifest.read(root)
+        try:
+            _check(root, manifest)
+            return read(manifest)
+        except (InputError, OSError):
+            if Manifest.read(root) == manifest:
+                raise
+
+
+def _check(root: Path, manifest: Manifest) -> None:
+    schema = manifest.payload.get("schema")
+    if isinstance(schema, int) and schema < SCHEMA:
+        raise InputError(
+            f"store {root}: schema {schema} is of an earlier evercal; learn the scenes again into a"
+            " new store"
+        )
+    if schema != SCHEMA:
+        raise InputError(f"store {root}: schema {schema!r} is not {SCHEMA}; update evercal")
+    problems = manifest.problems(root)
+    if problems:
+        raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
+    for name in manifest.payload.get("networks", []):
+        if name not in manifest.files:
+            raise InputError(f"store {root}: network {name!r} is not in the manifest; restore it")
+    for name in manifest.payload.get("stages", []):
+        if not isinstance(name, str) or not _STAGE.fullmatch(name):
+            raise InputError(f"store {root}: stage {name!r} is not a stage's name; restore it")
+
+
+class StageStore:
+    """Stages on disk.
+
+    Args:
+        root: folder of the store; nothing is written before the first stage is added.
+        stages: folder names of the stages, in order.
+        networks: file names of the networks that all stages share.
+    """
+
+    def __init__(self, root: Path, stages: Sequence[str], networks: Sequence[str]):
+        self.root, self.stages, self.networks = root, list(stages), tuple(networks)
+        resolved = root.resolve()  # one lock, whichever name the store is opened by
+        self._lock = FileLock(resolved.parent / f".{resolved.name}.lock")
+
+    def folder(self, stage: str) -> Path:
+        """Folder of a stage."""
+        return self.root / STAGES / stage
+
+    @contextmanager
+    def writing(self) -> Iterator[Manifest | None]:
+        """Keep other writers out while this store is changed.
+
+        Yields:
+            The manifest that will be replaced; None for a new store.
+
+        Raises:
+            InputError: Another process writes into the store or has changed it since it was
+                opened, or it cannot be written.
+        """
+        # The lock file is never removed: a process that waits for it would lock a deleted file.
+        lock = Path(self._lock.lock_file)
+        try:
+            lock.parent.mkdir(parents=True, exist_ok=True)
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            raise InputError(
+                f"store {self.root}: another process is writing into it; wait until it has finished"
+            ) from None
+        except OSError as error:
+            raise InputError(f"store {self.root}: cannot be written ({error.strerror})") from error
+        try:
+            before = Manifest.read(self.root) if is_store(self.root) else None
+            if self.stages != (before.payload["stages"] if before else []):
+                raise InputError(f"store {self.root}: another process has changed it; run it again")
+            yield before
+        finally:
+            self._lock.release()
+
+    def add(
+        self,
+        name: str,
+        write: Callable[[Path], None],
+        payload: Mapping[str, object],
+        superseded: Callable[[str], bool] = lambda _: False,
+    ) -> None:
+        """Add a stage: whole, or not at all.
+
+        Args:
+            name: of the scene; characters that a folder name cannot hold are replaced.
+            write: writes the stage's files into an empty folder.
+            payload: settings of the store, for the manifest.
+            superseded: which files of earlier stages, by name, are dropped.
+
+        Raises:
+            InputError: As `writing`.
+        """
+        legal = re.sub(r"[^\w.-]", "_", name)[:60]
+        stage = f"{len(self.stages) + 1:04d}-{legal}"
+        with self.writing() as before:
+            temporary = self._empty(stage)
+            write(temporary)
+            self._publish([*self.stages, stage], stage, payload, before, superseded)
+
+    def replace(
+        self, index: int, write: Callable[[Path], None], payload: Mapping[str, object]
+    ) -> None:
+        """Replace a stage: whole, or not at all.
+
+        Args:
+            index: number of the stage.
+            write: changes files in a copy of the stage's folder.
+            payload: settings of the store, for the manifest.
+
+        Raises:
+            InputError: As `writing`, and where a file of the store is missing or was changed.
+        """
+        old = self.stages[index]
+        stem, _, version = old.partition("~")
+        stage = f"{stem}~{int(version or 1) + 1}"
+        with self.writing() as before:
+            assert before is not None, "a store with stages has a manifest"
+            _check(self.root, before)  # copies get checksums of their own
+            temporary = self._empty(stage)
+            for file in before.files:
+                if file.startswith(f"{STAGES}/{old}/"):
+                    shutil.copyfile(self.root / file, temporary / Path(file).name)
+            write(temporary)
+            stages = [*self.stages[:index], stage, *self.stages[index + 1 :]]
+            self._publish(stages, stage, payload, before, lambda _: False)
+
+    def reports(self) -> list[dict[str, Any]]:
+        """`report.json` of every stage, in order."""
+        return [json.loads((self.folder(name) / REPORT).read_text()) for name in self.stages]
+
+    def size_bytes(self) -> dict[str, int]:
+        """Size on disk of every file in the manifest, by relative path."""
+        manifest = Manifest.read(self.root)
+        return {file: int(str(record["bytes"])) for file, record in manifest.files.items()}
+
+    def _empty(self, stage: str) -> Path:
+        """An empty folder in which a stage is prepared."""
+        folder = self.folder(f".{stage}")
+        shutil.rmtree(folder, ignore_errors=True)  # left by a writer that was killed
+        folder.mkdir(parents=True)
+        return folder
+
+    def _publish(
+        self,
+        stages: list[str],
+        new: str,
+        payload: Mapping[str, object],
+        before: Manifest | None,
+        superseded: Callable[[str], bool],
+    ) -> None:
+        """Move a prepared stage into place and write the manifest: the store is then `stages`."""
+        replace_folder(self.folder(f".{new}"), self.folder(new))
+        files = [*self.networks, *(f"{STAGES}/{new}/{p.name}" for p in self.folder(new).iterdir())]
+        for file in before.files if before else ():
+            stage, _, name = file.removeprefix(f"{STAGES}/").partition("/")
+            if stage in stages and stage != new and not superseded(name):
+                files.append(file)
+        settings = {"schema": SCHEMA, **payload, "networks": list(self.networks), "stages": stages}
+        write_manifest(self.root, settings, files, before)
+        self.stages = stages
+        self._tidy(set(files))
+
+    def _tidy(self, files: set[str]) -> None:
+        """Remove files of stages that the manifest does not list, and what killed writers left."""
+        for folder in (self.root / STAGES).iterdir():
+            if folder.name not in self.stages:
+                if _STAGE.fullmatch(folder.name.removeprefix(".")):
+                    shutil.rmtree(folder, ignore_errors=True)
+                continue
+            for path in folder.iterdir():
+                if f"{STAGES}/{folder.name}/{path.name}" not in files:
+                    path.unlink(missing_ok=True)
+        for unfinished in self.root.glob(".*.tmp"):
+            unfinished.unlink(missing_ok=True)
+
+
+def write_report(folder: Path, report: Mapping[str, object]) -> None:
+    """Write `report.json` of a stage."""
+    write_json(folder / REPORT, report)

@@ -1,0 +1,94 @@
+"""Covariances of composed and inverted poses agree with sampling."""
+
+import numpy as np
+import pytest
+
+from evercal.geometry import SE3, UncertainPose, axis_deviation
+from evercal.geometry.uncertain_pose import frame_covariance
+
+FIRST = SE3.exp([0.4, -0.3, 1.2, 0.5, -0.8, 0.3])
+SECOND = SE3.exp([-0.2, 0.6, 0.7, -1.1, 0.4, 0.9])
+
+
+def covariance(seed: int) -> np.ndarray:
+    root = np.random.default_rng(seed).normal(size=(6, 6)) * [0.002] * 6
+    root[3:] *= 0.5
+    return root @ root.T
+
+
+def sampled(uncertain: UncertainPose, seed: int, count: int = 40_000) -> SE3:
+    """Draw poses: the translation moves in the parent frame, the rotation about child axes."""
+    draws = np.random.default_rng(seed).multivariate_normal(
+        np.zeros(6), uncertain.covariance, size=count
+    )
+    rotation = SE3.exp(np.concatenate([np.zeros((count, 3)), draws[:, 3:]], 1))
+    turned = SE3(uncertain.pose.rotation_wxyz[None].repeat(count, 0), np.zeros((count, 3)))
+    return SE3((turned @ rotation).rotation_wxyz, uncertain.pose.translation_m + draws[:, :3])
+
+
+def sample_covariance(poses: SE3, mean: SE3) -> np.ndarray:
+    shift = poses.translation_m - mean.translation_m
+    rotation = (mean.inverse() @ poses).log()[:, 3:]
+    errors = np.concatenate([shift, rotation], 1)
+    return errors.T @ errors / len(errors)
+
+
+def assert_same(estimate: np.ndarray, expected: np.ndarray) -> None:
+    assert np.abs(estimate - expected).max() < 0.04 * np.abs(expected).max()
+
+
+def test_composition_adds_the_errors_of_both() -> None:
+    a, b = UncertainPose(FIRST, covariance(0)), UncertainPose(SECOND, covariance(1))
+    both = a @ b
+    draws = sampled(a, 2) @ sampled(b, 3)
+    assert_same(both.covariance, sample_covariance(draws, FIRST @ SECOND))
+    np.testing.assert_allclose(both.pose.matrix(), (FIRST @ SECOND).matrix())
+
+
+def test_inverse() -> None:
+    a = UncertainPose(FIRST, covariance(4))
+    assert_same(a.inverse().covariance, sample_covariance(sampled(a, 5).inverse(), FIRST.inverse()))
+    np.testing.assert_allclose(a.inverse().inverse().covariance, a.covariance, atol=1e-15)
+
+
+def test_exact_transforms_on_either_side() -> None:
+    a = UncertainPose(SECOND, covariance(6))
+    left, right = FIRST @ a, a @ FIRST
+    assert_same(left.covariance, sample_covariance(FIRST @ sampled(a, 7), left.pose))
+    assert_same(right.covariance, sample_covariance(sampled(a, 8) @ FIRST, right.pose))
+
+
+def test_common_motion_of_the_cameras_moves_the_base_frame() -> None:
+    motion = covariance(9)
+    frame = frame_covariance(SE3.stack([FIRST]), motion)
+    draws = np.random.default_rng(10).multivariate_normal(np.zeros(6), motion, size=40_000)
+    # exp(x) in the base frame moves FIRST as the drawn motion moves it in the camera frame.
+    moved = FIRST @ SE3.exp(draws) @ FIRST.inverse()
+    errors = moved.log()
+    assert_same(frame, errors.T @ errors / len(errors))
+
+
+def test_adjoint_moves_a_tangent_to_the_other_side() -> None:
+    tangent = np.array([0.1, -0.2, 0.3, 0.2, 0.4, -0.3])
+    right = FIRST @ SE3.exp(tangent)
+    left = SE3.exp(FIRST.adjoint() @ tangent) @ FIRST
+    np.testing.assert_allclose(right.matrix(), left.matrix(), atol=1e-12)
+
+
+def test_squared_mahalanobis_has_six_degrees_of_freedom() -> None:
+    a = UncertainPose(FIRST, covariance(11))
+    squares = [a.squared_mahalanobis(truth) for truth in sampled(a, 12, 2000)]
+    assert np.mean(squares) == pytest.approx(6, rel=0.06)
+
+
+def test_axis_deviation() -> None:
+    assert axis_deviation(np.diag([1e-6, 4e-6, 4e-6, 1e-4, 1e-4, 1e-4])) == pytest.approx(
+        (3**0.5, np.rad2deg(0.01))
+    )
+
+
+def test_batches_and_other_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"covariance \(6, 6\)"):
+        UncertainPose(SE3.identity((2,)), np.eye(6))
+    with pytest.raises(ValueError, match=r"\(3, 3\)"):
+        UncertainPose(FIRST, np.eye(3))
