@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from evercal.continual.methods.penalties import Penalty
-from evercal.continual.methods.preconditioning import PreconditionedReplay, held_rows
+from evercal.continual.methods.preconditioning import PreconditionedReplay, owned_rows
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
 from evercal.continual.networks.head import Head, HeadOptions, HeadOutput
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
@@ -119,7 +119,7 @@ def test_centres_that_belong_to_no_scene_are_free_to_learn() -> None:
     options = HeadOptions(width=16, condition="descriptor", centres="fixed", whiten=False)
     head = wave_head(1, options)
     head.grow(torch.zeros(0, 3), seed=1)
-    assert held_rows(head, [wave_buffer(0)]) == {}
+    assert owned_rows(head, [wave_buffer(0)]) == {}
     before = {name: value.clone() for name, value in head.state_dict().items()}
     hooks = hooks_for(head, [wave_buffer(0)], Free(), 0.5)
     list(HeadTrainer(head, [wave_buffer(1, shift_px=9.0)], OPTIONS, 0, hooks).run())

@@ -17,7 +17,7 @@ from evercal.continual.pretraining.contrastive import (
 from evercal.continual.pretraining.furnished import (
     FurnishedViews,
     furnished_views,
-    kept_furnished_views,
+    cached_furnished_views,
 )
 from evercal.continual.pretraining.pairs import (
     FIRST_ROOM_SEED,
@@ -124,9 +124,9 @@ def test_rendered_pairs_look_alike_and_are_kept(tmp_path: Path) -> None:
     patch = pytest.MonkeyPatch()
     with patch.context() as patched:
         patched.setattr(furnished, "furnished_views", lambda seed: views)
-        kept = kept_furnished_views(1001, tmp_path / "new")
+        kept = cached_furnished_views(1001, tmp_path / "new")
         patched.setattr(furnished, "furnished_views", None)
-        again = kept_furnished_views(1001, tmp_path / "new")
+        again = cached_furnished_views(1001, tmp_path / "new")
     for found in (kept, again):
         np.testing.assert_array_equal(found.images, views.images)
         np.testing.assert_array_equal(found.depth_m, views.depth_m)

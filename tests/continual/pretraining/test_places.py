@@ -16,7 +16,12 @@ from evercal.continual.pretraining import make, places
 from evercal.continual.pretraining.contrastive import PretrainData, PretrainOptions
 from evercal.continual.pretraining.make import pretrain
 from evercal.continual.pretraining.pairs import RoomViews, leaf_picture
-from evercal.continual.pretraining.places import place_accuracy, place_loss, train_descriptor
+from evercal.continual.pretraining.places import (
+    place_accuracy,
+    place_loss,
+    random_crop,
+    train_descriptor,
+)
 from evercal.features.encoder import LocalEncoder, load_encoder
 from evercal.simulation.box_room import BoxRoom, default_camera
 
@@ -61,7 +66,7 @@ def test_crops_are_windows_of_the_map() -> None:
     maps = torch.arange(24 * 32.0).view(1, 1, 24, 32)
     rng, sizes = np.random.default_rng(0), set()
     for _ in range(40):
-        crop = places._crop(maps, rng)
+        crop = random_crop(maps, rng)
         height, width = crop.shape[-2:]
         sizes.add((height, width))
         top, left = divmod(int(crop[0, 0, 0, 0]), 32)

@@ -133,27 +133,11 @@ def gather(part: Mapping[str, Tensor] | None) -> list[dict[str, Tensor]]:
     Args:
         part: Named CPU tensors of this process, of any shape; None if it has no result.
     """
-    count = processes()
-    if count == 1:
+    if processes() == 1:
         return [] if part is None else [dict(part)]
-    from safetensors.torch import load, save
-
-    device = _exchange_device()
-    own = b"" if part is None else save({k: v.contiguous() for k, v in part.items()})
-    length = torch.tensor([len(own)], device=device)
-    lengths = [torch.zeros_like(length) for _ in range(count)]
-    distributed.all_gather(lengths, length)
-    sizes = [int(size) for size in lengths]
-    sent = torch.zeros(max(sizes), dtype=torch.uint8, device=device)
-    if own:
-        sent[: len(own)] = torch.frombuffer(bytearray(own), dtype=torch.uint8)
-    received = [torch.empty_like(sent) for _ in range(count)]
-    distributed.all_gather(received, sent)
-    return [
-        load(data[:size].cpu().numpy().tobytes())
-        for data, size in zip(received, sizes, strict=True)
-        if size
-    ]
+    received: list[dict[str, Tensor] | None] = [None] * processes()
+    distributed.all_gather_object(received, part)
+    return [tensors for tensors in received if tensors is not None]
 
 
 def wait_for_all() -> None:

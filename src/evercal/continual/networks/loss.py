@@ -42,11 +42,6 @@ class Target:
     camera_from_atlas: Tensor
     """(n, 3, 4)."""
 
-    def to(self, device: torch.device, non_blocking: bool = False) -> "Target":
-        """Copy to a device."""
-        parts = (self.pixels, self.intrinsics, self.camera_from_atlas)
-        return Target(*(part.to(device, non_blocking=non_blocking) for part in parts))
-
 
 def clamp_px(options: LossOptions, progress: float) -> float:
     """Return the soft clamp tau at `progress` in [0, 1]."""
