@@ -103,7 +103,7 @@ def test_where_centres_are_known_in_advance_all_of_them_give_gradients(
     options = HeadOptions(
         width=16, blocks=1, condition="descriptor", centres="fixed", centres_per_scene=6
     )
-    head = Head(known.features, known.descriptor, options)
+    head = Head(known.features, 8, options)
     head.grow(torch.randn(6, 3) + torch.tensor([0.0, 0.0, 2.0]), seed=0)
     later = FeatureBuffer(1, buffer.atlas_from_base)
     later.restore(dict(buffer.tensors))

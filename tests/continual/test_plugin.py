@@ -45,7 +45,7 @@ def test_the_example_is_short_and_can_be_loaded_twice() -> None:
     told = STRATEGIES["spread"].description()["method"]
     assert isinstance(told, dict)
     assert (told["kind"], told["penalty"]) == ("Spread", {"kind": "OldOutput", "px_per_m": 25.0})
-    with pytest.raises(InputError, match="'spread' is evercal's own"):
+    with pytest.raises(InputError, match="'spread' exists"):
         load_plugin(EXAMPLE)
 
 
@@ -80,7 +80,7 @@ def test_names_of_ours_are_taken(tmp_path: Path) -> None:
         "from evercal.continual.strategies import Strategy\n"
         "STRATEGIES = {'finetune': Strategy('finetune', source='mine')}"
     )
-    with pytest.raises(InputError, match="'finetune' is evercal's own"):
+    with pytest.raises(InputError, match="'finetune' exists"):
         load_plugin(path)
     with pytest.raises(InputError, match="no such file"):
         load_plugin(tmp_path / "none.py")
