@@ -30,12 +30,12 @@ def off_by(pixels: float) -> list[float]:
     return [pixels / FOCAL_PX * DEPTH_M, 0.0, DEPTH_M]
 
 
-def says(points: list[list[float]], hidden: list[list[float]] | None = None) -> HeadOutput:
+def head_output(points: list[list[float]], hidden: list[list[float]] | None = None) -> HeadOutput:
     """A head's output with these points (camera frame, metres)."""
     where = torch.tensor(points, requires_grad=True)
     zero = torch.zeros(len(points), 2)
-    felt = zero if hidden is None else torch.tensor(hidden)
-    return HeadOutput(zero, torch.zeros(len(points), 1, 3), where, felt)
+    activations = zero if hidden is None else torch.tensor(hidden)
+    return HeadOutput(zero, torch.zeros(len(points), 1, 3), where, activations)
 
 
 def wave_buffer(scene: int, views: int = 4, shift_px: float = 0.0, few: int = 0) -> FeatureBuffer:
@@ -81,8 +81,8 @@ def stage_start(
     replay_rows: int = 64,
 ) -> StageStart:
     """A stage that begins with these memories."""
-    kept: list[MethodState] = [{} for _ in memories] if states is None else states
-    return StageStart(head, teacher, memories, kept, replay_rows, 0)
+    selected: list[MethodState] = [{} for _ in memories] if states is None else states
+    return StageStart(head, teacher, memories, selected, replay_rows, 0)
 
 
 def flat(head: Head) -> Tensor:

@@ -30,7 +30,7 @@ def saved(head: Head) -> bytes:
     return file.getvalue()
 
 
-def test_neither_adds_anything_to_training() -> None:
+def test_controls_add_nothing_to_training() -> None:
     for method in (FineTuning(), Isolation()):
         hooks = method.begin(stage_start(wave_head(1), []))
         assert type(hooks) is TrainingHooks
@@ -39,7 +39,7 @@ def test_neither_adds_anything_to_training() -> None:
 
 @pytest.mark.parametrize("offsets", ["per_centre", "shared"])
 @pytest.mark.parametrize("condition", ["code", "descriptor"])
-def test_new_heads_start_from_the_last_trunk_and_earlier_ones_stay(
+def test_new_head_starts_from_the_shared_weights_of_the_last(
     condition: str, offsets: str, first: dict[str, SceneMaps], rooms: Rooms, quick: StageOptions
 ) -> None:
     """With no step at all, the second head is the first one but for what the scene owns."""

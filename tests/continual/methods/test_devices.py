@@ -41,7 +41,7 @@ BACKBONES = {
 
 
 def learned(
-    method: Method, options: HeadOptions, made: AbstractContextManager[None]
+    method: Method, options: HeadOptions, context: AbstractContextManager[None]
 ) -> tuple[dict[str, Tensor], np.ndarray | None]:
     """A second scene is learned and finished: all tensors that come of it, and the frames kept."""
     own, memory = wave_buffer(1), wave_buffer(0, views=2)
@@ -49,7 +49,7 @@ def learned(
     teacher = copy.deepcopy(head).eval()
     pose = SE3.identity()
     frames = [Frame(str(i), IMAGE, CAMERA, pose) for i in range(own.views)]
-    with made:
+    with context:
         alone = method.begin(stage_start(teacher, []))
         first = FinishedScene(teacher, 0, lambda: memory, lambda: memory, 2, [], alone, 0.1)
         states: list[MethodState] = [method.after_scene(first)]
@@ -60,18 +60,18 @@ def learned(
         trainer.load(trainer.state())
         chosen = method.select(FrameStatistics(frames, head, lambda: own, 0), 2)
         last = FinishedScene(head, 1, lambda: own, lambda: memory, 2, states, hooks, 0.1)
-        kept = method.after_scene(last)
-    return dict(head.state_dict()) | {f"kept.{k}": v for k, v in kept.items()}, chosen
+        selected = method.after_scene(last)
+    return dict(head.state_dict()) | {f"kept.{k}": v for k, v in selected.items()}, chosen
 
 
 @pytest.mark.parametrize("backbone", BACKBONES)
 @pytest.mark.parametrize("name", METHODS)
-def test_nothing_is_made_on_the_default_device(name: str, backbone: str) -> None:
+def test_no_tensor_is_created_on_the_default_device(name: str, backbone: str) -> None:
     # The default device is `meta`, the inputs lie on the CPU: numbers must come out, and the same.
     expected, frames = learned(METHODS[name], BACKBONES[backbone], nullcontext())
-    found, again = learned(METHODS[name], BACKBONES[backbone], made_where_inputs_lie())
-    assert found.keys() == expected.keys()
-    for key, value in found.items():
+    actual, again = learned(METHODS[name], BACKBONES[backbone], made_where_inputs_lie())
+    assert actual.keys() == expected.keys()
+    for key, value in actual.items():
         assert value.device.type == "cpu", key
         torch.testing.assert_close(value, expected[key], msg=key)
     assert (frames is None) == (again is None)

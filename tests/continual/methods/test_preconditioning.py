@@ -68,35 +68,33 @@ def edited(hooks: TrainingHooks, head: Head, changes: dict[str, Tensor]) -> dict
 
 
 @pytest.mark.parametrize("scenes", [1, 2])
-def test_changes_are_damped_as_the_formula_says(learnable: Learnable, scenes: int) -> None:
+def test_changes_are_damped_by_the_formula(learnable: Learnable, scenes: int) -> None:
     buffers = [learnable(scene)[0] for scene in range(scenes)]
     head, strength = head_of(buffers), 3.0
-    seen: list[Tensor] = []
+    captured: list[Tensor] = []
     first = head.first[0]
     assert isinstance(first, torch.nn.Linear)
-    hook = first.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0]))
+    hook = first.register_forward_hook(lambda _, inputs, __: captured.append(inputs[0]))
     hooks = hooks_for(head, buffers, Free(), strength)
     hook.remove()
-    moments = [x.double().T @ x.double() / len(x) for x in seen]
+    moments = [x.double().T @ x.double() / len(x) for x in captured]
     assert len(moments) == scenes
     moment = torch.stack([m / m.diagonal().mean() for m in moments]).sum(0)
     expected = torch.linalg.inv(torch.eye(48) + strength * moment)
     change = torch.randn(32, 48, generator=torch.Generator().manual_seed(2))
     bias = torch.ones(32)
-    found = edited(hooks, head, {"first.0.weight": change.clone(), "first.0.bias": bias.clone()})
-    damped = found["first.0.weight"]
+    actual = edited(hooks, head, {"first.0.weight": change.clone(), "first.0.bias": bias.clone()})
+    damped = actual["first.0.weight"]
     torch.testing.assert_close(damped.double(), change.double() @ expected, atol=1e-4, rtol=1e-4)
-    torch.testing.assert_close(found["first.0.bias"], bias)
+    torch.testing.assert_close(actual["first.0.bias"], bias)
     # A direction that the scene uses moves less than one that it hardly uses.
     _, axes = torch.linalg.eigh(moment)
-    kept = [float((damped.double() @ a).norm() / (change.double() @ a).norm()) for a in axes.T]
-    assert kept[-1] < 0.3 < 0.9 < kept[0]
+    selected = [float((damped.double() @ a).norm() / (change.double() @ a).norm()) for a in axes.T]
+    assert selected[-1] < 0.3 < 0.9 < selected[0]
 
 
 @pytest.mark.parametrize("strength", [0.0, 0.5])
-def test_what_one_remembered_scene_owns_does_not_move(
-    learnable: Learnable, strength: float
-) -> None:
+def test_parameters_of_remembered_scenes_are_fixed(learnable: Learnable, strength: float) -> None:
     buffers = [learnable(scene)[0] for scene in range(3)]
     head = head_of(buffers)
     before = {name: value.clone() for name, value in head.state_dict().items()}
@@ -114,7 +112,7 @@ def test_what_one_remembered_scene_owns_does_not_move(
     assert (after["last.1.weight"] != before["last.1.weight"]).any()
 
 
-def test_centres_that_belong_to_no_scene_are_free_to_learn() -> None:
+def test_shared_centres_are_trained() -> None:
     """On the paper's network the first scene's centres are those of all."""
     options = HeadOptions(width=16, condition="descriptor", centres="fixed", whiten=False)
     head = wave_head(1, options)
@@ -127,7 +125,7 @@ def test_centres_that_belong_to_no_scene_are_free_to_learn() -> None:
         assert not torch.equal(head.state_dict()[name], before[name])
 
 
-def test_an_old_scene_drifts_less(learnable: Learnable) -> None:
+def test_damping_reduces_drift(learnable: Learnable) -> None:
     old, new = learnable(0)[0], learnable(1)[0]
     drift = {}
     for strength in (0.0, 30.0):
@@ -144,7 +142,7 @@ def test_an_old_scene_drifts_less(learnable: Learnable) -> None:
 
 
 @pytest.mark.parametrize("stop", [1, 17])
-def test_a_resumed_run_protects_the_same_directions(learnable: Learnable, stop: int) -> None:
+def test_resumed_run_has_the_same_damping(learnable: Learnable, stop: int) -> None:
     """The matrices are those of the head before the stage, though they are made anew."""
     old, new = learnable(0)[0], learnable(1)[0]
 

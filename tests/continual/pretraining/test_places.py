@@ -35,7 +35,7 @@ def test_loss_of_two_rooms() -> None:
     assert float(place_loss(eye, eye.flip(0), rooms)) == pytest.approx(1 / T, rel=1e-4)
 
 
-def test_places_of_one_room_are_neither_friend_nor_foe() -> None:
+def test_places_of_one_room_are_ignored() -> None:
     same = torch.ones(2, 2) / math.sqrt(2)
     assert float(place_loss(same, same, torch.tensor([3, 3]))) == pytest.approx(0, abs=1e-6)
     assert float(place_loss(same, same, torch.tensor([3, 4]))) == pytest.approx(math.log(2))
@@ -50,7 +50,7 @@ class Mean(nn.Module):
         return F.normalize(maps.mean((2, 3)), dim=-1)
 
 
-def test_accuracy_is_the_share_of_queries_whose_nearest_view_is_of_their_room() -> None:
+def test_accuracy_by_hand() -> None:
     """Three rooms, two anchors, four views; view 0 asks, the others answer."""
     maps = torch.zeros(3, 2, 4, 3, 2, 2)
     for room in range(3):
@@ -80,27 +80,25 @@ def test_crops_are_windows_of_the_map() -> None:
 def trained(one_room: RoomViews, steps: int) -> tuple[dict[str, Tensor], list[str]]:
     torch.manual_seed(0)
     encoder = LocalEncoder((4, 4), 8, 1, 8).eval()
-    said: list[str] = []
+    lines: list[str] = []
     options = PretrainOptions(descriptor_steps=steps)
     data = PretrainData([one_room, one_room], [])
-    descriptor = train_descriptor(data, options, encoder, said.append)
-    return descriptor.state_dict(), said
+    descriptor = train_descriptor(data, options, encoder, lines.append)
+    return descriptor.state_dict(), lines
 
 
-def test_training_repeats_with_the_seed(
-    one_room: RoomViews, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_is_reproducible(one_room: RoomViews, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(places, "photometric", lambda image, rng: image)
     first, _ = trained(one_room, 5)
     torch.rand(3)
     again, _ = trained(one_room, 5)
     assert all(torch.equal(value, again[name]) for name, value in first.items())
-    longer, said = trained(one_room, 6)
+    longer, lines = trained(one_room, 6)
     assert not torch.equal(first["project.weight"], longer["project.weight"])
-    assert said == []
+    assert lines == []
 
 
-def test_pretrain_writes_what_the_loaders_read(
+def test_pretrain_writes_loadable_files(
     tmp_path: Path, one_room: RoomViews, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With stand-ins for the two long parts: data and the encoder's training."""
@@ -125,7 +123,7 @@ def test_pretrain_writes_what_the_loaders_read(
 
 
 @pytest.mark.slow
-def test_the_whole_of_pretrain_in_small_and_once_more(tmp_path: Path) -> None:
+def test_small_pretraining_is_complete_and_resumable(tmp_path: Path) -> None:
     options = PretrainOptions(
         steps=3, rooms=2, furnished=0, furnished_pairs=0, pictures=2, descriptor_steps=2
     )
@@ -165,20 +163,20 @@ def ranks(seeds: range, gallery: int, queries: int) -> np.ndarray:
             return descriptor(encoder(torch.from_numpy(np.stack(images))[:, None].float() / 255))
 
     rooms = [BoxRoom(seed, texture_px=128) for seed in seeds]
-    known = [describe(room, gallery, 1) for room in rooms]
-    found = []
+    learned_head = [describe(room, gallery, 1) for room in rooms]
+    actual = []
     for own, room in enumerate(rooms):
-        asked = describe(room, queries, 2)
-        likeness = torch.stack([(asked @ views.T).amax(1) for views in known], 1)
-        found.append((likeness > likeness[:, own : own + 1]).sum(1).numpy())
-    return np.concatenate(found)
+        calls = describe(room, queries, 2)
+        likeness = torch.stack([(calls @ views.T).amax(1) for views in learned_head], 1)
+        actual.append((likeness > likeness[:, own : own + 1]).sum(1).numpy())
+    return np.concatenate(actual)
 
 
-def test_the_shipped_descriptor_tells_three_rooms_it_never_saw_apart() -> None:
+def test_shipped_descriptor_separates_three_new_rooms() -> None:
     assert (ranks(range(300, 303), gallery=12, queries=4) == 0).mean() >= 0.8
 
 
 @pytest.mark.slow
-def test_the_shipped_descriptor_names_the_right_room_of_twelve() -> None:
+def test_shipped_descriptor_separates_twelve_new_rooms() -> None:
     """Measured: 99 % of images taken half a step beside the gallery's; a guess gives 8 %."""
     assert (ranks(range(300, 312), gallery=40, queries=8) == 0).mean() >= 0.9
