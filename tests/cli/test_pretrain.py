@@ -1,4 +1,4 @@
-"""`evercal pretrain`: the options of the training are its own."""
+"""`evercal pretrain` and its options."""
 
 import dataclasses
 import json

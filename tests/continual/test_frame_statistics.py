@@ -1,4 +1,4 @@
-"""What selectors see of frames: means over the right rows, parts that overlap, true gradients."""
+"""Statistics of frames: features, parts of the scene, gradients."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ from .stages import Blank, Rooms
 def captured(
     blank: Blank, rooms: Rooms, quick: StageOptions
 ) -> tuple[FrameStatistics, Head, FeatureBuffer]:
-    """Frames of `alpha` after some learning, with two views of each in the buffer."""
+    """Frames of `alpha` after some training, with two views of each in the buffer."""
     options = replace(quick, fit=replace(quick.fit, iterations=60))
     *_, stage = learn(blank("finetune"), STRATEGIES["finetune"], rooms[0], options)
     assert isinstance(stage, Stage)
@@ -69,7 +69,7 @@ def test_neighbouring_frames_share_parts(
 def test_gradient_predicts_the_change_of_the_loss(
     captured: tuple[FrameStatistics, Head, FeatureBuffer], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A small step against a frame's gradient lowers the loss by its squared length."""
+    """A small step against the gradient lowers the loss by the predicted amount."""
     candidates, head, buffer = captured
     gradient = candidates.gradients()[3]
     where = torch.nonzero(buffer.tensors["view"] == 3)[:, 0]
@@ -99,7 +99,7 @@ def test_gradient_predicts_the_change_of_the_loss(
 def test_fixed_centres_all_have_gradients(
     captured: tuple[FrameStatistics, Head, FeatureBuffer], rooms: Rooms
 ) -> None:
-    """They belong to no scene: those of a later scene would have none of its own."""
+    """Fixed centres belong to no scene, so all of them are used."""
     _, learned_head, buffer = captured
     torch.manual_seed(0)
     options = HeadOptions(

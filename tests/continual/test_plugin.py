@@ -41,7 +41,7 @@ def test_example_is_short_and_can_be_loaded_twice() -> None:
     selected = method.select(Line(), 3)  # pyright: ignore[reportArgumentType]
     assert selected is not None
     assert selected.tolist() == [0, 5, 10]
-    # What it is made of is recorded like ours.
+    # Its hyper-parameters are recorded.
     records = STRATEGIES["spread"].description()["method"]
     assert isinstance(records, dict)
     assert (records["kind"], records["penalty"]) == (
@@ -93,7 +93,7 @@ def test_existing_names_are_refused(tmp_path: Path) -> None:
 
 
 def test_example_learns_two_scenes(blank: Blank, rooms: Rooms, quick: StageOptions) -> None:
-    """Its frames are replayed, with its penalty: without a weight it ends elsewhere."""
+    """The penalty of the example changes the training."""
     (name,) = load_plugin(EXAMPLE)
     strategy = strategy_named(name)
     before = outcome(learn(blank(name), strategy, rooms[0], quick))

@@ -1,4 +1,4 @@
-"""Selectors of other methods: by hand, against slow twins, and by what they promise."""
+"""Selectors of other methods, by hand and against slow references."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def test_reservoir_is_uniform() -> None:
 
 
 def test_hybrid_prefers_novel_frames() -> None:
-    # A camera that stands still but for three jumps: steps of 0, 20, 0, 0, 30, 0, 40, 0 degrees.
+    # The camera rotates by 0, 20, 0, 0, 30, 0, 40, 0 degrees.
     angles = np.deg2rad([0.0, 0, 20, 20, 20, 50, 50, 90, 90])
     features = 3.0 * np.stack([np.cos(angles), np.sin(angles)], 1)
     for seed in range(10):
@@ -35,7 +35,7 @@ def test_hybrid_prefers_novel_frames() -> None:
         assert set(select_hybrid(features, 3, rng(seed))) < {0, 2, 5, 7}
         assert {0, 2, 5, 7} < set(select_hybrid(features, 6, rng(seed)))
         assert len(select_hybrid(features, 6, rng(seed))) == 6
-    # A plain reservoir has no such preference.
+    # A plain reservoir has no preference.
     plain = [select_reservoir(9, 4, rng(seed)).tolist() for seed in range(20)]
     assert [0, 2, 5, 7] not in plain
 
@@ -66,10 +66,10 @@ def test_herding_matches_a_slow_reference() -> None:
 
 
 def test_leverage_by_hand() -> None:
-    # Three copies of one direction share it, the only frame of another has it to itself.
+    # Three equal frames share the leverage of their direction.
     features = np.array([[2.0, 0.0], [2.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
     assert leverage_scores(features, 2) == pytest.approx([1 / 3, 1 / 3, 1 / 3, 1.0])
-    # Of rank one, only the strongest direction (norm sqrt 12) counts.
+    # With rank one, only the strongest direction (norm sqrt 12) counts.
     assert leverage_scores(features, 1) == pytest.approx([1 / 3, 1 / 3, 1 / 3, 0.0], abs=1e-12)
 
 
@@ -86,12 +86,12 @@ def test_leverage_prefers_the_isolated_frame() -> None:
     features = np.array([[1.0, 0.0]] * 19 + [[0.0, 1.0]])
     runs = 400
     lone = sum(19 in select_leverage(features, 1, rng(seed)) for seed in range(runs)) / runs
-    assert lone == pytest.approx(0.5, abs=5 * 0.5 / np.sqrt(runs))  # by chance it would be 1/20
+    assert lone == pytest.approx(0.5, abs=5 * 0.5 / np.sqrt(runs))  # 1/20 by chance
 
 
 @pytest.mark.parametrize("victim", ["random", "redundant"])
 def test_coverage_selects_frames_with_new_parts(victim: str) -> None:
-    # Forty frames show part 0 and one shows part 1: a reservoir of 4 often misses it.
+    # Forty frames show part 0, one frame also part 1.
     visible = [np.array([0])] * 40 + [np.array([0, 1])]
     runs = 300
     covered = sum(40 in select_coverage(visible, 4, rng(s), victim) for s in range(runs))  # pyright: ignore[reportArgumentType]
@@ -101,7 +101,7 @@ def test_coverage_selects_frames_with_new_parts(victim: str) -> None:
 
 
 def test_redundant_frame_is_replaced() -> None:
-    # Frames 0 and 1 show the same; whoever comes last shows something new and one of them goes.
+    # Frames 0 and 1 show the same parts; a later frame with a new part replaces one of them.
     visible = [np.array([0, 1]), np.array([0, 1]), np.array([2]), np.array([3])]
     for seed in range(20):
         order = rng(seed).permutation(4).tolist()
@@ -112,12 +112,12 @@ def test_redundant_frame_is_replaced() -> None:
 
 
 def test_opposed_gradient_replaces_a_frame() -> None:
-    # All but the last frame pull one way: the last enters a full buffer, a copy never does.
+    # An opposed gradient enters a full buffer, a repeated one does not.
     same = np.tile([1.0, 0.0], (30, 1))
     away = np.concatenate([same, [[-1.0, 0.0]]])
     assert select_gradients(same, 4, rng()).tolist() == [0, 1, 2, 3]
     entered = [30 in select_gradients(away, 4, rng(seed)) for seed in range(50)]
-    # Its score is 0, so whomever it challenges loses for sure.
+    # Its score is 0, so it always replaces the drawn frame.
     assert all(entered)
 
 

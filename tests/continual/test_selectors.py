@@ -1,4 +1,4 @@
-"""Which frames stay: within the capacity, in recorded order, whatever the rule."""
+"""All selectors: capacity and order."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from evercal.recordings.frame import Frame
 
 
 class SyntheticFrames(FrameStatistics):
-    """Frames of a camera that moves by random steps; what a head would say is made up."""
+    """Frames of a moving camera, with synthetic outputs of a head."""
 
     def __init__(self, positions: np.ndarray, quaternions: np.ndarray):
         camera, image = Camera(8, 8, 8, 8, 3.5, 3.5), np.zeros((8, 8, 3), np.uint8)
@@ -51,7 +51,7 @@ def test_selection_is_sorted_and_within_capacity(name: str, count: int) -> None:
 
 
 def test_only_sars_may_leave_memory_unused() -> None:
-    # A camera that moves little relative to its turning stays within r = 0.5 of few frames.
+    # On a straight path few frames are 0.5 apart.
     positions = np.linspace(0, 1, 200)[:, None] * [1.0, 0, 0]
     quaternions = np.tile([1.0, 0, 0, 0], (200, 1))
     selected = {

@@ -1,4 +1,4 @@
-"""The list of strategies: what each is, in plain data, and that they hang together."""
+"""The list of strategies and their descriptions."""
 
 import json
 from dataclasses import fields, replace
@@ -68,7 +68,7 @@ def test_hybrid_is_network_and_map() -> None:
 
 
 def test_sars_spdd_has_the_settings_of_the_paper() -> None:
-    """SARS with the fixed radius, the teacher alone, all weights 1, tau 2, 50 active centres."""
+    """SARS with the fixed radius, SPDD with weights 1, tau 2 and 50 active centres."""
     method = STRATEGIES["sars_spdd"].method
     assert isinstance(method, Replay)
     assert method == Replay("sars", Distillation(), weight=1.0)

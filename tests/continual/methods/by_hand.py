@@ -1,4 +1,4 @@
-"""Rows, outputs and scenes small enough to do by hand."""
+"""Rows, outputs and scenes for calculations by hand."""
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ DEPTH_M, FOCAL_PX = 2.0, 100.0
 
 
 def rows(count: int, scene: int = 0) -> Rows:
-    """Rows seen by a camera at the origin, each of which must project to the image centre."""
+    """Create rows of a camera at the origin; the target is always the image centre."""
     target = Target(
         torch.full((count, 2), 50.0),
         torch.tensor([FOCAL_PX, FOCAL_PX, 50.0, 50.0]).repeat(count, 1),
@@ -26,12 +26,12 @@ def rows(count: int, scene: int = 0) -> Rows:
 
 
 def off_by(pixels: float) -> list[float]:
-    """A point that projects `pixels` to the right of where it must."""
+    """Return a point that projects `pixels` to the right of its target."""
     return [pixels / FOCAL_PX * DEPTH_M, 0.0, DEPTH_M]
 
 
 def head_output(points: list[list[float]], hidden: list[list[float]] | None = None) -> HeadOutput:
-    """A head's output with these points (camera frame, metres)."""
+    """Create a head's output with given points (camera frame, metres)."""
     where = torch.tensor(points, requires_grad=True)
     zero = torch.zeros(len(points), 2)
     activations = zero if hidden is None else torch.tensor(hidden)
@@ -64,7 +64,7 @@ def wave_buffer(scene: int, views: int = 4, shift_px: float = 0.0, few: int = 0)
 
 
 def wave_head(scenes: int, options: HeadOptions | None = None) -> Head:
-    """A head with room for such scenes."""
+    """Create a head for scenes of `wave_buffer`."""
     torch.manual_seed(0)
     head = Head(9, 4, options or HeadOptions(width=16, blocks=1, whiten=False))
     for scene in range(scenes):
@@ -80,16 +80,16 @@ def stage_start(
     states: list[MethodState] | None = None,
     replay_rows: int = 64,
 ) -> StageStart:
-    """A stage that begins with these memories."""
+    """Create the start of a stage."""
     selected: list[MethodState] = [{} for _ in memories] if states is None else states
     return StageStart(head, teacher, memories, selected, replay_rows, 0)
 
 
 def flat(head: Head) -> Tensor:
-    """(p,) a copy of all weights."""
+    """Copy all weights, (p,)."""
     return torch.cat([value.detach().flatten() for value in head.parameters()]).clone()
 
 
 def flat_of(head: Head, named: dict[str, Tensor]) -> Tensor:
-    """(p,) tensors by parameter name, in the order of `flat`."""
+    """Concatenate tensors by parameter name, in the order of `flat`."""
     return torch.cat([named[name].flatten() for name, _ in head.named_parameters()]).clone()

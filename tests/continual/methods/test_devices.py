@@ -1,4 +1,4 @@
-"""Every method keeps to one device: what it makes lies where its inputs lie."""
+"""Every method creates tensors only on the device of its inputs."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ BACKBONES = {
 def learned(
     method: Method, options: HeadOptions, context: AbstractContextManager[None]
 ) -> tuple[dict[str, Tensor], np.ndarray | None]:
-    """A second scene is learned and finished: all tensors that come of it, and the frames kept."""
+    """Learn and finish a second scene; return all resulting tensors and the selected frames."""
     own, memory = wave_buffer(1), wave_buffer(0, views=2)
     head = wave_head(2, options)
     teacher = copy.deepcopy(head).eval()
@@ -67,7 +67,7 @@ def learned(
 @pytest.mark.parametrize("backbone", BACKBONES)
 @pytest.mark.parametrize("name", METHODS)
 def test_no_tensor_is_created_on_the_default_device(name: str, backbone: str) -> None:
-    # The default device is `meta`, the inputs lie on the CPU: numbers must come out, and the same.
+    # With `meta` as the default device and inputs on the CPU, results are the same.
     expected, frames = learned(METHODS[name], BACKBONES[backbone], nullcontext())
     actual, again = learned(METHODS[name], BACKBONES[backbone], made_where_inputs_lie())
     assert actual.keys() == expected.keys()

@@ -1,4 +1,4 @@
-"""Constraints hold for the step that is really taken, whatever optimisers make of a gradient."""
+"""Gradient constraints hold for the applied step of the optimisers."""
 
 import copy
 import itertools
@@ -20,7 +20,7 @@ from evercal.continual.methods.gradient_constraints import (
 from evercal.continual.methods.method import FinishedScene, MethodState
 from evercal.continual.networks.buffer import diffused
 from evercal.continual.networks.head import HeadOptions
-from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
+from evercal.continual.networks.hooks import ProposedStep
 from evercal.continual.networks.loss import LossOptions, fixed_clamp_loss, reprojection_loss
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer, one_cycle
 
@@ -31,7 +31,7 @@ OPTIONS = FitOptions(iterations=14, batch=64, replay_batch=64, peak_rate=1e-2)
 
 
 def slow_nearest(changes: np.ndarray, g: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """Every set of constraints that may be active is tried; the nearest allowed change is best."""
+    """Search all sets of active constraints for the nearest allowed change."""
     best, actual = np.inf, None
     for count in range(min(len(g), len(changes)) + 1):
         for active in itertools.combinations(range(len(g)), count):
@@ -57,7 +57,7 @@ def test_nearest_change_equals_search_over_active_sets(seed: int) -> None:
     rng = np.random.default_rng(seed)
     count, size = 1 + seed % 5, 7
     changes, g = rng.normal(size=size), rng.normal(size=(count, size))
-    # Gradients of remembered scenes differ in length by orders of magnitude.
+    # Gradient lengths differ by orders of magnitude.
     g *= 10.0 ** rng.uniform(-4, 4, (count, 1))
     most = rng.uniform(-1, 1, count) * np.linalg.norm(g, axis=1) * (seed % 3 > 0)
     actual = nearest(changes, g, most)
@@ -66,7 +66,7 @@ def test_nearest_change_equals_search_over_active_sets(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_parallel_constraints_have_a_solution(seed: int) -> None:
-    # The tightest of several along one direction decides.
+    # Along one direction the tightest constraint is active.
     rng = np.random.default_rng(seed)
     along = rng.normal(size=5)
     g = along * np.array([[1.0], [1.0], [2.0], [30.0]])
@@ -85,7 +85,7 @@ def test_constraint_without_a_gradient_is_ignored() -> None:
 
 @dataclass
 class AppliedStep:
-    """A step as it was proposed and as it was taken."""
+    """A proposed step and the applied one."""
 
     wanted: Tensor
     taken: Tensor
@@ -119,13 +119,13 @@ def steps_of(method: ConstrainedStep) -> list[AppliedStep]:
 
 
 def excess(step: AppliedStep, g: Tensor, most: Tensor) -> float:
-    """By how much the worst constraint is broken, as a share of the longest that it could be."""
+    """Compute the largest violation, relative to the lengths of gradient and step."""
     size = g.double().norm(dim=1) * step.taken.double().norm()
     return float(((g.double() @ step.taken.double() - most.double()) / size).max())
 
 
 def bounds(method: ConstrainedStep, step: AppliedStep) -> tuple[Tensor, Tensor]:
-    """What the originals ask of a step: gradients and allowed increases."""
+    """Return the constraints of the original methods: gradients and allowed increases."""
     if isinstance(method, AveragedGem):
         return step.g.mean(0, keepdim=True), torch.zeros(1)
     if isinstance(method, Gem):
@@ -151,16 +151,16 @@ def test_applied_step_satisfies_every_constraint(method: ConstrainedStep) -> Non
         size = float(step.wanted.norm())
         np.testing.assert_allclose(step.taken.numpy(), allowed, atol=1e-4 * size)
         if bool((g @ step.wanted <= most).all()):
-            # Nothing stands against it: the very step of the optimisers, but for float rounding.
+            # No constraint is active, so the step of the optimisers is applied.
             torch.testing.assert_close(step.taken, step.wanted, rtol=0, atol=1e-6)
         else:
             bound += 1
             assert float((step.taken - step.wanted).norm()) > 1e-4 * size
-    assert bound > 3  # the example is one in which memory is in the way
+    assert bound > 3  # constraints are active in several steps
 
 
 def test_constraint_gradients_are_of_the_remembered_losses() -> None:
-    """The constraint's gradient against differences of the loss on the very rows replayed."""
+    """Constraint gradients equal the gradients of the loss on the replayed rows."""
     head, method = wave_head(3), Gem()
     memories = [wave_buffer(i, shift_px=3.0 * i) for i in range(2)]
     hooks = method.begin(stage_start(head, memories))
@@ -183,7 +183,7 @@ def test_constraint_gradients_are_of_the_remembered_losses() -> None:
 def proposed_of(
     losses: list[float], change: list[float], step: int = 100, schedule: float = 1.0
 ) -> ProposedStep:
-    """One weight a scene, whose gradient is 1."""
+    """Create a step with one weight per scene, with gradient 1."""
     count = len(losses)
     constraints: list[Mapping[str, Tensor]] = [{"w": torch.eye(count)[i]} for i in range(count)]
     return ProposedStep(
@@ -208,23 +208,23 @@ def test_episodic_constraint_by_hand() -> None:
     # h = 1 - 2.1 = -1.1, it may rise by 0.055.
     proposed = proposed_of([5.0, 1.0], [0.3, 0.3])
     assert edited(gec, proposed, [2.0, 2.0]) == [-0.145, 0.055]
-    # What falls by more, or rises by less, is left alone.
+    # A sufficient fall, and an allowed rise, are not edited.
     assert edited(gec, proposed_of([5.0, 1.0], [-0.2, 0.05]), [2.0, 2.0]) == [-0.2, 0.05]
-    # Half way down the schedule half of it is asked; the share of slack is of the reference.
+    # Half the learning rate halves the bound; the slack is relative to the reference.
     assert edited(gec, proposed_of([5.0], [0.3], schedule=0.5), [2.0]) == [-0.0725]
     slack = EpisodicConstraint(alpha=1.0, eta=0.1, slack=0.5, longest=9.0)
     assert edited(slack, proposed_of([3.0], [0.3]), [2.0]) == [0.0]
-    # Steps of the warm-up are not edited, and a scene without a reference has no constraint.
+    # Warm-up steps are not edited. A scene without a reference has no constraint.
     assert edited(gec, proposed_of([5.0], [0.3], step=4), [2.0]) == [pytest.approx(0.3)]
     assert edited(gec, proposed_of([5.0], [0.3], step=5), [2.0]) == [-0.145]
     assert edited(gec, proposed_of([5.0, 5.0], [0.3, 0.3]), [float("nan"), 2.0])[0] == 0.3
-    # Whatever is asked, no more than the length of the step is added to it.
+    # The added length is at most the length of the step.
     assert edited(EpisodicConstraint(), proposed_of([900.0], [0.3]), [2.0]) == [0.0]
 
 
 def test_averaged_and_single_constraints_by_hand() -> None:
-    # One loss is constrained, the mean of both, with the gradient (1, 1) / 2: what goes against it
-    # is taken out of the step.
+    # The mean loss has the gradient (1, 1) / 2; the component of the step along it
+    # is removed.
     (mean,) = AveragedGem().constrained([torch.tensor(1.0), torch.tensor(3.0)])
     assert float(mean) == 2.0
     proposed = proposed_of([1.0, 1.0], [0.5, -0.1])
@@ -236,8 +236,8 @@ def test_averaged_and_single_constraints_by_hand() -> None:
 
 
 def test_gem_margin_lowers_every_remembered_loss() -> None:
-    # A step (0.3, -0.4) is half a unit long: a tenth of that is added against each gradient, which
-    # is an axis; where that is not enough the step is projected as well.
+    # The step (0.3, -0.4) has length 0.5. A tenth of that is added against each gradient (an
+    # axis); if that is not enough, the step is also projected.
     proposed = proposed_of([1.0, 1.0], [0.3, -0.4])
     assert edited(Gem(margin=0.1), proposed, [1.0, 1.0]) == [0.0, pytest.approx(-0.45)]
     harmless = proposed_of([1.0, 1.0], [-0.3, -0.4])
@@ -259,7 +259,7 @@ def test_first_steps_are_plain_replay() -> None:
         hooks.edit_step(proposed)
         moved = (proposed.changes["w"] - 0.5).abs().max() > 0
         assert bool(moved) == (step >= 5)
-    # At the last step's clamp of 1 px: the mean of tanh 3 and tanh 1.
+    # With a clamp of 1 px: the mean of tanh 3 and tanh 1.
     assert costs[:5] == pytest.approx([(np.tanh(3.0) + np.tanh(1.0)) / 2] * 5, rel=1e-5)
     assert costs[5:] == [None, None]
 
@@ -269,17 +269,17 @@ def test_moving_reference_is_the_previous_step() -> None:
     state: list[MethodState] = [{"reference": torch.tensor(1.0)}]
     method = EpisodicConstraint(alpha=1.0, eta=1.0, longest=9.0, warm_steps=0, moving=True)
     hooks = method.begin(stage_start(head, memories, states=state))
-    # The first step knows of none before it, however bad the scene is.
+    # The first step has no reference.
     first = proposed_of([9.0], [0.7])
     hooks.edit_step(first)
     assert first.changes["w"].tolist() == pytest.approx([0.7])
-    # 9 -> 10: h = 10 - 1.05 x 9 = 0.55 must be made up for; 10 -> 10: 0.5 is free.
+    # 9 -> 10: h = 10 - 1.05 x 9 = 0.55 must be recovered; 10 -> 10: a rise of 0.5 is allowed.
     second, third = proposed_of([10.0], [0.7]), proposed_of([10.0], [0.7])
     hooks.edit_step(second)
     assert second.changes["w"].tolist() == pytest.approx([-0.55])
     hooks.edit_step(third)
     assert third.changes["w"].tolist() == pytest.approx([0.5])
-    # What it looks at survives an interruption.
+    # The reference survives a resume.
     again = method.begin(stage_start(head, memories, states=state))
     again.load(hooks.state())
     fourth = proposed_of([11.0], [0.7])
@@ -323,7 +323,7 @@ def test_reference_includes_descriptor_noise() -> None:
 
 @pytest.mark.parametrize("pixels", [5.0, 40.0])
 def test_forgotten_row_has_a_gradient(pixels: float) -> None:
-    # d/de of 50 tanh(e / 50); with a clamp of 5 px it would be 4e-7 at 40 px.
+    # d/de of 50 tanh(e / 50). With a clamp of 5 px it is 4e-7 at 40 px.
     output = head_output([off_by(pixels)])
     AveragedGem().loss(output, rows(1)).backward()
     assert output.points.grad is not None

@@ -1,4 +1,4 @@
-"""LwF: new rows asked as if they showed an old scene, held where the old head put them."""
+"""LwF: new rows with the index of an old scene keep the output of the old head."""
 
 import copy
 
@@ -15,7 +15,7 @@ from .by_hand import stage_start, wave_buffer, wave_head
 
 
 def grown(scenes: int) -> tuple[Head, Head]:
-    """A teacher of these scenes, and a student with room for one more."""
+    """Create a teacher, and a student with one more scene."""
     teacher = wave_head(scenes)
     student = copy.deepcopy(teacher)
     student.grow(torch.ones(2, 3), seed=9)
@@ -37,7 +37,7 @@ def test_new_rows_are_replayed_with_every_old_scene(scenes: int) -> None:
         assert len(part.scene) == 60 // scenes
         new = {tuple(row) for row in fresh.features.tolist()}
         assert {tuple(row) for row in part.features.tolist()} <= new
-    assert set(fresh.scene.tolist()) == {9}  # the rows themselves stay those of the new scene
+    assert set(fresh.scene.tolist()) == {9}  # the new rows are unchanged
 
 
 def test_cost_by_hand() -> None:
@@ -50,16 +50,16 @@ def test_cost_by_hand() -> None:
     output = student(rows.features.float(), rows.scene, rows.descriptor)
     actual = hooks.cost(output, rows, 0.3)
     assert actual is not None
-    assert float(actual.detach()) == pytest.approx(0.0, abs=0.5)  # bfloat16 on some processors
+    assert float(actual.detach()) == pytest.approx(0.0, abs=0.5)  # some processors use bfloat16
     away = HeadOutput(output.logits, output.offsets, output.points + 0.3, output.hidden)
     actual = hooks.cost(away, rows, 0.3)
     assert actual is not None
-    # Each of two old scenes costs 0.5 x 20 px/m x (3 x 0.3 m).
+    # Loss of each old scene: 0.5 x 20 px/m x (3 x 0.3 m).
     assert float(actual.detach()) == pytest.approx(2 * 0.5 * 20 * 0.9, rel=0.03)
 
 
 def test_distillation_reduces_drift_on_new_images() -> None:
-    """Beside plain training, from the same start."""
+    """Compared with plain training from the same start."""
     drift = {}
     options = FitOptions(iterations=40, batch=64, peak_rate=1e-2)
     new = wave_buffer(1, shift_px=-12.0)

@@ -1,4 +1,4 @@
-"""Maximally interfered retrieval: what a step spoils is found, and the head stays as it was."""
+"""Maximally interfered retrieval selects harmed views and does not change the head."""
 
 import copy
 from collections.abc import Callable
@@ -33,7 +33,7 @@ def head_of(buffers: list[FeatureBuffer]) -> Head:
 
 @pytest.fixture(scope="module")
 def trained_head(learnable: Learnable) -> tuple[Head, FeatureBuffer]:
-    """A head that knows a scene of 24 views."""
+    """A head trained on a scene of 24 views, and the scene's rows."""
     buffer, _ = learnable(views=24)
     head = head_of([buffer])
     options = FitOptions(iterations=600, batch=512, replay_batch=64)
@@ -46,7 +46,7 @@ def trained_head(learnable: Learnable) -> tuple[Head, FeatureBuffer]:
 def test_views_contradicted_by_new_rows_are_selected(
     trained_head: tuple[Head, FeatureBuffer], harmed: int
 ) -> None:
-    """New rows look like one remembered view and want their points elsewhere."""
+    """New rows have the features of one remembered view and other targets."""
     head, buffer = trained_head
     before = copy.deepcopy(head.state_dict())
     rows = buffer.rows(torch.nonzero(buffer.tensors["view"] == harmed)[:, 0])
@@ -59,7 +59,7 @@ def test_views_contradicted_by_new_rows_are_selected(
     ]
     assert all(len(set(views)) == MIR.chosen for views in actual)
     hits = sum(harmed in views for views in actual)
-    assert hits >= 4  # by chance a third of them
+    assert hits >= 4  # a third by chance
     for name, value in head.state_dict().items():
         assert torch.equal(value, before[name]), name
 
@@ -67,7 +67,7 @@ def test_views_contradicted_by_new_rows_are_selected(
 def test_forgotten_view_can_be_selected(
     trained_head: tuple[Head, FeatureBuffer],
 ) -> None:
-    """Its points are 20 px off; under a clamp of 5 px nothing more could be lost there."""
+    """With a clamp of 5 px, the loss of points that are 20 px off cannot rise further."""
     head, buffer = trained_head
     harmed = buffer.tensors["view"] == 17
     rows = buffer.rows(torch.nonzero(harmed)[:, 0])
@@ -105,7 +105,7 @@ def test_only_selected_views_are_replayed_also_after_a_resume(learnable: Learnab
     head = head_of([old, new])
     twin, third = copy.deepcopy(head), copy.deepcopy(head)
     list(HeadTrainer(head, [new], OPTIONS, 3, hooks_for(head)).run())
-    assert len(set.union(*captured)) <= MIR.chosen  # one choice lasts for these twenty steps
+    assert len(set.union(*captured)) <= MIR.chosen  # one selection for twenty steps
     first = HeadTrainer(twin, [new], OPTIONS, 3, hooks_for(twin))
     list(islice(first.run(), 7))
     second = HeadTrainer(third, [new], OPTIONS, 3, hooks_for(third))

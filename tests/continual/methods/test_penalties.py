@@ -1,4 +1,4 @@
-"""What replayed rows cost, on rows small enough to do by hand."""
+"""Losses of replayed rows, calculated by hand."""
 
 import math
 from dataclasses import replace
@@ -46,7 +46,7 @@ def test_reprojection_costs_the_loss_of_new_rows(tau: float) -> None:
 
 
 def test_old_output_by_hand() -> None:
-    # The student is 3 px (6 cm) right of the truth, the teacher 2 px (4 cm) left of it.
+    # The student is 3 px (6 cm) right of the target, the teacher 2 px (4 cm) left.
     actual = cost(
         OldOutput(), head_output([off_by(3.0)]), head_output([off_by(-2.0)]), rows(1), 1.0
     )
@@ -62,7 +62,7 @@ def test_old_output_by_hand() -> None:
 
 
 def test_teacher_bounds_only_a_worse_student() -> None:
-    # Row 0: student 3 px, teacher 1 px off: pulled by 4 cm. Row 1: the teacher is worse: free.
+    # Row 0: errors 3 px (student) and 1 px (teacher), 4 cm apart. Row 1: the teacher is worse.
     student = head_output([off_by(3.0), off_by(1.0)])
     teacher = head_output([off_by(1.0), off_by(2.0)])
     truth = (math.tanh(3.0) + math.tanh(1.0)) / 2
@@ -71,20 +71,20 @@ def test_teacher_bounds_only_a_worse_student() -> None:
 
 
 def test_stored_output_by_hand() -> None:
-    # Two rows 3 px (6 cm) off; what was said of the first is the truth, of the second nothing: the
-    # distance is a mean over rows of which something was said.
+    # Two rows with errors of 3 px (6 cm). The stored point of the first is correct, the second has
+    # no stored point and is excluded from the mean distance.
     records = replace(rows(2), stored=torch.tensor([off_by(0.0), [math.nan] * 3]))
     actual = cost(StoredOutput(), head_output([off_by(3.0)] * 2), None, records, 1.0)
     assert actual == pytest.approx(0.5 * math.tanh(3.0) + 0.5 * PX_PER_M * 0.06, rel=1e-5)
 
 
 def test_relations_by_hand() -> None:
-    # To the teacher rows 0 and 1 are alike and row 2 differs; the student has 1 and 2 alike.
+    # For the teacher rows 0 and 1 are equal, for the student rows 1 and 2.
     right = [off_by(0.0)] * 3
     teacher = head_output(right, [[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     student = head_output(right, [[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
     near = 1 / (1 + math.exp(-1 / 0.2))
-    # Row 0: teacher near and far, student halves. Row 1: swapped. Row 2: halves, student far, near.
+    # Probabilities of row 0: teacher (near, far), student (1/2, 1/2). Row 1: swapped.
     row_0 = near * math.log(2 * near) + (1 - near) * math.log(2 * (1 - near))
     row_1 = near * math.log(near / (1 - near)) + (1 - near) * math.log((1 - near) / near)
     row_2 = -0.5 * (math.log(2 * near) + math.log(2 * (1 - near)))
@@ -95,7 +95,7 @@ def test_relations_by_hand() -> None:
 
 @pytest.mark.parametrize("scene", range(4))
 def test_relations_cover_every_remembered_scene(scene: int) -> None:
-    """Rows come scene by scene, 700 of each; what changes in one of them must cost something."""
+    """Rows are ordered by scene, 700 of each; a change in any scene has a loss."""
     generator = torch.Generator().manual_seed(1)
     activations = torch.randn(2800, 8, generator=generator)
     right = [off_by(0.0)] * 2800
@@ -104,7 +104,7 @@ def test_relations_cover_every_remembered_scene(scene: int) -> None:
     moved[700 * scene : 700 * (scene + 1), 0] += 2.0
     actual = cost(Relations(), head_output(right, moved.tolist()), teacher, rows(2800), 1.0)
     assert actual > 1e-2
-    # Each scene has its share of the 512 rows that are compared.
+    # Each scene has a quarter of the 512 compared rows.
     student = head_output(right, activations.tolist())
     student.hidden.requires_grad_()
     student.hidden.data += 0.1 * torch.randn(2800, 8, generator=generator)
@@ -115,13 +115,13 @@ def test_relations_cover_every_remembered_scene(scene: int) -> None:
 
 
 def test_anchored_reprojection_by_hand() -> None:
-    # Row 0: the teacher is right, the student 3 px (6 cm) off: it pays for both.
-    # Row 1: the teacher is far off, the student right: it pays nothing, however far they are apart.
+    # Row 0: the teacher is exact, the student has an error of 3 px (6 cm): both terms apply.
+    # Row 1: the teacher is wrong and ignored, the student is exact.
     penalty = AnchoredReprojection(clamp_px=5.0, teacher_limit_px=10.0)
     teacher = head_output([off_by(0.0), off_by(40.0)])
     student = head_output([off_by(3.0), off_by(0.0)])
     expected = 5 * math.tanh(3.0 / 5) / 2 + PX_PER_M * 0.06 / 2
-    for tau_px in (100.0, 1.0):  # its clamp does not follow the schedule
+    for tau_px in (100.0, 1.0):  # the clamp is fixed
         assert cost(penalty, student, teacher, rows(2), tau_px) == pytest.approx(expected)
 
 
@@ -134,9 +134,7 @@ def test_accurate_teacher_constrains_the_depth() -> None:
 
 
 def test_teacher_behind_the_camera_is_ignored() -> None:
-    behind = head_output(
-        [[0.0, 0.0, -DEPTH_M]]
-    )  # projects to the very pixel, if one divides blindly
+    behind = head_output([[0.0, 0.0, -DEPTH_M]])  # division by its depth gives the target pixel
     actual = cost(AnchoredReprojection(), head_output([off_by(0.0)]), behind, rows(1), 0.0)
     assert actual == pytest.approx(0.0, abs=1e-6)
 
@@ -148,7 +146,7 @@ def test_accurate_student_has_no_loss(penalty: Penalty) -> None:
     now = penalty(student, teacher, records, 0.3)
     now.backward()
     assert student.points.grad is not None
-    assert bool((student.points.grad[:, 0] > 0).all())  # back towards the truth
+    assert bool((student.points.grad[:, 0] > 0).all())  # towards the target
     assert teacher.points.grad is None
     assert cost(penalty, head_output([off_by(0.0)] * 3), teacher, records, 0.3) == pytest.approx(
         0, abs=1e-6
@@ -170,7 +168,7 @@ def test_distillation_is_spdd_with_a_scale() -> None:
     assert cost(Distillation(), student, teacher, rows(5), 0.7) == pytest.approx(expected)
     ten = cost(Distillation(scale=10.0), student, teacher, rows(5), 0.7)
     assert ten == pytest.approx(10 * expected, rel=1e-6)
-    # Without the first two terms it is the L1 distance of the points alone.
+    # Without the first two terms it is the L1 distance of the points.
     alone = Distillation(SpddOptions(prior_weight=0.0, metric_weight=0.0))
     drift = float((student.points - teacher.points).abs().sum(-1).mean())
     assert cost(alone, student, teacher, rows(5), 0.7) == pytest.approx(drift, rel=1e-6)

@@ -1,4 +1,4 @@
-"""Protection: exact in a linear case, less drift of old scenes, and the same after a resumption."""
+"""Preconditioned steps: the formula, fixed parameters, less drift, resuming."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,27 +22,27 @@ OPTIONS = FitOptions(iterations=30, batch=128, replay_batch=128)
 
 @dataclass(frozen=True)
 class Free(Penalty):
-    """Replayed rows cost nothing."""
+    """No loss on replayed rows."""
 
     needs_teacher = False
 
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """Zero."""
+        """Return zero."""
         return torch.zeros(())
 
 
 @dataclass(frozen=True)
 class Short(Penalty):
-    """Points near the middle cost less: a pull on everything."""
+    """The mean length of points, which depends on all parameters."""
 
     needs_teacher = False
 
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """Mean length."""
+        """Compute the mean."""
         return student.points.abs().mean()
 
 
@@ -87,7 +87,7 @@ def test_changes_are_damped_by_the_formula(learnable: Learnable, scenes: int) ->
     damped = actual["first.0.weight"]
     torch.testing.assert_close(damped.double(), change.double() @ expected, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(actual["first.0.bias"], bias)
-    # A direction that the scene uses moves less than one that it hardly uses.
+    # The main input direction is damped more than the least used one.
     _, axes = torch.linalg.eigh(moment)
     selected = [float((damped.double() @ a).norm() / (change.double() @ a).norm()) for a in axes.T]
     assert selected[-1] < 0.3 < 0.9 < selected[0]
@@ -113,7 +113,7 @@ def test_parameters_of_remembered_scenes_are_fixed(learnable: Learnable, strengt
 
 
 def test_shared_centres_are_trained() -> None:
-    """On the paper's network the first scene's centres are those of all."""
+    """With fixed centres, all scenes share the centres of the first stage."""
     options = HeadOptions(width=16, condition="descriptor", centres="fixed", whiten=False)
     head = wave_head(1, options)
     head.grow(torch.zeros(0, 3), seed=1)
@@ -143,7 +143,7 @@ def test_damping_reduces_drift(learnable: Learnable) -> None:
 
 @pytest.mark.parametrize("stop", [1, 17])
 def test_resumed_run_has_the_same_damping(learnable: Learnable, stop: int) -> None:
-    """The matrices are those of the head before the stage, though they are made anew."""
+    """The damping is computed from the head before the stage."""
     old, new = learnable(0)[0], learnable(1)[0]
 
     def trainer(strength: float = 5.0) -> HeadTrainer:

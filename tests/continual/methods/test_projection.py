@@ -1,4 +1,4 @@
-"""GPM: what is read from a subspace does not move, and the bases hold what they promise."""
+"""GPM: bases, and outputs for inputs in the basis."""
 
 import copy
 
@@ -23,7 +23,7 @@ OPTIONS = FitOptions(iterations=60, batch=64, peak_rate=1e-2)
 
 
 def moment_of(values: list[float], seed: int = 0) -> Tensor:
-    """(n, n) with these eigenvalues and random axes."""
+    """Create an (n, n) matrix with given eigenvalues and random axes."""
     generator = torch.Generator().manual_seed(seed)
     axes = torch.linalg.qr(
         torch.randn(len(values), len(values), generator=generator, dtype=torch.float64)
@@ -32,7 +32,7 @@ def moment_of(values: list[float], seed: int = 0) -> Tensor:
 
 
 def held(basis: Tensor, moment: Tensor) -> float:
-    """Share of the squared inputs that lie within the columns."""
+    """Compute the share of the squared inputs that a basis holds."""
     return float(torch.trace(basis.T @ moment @ basis) / moment.trace())
 
 
@@ -44,7 +44,7 @@ def test_new_basis_has_the_fewest_columns(share: float, count: int) -> None:
     actual = grown_basis(torch.zeros(6, 0, dtype=torch.float64), moment, share - 1e-9)
     assert actual.shape == (6, count)
     torch.testing.assert_close(actual.T @ actual, torch.eye(count, dtype=torch.float64))
-    # The best that so many columns can hold: the largest eigenvalues.
+    # The optimum is the sum of the largest eigenvalues.
     assert held(actual, moment) == pytest.approx(sum([50, 30, 10, 8][:count]) / 100)
 
 
@@ -59,15 +59,15 @@ def test_grown_basis_contains_the_old_one_and_holds_the_share(seed: int) -> None
     count = grown.shape[1]
     assert old.shape[1] < count < 8
     torch.testing.assert_close(grown.T @ grown, torch.eye(count, dtype=torch.float64))
-    # Old directions are within the new ones.
+    # The span contains the old basis.
     torch.testing.assert_close(grown @ (grown.T @ old), old)
     assert held(grown, second) >= 0.9 - 1e-9
-    # And no column is more than needed: what is added are the main directions of what is left.
+    # One column fewer would not reach the share.
     free = torch.eye(8, dtype=torch.float64) - old @ old.T
     left = torch.linalg.eigvalsh(free @ second @ free).flip(0)
     fewer = held(old, second) + float(left[: count - old.shape[1] - 1].sum() / second.trace())
     assert fewer < 0.9
-    assert torch.equal(grown_basis(grown, second, 0.9), grown)  # nothing is missing now
+    assert torch.equal(grown_basis(grown, second, 0.9), grown)  # the share is reached
 
 
 def state_of(head: Head, buffer: FeatureBuffer, share: float) -> dict[str, Tensor]:
@@ -76,7 +76,7 @@ def state_of(head: Head, buffer: FeatureBuffer, share: float) -> dict[str, Tenso
 
 
 def exact_state(head: Head, buffer: FeatureBuffer) -> dict[str, Tensor]:
-    """The same in full precision, from the singular vectors of the inputs themselves."""
+    """Compute the bases in full precision from the singular vectors of the inputs."""
     actual: dict[str, Tensor] = {}
     handles = []
     for name, layer in head.named_modules():
@@ -106,7 +106,7 @@ SHAPES = [
 
 
 def trained(hooks: TrainingHooks | None, head: Head) -> float:
-    """Learns a scene that contradicts the first; the fall of its loss."""
+    """Train on a scene that contradicts the first; return the last loss."""
     new = wave_buffer(1, shift_px=-12.0)
     *_, last = HeadTrainer(head, [new], OPTIONS, 0, hooks).run()
     return float(last.loss)
@@ -125,12 +125,12 @@ def two_scenes(options: HeadOptions) -> Head:
 
 @pytest.mark.parametrize("options", SHAPES, ids=lambda o: f"{o.condition}-{o.offsets}-{o.centres}")
 def test_output_for_inputs_in_the_basis_is_unchanged(options: HeadOptions) -> None:
-    """The old scene shows five different points: every layer's inputs span five directions."""
+    """The old scene has five distinct rows, so the inputs of every layer span five directions."""
     old = wave_buffer(0, few=5)
     rows = old.rows(torch.arange(5))
 
     def lines(head: Head) -> Tensor:
-        # Before the softmax mixes in centres of later scenes.
+        # Outputs of the old scene's centres only.
         with torch.no_grad():
             actual = head(rows.features.float(), rows.scene, rows.descriptor)
         return torch.cat([actual.points, actual.offsets[:, 0], actual.logits[:, :2]], 1)
@@ -152,9 +152,9 @@ def test_output_for_inputs_in_the_basis_is_unchanged(options: HeadOptions) -> No
     stored, _, _ = drift(state_of(head, old, 1 - 1e-9))
     assert free > 0.1
     assert exact < 1e-4
-    assert stored < 0.02 * free  # directions are kept in half precision
+    assert stored < 0.02 * free  # bases are stored in half precision
     assert moved
-    assert loss < 60  # and something is learned in what is left
+    assert loss < 60  # the new scene is learned
 
 
 def test_only_directions_of_the_basis_are_removed() -> None:
@@ -169,7 +169,7 @@ def test_only_directions_of_the_basis_are_removed() -> None:
         assert 0 < basis.shape[1] <= 5
         assert float((change @ basis).norm()) < 1e-4 * float(change.norm())
         assert float(change.norm()) > 0
-    # What the first scene owns alone did not move; what the second owns did.
+    # Parameters of the first scene are fixed, those of the second are trained.
     own = head.centre_scene == 0
     for name in ("logit", "logit_bias", "offset", "offset_bias"):
         moved = (head.get_parameter(name) - before.get_parameter(name)).detach()

@@ -1,4 +1,4 @@
-"""Replay: rows of which scenes, what they cost together, and what is stored beside them."""
+"""Replay: division of rows, weights, and stored points."""
 
 import copy
 from dataclasses import dataclass, replace
@@ -24,14 +24,14 @@ from .by_hand import head_output, off_by, stage_start, wave_buffer, wave_head
 
 @dataclass(frozen=True)
 class OneEach(Penalty):
-    """One per row, whatever the head says."""
+    """A constant loss of one per row."""
 
     needs_teacher = False
 
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """The mean of ones."""
+        """Return one."""
         assert teacher is None
         return torch.ones(len(rows.scene)).mean()
 
@@ -50,7 +50,7 @@ def test_weight_applies_per_scene_or_in_total(scenes: int, every_scene: bool) ->
     replayed = join(drawn(hooks))
     cost = hooks.cost(head_output([off_by(0.0)] * len(replayed.scene)), replayed, 0.0)
     assert cost is not None
-    # S scenes cost S times the mean over their rows, as if each were added up on its own.
+    # S scenes have S times the mean over their rows, the sum of the scenes' means.
     assert float(cost) == pytest.approx(0.3 * (scenes if every_scene else 1))
 
 
@@ -97,7 +97,7 @@ def test_teacher_runs_only_if_needed() -> None:
 
 
 def test_stored_points_are_the_output_for_plain_views() -> None:
-    """Four views, of which the first two show keyframes as they are."""
+    """The first two of four views are plain."""
     head, buffer = wave_head(2), wave_buffer(1, views=4)
     scene = FinishedScene(head, 1, lambda: buffer, lambda: buffer, 2, [], None)
     state = DarkExperienceReplay().after_scene(scene)
@@ -112,7 +112,7 @@ def test_stored_points_are_the_output_for_plain_views() -> None:
 
 
 def test_stored_points_return_to_their_rows() -> None:
-    """In a later stage rows are drawn at random, also those of augmented views."""
+    """Drawn rows of augmented views have no stored point."""
     head = wave_head(3)
     buffers = [wave_buffer(i, views=4) for i in range(2)]
     method, states = DarkExperienceReplay(), []
@@ -134,7 +134,7 @@ def test_stored_points_return_to_their_rows() -> None:
             part.stored[learned_head], lines[learned_head], atol=5e-3, rtol=0
         )
         assert bool(part.stored[~learned_head].isnan().all())
-    # The cost is that of a student who has not moved: the truth alone.
+    # An unchanged student has only the reprojection loss.
     replayed = join(parts)
     output = head(replayed.features.float(), replayed.scene, replayed.descriptor)
     hooks = method.begin(start)

@@ -1,4 +1,4 @@
-"""SPDD against numbers worked out with `math` alone."""
+"""SPDD against calculations in plain Python."""
 
 import math
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ def softmax(values, temperature):
 
 
 def slow_terms(student, teacher, active, temperature):
-    """The docstring of spdd_loss in plain loops, for per_centre offsets; -inf masks a centre."""
+    """Compute the terms in plain loops, for per-centre offsets; -inf masks a centre."""
     zs, zt = student.logits.tolist(), teacher.logits.tolist()
     ds, dt = student.offsets.tolist(), teacher.offsets.tolist()
     rows, old = len(zt), len(zt[0])
@@ -55,7 +55,7 @@ def slow_terms(student, teacher, active, temperature):
 
 
 def two_rows():
-    """With M_a = 2 of 4 centres, A is {0, 2} in the first row and {1, 3} in the second."""
+    """With M_a = 2, the active set is {0, 2} in the first row and {1, 3} in the second."""
     teacher = Output(
         tensor([[2.0, -1.0, 1.0, 0.0], [0.0, 3.0, -2.0, 3.5]]),
         tensor([[[0.0] * 3, [9.0] * 3, [1.0, 2.0, 3.0], [9.0] * 3]] * 2),
@@ -133,7 +133,7 @@ def test_probability_of_a_new_centre_is_charged():
     spdd_loss(student, teacher, options).prior.backward()
     gradient = student.logits.grad
     assert gradient is not None
-    assert (gradient[:, 8] > 0).all()  # descent lowers the new centre on old rows
+    assert (gradient[:, 8] > 0).all()  # gradient descent lowers the logit of the new centre
 
 
 def test_inactive_centres_are_free():
@@ -205,7 +205,7 @@ def test_masked_centres_give_finite_gradients(dtype, temperature):
 @pytest.mark.parametrize("who", ["teacher", "student", "both"])
 def test_masked_centre_equals_missing_centre(who):
     teacher, student = random_output(3, 7, 18), random_output(3, 9, 19)
-    teacher.logits[:, 4] = 20.0  # would be the most active one
+    teacher.logits[:, 4] = 20.0  # the largest logit
     keep = [k for k in range(9) if k != 4]
     without = spdd_loss(
         Output(student.logits[:, keep], student.offsets[:, keep], student.points),

@@ -1,4 +1,4 @@
-"""EWC, SI and MAS: the cost by hand, importances where they are known in closed form."""
+"""EWC, SI and MAS: cost and importances against closed forms."""
 
 import copy
 from dataclasses import replace
@@ -27,7 +27,7 @@ OPTIONS = FitOptions(iterations=8, batch=64, peak_rate=1e-2)
 
 
 def tied(head: Head, importance: float, shift: float = 0.0) -> dict[str, Tensor]:
-    """A state whose anchors lie `shift` beside the weights."""
+    """Create a state whose anchors differ from the weights by `shift`."""
     state = {f"anchor.{n}": v.detach() + shift for n, v in head.named_parameters()}
     return state | {
         f"importance.{n}": torch.full_like(v.detach(), importance)
@@ -44,10 +44,10 @@ def test_cost_by_hand() -> None:
     head = wave_head(1)
     ewc = ElasticWeightConsolidation(strength=7.0)
     assert cost(ewc, head, [tied(head, 3.0)]) == 0.0
-    # Every weight 0.1 away, importance 3 once and 1 once: strength / 2 (3 + 1) 0.01, a mean.
+    # Two scenes with importances 3 and 1, every weight changed by 0.1.
     states: list[MethodState] = [tied(head, 3.0, 0.1), tied(head, 1.0, -0.1)]
     assert cost(ewc, head, states) == pytest.approx(0.5 * 7 * 4 * 0.01, rel=1e-4)
-    # The running form looks at the newest state alone.
+    # The running form uses the newest state only.
     assert cost(replace(ewc, running=True), head, states) == pytest.approx(0.5 * 7 * 0.01, rel=1e-4)
     assert cost(ewc, head, []) == 0.0
 
@@ -75,7 +75,7 @@ def test_importances_have_mean_one() -> None:
 
 @pytest.fixture
 def finished() -> FinishedScene:
-    """The second of two scenes was learned."""
+    """The second of two scenes after training."""
     head, buffer = wave_head(2), wave_buffer(1)
     list(HeadTrainer(head, [buffer], OPTIONS, 0).run())
     return FinishedScene(head, 1, lambda: buffer, lambda: buffer, 2, [], None)
@@ -105,7 +105,7 @@ def test_unused_parameters_have_no_importance(
 
 
 def test_fisher_information_is_the_mean_squared_gradient(finished: FinishedScene) -> None:
-    """One image, all of whose rows are alike: the gradient of any draw is the same."""
+    """All rows of the image are equal, so every draw has the same gradient."""
     buffer = wave_buffer(1, views=1, few=1)
     scene = replace(finished, rows=lambda: buffer)
     actual = ElasticWeightConsolidation().importance(scene)
@@ -129,7 +129,7 @@ def test_running_sums_by_hand(finished: FinishedScene) -> None:
         expected = first[name].float() * (1 + selected)
         torch.testing.assert_close(second[name].float(), expected, rtol=5e-3, atol=1e-3)
         assert set(second) == set(first)
-    # One of each kind a scene: earlier states do not enter.
+    # Without a running sum, earlier states are not used.
     plain = ElasticWeightConsolidation()
     alone = plain.after_scene(finished)
     again = plain.after_scene(replace(finished, earlier=[alone]))
@@ -137,16 +137,16 @@ def test_running_sums_by_hand(finished: FinishedScene) -> None:
 
 
 def test_mas_measures_from_the_mean_of_the_scene(finished: FinishedScene) -> None:
-    """Points of an image count from the middle of the scene, not from the middle of the image."""
+    """Lengths are measured from the mean of the scene, not of the image."""
     one_point = wave_buffer(1, views=2, few=1)
     two_images = wave_buffer(1, views=4)
     actual = MemoryAwareSynapses().importance(replace(finished, rows=lambda: two_images))
     assert float(actual["offset_bias"].max()) > 0
-    # A scene of one point reacts to nothing: all of it lies in its middle.
+    # In a scene of one point all lengths are zero.
     actual = MemoryAwareSynapses().importance(replace(finished, rows=lambda: one_point))
     assert max(float(value.max()) for value in actual.values()) < 1e-4
-    # Two images of a point each, which differ: with a middle of each image's own nothing would
-    # matter.
+    # Two images of one point each: with the mean of each image, all lengths would be
+    # zero.
     apart = wave_buffer(1, views=2)
     apart.tensors["features"][:50] = apart.tensors["features"][0]
     apart.tensors["features"][50:] = apart.tensors["features"][50]
@@ -171,7 +171,7 @@ def test_running_sum_adds_to_old_rows_only(finished: FinishedScene) -> None:
 
 
 class Linear(torch.nn.Module):
-    """Points that are a linear function of the features: P = F W'."""
+    """Linear points, P = F W'."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -185,7 +185,7 @@ class Linear(torch.nn.Module):
 def test_mas_of_a_linear_function_in_closed_form() -> None:
     """|d/dW of the mean |p - mean p|^2| = |2/n sum_i (p_i - mean p) f_i'|, the mean held fixed."""
     buffer, linear = wave_buffer(1, views=1, few=1), Linear()
-    # Two different rows, as many of each in every draw on average; take the draw's own rows.
+    # The expected value uses the drawn rows.
     drawn = []
 
     def length(some) -> Tensor:
@@ -205,7 +205,7 @@ def test_mas_of_a_linear_function_in_closed_form() -> None:
 
 
 def test_mas_does_not_depend_on_the_position_of_the_scene(finished: FinishedScene) -> None:
-    """The length is taken from the mean of the scene: moving all centres changes nothing."""
+    """A translation of all centres does not change the importances."""
     method = MemoryAwareSynapses()
     here = method.importance(finished)
     moved = copy.deepcopy(finished.head)
@@ -216,7 +216,7 @@ def test_mas_does_not_depend_on_the_position_of_the_scene(finished: FinishedScen
 
 
 def test_path_integral_equals_the_fall_of_a_quadratic_loss() -> None:
-    """SI's sum over the path of -gradient x change, with small plain gradient steps."""
+    """The sum of -gradient x change over small gradient steps."""
     head = wave_head(1)
     method = SynapticIntelligence()
     hooks = method.begin(stage_start(head, []))
@@ -245,10 +245,10 @@ def test_path_integral_equals_the_fall_of_a_quadratic_loss() -> None:
         hooks.edit_step(ProposedStep(changes, gradients, torch.zeros(0), [], step, 1.0))
     path = {k.removeprefix("path."): v for k, v in hooks.state().items() if k.startswith("path.")}
     fell = sum(float(value.sum()) for value in path.values())
-    # The sum takes the gradient at the start of each step: too much by rate x curve / 2 at most.
+    # The gradient at the start of a step overestimates by at most rate x curvature / 2.
     assert fell == pytest.approx(first - loss(), rel=rate)
     assert first - loss() > 0.3 * first
-    # So it is weight by weight.
+    # This also holds for each weight.
     name = "first.1.weight"
     torch.testing.assert_close(path[name], before[name] - share(name), rtol=rate, atol=1e-5)
 
@@ -259,7 +259,7 @@ def test_path_importance_by_hand() -> None:
     named = dict(head.named_parameters())
     changes = {name: torch.zeros_like(value) for name, value in named.items()}
     gradients = {name: torch.zeros_like(value) for name, value in named.items()}
-    # Two weights move: one downhill by 0.2 at a slope of -3, one uphill.
+    # One weight moves downhill by 0.2 at a slope of -3, one moves uphill.
     for i, (slope, distance) in enumerate(((-3.0, 0.2), (2.0, 0.1))):
         changes["logit"][0, i], gradients["logit"][0, i] = distance, slope
     with torch.no_grad():
@@ -276,7 +276,7 @@ def test_path_importance_by_hand() -> None:
 
 
 def test_pull_of_the_ties_is_excluded_from_the_path() -> None:
-    """The new scene's loss is flat here; all that moves the weights are the ties."""
+    """The loss of the new scene is constant, so only the ties change the weights."""
     head = wave_head(1)
     state = tied(head, 1.0, 0.5)
     hooks = SynapticIntelligence(strength=100.0).begin(stage_start(head, [], states=[state]))
@@ -292,12 +292,12 @@ def test_pull_of_the_ties_is_excluded_from_the_path() -> None:
         changes = {n: v.detach() - before[n] for n, v in head.named_parameters()}
         hooks.edit_step(ProposedStep(changes, gradients, torch.zeros(0), [], step, 1.0))
     path = torch.cat([v.flatten() for k, v in hooks.state().items() if k.startswith("path.")])
-    fallen = 0.5 * 100 * 0.25  # what the ties cost at first
+    fallen = 0.5 * 100 * 0.25  # initial cost of the ties
     assert float(path.abs().sum()) < 1e-4 * fallen
 
 
 def test_path_does_not_change_the_training() -> None:
-    """Importances after plain training: only what the scene uses, and an interruption is unseen."""
+    """Accumulating the path does not change the training."""
     head, buffer = wave_head(2), wave_buffer(1)
     method = SynapticIntelligence()
     twin = copy.deepcopy(head)
@@ -306,7 +306,7 @@ def test_path_does_not_change_the_training() -> None:
     list(trainer.run())
     free = HeadTrainer(twin, [buffer], OPTIONS, 0)
     list(free.run())
-    # Looking on changes nothing but the rounding of sums.
+    # Equal except for rounding.
     torch.testing.assert_close(flat(head), flat(twin), rtol=0, atol=1e-5)
     scene = FinishedScene(head, 1, lambda: buffer, lambda: buffer, 2, [], hooks)
     actual = method.after_scene(scene)

@@ -1,4 +1,4 @@
-"""Cells never overlap, never move, and hold their scene."""
+"""Cells of the atlas: no overlap, each contains its scene."""
 
 import math
 from fractions import Fraction
@@ -19,7 +19,7 @@ from evercal.errors import InputError
 
 
 def random_scene(rng: np.random.Generator) -> np.ndarray:
-    """(n, 3) camera positions of a scene from hand size to a hall, anywhere in its base frame."""
+    """Draw (n, 3) camera positions of a scene of 3 cm to 50 m, anywhere in its base frame."""
     span = 10.0 ** rng.uniform(-1.5, 1.7, 3)
     return rng.uniform(-1, 1, (int(rng.integers(1, 40)), 3)) * span + rng.normal(0, 30, 3)
 
@@ -33,7 +33,7 @@ def filled(seed: int, count: int) -> tuple[Atlas, list[np.ndarray]]:
 
 
 def overlap(a: Cell, b: Cell) -> float:
-    """Area in square metres that two cells share."""
+    """Compute the common area of two cells, square metres."""
     sides = [
         min(a.centre_m[k] + a.side_m / 2, b.centre_m[k] + b.side_m / 2)
         - max(a.centre_m[k] - a.side_m / 2, b.centre_m[k] - b.side_m / 2)
@@ -56,7 +56,7 @@ def test_cell_contains_the_cameras_of_its_scene(seed: int) -> None:
     for i, (cell, scene) in enumerate(zip(atlas.cells, scenes, strict=True)):
         in_atlas = cell.atlas_from_base.apply(scene)
         assert {atlas.scene_at(position) for position in in_atlas} == {i}
-        # A pure shift that puts the mean camera into the middle.
+        # A translation that moves the mean camera to the centre.
         np.testing.assert_array_equal(cell.atlas_from_base.rotation_wxyz, [1, 0, 0, 0])
         np.testing.assert_allclose(in_atlas.mean(0), cell.centre_m, atol=1e-9)
         np.testing.assert_allclose(in_atlas - in_atlas[0], scene - scene[0], atol=1e-9)
@@ -88,7 +88,7 @@ def test_scene_at_a_position() -> None:
             step = np.array([*corner, 0]) * cell.side_m / 2
             assert atlas.scene_at(np.array(cell.centre_m) + 0.999 * step) == i
             assert atlas.scene_at(np.array(cell.centre_m) + 1.001 * step) != i
-    assert atlas.scene_at(np.array([0, 0, 40.0])) == 0  # height does not matter
+    assert atlas.scene_at(np.array([0, 0, 40.0])) == 0  # any height
     assert atlas.scene_at(np.array([1000.0, 0, 0])) is None
     assert atlas.scene_at(np.full(3, np.nan)) is None
 
@@ -130,7 +130,7 @@ def test_combined_centres_lie_among_the_cameras(seed: int) -> None:
     shares = []
     for positions in scenes:
         in_atlas = atlas.place(positions).atlas_from_base.apply(positions)
-        # Scenes are 5 m apart and 2 m wide, so that each centre is the mean of one's cameras.
+        # Scenes are 5 m apart and 2 m wide, so each centre is a mean of one scene's cameras.
         inside = (centres >= in_atlas.min(0) - 1e-9) & (centres <= in_atlas.max(0) + 1e-9)
         shares.append(inside.all(1).sum())
     assert sum(shares) == 15

@@ -1,4 +1,4 @@
-"""Rows of the feature buffer: what they must project to, and what an interruption may change."""
+"""The feature buffer: projections of its rows, checkpoints and draws."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -27,7 +27,7 @@ CAMERAS = (
     replace(LANDSCAPE, distortion=(-0.22, 0.07, 0.004, -0.003)),
     Camera(120, 160, 128.0, 131.0, 57.0, 83.0),
 )
-# Nothing in a buffer may rely on the atlas being a mere shift.
+# The buffer must support any pose of the base frame, not only a translation.
 ATLAS_FROM_BASE = SE3.exp([10.0, -5.0, 0.3, 0.2, -0.4, 1.1])
 PLAN = EncodePlan(views_per_frame=3, cells=40, seed=5, view=ViewOptions(short_side=120, gamma=0.0))
 
@@ -56,7 +56,7 @@ def filled(
 
 
 def camera_of(target: module.Target, row: int) -> tuple[Camera, SE3]:
-    """The ideal camera that a row is judged by, and `atlas_from_camera`."""
+    """Return the ideal camera of a row and `atlas_from_camera`."""
     fx, fy, cx, cy = (float(value) for value in target.intrinsics[row])
     matrix = np.vstack([target.camera_from_atlas[row].cpu().double().numpy(), [0, 0, 0, 1]])
     return Camera(400, 400, fx, fy, cx, cy), SE3.from_matrix(matrix).inverse()
@@ -65,7 +65,7 @@ def camera_of(target: module.Target, row: int) -> tuple[Camera, SE3]:
 def test_point_of_a_cell_projects_to_its_pixel(
     box: BoxRoom, frames: list[Frame], filled: Filled
 ) -> None:
-    """Cell -> ray of the frame's real lens -> point of the room -> atlas -> the row's target."""
+    """Cell -> ray of the frame's camera -> point of the room -> atlas -> target of the row."""
     buffer = filled()
     start, checked = 0, 0
     for number in range(PLAN.views_per_frame):
@@ -98,14 +98,16 @@ def test_point_of_a_cell_projects_to_its_pixel(
 def test_feature_belongs_to_the_cell_of_its_target(
     box: BoxRoom, frames: list[Frame], filled: Filled
 ) -> None:
-    """The room, drawn with each row's own camera, shows at its pixel what the cell shows."""
+    """A rendering by the row's camera shows the cell's grey value at the row's pixel."""
     buffer = filled(replace(PLAN, view=replace(PLAN.view, zoom=1.1)))
     actual, expected = [], []
     views = buffer.tensors["view"]
     for view in range(buffer.views):
         rows = buffer.rows(torch.nonzero(views == view)[:, 0])
         ideal, atlas_from_camera = camera_of(rows.target, 0)
-        ideal = replace(ideal, cx=ideal.cx + 60, cy=ideal.cy + 60)  # a barrel lens sees more
+        ideal = replace(
+            ideal, cx=ideal.cx + 60, cy=ideal.cy + 60
+        )  # barrel distortion has a wider view
         image = box.render(ideal, ATLAS_FROM_BASE.inverse() @ atlas_from_camera)
         grey = cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (9, 9))
         where = (rows.target.pixels.cpu().numpy() + 60)[:, None].astype(np.float32)
@@ -147,12 +149,12 @@ def test_rows_depend_on_the_seed_only(filled: Filled) -> None:
 
 
 def plain_views(buffer: FeatureBuffer) -> list[Tensor]:
-    """Row numbers of the views of the first pass."""
+    """Return the row numbers of each view of the first pass."""
     return [torch.nonzero(buffer.tensors["view"] == view)[:, 0] for view in range(7)]
 
 
 def test_view_does_not_depend_on_other_frames(frames: list[Frame], filled: Filled) -> None:
-    """Position and pass count, not how many other frames there are."""
+    """A view depends on position and pass, not on the number of frames."""
     whole, few = filled(), filled(some=frames[:2])
     last = whole.rows(torch.nonzero(whole.tensors["view"] == 7)[:, 0])  # frame 0, pass 1
     alone = few.rows(torch.nonzero(few.tensors["view"] == 2)[:, 0])
@@ -170,7 +172,7 @@ def test_augmented_views_have_the_planned_number_of_valid_cells(
     for number, position in ((1, 0), (2, 3)):
         rng = np.random.default_rng([plan.seed, number, position])
         valid = augmented_view(frames[position], 8, plan.view, rng).valid
-        # All valid cells, when more are asked for than there are.
+        # A larger plan selects all valid cells.
         buffer = filled(replace(plan, cells=10_000))
         count = int((buffer.tensors["view"] == number * 7 + position).sum())
         assert count == valid.sum() <= len(valid)
@@ -185,7 +187,7 @@ def test_resumed_encoding_equals_uninterrupted_encoding(
     device: torch.device,
     stop: int,
 ) -> None:
-    """`take_new` is asked after every batch, as checkpoints do."""
+    """Like checkpoints, call `take_new` after every batch."""
     first, saved = FeatureBuffer(4, ATLAS_FROM_BASE, device=device), []
     for _ in islice(encode_frames(first, frames, PLAN, block_mean, describe), stop):
         saved.append(first.take_new())
@@ -194,7 +196,7 @@ def test_resumed_encoding_equals_uninterrupted_encoding(
     for rows in saved:
         resumed.restore(rows)
     assert resumed.views == first.views
-    assert resumed.take_new() == {}  # what was restored is saved already
+    assert resumed.take_new() == {}  # restored rows are already saved
     done = list(encode_frames(resumed, frames, PLAN, block_mean, describe))
     assert done[-1] == PLAN.views_per_frame * len(frames)
     assert same(resumed, filled())
@@ -259,7 +261,7 @@ def test_corrected_rows_follow_an_ideal_pinhole() -> None:
     }
     buffer.restore(rows)
     each = torch.arange(60)
-    # Pixels that the corrected lens sees the points at.
+    # Pixels of the points in the corrected camera.
     captured, _ = reprojection_error(points, buffer.rows(each).target, correction.expand(60, 5))
     buffer = FeatureBuffer(0, SE3.identity())
     buffer.restore({**rows, "pixels": captured})

@@ -1,4 +1,4 @@
-"""The global descriptor: what it must not depend on, and the file it is read from."""
+"""The global descriptor and its file."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ def tiny() -> GlobalDescriptor:
 
 
 def by_hand(descriptor: GlobalDescriptor, features: np.ndarray) -> np.ndarray:
-    """One image's (inputs, cells) features to (width,), cell by cell in double precision."""
+    """Map one image's (inputs, cells) features to (width,), cell by cell in double precision."""
     w = {k: v.double().squeeze(-1).squeeze(-1).numpy() for k, v in descriptor.state_dict().items()}
     weights, values = [], []
     for cell in features.T:

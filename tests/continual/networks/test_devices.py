@@ -1,4 +1,4 @@
-"""Head, buffer and loss on any device: the CPU's answers, and no tensor made elsewhere."""
+"""Head, buffer and loss on any device: equal results, and no tensor on another device."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 
 
 def head_of(options: HeadOptions, device: torch.device) -> Head:
-    """A head for three scenes that was moved before it grew and was whitened there."""
+    """Create a head for three scenes that was moved before growth and whitening."""
     torch.manual_seed(5)
     head = Head(7, 4, options).to(device)
     for scene in range(3):
@@ -45,10 +45,10 @@ def head_of(options: HeadOptions, device: torch.device) -> Head:
 
 
 def buffer_of(device: torch.device, scene: int = 1) -> FeatureBuffer:
-    """Forty rows of two views; points were kept of the first thirty."""
+    """Create forty rows of two views, with stored points for the first thirty."""
     buffer = FeatureBuffer(scene, SE3.identity(), device=device)
     matrix = torch.eye(4, device="cpu")[None, :3] + 0.1 * random(2, 3, 4, seed=2)
-    matrix[:, 2, 3] += 8  # most points lie before the camera
+    matrix[:, 2, 3] += 8  # most points are in front of the camera
     buffer.restore(
         {
             "features": random(40, 7).half(),
@@ -83,7 +83,7 @@ def everything(rows: Rows) -> dict[str, Tensor]:
 
 
 def step(head: Head, rows: Rows, scene: Tensor | int) -> dict[str, Tensor]:
-    """Loss and error of rows, and the gradient of every parameter, in fp32."""
+    """Compute loss and error of rows, and the gradient of every parameter, in fp32."""
     output = head(rows.features.float(), scene, rows.descriptor)
     correction = 0.01 * rows.features[:, :5].float()
     loss, error = reprojection_loss(output.points, rows.target, 7.0, LossOptions(), correction)
@@ -145,7 +145,7 @@ def test_quarter_of_the_gpu_memory_stays_free(
 @pytest.mark.parametrize("options", SHAPES)
 @pytest.mark.parametrize("one_scene", [False, True])
 def test_no_tensor_is_created_on_the_default_device(options: HeadOptions, one_scene: bool) -> None:
-    """The default device is `meta`, the inputs lie on the CPU: both must give the same numbers."""
+    """With `meta` as the default device and inputs on the CPU, results are the same."""
 
     def whole() -> dict[str, Tensor]:
         head, buffers = head_of(options, CPU), [buffer_of(CPU), buffer_of(CPU, 2)]
@@ -168,8 +168,8 @@ def test_no_tensor_is_created_on_the_default_device(options: HeadOptions, one_sc
 
 @pytest.mark.parametrize("options", SHAPES)
 def test_no_tensor_stays_on_the_cpu(options: HeadOptions, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Head and rows lie on `meta`, the default device is the CPU; no operation takes both."""
-    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # has none for meta
+    """Head and rows are on `meta`, the default device is the CPU; no operation mixes them."""
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # not available for meta
     head, buffers = Head(7, 4, options).to(META), [buffer_of(META), buffer_of(META, 2)]
     with OneDevice():
         for scene in range(3):
@@ -197,7 +197,7 @@ def networks(device: torch.device) -> tuple[LocalEncoder, GlobalDescriptor]:
 
 
 def encoded(device: torch.device, rows_on: torch.device) -> FeatureBuffer:
-    """A buffer that networks on a device filled; someone looked in between."""
+    """Fill a buffer by networks on a device, reading it after every batch."""
     buffer, taken = FeatureBuffer(0, SE3.identity(), device=rows_on), 0
     for _ in encode_frames(buffer, FRAMES, PLAN, *networks(device)):
         new = buffer.take_new()
@@ -215,7 +215,7 @@ def test_views_are_encoded_on_the_device_of_the_networks(
     where = CPU if rows_on == "cpu" else device
     for name, value in encoded(device, where).tensors.items():
         assert value.device == where, name
-        # Features in half precision, made in bfloat16 where that is fast.
+        # Features have half precision, and bfloat16 is used if it is fast.
         torch.testing.assert_close(value.cpu(), expected[name], atol=0.03, rtol=0.03)
 
 

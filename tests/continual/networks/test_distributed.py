@@ -1,4 +1,4 @@
-"""Two processes with half a batch each leave the gradients that one has with the whole batch.
+"""Two processes with half a batch each have the gradients of one process with the whole batch.
 
 They start with the weights of the first, and encode each view once between them.
 """
@@ -45,14 +45,14 @@ from evercal.simulation.box_room import default_camera
 
 OPTIONS = FitOptions(iterations=4, batch=64)
 RULES = ("cost", "constraints", "descriptor")
-"""What remembered rows do; with the last they cost something and the head sees descriptors."""
+"""Use of remembered rows: as a loss, as constraints, as a loss with descriptor input."""
 STOPS = (0, 2)
-"""Rounds of encoding after which a run is interrupted."""
+"""Rounds of encoding before an interruption."""
 Made = list[dict[str, dict[str, Tensor]]]
 
 
 def buffer_of(scene: int) -> FeatureBuffer:
-    """Rows of points in front of two cameras; features are the points themselves."""
+    """Create rows of points in front of two cameras; the features are functions of the points."""
     generator = torch.Generator().manual_seed(scene)
     buffer = FeatureBuffer(scene, SE3.identity(), correctable=True)
     points = torch.randn(200, 3, generator=generator) + torch.tensor([0.0, 0, 4])
@@ -71,7 +71,7 @@ def buffer_of(scene: int) -> FeatureBuffer:
 
 
 class ReplayOrConstrain(TrainingHooks):
-    """Remembered scenes cost something, or constrain the step; keeps what it was shown."""
+    """Uses remembered rows as a loss or as constraints, and records the proposed step."""
 
     def __init__(self, rule: str, memories: list[FeatureBuffer]):
         self.rule, self.memories, self.captured = rule, memories, dict[str, Tensor]()
@@ -101,7 +101,7 @@ class ReplayOrConstrain(TrainingHooks):
 
 
 def gradients(rule: str, steps: int = 1) -> dict[str, Tensor]:
-    """What is in `.grad` after some steps of training, and what the hooks were shown."""
+    """Return all gradients after some steps, and the constraints that the hooks received."""
     torch.manual_seed(0)
     torch.set_num_threads(1)
     buffers = [buffer_of(scene) for scene in range(3)]
@@ -131,7 +131,7 @@ def _worker(number: int, folder: str) -> None:
 
 @pytest.fixture(scope="module")
 def by_two(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """What each of two processes that work together has made; starting them is what takes time."""
+    """Results of two processes that train together, started once because that is slow."""
     folder = tmp_path_factory.mktemp("processes")
     os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
     spawn(_worker, (str(folder),), nprocs=2)
@@ -146,13 +146,13 @@ def test_two_processes_have_the_gradients_of_one(rule: str, by_two: Made) -> Non
     assert ("losses" in alone) == (rule == "constraints")
     for name, value in alone.items():
         assert torch.equal(actual[0][name], actual[1][name]), name
-        # Products in half precision differ with the shape of the batch.
+        # Rounding in half precision depends on the batch size.
         size = float(value.abs().max()) + 1e-6
         torch.testing.assert_close(actual[0][name], value, atol=0.02 * size, rtol=0.02)
 
 
 def exchanged() -> dict[str, Tensor]:
-    """What averaging, broadcasting and gathering make of tensors that differ by process."""
+    """Average, broadcast and gather tensors that differ by process."""
     own, carried = rank(), 0
     whole, shared = distributed.all_reduce, distributed.broadcast
 
@@ -174,7 +174,7 @@ def exchanged() -> dict[str, Tensor]:
         layer.bias.fill_(torch.nan if own == 0 else 1.0)
     steps = torch.tensor([7 + own])
     broadcast([*layer.parameters(), steps])
-    assert carried == 3  # floats, whole numbers
+    assert carried == 3  # floats, integers
     assert layer.weight.requires_grad
     distributed.all_reduce, distributed.broadcast = whole, shared
 
@@ -211,7 +211,7 @@ def test_tensors_are_averaged_broadcast_and_gathered_exactly(by_two: Made) -> No
 
 
 def frames_of(sizes: Sequence[tuple[int, int]]) -> list[Frame]:
-    """Frames of noise, of cameras of some sizes."""
+    """Create frames of noise with cameras of given sizes."""
     rng, frames = np.random.default_rng(0), []
     for i, (width, height) in enumerate(sizes):
         image = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
@@ -221,10 +221,10 @@ def frames_of(sizes: Sequence[tuple[int, int]]) -> list[Frame]:
 
 
 def encoded(stop: int = 0) -> dict[str, Tensor]:
-    """A buffer of nine frames of two sizes, and how many views this process encoded itself.
+    """Fill a buffer with nine frames of two sizes, and count the views encoded by this process.
 
     Args:
-        stop: after so many rounds the rows move to another buffer, as after an interruption.
+        stop: Number of rounds after which the rows move to another buffer, as after a resume.
     """
     torch.set_num_threads(1)
     torch.manual_seed(0)
@@ -270,7 +270,7 @@ def test_two_processes_share_the_encoding(stop: int, by_two: Made) -> None:
 @given(st.lists(st.integers(), max_size=20), st.integers(1, 5))
 def test_work_is_divided_once_and_in_order(work: list[int], count: int) -> None:
     shares = [shared_out(work, number, count) for number in range(count)]
-    assert len({len(share) for share in shares}) == 1  # all exchange equally often
+    assert len({len(share) for share in shares}) == 1  # equal numbers of exchanges
     in_turn = [
         piece for rotation in zip(*shares, strict=True) for piece in rotation if piece is not None
     ]
@@ -301,7 +301,7 @@ def test_without_torchrun_there_is_one_process() -> None:
 
 
 def test_each_process_of_a_machine_has_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is asked of torch where there are two GPUs; neither GPU nor process is there."""
+    """Calls to torch on a simulated machine with two GPUs."""
     calls: list[object] = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)

@@ -1,4 +1,4 @@
-"""Features that were computed before are found again, and what is broken is made again."""
+"""The feature cache: hits, limits, and broken files."""
 
 import os
 import shutil
@@ -14,7 +14,7 @@ from evercal.continual.networks.feature_cache import cache_features
 
 
 class Counting(nn.Module):
-    """Means over 8x8 pixels times a weight; counts the images it has seen."""
+    """Encodes 8x8 means times a weight, and counts the encoded images."""
 
     stride, width = 8, 2
 
@@ -35,7 +35,7 @@ def test_every_image_is_encoded_once(tmp_path: Path, device: torch.device) -> No
     cache_features(encoder, tmp_path)
     first = encoder(images[:3])
     torch.testing.assert_close(first, plain(images[:3]), atol=1e-3, rtol=0)
-    mixed = encoder(images[[4, 1, 0]])  # one new among known ones, in another order
+    mixed = encoder(images[[4, 1, 0]])  # one new and two cached images
     assert encoder.captured == 4
     assert torch.equal(mixed[1], first[1])
     assert torch.equal(mixed[2], first[0])
@@ -87,7 +87,7 @@ def test_full_folder_is_read_but_not_written(tmp_path: Path) -> None:
 
 @torch.inference_mode()
 def test_half_of_the_free_disk_stays_free(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    free = iter([200, 200, 150, *[110] * 9])  # others write too
+    free = iter([200, 200, 150, *[110] * 9])  # another program writes to the disk
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=next(free)))
     encoder = Counting()
     cache_features(encoder, tmp_path)  # 16 bytes an image

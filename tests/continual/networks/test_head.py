@@ -1,4 +1,4 @@
-"""The scene-coordinate head against closed forms and a slow twin, and what growing may change."""
+"""The scene-coordinate head against closed forms and a slow reference, and its growth."""
 
 import math
 from dataclasses import replace
@@ -77,7 +77,7 @@ def test_scale_in_closed_form() -> None:
 
 
 def by_hand(head: Head, feature: np.ndarray, scene: int, descriptor: np.ndarray) -> np.ndarray:
-    """One row's point (3,), layer by layer in double precision."""
+    """Compute one row's point (3,), layer by layer in double precision."""
     w = {key: value.double().numpy() for key, value in head.state_dict().items()}
     coded, layer = head.options.condition == "code", 0
 
@@ -149,7 +149,7 @@ def test_new_scenes_do_not_change_the_output_for_old_scenes(
             head.grow(20 * random(CENTRES + more, 3, seed=more), seed=more)
             for scene in (0, 1):
                 assert torch.equal(head(features, scene, None).points, before[scene])
-            # With rows of several scenes the products get wider, and rounding with them.
+            # With rows of several scenes, rounding depends on the number of centres.
             close = head(features, mixed, None).points
             torch.testing.assert_close(close, together, atol=1e-5, rtol=0)
     assert head.scenes == 5
@@ -195,7 +195,7 @@ def test_with_a_descriptor_the_scene_index_is_ignored() -> None:
 
 
 def test_centres_are_added_in_fp32_under_autocast() -> None:
-    """At 5 km bfloat16 steps by 32 m; only the offset may carry the error of mixed precision."""
+    """At 5 km the resolution of bfloat16 is 32 m, so only the offset may be in bfloat16."""
     head, features = grown(SHAPES[0], 1), random(30, FEATURES, seed=1)
     head.centres += torch.tensor([5000.0, 0.0, 0.0])
     with torch.no_grad():
@@ -216,7 +216,7 @@ def in_preset(name: str, scenes: int) -> Head:
 
 
 def total_bytes(head: Head) -> int:
-    """In half precision, the centres in single."""
+    """Compute the stored size: half precision, centres in single precision."""
     return 2 * sum(p.numel() for p in head.parameters()) + 4 * head.centres.numel()
 
 

@@ -31,7 +31,7 @@ def target(pixels: np.ndarray, poses: SE3, camera: Camera = CAMERA) -> Target:
 
 
 def scattered(seed: int, count: int = 200) -> tuple[SE3, np.ndarray, np.ndarray]:
-    """Camera poses, points before them (camera frame) and the same points in the atlas."""
+    """Draw camera poses, points in the camera frames, and the same points in the atlas."""
     rng = np.random.default_rng(seed)
     poses = SE3.exp(rng.uniform(-1, 1, (count, 6)) * [5, 5, 1, 2, 2, 2])
     in_camera = rng.uniform([-0.6, -0.45, 0.5], [0.6, 0.45, 6.0], (count, 3))
@@ -40,7 +40,7 @@ def scattered(seed: int, count: int = 200) -> tuple[SE3, np.ndarray, np.ndarray]
 
 
 def straight(in_camera: list[list[float]], pixels: list[list[float]]) -> tuple[Tensor, Target]:
-    """Points in the frame of a camera that stands at the atlas' origin."""
+    """Create points and targets of a camera at the origin of the atlas."""
     poses = SE3.identity((len(pixels),))
     return torch.tensor(in_camera), target(np.array(pixels), poses)
 
@@ -106,8 +106,8 @@ def test_invalid_rows_are_attracted_to_the_proxy_depth() -> None:
     in_camera = [
         [0.3, 0.0, -2.0],  # behind the camera
         [0.0, 0.0, 0.05],  # too near
-        [100.0, -200.0, 1000.5],  # too far, though on the ray
-        [8.0, 0.0, 1.0],  # 2000 px off
+        [100.0, -200.0, 1000.5],  # too far
+        [8.0, 0.0, 1.0],  # error of 2000 px
     ]
     points, where = straight(in_camera, [pixel] * 4)
     loss, error = reprojection_loss(points, where, TAU, OPTIONS)
@@ -139,6 +139,6 @@ def test_step_against_the_gradient_lowers_the_loss(kind: str) -> None:
     length = gradient.norm(dim=-1, keepdim=True)
     assert (length > 0).all()
     after, _ = reprojection_loss(points - 1e-3 * gradient / length, where, 50.0, OPTIONS)
-    assert (after < loss).float().mean() > 0.98  # at a kink of the L1 norm a step may be too long
+    assert (after < loss).float().mean() > 0.98  # a step can cross a kink of the L1 norm
     truth = torch.from_numpy(atlas).float()
     assert float(reprojection_loss(truth, where, 50.0, OPTIONS)[0].max()) < 0.05

@@ -1,4 +1,4 @@
-"""Our Muon against that of torch, whose products are in bfloat16."""
+"""Muon against torch.optim.Muon, which multiplies in bfloat16."""
 
 import pytest
 import torch
@@ -26,5 +26,5 @@ def test_updates_match_torch(fast: bool, tolerance: float, monkeypatch: pytest.M
         moved = (yours - before).norm()
         assert (mine - yours).norm() < tolerance * moved
     assert torch.equal(unused, start[0])
-    # What a checkpoint of one holds, the other understands.
+    # Checkpoints are interchangeable.
     assert one.state[ours[0]].keys() == other.state[theirs[0]].keys()

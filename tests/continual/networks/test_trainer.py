@@ -1,4 +1,4 @@
-"""The training loop: its schedule, its seeds, stopping and going on, and that it learns."""
+"""The training loop: schedule, seeds, resuming, hooks, and learning."""
 
 import copy
 from collections.abc import Callable, Mapping
@@ -33,7 +33,7 @@ Cost = Callable[[HeadOutput, Rows, float], Tensor]
 
 
 class Replayed(TrainingHooks):
-    """Thirty rows of each buffer join every step and cost what a function says."""
+    """Replays thirty rows of each buffer with a given loss."""
 
     def __init__(self, memories: list[FeatureBuffer], penalty: Cost):
         self.memories, self.penalty = memories, penalty
@@ -48,7 +48,7 @@ class Replayed(TrainingHooks):
 
 
 class Counted(Replayed):
-    """Replay that counts its steps and edits them by the count."""
+    """Replays and scales each step by the number of steps."""
 
     edits_steps = True
 
@@ -69,7 +69,7 @@ class Counted(Replayed):
 
 
 def numbers(steps: list[Progress]) -> list[tuple[int, float, float]]:
-    """What progress says, as plain numbers."""
+    """Return the fields of progress as numbers."""
     return [(step.step, step.loss, step.inlier_share) for step in steps]
 
 
@@ -89,7 +89,7 @@ def snapshot(trainer: HeadTrainer) -> dict[str, Tensor]:
 
 @pytest.mark.parametrize(("iterations", "warm"), [(100, 0.05), (1000, 0.3), (40, 0.5)])
 def test_rate_follows_one_cycle_of_torch(iterations: int, warm: float) -> None:
-    """Up over warm * iterations steps and down to zero at the step that would come next."""
+    """Up for warm * iterations steps, then down to zero after the last step."""
     options = FitOptions(iterations=iterations, warm_share=warm, peak_rate=2e-3)
     rise = round(warm * iterations)
     optimiser = torch.optim.SGD([torch.zeros(1, requires_grad=True)])
@@ -124,7 +124,7 @@ def test_short_schedules_have_positive_rates(iterations: int) -> None:
 def test_resumed_training_equals_uninterrupted_training(
     learnable: Learnable, stop: int, condition: str, kind: type[Replayed]
 ) -> None:
-    """Twenty steps in one go, and in two goes by two fitters that share only the saved state."""
+    """Twenty steps of one trainer, and of two trainers that share only the saved state."""
     fresh, _ = learnable(1, correctable=True)
     past, _ = learnable(0)
     shape = HeadOptions(width=32, condition=condition)  # pyright: ignore[reportArgumentType]
@@ -165,7 +165,7 @@ def test_state_is_a_copy(learnable: Learnable) -> None:
 
 
 class RecordingBuffer(FeatureBuffer):
-    """Writes down which rows were drawn."""
+    """Records the drawn rows."""
 
     drawn: list[Tensor]
 
@@ -198,7 +198,7 @@ def test_rows_depend_on_seed_and_step_only(learnable: Learnable) -> None:
 def test_replay_cost_is_minimised_on_even_shares(learnable: Learnable) -> None:
     buffers = [learnable(scene)[0] for scene in range(3)]
     captured: list[tuple[Tensor, float]] = []
-    # A cost that fresh rows alone would never pay: all logits' biases of scene 0 to -3.
+    # This loss, which new rows do not have, moves the logits of scene 0 to -3.
     head = head_for(buffers)
 
     def penalty(output: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
@@ -218,7 +218,7 @@ def test_replay_cost_is_minimised_on_even_shares(learnable: Learnable) -> None:
     assert abs(mean_logit() + 3) < 0.3 < abs(before + 3)
     for scene, _ in captured:
         assert torch.bincount(scene, minlength=3).tolist() == [30, 30, 0]
-    clamps = [clamp_px(options.loss, i / 60) for i in range(60)]  # those of the new rows
+    clamps = [clamp_px(options.loss, i / 60) for i in range(60)]  # clamps of the new rows
     assert [tau_px for _, tau_px in captured] == pytest.approx(clamps)
 
 
@@ -244,13 +244,13 @@ def test_descriptor_noise_has_the_stated_size(learnable: Learnable) -> None:
     rows = buffer.draw(4000, torch.Generator().manual_seed(0))
     cosine = (shaken * rows.descriptor.float()).sum(-1)
     noise = torch.randn(200_000, DESCRIPTOR) * 0.5
-    noise[:, 0] += 1  # any direction will do
+    noise[:, 0] += 1  # an arbitrary direction
     expected = float((noise[:, 0] / noise.norm(dim=-1)).mean())
     assert float(cosine.mean()) == pytest.approx(expected, abs=0.02)
 
 
 def test_small_head_learns_scene_coordinates(learnable: Learnable) -> None:
-    """From reprojection alone it must find the depth that several views agree on."""
+    """Reprojection from several views determines the depth."""
     buffer, points = learnable(views=20)
     head = head_for([buffer], HeadOptions(width=64))
     every = buffer.rows(torch.arange(len(buffer)))
@@ -273,7 +273,7 @@ def test_small_head_learns_scene_coordinates(learnable: Learnable) -> None:
 
 
 def test_wrong_intrinsics_are_corrected_if_allowed(learnable: Learnable) -> None:
-    """Images through a lens 4 % longer than stated, and with some barrel."""
+    """The true focal length is 4 % longer than stated, and there is barrel distortion."""
     true = replace(CAMERA, fx=CAMERA.fx * 1.04, fy=CAMERA.fy * 1.04, distortion=(-0.1, 0, 0, 0))
     options = FitOptions(iterations=400, batch=512, peak_rate=5e-3, intrinsics_rate=1.0)
     options = replace(options, loss=OPTIONS.loss)
@@ -283,7 +283,7 @@ def test_wrong_intrinsics_are_corrected_if_allowed(learnable: Learnable) -> None
         head = head_for([buffer], HeadOptions(width=64))
         trainer = HeadTrainer(head, [buffer], replace(options, iterations=steps), 0)
         list(trainer.run())
-        # How far off the lens is on its own, with the pose out of the question.
+        # Error of the intrinsics alone, at the identity pose.
         where = buffer.rows(torch.arange(300)).target
         where.camera_from_atlas = torch.eye(3, 4).expand(300, 3, 4)
         off, _ = reprojection_error(rays, where, trainer.correction[0].expand(300, 5))
@@ -311,7 +311,7 @@ def test_progress_describes_the_last_step(learnable: Learnable) -> None:
 
 
 class Regularized(TrainingHooks):
-    """Pulls the logits back to where they were."""
+    """Ties the logits to their initial values."""
 
     def __init__(self, head: Head, strength: float):
         self.head, self.strength, self.anchor = head, strength, head.logit.detach().clone()
@@ -332,7 +332,7 @@ def test_regularizer_constrains_the_weights(learnable: Learnable) -> None:
 
 
 class StepRecorder(Replayed):
-    """Adds up proposed steps and keeps the last one."""
+    """Sums the proposed changes and records the last step."""
 
     edits_steps = True
 
@@ -353,7 +353,7 @@ class StepRecorder(Replayed):
 
 
 def test_proposed_changes_sum_to_the_change_of_the_weights(learnable: Learnable) -> None:
-    """Also where AdamW decays weights and Muon has momentum: nothing else moves them."""
+    """Holds for AdamW with decay and Muon with momentum."""
     buffers = [learnable(scene)[0] for scene in range(3)]
     head = head_for(buffers)
     first = {name: value.detach().clone() for name, value in head.named_parameters()}
@@ -369,7 +369,7 @@ def test_proposed_changes_sum_to_the_change_of_the_weights(learnable: Learnable)
 
 
 def test_edited_step_is_applied(learnable: Learnable) -> None:
-    """Half of every change, and none of the codes'."""
+    """Halve every change and undo changes of the codes."""
     buffer, _ = learnable()
 
     class Halved(TrainingHooks):
@@ -393,7 +393,7 @@ def test_edited_step_is_applied(learnable: Learnable) -> None:
 def test_constraints_are_not_minimised(
     learnable: Learnable,
 ) -> None:
-    """With and without them the step is the same, and each gradient is that of one scene's rows."""
+    """Constraints do not change the step, and each gradient belongs to one scene's rows."""
     buffers = [learnable(scene)[0] for scene in range(3)]
 
     def nothing(output: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
@@ -411,5 +411,5 @@ def test_constraints_are_not_minimised(
         used = gradient["code"].abs().sum((1, 2)) > 0
         assert used.tolist() == [number == scene for number in range(3)]
         assert float(gradient["first.1.weight"].abs().max()) > 0
-    # What is minimised here is the loss of the new scene alone.
+    # Only the loss of the new scene is minimised.
     assert (hooks.last.gradients["code"].abs().sum((1, 2)) > 0).tolist() == [False, False, True]

@@ -1,4 +1,4 @@
-"""Contrastive training: closed forms, an oracle that matches all, and going on after a stop."""
+"""Contrastive training: closed forms, an oracle, resuming."""
 
 import math
 from dataclasses import replace
@@ -40,7 +40,7 @@ def unit(*shape: int, seed: int = 0) -> Tensor:
 
 
 def twice(pixels: Tensor) -> Tensor:
-    """The same pixels in both images."""
+    """Use the same pixels in both images."""
     return torch.stack([pixels, pixels])
 
 
@@ -79,10 +79,10 @@ def test_close_points_of_one_image_are_no_negatives() -> None:
     assert float(contrastive_loss(same, near, valid, 0.1)) == pytest.approx(0, abs=1e-6)
     apart = twice(torch.tensor([[[0.0, 0.0], [6.0, 8.1]]]))  # 10.08 px
     assert float(contrastive_loss(same, apart, valid, 0.1)) == pytest.approx(math.log(2))
-    # Close in the second images only: rivals count where they are looked for.
+    # Close in the second images only.
     mixed = torch.stack([apart[0], near[0]])
     assert float(contrastive_loss(same, mixed, valid, 0.1)) == pytest.approx(math.log(2) / 2)
-    # The same pixels in two images are two places.
+    # Equal pixels of different images are different points.
     two = twice(torch.tensor([[[0.0, 0.0]], [[6.0, 7.9]]]))
     loss = contrastive_loss(same.transpose(1, 2), two, valid.T, 0.1)
     assert float(loss) == pytest.approx(math.log(2))
@@ -120,7 +120,7 @@ def test_loss_matches_a_slow_reference(dense: bool) -> None:
 
 
 class Oracle(nn.Module):
-    """Gives every cell of the first images a vector of its own; the second ones are moved."""
+    """Gives every cell of the first images a unique vector; the second images are shifted."""
 
     def __init__(self, columns: int):
         super().__init__()
@@ -177,7 +177,7 @@ def test_batches_depend_on_seed_and_step_only(data: PretrainData) -> None:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, one_room: RoomViews) -> None:
-    """A small encoder, checkpoints at every other step, and no worker process."""
+    """Use a small encoder, checkpoints every two steps, and no worker process."""
     monkeypatch.setattr(contrastive, "CHECKPOINT_STEPS", 2)
     tiny = partial(LocalEncoder, (4, 4), 8, 1, 8)
     monkeypatch.setattr(contrastive, "LocalEncoder", tiny)
@@ -218,12 +218,12 @@ def test_resumed_training_equals_uninterrupted_training(data: PretrainData, tmp_
     assert [line.split()[1] for line in lines[1:]] == ["4", "6"]
     for name, value in whole.items():
         assert torch.equal(value, again[name]), name
-    # Finished: nothing is left to do, and nothing is done.
+    # A finished run does no further steps.
     lines.clear()
     third = train_encoder(data, OPTIONS, tmp_path / "b", lines.append).state_dict()
     assert lines == ["resumed at step 6"]
     assert all(torch.equal(value, third[name]) for name, value in whole.items())
-    # A checkpoint made with other options is not taken up.
+    # A checkpoint with other options is ignored.
     lines.clear()
     train_encoder(data, replace(OPTIONS, seed=7, steps=2), tmp_path / "b", lines.append)
     assert not any("resumed" in line for line in lines)
@@ -243,7 +243,7 @@ def test_training_lowers_the_loss(data: PretrainData, tmp_path: Path) -> None:
 def test_training_starts_from_an_earlier_run(
     data: PretrainData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(contrastive, "DataLoader", DataLoader)  # here with its worker process
+    monkeypatch.setattr(contrastive, "DataLoader", DataLoader)  # with a worker process
     lines: list[str] = []
     first, second = tmp_path / "first", tmp_path / "second"
     for folder in (first, second):

@@ -36,13 +36,13 @@ CAMERA = Camera(WIDTH, HEIGHT, 200.0, 200.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 
 
 def step() -> FurnishedViews:
-    """A wall 2 m off whose left half stands out by a metre, seen from two places."""
+    """Two views of a wall at 2 m whose left half is at 1 m."""
     depth = np.full((2, HEIGHT, WIDTH), 2.0, np.float16)
     depth[0, :, : WIDTH // 2] = 1.0
     shift = 0.1
-    edge = WIDTH // 2 - round(shift * 200)  # the near half ends 20 pixels further left
+    edge = WIDTH // 2 - round(shift * 200)  # parallax of 20 pixels
     depth[1, :, :edge] = 1.0
-    depth[:, :20] = 0.0  # nothing was hit
+    depth[:, :20] = 0.0  # no surface
     move = SE3(np.array([1.0, 0, 0, 0]), np.array([shift, 0, 0]))
     images = np.zeros((2, HEIGHT, WIDTH), np.uint8)
     return FurnishedViews(images, SE3.stack([SE3.identity(), move]), (CAMERA, CAMERA), depth)
@@ -62,7 +62,7 @@ def test_depth_maps_give_points_and_occlusion() -> None:
     np.testing.assert_allclose(parallax[~near], 10.0, atol=1e-3)
     assert min(near.sum(), (~near).sum()) > 100
     assert first[:, 1].min() > 19
-    # From the left, the near half hides a strip of the far one.
+    # The near half occludes a strip of the far half.
     back = view_pair(views, 1, 0, np.random.default_rng(0)).pixels[0]
     strip = WIDTH // 2 - 20
     assert not ((back[:, 0] > strip) & (back[:, 0] < strip + 9)).any()
@@ -101,7 +101,7 @@ def test_batch_contains_furnished_rooms() -> None:
     shades = (grey[:, :, 0, 96, 128] * 255).round().int()
     assert ((shades[:, :2] >= 80) & (shades[:, :2] <= 83)).all()
     assert (shades[:, 2] == 200).all()
-    # Points of the furnished room keep their parallax: 0, 10 or 20 pixels for these cameras.
+    # The parallax of these cameras is 0, 10 or 20 pixels.
     across = (pixels[0, :2] - pixels[1, :2])[valid[:2]][:, 0].abs()
     assert (across[:, None] - torch.tensor([0.0, 10.0, 20.0])).abs().min(1).values.max() < 1e-2
 
@@ -116,7 +116,7 @@ def test_rendered_pairs_correspond_and_are_cached(tmp_path: Path) -> None:
         assert pair.pixels.shape[1] > 20
         (u, v), (x, y) = np.rint(pair.pixels).astype(int).transpose(0, 2, 1)
         captured.append(np.stack([pair.images[0, v, u], pair.images[1, y, x]]).astype(float))
-        # The same surface point, found from either side.
+        # Both views give the same surface point.
         gap = views.hit(first, pair.pixels[0]) - views.hit(second, pair.pixels[1])
         assert np.median(np.linalg.norm(gap, axis=-1)) < 0.01
     left, right = np.concatenate(captured, 1)

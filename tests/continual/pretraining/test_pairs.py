@@ -1,4 +1,4 @@
-"""Pairs of images: the two pixels of a correspondence really show one surface point."""
+"""Image pairs: corresponding pixels show the same surface point."""
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ from .conftest import SEED
 
 
 def hit(views: RoomViews, index: int, pixels: np.ndarray) -> np.ndarray:
-    """(n, 3) room points that pixels of one view show."""
+    """Intersect the rays of pixels with the room, (n, 3)."""
     pose = views.base_from_camera[index]
     rays = views.cameras[index].unproject(pixels) @ pose.rotation_matrix().T
     return views.geometry.intersect(pose.translation_m, rays)[0]
@@ -49,13 +49,13 @@ def test_rays_of_both_cameras_meet(views: RoomViews, first: int, second: int) ->
     away = np.linalg.norm(here - views.base_from_camera[second].translation_m, axis=1)
     assert (np.linalg.norm(here - there, axis=1) < 0.011 * away + 1e-4).all()
     assert np.median(np.linalg.norm(here - there, axis=1)) < 1e-4
-    assert np.abs(a - b).max() > 5  # the camera did move
+    assert np.abs(a - b).max() > 5  # the cameras differ
     np.testing.assert_array_equal(pair.images, views.images[[first, second]])
 
 
 @pytest.mark.parametrize(("first", "second"), [(0, 1), (4, 6)])
 def test_no_visible_point_is_missing(views: RoomViews, first: int, second: int) -> None:
-    """Slow twin: of all candidates, those that the second camera's own ray finds again."""
+    """Compare with a loop over all candidates that intersects the second camera's rays."""
     candidates = cell_pixels() + np.random.default_rng(3).uniform(-3.5, 3.5, (768, 2))
     points = hit(views, first, candidates)
     other, camera = views.base_from_camera[second], views.cameras[second]
@@ -71,7 +71,7 @@ def test_no_visible_point_is_missing(views: RoomViews, first: int, second: int) 
         if np.linalg.norm(again - point) < 0.01 * np.linalg.norm(local):
             expected.append([candidate, pixel])
     actual = view_pair(views, first, second, np.random.default_rng(3)).pixels
-    assert abs(len(expected) - actual.shape[1]) <= 2  # a ray may graze an edge
+    assert abs(len(expected) - actual.shape[1]) <= 2  # rays may touch an edge
     nearest = np.abs(np.array(expected)[:, None] - actual.transpose(1, 0, 2)[None]).max((2, 3))
     assert (nearest.min(1) < 1e-3).mean() > 0.98
 
@@ -94,14 +94,14 @@ def test_views_equal_direct_renderings(views: RoomViews) -> None:
     assert (np.abs(eyes[:, :2]) <= room.size_m[:2] / 2 - 0.3 + 1e-9).all()
     assert (eyes[:, 2] >= 0.3 - 1e-9).all()
     assert (eyes[:, 2] <= room.size_m[2] - 0.2 + 1e-9).all()
-    # One focal length per anchor, another for the next.
+    # One focal length per anchor.
     focal = [camera.fx for camera in views.cameras]
     assert len(set(focal[:4])) == len(set(focal[4:])) == 1
     assert focal[0] != focal[4]
 
 
 def test_homography_pair_shows_the_same_points() -> None:
-    """Ramps instead of a picture: their grey values are the coordinates."""
+    """The pictures are ramps, so grey values are coordinates."""
     side = 240
     ramp = np.tile(np.arange(side, dtype=np.uint8)[None], (side, 1))
     for seed in range(6):

@@ -1,4 +1,4 @@
-"""Training of the global descriptor: closed forms, and what it is worth on rooms it never saw."""
+"""Training of the global descriptor, and its accuracy on new rooms."""
 
 import math
 from dataclasses import replace
@@ -39,7 +39,7 @@ def test_places_of_one_room_are_ignored() -> None:
     same = torch.ones(2, 2) / math.sqrt(2)
     assert float(place_loss(same, same, torch.tensor([3, 3]))) == pytest.approx(0, abs=1e-6)
     assert float(place_loss(same, same, torch.tensor([3, 4]))) == pytest.approx(math.log(2))
-    rooms = torch.tensor([3, 3, 4])  # each of the first two has one rival, the third has two
+    rooms = torch.tensor([3, 3, 4])  # numbers of negatives: 1, 1, 2
     same = torch.ones(3, 2) / math.sqrt(2)
     expected = (math.log(2) + math.log(2) + math.log(3)) / 3
     assert float(place_loss(same, same, rooms)) == pytest.approx(expected)
@@ -51,12 +51,12 @@ class Mean(nn.Module):
 
 
 def test_accuracy_by_hand() -> None:
-    """Three rooms, two anchors, four views; view 0 asks, the others answer."""
+    """Three rooms, two anchors, four views; view 0 is the query."""
     maps = torch.zeros(3, 2, 4, 3, 2, 2)
     for room in range(3):
         maps[room, :, :, room] = 1.0
     assert place_accuracy(Mean(), maps) == 100.0  # pyright: ignore[reportArgumentType]
-    maps[0, 1, 0] = maps[1, 0, 0]  # one query of six looks like room 1
+    maps[0, 1, 0] = maps[1, 0, 0]  # one of six queries is like room 1
     assert place_accuracy(Mean(), maps) == pytest.approx(100 * 5 / 6)  # pyright: ignore[reportArgumentType]
     maps[2, :, 0] = maps[1, :, 0]
     assert place_accuracy(Mean(), maps) == pytest.approx(100 * 3 / 6)  # pyright: ignore[reportArgumentType]
@@ -101,7 +101,7 @@ def test_training_is_reproducible(one_room: RoomViews, monkeypatch: pytest.Monke
 def test_pretrain_writes_loadable_files(
     tmp_path: Path, one_room: RoomViews, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With stand-ins for the two long parts: data and the encoder's training."""
+    """Without the two slow parts, rendering and training of the encoder."""
     data = PretrainData([one_room], [leaf_picture(np.random.default_rng(0), 64)])
     unfused = LocalEncoder((4, 4), 8, 1, 8, fused=False)
     monkeypatch.setattr(make, "make_data", lambda options, folder: data)
@@ -147,7 +147,7 @@ def test_small_pretraining_is_complete_and_resumable(tmp_path: Path) -> None:
 
 
 def ranks(seeds: range, gallery: int, queries: int) -> np.ndarray:
-    """For each query, how many other rooms look more like it than its own does.
+    """Count for each query the rooms that are more similar than its own.
 
     Both come from the shipped networks: a gallery from one sweep through each room, queries from
     another walk along the same way; a room is as like as its likest gallery image.
@@ -178,5 +178,5 @@ def test_shipped_descriptor_separates_three_new_rooms() -> None:
 
 @pytest.mark.slow
 def test_shipped_descriptor_separates_twelve_new_rooms() -> None:
-    """Measured: 99 % of images taken half a step beside the gallery's; a guess gives 8 %."""
+    """Measured: 99 % of images between those of the gallery; chance is 8 %."""
     assert (ranks(range(300, 312), gallery=40, queries=8) == 0).mean() >= 0.9
