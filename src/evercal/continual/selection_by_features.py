@@ -164,9 +164,8 @@ def select_gradients(gradients: np.ndarray, capacity: int, rng: np.random.Genera
     """Gradient-based sample selection, greedy (GSS, Aljundi et al., NeurIPS 2019, Algorithm 2).
 
     A frame's score c is one plus its largest cosine with a few buffered frames. Frames are appended
-    until the buffer is full. Later a frame enters only if c < 1, so its gradient opposes those
-    frames. It then replaces a buffered frame i, drawn by its score c_i, with probability
-    c_i / (c_i + c).
+    until the buffer is full. Later a frame enters only if c < 1, which means opposed gradients. It
+    then replaces a buffered frame i, drawn by its score c_i, with probability c_i / (c_i + c).
 
     Args:
         gradients: (n, p) gradient of the loss on each frame.

@@ -6,7 +6,7 @@ from torch.nn.functional import normalize
 
 from evercal.continual.methods.method import MethodState, StageStart
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
-from evercal.continual.networks.head import Head, HeadOptions, HeadOutput
+from evercal.continual.networks.head import Head, HeadOptions, HeadOutput, fresh_head
 from evercal.continual.networks.loss import Target
 from evercal.geometry import SE3
 
@@ -65,10 +65,19 @@ def wave_buffer(scene: int, views: int = 4, shift_px: float = 0.0, few: int = 0)
 
 def wave_head(scenes: int, options: HeadOptions | None = None) -> Head:
     """Create a head for scenes of `wave_buffer`."""
-    torch.manual_seed(0)
-    head = Head(9, 4, options or HeadOptions(width=16, blocks=1, whiten=False))
+    options = options or HeadOptions(width=16, blocks=1, whiten=False)
+    head = fresh_head(9, 4, options, seed=0)
     for scene in range(scenes):
         head.grow(torch.tensor([[0.3, 0.0, 4.0], [-0.3, 0.2, 3.5]]), seed=scene)
+    return head
+
+
+def head_at_cameras(buffers: list[FeatureBuffer]) -> Head:
+    """Create a head for scenes of `learnable`, with centres at three cameras of each."""
+    head = fresh_head(48, 6, HeadOptions(width=32), seed=0)
+    for buffer in buffers:
+        matrix = buffer.tensors["camera_from_atlas"][:3].double()
+        head.grow((-matrix[:, :, :3].mT @ matrix[:, :, 3:])[..., 0].float(), seed=buffer.scene)
     return head
 
 

@@ -11,31 +11,22 @@ from torch import Tensor
 
 from evercal.continual.methods.mir import MaximallyInterferedRetrieval, interfered_views
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
-from evercal.continual.networks.head import Head, HeadOptions
+from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 
-from .by_hand import stage_start
+from .by_hand import head_at_cameras, stage_start
 
 Learnable = Callable[..., tuple[FeatureBuffer, Tensor]]
 OPTIONS = FitOptions(iterations=20, batch=96, replay_batch=60)
 MIR = MaximallyInterferedRetrieval()
 
 
-def head_of(buffers: list[FeatureBuffer]) -> Head:
-    torch.manual_seed(0)
-    head = Head(48, 6, HeadOptions(width=32))
-    for buffer in buffers:
-        matrix = buffer.tensors["camera_from_atlas"][:3].double()
-        head.grow((-matrix[:, :, :3].mT @ matrix[:, :, 3:])[..., 0].float(), seed=buffer.scene)
-    return head
-
-
 @pytest.fixture(scope="module")
 def trained_head(learnable: Learnable) -> tuple[Head, FeatureBuffer]:
     """A head trained on a scene of 24 views, and the scene's rows."""
     buffer, _ = learnable(views=24)
-    head = head_of([buffer])
+    head = head_at_cameras([buffer])
     options = FitOptions(iterations=600, batch=512, replay_batch=64)
     *_, last = HeadTrainer(head, [buffer], options, 0).run()
     assert last.inlier_share > 0.5
@@ -102,7 +93,7 @@ def test_only_selected_views_are_replayed_also_after_a_resume(learnable: Learnab
         hooks.replayed = watched  # type: ignore[method-assign]
         return hooks
 
-    head = head_of([old, new])
+    head = head_at_cameras([old, new])
     twin, third = copy.deepcopy(head), copy.deepcopy(head)
     list(HeadTrainer(head, [new], OPTIONS, 3, hooks_for(head)).run())
     assert len(set.union(*captured)) <= MIR.chosen  # one selection for twenty steps

@@ -14,7 +14,7 @@ from evercal.continual.networks.head import Head, HeadOptions, HeadOutput
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 
-from .by_hand import stage_start, wave_buffer, wave_head
+from .by_hand import head_at_cameras, stage_start, wave_buffer, wave_head
 
 Learnable = Callable[..., tuple[FeatureBuffer, Tensor]]
 OPTIONS = FitOptions(iterations=30, batch=128, replay_batch=128)
@@ -51,15 +51,6 @@ def hooks_for(head: Head, memories: list[FeatureBuffer], penalty: Penalty, stren
     return method.begin(stage_start(head, memories, replay_rows=128))
 
 
-def head_of(buffers: list[FeatureBuffer]) -> Head:
-    torch.manual_seed(0)
-    head = Head(48, 6, HeadOptions(width=32))
-    for buffer in buffers:
-        matrix = buffer.tensors["camera_from_atlas"][:3].double()
-        head.grow((-matrix[:, :, :3].mT @ matrix[:, :, 3:])[..., 0].float(), seed=buffer.scene)
-    return head
-
-
 def edited(hooks: TrainingHooks, head: Head, changes: dict[str, Tensor]) -> dict[str, Tensor]:
     zero = {name: torch.zeros_like(value) for name, value in head.named_parameters()}
     proposed = ProposedStep(zero | changes, zero, torch.zeros(0), [], 0, 1.0)
@@ -70,7 +61,7 @@ def edited(hooks: TrainingHooks, head: Head, changes: dict[str, Tensor]) -> dict
 @pytest.mark.parametrize("scenes", [1, 2])
 def test_changes_are_damped_by_the_formula(learnable: Learnable, scenes: int) -> None:
     buffers = [learnable(scene)[0] for scene in range(scenes)]
-    head, strength = head_of(buffers), 3.0
+    head, strength = head_at_cameras(buffers), 3.0
     captured: list[Tensor] = []
     first = head.first[0]
     assert isinstance(first, torch.nn.Linear)
@@ -96,7 +87,7 @@ def test_changes_are_damped_by_the_formula(learnable: Learnable, scenes: int) ->
 @pytest.mark.parametrize("strength", [0.0, 0.5])
 def test_parameters_of_remembered_scenes_are_fixed(learnable: Learnable, strength: float) -> None:
     buffers = [learnable(scene)[0] for scene in range(3)]
-    head = head_of(buffers)
+    head = head_at_cameras(buffers)
     before = {name: value.clone() for name, value in head.state_dict().items()}
     hooks = hooks_for(head, buffers[:2], Short(), strength)
     list(HeadTrainer(head, buffers[2:], OPTIONS, 0, hooks).run())
@@ -129,7 +120,7 @@ def test_damping_reduces_drift(learnable: Learnable) -> None:
     old, new = learnable(0)[0], learnable(1)[0]
     drift = {}
     for strength in (0.0, 30.0):
-        head = head_of([old, new])
+        head = head_at_cameras([old, new])
         rows = old.draw(500, torch.Generator().manual_seed(0))
         with torch.no_grad():
             before = head(rows.features.float(), 0, None).points
@@ -147,7 +138,7 @@ def test_resumed_run_has_the_same_damping(learnable: Learnable, stop: int) -> No
     old, new = learnable(0)[0], learnable(1)[0]
 
     def trainer(strength: float = 5.0) -> HeadTrainer:
-        head = head_of([old, new])
+        head = head_at_cameras([old, new])
         return HeadTrainer(head, [new], OPTIONS, 0, hooks_for(head, [old], Free(), strength))
 
     whole, part, rest = trainer(), trainer(), trainer()

@@ -105,13 +105,6 @@ def test_terms_match_a_slow_reference(new, active, temperature):
     assert actual == pytest.approx(expected, rel=1e-10)
 
 
-def test_identical_outputs_have_no_loss():
-    for shared in (False, True):
-        output = random_output(5, 8, 2, shared)
-        terms = spdd_loss(output, output, SpddOptions())
-        assert terms.total.item() == pytest.approx(0.0, abs=1e-12)
-
-
 def test_probability_of_a_new_centre_is_charged():
     teacher = random_output(5, 8, 3)
     new = tensor([[-4.0], [0.0], [1.0], [3.0], [6.0]])

@@ -136,40 +136,6 @@ def test_running_sums_by_hand(finished: FinishedScene) -> None:
     assert all(torch.equal(alone[key], again[key]) for key in alone)
 
 
-def test_mas_measures_from_the_mean_of_the_scene(finished: FinishedScene) -> None:
-    """Lengths are measured from the mean of the scene, not of the image."""
-    one_point = wave_buffer(1, views=2, few=1)
-    two_images = wave_buffer(1, views=4)
-    actual = MemoryAwareSynapses().importance(replace(finished, rows=lambda: two_images))
-    assert float(actual["offset_bias"].max()) > 0
-    # In a scene of one point all lengths are zero.
-    actual = MemoryAwareSynapses().importance(replace(finished, rows=lambda: one_point))
-    assert max(float(value.max()) for value in actual.values()) < 1e-4
-    # Two images of one point each: with the mean of each image, all lengths would be
-    # zero.
-    apart = wave_buffer(1, views=2)
-    apart.tensors["features"][:50] = apart.tensors["features"][0]
-    apart.tensors["features"][50:] = apart.tensors["features"][50]
-    actual = MemoryAwareSynapses().importance(replace(finished, rows=lambda: apart))
-    assert max(float(value.max()) for value in actual.values()) > 1e-3
-
-
-def test_running_sum_adds_to_old_rows_only(finished: FinishedScene) -> None:
-    method = ElasticWeightConsolidation(running=True)
-    earlier = {
-        f"importance.{name}": torch.ones_like(value[: len(value) // 2]).half()
-        for name, value in finished.head.named_parameters()
-    }
-    actual = importances(method.after_scene(replace(finished, earlier=[earlier])))
-    alone = importances(method.after_scene(finished))
-    half = len(alone["logit"]) // 2
-    gained = actual["logit"] - alone["logit"]
-    torch.testing.assert_close(
-        gained[:half], torch.full_like(gained[:half], 0.9), atol=0.02, rtol=0
-    )
-    torch.testing.assert_close(gained[half:], torch.zeros_like(gained[half:]), atol=0.02, rtol=0)
-
-
 class Linear(torch.nn.Module):
     """Linear points, P = F W'."""
 
@@ -294,24 +260,6 @@ def test_pull_of_the_ties_is_excluded_from_the_path() -> None:
     path = torch.cat([v.flatten() for k, v in hooks.state().items() if k.startswith("path.")])
     fallen = 0.5 * 100 * 0.25  # initial cost of the ties
     assert float(path.abs().sum()) < 1e-4 * fallen
-
-
-def test_path_does_not_change_the_training() -> None:
-    """Accumulating the path does not change the training."""
-    head, buffer = wave_head(2), wave_buffer(1)
-    method = SynapticIntelligence()
-    twin = copy.deepcopy(head)
-    hooks = method.begin(stage_start(head, []))
-    trainer = HeadTrainer(head, [buffer], OPTIONS, 0, hooks)
-    list(trainer.run())
-    free = HeadTrainer(twin, [buffer], OPTIONS, 0)
-    list(free.run())
-    # Equal except for rounding.
-    torch.testing.assert_close(flat(head), flat(twin), rtol=0, atol=1e-5)
-    scene = FinishedScene(head, 1, lambda: buffer, lambda: buffer, 2, [], hooks)
-    actual = method.after_scene(scene)
-    assert float(actual["importance.code"][0].abs().max()) == 0.0
-    assert float(actual["importance.code"][1].max()) > 0
 
 
 @pytest.mark.parametrize("method", [ElasticWeightConsolidation(), SynapticIntelligence()])

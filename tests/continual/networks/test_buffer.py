@@ -199,26 +199,8 @@ def test_resumed_encoding_equals_uninterrupted_encoding(
     assert resumed.take_new() == {}  # restored rows are already saved
     done = list(encode_frames(resumed, frames, PLAN, block_mean, describe))
     assert done[-1] == PLAN.views_per_frame * len(frames)
+    assert list(encode_frames(resumed, frames, PLAN, block_mean, describe)) == []
     assert same(resumed, filled())
-
-
-def test_take_new_returns_every_row_once(
-    frames: list[Frame],
-    filled: Filled,
-    block_mean: Encoder,
-    describe: GlobalDescriptor,
-    device: torch.device,
-) -> None:
-    buffer, parts = FeatureBuffer(4, ATLAS_FROM_BASE, device=device), []
-    assert buffer.take_new() == {}
-    for i, _ in enumerate(encode_frames(buffer, frames, PLAN, block_mean, describe)):
-        if i % 2:
-            parts.append(buffer.take_new())
-    parts.append(buffer.take_new())
-    assert buffer.take_new() == {}
-    whole = filled().tensors
-    for name, value in whole.items():
-        assert torch.equal(torch.cat([part[name] for part in parts if part]), value.cpu())
 
 
 def test_draws_are_reproducible_and_cover_the_buffer(filled: Filled) -> None:

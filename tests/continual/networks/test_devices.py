@@ -11,7 +11,7 @@ from torch import Tensor
 from evercal.continual.networks import buffer as module
 from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, Rows, encode_frames, join
 from evercal.continual.networks.descriptor import GlobalDescriptor
-from evercal.continual.networks.head import Head, HeadOptions
+from evercal.continual.networks.head import Head, HeadOptions, fresh_head
 from evercal.continual.networks.loss import LossOptions, reprojection_loss
 from evercal.features.encoder import LocalEncoder
 from evercal.features.views import ViewOptions
@@ -36,8 +36,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 
 def head_of(options: HeadOptions, device: torch.device) -> Head:
     """Create a head for three scenes that was moved before growth and whitening."""
-    torch.manual_seed(5)
-    head = Head(7, 4, options).to(device)
+    head = fresh_head(7, 4, options, seed=5).to(device)
     for scene in range(3):
         head.grow(3 * random(2, 3, seed=scene), seed=scene)
     head.whiten((random(60, 7, seed=9) + 1).to(device))

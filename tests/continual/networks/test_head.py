@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.networks.head import Head, HeadOptions, homogeneous_scale
+from evercal.continual.networks.head import Head, HeadOptions, fresh_head, homogeneous_scale
 from evercal.continual.presets import PRESETS
 from evercal.errors import InputError
 
@@ -20,8 +20,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 
 
 def grown(options: HeadOptions, scenes: int, features: int = FEATURES) -> Head:
-    torch.manual_seed(5)
-    head = Head(features, DESCRIPTOR, options)
+    head = fresh_head(features, DESCRIPTOR, options, seed=5)
     for scene in range(scenes):
         head.grow(4 * random(CENTRES, 3, seed=scene), seed=scene)
     with torch.no_grad():  # a new scene's biases are zero; a trained head's are not
@@ -208,8 +207,7 @@ def test_centres_are_added_in_fp32_under_autocast() -> None:
 
 def in_preset(name: str, scenes: int) -> Head:
     options = PRESETS[name].head
-    torch.manual_seed(0)
-    head = Head(128, 128, options)
+    head = fresh_head(128, 128, options, seed=0)
     for scene in range(scenes):
         head.grow(5 * random(options.centres_per_scene, 3, seed=scene), seed=scene)
     return head
@@ -256,3 +254,20 @@ def test_fixed_centres_need_the_descriptor() -> None:
     assert torch.isfinite(points).all()
     with pytest.raises(InputError, match="condition 'code'"):
         Head(FEATURES, DESCRIPTOR, replace(options, condition="code"))
+
+
+def test_fresh_head_depends_on_its_seed_only() -> None:
+    before = torch.random.get_rng_state()
+    first, again, other = (fresh_head(FEATURES, DESCRIPTOR, SHAPES[1], seed=s) for s in (1, 1, 2))
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert torch.equal(first.offset, again.offset)
+    assert not torch.equal(first.offset, other.offset)
+    Head.from_state(FEATURES, DESCRIPTOR, SHAPES[1], first.state_dict())
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("options", SHAPES)
+def test_sizes_are_those_of_the_inputs(options: HeadOptions) -> None:
+    head = grown(options, 1)
+    assert head.features == FEATURES
+    assert head.descriptor == (DESCRIPTOR if options.condition == "descriptor" else 0)

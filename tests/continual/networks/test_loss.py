@@ -134,6 +134,7 @@ def test_step_against_the_gradient_lowers_the_loss(kind: str) -> None:
     where = target(CAMERA.project(in_camera), poses)
     loss, error = reprojection_loss(points, where, 50.0, OPTIONS)
     assert torch.isfinite(error).all() == (kind == "valid")
+    assert not error.requires_grad
     (gradient,) = torch.autograd.grad(loss.sum(), points)
     assert torch.isfinite(gradient).all()
     length = gradient.norm(dim=-1, keepdim=True)

@@ -60,34 +60,6 @@ def test_features_between_cells_are_bilinear_unit_vectors() -> None:
     torch.testing.assert_close(actual, F.normalize(mixed, dim=0), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("temperature", [0.07, 0.5, 2.0])
-def test_loss_of_two_orthogonal_points(temperature: float) -> None:
-    eye, valid = torch.eye(2)[None], torch.ones(1, 2, dtype=torch.bool)
-    expected = math.log(1 + math.exp(-1 / temperature))
-    actual = contrastive_loss(torch.stack([eye, eye]), twice(FAR[None]), valid, temperature)
-    assert float(actual) == pytest.approx(expected, rel=1e-4, abs=1e-6)
-    swapped = contrastive_loss(
-        torch.stack([eye, eye.flip(1)]), twice(FAR[None]), valid, temperature
-    )
-    assert float(swapped) == pytest.approx(expected + 1 / temperature, rel=1e-4)
-
-
-def test_close_points_of_one_image_are_no_negatives() -> None:
-    valid = torch.ones(1, 2, dtype=torch.bool)
-    near = twice(torch.tensor([[[0.0, 0.0], [6.0, 7.9]]]))  # 9.92 px
-    same = torch.ones(2, 1, 2, 2) / math.sqrt(2)
-    assert float(contrastive_loss(same, near, valid, 0.1)) == pytest.approx(0, abs=1e-6)
-    apart = twice(torch.tensor([[[0.0, 0.0], [6.0, 8.1]]]))  # 10.08 px
-    assert float(contrastive_loss(same, apart, valid, 0.1)) == pytest.approx(math.log(2))
-    # Close in the second images only.
-    mixed = torch.stack([apart[0], near[0]])
-    assert float(contrastive_loss(same, mixed, valid, 0.1)) == pytest.approx(math.log(2) / 2)
-    # Equal pixels of different images are different points.
-    two = twice(torch.tensor([[[0.0, 0.0]], [[6.0, 7.9]]]))
-    loss = contrastive_loss(same.transpose(1, 2), two, valid.T, 0.1)
-    assert float(loss) == pytest.approx(math.log(2))
-
-
 @pytest.mark.parametrize("dense", [False, True])
 def test_loss_matches_a_slow_reference(dense: bool) -> None:
     generator = torch.Generator().manual_seed(3)

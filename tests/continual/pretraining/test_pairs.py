@@ -76,13 +76,6 @@ def test_no_visible_point_is_missing(views: RoomViews, first: int, second: int) 
     assert (nearest.min(1) < 1e-3).mean() > 0.98
 
 
-def test_view_paired_with_itself_is_the_identity(views: RoomViews) -> None:
-    pair = view_pair(views, 3, 3, np.random.default_rng(0))
-    np.testing.assert_allclose(pair.pixels[0], pair.pixels[1], atol=1e-3)
-    candidates = cell_pixels() + np.random.default_rng(0).uniform(-3.5, 3.5, (768, 2))
-    assert pair.pixels.shape[1] == inside(candidates).sum()
-
-
 def test_views_equal_direct_renderings(views: RoomViews) -> None:
     assert views.images.shape == (8, HEIGHT, WIDTH)
     assert len(views.cameras) == len(views.base_from_camera) == 8

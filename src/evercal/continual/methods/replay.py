@@ -99,7 +99,7 @@ def teacher_output(teacher: Head, rows: Rows) -> HeadOutput:
 def by_scene(
     output: HeadOutput, rows: Rows, memories: Sequence[FeatureBuffer]
 ) -> list[tuple[HeadOutput, Rows]]:
-    """Split replayed rows, which are ordered by scene, into those of each remembered scene."""
+    """Split replayed rows by remembered scene; rows are ordered by scene."""
     each = len(rows.scene) // len(memories)
     slices = [slice(i * each, (i + 1) * each) for i in range(len(memories))]
     return [(output.part(where), rows.part(where)) for where in slices]

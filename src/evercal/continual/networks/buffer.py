@@ -162,7 +162,7 @@ class FeatureBuffer:
         return len(self.tensors["features"])
 
     def correct_lens(self, correction: Tensor) -> None:
-        """Move the pixels to those of an ideal pinhole camera.
+        """Undistort the pixels and correct the intrinsics.
 
         Args:
             correction: (5,) correction of the camera that took all frames; see

@@ -54,7 +54,7 @@ class HeadOptions:
 
 @dataclass
 class HeadOutput:
-    """Output for n rows and K centres (those of one scene if one scene was given)."""
+    """Output for n rows and K centres; with a single scene, K counts its own centres."""
 
     logits: Tensor
     """(n, K) fp32; -inf for centres of other scenes."""

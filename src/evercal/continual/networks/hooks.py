@@ -29,7 +29,7 @@ class ProposedStep:
 
 
 class TrainingHooks:
-    """No-op hooks; a method overrides those that it needs."""
+    """No-op hooks that a method may override."""
 
     edits_steps = False
     """Whether `edit_step` is called. It costs a copy of all weights per step."""

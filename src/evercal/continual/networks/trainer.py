@@ -39,7 +39,7 @@ class FitOptions:
     warm_share: float = 0.05
     """Share of the steps during which the rate rises."""
     weight_decay: float = 0.01
-    """Decoupled weight decay, relative to the rate. Codes and logits have none."""
+    """Decoupled weight decay, relative to the rate; not applied to codes and logits."""
     diffusion: float = 0.1
     """Standard deviation of the noise on each row's descriptor (GLACE's feature diffusion)."""
     intrinsics_rate: float = 0.3

@@ -45,7 +45,7 @@ NEAR_PX = 10.0
 
 @dataclass(frozen=True)
 class PretrainOptions:
-    """Options of the pretraining; `pretrain.log` records those of the shipped weights."""
+    """Options of the pretraining; `pretrain.log` records the options of the shipped weights."""
 
     steps: int = 9_000
     """Optimiser steps of the local encoder."""
