@@ -61,7 +61,7 @@ def learned(
         chosen = method.select(FrameStatistics(frames, head, lambda: own, 0), 2)
         last = FinishedScene(head, 1, lambda: own, lambda: memory, 2, states, hooks, 0.1)
         selected = method.after_scene(last)
-    return dict(head.state_dict()) | {f"kept.{k}": v for k, v in selected.items()}, chosen
+    return dict(head.state_dict()) | {f"state.{k}": v for k, v in selected.items()}, chosen
 
 
 @pytest.mark.parametrize("backbone", BACKBONES)

@@ -237,16 +237,16 @@ def encoded(stop: int = 0) -> dict[str, Tensor]:
         pass
     buffer_module.ENCODE_BATCH = 8
     assert buffer.views == 27
-    return dict(buffer.tensors) | {"seen": torch.tensor(captured)}
+    return dict(buffer.tensors) | {"encoded": torch.tensor(captured)}
 
 
 @pytest.mark.parametrize("stop", STOPS)
 def test_two_processes_share_the_encoding(stop: int, by_two: Made) -> None:
     alone = encoded()
     actual = [dict(context[f"encoded {stop}"]) for context in by_two]
-    assert sum(int(one["seen"]) for one in actual) == int(alone.pop("seen")) == 27
+    assert sum(int(one["encoded"]) for one in actual) == int(alone.pop("encoded")) == 27
     for one in actual:
-        assert 27 * 0.35 < int(one.pop("seen")) < 27 * 0.65
+        assert 27 * 0.35 < int(one.pop("encoded")) < 27 * 0.65
         assert one.keys() == alone.keys()
         for name, value in alone.items():
             assert value.dtype == one[name].dtype

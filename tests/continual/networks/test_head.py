@@ -222,9 +222,9 @@ def total_bytes(head: Head) -> int:
 def test_every_scene_trains_90_percent_of_the_head(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """Shared means shared, with seven scenes: no part of the head is set aside for one of them.
+    """No part of the head belongs to a single scene of seven.
 
-    Which units a ReLU closes is a matter of weights, not of the layout, so here none is closed.
+    ReLU is replaced, because the units that it closes depend on the weights.
     """
     monkeypatch.setattr(torch.nn.functional, "relu", torch.nn.functional.softplus)
     head = in_preset(name, 7)

@@ -1,5 +1,7 @@
-"""Furnished rooms for pretraining: pairs show one point, files are kept, reserved seeds are left
-alone. Rendering needs the extra `sim`."""
+"""Furnished rooms for pretraining: correspondences, cached files, reserved seeds.
+
+Rendering needs the extra `sim`.
+"""
 
 from pathlib import Path
 

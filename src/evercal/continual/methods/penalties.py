@@ -117,8 +117,8 @@ class StoredOutput(Penalty):
     ) -> Tensor:
         """Compute the mean of both terms, each with weight 1/2."""
         assert rows.stored is not None, "the method stores points when a scene is finished"
-        known = ~rows.stored[:, 0].isnan()
-        distance = (student.points[known] - rows.stored[known]).abs().sum(-1)
+        has_point = ~rows.stored[:, 0].isnan()
+        distance = (student.points[has_point] - rows.stored[has_point]).abs().sum(-1)
         distance = distance.sum() / max(len(distance), 1)
         reprojection = Reprojection()(student, None, rows, tau_px)
         return 0.5 * reprojection + 0.5 * self.px_per_m * distance
