@@ -1,22 +1,19 @@
 """SPDD against calculations in plain Python."""
 
 import math
-from dataclasses import dataclass
 
 import pytest
 import torch
 from torch import Tensor
 
 from evercal.continual.methods.spdd import SpddOptions, spdd_loss
+from evercal.continual.networks.head import HeadOutput
 
 INF = math.inf
 
 
-@dataclass
-class Output:
-    logits: Tensor
-    offsets: Tensor
-    points: Tensor
+def head_output(logits: Tensor, offsets: Tensor, points: Tensor) -> HeadOutput:
+    return HeadOutput(logits, offsets, points, hidden=points)
 
 
 def tensor(values):
@@ -29,7 +26,9 @@ def random_output(rows, centres, seed, shared=False):
     def draw(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
-    return Output(3 * draw(rows, centres), draw(rows, 1 if shared else centres, 3), draw(rows, 3))
+    return head_output(
+        3 * draw(rows, centres), draw(rows, 1 if shared else centres, 3), draw(rows, 3)
+    )
 
 
 def softmax(values, temperature):
@@ -56,12 +55,12 @@ def slow_terms(student, teacher, active, temperature):
 
 def two_rows():
     """With M_a = 2, the active set is {0, 2} in the first row and {1, 3} in the second."""
-    teacher = Output(
+    teacher = head_output(
         tensor([[2.0, -1.0, 1.0, 0.0], [0.0, 3.0, -2.0, 3.5]]),
         tensor([[[0.0] * 3, [9.0] * 3, [1.0, 2.0, 3.0], [9.0] * 3]] * 2),
         tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]),
     )
-    student = Output(
+    student = head_output(
         tensor([[1.0, 5.0, 1.0, 7.0], [8.0, 3.0, 4.0, 1.5]]),
         tensor(
             [
@@ -108,7 +107,7 @@ def test_terms_match_a_slow_reference(new, active, temperature):
 def test_probability_of_a_new_centre_is_charged():
     teacher = random_output(5, 8, 3)
     new = tensor([[-4.0], [0.0], [1.0], [3.0], [6.0]])
-    student = Output(
+    student = head_output(
         torch.cat([teacher.logits, new], dim=1),
         torch.cat([teacher.offsets, torch.zeros(5, 1, 3, dtype=torch.float64)], dim=1),
         teacher.points,
@@ -154,7 +153,7 @@ def test_gradients(new, shared):
     teacher, start = random_output(3, 6, 12, shared), random_output(3, 6 + new, 13, shared)
 
     def total(logits, offsets, points):
-        return spdd_loss(Output(logits, offsets, points), teacher, SpddOptions(1, 2, 3)).total
+        return spdd_loss(head_output(logits, offsets, points), teacher, SpddOptions(1, 2, 3)).total
 
     leaves = [x.requires_grad_() for x in (start.logits, start.offsets, start.points)]
     assert torch.autograd.gradcheck(total, leaves)
@@ -201,8 +200,8 @@ def test_masked_centre_equals_missing_centre(who):
     teacher.logits[:, 4] = 20.0  # the largest logit
     keep = [k for k in range(9) if k != 4]
     without = spdd_loss(
-        Output(student.logits[:, keep], student.offsets[:, keep], student.points),
-        Output(teacher.logits[:, keep[:6]], teacher.offsets[:, keep[:6]], teacher.points),
+        head_output(student.logits[:, keep], student.offsets[:, keep], student.points),
+        head_output(teacher.logits[:, keep[:6]], teacher.offsets[:, keep[:6]], teacher.points),
         SpddOptions(),
     )
     if who != "student":
@@ -225,7 +224,7 @@ def test_at_most_fifty_centres_are_active(centres):
     student.offsets.requires_grad_()
     terms = spdd_loss(student, teacher, SpddOptions())
     actual = terms.prior.item(), terms.metric.item(), terms.output.item()
-    detached = Output(student.logits, student.offsets.detach(), student.points)
+    detached = head_output(student.logits, student.offsets.detach(), student.points)
     assert actual == pytest.approx(slow_terms(detached, teacher, 50, 2.0), rel=1e-10, abs=1e-12)
     terms.metric.backward()
     assert student.offsets.grad is not None

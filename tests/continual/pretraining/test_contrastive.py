@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader
 
 from evercal.continual.pretraining import contrastive
 from evercal.continual.pretraining.contrastive import (
+    Batch,
     PairStream,
     PretrainData,
     PretrainOptions,
@@ -118,15 +119,15 @@ def test_matching_accuracy_of_an_oracle(
 
     def evaluate(moved: float, valid: Tensor = valid) -> float:
         truth = there + torch.tensor([0.0, moved])
-        return matching_accuracy(oracle, [(images, torch.stack([pixels, truth]), valid)])
+        return matching_accuracy(oracle, [Batch(images, torch.stack([pixels, truth]), valid)])
 
     assert evaluate(0.0) == evaluate(7.5) == 100.0
     assert evaluate(8.5) == evaluate(-40.0) == 0.0
     half = torch.arange(100).expand(3, -1) < 50
     mixed = torch.where(half[..., None], there, there + 40)
-    batch = (images, torch.stack([pixels, mixed]), valid)
+    batch = Batch(images, torch.stack([pixels, mixed]), valid)
     assert matching_accuracy(oracle, [batch]) == 50.0
-    assert matching_accuracy(oracle, [(*batch[:2], half)]) == 100.0
+    assert matching_accuracy(oracle, [batch._replace(valid=half)]) == 100.0
 
 
 def test_batches_depend_on_seed_and_step_only(data: PretrainData) -> None:
@@ -155,9 +156,9 @@ def small(monkeypatch: pytest.MonkeyPatch, one_room: RoomViews) -> None:
     monkeypatch.setattr(contrastive, "LocalEncoder", tiny)
     monkeypatch.setattr(contrastive, "DataLoader", lambda stream, **_: stream)
     draw = PairStream.draw
-    batches: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+    batches: dict[int, Batch] = {}
 
-    def cheap(stream: PairStream, step: int) -> tuple[Tensor, Tensor, Tensor]:
+    def cheap(stream: PairStream, step: int) -> Batch:
         if stream.options.room_pairs != 8:
             return draw(stream, step)
         stream.options = replace(stream.options, room_pairs=1)  # the validation set

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -86,6 +86,17 @@ class PretrainData:
     furnished: list[FurnishedViews] = field(default_factory=list)
 
 
+class Batch(NamedTuple):
+    """One training batch of b image pairs."""
+
+    images: Tensor
+    """(2, b, 1, h, w) grey values in [0, 1]."""
+    pixels: Tensor
+    """(2, b, points, 2) corresponding pixels."""
+    valid: Tensor
+    """(b, points) bool; pairs may have fewer points."""
+
+
 def _picture(seed: int) -> np.ndarray:
     return leaf_picture(np.random.default_rng([seed, 3]))
 
@@ -125,8 +136,8 @@ class PairStream(IterableDataset):
     def __init__(self, data: PretrainData, options: PretrainOptions, first_step: int):
         self.data, self.options, self.first_step = data, options, first_step
 
-    def draw(self, step: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return images (2, b, 1, h, w), pixels (2, b, points, 2), valid (b, points) of a step."""
+    def draw(self, step: int) -> Batch:
+        """Draw the batch of a step."""
         o = self.options
         rng = np.random.default_rng([o.seed, step])
         pairs: list[Pair] = []
@@ -149,7 +160,7 @@ class PairStream(IterableDataset):
             pixels[:, i, : len(chosen)] = pair.pixels[:, chosen]
             valid[i, : len(chosen)] = True
         grey = torch.from_numpy(images[:, :, None]).float() / 255
-        return grey, torch.from_numpy(pixels), torch.from_numpy(valid)
+        return Batch(grey, torch.from_numpy(pixels), torch.from_numpy(valid))
 
     def _parallax(self, rooms: Sequence[Views], rng: np.random.Generator) -> Pair:
         """Draw two views of one part of a room."""
@@ -162,7 +173,7 @@ class PairStream(IterableDataset):
         picture = self.data.pictures[rng.integers(len(self.data.pictures))]
         return homography_pair(picture, rng)
 
-    def __iter__(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    def __iter__(self) -> Iterator[Batch]:
         import cv2
 
         cv2.setNumThreads(1)
@@ -215,9 +226,7 @@ def contrastive_loss(
 
 
 @torch.inference_mode()
-def matching_accuracy(
-    encoder: torch.nn.Module, batches: list[tuple[Tensor, Tensor, Tensor]]
-) -> float:
+def matching_accuracy(encoder: torch.nn.Module, batches: list[Batch]) -> float:
     """Compute the share (%) of points whose best cell is within 8 pixels of the true match."""
     right = total = 0
     for images, pixels, valid in batches:
@@ -329,7 +338,7 @@ def _earlier(checkpoint: Path) -> dict[str, Tensor]:
     return weights
 
 
-def _validation(data: PretrainData, folder: Path) -> dict[str, list[tuple[Tensor, Tensor, Tensor]]]:
+def _validation(data: PretrainData, folder: Path) -> dict[str, list[Batch]]:
     """Draw batches from held-out rooms, by kind of room."""
     rooms = [room_views(VALIDATION_ROOM_SEED + i) for i in range(8)]
     options = PretrainOptions(room_pairs=8, furnished_pairs=0, leaf_pairs=0)
