@@ -9,7 +9,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from evercal.calibration.calibration import Mount
-from evercal.calibration.pose_pairs.closed_form import daniilidis, motions, park, shah
+from evercal.calibration.pose_pairs.closed_form import motions, park, shah
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve
 from evercal.evaluation.metrics import share_inside
@@ -150,7 +150,6 @@ def closed_forms(setting: Setting, count: int) -> dict[str, tuple[float, float]]
         a, b = motions(fixed_from_parent, drawn.pairs.camera_from_board)
         found = {
             "Park": park(a, b)[0],
-            "Daniilidis": daniilidis(a, b),
             "Shah": shah(fixed_from_parent, drawn.pairs.camera_from_board)[0],
         }
         for name, answer in found.items():

@@ -85,8 +85,8 @@ class Align:
         if self.board_poses is not None:
             from evercal.calibration.boards.board_poses import read_board_poses
 
-            found = read_board_poses(self.board_poses).found
-            seen = {image.name: image.camera_from_board for image in found}
+            found = read_board_poses(self.board_poses).detected
+            seen = {Path(image.name).name: image.camera_from_board for image in found}
             boards = {str(f): pose for f in files if (pose := seen.get(f.name)) is not None}
         return align_by_gripper(localizer, self.scene, images, poses, known, boards)
 

@@ -75,10 +75,10 @@ def test_kinds_of_noise_move_the_residuals_as_said(mount: Mount) -> None:
     pairs = drawn.pairs
     robot, camera = pairs.base_from_gripper, pairs.camera_from_board
     spoiled = {
-        "turn about gripper": replace(pairs, base_from_gripper=robot @ wobble),
-        "turn about base": replace(pairs, base_from_gripper=wobble @ robot),
-        "turn about camera": replace(pairs, camera_from_board=wobble @ camera),
-        "turn about board": replace(pairs, camera_from_board=camera @ wobble),
+        "rotation about gripper": replace(pairs, base_from_gripper=robot @ wobble),
+        "rotation about base": replace(pairs, base_from_gripper=wobble @ robot),
+        "rotation about camera": replace(pairs, camera_from_board=wobble @ camera),
+        "rotation about board": replace(pairs, camera_from_board=camera @ wobble),
     }
     for kind, changed in spoiled.items():
         residual = changed.equation(mount).residuals(at) / step
@@ -86,7 +86,7 @@ def test_kinds_of_noise_move_the_residuals_as_said(mount: Mount) -> None:
         # The residual lies in what the kind can do, at the length of one radian.
         length = np.einsum("ni,nij,nj->n", residual, np.linalg.pinv(covariance, 1e-9), residual)
         assert length == pytest.approx(1.0, abs=1e-3)
-        other = "turn about camera" if kind == "turn about base" else "turn about base"
+        other = "rotation about camera" if kind == "turn about base" else "turn about base"
         foreign = directions[other] @ directions[other].transpose(0, 2, 1)
         fitted = foreign @ np.linalg.pinv(foreign, 1e-9) @ residual[..., None]
         assert np.abs(fitted[..., 0] - residual).max() > 0.01
