@@ -2,9 +2,9 @@
 
 Board frames, in metres:
 
-- chessboard: the origin is an inner corner, x follows the columns, y the rows, and z points into the
-  board, away from the camera. If columns + rows is odd, the origin is the corner next to a bright
-  inner square, whatever the roll of the camera.
+- chessboard: the origin is an inner corner, x follows the columns, y the rows, and z points into
+  the board, away from the camera. If columns + rows is odd, the origin is the corner next to a
+  bright inner square, whatever the roll of the camera.
 - charuco: the frame of OpenCV's `CharucoBoard`: origin at an outer corner, z into the board.
 - apriltag: the origin is the centre of the black square, x right and y up in OpenCV's print, z
   towards the camera.
@@ -123,8 +123,8 @@ def _find_chessboard(grey: NDArray, board: Board) -> BoardView | str:
         detected, pixels = cv2.findChessboardCornersSB(grey, shape, flags=flags)
     if not detected:
         return (
-            f"no chessboard with {board.columns}x{board.rows} inner corners; the whole board must be"
-            f" visible, sharp and without glare"
+            f"no chessboard with {board.columns}x{board.rows} inner corners; the whole board must"
+            f" be visible, sharp and without glare"
         )
     grid = _sharpened(grey, pixels).reshape(board.rows, board.columns, 2)
     if not board.half_turn and not _first_square_is_bright(grey, grid):
@@ -211,7 +211,7 @@ def _find_tag(grey: NDArray, board: Board) -> BoardView | str:
 def _square_by_its_sides(grey: NDArray, square: Array) -> Array:
     """Refine the (4, 2) corners of a dark square by intersecting lines along its edges.
 
-    Blur rounds outer corners, so they are detected 0.1 px or more too far inside; edges do not move.
+    Blur rounds outer corners: they are detected 0.1 px or more too far inside. Edges do not move.
     OpenCV's refinement by lines is off by half a pixel in some versions.
     """
     import cv2

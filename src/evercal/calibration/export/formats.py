@@ -137,6 +137,8 @@ def _write(path: Path, content: Content) -> tuple[Path, ...]:
             raise InputError(f"{existing}: already there; give a new folder with --out")
         path.mkdir(parents=True, exist_ok=True)
     else:
+        if not path.absolute().parent.is_dir():
+            raise InputError(f"--out {path}: its folder does not exist; create it first")
         files = {path: content}
     for file, text in files.items():
         write_bytes(file, text if isinstance(text, bytes) else text.encode())
