@@ -32,10 +32,11 @@ def test_names_that_differ_only_in_their_folder_are_refused(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("role", ["robot", "camera"])
 def test_messages_name_the_file_and_its_option(tmp_path: Path, role: str) -> None:
-    files = {name: write(tmp_path / f"{name}.csv", ["1", "2"]) for name in ("robot", "camera")}
-    files[role].write_text("1 2 3 4 5 6\n")
+    robot, camera = (write(tmp_path / f"{name}.csv", ["1", "2"]) for name in ("robot", "camera"))
+    broken = tmp_path / f"{role}.csv"
+    broken.write_text("1 2 3 4 5 6\n")
     with pytest.raises(InputError, match=rf"{role}\.csv: .*--{role}-convention"):
-        read_pairs(PairFiles(**files))
-    files[role].unlink()
+        read_pairs(PairFiles(robot, camera))
+    broken.unlink()
     with pytest.raises(InputError, match=f"file of {role} poses is missing; check --{role}-poses"):
-        read_pairs(PairFiles(**files))
+        read_pairs(PairFiles(robot, camera))

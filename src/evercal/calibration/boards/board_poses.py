@@ -34,7 +34,7 @@ FORMAT, VERSION = "evercal-board-poses", 1
 
 @dataclass(frozen=True, eq=False)
 class BoardImage:
-    """One image; all fields but `name` and `reason` are None if it shows no board."""
+    """One image; without a board, only `name` and `reason` are set."""
 
     name: str
     """Path relative to the file of board poses, or a bare file name."""

@@ -48,7 +48,7 @@ class Board:
     dictionary: str = ""
     """Marker dictionary, OpenCV's name without DICT_: 4X4_50, APRILTAG_36h11."""
     tag: int | None = None
-    """Number of the tag; None for any."""
+    """Number of the tag; if omitted, any tag."""
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(BoardKind):

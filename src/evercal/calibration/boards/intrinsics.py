@@ -31,7 +31,7 @@ class Intrinsics:
 def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Intrinsics:
     """Estimate focal lengths, principal point and distortion.
 
-    Distortion models of increasing size are fitted: none, k1, k1 k2, then with p1 p2, then with k3.
+    Models of 0, 1 (k1), 2 (k2), 4 (p1 p2) and 5 (k3) distortion coefficients are fitted.
     The Bayesian information criterion selects one, so that few views do not overfit.
 
     Args:

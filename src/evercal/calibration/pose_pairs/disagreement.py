@@ -28,7 +28,7 @@ HOPELESS_M, HOPELESS_RAD = 0.05, np.deg2rad(3.0)
 _BETTER = 3.0
 """Factor by which another reading must reduce the residuals."""
 _FITTED = 24
-"""Number of rotation readings that are fitted, those with the smallest angle differences."""
+"""Number of rotation readings to fit, sorted by angle differences."""
 _FIXED = ("xyz", "zyx", "xzy", "yxz", "yzx", "zxy")
 _USUAL = ("xyz", "ZYX", "XYZ", "zyx")
 _ORDERS = (*_USUAL, *_FIXED[2:], *(order.upper() for order in _FIXED[2:]))
@@ -144,7 +144,7 @@ def _inversion(inverted: PosePairs, mount: Mount, scale_known: bool) -> str:
 
 
 def _rotation_readings(pairs: PosePairs) -> Iterator[_Reading]:
-    """Yield other readings of the rotations, those with the smallest angle differences."""
+    """Yield other readings of the rotations, sorted by angle differences."""
     readings: list[tuple[float, int, _Reading]] = []
     for part, name in {"base_from_gripper": "robot", "camera_from_board": "camera"}.items():
         poses: SE3 = getattr(pairs, part)

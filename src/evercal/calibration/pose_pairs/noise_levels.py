@@ -175,7 +175,7 @@ def ellipsoid_factor(covariance: Array, slopes: Array, uncertainty: Array) -> fl
     Args:
         covariance: (d, d) covariance.
         slopes: (k, d, d) derivatives of the covariance by the variances of the noise.
-        uncertainty: (k, k) covariance of those variances.
+        uncertainty: (k, k) covariance of the variances.
     """
     d = len(covariance)
     variances, axes = np.linalg.eigh(covariance)

@@ -30,9 +30,9 @@ class PairFiles:
     camera: Path
     """camera_from_board: the file of `evercal detect`, or a file like that of the robot."""
     robot_convention: str | None = None
-    """Pose convention of the robot file if it states none."""
+    """Pose convention of a robot file without a header."""
     camera_convention: str | None = None
-    """Pose convention of the camera file if it states none."""
+    """Pose convention of a camera file without a header."""
     invert: Inverted | None = None
     """Files that hold inverted poses: gripper_from_base, board_from_camera."""
 
@@ -46,7 +46,7 @@ class _CameraPoses:
     stamps_s: NDArray[np.float64] | None
     """(n,) times from the file or from the names."""
     poses: list[SE3 | None]
-    """(n,) poses; None for an image without a board."""
+    """(n,) poses; an image without a board has None."""
     board: BoardPoses | None
     """The file of `evercal detect`."""
 

@@ -1,7 +1,7 @@
 """Joint estimation of the calibration and the time offset between robot and camera clocks.
 
 A camera fixed to the gripper rotates by the same angle as the gripper. For a grid of offsets, the
-angles between successive images are compared with those of the robot. The best offset is then
+angles between successive images are compared with the robot's angles. The best offset is then
 refined together with the transforms.
 """
 
