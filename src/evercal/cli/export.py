@@ -27,7 +27,7 @@ class ExportCalibration:
     ] = None
     """Calibration file."""
     format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """Format, such as easy_handeye2, launch_py, urdf, opencv or kuka; `list` lists all."""
+    """Format, such as easy_handeye2, urdf, opencv or kuka; `list` lists all."""
     out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """File to write; a new folder for colmap."""
     parent: Annotated[str | None, arg(metavar="FRAME", help_behavior_hint="")] = None
@@ -35,22 +35,19 @@ class ExportCalibration:
     child: Annotated[str | None, arg(metavar="FRAME", help_behavior_hint="")] = None
     """New name of the child frame: the camera's optical frame."""
     via: Annotated[str | None, arg(metavar="FRAME", help_behavior_hint="")] = None
-    """Root frame of the camera driver, such as camera_link, to export instead of the optical
-    frame."""
+    """Export this root frame of the camera driver, such as camera_link."""
     via_transform: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """With --via: output of `ros2 topic echo --once /tf_static`, or a TransformStamped as YAML."""
+    """With --via: output of `ros2 topic echo --once /tf_static`, or a TransformStamped."""
     via_offset: Annotated[
         tuple[float, float, float] | None, arg(metavar="X Y Z", help_behavior_hint="")
     ] = None
-    """With --via: origin of the optical frame in the root frame (forward, left, up), metres."""
+    """With --via: offset of the optical frame (forward, left, up), metres."""
     via_optical: bool = False
     """With --via: both frames have the same origin."""
     robot_frame: Annotated[str | None, arg(metavar="FRAME", help_behavior_hint="")] = None
-    """For easy_handeye: the gripper frame of a fixed camera, the base frame of a camera on the
-    arm."""
+    """For easy_handeye: gripper frame of a fixed camera, else base frame."""
     robot_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Gripper pose of every image, for moveit_samples and for tum, colmap and nerfstudio of a
-    camera on the arm."""
+    """Gripper pose of every image: moveit_samples, or tum, colmap, nerfstudio on the arm."""
     target_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Board pose in the camera for every image, for moveit_samples."""
     convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None

@@ -25,8 +25,7 @@ class Solve:
     robot_poses: Annotated[Path, arg(metavar="FILE")]
     """base_from_gripper of every image: CSV, JSON, NPY or TUM."""
     camera_poses: Annotated[Path, arg(metavar="FILE")]
-    """camera_from_board of every image: the file of 'evercal detect', or a file like the robot
-    poses."""
+    """camera_from_board of every image: from 'evercal detect', or CSV, JSON, NPY, TUM."""
     mount: Literal["eye_in_hand", "eye_to_hand"]
     """eye_in_hand: camera on the gripper. eye_to_hand: fixed camera, board in the gripper."""
     scale: Literal["known", "unknown"] = "known"
@@ -34,14 +33,13 @@ class Solve:
     time_offset: bool = False
     """Estimate the offset between the clocks of robot and camera; both files need times."""
     robot_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """Pose convention of the robot poses if their file does not state it: ur, kuka, xyzw:mm, ..."""
+    """Pose convention of robot poses without a header: ur, kuka, xyzw:mm, ..."""
     camera_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """Pose convention of the camera poses if their file does not state it."""
+    """Pose convention of camera poses without a header."""
     invert: Annotated[
         Literal["robot", "camera", "both"] | None, arg(metavar="FILE", help_behavior_hint="")
     ] = None
-    """Invert the poses of a file that holds gripper_from_base or board_from_camera: robot, camera
-    or both."""
+    """Invert the poses of a file: robot, camera or both."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("calibration.json")
     """Calibration file to write."""
     json: bool = False
