@@ -9,10 +9,16 @@ from hypothesis import strategies as st
 
 from benchmarks.hand_eye import Setting, SimulatedPairs, recording
 from evercal.calibration.calibration import Mount
-from evercal.calibration.pose_pairs.pose_equation import PoseEquation, Unknowns
+from evercal.calibration.pose_pairs.pairs import PosePairs
+from evercal.calibration.pose_pairs.pose_equation import Unknowns
 from evercal.geometry import SE3
 
 MOUNTS: tuple[Mount, ...] = ("eye_in_hand", "eye_to_hand")
+
+
+def unknowns(parent_from_camera: SE3, fixed_from_board: SE3, scale: float = 1.0) -> Unknowns:
+    both = SE3.stack([parent_from_camera, fixed_from_board])
+    return Unknowns(both.rotation_matrix(), both.translation_m, scale)
 
 
 def exact(mount: Mount, seed: int, scale: float | None = None) -> SimulatedPairs:
@@ -24,7 +30,7 @@ def exact(mount: Mount, seed: int, scale: float | None = None) -> SimulatedPairs
 def test_true_transforms_have_zero_residuals(mount: Mount, scale: float | None) -> None:
     simulated = exact(mount, 0, scale)
     equation = simulated.pairs.equation(mount, scale is None)
-    at = Unknowns.of(simulated.parent_from_camera, simulated.fixed_from_board, scale or 1.0)
+    at = unknowns(simulated.parent_from_camera, simulated.fixed_from_board, scale or 1.0)
     assert np.abs(equation.residuals(at)).max() < 1e-12
 
 
@@ -38,7 +44,7 @@ def test_derivatives_match_finite_differences(
     rng = np.random.default_rng(seed)
     if moving:
         equation = replace(equation, velocity=rng.normal(size=(6, 6)))
-    at = Unknowns.of(simulated.parent_from_camera, simulated.fixed_from_board, 0.5)
+    at = unknowns(simulated.parent_from_camera, simulated.fixed_from_board, 0.5)
     at = at.moved(rng.normal(0, 0.05, equation.unknowns), known)
     at = replace(at, offset_s=0.0)
     jacobian = equation.jacobian(at, equation.residuals(at))
@@ -59,7 +65,7 @@ def test_velocity_gives_the_derivative_by_time(mount: Mount) -> None:
         (rotation @ SE3(robot.rotation_wxyz, np.zeros((6, 3)))).rotation_wxyz,
         robot.translation_m + step * velocity[:, :3],
     )
-    at = Unknowns.of(simulated.parent_from_camera, simulated.fixed_from_board)
+    at = unknowns(simulated.parent_from_camera, simulated.fixed_from_board)
     pairs = replace(simulated.pairs, velocity=velocity)
     equation = pairs.equation(mount)
     slope = equation.jacobian(at, equation.residuals(at))[:, :, -1]
@@ -70,7 +76,7 @@ def test_velocity_gives_the_derivative_by_time(mount: Mount) -> None:
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_noise_directions_match_perturbed_poses(mount: Mount) -> None:
     simulated, step = exact(mount, 5), 1e-6
-    at = Unknowns.of(simulated.parent_from_camera, simulated.fixed_from_board)
+    at = unknowns(simulated.parent_from_camera, simulated.fixed_from_board)
     directions = simulated.pairs.equation(mount).noise_directions(at)
     small = SE3.exp(np.array([0, 0, 0, step, 0, 0]))
     pairs = simulated.pairs
@@ -99,12 +105,13 @@ def test_known_noise_matches_sampled_camera_poses() -> None:
     root = rng.normal(size=(6, 6, 6)) * 1e-4
     covariance = root @ root.transpose(0, 2, 1)
     pairs = replace(simulated.pairs, camera_covariance=covariance)
-    at = Unknowns.of(simulated.parent_from_camera, simulated.fixed_from_board)
+    at = unknowns(simulated.parent_from_camera, simulated.fixed_from_board)
     known = pairs.equation("eye_in_hand").known_noise(at)
     draws = rng.normal(size=(20000, 6)) @ root[0].T
     camera = simulated.pairs.camera_from_board[0]
     rotation = SE3.exp(np.concatenate([np.zeros((20000, 3)), draws[:, 3:]], 1))
     noisy = SE3((camera @ rotation).rotation_wxyz, camera.translation_m + draws[:, :3])
-    many = PoseEquation.of(simulated.pairs.base_from_gripper[np.zeros(20000, dtype=int)], noisy)
+    robot = pairs.base_from_gripper[np.zeros(20000, dtype=int)]
+    many = PosePairs(("",) * 20000, robot, noisy).equation("eye_in_hand")
     sampled = np.cov(many.residuals(at).T)
     assert sampled == pytest.approx(known[0], abs=0.05 * np.abs(known[0]).max())

@@ -99,16 +99,20 @@ class PosePairs:
         The board is fixed in the base for a camera on the arm, otherwise in the gripper.
         """
         on_arm, robot = mount == "eye_in_hand", self.base_from_gripper
-        equation = PoseEquation.of(
-            robot if on_arm else robot.inverse(),
-            self.camera_from_board,
-            self.camera_covariance,
-            scale_known,
+        fixed_from_parent = robot if on_arm else robot.inverse()
+        covariance, velocity = self.camera_covariance, self.velocity
+        if velocity is not None and not on_arm:
+            velocity = _inverse_velocity(robot, velocity)
+        return PoseEquation(
+            robot_rotation=fixed_from_parent.rotation_matrix(),
+            robot_translation=fixed_from_parent.translation_m,
+            camera_rotation=self.camera_from_board.rotation_matrix(),
+            camera_translation=self.camera_from_board.translation_m,
+            camera_covariance=np.zeros((len(self), 6, 6)) if covariance is None else covariance,
+            scale_known=scale_known,
             base_is_fixed=on_arm,
+            velocity=velocity,
         )
-        if self.velocity is None:
-            return equation
-        return replace(equation, velocity=self.velocity if on_arm else _inverse_velocity(self))
 
 
 def listed(names: Sequence[str], limit: int = 5) -> str:
@@ -117,12 +121,11 @@ def listed(names: Sequence[str], limit: int = 5) -> str:
     return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"
 
 
-def _inverse_velocity(pairs: PosePairs) -> Array:
+def _inverse_velocity(base_from_gripper: SE3, velocity: Array) -> Array:
     """Return the (n, 6) velocity of the base in the gripper frame."""
-    assert pairs.velocity is not None
-    linear, angular = np.split(pairs.velocity, 2, 1)
-    gripper_from_base = np.swapaxes(pairs.base_from_gripper.rotation_matrix(), 1, 2)
-    moved = np.cross(angular, pairs.base_from_gripper.translation_m) - linear
+    linear, angular = np.split(velocity, 2, 1)
+    gripper_from_base = np.swapaxes(base_from_gripper.rotation_matrix(), 1, 2)
+    moved = np.cross(angular, base_from_gripper.translation_m) - linear
     rotated = (gripper_from_base @ v[..., None] for v in (moved, -angular))
     return np.concatenate([v[..., 0] for v in rotated], 1)
 

@@ -34,12 +34,6 @@ class Unknowns:
     offset_s: float = 0.0
     """Time to add to a camera stamp to get the robot's time, seconds."""
 
-    @classmethod
-    def of(cls, parent_from_camera: SE3, fixed_from_board: SE3, scale: float = 1.0) -> Self:
-        """Create the unknowns from two single transforms."""
-        both = SE3.stack([parent_from_camera, fixed_from_board])
-        return cls(both.rotation_matrix(), both.translation_m, scale)
-
     @property
     def parent_from_camera(self) -> SE3:
         """The calibration, a single transform."""
@@ -90,27 +84,6 @@ class PoseEquation:
     velocity: Array | None = None
     """(n, 6) velocity of the parent in the frame `fixed`, m/s and rad/s; required for a time
     offset."""
-
-    @classmethod
-    def of(
-        cls,
-        fixed_from_parent: SE3,
-        camera_from_board: SE3,
-        camera_covariance: Array | None = None,
-        scale_known: bool = True,
-        base_is_fixed: bool = True,
-    ) -> Self:
-        """Create the equation from (n,) poses."""
-        n = len(fixed_from_parent)
-        return cls(
-            fixed_from_parent.rotation_matrix(),
-            fixed_from_parent.translation_m,
-            camera_from_board.rotation_matrix(),
-            camera_from_board.translation_m,
-            np.zeros((n, 6, 6)) if camera_covariance is None else camera_covariance,
-            scale_known,
-            base_is_fixed,
-        )
 
     def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Self:
         """Return a subset of the poses."""
