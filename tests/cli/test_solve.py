@@ -270,4 +270,3 @@ def test_matrices_that_are_not_rigid_are_refused(run: Any, tmp_path: Path) -> No
     ran = run(*words, "--mount", "eye_in_hand")
     assert (ran.code, len(ran.err)) == (2, 1)
     assert "look like millimetres" in ran.err[0]
-    assert "--robot-convention" in ran.err[0]

@@ -123,8 +123,8 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     "two poses": (lambda p: p[np.arange(2)], "^2 pose pairs; .* at least 5"),
     "one pose": (lambda p: p[np.arange(1)], "^1 pose pair; "),
     "duplicates": (lambda p: p[np.arange(25) % 3], "25 pose pairs hold only 3 different ones"),
-    "robot in mm": (robot_by(scaled(1000)), "robot poses look like mill.*--robot-convention"),
-    "camera in mm": (camera_by(scaled(1000)), "camera poses look like mill.*--camera-convention"),
+    "robot in mm": (robot_by(scaled(1000)), "the robot poses look like millimetres"),
+    "camera in mm": (camera_by(scaled(1000)), "the camera poses look like millimetres"),
     "camera in cm": (camera_by(scaled(100)), "the camera poses look like another unit"),
     "some rows in mm": (
         robot_by(scaled(1000, slice(3, 9))),

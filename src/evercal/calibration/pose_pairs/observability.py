@@ -118,7 +118,7 @@ def _require_metres(poses: SE3, names: Sequence[str], role: str) -> None:
         raise InputError(
             f"the {role} poses look like {'millimetres' if millimetres else 'another unit'}, not"
             f" metres: their distance from the origin is {float(np.median(distance)):.0f};"
-            f" convert them, or state the unit with --{role}-convention"
+            f" convert them, or correct the unit in the file's header or pose convention"
         )
     rows = listed([name for name, is_far in zip(names, far, strict=True) if is_far])
     raise InputError(
