@@ -100,7 +100,7 @@ def nerfstudio(export: Export) -> str:
     if any(rational):
         # nerfstudio's k4 is the fourth coefficient of a polynomial, not OpenCV's k4.
         raise InputError(
-            "there are no terms for k4 k5 k6 of this lens; calibrate it with k1 k2 p1 p2 k3,"
+            "there are no terms for k4 k5 k6 of this camera; calibrate it with k1 k2 p1 p2 k3,"
             " or undistort the images"
         )
     record = {

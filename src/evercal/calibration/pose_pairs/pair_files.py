@@ -46,7 +46,7 @@ class _CameraPoses:
     stamps_s: NDArray[np.float64] | None
     """(n,) times from the file or from the names."""
     poses: list[SE3 | None]
-    """(n,) poses; an image without a board has None."""
+    """(n,) poses, or None if the image shows no board."""
     board: BoardPoses | None
     """The file of `evercal detect`."""
 
