@@ -82,7 +82,7 @@ class Align:
         if self.board_poses is not None:
             from evercal.calibration.boards.board_poses import read_board_poses
 
-            detected = read_board_poses(self.board_poses).found
+            detected = read_board_poses(self.board_poses).detected
             by_name = {Path(image.name).name: image.camera_from_board for image in detected}
             boards = {str(f): pose for f in files if (pose := by_name.get(f.name)) is not None}
         metric = not self.unknown_scale

@@ -1,4 +1,4 @@
-"""Calibrations to export, and rotations that are no library's."""
+"""Random calibrations to export, and a quaternion formula of its own."""
 
 import numpy as np
 from hypothesis import strategies as st
@@ -10,8 +10,10 @@ from evercal.geometry import SE3, Camera
 CAMERA = Camera(640, 480, 600.25, 601.5, 319.75, 240.5, (0.1, -0.2, 0.001, 0.002, 0.03))
 
 
-def made(pose: SE3, mount: Mount = "eye_to_hand", camera: Camera | None = CAMERA) -> Calibration:
-    """A calibration with names as robots have them and three images, one of them not used."""
+def calibration_of(
+    pose: SE3, mount: Mount = "eye_to_hand", camera: Camera | None = CAMERA
+) -> Calibration:
+    """Return a calibration with typical frame names and three images, one of them unused."""
     parent = "base_link" if mount == "eye_to_hand" else "tool0"
     images = (ImageUse("a.png", True), ImageUse("b.png", False, "blurred"), ImageUse("c.png", True))
     covariance = np.diag([1e-6, 2e-6, 3e-6, 1e-8, 2e-8, 3e-8])
@@ -19,10 +21,10 @@ def made(pose: SE3, mount: Mount = "eye_to_hand", camera: Camera | None = CAMERA
 
 
 def poses() -> st.SearchStrategy[SE3]:
-    """Any rotation, and those where Euler angles lock and rotation vectors jump."""
+    """Draw any pose, and often one at gimbal lock or with a rotation of 180 degrees."""
     number = st.floats(-3, 3, allow_subnormal=False)
     unit = st.floats(-1, 1, allow_subnormal=False)
-    drawn = st.tuples(unit, unit, unit, unit).filter(lambda q: sum(v * v for v in q) > 1e-3)
+    quaternions = st.tuples(unit, unit, unit, unit).filter(lambda q: sum(v * v for v in q) > 1e-3)
     special = st.sampled_from(
         [
             (1.0, 0.0, 0.0, 0.0),
@@ -35,13 +37,13 @@ def poses() -> st.SearchStrategy[SE3]:
     )
     return st.builds(
         lambda q, t: SE3(np.array(q), np.array(t)),
-        st.one_of(drawn, special),
+        st.one_of(quaternions, special),
         st.tuples(number, number, number),
     )
 
 
-def arm(count: int = 5, seed: int = 3) -> SE3:
-    """Poses of a gripper, or of a board."""
+def random_poses(count: int = 5, seed: int = 3) -> SE3:
+    """Return poses of a gripper or of a board."""
     rng = np.random.default_rng(seed)
     return SE3(rng.normal(size=(count, 4)), rng.uniform(0.2, 0.8, (count, 3)))
 
@@ -49,7 +51,7 @@ def arm(count: int = 5, seed: int = 3) -> SE3:
 def quaternion_matrix(
     x: float, y: float, z: float, w: float, translation: ArrayLike
 ) -> NDArray[np.float64]:
-    """4x4 from the textbook's formula."""
+    """Return a 4x4 matrix by the textbook formula."""
     matrix = np.eye(4)
     matrix[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
