@@ -255,10 +255,7 @@ def _on_floor(item: Item) -> Item:
     """Twice as large for things that also stand on tables."""
     if item.kind != "plant":
         return item
-    parts = [
-        (Mesh(2.6 * p.vertices_m, p.faces, p.normals, 2.6 * p.uv), mat) for p, mat in item.parts
-    ]
-    return Item(item.kind, parts)
+    return Item(item.kind, [(mesh.scaled(2.6), material) for mesh, material in item.parts])
 
 
 def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:

@@ -55,6 +55,10 @@ class Mesh:
         """Moved along."""
         return replace(self, vertices_m=self.vertices_m + np.array([x, y, z]))
 
+    def scaled(self, factor: float) -> "Mesh":
+        """Enlarged about the origin; the texture keeps its size in metres."""
+        return replace(self, vertices_m=self.vertices_m * factor, uv=self.uv * factor)
+
 
 def about_x(angle_rad: float) -> np.ndarray:
     """(3, 3) rotation about x."""
