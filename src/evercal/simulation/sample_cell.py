@@ -19,6 +19,7 @@ import numpy as np
 from evercal.geometry import SE3
 from evercal.recordings import generic
 from evercal.simulation.box_room import default_camera, look_at
+from evercal.simulation.cell import write_jpeg
 from evercal.simulation.furnished.panda import Panda
 from evercal.simulation.furnished.renderer import Renderer, RenderOptions, mitsuba
 from evercal.simulation.furnished.rooms import room
@@ -51,7 +52,7 @@ def render_sample_cell(out: Path) -> None:
     Raises:
         InputError: The extra `sim` is not installed.
     """
-    camera, panda, place = default_camera(), Panda(), room(*ROOM)
+    camera, panda = default_camera(), Panda()
     gripper_from_camera = _mounted_camera()
     tripod = look_at(_TRIPOD_M, _TRIPOD_TARGET_M)
     bumped = tripod @ _bump()
@@ -59,12 +60,12 @@ def render_sample_cell(out: Path) -> None:
     work_joints = _arm_path(TRIPOD_IMAGES + 1, _WORK_CENTRE_RAD, _WORK_SPREAD_RAD, 2)
     grippers = SE3.stack([panda.base_from_flange(joints) for joints in wrist_joints])
     options = RenderOptions()
-    renderer = Renderer(place.meshes() + panda.meshes(wrist_joints[0]))
+    renderer = Renderer(room(*ROOM).meshes() + panda.meshes(wrist_joints[0]))
 
     def take(path: Path, joints: np.ndarray, base_from_camera: SE3) -> None:
         renderer.move({mesh.name: mesh for mesh, _ in panda.meshes(joints)})
         seed = int.from_bytes(path.relative_to(out).as_posix().encode()) % 2**31
-        _write_jpeg(path, renderer.render(camera, base_from_camera, options, seed))
+        write_jpeg(path, renderer.render(camera, base_from_camera, options, seed), JPEG_QUALITY)
 
     for i, joints in enumerate(wrist_joints):
         take(out / f"wrist/images/{i:04d}.jpg", joints, grippers[i] @ gripper_from_camera)
@@ -116,15 +117,6 @@ def _arm_path(count: int, centre: np.ndarray, spread: np.ndarray, stream: int) -
     phase = rng.uniform(0, 2 * np.pi, (2, 7))
     wave = 0.75 * np.sin(cycles * t + phase[0]) + 0.25 * np.sin(2 * cycles * t + phase[1])
     return centre + spread * wave
-
-
-def _write_jpeg(path: Path, image: np.ndarray) -> None:
-    import cv2
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    bgr = np.ascontiguousarray(image[..., ::-1])
-    encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
-    write_bytes(path, encoded.tobytes())
 
 
 def _write_gripper_poses(path: Path, grippers: SE3) -> None:
