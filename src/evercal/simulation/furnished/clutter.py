@@ -118,7 +118,7 @@ class SmallObjects:
         for _ in range(int(self.rng.integers(2, 6))):
             thick = float(self.rng.uniform(0.018, 0.045))
             upright = self.shop.book(thick, 0.16, float(self.rng.uniform(0.19, 0.25)))
-            lying = upright.turned(about_y(np.pi / 2), (0, 0, thick / 2)).shifted(-0.11, 0, z)
+            lying = upright.rotated(about_y(np.pi / 2), (0, 0, thick / 2)).shifted(-0.11, 0, z)
             pile.append(lying.placed((0, 0, 0), float(self.rng.normal(0, 0.15))))
             z += thick
         return Item("books", [(Mesh.merged(pile), self._spines)])
@@ -140,7 +140,7 @@ class SmallObjects:
         for i in range(int(self.rng.integers(9, 20))):
             low, high = (0.16, 0.04, 0.8), (0.34, 0.08, 2.2)
             blade = leaf(*(float(value) for value in self.rng.uniform(low, high)))
-            blade = blade.turned(about_y(float(self.rng.uniform(-0.7, 0.2))))
+            blade = blade.rotated(about_y(float(self.rng.uniform(-0.7, 0.2))))
             leaves.append(blade.placed((0, 0, 0.12), 2.4 * i + float(self.rng.normal(0, 0.2))))
         parts = [(pot, self.glaze()), (Mesh.merged(leaves), green)]
         return Item("plant", [(mesh.scaled(scale), material) for mesh, material in parts])
@@ -212,7 +212,7 @@ class SmallObjects:
         grille = m.fabric(self.shop.name("grille"), (0.3, 0.28, 0.25), self.rng)
         parts.append((box(0.13, 0.012, 0.1, 0.004).shifted(-0.035, -0.05, 0.02), grille))
         for z in (0.045, 0.095):
-            knob = cylinder(0.018, 0.02).turned(about_x(np.pi / 2), (0.08, -0.046, z))
+            knob = cylinder(0.018, 0.02).rotated(about_x(np.pi / 2), (0.08, -0.046, z))
             parts.append((knob, self.shop.steel))
         return Item("radio", parts)
 

@@ -111,9 +111,9 @@ class FurnitureBuilder:
             (box(w + 0.04, 1.3, 0.14, 0.06, steps=4).shifted(0, -1.42, 0.42), self.cloths[0]),
         ]
         for x in (-0.36, 0.36):
-            pillow = cushion(0.62, 0.42, 0.17).turned(about_x(0.35), (x, -0.36, 0.52))
+            pillow = cushion(0.62, 0.42, 0.17).rotated(about_x(0.35), (x, -0.36, 0.52))
             parts.append((pillow, self.cloths[1]))
-        small = cushion(0.4, 0.4, 0.16).turned(about_x(0.9), (0.05, -0.55, 0.62))
+        small = cushion(0.4, 0.4, 0.16).rotated(about_x(0.9), (0.05, -0.55, 0.62))
         parts.append((small, self.cloths[2]))
         return Item("bed", parts)
 
@@ -139,7 +139,7 @@ class FurnitureBuilder:
             z = 0.05 + i * (h - 0.08) / rows
             parts.append((box(w - 0.05, 0.024, (h - 0.12) / rows, 0.008).shifted(0, -d, z), front))
             for x in (-w / 4, w / 4):
-                knob = ball(0.016).turned(about_x(np.pi / 2), (x, -d - 0.005, z + 0.5 * h / rows))
+                knob = ball(0.016).rotated(about_x(np.pi / 2), (x, -d - 0.005, z + 0.5 * h / rows))
                 parts.append((knob, self.steel))
         return Item("drawers", parts, [(-w / 2 + 0.05, w / 2 - 0.05, -d + 0.06, -0.06, h)])
 
@@ -152,10 +152,10 @@ class FurnitureBuilder:
         parts.append((box(w, 0.22, 0.82, 0.09, steps=5).shifted(0, -0.11, 0.06), cloth))
         for x in (-0.38, 0.38):
             seat = box(0.74, 0.64, 0.17, 0.06, steps=4).shifted(x, -0.53, 0.36)
-            back = box(0.72, 0.17, 0.42, 0.07, steps=4).turned(about_x(0.2), (x, -0.24, 0.48))
+            back = box(0.72, 0.17, 0.42, 0.07, steps=4).rotated(about_x(0.2), (x, -0.24, 0.48))
             parts += [(seat, cloth), (back, cloth)]
         for i, x in enumerate((-0.6, 0.2, 0.62)):
-            pillow = cushion(0.42, 0.42, 0.17).turned(about_x(1.15), (x, -0.42, 0.74))
+            pillow = cushion(0.42, 0.42, 0.17).rotated(about_x(1.15), (x, -0.42, 0.74))
             parts.append((pillow, self.cloths[1 + i % 2]))
         return Item("sofa", parts)
 
@@ -262,7 +262,7 @@ class FurnitureBuilder:
                 parts.append((box(0.56, 0.03, 0.6, 0.01).shifted(x, -d + 0.02, 0.14), self.dark))
                 parts.append((_handle(x, 0.22, -d - 0.03, 0.66, 0.01), self.steel))
                 knobs = [
-                    cylinder(0.018, 0.025).turned(about_x(np.pi / 2), (x + k, -d + 0.01, 0.8))
+                    cylinder(0.018, 0.025).rotated(about_x(np.pi / 2), (x + k, -d + 0.01, 0.8))
                     for k in (-0.2, -0.1, 0.1, 0.2)
                 ]
                 parts.append((Mesh.merged(knobs), self.steel))

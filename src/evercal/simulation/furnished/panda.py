@@ -58,7 +58,7 @@ class Panda:
         groups: dict[str, tuple[Material, list[Mesh]]] = {}
         for node, mesh, material in self._parts:
             matrix = np.asarray(self._urdf.scene.graph.get(node)[0], float)
-            rotated = mesh.turned(matrix[:3, :3], matrix[:3, 3].tolist())
+            rotated = mesh.rotated(matrix[:3, :3], matrix[:3, 3].tolist())
             groups.setdefault(material.name, (material, []))[1].append(rotated)
         return [(Mesh.merged(group), material) for material, group in groups.values()]
 

@@ -41,9 +41,9 @@ class Mesh:
         """The mesh rotated about z, then shifted."""
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        return self.turned(rotation, position_m)
+        return self.rotated(rotation, position_m)
 
-    def turned(self, rotation: np.ndarray, position_m: Sequence[float] = (0, 0, 0)) -> "Mesh":
+    def rotated(self, rotation: np.ndarray, position_m: Sequence[float] = (0, 0, 0)) -> "Mesh":
         """The mesh rotated by a (3, 3) matrix, then shifted."""
         return replace(
             self,

@@ -20,7 +20,9 @@ class WallObjects:
         parts = [(box(w, 0.32, 0.65, 0.006).shifted(0, -0.16, 0), shop.paint)]
         for x, knob in ((-w / 4, -0.06), (w / 4, 0.06)):
             parts.append((box(w / 2 - 0.01, 0.02, 0.63, 0.008).shifted(x, -0.33, 0.01), shop.paint))
-            parts.append((ball(0.014).turned(about_x(np.pi / 2), (knob, -0.335, 0.08)), shop.steel))
+            parts.append(
+                (ball(0.014).rotated(about_x(np.pi / 2), (knob, -0.335, 0.08)), shop.steel)
+            )
         return Item("cupboard", parts)
 
     def wall_shelf(self) -> Item:
@@ -64,8 +66,8 @@ class WallObjects:
         points = np.concatenate([points, [[0, 0, 0]]])
         face = Mesh(points, fan, np.tile([0.0, 0, 1], (37, 1)), uv)
         parts = [
-            (rim.turned(up, (0, 0, r)), shop.dark),
-            (face.turned(up, (0, -0.012, r)), m.clock_face("clock")),
+            (rim.rotated(up, (0, 0, r)), shop.dark),
+            (face.rotated(up, (0, -0.012, r)), m.clock_face("clock")),
         ]
         return Item("clock", parts)
 
