@@ -139,7 +139,8 @@ class SmallObjects:
         leaves = []
         for i in range(int(self.rng.integers(9, 20))):
             low, high = (0.16, 0.04, 0.8), (0.34, 0.08, 2.2)
-            blade = leaf(*(float(value) for value in self.rng.uniform(low, high)))
+            length, width, droop = self.rng.uniform(low, high).tolist()
+            blade = leaf(length, width, droop)
             blade = blade.rotated(about_y(float(self.rng.uniform(-0.7, 0.2))))
             leaves.append(blade.placed((0, 0, 0.12), 2.4 * i + float(self.rng.normal(0, 0.2))))
         parts = [(pot, self.glaze()), (Mesh.merged(leaves), green)]
