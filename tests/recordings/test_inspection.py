@@ -5,7 +5,7 @@ import pytest
 
 from evercal.geometry import SE3, Camera
 from evercal.recordings import Frame, Recording
-from evercal.recordings.inspection import inspect_scene, turning_shares
+from evercal.recordings.inspection import inspect_recording, rotation_shares
 from evercal.simulation.box_room import BoxRoom, look_at
 
 LENS = Camera(32, 24, 26, 26, 15.5, 11.5)
@@ -21,7 +21,7 @@ def scene(train: SE3, test: SE3, camera: Camera = LENS, untracked: int = 0) -> R
 
 
 def warned(scene: Recording) -> str:
-    return "\n".join(inspect_scene(scene).warnings)
+    return "\n".join(inspect_recording(scene).warnings)
 
 
 ROOM = BoxRoom(41, furniture=0, texture_px=16)
@@ -31,7 +31,7 @@ TRAIN, TEST = ROOM.path(200, 1), ROOM.path(40, 2)
 def test_numbers_are_those_of_a_known_path() -> None:
     x = np.linspace(0, 1.9, 20)
     path = SE3.stack([look_at(np.array([v, 0, 1]), np.array([v, 5, 1.5])) for v in x])
-    found = inspect_scene(scene(path, path[::4], untracked=3))
+    found = inspect_recording(scene(path, path[::4], untracked=3))
     np.testing.assert_allclose(found.extent_m, (1.9, 0, 0), atol=1e-12)
     assert found.step_median_m == pytest.approx(0.1)
     assert found.step_largest_m == pytest.approx(0.1)
@@ -73,11 +73,11 @@ def test_other_conventions_are_found() -> None:
 def test_turning_is_told_apart_by_axis() -> None:
     eye, angles = np.zeros(3), np.linspace(0, 6, 100)
     pan = [look_at(eye, np.array([np.cos(a), np.sin(a), 0.0])) for a in angles]
-    np.testing.assert_allclose(turning_shares(SE3.stack(pan)), (0, 1, 0), atol=1e-9)
+    np.testing.assert_allclose(rotation_shares(SE3.stack(pan)), (0, 1, 0), atol=1e-9)
     # Looking down by 45 deg, half of a pan is a roll: no reason for a warning.
     down = [look_at(eye, np.array([np.cos(a), np.sin(a), -1.0])) for a in angles]
-    np.testing.assert_allclose(turning_shares(SE3.stack(down)), (0, 0.5, 0.5), atol=1e-9)
+    np.testing.assert_allclose(rotation_shares(SE3.stack(down)), (0, 0.5, 0.5), atol=1e-9)
     roll = [look_at(eye, np.array([1.0, 0, 0]), a) for a in angles]
-    np.testing.assert_allclose(turning_shares(SE3.stack(roll)), (0, 0, 1), atol=1e-9)
+    np.testing.assert_allclose(rotation_shares(SE3.stack(roll)), (0, 0, 1), atol=1e-9)
     leaps = SE3.stack([pose for i in range(10) for pose in (pan[i], roll[50 + i])])
-    assert turning_shares(leaps) == (1 / 3, 1 / 3, 1 / 3)
+    assert rotation_shares(leaps) == (1 / 3, 1 / 3, 1 / 3)

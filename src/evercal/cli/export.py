@@ -121,10 +121,10 @@ class ExportCalibration:
 
         calibration = renamed(read_calibration(path), self.parent, self.child)
         robot, target = (
-            None if file is None else read_robot_poses(file, convention)
-            for file, convention in (
-                (self.robot_poses, self.convention),
-                (self.target_poses, None),
+            None if file is None else read_robot_poses(file, convention, option=option)
+            for file, convention, option in (
+                (self.robot_poses, self.convention, "--convention"),
+                (self.target_poses, None, None),
             )
         )
         return Export(

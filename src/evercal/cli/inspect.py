@@ -23,9 +23,9 @@ class Inspect:
 
     def run(self) -> int:
         """Reads the scene and some of its images."""
-        from evercal.recordings.inspection import inspect_scene
+        from evercal.recordings.inspection import inspect_recording
 
-        found = inspect_scene(self.reading.scene(self.scene))
+        found = inspect_recording(self.reading.scene(self.scene))
         if self.json:
             print_json(asdict(found))
             return 0

@@ -1,39 +1,84 @@
-"""Images on disk: (H, W, 3) uint8 in the order red, green, blue."""
+"""Images on disk and in memory: (H, W, 3) uint8 in the order red, green, blue."""
 
 import os
 from abc import ABC, abstractmethod
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from evercal.errors import InputError
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-"""Of the image files that recordings are made of, in lower case."""
+"""Endings of image files, in lower case."""
 
 
 class StoredImage(ABC):
-    """An image inside a larger file, such as a bag or a video, read when it is needed."""
+    """An image inside a larger file, such as a bag or a video, that is read on demand."""
 
     @abstractmethod
     def read(self) -> NDArray[np.uint8]:
-        """(H, W, 3) uint8 RGB.
+        """Decode the image.
+
+        Returns:
+            (H, W, 3) uint8 RGB.
 
         Raises:
-            InputError: It cannot be read or decoded.
+            InputError: The image cannot be read or decoded.
         """
 
     def file(self) -> tuple[str, bytes] | None:
-        """The ending and content of an image file where it is stored as one, else None."""
+        """Ending and content of the image file, or None if the image is not stored as a file."""
         return None
 
 
-def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
-    """Decodes an image file as it is stored, without applying an EXIF rotation.
+def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
+    """Convert an image in memory to 8-bit RGB.
+
+    Grey becomes equal red, green and blue. Alpha is dropped. 16-bit values are divided by 257 and
+    rounded, so that 65535 becomes 255.
+
+    Args:
+        image: (H, W), (H, W, 1), (H, W, 3) RGB or (H, W, 4) RGBA; uint8 or uint16, or nested lists
+            of integers from 0 to 255.
 
     Returns:
         (H, W, 3) uint8 RGB.
+
+    Raises:
+        InputError: The image is empty or has another shape or type.
+    """
+    try:
+        pixels = np.asarray(image)
+    except (TypeError, ValueError):
+        raise InputError("image: not an array; give (H, W, 3) uint8 RGB") from None
+    if isinstance(image, (list, tuple)) and np.issubdtype(pixels.dtype, np.integer) and pixels.size:
+        in_range = pixels.min() >= 0 and pixels.max() <= 255
+        pixels = pixels.astype(np.uint8) if in_range else pixels
+    channels = pixels.shape[2:] or (1,)
+    valid = pixels.ndim in (2, 3) and channels[0] in (1, 3, 4) and pixels.size
+    if not valid or pixels.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"image: array of shape {pixels.shape} and type {pixels.dtype}; give (H, W) grey,"
+            f" (H, W, 3) RGB or (H, W, 4) RGBA as uint8 or uint16"
+        )
+    if pixels.dtype == np.uint16:
+        pixels = ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if channels == (1,):
+        pixels = np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, axis=2)
+    return np.ascontiguousarray(pixels[:, :, :3])
+
+
+def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
+    """Read an image file, turned upright as its EXIF orientation states.
+
+    Intrinsics are those of the upright image.
+
+    Args:
+        path: PNG, JPEG or another file that OpenCV decodes; grey, RGB or RGBA of 8 or 16 bits.
+
+    Returns:
+        (H, W, 3) uint8 RGB, converted as by `as_rgb`.
 
     Raises:
         InputError: The file is missing, is a folder, or is not an image.
@@ -54,35 +99,35 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
 
 
 def decode_image(data: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
-    """The pixels of an image file's content, without applying an EXIF rotation.
+    """Decode the content of an image file, turned upright as its EXIF orientation states.
 
     Args:
         data: (n,) uint8 bytes of a file.
 
     Returns:
-        (H, W, 3) uint8 RGB, or None if it is no image.
+        (H, W, 3) uint8 RGB, or None if the bytes are not an image of 8 or 16 bits.
     """
     import cv2
 
-    # A rotated image would not fit the intrinsics, which are those of the sensor.
-    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+    # IMREAD_UNCHANGED would ignore the orientation; ANYDEPTH keeps 16 bits for as_rgb to round.
+    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
     image = cv2.imdecode(data, flags) if data.size else None
-    return None if image is None else image.astype(np.uint8, copy=False)
+    return as_rgb(image) if image is not None and image.dtype in (np.uint8, np.uint16) else None
 
 
 def image_file(data: bytes) -> tuple[str, bytes] | None:
-    """The ending that goes with the bytes of a PNG or JPEG file, and the bytes; None for others."""
+    """Ending and bytes of a PNG or JPEG file, or None for other bytes."""
     starts = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}
     ending = next((e for start, e in starts.items() if data.startswith(start)), None)
     return None if ending is None else (ending, data)
 
 
 def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
-    """Writes (H, W, 3) uint8 RGB in the format that the file's ending names.
+    """Write (H, W, 3) uint8 RGB in the format of the file's ending.
 
     Raises:
-        InputError: An ending that names no image format.
-        ValueError: Not (H, W, 3) uint8.
+        InputError: The ending belongs to no image format.
+        ValueError: The image is not (H, W, 3) uint8.
     """
     import cv2
 
@@ -90,16 +135,16 @@ def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         raise ValueError(f"an image is (H, W, 3) uint8, got {image.shape} {image.dtype}")
     try:
-        done, data = cv2.imencode(path.suffix, np.ascontiguousarray(image[:, :, ::-1]))
+        encoded, data = cv2.imencode(path.suffix, np.ascontiguousarray(image[:, :, ::-1]))
     except cv2.error:
-        done, data = False, np.empty(0, np.uint8)
-    if not done:
+        encoded, data = False, np.empty(0, np.uint8)
+    if not encoded:
         raise InputError(f"{path}: '{path.suffix}' is no image format; use .png or .jpg")
     path.write_bytes(data.tobytes())
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """(width, height) in pixels of the stored image.
+    """Width and height in pixels of an image file, turned upright as by `read_image`.
 
     Raises:
         InputError: As `read_image`.

@@ -1,4 +1,4 @@
-"""The sample rooms that come with the package: three rendered rooms, made by `evercal simulate`."""
+"""Sample recordings of three rendered rooms, made by `evercal simulate`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from evercal.recordings import Recording, load_recording
 
 FOLDER = Path(__file__).parent / "sample_rooms"
-"""One folder for each room."""
+"""Folder with one folder for each room."""
 ROOMS = ("bedroom", "kitchen", "living")
 """Names of the rooms, in order of learning."""
 
@@ -16,13 +16,13 @@ class SampleRoom:
     """The recordings of one sample room."""
 
     scene: Recording
-    """From a moving camera: frames to learn from and frames to test on."""
+    """From a moving camera: training and test frames."""
     fixed: Recording | None = None
-    """From a camera that stands still while the arm moves; all frames are test frames."""
+    """From a fixed camera while the arm moves; test frames only."""
     bumped: Recording | None = None
-    """Like `fixed`, after a bump moved the camera; all frames are test frames."""
+    """Like `fixed`, after a bump moved the camera; test frames only."""
     changed: Recording | None = None
-    """From a moving camera after small objects moved and lamps switched; all are test frames."""
+    """From a moving camera after small objects and lamps changed; test frames only."""
 
 
 def sample_rooms() -> tuple[SampleRoom, ...]:

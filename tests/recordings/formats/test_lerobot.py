@@ -15,7 +15,7 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.recordings import ReadOptions, generic, load_recording
+from evercal.recordings import ReadOptions, generic, load_recording, write_image
 
 av: Any = pytest.importorskip("av", reason="the extra 'lerobot' is not installed")
 pa: Any = pytest.importorskip("pyarrow", reason="the extra 'lerobot' is not installed")
@@ -199,7 +199,7 @@ def test_poses_in_a_given_convention(tmp_path: Path) -> None:
     for convention, feature, message in (
         ("xyzw", None, r"observation\.state: "),
         ("martian", "observation.ee", "martian"),
-        ("xyzw", "observation.hand", r"no feature 'observation\.hand'; --gripper-frame names one"),
+        ("xyzw", "observation.hand", r"no feature 'observation\.hand'; --gripper-frame is one of"),
     ):
         read = options(root, pose_convention=convention, gripper_frame=feature)
         with pytest.raises(InputError, match=message):
@@ -331,6 +331,38 @@ def test_other_versions_and_features_are_refused(tmp_path: Path) -> None:
         load_recording(root, options=options(root))
     change(root, codebase_version="v2.1", fps=0)
     with pytest.raises(InputError, match="no LeRobot dataset"):
+        load_recording(root, options=options(root))
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize(
+    ("name", "path", "message"),
+    [
+        ("video_path", "../other/{video_key}.mp4", "'video_path' stays inside the folder"),
+        ("video_path", "/tmp/{video_key}.mp4", "'video_path' is a path relative to the folder"),
+        ("data_path", "../../data.parquet", "'data_path' stays inside the folder"),
+        ("video_path", "{nothing}.mp4", "unusable 'video_path': 'nothing'"),
+    ],
+)
+def test_paths_outside_the_dataset_are_refused(
+    version: str, name: str, path: str, message: str, tmp_path: Path
+) -> None:
+    root = make(tmp_path / "wave", version)
+    change(root, **{name: path})
+    with pytest.raises(InputError, match=f"info.json: .*{message}"):
+        load_recording(root, options=options(root))
+
+
+@pytest.mark.parametrize("path", ["../secret.png", "/etc/secret.png"])
+def test_image_paths_outside_the_dataset_are_refused(path: str, tmp_path: Path) -> None:
+    root = make(tmp_path / "wave", "v2.1", "image")
+    write_image(tmp_path / "secret.png", picture(0, 0))
+    for file in root.glob("data/*/*.parquet"):
+        table = pq.read_table(file)
+        cells = pa.array([{"bytes": None, "path": path}] * len(table))
+        table = table.set_column(table.schema.get_field_index(WRIST), WRIST, cells)
+        pq.write_table(table, file)
+    with pytest.raises(InputError, match=f"image '{path}': the path"):
         load_recording(root, options=options(root))
 
 

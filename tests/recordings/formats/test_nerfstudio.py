@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings import Frame, load_recording, nerfstudio, write_image
-from evercal.recordings.inspection import inspect_scene
+from evercal.recordings.inspection import inspect_recording
 
 LENS = {"fl_x": 40.0, "fl_y": 42.0, "cx": 13.0, "cy": 17.5, "w": 24, "h": 36,
         "k1": 0.05, "k2": -0.02, "p1": 0.003, "p2": -0.002}  # fmt: skip
@@ -88,7 +88,7 @@ def test_points_land_where_the_files_own_formulas_say(shared: bool, tmp_path: Pa
         assert frame.read_image().shape == (36, 24, 3)  # portrait
         for point in points:
             np.testing.assert_allclose(seen(frame, point), gl_pixel(matrix, LENS, point), atol=1e-9)
-    assert "are those of transforms.json" in inspect_scene(scene).notes[0]
+    assert "are those of transforms.json" in inspect_recording(scene).notes[0]
 
 
 @settings(max_examples=20)
@@ -168,10 +168,10 @@ BREAKS: list[tuple[dict[str, Any], str]] = [
     ({"fl_x": None, "camera_angle_x": 28.0}, "'camera_angle_x' is between 0 and pi radians"),
     ({"fl_x": 0}, "fx is finite"),
     ({"w": None}, "'w' is missing"),
-    ({"test_filenames": ["frame_00001.png"]}, "names 'frame_00001.png', which no frame does"),
+    ({"test_filenames": ["frame_00001.png"]}, "names 'frame_00001.png', which is no frame"),
     ({"fl_x": "wide"}, "'fl_x' is a number"),
     ({"fl_x": -3}, "fx is finite"),
-    ({"w": 36, "h": 24}, "is 24x36, transforms.json says 36x24 .the image was turned"),
+    ({"w": 36, "h": 24}, "is 24x36, transforms.json says 36x24 .the image was rotated"),
     ({"w": 30}, "is 24x36, transforms.json says 30x36 .cropped"),
     ({"applied_scale": 0}, "'applied_scale' is > 0"),
     ({"applied_transform": [[1, 0], [0, 1]]}, "'applied_transform' is 4x4 or 3x4"),

@@ -12,6 +12,7 @@ import pytest
 from evercal.errors import InputError
 from evercal.geometry import Camera, pose_distance
 from evercal.recordings import ReadOptions, generic, load_recording
+from evercal.recordings.formats.ros_bag import BagImage
 
 pytest.importorskip("rosbags", reason="the extra 'bags' is not installed")
 
@@ -51,9 +52,9 @@ def test_a_recording_comes_back(kind: str, tmp_path: Path) -> None:
             metres, radians = pose_distance(frame.base_from_gripper, expected)
             assert metres < 1e-9
             assert radians < 1e-7
-        assert scene.notes[0].startswith("2 of 8 images lie outside the recorded poses")
+        assert scene.notes[0].startswith("2 of 8 images were taken outside the recorded poses")
         assert scene.notes[1] == "poses of the gripper are those of tool0 in base_link, from tf"
-        assert "tf states the camera too (camera_optical)" in scene.notes[2]
+        assert "tf also has the camera (camera_optical)" in scene.notes[2]
 
 
 def test_old_ros2_bags_hold_no_definitions(tmp_path: Path) -> None:
@@ -96,7 +97,15 @@ def test_jpegs_stay_as_they_are_and_threads_may_read(tmp_path: Path) -> None:
         assert frame.image.read_bytes() == data
 
 
-MOSAIC = np.tile(np.arange(8, dtype=np.uint8)[:, None], (1, 8))
+@pytest.mark.parametrize("kind", KINDS)
+def test_images_may_be_read_while_messages_are_iterated(kind: str, tmp_path: Path) -> None:
+    frames = load_recording(recording(kind).write(tmp_path)).train
+    image = frames[0].image
+    assert isinstance(image, BagImage)
+    with ThreadPoolExecutor(1) as pool:  # a deadlock would be in a thread with a time limit
+        for i, _ in enumerate(image.bag.messages(["/cam/image_raw"])):
+            pixels = pool.submit(frames[i % 6].read_image).result(timeout=5)
+            np.testing.assert_array_equal(pixels, picture(i % 6))
 
 
 def bayer(pattern: str, rgb: tuple[int, int, int]) -> np.ndarray:
@@ -184,10 +193,7 @@ def test_a_bag_without_images_tf_or_camera_info_says_which(tmp_path: Path) -> No
         "It holds /cam/camera_info (sensor_msgs/CameraInfo), /tf (tf2_msgs/TFMessage)"
         in (parts["images"])
     )
-    assert (
-        "no tf in it, so nothing says where the gripper was; record /tf and /tf_static"
-        in (parts["tf"])
-    )
+    assert "no tf in it, so there are no gripper poses; record /tf and /tf_static" in (parts["tf"])
     assert "no camera_info for /cam/image_raw (/cam/camera_info is expected" in parts["info"]
     lens = tmp_path / "camera.txt"
     lens.write_text("31 0 15\n0 31 11\n0 0 1\n")
@@ -226,7 +232,7 @@ def test_of_several_image_topics_one_is_named(tmp_path: Path) -> None:
     [
         ({"focal": 0.0}, "K is all zeros: the camera is not calibrated; give --camera"),
         ({"model": "equidistant"}, "distortion_model 'equidistant' is not supported"),
-        ({"size": (64, 48)}, "is for images of 64x48, those on /cam/image_raw are 32x24"),
+        ({"size": (64, 48)}, "is for images of 64x48, /cam/image_raw is 32x24"),
     ],
 )
 def test_unusable_camera_info_is_named(

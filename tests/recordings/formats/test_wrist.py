@@ -174,7 +174,7 @@ def test_images_outside_the_poses_times_have_none(tmp_path: Path) -> None:
     rows = RobotPoses(None, stamps, some_poses(3))
     found, notes = pair_images(images, rows, None, Path("p"))
     assert [pose is None for pose in found] == [True, False, True]
-    assert notes[1].startswith("2 images lie outside")
+    assert notes[1].startswith("2 images taken outside")
 
 
 def test_images_in_another_order_than_their_names_are_not_paired_in_order() -> None:

@@ -201,7 +201,7 @@ def test_missing_binary_and_sizeless_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "image.png").write_bytes(b"\x89PNG\xff\xfe")
     with pytest.raises(InputError, match="not a text file"):
         read_camera(tmp_path / "image.png")
-    with pytest.raises(InputError, match="does not tell the image size"):
+    with pytest.raises(InputError, match="has no image size"):
         read_camera(written(tmp_path, "1 0 0 0 1 0 0 0 1"))
 
 

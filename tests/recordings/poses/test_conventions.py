@@ -13,7 +13,8 @@ from scipy.linalg import expm
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.conventions import (
     CONVENTIONS,
-    doubt,
+    ConventionError,
+    check_units,
     numbers_from_poses,
     pose_convention,
     poses_from_numbers,
@@ -168,9 +169,9 @@ def test_quaternions_are_written_with_positive_w() -> None:
         ("euler", "is not known; use one of wxyz, xyzw"),
         ("kuka:cm", "modifier 'cm' is not known"),
         ("wxyz:deg", "has no angles"),
-        ("kuka:m:mm", "says a thing twice"),
-        ("kuka:deg:rad", "says a thing twice"),
-        ("matrix:inverse:inverse", "says a thing twice"),
+        ("kuka:m:mm", "repeats a modifier"),
+        ("kuka:deg:rad", "repeats a modifier"),
+        ("matrix:inverse:inverse", "repeats a modifier"),
     ],
 )
 def test_names_that_are_none(name: str, said: str) -> None:
@@ -186,38 +187,38 @@ def rows(name: str) -> Array:
 
 
 @pytest.mark.parametrize("name", sorted(CONVENTIONS))
-def test_sound_numbers_raise_no_doubt(name: str) -> None:
-    assert doubt(rows(name), CONVENTIONS[name]) is None
+def test_numbers_in_the_unit_of_their_convention_pass(name: str) -> None:
+    check_units(rows(name), CONVENTIONS[name])
 
 
 @pytest.mark.parametrize(
-    ("written", "read", "said"),
+    ("written", "read", "remedy"),
     [
-        ("wxyz:mm", "wxyz", "look like millimetres; give --convention wxyz:mm"),
-        ("matrix:mm", "matrix", "look like millimetres; give --convention matrix:mm"),
-        ("franka:mm", "franka:inverse", "give --convention franka:inverse:mm"),
-        ("kuka:m", "kuka", "looks like metres; give --convention kuka:m"),
-        ("rpy:deg", "rpy", "looks like degrees; give --convention rpy:deg"),
-        ("ur:deg", "ur", "looks like degrees; give --convention ur:deg"),
-        ("fanuc:rad", "fanuc", "looks like radians; give --convention fanuc:rad"),
+        ("wxyz:mm", "wxyz", "look like millimetres; give --robot-convention wxyz:mm"),
+        ("matrix:mm", "matrix", "look like millimetres; give --robot-convention matrix:mm"),
+        ("franka:mm", "franka:inverse", "give --robot-convention franka:inverse:mm"),
+        ("kuka:m", "kuka", "looks like metres; give --robot-convention kuka:m"),
+        ("rpy:deg", "rpy", "looks like degrees; give --robot-convention rpy:deg"),
+        ("ur:deg", "ur", "looks like degrees; give --robot-convention ur:deg"),
+        ("fanuc:rad", "fanuc", "looks like radians; give --robot-convention fanuc:rad"),
     ],
 )
-def test_wrong_units_are_doubted_until_they_are_stated(written: str, read: str, said: str) -> None:
-    assert said in (doubt(rows(written), pose_convention(read)) or "")
-    stated = said.split("--convention ")[1]
-    assert doubt(rows(written), pose_convention(stated)) is None
-    # Who states the unit, even an odd one, is believed.
+def test_other_units_are_refused_unless_stated(written: str, read: str, remedy: str) -> None:
+    with pytest.raises(ConventionError) as caught:
+        check_units(rows(written), pose_convention(read))
+    assert remedy in caught.value.naming("--robot-convention")
+    stated = remedy.split("--robot-convention ")[1]
+    check_units(rows(written), pose_convention(stated))
     units = {"mm": ":m", "m": ":mm", "deg": ":rad", "rad": ":deg"}[stated.split(":")[-1]]
-    assert doubt(rows(written), pose_convention(read + units)) is None
+    check_units(rows(written), pose_convention(read + units))
 
 
 @pytest.mark.parametrize(("name", "factor"), [("xyzw", 1000.0), ("abb", 0.001)])
-def test_mixed_units_name_the_poses(name: str, factor: float) -> None:
+def test_poses_in_mixed_units_are_named(name: str, factor: float) -> None:
     numbers = rows(name)
     numbers[[1, 4], :3] *= factor
-    found = doubt(numbers, CONVENTIONS[name]) or ""
-    assert "poses 2, 5" in found
-    assert "mix millimetres and metres" in found
+    with pytest.raises(ValueError, match=r"poses 2, 5 .*millimetres and metres may be mixed"):
+        check_units(numbers, CONVENTIONS[name])
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings import Frame, Recording, load_recording, write_image
-from evercal.recordings.inspection import inspect_scene
+from evercal.recordings.inspection import inspect_recording
 from evercal.recordings.poses import pose_evidence
-from evercal.recordings.poses.pose_evidence import doubts
+from evercal.recordings.poses.pose_evidence import rotation_warnings
 from evercal.recordings.samples import FOLDER
 
 GRIPPER_FROM_CAMERA = SE3.exp([0.05, 0.02, 0.08, 0.4, -1.0, 0.7])
@@ -32,7 +32,7 @@ def bedroom() -> tuple[Frame, ...]:
 @pytest.fixture(scope="module", autouse=True)
 def matched_once() -> Iterator[None]:
     """Every pair of images is matched once for all tests."""
-    real, known = pose_evidence.seen_turn, {}
+    real, known = pose_evidence.measured_rotation, {}
 
     def cached(first: Frame, second: Frame) -> np.ndarray | None:
         key = first.image, second.image
@@ -41,17 +41,17 @@ def matched_once() -> Iterator[None]:
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pose_evidence, "seen_turn", cached)
+        patch.setattr(pose_evidence, "measured_rotation", cached)
         yield
 
 
 def test_turns_between_images_are_those_of_the_true_poses(bedroom: tuple[Frame, ...]) -> None:
-    turns = pose_evidence.measure(bedroom, stated(bedroom))
+    turns = pose_evidence.pair_rotations(bedroom, stated(bedroom))
     assert turns is not None
-    assert len(turns.seen) >= 8
-    off = Rotation.from_rotvec(turns.seen).inv() * Rotation.from_rotvec(turns.stated)
+    assert len(turns.measured) >= 8
+    off = Rotation.from_rotvec(turns.measured).inv() * Rotation.from_rotvec(turns.stated)
     assert np.rad2deg(np.median(off.magnitude())) < 1.0
-    assert np.rad2deg(np.median(np.linalg.norm(turns.seen, axis=1))) > pose_evidence.TURN_DEG
+    assert np.rad2deg(np.median(np.linalg.norm(turns.measured, axis=1))) > pose_evidence.LEAST_DEG
 
 
 def reordered(poses: SE3) -> SE3:
@@ -72,38 +72,38 @@ SPOILED: dict[str, tuple[Callable[[SE3], SE3], str]] = {
     "both": (lambda poses: (poses @ FLIP).inverse(), "the inverse with OpenGL's camera axes"),
     "order": (reordered, "they are with quaternions in another order"),
     "body": (lambda poses: poses @ GRIPPER_FROM_CAMERA, "those of another frame, at a fixed angle"),
-    "degrees": (as_degrees, "are angles in the unit and Euler order that was said"),
+    "degrees": (as_degrees, "are angles in the stated unit and Euler order"),
 }
 
 
 @pytest.mark.parametrize("how", SPOILED)
 def test_spoiled_camera_poses_are_named(bedroom: tuple[Frame, ...], how: str) -> None:
     spoil, message = SPOILED[how]
-    assert doubts(bedroom, stated(bedroom), True) == []
-    (said,) = doubts(bedroom, spoil(stated(bedroom)), True)
-    assert said.startswith("the camera turns otherwise than the images do, by ")
+    assert rotation_warnings(bedroom, stated(bedroom), True) == []
+    (said,) = rotation_warnings(bedroom, spoil(stated(bedroom)), True)
+    assert said.startswith("the camera rotates differently from the images, by ")
     assert message in said
 
 
 def test_spoiled_gripper_poses_are_named(bedroom: tuple[Frame, ...]) -> None:
     gripper = stated(bedroom) @ GRIPPER_FROM_CAMERA.inverse()
-    assert doubts(bedroom, gripper, False) == []
+    assert rotation_warnings(bedroom, gripper, False) == []
     # Any frame that is fixed to the gripper is as good.
-    assert doubts(bedroom, gripper @ FLIP, False) == []
-    (said,) = doubts(bedroom, gripper.inverse(), False)
+    assert rotation_warnings(bedroom, gripper @ FLIP, False) == []
+    (said,) = rotation_warnings(bedroom, gripper.inverse(), False)
     assert "they are gripper_from_base, the inverse" in said
-    (said,) = doubts(bedroom, reordered(gripper), False)
+    (said,) = rotation_warnings(bedroom, reordered(gripper), False)
     assert "with quaternions in another order" in said
-    (said,) = doubts(bedroom, as_degrees(gripper), False)
-    assert "are angles in the unit" in said or "the angles in another unit" in said
+    (said,) = rotation_warnings(bedroom, as_degrees(gripper), False)
+    assert "are angles in the stated unit" in said or "the angles in another unit" in said
 
 
 def test_a_camera_that_stands_still_is_noticed(bedroom: tuple[Frame, ...]) -> None:
     same = tuple(dataclasses.replace(f, image=bedroom[0].image) for f in bedroom)
     gripper = stated(bedroom) @ GRIPPER_FROM_CAMERA.inverse()
-    (said,) = doubts(same, gripper, False)
+    (said,) = rotation_warnings(same, gripper, False)
     assert said.startswith(
-        "the gripper turns and the images hardly do; does the camera stand still"
+        "the gripper rotates and the images hardly do; does the camera stand still"
     )
 
 
@@ -113,7 +113,7 @@ def test_images_without_texture_say_nothing(tmp_path: Path) -> None:
     blank = tmp_path / "blank.png"
     write_image(blank, np.full((48, 64, 3), 128, np.uint8))
     frames = tuple(Frame(str(i), blank, camera, pose) for i, pose in enumerate(poses))
-    assert doubts(frames, poses, True) == []
+    assert rotation_warnings(frames, poses, True) == []
 
 
 def test_a_wrist_recording_is_inspected_by_its_gripper(bedroom: tuple[Frame, ...]) -> None:
@@ -124,7 +124,7 @@ def test_a_wrist_recording_is_inspected_by_its_gripper(bedroom: tuple[Frame, ...
             dataclasses.replace(f, base_from_camera=None, base_from_gripper=pose)
             for f, pose in zip(bedroom, poses, strict=True)
         )
-        found = inspect_scene(Recording("wave", frames, ()))
+        found = inspect_recording(Recording("wave", frames, ()))
         assert (found.poses, found.train) == ("gripper", len(frames))
         return found.warnings
 
@@ -132,7 +132,7 @@ def test_a_wrist_recording_is_inspected_by_its_gripper(bedroom: tuple[Frame, ...
     (millimetres,) = warned(SE3(gripper.rotation_wxyz, 1000 * gripper.translation_m))[:1]
     assert "farther than arms reach; are the poses in millimetres?" in millimetres
     (nowhere,) = warned(SE3(gripper.rotation_wxyz, 1e-6 * gripper.translation_m))
-    assert "stand at one point, turning by" in nowhere
+    assert "stand at one point, rotating by" in nowhere
     assert "in metres?" in nowhere
     (inverse,) = warned(gripper.inverse())
     assert "gripper_from_base, the inverse" in inverse
@@ -144,6 +144,6 @@ def test_many_cameras_take_one_line(bedroom: tuple[Frame, ...]) -> None:
         dataclasses.replace(f, camera=dataclasses.replace(lens, fx=lens.fx + i / 10))
         for i, f in enumerate(bedroom)
     )
-    (line,) = inspect_scene(Recording("phone", frames, ())).cameras
+    (line,) = inspect_recording(Recording("phone", frames, ())).cameras
     assert f"{len(frames)} sets of intrinsics" in line
     assert pose_distance(stated(frames), stated(bedroom))[0].max() == 0

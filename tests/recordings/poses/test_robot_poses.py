@@ -185,7 +185,7 @@ def test_json_matrices_and_numbers(tmp_path: Path) -> None:
     assert same(read_robot_poses(file).poses, arm())
     file.write_text(json.dumps(numbers_from_poses(arm(), CONVENTIONS["kuka"]).tolist()))
     assert same(read_robot_poses(file, "kuka").poses, arm())
-    with pytest.raises(InputError, match="6 numbers a pose do not say how they are meant"):
+    with pytest.raises(InputError, match="6 numbers do not define a pose"):
         read_robot_poses(file)
 
 
@@ -197,23 +197,27 @@ def test_npy(tmp_path: Path) -> None:
     assert same(read_robot_poses(file).poses, arm()[:1])
     np.save(file, arm().matrix().swapaxes(1, 2))
     assert same(read_robot_poses(file, "franka").poses, arm())
-    with pytest.raises(InputError, match="written column after column; give --convention franka"):
+    with pytest.raises(InputError, match="written column after column; give the convention franka"):
         read_robot_poses(file)
     for name in ("wxyz", "xyzw", "ur", "kuka", "franka"):
         np.save(file, numbers_from_poses(arm(), CONVENTIONS[name]))
         assert same(read_robot_poses(file, name).poses, arm())
-        with pytest.raises(InputError, match="do not say how they are meant"):
+        with pytest.raises(InputError, match="do not define a pose"):
             read_robot_poses(file)
 
 
 Q = "0.5,0.1,0.2,1,0,0,0"
 REFUSED = [
-    ("x,y,z,rx,ry,rz\n0.5,0,0,0.1,0.2,0.3", None, "give --convention ur .rotation vector., yask"),
-    ("x,y,z,roll,pitch,yaw\n0.5,0,0,0.1,0.2,0.3", None, "give --convention rpy:rad or rpy:deg"),
-    ("x,y,z,a,b,c\n500,0,0,10,20,30", None, "columns of a, b, c .* give --convention kuka"),
-    ("x,y,z,q1,q2,q3,q4\n" + Q, None, "give --convention abb, wxyz or xyzw"),
-    ("x,y,z,qw,qx,qy,qz,rotvec_x,rotvec_y,rotvec_z\n" + Q + ",0,0,0", None, "say which with"),
-    ("a1,a2,a3,a4,a5,a6,a7\n" + Q, None, "names no pose that is known"),
+    ("x,y,z,rx,ry,rz\n0.5,0,0,0.1,0.2,0.3", None, "give the convention ur .rotation vector., yask"),
+    ("x,y,z,roll,pitch,yaw\n0.5,0,0,0.1,0.2,0.3", None, "give the convention rpy:rad or rpy:deg"),
+    ("x,y,z,a,b,c\n500,0,0,10,20,30", None, "columns a, b, c .* give the convention kuka"),
+    ("x,y,z,q1,q2,q3,q4\n" + Q, None, "give the convention abb, wxyz or xyzw"),
+    (
+        "x,y,z,qw,qx,qy,qz,rotvec_x,rotvec_y,rotvec_z\n" + Q + ",0,0,0",
+        None,
+        "names quaternion and",
+    ),
+    ("a1,a2,a3,a4,a5,a6,a7\n" + Q, None, "names no known pose"),
     ("x,y,z,u,v\n0,0,0,0,0", "kuka", "its 5 columns are not the 6 of kuka"),
     ("x,y,z,qw,qx,qy,qz\n" + Q, "kuka", "no columns for kuka"),
     ("x,y,z,rx,ry,rz\n500,0,0,10,20,30", "kuka", "no columns for kuka .X Y Z A B C"),
@@ -225,8 +229,8 @@ REFUSED = [
     ("x,y,z,qw,qx,qy,qz\n500,100,200,1,0,0,0", None, "look like millimetres.* wxyz:mm"),
     ("x_m,y_m,z_m,qw,qx,qy,qz\n500,100,200,1,0,0,0", None, "look like millimetres.* wxyz:mm"),
     ("x,y,z,rotvec_x,rotvec_y,rotvec_z\n0.5,0,0,100,20,3", None, "looks like degrees.* ur:deg"),
-    ("x_m,y_m,z_m,A,B,C\n0.5,0,0,100,20,3", "kuka", "header says m .* give --convention kuka:m"),
-    ("x,y,z,roll_rad,pitch_rad,yaw_rad\n0,0,0,1,1,1", "fanuc", "give --convention fanuc:rad"),
+    ("x_m,y_m,z_m,A,B,C\n0.5,0,0,100,20,3", "kuka", "header says m .* give the convention kuka:m"),
+    ("x,y,z,roll_rad,pitch_rad,yaw_rad\n0,0,0,1,1,1", "fanuc", "give the convention fanuc:rad"),
     ("x_m,y,z,qw,qx,qy,qz\n" + Q, None, "x_m, y, z differ in unit"),
     ("stamp,x,y,z,qw,qx,qy,qz\n1.7e18," + Q, None, "not in seconds; call the column stamp_ns"),
     ("image,x,y,z,qw,qx,qy,qz\na," + Q + "\na," + Q, None, "'a' comes twice"),
@@ -250,6 +254,12 @@ def test_what_is_open_or_wrong_is_said(
         read_robot_poses(tmp_path / "p.csv", given)
     assert str(caught.value).startswith(str(tmp_path / "p.csv"))
     assert "\n" not in str(caught.value)
+
+
+def test_messages_name_the_option_of_the_command(tmp_path: Path) -> None:
+    (tmp_path / "p.csv").write_text("x,y,z,rx,ry,rz\n0.5,0,0,0.1,0.2,0.3")
+    with pytest.raises(InputError, match="columns rx, ry, rz .*; give --pose-convention ur "):
+        read_robot_poses(tmp_path / "p.csv", option="--pose-convention")
 
 
 def test_a_header_that_lies_is_overruled_by_the_user(tmp_path: Path) -> None:
@@ -281,8 +291,10 @@ def test_json_that_is_none(tmp_path: Path, data: object, given: str | None, said
 
 def test_files_that_are_none(tmp_path: Path) -> None:
     for name in ("no.csv", "no.json", "no.npy"):
-        with pytest.raises(InputError, match="missing; check the path"):
+        with pytest.raises(InputError, match="file of robot poses is missing; check the path"):
             read_robot_poses(tmp_path / name)
+        with pytest.raises(InputError, match=f"{name}: camera file is missing"):
+            read_robot_poses(tmp_path / name, what="camera file")
     (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(InputError, match="not a text file"):
         read_robot_poses(tmp_path / "b.csv")

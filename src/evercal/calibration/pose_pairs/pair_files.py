@@ -101,7 +101,7 @@ def read_streams(files: PairFiles) -> tuple[PoseTrack, CameraTrack]:
 
 
 def _robot(files: PairFiles) -> RobotPoses:
-    found = read_robot_poses(files.robot, files.robot_convention)
+    found = read_robot_poses(files.robot, files.robot_convention, option="--robot-convention")
     if files.invert in ("robot", "both"):
         found = replace(found, poses=found.poses.inverse())
     return found
@@ -116,7 +116,12 @@ def _camera(files: PairFiles) -> _CameraPoses:
         poses = [image.camera_from_board for image in board.images]
         found = _CameraPoses(names, times_in_names(names), poses, board)
     else:
-        read = read_robot_poses(files.camera, files.camera_convention)
+        read = read_robot_poses(
+            files.camera,
+            files.camera_convention,
+            what="camera file",
+            option="--camera-convention",
+        )
         stamps = read.stamps_s
         if stamps is None and read.names is not None:
             stamps = times_in_names(read.names)

@@ -99,8 +99,8 @@ def test_a_joint_on_several_topics_is_asked_for(tmp_path: Path) -> None:
     bag.image(1.0, "/cam/image_raw", picture(0))
     bag.info("/cam/camera_info")
     assert (
-        "joint turn is on several topics, /joint_states, /joint_states_desired; name the one that"
-        " holds with --pose-topic"
+        "joint turn is on several topics, /joint_states, /joint_states_desired; choose one with"
+        " --pose-topic"
     ) in refusal(bag, tmp_path, urdf=urdf)
     path = tmp_path / "wave"
     scene = load_recording(path, options=ReadOptions(urdf=urdf, pose_topic="/joint_states"))
@@ -118,12 +118,12 @@ def test_a_frame_that_several_topics_place_is_asked_for(tmp_path: Path) -> None:
     bag.tf(0.0, "tool0", "finger", SE3.exp([1, 0, 0, 0, 0, 0]), static=True, robot="/left")
     (tmp_path / "static").mkdir()
     assert len(load_recording(bag.write(tmp_path / "static")).train) == 6
-    said = "tf tool0 -> finger is on several topics, /left/tf, /tf; name the one"
+    said = "tf tool0 -> finger is on several topics, /left/tf, /tf; choose one"
     assert said in refusal_of(tmp_path / "static/wave", gripper_frame="finger")
     for i in range(51):
         bag.tf(i / 25, "shoulder", "tool0", shoulder_from_tool(i / 25 + 0.3), robot="/left")
     (tmp_path / "moving").mkdir()
-    said = "tf shoulder -> tool0 is on several topics, /left/tf, /tf; name the one"
+    said = "tf shoulder -> tool0 is on several topics, /left/tf, /tf; choose one"
     assert said in refusal(bag, tmp_path / "moving")
     for topic, late in (("/tf", 0.0), ("/left/tf", 0.3)):
         scene = load_recording(tmp_path / "moving/wave", options=ReadOptions(pose_topic=topic))
@@ -154,7 +154,7 @@ def test_frames_that_cannot_be_guessed_are_asked_for(tmp_path: Path) -> None:
     odd.tf(0.0, "map", "phone", SE3.identity())
     odd.image(0.0, "/cam/image_raw", picture(0))
     odd.info("/cam/camera_info")
-    assert "--base-frame (none has a usual name); tf has map, phone" in refusal(
+    assert "--base-frame (no frame has a usual name); tf has map, phone" in refusal(
         odd, tmp_path / "odd"
     )
 
@@ -162,7 +162,7 @@ def test_frames_that_cannot_be_guessed_are_asked_for(tmp_path: Path) -> None:
 def test_broken_trees_of_frames_are_named(tmp_path: Path) -> None:
     for name, parent, child, message in (
         ("apart", "elsewhere", "flange", "tf has no chain between 'base_link' and 'flange'"),
-        ("circle", "camera_optical", "world", "tf goes in a circle"),
+        ("circle", "camera_optical", "world", "tf has a cycle"),
         ("two", "world", "tool0", "tf frame 'tool0' has several parents, shoulder, world"),
     ):
         bag = recording("mcap")
@@ -176,7 +176,7 @@ def test_broken_trees_of_frames_are_named(tmp_path: Path) -> None:
     transform = dataclasses.replace(nothing.transform, rotation=zero)
     bag.messages[0][3].transforms[0] = dataclasses.replace(nothing, transform=transform)
     (tmp_path / "zero").mkdir()
-    assert "no rigid transform; mend what publishes it" in refusal(bag, tmp_path / "zero")
+    assert "no rigid transform; repair the program" in refusal(bag, tmp_path / "zero")
 
 
 def test_clocks_that_differ_are_named(tmp_path: Path) -> None:
