@@ -258,7 +258,7 @@ def test_what_is_open_or_wrong_is_said(
 
 def test_messages_name_the_option_of_the_command(tmp_path: Path) -> None:
     (tmp_path / "p.csv").write_text("x,y,z,rx,ry,rz\n0.5,0,0,0.1,0.2,0.3")
-    with pytest.raises(InputError, match="columns rx, ry, rz .*; give --pose-convention ur "):
+    with pytest.raises(InputError, match=r"columns rx, ry, rz .*; give --pose-convention ur "):
         read_robot_poses(tmp_path / "p.csv", option="--pose-convention")
 
 

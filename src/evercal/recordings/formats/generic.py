@@ -1,19 +1,7 @@
 """evercal's own folder format: one `scene.json` beside the images it names.
 
-    {"format": "evercal-scene", "version": 1, "name": "kitchen",
-     "cameras": {"0": {"width", "height", "fx", "fy", "cx", "cy", "distortion": []}},
-     "frames": [{"name": "000000", "image": "images/000000.png", "camera": "0", "split": "train",
-                 "base_from_camera": {"translation_m": [3], "quaternion_wxyz": [4]},
-                 "base_from_gripper": null, "depth": "depth/000000.png",
-                 "joints_rad": [7]}, ...],
-     "untracked": 0, "notes": [], "render": {}}
-
-Metres, quaternions in the order w, x, y, z, OpenCV camera axes, pixel (0, 0) at the centre of the
-top-left pixel, distortion k1 k2 p1 p2 k3 k4 k5 k6 as in OpenCV. Frames are in recorded order. Image
-paths are relative to the folder, with forward slashes. Poses may be null. Depth is a 16-bit PNG in
-millimetres along the optical axis, 0 where unknown. `notes` are the reader's remarks. `render`
-describes how a simulated scene was made. `name`, `untracked`, poses, depth, joint angles, `notes`
-and `render` may be omitted. Other keys are ignored.
+docs/formats.md lists the keys. `render` describes how a simulated scene was made. Unknown keys are
+ignored.
 """
 
 import json

@@ -1,14 +1,9 @@
 """nerfstudio's `transforms.json`, as written by phone apps and `ns-process-data`.
 
-    {"camera_model": "OPENCV", "fl_x": 1450, "fl_y": 1450, "cx": 960, "cy": 540, "w": 1920,
-     "h": 1080, "k1": 0, "k2": 0, "p1": 0, "p2": 0, "applied_transform": [3][4],
-     "frames": [{"file_path": "images/frame_00001.png", "transform_matrix": [4][4]}, ...],
-     "test_filenames": [...]}
-
 `transform_matrix` is the camera in the world with OpenGL's axes (y up, looking along -z).
 Intrinsics stand at the top or in each frame. The centre of the top-left pixel is (0.5, 0.5), as in
 COLMAP. `applied_transform` and `applied_scale` are undone, so the base frame and the unit of length
-are those of the program that estimated the poses. Files in `val_filenames` and `test_filenames` are
+are set by the program that estimated the poses. Files in `val_filenames` and `test_filenames` are
 test frames. (Tancik et al., Nerfstudio, SIGGRAPH 2023; its documentation, Data conventions.)
 """
 

@@ -1,13 +1,8 @@
-"""A plain folder: images, and the gripper pose at each.
+"""A plain folder: images, and the gripper pose at each, see docs/formats.md.
 
-    ROOT/image-1.png, ...               or in ROOT/images, ROOT/rgb
-    ROOT/base_from_gripper.csv          or .json, .npy, .tum, .txt, see `read_robot_poses`
-    ROOT/joints.csv, ROOT/arm.urdf      or joint angles and a URDF in its place
-    ROOT/camera.json                    or .yaml, .yml, .xml, .txt, see `read_camera`
-    ROOT/stamps.csv                     optional: columns image, stamp_s
-
-Rows are paired with images by name, by time or in order. Images with a pose become training frames
-with base_from_gripper; gripper_from_camera is unknown. All images come from one camera.
+Poses are in base_from_gripper.csv, .json, .npy, .tum or .txt, or in joints.csv or joints.json with
+a URDF. Rows are paired with images by name, by time or in order. Images with a pose become training
+frames with base_from_gripper; gripper_from_camera is unknown. All images come from one camera.
 """
 
 import os

@@ -1,10 +1,5 @@
 """Camera files: 3x3 matrix as text, evercal's JSON, ROS camera_info, OpenCV's FileStorage.
 
-    525 0 319.5                  {"width": 640, "height": 480,       image_width: 640
-    0 525 239.5                   "fx": 525, "fy": 525,              image_height: 480
-    0 0 1                         "cx": 319.5, "cy": 239.5,          camera_matrix: {data: [...]}
-                                  "distortion": []}                  distortion_coefficients: ...
-
 The content decides the kind, not the file ending. Both ROS calibration files and printed messages
 (`ros2 topic echo --once .../camera_info`) are read, with the matrix K and D of the raw image. In
 all kinds, pixel (0, 0) is the centre of the top-left pixel, and images are upright.

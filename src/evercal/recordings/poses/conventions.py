@@ -10,7 +10,7 @@ Yaskawa), Universal Robots' script manual, RoboDK's converters (Staubli) and lib
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -86,32 +86,38 @@ class ConventionError(ValueError):
         return f"{self.problem}; give {option or 'the convention'} {self.remedy}"
 
 
-def _table() -> dict[str, PoseConvention]:
-    rows = [
+_MM: dict[str, Any] = {"metres_per_unit": 0.001}
+_MM_DEG: dict[str, Any] = {"metres_per_unit": 0.001, "degrees": True}
+CONVENTIONS = {
+    convention.name: convention
+    for convention in (
         PoseConvention("wxyz", "wxyz", "x y z qw qx qy qz, metres"),
         PoseConvention("xyzw", "xyzw", "x y z qx qy qz qw, metres, as ROS and TUM"),
-        PoseConvention("abb", "wxyz", "X Y Z q1 q2 q3 q4, millimetres, q1 is w"),
+        PoseConvention("abb", "wxyz", "X Y Z q1 q2 q3 q4, millimetres, q1 is w", **_MM),
         PoseConvention("ur", "rotation_vector", "x y z rx ry rz, metres, rotation vector"),
         PoseConvention("rpy", "euler", "x y z roll pitch yaw, metres, radians, as URDF", "xyz"),
-        PoseConvention("kuka", "euler", "X Y Z A B C, mm, degrees, A about z", "ZYX"),
-        PoseConvention("fanuc", "euler", "X Y Z W P R, mm, degrees, W about x", "xyz"),
-        PoseConvention("yaskawa", "euler", "X Y Z Rx Ry Rz, mm, degrees, fixed axes", "xyz"),
-        PoseConvention("staubli", "euler", "X Y Z RX RY RZ, mm, degrees, moving axes", "XYZ"),
+        PoseConvention("kuka", "euler", "X Y Z A B C, mm, degrees, A about z", "ZYX", **_MM_DEG),
+        PoseConvention("fanuc", "euler", "X Y Z W P R, mm, degrees, W about x", "xyz", **_MM_DEG),
+        PoseConvention(
+            "yaskawa", "euler", "X Y Z Rx Ry Rz, mm, degrees, fixed axes", "xyz", **_MM_DEG
+        ),
+        PoseConvention(
+            "staubli", "euler", "X Y Z RX RY RZ, mm, degrees, moving axes", "XYZ", **_MM_DEG
+        ),
         PoseConvention("matrix", "rows", "4x4 matrix row after row, metres"),
         PoseConvention("franka", "columns", "4x4 matrix column after column, metres (O_T_EE)"),
-    ]
-    millimetres = ("abb", "kuka", "fanuc", "yaskawa", "staubli")
-    return {
-        row.name: replace(row, metres_per_unit=0.001, degrees=row.has_angles)
-        if row.name in millimetres
-        else row
-        for row in rows
-    }
-
-
-CONVENTIONS = _table()
+    )
+}
 """All conventions by name, without modifiers."""
-MODIFIERS = ("m", "mm", "rad", "deg", "inverse", "opengl")
+MODIFIERS: dict[str, dict[str, Any]] = {
+    "m": {"metres_per_unit": 1.0, "length_stated": True},
+    "mm": {"metres_per_unit": 0.001, "length_stated": True},
+    "rad": {"degrees": False, "angle_stated": True},
+    "deg": {"degrees": True, "angle_stated": True},
+    "inverse": {"inverse": True},
+    "opengl": {"opengl": True},
+}
+"""Fields that each modifier sets."""
 
 
 def pose_convention(name: str) -> PoseConvention:
@@ -125,7 +131,14 @@ def pose_convention(name: str) -> PoseConvention:
         raise ValueError(f"pose convention {name!r} is not known; use one of {known_conventions()}")
     convention = replace(CONVENTIONS[base], name=":".join([base, *modifiers]))
     for modifier in modifiers:
-        convention = _modified(convention, modifier)
+        if modifier not in MODIFIERS:
+            raise ValueError(
+                f"pose convention {name!r}: modifier {modifier!r} is not known;"
+                f" use one of {', '.join(MODIFIERS)}"
+            )
+        if modifier in ("rad", "deg") and not convention.has_angles:
+            raise ValueError(f"pose convention {name!r}: it has no angles; leave :{modifier} out")
+        convention = replace(convention, **MODIFIERS[modifier])
     kinds = [modifier.replace("mm", "m").replace("deg", "rad") for modifier in modifiers]
     if len(set(kinds)) < len(kinds):
         raise ValueError(f"pose convention {name!r} repeats a modifier; give each kind once")
@@ -136,24 +149,6 @@ def known_conventions() -> str:
     """All names and modifiers, for messages."""
     names = ", ".join(CONVENTIONS)
     return f"{names}, followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"
-
-
-def _modified(convention: PoseConvention, modifier: str) -> PoseConvention:
-    if modifier in ("m", "mm"):
-        scale = 0.001 if modifier == "mm" else 1.0
-        return replace(convention, metres_per_unit=scale, length_stated=True)
-    if modifier in ("rad", "deg"):
-        if not convention.has_angles:
-            raise ValueError(
-                f"pose convention {convention.name!r}: it has no angles; leave :{modifier} out"
-            )
-        return replace(convention, degrees=modifier == "deg", angle_stated=True)
-    if modifier in ("inverse", "opengl"):
-        return replace(convention, **{modifier: True})
-    raise ValueError(
-        f"pose convention {convention.name!r}: modifier {modifier!r} is not known;"
-        f" use one of {', '.join(MODIFIERS)}"
-    )
 
 
 def poses_from_numbers(numbers: ArrayLike, convention: PoseConvention) -> SE3:

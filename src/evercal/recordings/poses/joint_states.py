@@ -1,13 +1,8 @@
 """Gripper poses from joint angles and a URDF.
 
-    joints.csv                                   joints.json
-        image,panda_joint1,panda_joint2,...          {"joint_names": ["panda_joint1", ...],
-        image-1.png,0.12,-0.5,...                     "positions": [[0.12, -0.5, ...], ...],
-                                                      "images": ["image-1.png", ...]}
-
-The columns are the URDF's joint names. Values are radians, or degrees if a name ends in `_deg`, and
-metres for prismatic joints. Rows are labelled with images or times (`stamp_s`; in JSON `stamps_s`),
-or are in the order of the images.
+A CSV table has a column for each joint of the URDF; JSON has `joint_names` and `positions`. Values
+are radians, or degrees if a name ends in `_deg`, and metres for prismatic joints. Rows are labelled
+with images or times, or are in the order of the images.
 """
 
 import json

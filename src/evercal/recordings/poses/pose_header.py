@@ -1,15 +1,6 @@
 """Headers of pose tables: the meaning of columns by their names.
 
-Names are case-insensitive and may have a unit (`x_mm`, `rx [deg]`):
-
-    position         x  tx  px  pos_x  position_x  translation_x  pose.position.x
-    quaternion       qw  q_w  quat_w  quaternion_w  orientation_w  rotation_w
-    rotation vector  rotvec_x  rvec_x  rotation_vector_x
-    matrix           m00 ... m33 (row, column)
-    angles           rx  rot_x  rotation_x;  roll pitch yaw;  A B C;  W P R
-    four numbers     q1 q2 q3 q4
-    others           image, file, name, ...;  stamp, time, t, ...: see `labels`
-
+Names are case-insensitive and may have a unit (`x_mm`, `rx [deg]`); docs/formats.md lists them.
 Quaternions, rotation vectors, matrices, W P R (FANUC), and roll pitch yaw with a unit define the
 rotation. The others differ between robots and need a convention.
 """

@@ -1,13 +1,9 @@
 """Pose files: a table (CSV, TUM), JSON or NPY, in a named convention.
 
-    x,y,z,qw,qx,qy,qz,image           [{"translation_m": [3], "quaternion_wxyz": [4],
-    0.31,-0.02,0.4,1,0,0,0,a.png        "image": "a.png", "stamp_s": 12.5}, ...]
-
-The header of a table names its columns (`pose_header`, `labels`). JSON is a list of such objects,
-optionally with `matrix` [4][4] in place of translation and quaternion, or a list of lists of
-numbers; it may stand under `poses`. NPY is (n, 4, 4), or (n, k) numbers with a convention. A `.tum`
-file has lines of stamp, translation and quaternion x y z w. If the file does not define the meaning
-of its numbers, a convention is required (`evercal.recordings.poses.conventions`).
+The header of a table names its columns (`pose_header`, `labels`). JSON is a list of objects with
+`translation_m` and `quaternion_wxyz`, or `matrix`, or a list of lists of numbers; it may stand under
+`poses`. NPY is (n, 4, 4), or (n, k) numbers. If the file does not define the meaning of its numbers,
+a convention is required (`conventions`). docs/formats.md has examples.
 """
 
 import json
