@@ -28,18 +28,18 @@ ROOM = BoxRoom(41, furniture=0, texture_px=16)
 TRAIN, TEST = ROOM.path(200, 1), ROOM.path(40, 2)
 
 
-def test_numbers_are_those_of_a_known_path() -> None:
+def test_summary_of_a_straight_path() -> None:
     x = np.linspace(0, 1.9, 20)
     path = SE3.stack([look_at(np.array([v, 0, 1]), np.array([v, 5, 1.5])) for v in x])
-    found = inspect_recording(scene(path, path[::4], untracked=3))
-    np.testing.assert_allclose(found.extent_m, (1.9, 0, 0), atol=1e-12)
-    assert found.step_median_m == pytest.approx(0.1)
-    assert found.step_largest_m == pytest.approx(0.1)
-    assert found.near_training == 100
-    assert found.untracked == 3
+    inspection = inspect_recording(scene(path, path[::4], untracked=3))
+    np.testing.assert_allclose(inspection.extent_m, (1.9, 0, 0), atol=1e-12)
+    assert inspection.step_median_m == pytest.approx(0.1)
+    assert inspection.step_largest_m == pytest.approx(0.1)
+    assert inspection.near_training == 100
+    assert inspection.untracked == 3
 
 
-def test_planted_faults_are_found() -> None:
+def test_planted_faults_are_reported() -> None:
     assert warned(scene(TRAIN, TEST)) == ""
     still = SE3(TRAIN.rotation_wxyz, np.zeros((200, 3)))
     rigid = SE3(np.tile(TRAIN.rotation_wxyz[0], (200, 1)), TRAIN.translation_m)
@@ -60,7 +60,7 @@ def test_planted_faults_are_found() -> None:
     assert "square pixels" in warned(scene(TRAIN, TEST, Camera(32, 24, 26, 40, 15.5, 11.5)))
 
 
-def test_other_conventions_are_found() -> None:
+def test_other_conventions_are_reported() -> None:
     for shift in (1, -1):
         wrong = SE3(np.roll(TRAIN.rotation_wxyz, shift, axis=1), TRAIN.translation_m)
         assert "w x y z" in warned(scene(wrong, TEST))
@@ -70,7 +70,7 @@ def test_other_conventions_are_found() -> None:
     assert "forward" in warned(scene(TRAIN @ SE3.from_matrix(body), TEST))
 
 
-def test_turning_is_told_apart_by_axis() -> None:
+def test_rotation_is_attributed_to_axes() -> None:
     eye, angles = np.zeros(3), np.linspace(0, 6, 100)
     pan = [look_at(eye, np.array([np.cos(a), np.sin(a), 0.0])) for a in angles]
     np.testing.assert_allclose(rotation_shares(SE3.stack(pan)), (0, 1, 0), atol=1e-9)

@@ -32,7 +32,7 @@ def alike(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(edges(a).ravel(), edges(b).ravel())[0, 1])
 
 
-def test_three_rooms_in_thirteen_megabytes(rooms: tuple[SampleRoom, ...]) -> None:
+def test_three_rooms_are_complete_and_small(rooms: tuple[SampleRoom, ...]) -> None:
     assert [room.scene.name for room in rooms] == ["bedroom", "kitchen", "living"]
     for room in rooms:
         assert (len(room.scene.train), len(room.scene.test)) == (91, 39)
@@ -45,7 +45,7 @@ def test_three_rooms_in_thirteen_megabytes(rooms: tuple[SampleRoom, ...]) -> Non
     assert sum(path.stat().st_size for path in FOLDER.rglob("*")) <= 13e6
 
 
-def test_a_bump_and_a_change_were_recorded(rooms: tuple[SampleRoom, ...]) -> None:
+def test_bumped_and_changed_recordings_match_the_simulator(rooms: tuple[SampleRoom, ...]) -> None:
     for room, (name, kind, seed) in zip(rooms, SUITES["sim-mini"].rooms, strict=True):
         assert room.fixed is not None
         assert room.bumped is not None
@@ -58,17 +58,17 @@ def test_a_bump_and_a_change_were_recorded(rooms: tuple[SampleRoom, ...]) -> Non
         # What is in the package is what the simulator's room and paths are today.
         after, train = changed_room(simulated(kind, seed), 0), poses(room.scene.train)
         shots = changed_shots(after, 20, train, seed=0)
-        found = poses(room.changed.test).matrix()
+        changed_poses = poses(room.changed.test).matrix()
         np.testing.assert_allclose(
-            found, [shot.base_from_camera.matrix() for shot in shots], atol=1e-6
+            changed_poses, [shot.base_from_camera.matrix() for shot in shots], atol=1e-6
         )
-        assert not np.allclose(found, poses(room.scene.test[:20]).matrix(), atol=1e-2)
+        assert not np.allclose(changed_poses, poses(room.scene.test[:20]).matrix(), atol=1e-2)
         joints = {frame.joints_rad for frame in room.scene.train + room.scene.test}
         assert not joints & {frame.joints_rad for frame in room.changed.test}
     assert (SampleRoom(rooms[0].scene).bumped, SampleRoom(rooms[0].scene).changed) == (None, None)
 
 
-def test_untextured_renders_lie_less_well_over_a_changed_room(
+def test_untextured_renders_match_a_changed_room_less(
     rooms: tuple[SampleRoom, ...],
 ) -> None:
     pytest.importorskip("mitsuba", reason="the extra 'sim' is not installed")
@@ -86,7 +86,7 @@ def test_untextured_renders_lie_less_well_over_a_changed_room(
     assert 0.2 < agreement[1] < agreement[0]
 
 
-def test_test_frames_are_not_training_frames(rooms: tuple[SampleRoom, ...]) -> None:
+def test_test_frames_differ_from_training_frames(rooms: tuple[SampleRoom, ...]) -> None:
     for room in rooms:
         train, test = poses(room.scene.train), poses(room.scene.test)
         metres, radians = pose_distance(test[:, None], train[None])
@@ -96,7 +96,7 @@ def test_test_frames_are_not_training_frames(rooms: tuple[SampleRoom, ...]) -> N
         assert not same.any()
 
 
-def test_untextured_renders_lie_over_the_images(rooms: tuple[SampleRoom, ...]) -> None:
+def test_untextured_renders_match_the_images(rooms: tuple[SampleRoom, ...]) -> None:
     pytest.importorskip("mitsuba", reason="the extra 'sim' is not installed")
     room = rooms[1]
     frame = room.scene.test[5]
@@ -105,5 +105,5 @@ def test_untextured_renders_lie_over_the_images(rooms: tuple[SampleRoom, ...]) -
     off = pose @ SE3.exp([0.1, 0.05, 0, 0, 0, 0.05])
     right, wrong = untextured_renders(SUITES["sim-mini"].rooms[1][1:], [frame, frame], [pose, off])
     assert right.shape == frame.read_image().shape
-    seen = frame.read_image()
-    assert alike(seen, right) > alike(seen, wrong) + 0.2
+    image = frame.read_image()
+    assert alike(image, right) > alike(image, wrong) + 0.2

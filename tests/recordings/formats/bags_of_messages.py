@@ -28,8 +28,8 @@ TOOL_FROM_OPTICAL = SE3.exp([0.02, -0.05, 0.03, 0.3, -0.2, 1.2])
 
 def shoulder_from_tool(seconds: float) -> SE3:
     """Turns about a slanted axis and moves on a line, both steadily."""
-    turn = Rotation.from_rotvec(np.array([0.6, -0.3, 0.8]) * seconds)
-    return SE3(turn.as_quat(scalar_first=True), np.array([0.4, 0.1, 0.5]) + 0.2 * seconds)
+    rotation = Rotation.from_rotvec(np.array([0.6, -0.3, 0.8]) * seconds)
+    return SE3(rotation.as_quat(scalar_first=True), np.array([0.4, 0.1, 0.5]) + 0.2 * seconds)
 
 
 def picture(number: int) -> np.ndarray:
@@ -115,14 +115,14 @@ class Bag:
         content = np.frombuffer(data, np.uint8)
         self.add(topic, kind, seconds, self.make(kind, header=head, format=what, data=content))
 
-    def info(self, topic: str, focal: float = 30.0, lens: Iterable[float] = (0.1, 0, 0, 0, 0),
+    def info(self, topic: str, focal: float = 30.0, distortion: Iterable[float] = (0.1, 0, 0, 0, 0),
              model: str = "plumb_bob", rectified_focal: float = 28.0,
              size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:  # fmt: skip
         """A camera_info."""
         kind = "sensor_msgs/msg/CameraInfo"
         k = [focal, 0, 15.0, 0, focal, 11.0, 0, 0, 1] if focal else [0.0] * 9
         p = [rectified_focal, 0, 16.0, 0, 0, rectified_focal, 12.0, 0, 0, 0, 1, 0]
-        values = {"k": k, "d": list(lens), "r": np.eye(3).reshape(-1), "p": p}
+        values = {"k": k, "d": list(distortion), "r": np.eye(3).reshape(-1), "p": p}
         if self.kind == "ros1":
             values = {name.upper(): value for name, value in values.items()}
         roi = self.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0,

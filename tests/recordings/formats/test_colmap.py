@@ -30,13 +30,13 @@ def camera_from_world(i: int) -> SE3:
 
 
 def make(root: Path, model: str = "PINHOLE", kind: str = "bin", images: int = 4,
-         place: str = "sparse/0", params: list[float] | None = None) -> Any:  # fmt: skip
+         folder: str = "sparse/0", params: list[float] | None = None) -> Any:  # fmt: skip
     """A model with two cameras of a kind and its images, the last of which has no pose."""
-    found = pycolmap.Reconstruction()
+    reconstruction = pycolmap.Reconstruction()
     for number in (1, 2):
         values = [float(v) for v in params or MODELS[model]]
         values[0] += number  # so that images are not mixed up
-        found.add_camera_with_trivial_rig(
+        reconstruction.add_camera_with_trivial_rig(
             pycolmap.Camera(
                 model=model, width=WIDTH, height=HEIGHT, params=values, camera_id=number
             )
@@ -46,19 +46,21 @@ def make(root: Path, model: str = "PINHOLE", kind: str = "bin", images: int = 4,
         name = f"sub/image-{i + 8}.png"  # 10 comes after 9
         image = pycolmap.Image(name=name, camera_id=1 + i % 2, image_id=i + 1)
         matrix = camera_from_world(i).matrix()[:3]
-        found.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix))
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix))
         write_image(root / "images" / name, np.full((HEIGHT, WIDTH, 3), i, np.uint8))
     for point in np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3)):
-        found.add_point3D(point, pycolmap.Track())
+        reconstruction.add_point3D(point, pycolmap.Track())
     write_image(root / "images" / "sub" / "lost.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-    (root / place).mkdir(parents=True, exist_ok=True)
-    (found.write_binary if kind == "bin" else found.write_text)(str(root / place))
-    return found
+    (root / folder).mkdir(parents=True, exist_ok=True)
+    (reconstruction.write_binary if kind == "bin" else reconstruction.write_text)(
+        str(root / folder)
+    )
+    return reconstruction
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
 @pytest.mark.parametrize("model", MODELS)
-def test_points_land_where_colmap_says(model: str, kind: str, tmp_path: Path) -> None:
+def test_projections_agree_with_colmap(model: str, kind: str, tmp_path: Path) -> None:
     written = make(tmp_path, model, kind)
     scene = load_recording(tmp_path)
     assert [frame.name for frame in scene.train] == [f"sub/image-{i}.png" for i in range(8, 12)]
@@ -76,26 +78,26 @@ def test_points_land_where_colmap_says(model: str, kind: str, tmp_path: Path) ->
     assert "are those of COLMAP" in scene.notes[0]
 
 
-@pytest.mark.parametrize("place", [".", "sparse", "sparse/0", "colmap/sparse/0"])
-def test_the_model_is_found_in_the_usual_places(place: str, tmp_path: Path) -> None:
-    make(tmp_path, place=place)
+@pytest.mark.parametrize("folder", [".", "sparse", "sparse/0", "colmap/sparse/0"])
+def test_model_in_any_usual_folder_is_read(folder: str, tmp_path: Path) -> None:
+    make(tmp_path, folder=folder)
     assert len(load_recording(tmp_path).train) == 4
     # Pointing at the model itself, or at the folder of models, does as well.
-    assert len(load_recording(tmp_path / place).train) == 4
-    assert len(load_recording(tmp_path / place.removesuffix("/0")).train) == 4
+    assert len(load_recording(tmp_path / folder).train) == 4
+    assert len(load_recording(tmp_path / folder.removesuffix("/0")).train) == 4
 
 
-def test_of_several_models_the_largest_is_taken(tmp_path: Path) -> None:
-    make(tmp_path, images=4, place="sparse/0")
-    make(tmp_path, images=6, place="sparse/1")
+def test_largest_of_several_models_is_read(tmp_path: Path) -> None:
+    make(tmp_path, images=4, folder="sparse/0")
+    make(tmp_path, images=6, folder="sparse/1")
     scene = load_recording(tmp_path)
     assert len(scene.train) == 6
     assert scene.notes[1] == "took model 1, the one with the most images (0: 4, 1: 6)"
 
 
-def test_a_model_from_before_undistortion_is_not_mixed_in(tmp_path: Path) -> None:
-    make(tmp_path, "PINHOLE", images=3, place="sparse/0")
-    make(tmp_path, "OPENCV", images=4, place="distorted/sparse/0")  # one image more
+def test_distorted_model_is_ignored(tmp_path: Path) -> None:
+    make(tmp_path, "PINHOLE", images=3, folder="sparse/0")
+    make(tmp_path, "OPENCV", images=4, folder="distorted/sparse/0")  # one image more
     scene = load_recording(tmp_path)
     assert len(scene.train) == 3
     assert scene.train[0].camera.distortion == ()
@@ -105,14 +107,14 @@ def test_a_model_from_before_undistortion_is_not_mixed_in(tmp_path: Path) -> Non
     ("model", "params"),
     [("OPENCV_FISHEYE", [50, 50, 31, 25, 0, 0, 0, 0]), ("FOV", [50, 50, 31, 25, 0.5])],
 )
-def test_fisheye_lenses_are_refused(model: str, params: list[float], tmp_path: Path) -> None:
+def test_fisheye_cameras_are_refused(model: str, params: list[float], tmp_path: Path) -> None:
     make(tmp_path, model, params=params)
     with pytest.raises(InputError, match=f"{model} is not supported.*image_undistorter") as caught:
         load_recording(tmp_path)
     assert "\n" not in str(caught.value)
 
 
-def test_damage_is_named(tmp_path: Path) -> None:
+def test_broken_files_are_refused(tmp_path: Path) -> None:
     make(tmp_path)
     shutil.move(tmp_path / "images/sub/image-9.png", tmp_path / "away.png")
     with pytest.raises(InputError, match=r"images/sub/image-9\.png: missing"):
@@ -128,7 +130,7 @@ def test_damage_is_named(tmp_path: Path) -> None:
         load_recording(tmp_path / "none", format="colmap")
 
 
-def test_without_the_extra_the_install_line_is_named(
+def test_missing_extra_names_the_install_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make(tmp_path)
@@ -137,7 +139,7 @@ def test_without_the_extra_the_install_line_is_named(
         load_recording(tmp_path)
 
 
-def test_models_of_older_versions_have_no_rigs(tmp_path: Path) -> None:
+def test_models_without_rigs_are_read(tmp_path: Path) -> None:
     make(tmp_path)
     for name in ("rigs.bin", "frames.bin"):
         (tmp_path / "sparse/0" / name).unlink()

@@ -48,7 +48,7 @@ def assert_same(a: Recording, b: Recording) -> None:
             np.testing.assert_array_equal(x.read_image(), y.read_image())
 
 
-def test_a_scene_comes_back_as_it_was_written(tmp_path: Path) -> None:
+def test_round_trip_is_exact(tmp_path: Path) -> None:
     scene = make_scene()
     generic.write(tmp_path / "a", scene)
     read = load_recording(tmp_path / "a")
@@ -59,7 +59,7 @@ def test_a_scene_comes_back_as_it_was_written(tmp_path: Path) -> None:
     assert (tmp_path / "a/scene.json").read_bytes() == (tmp_path / "b/scene.json").read_bytes()
 
 
-def test_depth_and_joint_angles_travel_along(tmp_path: Path) -> None:
+def test_depth_and_joint_angles_are_written(tmp_path: Path) -> None:
     first = make_scene().train[0]
     depth = tmp_path / "depth.png"
     depth.write_bytes(b"any bytes: depth is copied, not decoded")
@@ -73,7 +73,7 @@ def test_depth_and_joint_angles_travel_along(tmp_path: Path) -> None:
     assert (read[1].depth, read[1].joints_rad) == (None, None)
 
 
-def test_an_interrupted_recording_is_no_scene(tmp_path: Path) -> None:
+def test_interrupted_recording_has_no_scene_file(tmp_path: Path) -> None:
     frame = make_scene().train[0]
 
     def record() -> None:
@@ -87,7 +87,7 @@ def test_an_interrupted_recording_is_no_scene(tmp_path: Path) -> None:
         load_recording(tmp_path)
 
 
-def test_the_writer_neither_overwrites_nor_repeats(tmp_path: Path) -> None:
+def test_writer_refuses_existing_scenes_and_repeated_names(tmp_path: Path) -> None:
     scene = make_scene()
     generic.write(tmp_path, scene)
     with pytest.raises(InputError, match=r"scene\.json: already there"):
@@ -113,7 +113,7 @@ def shown(scene: Recording) -> list[int]:
     return [int(frame.read_image()[0, 0, 0]) for frame in scene.train]
 
 
-def test_images_of_the_source_are_never_written_to(tmp_path: Path) -> None:
+def test_source_images_are_never_overwritten(tmp_path: Path) -> None:
     scene = numbered(tmp_path / "source" / "images", 4)
     fewer = replace(scene, train=scene.train[::2])
     # In place, where image 1 would become image 2.
@@ -138,7 +138,7 @@ def test_images_of_the_source_are_never_written_to(tmp_path: Path) -> None:
     assert not [path for path in (other / "images").iterdir() if path.name.startswith(".")]
 
 
-def test_unknown_keys_are_passed_over(tmp_path: Path) -> None:
+def test_unknown_keys_are_ignored(tmp_path: Path) -> None:
     scene = make_scene()
     generic.write(tmp_path, scene)
     file = tmp_path / "scene.json"
@@ -182,7 +182,7 @@ BREAKS = [
 
 
 @pytest.mark.parametrize(("where", "value", "message"), BREAKS)
-def test_damage_is_named_in_one_line(
+def test_broken_files_are_refused_in_one_line(
     tmp_path: Path, where: tuple[str | int, ...], value: object, message: str
 ) -> None:
     generic.write(tmp_path, make_scene())
@@ -200,13 +200,13 @@ def test_damage_is_named_in_one_line(
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", "\x00"])
-def test_what_is_no_scene_file_is_refused(tmp_path: Path, text: str) -> None:
+def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "scene.json").write_text(text)
     with pytest.raises(InputError, match=r"scene\.json"):
         load_recording(tmp_path)
 
 
-def test_formats_are_named_and_recognised(tmp_path: Path) -> None:
+def test_formats_are_recognised(tmp_path: Path) -> None:
     generic.write(tmp_path / "a", make_scene())
     assert load_recording(tmp_path / "a", format="generic", name="lab").name == "lab"
     with pytest.raises(InputError, match="use one of generic, 7scenes"):

@@ -148,7 +148,7 @@ def options(root: Path, **more: Any) -> ReadOptions:
         ("v3.0", "image", ""),
     ],
 )
-def test_a_dataset_comes_back(version: str, kind: str, codec: str, tmp_path: Path) -> None:
+def test_datasets_are_read(version: str, kind: str, codec: str, tmp_path: Path) -> None:
     root = make(tmp_path / "wave", version, kind, codec)
     scene = load_recording(root, options=options(root))
     assert scene.name == "wave"
@@ -177,8 +177,10 @@ def test_joints_and_a_urdf_in_radians_or_degrees(tmp_path: Path) -> None:
         scene = load_recording(root, options=read)
         assert len(scene.train) == 6
         for i, frame in enumerate(scene.train):
-            turn, reach = joints(*divmod(4 * i, LENGTH))
-            expected = SE3.exp([0, 0, 0, 0, 0, turn * unit]) @ SE3.exp([0.5 + reach, 0, 0, 0, 0, 0])
+            shoulder, reach = joints(*divmod(4 * i, LENGTH))
+            expected = SE3.exp([0, 0, 0, 0, 0, shoulder * unit]) @ SE3.exp(
+                [0.5 + reach, 0, 0, 0, 0, 0]
+            )
             assert frame.base_from_gripper is not None
             assert max(pose_distance(frame.base_from_gripper, expected)) < 1e-6
     with pytest.raises(InputError, match="--pose-convention grad: joint angles are rad or deg"):
@@ -219,11 +221,11 @@ def two_arms(root: Path, names: Any) -> None:
     change(root, features=features)
 
 
-def test_of_two_arms_one_is_named(tmp_path: Path) -> None:
+def test_one_of_two_arms_is_selected(tmp_path: Path) -> None:
     root, parts = make(tmp_path / "wave", "v2.1", "image"), ["x", "y", "z", "qx", "qy", "qz", "qw"]
     two_arms(root, [f"{side}_ee.{part}" for side in ("left", "right") for part in parts])
-    said = r"observation\.ee: holds several poses .*--gripper-frame left_ee or right_ee"
-    with pytest.raises(InputError, match=said):
+    message = r"observation\.ee: holds several poses .*--gripper-frame left_ee or right_ee"
+    with pytest.raises(InputError, match=message):
         load_recording(root, options=options(root))
     for arm, height in (("left_ee", 0.5), ("right_ee", 5.5)):
         frame = load_recording(root, options=options(root, gripper_frame=arm)).train[0]
@@ -253,7 +255,7 @@ def change_names(root: Path, names: Any, feature: str = "observation.ee") -> Non
     change(root, features=features)
 
 
-def test_joints_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_repeated_joint_names_are_refused(tmp_path: Path) -> None:
     pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
     root = make(tmp_path / "wave", "v2.1", "image")
     (root / "arm.urdf").write_text(URDF)
@@ -266,7 +268,7 @@ def test_joints_of_one_name_are_refused(tmp_path: Path) -> None:
         load_recording(root, options=read)
 
 
-def test_embedded_images_are_written_out(tmp_path: Path) -> None:
+def test_embedded_images_are_copied(tmp_path: Path) -> None:
     root = make(tmp_path / "wave", "v3.0", "image")
     generic.write(tmp_path / "out", load_recording(root, options=options(root, every=5)))
     image = load_recording(tmp_path / "out").train[3].read_image()
@@ -278,7 +280,7 @@ def change(root: Path, **values: Any) -> None:
     file.write_text(json.dumps({**json.loads(file.read_text()), **values}))
 
 
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
+def test_missing_options_and_files_are_named(tmp_path: Path) -> None:
     root = make(tmp_path / "wave", "v2.1")
     with pytest.raises(
         InputError, match=r"2 cameras; name one with --image-topic: observation\.images\.w"
@@ -304,7 +306,7 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
         load_recording(root, options=options(root))
 
 
-def test_a_video_that_ends_early_is_named(tmp_path: Path) -> None:
+def test_truncated_video_is_refused(tmp_path: Path) -> None:
     root = make(tmp_path / "wave", "v2.1")
     video = root / "videos/chunk-000" / WRIST / "episode_000000.mp4"
     write_video(video, [picture(0, n) for n in range(3)], "libx264")
@@ -367,7 +369,7 @@ def test_image_paths_outside_the_dataset_are_refused(path: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("module", ["av", "pyarrow.parquet"])
-def test_without_the_extra_the_install_line_is_named(
+def test_missing_extra_names_the_install_command(
     module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = make(tmp_path / "wave", "v2.1")

@@ -28,7 +28,7 @@ def look(eye: np.ndarray, target: np.ndarray, up: tuple[float, float, float]) ->
     return matrix
 
 
-def gl_pixel(matrix: np.ndarray, lens: dict[str, float], point: np.ndarray) -> np.ndarray:
+def gl_pixel(matrix: np.ndarray, intrinsics: dict[str, float], point: np.ndarray) -> np.ndarray:
     """Where a point is seen, x to the right and y down from the image's corner.
 
     The camera looks along -z with y up; the lens is Brown's in the plane at distance one, y down.
@@ -37,11 +37,15 @@ def gl_pixel(matrix: np.ndarray, lens: dict[str, float], point: np.ndarray) -> n
     assert z < 0
     u, v = x / -z, -y / -z
     r2 = u * u + v * v
-    radial = 1 + lens["k1"] * r2 + lens["k2"] * r2 * r2 + lens.get("k3", 0.0) * r2**3
-    p1, p2 = lens["p1"], lens["p2"]
+    radial = (
+        1 + intrinsics["k1"] * r2 + intrinsics["k2"] * r2 * r2 + intrinsics.get("k3", 0.0) * r2**3
+    )
+    p1, p2 = intrinsics["p1"], intrinsics["p2"]
     du = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
     dv = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
-    return np.array([lens["fl_x"] * du + lens["cx"], lens["fl_y"] * dv + lens["cy"]])
+    return np.array(
+        [intrinsics["fl_x"] * du + intrinsics["cx"], intrinsics["fl_y"] * dv + intrinsics["cy"]]
+    )
 
 
 def write(
@@ -68,14 +72,14 @@ def entries(matrices: list[np.ndarray], **more: Any) -> list[dict[str, Any]]:
     ]
 
 
-def seen(frame: Frame, point: np.ndarray) -> np.ndarray:
+def pixel_of(frame: Frame, point: np.ndarray) -> np.ndarray:
     """The pixel from the image's corner, by this program's own camera."""
     assert frame.base_from_camera is not None
     return frame.camera.project(frame.base_from_camera.inverse().apply(point)) + 0.5
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_points_land_where_the_files_own_formulas_say(shared: bool, tmp_path: Path) -> None:
+def test_projections_agree_with_the_documented_formulas(shared: bool, tmp_path: Path) -> None:
     matrices = ring()
     if shared:
         write(tmp_path, entries(matrices), camera_model="OPENCV", **LENS)
@@ -87,7 +91,9 @@ def test_points_land_where_the_files_own_formulas_say(shared: bool, tmp_path: Pa
     for frame, matrix in zip(scene.train, matrices, strict=True):
         assert frame.read_image().shape == (36, 24, 3)  # portrait
         for point in points:
-            np.testing.assert_allclose(seen(frame, point), gl_pixel(matrix, LENS, point), atol=1e-9)
+            np.testing.assert_allclose(
+                pixel_of(frame, point), gl_pixel(matrix, LENS, point), atol=1e-9
+            )
     assert "are those of transforms.json" in inspect_recording(scene).notes[0]
 
 
@@ -114,10 +120,10 @@ def test_an_applied_transform_is_undone(
         entry = {"file_path": "a.png", "transform_matrix": new.tolist()}
         frame = nerfstudio._frame(Path(), data, 0, entry, undo, divide)
         expected = gl_pixel(matrix, LENS, np.array(point))
-        np.testing.assert_allclose(seen(frame, np.array(point)), expected, atol=1e-6)
+        np.testing.assert_allclose(pixel_of(frame, np.array(point)), expected, atol=1e-6)
 
 
-def test_named_test_files_are_test_frames(tmp_path: Path) -> None:
+def test_test_filenames_are_test_frames(tmp_path: Path) -> None:
     names = [f"images/frame_{i:05d}.png" for i in range(4)]
     splits: dict[str, Any] = {"train_filenames": names[:1], "val_filenames": names[1:2]}
     write(tmp_path, entries(ring()), **LENS, **splits, test_filenames=[f"./{names[3]}"])
@@ -127,17 +133,17 @@ def test_named_test_files_are_test_frames(tmp_path: Path) -> None:
     assert load_recording(tmp_path / "transforms.json").name == tmp_path.name
 
 
-def test_smaller_copies_of_the_images_have_smaller_cameras(tmp_path: Path) -> None:
+def test_downscaled_images_get_scaled_cameras(tmp_path: Path) -> None:
     matrices = ring(2)
     write(tmp_path, entries(matrices), (12, 18), **LENS)
     frame = load_recording(tmp_path).train[1]
     assert (frame.camera.width, frame.camera.height) == (12, 18)
     point = np.array([0.2, -0.1, 0.3])
     # From the corner, every pixel coordinate is simply half.
-    np.testing.assert_allclose(seen(frame, point), gl_pixel(matrices[1], LENS, point) / 2)
+    np.testing.assert_allclose(pixel_of(frame, point), gl_pixel(matrices[1], LENS, point) / 2)
 
 
-def test_names_without_an_ending_and_an_angle_of_view(tmp_path: Path) -> None:
+def test_names_without_ending_and_horizontal_angle_of_view(tmp_path: Path) -> None:
     write(tmp_path, entries(ring(2)), camera_angle_x=0.5, w=24, h=36)
     file = tmp_path / "transforms.json"
     file.write_text(file.read_text().replace(".png", ""))
@@ -147,7 +153,7 @@ def test_names_without_an_ending_and_an_angle_of_view(tmp_path: Path) -> None:
     assert frame.read_image().shape == (36, 24, 3)
 
 
-def test_an_angle_of_view_upwards_and_a_size_that_is_not_stated(tmp_path: Path) -> None:
+def test_vertical_angle_of_view_without_image_size(tmp_path: Path) -> None:
     write(tmp_path, entries(ring(2)), camera_angle_y=0.5)
     camera = load_recording(tmp_path).train[1].camera
     assert (camera.width, camera.height) == (24, 36)
@@ -198,7 +204,7 @@ BREAKS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("change", "message"), BREAKS)
-def test_damage_is_named(change: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_broken_files_are_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
     write(tmp_path, entries(ring(2)), **LENS)
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
@@ -209,7 +215,7 @@ def test_damage_is_named(change: dict[str, Any], message: str, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", "\x00"])
-def test_what_is_no_json_object_is_refused(text: str, tmp_path: Path) -> None:
+def test_other_json_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text(text)
     with pytest.raises(InputError, match=r"transforms\.json"):
         load_recording(tmp_path)

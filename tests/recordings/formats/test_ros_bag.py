@@ -33,7 +33,7 @@ CAMERA = Camera(32, 24, 30.0, 30.0, 15.0, 11.0, (0.1, 0.0, 0.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_recording_comes_back(kind: str, tmp_path: Path) -> None:
+def test_bags_are_read(kind: str, tmp_path: Path) -> None:
     path = recording(kind).write(tmp_path)
     paths = [path]
     if kind != "ros1":  # the file inside the folder is a recording too
@@ -57,7 +57,7 @@ def test_a_recording_comes_back(kind: str, tmp_path: Path) -> None:
         assert "tf also has the camera (camera_optical)" in scene.notes[2]
 
 
-def test_old_ros2_bags_hold_no_definitions(tmp_path: Path) -> None:
+def test_old_ros2_bags_without_definitions_are_read(tmp_path: Path) -> None:
     path = recording("sqlite3").write(tmp_path)
     with sqlite3.connect(next(path.glob("*.db3"))) as database:
         database.execute("DROP TABLE message_definitions")
@@ -66,7 +66,7 @@ def test_old_ros2_bags_hold_no_definitions(tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_recording(path).train[4].read_image(), picture(4))
 
 
-def test_every_second_image_may_do(tmp_path: Path) -> None:
+def test_every_second_image_is_taken(tmp_path: Path) -> None:
     path = recording("ros1").write(tmp_path)
     scene = load_recording(path, options=ReadOptions(every=2))
     assert [frame.name for frame in scene.train] == ["000000", "000002", "000004"]
@@ -74,7 +74,7 @@ def test_every_second_image_may_do(tmp_path: Path) -> None:
         load_recording(path, options=ReadOptions(every=0))
 
 
-def test_jpegs_stay_as_they_are_and_threads_may_read(tmp_path: Path) -> None:
+def test_compressed_images_are_read_by_threads_and_copied(tmp_path: Path) -> None:
     bag, files = arm(Bag("mcap")), []
     for i, at in enumerate(SHOTS):
         ending = ".jpg" if i % 2 else ".png"
@@ -134,7 +134,7 @@ ENCODINGS = {
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_every_encoding_gives_the_colour_it_holds(encoding: str, tmp_path: Path) -> None:
+def test_encodings_are_decoded(encoding: str, tmp_path: Path) -> None:
     bag = arm(Bag("mcap"))
     bag.image(0.5, "/cam/image_raw", ENCODINGS[encoding], encoding)
     bag.info("/cam/camera_info")
@@ -147,7 +147,7 @@ def test_every_encoding_gives_the_colour_it_holds(encoding: str, tmp_path: Path)
     assert np.abs(image.astype(int) - expected).max() <= 2
 
 
-def test_grey_images_of_eight_and_sixteen_bits(tmp_path: Path) -> None:
+def test_grey_images_of_8_and_16_bits_are_decoded(tmp_path: Path) -> None:
     ramp = np.arange(24 * 32, dtype=np.uint8).reshape(24, 32)
     for encoding, pixels in (("mono8", ramp), ("mono16", ramp.astype(np.uint16) * 257)):
         bag = arm(Bag("mcap"))
@@ -158,14 +158,14 @@ def test_grey_images_of_eight_and_sixteen_bits(tmp_path: Path) -> None:
         np.testing.assert_array_equal(image, np.repeat(ramp[:, :, None], 3, axis=2))
 
 
-def test_rectified_images_have_the_projection_and_no_lens(tmp_path: Path) -> None:
+def test_rectified_images_use_the_projection_matrix(tmp_path: Path) -> None:
     bag = arm(Bag("ros1"))
     bag.image(0.5, "/cam/image_rect_color", picture(0))
     bag.info("/cam/camera_info")
     assert load_recording(bag.write(tmp_path)).train[0].camera == Camera(32, 24, 28, 28, 16, 12)
 
 
-def test_images_without_stamps_take_the_time_of_recording(tmp_path: Path) -> None:
+def test_images_without_stamps_use_the_time_of_recording(tmp_path: Path) -> None:
     bag = arm(Bag("mcap"))
     bag.image(0.5, "/cam/image_raw", picture(0), stamped=False)
     bag.info("/cam/camera_info")
@@ -178,7 +178,7 @@ def test_images_without_stamps_take_the_time_of_recording(tmp_path: Path) -> Non
     assert "carry no stamps" in scene.notes[0]
 
 
-def test_a_bag_without_images_tf_or_camera_info_says_which(tmp_path: Path) -> None:
+def test_missing_topics_are_named(tmp_path: Path) -> None:
     whole, parts = recording("mcap"), {}
     for missing, topic in (
         ("images", "/cam/image_raw"),
@@ -186,8 +186,8 @@ def test_a_bag_without_images_tf_or_camera_info_says_which(tmp_path: Path) -> No
         ("info", "/cam/camera_info"),
     ):
         (tmp_path / missing).mkdir()
-        kept = [m for m in whole.messages if m[0] != topic and not m[0].startswith(f"{topic}_")]
-        parts[missing] = refusal(Bag("mcap", kept), tmp_path / missing)
+        messages = [m for m in whole.messages if m[0] != topic and not m[0].startswith(f"{topic}_")]
+        parts[missing] = refusal(Bag("mcap", messages), tmp_path / missing)
     assert "no images in it" in parts["images"]
     assert (
         "It holds /cam/camera_info (sensor_msgs/CameraInfo), /tf (tf2_msgs/TFMessage)"
@@ -195,13 +195,13 @@ def test_a_bag_without_images_tf_or_camera_info_says_which(tmp_path: Path) -> No
     )
     assert "no tf in it, so there are no gripper poses; record /tf and /tf_static" in (parts["tf"])
     assert "no camera_info for /cam/image_raw (/cam/camera_info is expected" in parts["info"]
-    lens = tmp_path / "camera.txt"
-    lens.write_text("31 0 15\n0 31 11\n0 0 1\n")
-    scene = load_recording(tmp_path / "info" / "wave", options=ReadOptions(camera=lens))
+    camera_file = tmp_path / "camera.txt"
+    camera_file.write_text("31 0 15\n0 31 11\n0 0 1\n")
+    scene = load_recording(tmp_path / "info" / "wave", options=ReadOptions(camera=camera_file))
     assert scene.train[0].camera == Camera(32, 24, 31, 31, 15, 11)
 
 
-def test_of_several_image_topics_one_is_named(tmp_path: Path) -> None:
+def test_several_image_topics_need_a_choice(tmp_path: Path) -> None:
     bag = recording("sqlite3")
     bag.image(0.4, "/left/image_raw", picture(9))
     bag.image(0.4, "/depth/image_raw", np.ones((24, 32), np.uint16), "16UC1")
@@ -211,11 +211,11 @@ def test_of_several_image_topics_one_is_named(tmp_path: Path) -> None:
     expected = "images on 2 topics; name one with --image-topic: /cam/image_raw, /left/image_raw"
     assert expected in refusal(bag, path)
     # The only camera_info is that of the other camera.
-    said = "no camera_info for /left/image_raw (/left/camera_info is expected, there is /cam/"
-    assert said in refusal_of(path / "wave", image_topic="/left/image_raw")
-    lens = tmp_path / "camera.txt"
-    lens.write_text("31 0 15\n0 31 11\n0 0 1\n")
-    options = ReadOptions(image_topic="/left/image_raw", camera=lens)
+    message = "no camera_info for /left/image_raw (/left/camera_info is expected, there is /cam/"
+    assert message in refusal_of(path / "wave", image_topic="/left/image_raw")
+    camera_file = tmp_path / "camera.txt"
+    camera_file.write_text("31 0 15\n0 31 11\n0 0 1\n")
+    options = ReadOptions(image_topic="/left/image_raw", camera=camera_file)
     scene = load_recording(path / "wave", options=options)
     np.testing.assert_array_equal(scene.train[0].read_image(), picture(9))
     with pytest.raises(InputError, match="no images on topic '/no'; images are on /cam/image_raw"):
@@ -235,7 +235,7 @@ def test_of_several_image_topics_one_is_named(tmp_path: Path) -> None:
         ({"size": (64, 48)}, "is for images of 64x48, /cam/image_raw is 32x24"),
     ],
 )
-def test_unusable_camera_info_is_named(
+def test_unusable_camera_info_is_refused(
     info: dict[str, object], message: str, tmp_path: Path
 ) -> None:
     bag = arm(Bag("mcap"))
@@ -244,14 +244,14 @@ def test_unusable_camera_info_is_named(
     assert message in refusal(bag, tmp_path)
 
 
-def test_encodings_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+def test_unsupported_encodings_are_refused(tmp_path: Path) -> None:
     bag = arm(Bag("mcap"))
     bag.image(0.5, "/cam/image_raw", np.zeros((24, 32), np.uint8), "nv21")
     bag.info("/cam/camera_info")
     assert "encoding 'nv21' is not supported; use one of rgb8, bgr8" in refusal(bag, tmp_path)
 
 
-def test_files_that_are_no_bags_are_refused(tmp_path: Path) -> None:
+def test_damaged_bags_are_refused(tmp_path: Path) -> None:
     path = recording("ros1").write(tmp_path)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
@@ -263,7 +263,7 @@ def test_files_that_are_no_bags_are_refused(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
-def test_without_the_extra_the_install_line_is_named(
+def test_missing_extra_names_the_install_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = recording("mcap").write(tmp_path)

@@ -45,7 +45,7 @@ def apartment(tmp_path: Path) -> Path:
     return write(tmp_path / "apt1" / "kitchen")
 
 
-def test_the_first_sequence_is_tested_on(apartment: Path) -> None:
+def test_first_sequence_is_for_testing(apartment: Path) -> None:
     scene = load_recording(apartment)
     assert scene.name == "kitchen"
     assert [frame.name for frame in scene.test] == ["frame-000000", "frame-000001"]
@@ -57,14 +57,14 @@ def test_the_first_sequence_is_tested_on(apartment: Path) -> None:
     assert abs(float(scene.train[1].read_image().mean()) - 160) < 2
 
 
-def test_the_camera_is_scaled_to_the_images(apartment: Path) -> None:
+def test_camera_is_scaled_to_the_images(apartment: Path) -> None:
     camera = load_recording(apartment).train[0].camera
     assert (camera.width, camera.height, camera.fx, camera.fy) == (64, 48, 58, 57)
     # The corner of the image stays where it is: (65.5 + 0.5) / 2 - 0.5.
     assert (camera.cx, camera.cy) == (32.5, 23.5)
 
 
-def test_the_suite_finds_its_scenes_and_names_what_is_missing(apartment: Path) -> None:
+def test_suite_loads_scenes_and_names_missing_ones(apartment: Path) -> None:
     data = apartment.parents[1]
     write(data / "apt1" / "living")
     scenes = load_suite("i12s", data, ["apt1/living", "apt1/kitchen"])
@@ -85,7 +85,9 @@ def test_the_suite_finds_its_scenes_and_names_what_is_missing(apartment: Path) -
         ("data/frame-000002.pose.txt", None, r"frame-000002\.pose\.txt: missing"),
     ],
 )
-def test_broken_files_are_named(apartment: Path, file: str, text: str | None, message: str) -> None:
+def test_broken_files_are_refused(
+    apartment: Path, file: str, text: str | None, message: str
+) -> None:
     path = apartment / file
     if text is None:
         path.unlink()
@@ -95,7 +97,7 @@ def test_broken_files_are_named(apartment: Path, file: str, text: str | None, me
         load_recording(apartment)
 
 
-def test_a_folder_without_images(apartment: Path) -> None:
+def test_folder_without_images_is_refused(apartment: Path) -> None:
     for image in (apartment / "data").glob("*.jpg"):
         image.unlink()
     with pytest.raises(InputError, match="no images"):

@@ -1,7 +1,6 @@
 """A folder of images and gripper poses: rows find their images by name, by time or in order."""
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -51,7 +50,7 @@ def assert_paired(scene: Recording, names: Sequence[str], poses: SE3) -> None:
 
 
 @pytest.mark.parametrize("folder", [".", "images", "rgb"])
-def test_rows_without_names_go_in_natural_order(tmp_path: Path, folder: str) -> None:
+def test_rows_without_names_are_paired_in_natural_order(tmp_path: Path, folder: str) -> None:
     names = [f"image-{i}.png" for i in range(1, 13)]  # image-10 comes after image-9
     poses = some_poses(12)
     scene = load_recording(make_folder(tmp_path / "wave", names, poses, folder))
@@ -67,16 +66,16 @@ def test_too_few_rows_are_refused(tmp_path: Path) -> None:
         load_recording(tmp_path)
 
 
-def test_names_pair_whatever_the_order() -> None:
+def test_names_pair_in_any_order() -> None:
     images = [Path(f"rgb/{name}") for name in ("a.png", "b.png", "c.png")]
     poses = some_poses(3)
     rows = RobotPoses(("c", "rgb/a.png", "gone.png"), None, poses)
-    found, notes = pair_images(images, rows, None, Path("poses.csv"))
-    assert found[0] is not None
-    assert found[2] is not None
-    assert found[1] is None
-    assert max(pose_distance(found[0], poses[1])) < 1e-12
-    assert max(pose_distance(found[2], poses[0])) < 1e-12
+    paired, notes = pair_images(images, rows, None, Path("poses.csv"))
+    assert paired[0] is not None
+    assert paired[2] is not None
+    assert paired[1] is None
+    assert max(pose_distance(paired[0], poses[1])) < 1e-12
+    assert max(pose_distance(paired[2], poses[0])) < 1e-12
     assert notes == [
         "1 image without a row in poses.csv: b.png",
         "1 row of poses.csv without an image: gone.png",
@@ -92,12 +91,12 @@ def test_names_of_other_images_and_repeated_names_are_refused() -> None:
         pair_images(images, rows, None, Path("p.csv"))
 
 
-def test_image_names_that_are_times_are_interpolated() -> None:
+def test_poses_are_interpolated_at_times_in_image_names() -> None:
     stamps = 1305031102.0 + np.arange(11) / 10
     poses = SE3.exp(np.outer(np.arange(11), [0.01, 0, 0, 0, 0.02, 0]))
     images = [Path(f"{stamps[0] + t:.6f}.png") for t in (0.25, 0.5, 0.975)]
-    found, _ = pair_images(images, RobotPoses(None, stamps, poses), None, Path("p.tum"))
-    for pose, at in zip(found, (2.5, 5.0, 9.75), strict=True):
+    paired, _ = pair_images(images, RobotPoses(None, stamps, poses), None, Path("p.tum"))
+    for pose, at in zip(paired, (2.5, 5.0, 9.75), strict=True):
         assert pose is not None
         expected = SE3.exp(np.array([0.01, 0, 0, 0, 0.02, 0]) * at)
         # Between the screw's poses a line is followed, not an arc: microns apart here.
@@ -105,7 +104,7 @@ def test_image_names_that_are_times_are_interpolated() -> None:
         assert pose_distance(pose, expected)[1] < 1e-6
 
 
-def test_nanoseconds_and_a_stamps_file_are_times_too(tmp_path: Path) -> None:
+def test_poses_are_interpolated_at_times_in_a_stamps_file(tmp_path: Path) -> None:
     assert in_seconds([1403636579763555584])[0] == pytest.approx(1403636579.763556, abs=1e-6)
     assert in_seconds([1403636579763555])[0] == pytest.approx(1403636579.763555, abs=1e-6)
     assert in_seconds([1403636579763])[0] == pytest.approx(1403636579.763)
@@ -132,14 +131,14 @@ def test_nanoseconds_and_a_stamps_file_are_times_too(tmp_path: Path) -> None:
 
 def test_frame_numbers_are_not_times() -> None:
     rows = RobotPoses(None, 1.7e9 + np.arange(3.0), some_poses(3))
-    found, notes = pair_images([Path(f"{i:06d}.png") for i in range(3)], rows, None, Path("p"))
-    assert None not in found
+    paired, notes = pair_images([Path(f"{i:06d}.png") for i in range(3)], rows, None, Path("p"))
+    assert None not in paired
     assert "in order" in notes[0]
     with pytest.raises(InputError, match=r"3 poses for 2 images.*stamps\.csv"):
         pair_images([Path("000001.png"), Path("000002.png")], rows, None, Path("p"))
 
 
-def test_frame_numbers_are_no_seconds_among_poses_from_zero() -> None:
+def test_frame_numbers_are_not_seconds() -> None:
     # A robot's clock often starts at 0: frame 50 was not taken 50 s later.
     stamps = np.arange(2001) / 10
     rows = RobotPoses(None, stamps, SE3.exp(np.outer(stamps, [0.001, 0, 0, 0, 0, 0])))
@@ -149,7 +148,7 @@ def test_frame_numbers_are_no_seconds_among_poses_from_zero() -> None:
             pair_images(images, rows, None, Path("p"))
 
 
-def test_names_that_are_times_of_another_clock_are_refused() -> None:
+def test_times_of_another_clock_are_refused() -> None:
     rows = RobotPoses(None, np.arange(3.0), some_poses(3))
     for names in (("9.25", "9.5", "9.75"), ("1700000000123", "1700000000223", "1700000000323")):
         images = [Path(f"{name}.png") for name in names]
@@ -168,16 +167,16 @@ def test_times_in_names() -> None:
         assert times_in_names([name]) is None
 
 
-def test_images_outside_the_poses_times_have_none(tmp_path: Path) -> None:
+def test_images_outside_the_recorded_poses_get_no_pose(tmp_path: Path) -> None:
     stamps = np.array([10.0, 10.1, 10.2])
     images = [Path(f"{t}.png") for t in ("9.9", "10.05", "10.3")]
     rows = RobotPoses(None, stamps, some_poses(3))
-    found, notes = pair_images(images, rows, None, Path("p"))
-    assert [pose is None for pose in found] == [True, False, True]
+    paired, notes = pair_images(images, rows, None, Path("p"))
+    assert [pose is None for pose in paired] == [True, False, True]
     assert notes[1].startswith("2 images taken outside")
 
 
-def test_images_in_another_order_than_their_names_are_not_paired_in_order() -> None:
+def test_images_out_of_natural_order_are_not_paired_in_order() -> None:
     rows = RobotPoses(None, None, some_poses(3))
     images = [Path(f"{name}.png") for name in ("image-1", "image-10", "image-2")]
     with pytest.raises(InputError, match=r"image-2\.png is given after image-10\.png"):
@@ -187,21 +186,21 @@ def test_images_in_another_order_than_their_names_are_not_paired_in_order() -> N
     assert None not in pair_images(images, rows, None, Path("p"))[0]
 
 
-def test_a_folder_given_to_a_command_is_in_natural_order(tmp_path: Path) -> None:
+def test_folder_of_images_is_in_natural_order(tmp_path: Path) -> None:
     for i in range(1, 12):
         (tmp_path / f"image-{i}.png").touch()
     names = [file.name for file in image_files([tmp_path])]
     assert names == [f"image-{i}.png" for i in range(1, 12)]
 
 
-def test_natural_order_takes_any_names() -> None:
+def test_natural_order_of_mixed_names() -> None:
     names = ["b2.png", "10.png", "b10.png", "9.png", "a.png", "b.png"]
     assert sorted(names, key=natural_key) == [
         "9.png", "10.png", "a.png", "b2.png", "b10.png", "b.png"
     ]  # fmt: skip
 
 
-def test_the_camera_may_be_any_file_and_fits_the_images(tmp_path: Path) -> None:
+def test_camera_file_is_chosen_and_must_fit_the_images(tmp_path: Path) -> None:
     make_folder(tmp_path, ["1.png", "2.png"], some_poses(2))
     (tmp_path / "camera.json").rename(tmp_path / "other.json")
     with pytest.raises(InputError, match=r"no camera file in it; name the file .* --camera"):
@@ -217,7 +216,7 @@ def test_the_camera_may_be_any_file_and_fits_the_images(tmp_path: Path) -> None:
         load_recording(tmp_path)
 
 
-def test_what_is_missing_or_twice_is_named(tmp_path: Path) -> None:
+def test_missing_and_ambiguous_files_are_refused(tmp_path: Path) -> None:
     make_folder(tmp_path, [], some_poses(2))
     with pytest.raises(InputError, match="no images"):
         load_recording(tmp_path)
@@ -244,7 +243,7 @@ def test_what_is_missing_or_twice_is_named(tmp_path: Path) -> None:
         ("image,stamp_s\nl/a.png,1\nr/a.png,2\n", "'a.png' comes twice"),
     ],
 )
-def test_broken_tables_are_named(tmp_path: Path, text: str, message: str) -> None:
+def test_broken_stamps_are_refused(tmp_path: Path, text: str, message: str) -> None:
     make_folder(tmp_path, ["1.png"], some_poses(1))
     (tmp_path / "stamps.csv").write_text(text)
     with pytest.raises(InputError, match=message) as caught:
@@ -253,7 +252,7 @@ def test_broken_tables_are_named(tmp_path: Path, text: str, message: str) -> Non
     assert "stamps.csv" in str(caught.value)
 
 
-def test_the_formats_of_pose_files_are_read(tmp_path: Path) -> None:
+def test_other_kinds_of_pose_files_are_read(tmp_path: Path) -> None:
     names, poses = ["1.png", "2.png"], some_poses(2)
     make_folder(tmp_path, names, None)
     np.save(tmp_path / "base_from_gripper.npy", poses.matrix())
@@ -266,28 +265,3 @@ def test_the_formats_of_pose_files_are_read(tmp_path: Path) -> None:
         load_recording(tmp_path)  # nothing says how the numbers are meant
     scene = load_recording(tmp_path, options=ReadOptions(pose_convention="ur:mm"))
     assert_paired(scene, names, poses)
-
-
-REAL = os.environ.get("EVERCAL_REAL_DATA", "")
-
-
-@pytest.mark.skipif(not REAL, reason="EVERCAL_REAL_DATA names no folder with real recordings")
-@pytest.mark.parametrize(
-    ("name", "count"),
-    [("franka_eye_in_hand", 8), ("franka_eye_to_hand", 8), ("kuka_eye_in_hand", 28)],
-)
-def test_real_recordings_load(name: str, count: int, tmp_path: Path) -> None:
-    root = Path(REAL) / "handeye" / name
-    if not root.is_dir():
-        pytest.skip(f"{root} is not there")
-    lens = tmp_path / "camera.txt"
-    lens.write_text("607.6 0 323.5\n0 607.6 243.3\n0 0 1\n")
-    scene = load_recording(root, options=ReadOptions(camera=lens))
-    assert len(scene.train) == count
-    assert [natural_key(f.name) for f in scene.train] == sorted(
-        natural_key(f.name) for f in scene.train
-    )
-    poses = SE3.stack([f.base_from_gripper for f in scene.train if f.base_from_gripper])
-    # An arm's reach, and a wrist that turns.
-    assert (np.linalg.norm(poses.translation_m, axis=1) < 1.6).all()
-    assert np.rad2deg(pose_distance(poses[0], poses)[1]).max() > 20

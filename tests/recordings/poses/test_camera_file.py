@@ -88,7 +88,7 @@ def stored(folder: Path, ending: str = "yml", size: bool = True, **more: object)
     return path
 
 
-def test_the_storage_of_opencv_is_read(tmp_path: Path) -> None:
+def test_opencv_storage_is_read(tmp_path: Path) -> None:
     assert read_camera(stored(tmp_path, "xml")) == LENS
     yaml = stored(tmp_path, fisheye_model=0, board="9x6")
     assert read_camera(yaml, (320, 240)) == LENS
@@ -97,43 +97,43 @@ def test_the_storage_of_opencv_is_read(tmp_path: Path) -> None:
     assert read_camera(stored(tmp_path, size=False), (640, 480)) == LENS
     with pytest.raises(InputError, match="'image_width' is missing"):
         read_camera(stored(tmp_path, size=False))
-    for more, said in (
+    for more, expected in (
         ({"fisheye_model": 1}, "fisheye_model is set"),
         ({"K": np.eye(3)}, "camera_matrix and K are the same; keep one"),
         ({"camera_matrix": np.eye(2)}, "camera_matrix has 9 numbers, got 4"),
     ):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=expected):
             read_camera(stored(tmp_path, **more))  # pyright: ignore[reportArgumentType]
     stereo = old.replace("camera_matrix", "M1").replace("dist_coeffs", "D1")
-    for text, said in (
+    for text, expected in (
         (stereo, "'camera_matrix' is missing, there is M1, D1, fisheye_model"),
         (old[:120], "OpenCV cannot read its storage"),
         ("<opencv_storage><a>", "OpenCV cannot read its storage"),
     ):
-        with pytest.raises(InputError, match=said) as caught:
+        with pytest.raises(InputError, match=expected) as caught:
             read_camera(written(tmp_path, text), (640, 480))
         assert "\n" not in str(caught.value)
 
 
-def test_a_byte_order_mark_is_passed_over(tmp_path: Path) -> None:
+def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "camera.any"
     for text in (json.dumps(LENS.to_dict()), CALIBRATION, MESSAGE, "525 0 319.5 0 525 239.5 0 0 1"):
         path.write_text(text, encoding="utf-8-sig")
         assert read_camera(path, (640, 480)).width == 640
 
 
-def test_a_lens_that_is_called_otherwise_is_not_passed_over(tmp_path: Path) -> None:
+def test_missing_distortion_is_refused(tmp_path: Path) -> None:
     text = CALIBRATION.replace("distortion_coefficients", "dist_coeff")
     with pytest.raises(InputError, match="'distortion_coefficients' is missing"):
         read_camera(written(tmp_path, text))
     assert read_camera(written(tmp_path, text + "d: [0, 0, 0, 0]\n")).distortion == ()
 
 
-def test_the_size_given_does_not_override_what_a_file_says(tmp_path: Path) -> None:
+def test_size_in_the_file_takes_precedence(tmp_path: Path) -> None:
     assert read_camera(written(tmp_path, CALIBRATION), (320, 240)) == LENS
 
 
-def test_the_message_of_ros_1_and_longer_models_are_read(tmp_path: Path) -> None:
+def test_ros_1_messages_and_longer_models_are_read(tmp_path: Path) -> None:
     old = MESSAGE.replace("d:\n", "D:\n").replace("k: [", "K: [")
     assert read_camera(written(tmp_path, old)).fx == LENS.fx
     longer = CALIBRATION.replace("1e-05, 0.03]", "1e-05, 0.03, 0, 0, 0, 0, 0, 0, 0]")
@@ -150,7 +150,7 @@ def test_the_message_of_ros_1_and_longer_models_are_read(tmp_path: Path) -> None
     st.floats(-1e3, 1e3),
     st.lists(st.floats(-1, 1), min_size=5, max_size=5),
 )
-def test_ros_numbers_survive_however_yaml_writes_them(
+def test_ros_numbers_in_any_notation_are_exact(
     tmp_path: Path, fx: float, fy: float, cx: float, cy: float, distortion: list[float]
 ) -> None:
     lens = Camera(640, 480, fx, fy, cx, cy, tuple(distortion))
@@ -161,7 +161,7 @@ def test_ros_numbers_survive_however_yaml_writes_them(
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ("1 2 3", "3 numbers, a 3x3 matrix has 9"),
         ("", "0 numbers"),
@@ -183,17 +183,17 @@ def test_ros_numbers_survive_however_yaml_writes_them(
         (MESSAGE.replace("525.25", "0.0"), "fx"),
     ],
 )
-def test_damage_is_named_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+def test_broken_files_are_refused_in_one_line(tmp_path: Path, text: str, expected: str) -> None:
     path = written(tmp_path, text)
     with pytest.raises(InputError) as caught:
         read_camera(path, (640, 480))
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
-    assert said in message
+    assert expected in message
     assert "\n" not in message
 
 
-def test_missing_binary_and_sizeless_files_are_refused(tmp_path: Path) -> None:
+def test_missing_camera_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="missing"):
         read_camera(tmp_path / "none.yaml")
     with pytest.raises(InputError, match="cannot be read"):
@@ -205,7 +205,7 @@ def test_missing_binary_and_sizeless_files_are_refused(tmp_path: Path) -> None:
         read_camera(written(tmp_path, "1 0 0 0 1 0 0 0 1"))
 
 
-def test_yaml_runs_no_code(tmp_path: Path) -> None:
+def test_yaml_cannot_run_code(tmp_path: Path) -> None:
     bait = tmp_path / "bait"
     text = f"width: !!python/object/apply:os.mkdir ['{bait}']\n"
     with pytest.raises(InputError, match="not valid YAML"):

@@ -23,7 +23,7 @@ from evercal.recordings.poses.conventions import (
 Array = NDArray[np.float64]
 
 
-def turn(axis: str, angle: float) -> Array:
+def rotation_about(axis: str, angle: float) -> Array:
     """About x, y or z, as a textbook has it."""
     c, s = math.cos(angle), math.sin(angle)
     return {
@@ -48,7 +48,11 @@ def of_vector(x: float, y: float, z: float) -> Array:
 
 
 def fixed_xyz(unit: float) -> Callable[..., Array]:
-    return lambda a, b, c: turn("z", c * unit) @ turn("y", b * unit) @ turn("x", a * unit)
+    return lambda a, b, c: (
+        rotation_about("z", c * unit)
+        @ rotation_about("y", b * unit)
+        @ rotation_about("x", a * unit)
+    )
 
 
 DEGREE = math.pi / 180
@@ -58,11 +62,17 @@ ROTATIONS: dict[str, Callable[..., Array]] = {
     "abb": of_quaternion,
     "ur": of_vector,
     "rpy": fixed_xyz(1.0),
-    "kuka": lambda a, b, c: turn("z", a * DEGREE) @ turn("y", b * DEGREE) @ turn("x", c * DEGREE),
+    "kuka": lambda a, b, c: (
+        rotation_about("z", a * DEGREE)
+        @ rotation_about("y", b * DEGREE)
+        @ rotation_about("x", c * DEGREE)
+    ),
     "fanuc": fixed_xyz(DEGREE),
     "yaskawa": fixed_xyz(DEGREE),
     "staubli": lambda a, b, c: (
-        turn("x", a * DEGREE) @ turn("y", b * DEGREE) @ turn("z", c * DEGREE)
+        rotation_about("x", a * DEGREE)
+        @ rotation_about("y", b * DEGREE)
+        @ rotation_about("z", c * DEGREE)
     ),
 }
 MILLIMETRES = {"abb", "kuka", "fanuc", "yaskawa", "staubli"}
@@ -89,7 +99,7 @@ names = st.sampled_from(sorted(CONVENTIONS))
 
 @given(names, seeds)
 @settings(deadline=None, max_examples=200)
-def test_what_is_written_means_the_pose(name: str, seed: int) -> None:
+def test_written_numbers_represent_the_pose(name: str, seed: int) -> None:
     pose = drawn(seed)
     numbers = numbers_from_poses(pose, CONVENTIONS[name])
     assert numbers.shape == (CONVENTIONS[name].count,)
@@ -98,7 +108,7 @@ def test_what_is_written_means_the_pose(name: str, seed: int) -> None:
 
 @given(st.sampled_from(sorted(ROTATIONS)), seeds)
 @settings(deadline=None, max_examples=200)
-def test_what_is_read_is_what_the_numbers_mean(name: str, seed: int) -> None:
+def test_read_poses_agree_with_their_numbers(name: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     convention = CONVENTIONS[name]
     rotation = rng.normal(size=convention.count - 3)
@@ -119,7 +129,7 @@ def test_what_is_read_is_what_the_numbers_mean(name: str, seed: int) -> None:
     st.sampled_from(["", ":opengl"]),
 )
 @settings(deadline=None, max_examples=200)
-def test_modifiers_mean_what_they_say(
+def test_modifiers_change_unit_direction_and_axes(
     name: str, seed: int, unit: str, inverse: str, opengl: str
 ) -> None:
     convention = pose_convention(name + unit + inverse + opengl)
@@ -133,12 +143,14 @@ def test_modifiers_mean_what_they_say(
     expected = np.linalg.inv(expected) if inverse else expected
     implied = 0.001 if name in MILLIMETRES else 1.0
     scale = {"": implied, ":m": 1.0, ":mm": 0.001}[unit]
-    meant = numbers[0].copy()
-    meant[{"matrix": [3, 7, 11], "franka": [12, 13, 14]}.get(name, [0, 1, 2])] *= scale / implied
-    np.testing.assert_allclose(twin(name, meant), expected, atol=1e-12)
+    expected_numbers = numbers[0].copy()
+    expected_numbers[{"matrix": [3, 7, 11], "franka": [12, 13, 14]}.get(name, [0, 1, 2])] *= (
+        scale / implied
+    )
+    np.testing.assert_allclose(twin(name, expected_numbers), expected, atol=1e-12)
 
 
-def test_angles_that_are_known() -> None:
+def test_published_angles_are_reproduced() -> None:
     """rpy (0.3, 0.4, 0.5) of URDF; the same rotation about moved axes has other angles."""
     pose = poses_from_numbers([0, 0, 0, 0.3, 0.4, 0.5], CONVENTIONS["rpy"])
     moved = numbers_from_poses(pose, pose_convention("staubli:rad"))
@@ -164,7 +176,7 @@ def test_quaternions_are_written_with_positive_w() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("euler", "is not known; use one of wxyz, xyzw"),
         ("kuka:cm", "modifier 'cm' is not known"),
@@ -174,8 +186,8 @@ def test_quaternions_are_written_with_positive_w() -> None:
         ("matrix:inverse:inverse", "repeats a modifier"),
     ],
 )
-def test_names_that_are_none(name: str, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_unknown_names_are_refused(name: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         pose_convention(name)
 
 
@@ -222,7 +234,7 @@ def test_poses_in_mixed_units_are_named(name: str, factor: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "said"),
+    ("name", "change", "message"),
     [
         ("wxyz", lambda n: n[:, :6], "has 7 numbers .* got 6"),
         ("wxyz", lambda n: n * np.where(np.arange(7) > 2, 2, 1), "pose 1 .* not of length 1"),
@@ -234,12 +246,14 @@ def test_poses_in_mixed_units_are_named(name: str, factor: float) -> None:
         ("matrix", lambda n: n * np.where(np.arange(16) % 4 == 0, -1, 1), "is no rotation"),
     ],
 )
-def test_numbers_that_are_no_pose(name: str, change: Callable[[Array], Array], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_invalid_numbers_are_refused(
+    name: str, change: Callable[[Array], Array], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
         poses_from_numbers(change(rows(name)), CONVENTIONS[name])
 
 
-def test_the_first_broken_pose_is_named() -> None:
+def test_first_broken_pose_is_named() -> None:
     numbers = rows("wxyz")
     numbers[[2, 3], 3:] *= 1.2
     with pytest.raises(ValueError, match=r"pose 3 \(and 1 more\)"):

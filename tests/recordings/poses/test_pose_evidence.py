@@ -32,20 +32,20 @@ def bedroom() -> tuple[Frame, ...]:
 @pytest.fixture(scope="module", autouse=True)
 def matched_once() -> Iterator[None]:
     """Every pair of images is matched once for all tests."""
-    real, known = pose_evidence.measured_rotation, {}
+    real, cache = pose_evidence.measured_rotation, {}
 
     def cached(first: Frame, second: Frame) -> np.ndarray | None:
         key = first.image, second.image
-        if key not in known:
-            known[key] = real(first, second)
-        return known[key]
+        if key not in cache:
+            cache[key] = real(first, second)
+        return cache[key]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pose_evidence, "measured_rotation", cached)
         yield
 
 
-def test_turns_between_images_are_those_of_the_true_poses(bedroom: tuple[Frame, ...]) -> None:
+def test_measured_rotations_agree_with_true_poses(bedroom: tuple[Frame, ...]) -> None:
     turns = pose_evidence.pair_rotations(bedroom, stated(bedroom))
     assert turns is not None
     assert len(turns.measured) >= 8
@@ -77,37 +77,37 @@ SPOILED: dict[str, tuple[Callable[[SE3], SE3], str]] = {
 
 
 @pytest.mark.parametrize("how", SPOILED)
-def test_spoiled_camera_poses_are_named(bedroom: tuple[Frame, ...], how: str) -> None:
+def test_wrong_camera_poses_are_reported(bedroom: tuple[Frame, ...], how: str) -> None:
     spoil, message = SPOILED[how]
     assert rotation_warnings(bedroom, stated(bedroom), True) == []
-    (said,) = rotation_warnings(bedroom, spoil(stated(bedroom)), True)
-    assert said.startswith("the camera rotates differently from the images, by ")
-    assert message in said
+    (warning,) = rotation_warnings(bedroom, spoil(stated(bedroom)), True)
+    assert warning.startswith("the camera rotates differently from the images, by ")
+    assert message in warning
 
 
-def test_spoiled_gripper_poses_are_named(bedroom: tuple[Frame, ...]) -> None:
+def test_wrong_gripper_poses_are_reported(bedroom: tuple[Frame, ...]) -> None:
     gripper = stated(bedroom) @ GRIPPER_FROM_CAMERA.inverse()
     assert rotation_warnings(bedroom, gripper, False) == []
     # Any frame that is fixed to the gripper is as good.
     assert rotation_warnings(bedroom, gripper @ FLIP, False) == []
-    (said,) = rotation_warnings(bedroom, gripper.inverse(), False)
-    assert "they are gripper_from_base, the inverse" in said
-    (said,) = rotation_warnings(bedroom, reordered(gripper), False)
-    assert "with quaternions in another order" in said
-    (said,) = rotation_warnings(bedroom, as_degrees(gripper), False)
-    assert "are angles in the stated unit" in said or "the angles in another unit" in said
+    (warning,) = rotation_warnings(bedroom, gripper.inverse(), False)
+    assert "they are gripper_from_base, the inverse" in warning
+    (warning,) = rotation_warnings(bedroom, reordered(gripper), False)
+    assert "with quaternions in another order" in warning
+    (warning,) = rotation_warnings(bedroom, as_degrees(gripper), False)
+    assert "are angles in the stated unit" in warning or "the angles in another unit" in warning
 
 
-def test_a_camera_that_stands_still_is_noticed(bedroom: tuple[Frame, ...]) -> None:
+def test_still_camera_is_reported(bedroom: tuple[Frame, ...]) -> None:
     same = tuple(dataclasses.replace(f, image=bedroom[0].image) for f in bedroom)
     gripper = stated(bedroom) @ GRIPPER_FROM_CAMERA.inverse()
-    (said,) = rotation_warnings(same, gripper, False)
-    assert said.startswith(
+    (warning,) = rotation_warnings(same, gripper, False)
+    assert warning.startswith(
         "the gripper rotates and the images hardly do; does the camera stand still"
     )
 
 
-def test_images_without_texture_say_nothing(tmp_path: Path) -> None:
+def test_images_without_texture_give_no_warning(tmp_path: Path) -> None:
     camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
     poses = SE3.exp(np.linspace([0, 0, 0, 0, 0, 0], [1, 0, 0, 0, 2, 0], 20))
     blank = tmp_path / "blank.png"
@@ -116,7 +116,7 @@ def test_images_without_texture_say_nothing(tmp_path: Path) -> None:
     assert rotation_warnings(frames, poses, True) == []
 
 
-def test_a_wrist_recording_is_inspected_by_its_gripper(bedroom: tuple[Frame, ...]) -> None:
+def test_wrist_recordings_are_inspected_by_gripper_poses(bedroom: tuple[Frame, ...]) -> None:
     gripper = stated(bedroom) @ GRIPPER_FROM_CAMERA.inverse()
 
     def warned(poses: SE3) -> tuple[str, ...]:
@@ -124,9 +124,9 @@ def test_a_wrist_recording_is_inspected_by_its_gripper(bedroom: tuple[Frame, ...
             dataclasses.replace(f, base_from_camera=None, base_from_gripper=pose)
             for f, pose in zip(bedroom, poses, strict=True)
         )
-        found = inspect_recording(Recording("wave", frames, ()))
-        assert (found.poses, found.train) == ("gripper", len(frames))
-        return found.warnings
+        inspection = inspect_recording(Recording("wave", frames, ()))
+        assert (inspection.poses, inspection.train) == ("gripper", len(frames))
+        return inspection.warnings
 
     assert warned(gripper) == ()
     (millimetres,) = warned(SE3(gripper.rotation_wxyz, 1000 * gripper.translation_m))[:1]
@@ -138,10 +138,10 @@ def test_a_wrist_recording_is_inspected_by_its_gripper(bedroom: tuple[Frame, ...
     assert "gripper_from_base, the inverse" in inverse
 
 
-def test_many_cameras_take_one_line(bedroom: tuple[Frame, ...]) -> None:
-    lens = bedroom[0].camera
+def test_many_cameras_are_summarised_in_one_line(bedroom: tuple[Frame, ...]) -> None:
+    camera = bedroom[0].camera
     frames = tuple(
-        dataclasses.replace(f, camera=dataclasses.replace(lens, fx=lens.fx + i / 10))
+        dataclasses.replace(f, camera=dataclasses.replace(camera, fx=camera.fx + i / 10))
         for i, f in enumerate(bedroom)
     )
     (line,) = inspect_recording(Recording("phone", frames, ())).cameras

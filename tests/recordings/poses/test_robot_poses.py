@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
@@ -36,8 +34,10 @@ def table(header: str, numbers: NDArray[np.float64], separator: str = ",") -> st
     return text.getvalue()
 
 
-def same(found: SE3, poses: SE3, tolerance: float = 1e-12) -> bool:
-    return found.shape == poses.shape and bool(np.max(pose_distance(found, poses)) < tolerance)
+def same(poses_read: SE3, poses: SE3, tolerance: float = 1e-12) -> bool:
+    return poses_read.shape == poses.shape and bool(
+        np.max(pose_distance(poses_read, poses)) < tolerance
+    )
 
 
 HEADERS = [
@@ -73,7 +73,7 @@ HEADERS = [
 
 @pytest.mark.parametrize(("header", "written", "given"), HEADERS)
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_headers(
+def test_headers_define_columns(
     tmp_path: Path, header: str, written: str, given: str | None, separator: str
 ) -> None:
     numbers = numbers_from_poses(arm(), pose_convention(written))
@@ -86,7 +86,7 @@ def test_headers(
 
 @given(st.permutations(range(9)), st.integers(0, 1000))
 @settings(deadline=None, max_examples=30)
-def test_columns_stand_in_any_order(
+def test_columns_may_be_in_any_order(
     tmp_path_factory: pytest.TempPathFactory, order: list[int], seed: int
 ) -> None:
     header = ["x", "y", "z", "qw", "qx", "qy", "qz", "stamp", "image"]
@@ -104,7 +104,7 @@ def test_columns_stand_in_any_order(
 
 @pytest.mark.parametrize("name", sorted(CONVENTIONS))
 @pytest.mark.parametrize("extra", ["", "name", "stamp", "stamp name", "name stamp"])
-def test_tables_without_a_header(tmp_path: Path, name: str, extra: str) -> None:
+def test_tables_without_header_are_read(tmp_path: Path, name: str, extra: str) -> None:
     lines = ["# made by a robot"]
     for i, row in enumerate(numbers_from_poses(arm(), CONVENTIONS[name])):
         before = {"": "", "name": f"{i}.png ", "stamp": f"{i}.5 "}.get(extra, f"{i}.5 {i}.png ")
@@ -117,14 +117,14 @@ def test_tables_without_a_header(tmp_path: Path, name: str, extra: str) -> None:
     assert (read.stamps_s is not None) == ("stamp" in extra)
 
 
-def test_tum_lines(tmp_path: Path) -> None:
+def test_tum_files_are_read(tmp_path: Path) -> None:
     numbers = numbers_from_poses(arm(), CONVENTIONS["xyzw"])
     lines = [f"{1.7e9 + i} " + " ".join(map(repr, row.tolist())) for i, row in enumerate(numbers)]
     (tmp_path / "a.tum").write_text("\n".join(lines))
     (tmp_path / "b.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines))
     (tmp_path / "c.txt").write_text("# ground truth\n" + "\n".join(lines))
-    for name, said in (("a.tum", None), ("b.txt", None), ("c.txt", "tum")):
-        read = read_robot_poses(tmp_path / name, said)
+    for name, message in (("a.tum", None), ("b.txt", None), ("c.txt", "tum")):
+        read = read_robot_poses(tmp_path / name, message)
         assert same(read.poses, arm())
         assert read.stamps_s is not None
         assert read.stamps_s[2] == 1.7e9 + 2
@@ -134,7 +134,7 @@ def test_tum_lines(tmp_path: Path) -> None:
         read_robot_poses(tmp_path / "c.txt")
 
 
-def test_a_decimal_comma(tmp_path: Path) -> None:
+def test_decimal_commas_are_read(tmp_path: Path) -> None:
     text = table("image,x,y,z,qw,qx,qy,qz", np.array([[0]]), ";").splitlines()[0]
     (tmp_path / "p.csv").write_text(text + "\na,b.png;0,5;0,25;0,1;1;0;0;0\n", encoding="utf-8-sig")
     read = read_robot_poses(tmp_path / "p.csv")
@@ -145,13 +145,13 @@ def test_a_decimal_comma(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("unit", "factor"), [("_s", 1), ("_ms", 1e3), (" [us]", 1e6), ("_ns", 1e9)]
 )
-def test_units_of_stamps(tmp_path: Path, unit: str, factor: float) -> None:
+def test_units_of_stamps_are_converted(tmp_path: Path, unit: str, factor: float) -> None:
     (tmp_path / "p.csv").write_text(f"t{unit},x,y,z,qw,qx,qy,qz\n{1.7e9 * factor},1,0,0,1,0,0,0\n")
     read = read_robot_poses(tmp_path / "p.csv")
     assert read.stamps_s == pytest.approx([1.7e9])
 
 
-def test_json_objects(tmp_path: Path) -> None:
+def test_json_objects_are_read(tmp_path: Path) -> None:
     objects = [
         {
             "translation_m": pose.translation_m.tolist(),
@@ -174,7 +174,7 @@ def test_json_objects(tmp_path: Path) -> None:
     assert same(read_robot_poses(file).poses, arm()[:1])
 
 
-def test_json_matrices_and_numbers(tmp_path: Path) -> None:
+def test_json_matrices_and_numbers_are_read(tmp_path: Path) -> None:
     file = tmp_path / "p.json"
     matrices = arm().matrix()
     file.write_text(json.dumps([{"matrix": m.tolist()} for m in matrices]))
@@ -189,7 +189,7 @@ def test_json_matrices_and_numbers(tmp_path: Path) -> None:
         read_robot_poses(file)
 
 
-def test_npy(tmp_path: Path) -> None:
+def test_npy_files_are_read(tmp_path: Path) -> None:
     file = tmp_path / "p.npy"
     np.save(file, arm().matrix())
     assert same(read_robot_poses(file).poses, arm())
@@ -245,12 +245,12 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("text", "given", "said"), REFUSED)
-def test_what_is_open_or_wrong_is_said(
-    tmp_path: Path, text: str, given: str | None, said: str
+@pytest.mark.parametrize(("text", "given", "message"), REFUSED)
+def test_ambiguous_and_broken_tables_are_refused(
+    tmp_path: Path, text: str, given: str | None, message: str
 ) -> None:
     (tmp_path / "p.csv").write_text(text)
-    with pytest.raises(InputError, match=said) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_robot_poses(tmp_path / "p.csv", given)
     assert str(caught.value).startswith(str(tmp_path / "p.csv"))
     assert "\n" not in str(caught.value)
@@ -262,14 +262,14 @@ def test_messages_name_the_option_of_the_command(tmp_path: Path) -> None:
         read_robot_poses(tmp_path / "p.csv", option="--pose-convention")
 
 
-def test_a_header_that_lies_is_overruled_by_the_user(tmp_path: Path) -> None:
+def test_given_convention_overrides_the_header(tmp_path: Path) -> None:
     (tmp_path / "p.csv").write_text("x_m,y_m,z_m,qw,qx,qy,qz\n500,100,200,1,0,0,0")
     read = read_robot_poses(tmp_path / "p.csv", "wxyz:mm")
     np.testing.assert_allclose(read.poses.translation_m, [[0.5, 0.1, 0.2]])
 
 
 @pytest.mark.parametrize(
-    ("data", "given", "said"),
+    ("data", "given", "message"),
     [
         ([{"translation_m": [1, 2, 3]}], None, "'translation_m' and 'quaternion_wxyz'"),
         ([{"translation_m": [1, 2], "quaternion_wxyz": [1, 0, 0, 0]}], None, "three numbers"),
@@ -283,13 +283,15 @@ def test_a_header_that_lies_is_overruled_by_the_user(tmp_path: Path) -> None:
         ("text", None, "a list of objects"),
     ],
 )
-def test_json_that_is_none(tmp_path: Path, data: object, given: str | None, said: str) -> None:
+def test_broken_json_is_refused(
+    tmp_path: Path, data: object, given: str | None, message: str
+) -> None:
     (tmp_path / "p.json").write_text(json.dumps(data))
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         read_robot_poses(tmp_path / "p.json", given)
 
 
-def test_files_that_are_none(tmp_path: Path) -> None:
+def test_missing_and_broken_files_are_refused(tmp_path: Path) -> None:
     for name in ("no.csv", "no.json", "no.npy"):
         with pytest.raises(InputError, match="file of robot poses is missing; check the path"):
             read_robot_poses(tmp_path / name)
@@ -310,23 +312,3 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     np.save(tmp_path / "v.npy", np.zeros((2, 3, 4, 5)))
     with pytest.raises(InputError, match="got shape"):
         read_robot_poses(tmp_path / "v.npy")
-
-
-REAL = os.environ.get("EVERCAL_REAL_DATA", "")
-
-
-@pytest.mark.skipif(not REAL, reason="EVERCAL_REAL_DATA names no folder with real recordings")
-@pytest.mark.parametrize(
-    ("name", "count"),
-    [("franka_eye_in_hand", 8), ("franka_eye_to_hand", 8), ("kuka_eye_in_hand", 28)],
-)
-def test_real_recordings(name: str, count: int) -> None:
-    file = Path(REAL) / "handeye" / name / "base_from_gripper.csv"
-    if not file.is_file():
-        pytest.skip(f"{file} is not there")
-    read = read_robot_poses(file)
-    assert len(read) == count
-    columns = np.loadtxt(file, delimiter=",", skiprows=1)
-    np.testing.assert_allclose(read.poses.translation_m, columns[:, :3])
-    expected = Rotation.from_rotvec(columns[:, 3:]).as_matrix()
-    np.testing.assert_allclose(read.poses.rotation_matrix(), expected, atol=1e-12)

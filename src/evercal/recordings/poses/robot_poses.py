@@ -1,9 +1,9 @@
 """Pose files: a table (CSV, TUM), JSON or NPY, in a named convention.
 
 The header of a table names its columns (`pose_header`, `labels`). JSON is a list of objects with
-`translation_m` and `quaternion_wxyz`, or `matrix`, or a list of lists of numbers; it may stand under
-`poses`. NPY is (n, 4, 4), or (n, k) numbers. If the file does not define the meaning of its numbers,
-a convention is required (`conventions`). docs/formats.md has examples.
+`translation_m` and `quaternion_wxyz`, or `matrix`, or a list of lists of numbers; it may stand
+under `poses`. NPY is (n, 4, 4), or (n, k) numbers. A convention is required if the file does not
+define the meaning of its numbers. docs/formats.md has examples.
 """
 
 import json
