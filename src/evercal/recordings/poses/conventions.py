@@ -118,6 +118,10 @@ MODIFIERS: dict[str, dict[str, Any]] = {
     "opengl": {"opengl": True},
 }
 """Fields that each modifier sets."""
+KNOWN_CONVENTIONS = (
+    f"{', '.join(CONVENTIONS)}, followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"
+)
+"""All names and modifiers, for messages."""
 
 
 def pose_convention(name: str) -> PoseConvention:
@@ -128,7 +132,7 @@ def pose_convention(name: str) -> PoseConvention:
     """
     base, *modifiers = name.strip().lower().split(":")
     if base not in CONVENTIONS:
-        raise ValueError(f"pose convention {name!r} is not known; use one of {known_conventions()}")
+        raise ValueError(f"pose convention {name!r} is not known; use one of {KNOWN_CONVENTIONS}")
     convention = replace(CONVENTIONS[base], name=":".join([base, *modifiers]))
     for modifier in modifiers:
         if modifier not in MODIFIERS:
@@ -143,12 +147,6 @@ def pose_convention(name: str) -> PoseConvention:
     if len(set(kinds)) < len(kinds):
         raise ValueError(f"pose convention {name!r} repeats a modifier; give each kind once")
     return convention
-
-
-def known_conventions() -> str:
-    """All names and modifiers, for messages."""
-    names = ", ".join(CONVENTIONS)
-    return f"{names}, followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"
 
 
 def poses_from_numbers(numbers: ArrayLike, convention: PoseConvention) -> SE3:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.recordings.poses.kinematics import RobotModel
-from evercal.recordings.poses.labels import labels_of_lists
+from evercal.recordings.poses.labels import row_labels
 from evercal.recordings.poses.pose_track import MAX_GAP_S
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import Rows, read_rows
@@ -140,7 +140,8 @@ def read_joints(path: Path) -> Rows:
         data = json.loads(path.read_bytes())
         columns = tuple(str(name) for name in data["joint_names"])
         values = np.array(data["positions"], dtype=np.float64)
-        names, times = labels_of_lists(data, len(values))
+        lists = {key: value for key, value in data.items() if isinstance(value, list)}
+        names, times = row_labels(lists, len(values), plural=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -65,13 +65,9 @@ def name_and_unit(cell: str) -> tuple[str, str | None]:
     return re.sub(r"[\s.]+", "_", name), _SHORT.get(unit or "", unit)
 
 
-def image_column(columns: Mapping[str, Sequence[object]]) -> str | None:
-    """Name of the only column with nothing but names of image files, if there is one.
-
-    Raises:
-        ValueError: There are several.
-    """
-    names = [name for name, cells in columns.items() if all(map(_is_image, cells))]
+def _image_column(columns: Mapping[str, Sequence[object]]) -> str | None:
+    """Name of the only column with nothing but names of image files, if there is one."""
+    names = [name for name, cells in columns.items() if cells and all(map(_is_image, cells))]
     if len(names) > 1:
         raise ValueError(f"{' and '.join(names)} name image files; call the right one 'image'")
     return names[0] if names else None
@@ -81,25 +77,27 @@ def _is_image(cell: object) -> bool:
     return isinstance(cell, str) and PurePath(cell).suffix.lower() in IMAGE_ENDINGS
 
 
-def labels_of_lists(
-    data: Mapping[str, object], count: int
+def row_labels(
+    columns: Mapping[str, Sequence[object]], count: int, plural: bool = False
 ) -> tuple[tuple[str, ...] | None, NDArray[np.float64] | None]:
-    """Image names and seconds in JSON lists beside `count` poses, each None if missing.
+    """Image names and seconds of `count` rows, each None if there is no such column.
 
     Raises:
-        ValueError: A list has another length, or a time is no number.
+        ValueError: A column is incomplete, a time is no number, or the columns are ambiguous.
     """
-    lists = {key: value for key, value in data.items() if isinstance(value, list)}
-    labels = find_labels([*lists], plural=True)
-    names, stamps = (None if i is None else [*lists][i] for i in (labels.name, labels.stamp))
-    names = names or image_column({key: value for key, value in lists.items() if value})
-    for key in filter(None, (names, stamps)):
-        if len(lists[key]) != count:
-            raise ValueError(f"{key!r} holds {len(lists[key])} entries for {count} poses")
+    keys = [*columns]
+    labels = find_labels(keys, plural)
+    name, stamp = (None if i is None else keys[i] for i in (labels.name, labels.stamp))
+    name = name or _image_column(columns)
+    for key in filter(None, (name, stamp)):
+        if len(columns[key]) != count:
+            raise ValueError(f"{key!r} holds {len(columns[key])} entries for {count} poses")
+        if None in columns[key]:
+            raise ValueError(f"some poses have {key!r}, others lack it; give it to all poses")
     seconds = None
-    if stamps is not None:
-        seconds = in_unit(number_array(lists[stamps], f"{stamps!r}"), labels.unit)
-    return None if names is None else tuple(map(str, lists[names])), seconds
+    if stamp is not None:
+        seconds = in_unit(number_array(columns[stamp], f"{stamp!r}"), labels.unit)
+    return None if name is None else tuple(map(str, columns[name])), seconds
 
 
 def number_array(values: object, what: str) -> NDArray[np.float64]:

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evercal.recordings.poses.conventions import (
+    KNOWN_CONVENTIONS,
     ConventionError,
     PoseConvention,
-    known_conventions,
     pose_convention,
 )
 from evercal.recordings.poses.labels import Labels, find_labels, name_and_unit
@@ -164,7 +164,7 @@ def _defined_group(header: PoseHeader) -> str:
     if not defined or ("position" not in header.groups and defined != ["matrix"]):
         raise ConventionError(
             "the header names no known pose (such as x y z qw qx qy qz)",
-            f"NAME, one of {known_conventions()}",
+            f"NAME, one of {KNOWN_CONVENTIONS}",
         )
     return defined[0]
 

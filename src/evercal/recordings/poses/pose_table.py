@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.recordings.poses.conventions import ConventionError, PoseConvention, known_conventions
-from evercal.recordings.poses.labels import image_column, in_unit
+from evercal.recordings.poses.conventions import KNOWN_CONVENTIONS, ConventionError, PoseConvention
+from evercal.recordings.poses.labels import in_unit, row_labels
 from evercal.recordings.poses.pose_header import PoseHeader, is_number, pose_columns, pose_header
 
 Array = NDArray[np.float64]
@@ -53,15 +53,8 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
         if len(row) != header.width:
             raise ValueError(f"row {i + 1} has {len(row)} columns, the header {header.width}")
     convention, columns = pose_columns(header, given)
-    columns_by_name = dict(zip(header.cells, zip(*rows, strict=True), strict=True))
-    name = image_column(columns_by_name) if header.labels.name is None else None
-    names = None if name is None else columns_by_name[name]
-    if header.labels.name is not None:
-        names = tuple(row[header.labels.name] for row in rows)
-    stamps = None
-    if header.labels.stamp is not None:
-        cells = [_number(row[header.labels.stamp], i) for i, row in enumerate(rows)]
-        stamps = in_unit(np.array(cells), header.labels.unit)
+    cells = dict(zip(header.cells, zip(*rows, strict=True), strict=True))
+    names, stamps = row_labels(cells, len(rows))
     numbers = np.array([[_number(row[c], i) for c in columns] for i, row in enumerate(rows)])
     return PoseTable(numbers, convention, names, stamps)
 
@@ -100,7 +93,7 @@ def _without_header(rows: list[list[str]], given: PoseConvention | None) -> Pose
         raise ConventionError(
             f"{width} columns without a header do not define a pose; write a header such as"
             f" x,y,z,qw,qx,qy,qz",
-            f"NAME, one of {known_conventions()}, or tum",
+            f"NAME, one of {KNOWN_CONVENTIONS}, or tum",
         )
     words = [i for i, cell in enumerate(rows[0]) if not is_number(cell)]
     extra = width - given.count

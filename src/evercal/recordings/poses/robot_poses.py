@@ -18,20 +18,14 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.conventions import (
+    KNOWN_CONVENTIONS,
     ConventionError,
     PoseConvention,
     check_units,
-    known_conventions,
     pose_convention,
     poses_from_numbers,
 )
-from evercal.recordings.poses.labels import (
-    find_labels,
-    image_column,
-    in_unit,
-    labels_of_lists,
-    number_array,
-)
+from evercal.recordings.poses.labels import number_array, row_labels
 from evercal.recordings.poses.pose_table import PoseTable, read_pose_table
 
 
@@ -134,7 +128,7 @@ def _array_table(numbers: NDArray[np.float64], given: PoseConvention | None) -> 
     if given is None:
         raise ConventionError(
             f"{numbers.shape[1]} numbers do not define a pose",
-            f"NAME, one of {known_conventions()}",
+            f"NAME, one of {KNOWN_CONVENTIONS}",
         )
     return PoseTable(numbers, given)
 
@@ -142,8 +136,8 @@ def _array_table(numbers: NDArray[np.float64], given: PoseConvention | None) -> 
 def _json_table(data: object, given: PoseConvention | None) -> PoseTable:
     if isinstance(data, Mapping) and "poses" in data:
         table = _json_table(data["poses"], given)
-        beside = {key: value for key, value in data.items() if key != "poses"}
-        names, stamps = labels_of_lists(beside, len(table.numbers))
+        lists = {k: v for k, v in data.items() if k != "poses" and isinstance(v, list)}
+        names, stamps = row_labels(lists, len(table.numbers), plural=True)
         return replace(
             table,
             names=names if table.names is None else table.names,
@@ -185,26 +179,9 @@ def _object_table(
         raise ValueError(
             "every pose has 'translation_m' and 'quaternion_wxyz', or every pose 'matrix'"
         )
-    return PoseTable(numbers, convention, *_labels(entries))
-
-
-def _labels(
-    entries: Sequence[Mapping[str, object]],
-) -> tuple[tuple[str, ...] | None, NDArray[np.float64] | None]:
-    """Names and stamps of JSON objects, each None if missing."""
-    keys = [*dict.fromkeys(key for entry in entries for key in entry)]
-    labels = find_labels(keys)
-    name, stamp = (None if i is None else keys[i] for i in (labels.name, labels.stamp))
-    if name is None:
-        name = image_column({key: [entry.get(key) for entry in entries] for key in keys})
-    for key in filter(None, (name, stamp)):
-        if not all(key in entry for entry in entries):
-            raise ValueError(f"some poses have {key!r}, others lack it; give it to all poses")
-    seconds = None
-    if stamp is not None:
-        values = number_array([entry[stamp] for entry in entries], f"{stamp!r}")
-        seconds = in_unit(values, labels.unit)
-    return None if name is None else tuple(str(entry[name]) for entry in entries), seconds
+    keys = dict.fromkeys(key for entry in entries for key in entry)
+    columns = {key: [entry.get(key) for entry in entries] for key in keys}
+    return PoseTable(numbers, convention, *row_labels(columns, len(entries)))
 
 
 def _matrices(matrices: NDArray[np.float64], convention: PoseConvention) -> NDArray[np.float64]:
