@@ -1,7 +1,6 @@
 """COLMAP models written by pycolmap: points land on the pixels that pycolmap says."""
 
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -128,23 +127,3 @@ def test_broken_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "none/sparse/0").mkdir(parents=True)
     with pytest.raises(InputError, match="no COLMAP model"):
         load_recording(tmp_path / "none", format="colmap")
-
-
-def test_missing_extra_names_the_install_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    make(tmp_path)
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(InputError, match=r"pip install 'evercal\[colmap\]'"):
-        load_recording(tmp_path)
-
-
-def test_models_without_rigs_are_read(tmp_path: Path) -> None:
-    make(tmp_path)
-    for name in ("rigs.bin", "frames.bin"):
-        (tmp_path / "sparse/0" / name).unlink()
-    frames = load_recording(tmp_path).train
-    assert len(frames) == 4
-    for i, frame in enumerate(frames):
-        assert frame.base_from_camera is not None
-        assert max(pose_distance(frame.base_from_camera.inverse(), camera_from_world(i))) < 1e-7

@@ -4,7 +4,6 @@ The files are as the package lerobot 0.4 (version 3) and 0.3 (version 2) writes 
 """
 
 import json
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -365,14 +364,4 @@ def test_image_paths_outside_the_dataset_are_refused(path: str, tmp_path: Path) 
         table = table.set_column(table.schema.get_field_index(WRIST), WRIST, cells)
         pq.write_table(table, file)
     with pytest.raises(InputError, match=f"image '{path}': the path"):
-        load_recording(root, options=options(root))
-
-
-@pytest.mark.parametrize("module", ["av", "pyarrow.parquet"])
-def test_missing_extra_names_the_install_command(
-    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root = make(tmp_path / "wave", "v2.1")
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(InputError, match=r"pip install 'evercal\[lerobot\]'"):
         load_recording(root, options=options(root))

@@ -1,7 +1,6 @@
 """Bags of ROS 1 and ROS 2 and MCAP files, written by rosbags and read back."""
 
 import sqlite3
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -261,12 +260,3 @@ def test_damaged_bags_are_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="rosbags cannot read it") as caught:
             load_recording(file)
         assert "\n" not in str(caught.value)
-
-
-def test_missing_extra_names_the_install_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = recording("mcap").write(tmp_path)
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    with pytest.raises(InputError, match=r"pip install 'evercal\[bags\]'"):
-        load_recording(path)

@@ -1,7 +1,6 @@
 """Gripper poses from joints: a planar arm's closed form, the Panda's published parameters."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -223,11 +222,3 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "e.urdf.xacro").write_text("")
     with pytest.raises(InputError, match="'xacro' first"):
         RobotModel(tmp_path / "e.urdf.xacro")
-
-
-def test_missing_extra_names_the_install_command(
-    urdf: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "yourdfpy", None)
-    with pytest.raises(InputError, match=r"pip install 'evercal\[urdf\]'"):
-        RobotModel(urdf)
