@@ -1,4 +1,4 @@
-"""COLMAP models written by pycolmap: points land on the pixels that pycolmap says."""
+"""COLMAP models written by pycolmap: projections agree with pycolmap."""
 
 import shutil
 from pathlib import Path
@@ -30,7 +30,7 @@ def camera_from_world(i: int) -> SE3:
 
 def make(root: Path, model: str = "PINHOLE", kind: str = "bin", images: int = 4,
          folder: str = "sparse/0", params: list[float] | None = None) -> Any:  # fmt: skip
-    """A model with two cameras of a kind and its images, the last of which has no pose."""
+    """Write a model with two cameras, its images, and one image without a pose."""
     reconstruction = pycolmap.Reconstruction()
     for number in (1, 2):
         values = [float(v) for v in params or MODELS[model]]
@@ -61,10 +61,10 @@ def make(root: Path, model: str = "PINHOLE", kind: str = "bin", images: int = 4,
 @pytest.mark.parametrize("model", MODELS)
 def test_projections_agree_with_colmap(model: str, kind: str, tmp_path: Path) -> None:
     written = make(tmp_path, model, kind)
-    scene = load_recording(tmp_path)
-    assert [frame.name for frame in scene.train] == [f"sub/image-{i}.png" for i in range(8, 12)]
-    assert (scene.test, scene.untracked) == ((), 1)
-    for i, frame in enumerate(scene.train):
+    recording = load_recording(tmp_path)
+    assert [frame.name for frame in recording.train] == [f"sub/image-{i}.png" for i in range(8, 12)]
+    assert (recording.test, recording.untracked) == ((), 1)
+    for i, frame in enumerate(recording.train):
         assert frame.base_from_camera is not None
         assert int(frame.read_image().mean()) == i
         assert max(pose_distance(frame.base_from_camera.inverse(), camera_from_world(i))) < 1e-7
@@ -74,7 +74,7 @@ def test_projections_agree_with_colmap(model: str, kind: str, tmp_path: Path) ->
             # COLMAP counts from the image's corner, this program from its first pixel's centre.
             ours = frame.camera.project(frame.base_from_camera.inverse().apply(point.xyz)) + 0.5
             np.testing.assert_allclose(ours, expected, atol=1e-6)
-    assert "are those of COLMAP" in scene.notes[0]
+    assert "are those of COLMAP" in recording.notes[0]
 
 
 @pytest.mark.parametrize("folder", [".", "sparse", "sparse/0", "colmap/sparse/0"])
@@ -89,17 +89,17 @@ def test_model_in_any_usual_folder_is_read(folder: str, tmp_path: Path) -> None:
 def test_largest_of_several_models_is_read(tmp_path: Path) -> None:
     make(tmp_path, images=4, folder="sparse/0")
     make(tmp_path, images=6, folder="sparse/1")
-    scene = load_recording(tmp_path)
-    assert len(scene.train) == 6
-    assert scene.notes[1] == "took model 1, the one with the most images (0: 4, 1: 6)"
+    recording = load_recording(tmp_path)
+    assert len(recording.train) == 6
+    assert recording.notes[1] == "took model 1, the one with the most images (0: 4, 1: 6)"
 
 
 def test_distorted_model_is_ignored(tmp_path: Path) -> None:
     make(tmp_path, "PINHOLE", images=3, folder="sparse/0")
     make(tmp_path, "OPENCV", images=4, folder="distorted/sparse/0")  # one image more
-    scene = load_recording(tmp_path)
-    assert len(scene.train) == 3
-    assert scene.train[0].camera.distortion == ()
+    recording = load_recording(tmp_path)
+    assert len(recording.train) == 3
+    assert recording.train[0].camera.distortion == ()
 
 
 @pytest.mark.parametrize(

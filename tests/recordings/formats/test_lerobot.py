@@ -149,22 +149,22 @@ def options(root: Path, **more: Any) -> ReadOptions:
 )
 def test_datasets_are_read(version: str, kind: str, codec: str, tmp_path: Path) -> None:
     root = make(tmp_path / "wave", version, kind, codec)
-    scene = load_recording(root, options=options(root))
-    assert scene.name == "wave"
-    assert [frame.name for frame in scene.train[6:8]] == [
+    recording = load_recording(root, options=options(root))
+    assert recording.name == "wave"
+    assert [frame.name for frame in recording.train[6:8]] == [
         "episode_000000/000006",
         "episode_000001/000000",
     ]
     where = [divmod(i, LENGTH) for i in range(EPISODES * LENGTH)]
     with ThreadPoolExecutor(3) as pool:  # in any order
-        images = list(pool.map(lambda frame: frame.read_image(), scene.train[::-1]))[::-1]
-    for frame, image, (episode, number) in zip(scene.train, images, where, strict=True):
+        images = list(pool.map(lambda frame: frame.read_image(), recording.train[::-1]))[::-1]
+    for frame, image, (episode, number) in zip(recording.train, images, where, strict=True):
         assert frame.camera == Camera(96, 64, 80, 80, 47.5, 31.5)
         off = np.abs(image[8:24, 8:40].mean((0, 1)) - picture(episode, number)[16, 16])
         assert off.max() < (5 if kind == "video" else 1e-9)  # frames differ by 10
         assert frame.base_from_gripper is not None
         assert max(pose_distance(frame.base_from_gripper, pose(episode, number))) < 1e-6
-    assert scene.notes[0].startswith("gripper poses are observation.ee: ")
+    assert recording.notes[0].startswith("gripper poses are observation.ee: ")
 
 
 def test_joints_and_a_urdf_in_radians_or_degrees(tmp_path: Path) -> None:
@@ -173,9 +173,9 @@ def test_joints_and_a_urdf_in_radians_or_degrees(tmp_path: Path) -> None:
     (root / "arm.urdf").write_text(URDF)
     for convention, unit in ((None, 1.0), ("rad", 1.0), ("deg", np.pi / 180)):
         read = options(root, urdf=root / "arm.urdf", pose_convention=convention, every=4)
-        scene = load_recording(root, options=read)
-        assert len(scene.train) == 6
-        for i, frame in enumerate(scene.train):
+        recording = load_recording(root, options=read)
+        assert len(recording.train) == 6
+        for i, frame in enumerate(recording.train):
             shoulder, reach = joints(*divmod(4 * i, LENGTH))
             expected = SE3.exp([0, 0, 0, 0, 0, shoulder * unit]) @ SE3.exp(
                 [0.5 + reach, 0, 0, 0, 0, 0]
@@ -309,12 +309,12 @@ def test_truncated_video_is_refused(tmp_path: Path) -> None:
     root = make(tmp_path / "wave", "v2.1")
     video = root / "videos/chunk-000" / WRIST / "episode_000000.mp4"
     write_video(video, [picture(0, n) for n in range(3)], "libx264")
-    scene = load_recording(root, options=options(root))
+    recording = load_recording(root, options=options(root))
     with pytest.raises(InputError, match=r"no frame at 0\.500 s; the video is cut off"):
-        scene.train[5].read_image()
+        recording.train[5].read_image()
     # The others can still be read.
-    assert scene.train[2].read_image().shape == (64, 96, 3)
-    assert scene.train[9].read_image().shape == (64, 96, 3)
+    assert recording.train[2].read_image().shape == (64, 96, 3)
+    assert recording.train[9].read_image().shape == (64, 96, 3)
 
 
 def test_other_versions_and_features_are_refused(tmp_path: Path) -> None:

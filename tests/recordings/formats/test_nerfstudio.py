@@ -1,4 +1,4 @@
-"""nerfstudio's transforms.json: points land on the pixels that its own formulas say."""
+"""nerfstudio's transforms.json: projections agree with its documented formulas."""
 
 import json
 from pathlib import Path
@@ -29,9 +29,9 @@ def look(eye: np.ndarray, target: np.ndarray, up: tuple[float, float, float]) ->
 
 
 def gl_pixel(matrix: np.ndarray, intrinsics: dict[str, float], point: np.ndarray) -> np.ndarray:
-    """Where a point is seen, x to the right and y down from the image's corner.
+    """Pixel of a point, x to the right and y down from the image's corner.
 
-    The camera looks along -z with y up; the lens is Brown's in the plane at distance one, y down.
+    The camera looks along -z with y up; distortion is Brown's model in the plane z = 1, y down.
     """
     x, y, z = np.linalg.solve(matrix, np.append(point, 1.0))[:3]
     assert z < 0
@@ -85,16 +85,16 @@ def test_projections_agree_with_the_documented_formulas(shared: bool, tmp_path: 
         write(tmp_path, entries(matrices), camera_model="OPENCV", **LENS)
     else:
         write(tmp_path, entries(matrices, **LENS))
-    scene = load_recording(tmp_path)
-    assert (len(scene.train), scene.test) == (5, ())
+    recording = load_recording(tmp_path)
+    assert (len(recording.train), recording.test) == (5, ())
     points = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 3))
-    for frame, matrix in zip(scene.train, matrices, strict=True):
+    for frame, matrix in zip(recording.train, matrices, strict=True):
         assert frame.read_image().shape == (36, 24, 3)  # portrait
         for point in points:
             np.testing.assert_allclose(
                 pixel_of(frame, point), gl_pixel(matrix, LENS, point), atol=1e-9
             )
-    assert "are those of transforms.json" in inspect_recording(scene).notes[0]
+    assert "are those of transforms.json" in inspect_recording(recording).notes[0]
 
 
 @settings(max_examples=20)
@@ -127,9 +127,9 @@ def test_test_filenames_are_test_frames(tmp_path: Path) -> None:
     names = [f"images/frame_{i:05d}.png" for i in range(4)]
     splits: dict[str, Any] = {"train_filenames": names[:1], "val_filenames": names[1:2]}
     write(tmp_path, entries(ring()), **LENS, **splits, test_filenames=[f"./{names[3]}"])
-    scene = load_recording(tmp_path)
-    assert [f.name[-6:-4] for f in scene.train] == ["00", "02", "04"]
-    assert [f.name[-6:-4] for f in scene.test] == ["01", "03"]
+    recording = load_recording(tmp_path)
+    assert [f.name[-6:-4] for f in recording.train] == ["00", "02", "04"]
+    assert [f.name[-6:-4] for f in recording.test] == ["01", "03"]
     assert load_recording(tmp_path / "transforms.json").name == tmp_path.name
 
 

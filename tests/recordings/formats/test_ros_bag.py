@@ -22,7 +22,7 @@ from .bags_of_messages import (
     Bag,
     arm,
     picture,
-    recording,
+    recorded_bag,
     refusal,
     refusal_of,
     shoulder_from_tool,
@@ -33,16 +33,16 @@ CAMERA = Camera(32, 24, 30.0, 30.0, 15.0, 11.0, (0.1, 0.0, 0.0, 0.0, 0.0))
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_bags_are_read(kind: str, tmp_path: Path) -> None:
-    path = recording(kind).write(tmp_path)
+    path = recorded_bag(kind).write(tmp_path)
     paths = [path]
     if kind != "ros1":  # the file inside the folder is a recording too
         paths += [p for p in path.iterdir() if p.suffix != ".yaml"]
-    for place in paths:
-        scene = load_recording(place)
-        assert scene.name == "wave"
-        assert len(scene.train) == 6
-        assert (scene.test, scene.untracked) == ((), 2)
-        for i, frame in enumerate(scene.train):
+    for path_inside in paths:
+        recording = load_recording(path_inside)
+        assert recording.name == "wave"
+        assert len(recording.train) == 6
+        assert (recording.test, recording.untracked) == ((), 2)
+        for i, frame in enumerate(recording.train):
             assert frame.camera == CAMERA
             np.testing.assert_array_equal(frame.read_image(), picture(i))
             assert frame.base_from_camera is None
@@ -51,13 +51,13 @@ def test_bags_are_read(kind: str, tmp_path: Path) -> None:
             metres, radians = pose_distance(frame.base_from_gripper, expected)
             assert metres < 1e-9
             assert radians < 1e-7
-        assert scene.notes[0].startswith("2 of 8 images were taken outside the recorded poses")
-        assert scene.notes[1] == "poses of the gripper are those of tool0 in base_link, from tf"
-        assert "tf also has the camera (camera_optical)" in scene.notes[2]
+        assert recording.notes[0].startswith("2 of 8 images were taken outside the recorded poses")
+        assert recording.notes[1] == "poses of the gripper are those of tool0 in base_link, from tf"
+        assert "tf also has the camera (camera_optical)" in recording.notes[2]
 
 
 def test_old_ros2_bags_without_definitions_are_read(tmp_path: Path) -> None:
-    path = recording("sqlite3").write(tmp_path)
+    path = recorded_bag("sqlite3").write(tmp_path)
     with sqlite3.connect(next(path.glob("*.db3"))) as database:
         database.execute("DROP TABLE message_definitions")
         database.execute("UPDATE schema SET schema_version = 3")
@@ -66,9 +66,9 @@ def test_old_ros2_bags_without_definitions_are_read(tmp_path: Path) -> None:
 
 
 def test_every_second_image_is_taken(tmp_path: Path) -> None:
-    path = recording("ros1").write(tmp_path)
-    scene = load_recording(path, options=ReadOptions(every=2))
-    assert [frame.name for frame in scene.train] == ["000000", "000002", "000004"]
+    path = recorded_bag("ros1").write(tmp_path)
+    recording = load_recording(path, options=ReadOptions(every=2))
+    assert [frame.name for frame in recording.train] == ["000000", "000002", "000004"]
     with pytest.raises(InputError, match="--every 0: give a number >= 1"):
         load_recording(path, options=ReadOptions(every=0))
 
@@ -82,14 +82,14 @@ def test_compressed_images_are_read_by_threads_and_copied(tmp_path: Path) -> Non
         bag.compressed(at, "/cam/image_raw/compressed", data, what)
         files.append((ending, data))
     bag.info("/cam/camera_info")
-    scene = load_recording(bag.write(tmp_path))
+    recording = load_recording(bag.write(tmp_path))
     with ThreadPoolExecutor(4) as pool:
-        images = list(pool.map(lambda frame: frame.read_image(), scene.train * 3))
+        images = list(pool.map(lambda frame: frame.read_image(), recording.train * 3))
     for i, image in enumerate(images):
         # Where colours meet, a JPEG of that size is far off.
         off = np.abs(image.astype(int) - picture(i % 6).astype(int))
         assert np.median(off) <= 1 if i % 2 else off.max() == 0
-    generic.write(tmp_path / "out", scene)
+    generic.write(tmp_path / "out", recording)
     for (ending, data), frame in zip(files, load_recording(tmp_path / "out").train, strict=False):
         assert isinstance(frame.image, Path)
         assert frame.image.suffix == ending
@@ -98,7 +98,7 @@ def test_compressed_images_are_read_by_threads_and_copied(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_images_may_be_read_while_messages_are_iterated(kind: str, tmp_path: Path) -> None:
-    frames = load_recording(recording(kind).write(tmp_path)).train
+    frames = load_recording(recorded_bag(kind).write(tmp_path)).train
     image = frames[0].image
     assert isinstance(image, BagImage)
     with ThreadPoolExecutor(1) as pool:  # a deadlock would be in a thread with a time limit
@@ -168,17 +168,17 @@ def test_images_without_stamps_use_the_time_of_recording(tmp_path: Path) -> None
     bag = arm(Bag("mcap"))
     bag.image(0.5, "/cam/image_raw", picture(0), stamped=False)
     bag.info("/cam/camera_info")
-    scene = load_recording(bag.write(tmp_path))
-    pose = scene.train[0].base_from_gripper
+    recording = load_recording(bag.write(tmp_path))
+    pose = recording.train[0].base_from_gripper
     assert pose is not None
     # Messages are recorded 5 ms after their stamps.
     expected = BASE_FROM_SHOULDER @ shoulder_from_tool(0.505)
     assert max(pose_distance(pose, expected)) < 1e-6
-    assert "carry no stamps" in scene.notes[0]
+    assert "carry no stamps" in recording.notes[0]
 
 
 def test_missing_topics_are_named(tmp_path: Path) -> None:
-    whole, parts = recording("mcap"), {}
+    whole, parts = recorded_bag("mcap"), {}
     for missing, topic in (
         ("images", "/cam/image_raw"),
         ("tf", "/tf"),
@@ -196,12 +196,12 @@ def test_missing_topics_are_named(tmp_path: Path) -> None:
     assert "no camera_info for /cam/image_raw (/cam/camera_info is expected" in parts["info"]
     camera_file = tmp_path / "camera.txt"
     camera_file.write_text("31 0 15\n0 31 11\n0 0 1\n")
-    scene = load_recording(tmp_path / "info" / "wave", options=ReadOptions(camera=camera_file))
-    assert scene.train[0].camera == Camera(32, 24, 31, 31, 15, 11)
+    recording = load_recording(tmp_path / "info" / "wave", options=ReadOptions(camera=camera_file))
+    assert recording.train[0].camera == Camera(32, 24, 31, 31, 15, 11)
 
 
 def test_several_image_topics_need_a_choice(tmp_path: Path) -> None:
-    bag = recording("sqlite3")
+    bag = recorded_bag("sqlite3")
     bag.image(0.4, "/left/image_raw", picture(9))
     bag.image(0.4, "/depth/image_raw", np.ones((24, 32), np.uint16), "16UC1")
     (tmp_path / "a").mkdir()
@@ -215,8 +215,8 @@ def test_several_image_topics_need_a_choice(tmp_path: Path) -> None:
     camera_file = tmp_path / "camera.txt"
     camera_file.write_text("31 0 15\n0 31 11\n0 0 1\n")
     options = ReadOptions(image_topic="/left/image_raw", camera=camera_file)
-    scene = load_recording(path / "wave", options=options)
-    np.testing.assert_array_equal(scene.train[0].read_image(), picture(9))
+    recording = load_recording(path / "wave", options=options)
+    np.testing.assert_array_equal(recording.train[0].read_image(), picture(9))
     with pytest.raises(InputError, match="no images on topic '/no'; images are on /cam/image_raw"):
         load_recording(path / "wave", options=ReadOptions(image_topic="/no"))
     (tmp_path / "b").mkdir()
@@ -251,7 +251,7 @@ def test_unsupported_encodings_are_refused(tmp_path: Path) -> None:
 
 
 def test_damaged_bags_are_refused(tmp_path: Path) -> None:
-    path = recording("ros1").write(tmp_path)
+    path = recorded_bag("ros1").write(tmp_path)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     cut = tmp_path / "cut.mcap"

@@ -46,15 +46,15 @@ def apartment(tmp_path: Path) -> Path:
 
 
 def test_first_sequence_is_for_testing(apartment: Path) -> None:
-    scene = load_recording(apartment)
-    assert scene.name == "kitchen"
-    assert [frame.name for frame in scene.test] == ["frame-000000", "frame-000001"]
-    assert [frame.name for frame in scene.train] == ["frame-000002", "frame-000004"]
-    assert scene.untracked == 1
-    pose = scene.train[1].base_from_camera
+    recording = load_recording(apartment)
+    assert recording.name == "kitchen"
+    assert [frame.name for frame in recording.test] == ["frame-000000", "frame-000001"]
+    assert [frame.name for frame in recording.train] == ["frame-000002", "frame-000004"]
+    assert recording.untracked == 1
+    pose = recording.train[1].base_from_camera
     assert pose is not None
     assert max(pose_distance(pose, SE3.exp([1.0, 4, 0.0, 0.4, 0.2, 0.3]))) < 1e-5
-    assert abs(float(scene.train[1].read_image().mean()) - 160) < 2
+    assert abs(float(recording.train[1].read_image().mean()) - 160) < 2
 
 
 def test_camera_is_scaled_to_the_images(apartment: Path) -> None:
@@ -68,7 +68,7 @@ def test_suite_loads_scenes_and_names_missing_ones(apartment: Path) -> None:
     data = apartment.parents[1]
     write(data / "apt1" / "living")
     scenes = load_suite("i12s", data, ["apt1/living", "apt1/kitchen"])
-    assert [scene.name for scene in scenes] == ["apt1-kitchen", "apt1-living"]
+    assert [recording.name for recording in scenes] == ["apt1-kitchen", "apt1-living"]
     with pytest.raises(InputError, match="apt2/bed is missing; get it from https://graphics"):
         load_suite("i12s", data)
 

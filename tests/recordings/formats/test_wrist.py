@@ -1,4 +1,4 @@
-"""A folder of images and gripper poses: rows find their images by name, by time or in order."""
+"""A folder of images and gripper poses, paired by name, by time or in order."""
 
 import json
 from collections.abc import Sequence
@@ -40,9 +40,9 @@ def make_folder(root: Path, names: Sequence[str], poses: SE3 | None, folder: str
     return root
 
 
-def assert_paired(scene: Recording, names: Sequence[str], poses: SE3) -> None:
-    assert [frame.name for frame in scene.train] == list(names)
-    for frame, pose in zip(scene.train, poses, strict=True):
+def assert_paired(recording: Recording, names: Sequence[str], poses: SE3) -> None:
+    assert [frame.name for frame in recording.train] == list(names)
+    for frame, pose in zip(recording.train, poses, strict=True):
         assert frame.base_from_camera is None
         assert frame.base_from_gripper is not None
         assert max(pose_distance(frame.base_from_gripper, pose)) < 1e-9
@@ -166,8 +166,8 @@ def test_camera_file_is_chosen_and_must_fit_the_images(tmp_path: Path) -> None:
     (tmp_path / "camera.json").rename(tmp_path / "other.json")
     with pytest.raises(InputError, match=r"no camera file in it; name the file .* --camera"):
         load_recording(tmp_path)
-    scene = load_recording(tmp_path, options=ReadOptions(camera=tmp_path / "other.json"))
-    assert scene.train[0].camera == CAMERA
+    recording = load_recording(tmp_path, options=ReadOptions(camera=tmp_path / "other.json"))
+    assert recording.train[0].camera == CAMERA
     (tmp_path / "camera.txt").write_text("30 0 15\n0 31 11\n0 0 1\n")
     assert load_recording(tmp_path).train[0].camera == Camera(32, 24, 30.0, 31.0, 15.0, 11.0)
     (tmp_path / "camera.txt").unlink()
@@ -223,6 +223,6 @@ def test_other_kinds_of_pose_files_are_read(tmp_path: Path) -> None:
     numbers = "\n".join(" ".join(f"{v:.12g}" for v in row) for row in rows)
     (tmp_path / "base_from_gripper.txt").write_text(numbers)
     with pytest.raises(InputError, match=r"base_from_gripper\.txt"):
-        load_recording(tmp_path)  # nothing says how the numbers are meant
-    scene = load_recording(tmp_path, options=ReadOptions(pose_convention="ur:mm"))
-    assert_paired(scene, names, poses)
+        load_recording(tmp_path)  # the convention is missing
+    recording = load_recording(tmp_path, options=ReadOptions(pose_convention="ur:mm"))
+    assert_paired(recording, names, poses)

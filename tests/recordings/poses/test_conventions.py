@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 def rotation_about(axis: str, angle: float) -> Array:
-    """About x, y or z, as a textbook has it."""
+    """Elementary rotation about x, y or z."""
     c, s = math.cos(angle), math.sin(angle)
     return {
         "x": np.array([[1, 0, 0], [0, c, -s], [0, s, c]]),

@@ -120,10 +120,10 @@ def test_folder_with_joints_and_a_urdf_is_a_recording(tmp_path: Path, urdf: Path
     with pytest.raises(InputError, match="no URDF is beside it; give --urdf"):
         load_recording(tmp_path)
     options = ReadOptions(urdf=urdf)
-    scene = load_recording(tmp_path, options=options)
+    recording = load_recording(tmp_path, options=options)
     expected = [planar(0.25, np.deg2rad(-30), 0.2), planar(1, np.deg2rad(5), 0)]
     expected.append(planar(0.5, np.pi / 2, 0.1))
-    for frame, pose in zip(scene.train, expected, strict=True):
+    for frame, pose in zip(recording.train, expected, strict=True):
         assert frame.base_from_gripper is not None
         assert max(pose_distance(frame.base_from_gripper, pose)) < 1e-9
     degrees = ReadOptions(urdf=urdf, pose_convention="deg")  # of the column that does not say
@@ -131,7 +131,7 @@ def test_folder_with_joints_and_a_urdf_is_a_recording(tmp_path: Path, urdf: Path
     assert pose_in_degrees is not None
     expected = planar(np.deg2rad(0.25), np.deg2rad(-30), 0.2)
     assert max(pose_distance(pose_in_degrees, expected)) < 1e-7
-    assert scene.notes[0] == "gripper poses are those of tip in base, from planar.urdf"
+    assert recording.notes[0] == "gripper poses are those of tip in base, from planar.urdf"
     with pytest.raises(InputError, match="has no link 'hand'; its links are base, upper"):
         load_recording(tmp_path, options=ReadOptions(urdf=urdf, gripper_frame="hand"))
 

@@ -1,4 +1,4 @@
-"""Names of images and times are found under the same names in every kind of file."""
+"""Image names and times have the same labels in every kind of file."""
 
 import json
 from pathlib import Path

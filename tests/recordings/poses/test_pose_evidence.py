@@ -1,4 +1,4 @@
-"""What images say of stated rotations: sound poses raise no doubt, spoiled ones are named."""
+"""Comparison of stated rotations with images: correct poses pass, wrong ones are reported."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -66,7 +66,7 @@ def as_degrees(poses: SE3) -> SE3:
     return SE3(turned, poses.translation_m)
 
 
-SPOILED: dict[str, tuple[Callable[[SE3], SE3], str]] = {
+WRONG: dict[str, tuple[Callable[[SE3], SE3], str]] = {
     "inverse": (lambda poses: poses.inverse(), "they are camera_from_base, the inverse"),
     "opengl": (lambda poses: poses @ FLIP, "they are with OpenGL's camera axes"),
     "both": (lambda poses: (poses @ FLIP).inverse(), "the inverse with OpenGL's camera axes"),
@@ -76,11 +76,11 @@ SPOILED: dict[str, tuple[Callable[[SE3], SE3], str]] = {
 }
 
 
-@pytest.mark.parametrize("how", SPOILED)
+@pytest.mark.parametrize("how", WRONG)
 def test_wrong_camera_poses_are_reported(bedroom: tuple[Frame, ...], how: str) -> None:
-    spoil, message = SPOILED[how]
+    distort, message = WRONG[how]
     assert rotation_warnings(bedroom, stated(bedroom), True) == []
-    (warning,) = rotation_warnings(bedroom, spoil(stated(bedroom)), True)
+    (warning,) = rotation_warnings(bedroom, distort(stated(bedroom)), True)
     assert warning.startswith("the camera rotates differently from the images, by ")
     assert message in warning
 

@@ -1,4 +1,4 @@
-"""Files of robot poses: each kind is read as it was written; what is left open is asked for."""
+"""Pose files: every kind is read, and ambiguous files need a convention."""
 
 import csv
 import io
