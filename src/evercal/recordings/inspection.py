@@ -73,8 +73,8 @@ def inspect_recording(recording: Recording) -> Inspection:
     if len(train) > 1:
         metres, radians = pose_distance(poses[:-1], poses[1:])
     extent = np.ptp(poses.translation_m, axis=0) if len(train) else np.zeros(3)
-    lost = recording.untracked + len(both) - len(train) - len(test)
-    warnings = [*_warn_frames(len(train), len(test), lost, owner), *_warn_cameras(cameras)]
+    untracked = recording.untracked + len(both) - len(train) - len(test)
+    warnings = [*_warn_frames(len(train), len(test), untracked, owner), *_warn_cameras(cameras)]
     if metres is not None:
         warnings += _warn_motion(poses, extent, float(np.median(metres)), owner == "camera")
         warnings += rotation_warnings(train, poses, owner == "camera")
@@ -86,7 +86,7 @@ def inspect_recording(recording: Recording) -> Inspection:
         poses=owner,
         train=len(train),
         test=len(test),
-        untracked=lost,
+        untracked=untracked,
         cameras=_camera_lines(cameras),
         extent_m=(x, y, z),
         step_median_m=None if metres is None else float(np.median(metres)),
@@ -130,7 +130,7 @@ def _camera_line(camera: Camera, count: int) -> str:
     )
 
 
-def _warn_frames(train: int, test: int, lost: int, owner: str) -> list[str]:
+def _warn_frames(train: int, test: int, untracked: int, owner: str) -> list[str]:
     warnings = []
     if train < MIN_TRAIN_FRAMES:
         warnings.append(
@@ -138,8 +138,9 @@ def _warn_frames(train: int, test: int, lost: int, owner: str) -> list[str]:
         )
     if not test and owner != "gripper":
         warnings.append("no test frame with a pose; 'evercal evaluate' has nothing to measure on")
-    if lost > (train + test + lost) / 2:
-        warnings.append(f"{lost} of {train + test + lost} frames have no pose; check the tracking")
+    total = train + test + untracked
+    if untracked > total / 2:
+        warnings.append(f"{untracked} of {total} frames have no pose; check the tracking")
     return warnings
 
 

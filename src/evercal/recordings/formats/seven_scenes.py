@@ -12,14 +12,18 @@ untracked frames, which are left out and counted. All sequences come from one ca
 are not read.
 """
 
-import itertools
 import os
 import re
 from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.recordings.formats.pose_files import read_numbers, tracked_frames
+from evercal.recordings.formats.frame_files import (
+    colour_images,
+    frame_name,
+    read_numbers,
+    tracked_frames,
+)
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import image_size
 
@@ -47,7 +51,9 @@ def load(root: str | os.PathLike[str]) -> Recording:
     shared = sorted({folder.name for folder in splits[0]} & {folder.name for folder in splits[1]})
     if shared:
         raise InputError(f"{root}: {shared[0]} is in both {_SPLITS[0]} and {_SPLITS[1]}; keep one")
-    images = [[image for folder in folders for image in _images(folder)] for folders in splits]
+    images = [
+        [image for folder in folders for image in colour_images(folder)] for folders in splits
+    ]
     if not (images[0] or images[1]):
         raise InputError(f"{root}: {_SPLITS[0]} and {_SPLITS[1]} are empty; name a sequence in one")
     camera = _camera(root, (images[0] + images[1])[0])
@@ -80,21 +86,9 @@ def _sequences(root: Path, split: str) -> list[Path]:
     return folders
 
 
-def _images(folder: Path) -> list[Path]:
-    # os.listdir and one sort: globbing a thousand files twice dominates the loading time.
-    names = sorted(name for name in os.listdir(folder) if re.search(r"\.color\.(png|jpe?g)$", name))
-    if not names:
-        raise InputError(f"{folder}: no images; expected frame-XXXXXX.color.png or .jpg")
-    for first, second in itertools.pairwise(map(_stem, names)):
-        if first == second:
-            raise InputError(f"{folder}: {first}.color is there as .png and as .jpg; keep one")
-    return [folder / name for name in names]
-
-
 def _frames(images: list[Path], camera: Camera) -> tuple[Frame, ...]:
-    names = [f"{image.parent.name}/{_stem(image.name)}" for image in images]
-    poses = [image.with_name(_stem(image.name) + ".pose.txt") for image in images]
-    return tracked_frames(names, images, poses, camera)
+    names = [f"{image.parent.name}/{frame_name(image.name)}" for image in images]
+    return tracked_frames(names, images, camera)
 
 
 def _camera(root: Path, image: Path) -> Camera:
@@ -108,7 +102,3 @@ def _camera(root: Path, image: Path) -> Camera:
         return Camera.from_matrix(matrix, width, height)
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
-
-
-def _stem(name: str) -> str:
-    return name[: name.rindex(".color.")]

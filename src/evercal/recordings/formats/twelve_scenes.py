@@ -17,8 +17,8 @@ from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.recordings.formats.pose_files import tracked_frames
-from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.formats.frame_files import colour_images, frame_name, tracked_frames
+from evercal.recordings.frame import Recording
 from evercal.recordings.images import image_size
 
 
@@ -34,21 +34,14 @@ def load(root: str | os.PathLike[str]) -> Recording:
         InputError: A file is missing or broken.
     """
     root = Path(root)
-    images = _images(root)
+    images = colour_images(root / "data")
     split = _test_count(root, len(images))
     camera = _camera(root, images[0])
-    train, test = (_frames(part, camera) for part in (images[split:], images[:split]))
+    train, test = (
+        tracked_frames([frame_name(image.name) for image in part], part, camera)
+        for part in (images[split:], images[:split])
+    )
     return Recording(root.resolve().name, train, test, len(images) - len(train) - len(test))
-
-
-def _images(root: Path) -> list[Path]:
-    folder = root / "data"
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; expected frame-XXXXXX.color.jpg in it")
-    names = [name for name in os.listdir(folder) if re.search(r"\.color\.(jpe?g|png)$", name)]
-    if not names:
-        raise InputError(f"{folder}: no images; expected frame-XXXXXX.color.jpg")
-    return [folder / name for name in sorted(names)]
 
 
 def _test_count(root: Path, frames: int) -> int:
@@ -83,9 +76,3 @@ def _text(file: Path, contents: str) -> str:
         return file.read_text()
     except (OSError, UnicodeDecodeError):
         raise InputError(f"{file}: missing; {contents}") from None
-
-
-def _frames(images: list[Path], camera: Camera) -> tuple[Frame, ...]:
-    names = [image.name[: image.name.rindex(".color.")] for image in images]
-    poses = [image.with_name(f"{name}.pose.txt") for image, name in zip(images, names, strict=True)]
-    return tracked_frames(names, images, poses, camera)

@@ -1,5 +1,8 @@
-"""Text files with one 4x4 pose each, as in 7-Scenes and 12-Scenes."""
+"""Frames of 7-Scenes and 12-Scenes: frame-000000.color.png or .jpg and frame-000000.pose.txt."""
 
+import itertools
+import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,22 +17,44 @@ from evercal.recordings.frame import Frame
 _ROTATION_TOLERANCE = 1e-2
 
 
+def colour_images(folder: Path) -> list[Path]:
+    """Colour images of a folder, sorted by name.
+
+    Raises:
+        InputError: There are none, or a frame has two.
+    """
+    # os.listdir and one sort: globbing a thousand files twice dominates the loading time.
+    names = os.listdir(folder) if folder.is_dir() else []
+    names = sorted(name for name in names if re.search(r"\.color\.(png|jpe?g)$", name))
+    if not names:
+        raise InputError(f"{folder}: no images; expected frame-XXXXXX.color.png or .jpg")
+    for first, second in itertools.pairwise(map(frame_name, names)):
+        if first == second:
+            raise InputError(f"{folder}: {first}.color is there as .png and as .jpg; keep one")
+    return [folder / name for name in names]
+
+
+def frame_name(image: str) -> str:
+    """Name of a frame, such as frame-000000, from the name of its image."""
+    return image[: image.rindex(".color.")]
+
+
 def tracked_frames(
-    names: Sequence[str], images: Sequence[Path], files: Sequence[Path], camera: Camera
+    names: Sequence[str], images: Sequence[Path], camera: Camera
 ) -> tuple[Frame, ...]:
-    """Build frames from pose files and drop poses with inf or nan.
+    """Build frames from images and their pose files, and drop poses with inf or nan.
 
     Args:
         names: (n,) frame names.
-        images: (n,) image files.
-        files: (n,) pose files, 4x4 base_from_camera in metres.
+        images: (n,) image files, each beside a 4x4 base_from_camera in metres.
         camera: Intrinsics of all images.
 
     Raises:
         InputError: A pose file is missing or broken.
     """
     frames = []
-    for name, image, file in zip(names, images, files, strict=True):
+    for name, image in zip(names, images, strict=True):
+        file = image.with_name(f"{frame_name(image.name)}.pose.txt")
         matrix = read_numbers(file, 16, "4x4 base_from_camera").reshape(4, 4)
         if np.isfinite(matrix).all():
             frames.append(Frame(name, image, camera, _pose(file, matrix)))
