@@ -177,6 +177,8 @@ BREAKS = [
     (("untracked",), "many", "'untracked' is a count"),
     ((*FIRST, "image"), "images/none.png", r"images/none\.png: named in .*scene\.json but missing"),
     ((*FIRST, "image"), "../secret.png", "stays inside"),
+    ((*FIRST, "image"), "images\\..\\..\\secret.png", "stays inside"),
+    ((*FIRST, "image"), "C:/secret.png", "relative"),
     ((*FIRST, "image"), "/etc/hosts", "relative"),
     ((*FIRST, "camera"), "9", r"frame 0: 'camera' is one of \['0', '1'\], got '9'"),
     ((*FIRST, "camera"), [], "frame 0: 'camera'"),

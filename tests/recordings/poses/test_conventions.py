@@ -97,15 +97,6 @@ seeds = st.integers(0, 2**32 - 1)
 names = st.sampled_from(sorted(CONVENTIONS))
 
 
-@given(names, seeds)
-@settings(deadline=None, max_examples=200)
-def test_written_numbers_represent_the_pose(name: str, seed: int) -> None:
-    pose = drawn(seed)
-    numbers = numbers_from_poses(pose, CONVENTIONS[name])
-    assert numbers.shape == (CONVENTIONS[name].count,)
-    np.testing.assert_allclose(twin(name, numbers), pose.matrix(), atol=1e-12)
-
-
 @given(st.sampled_from(sorted(ROTATIONS)), seeds)
 @settings(deadline=None, max_examples=200)
 def test_read_poses_agree_with_their_numbers(name: str, seed: int) -> None:

@@ -9,7 +9,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PureWindowsPath
 from types import TracebackType
 from typing import Any, Literal, Self
 
@@ -352,9 +352,10 @@ def path_inside(path: object, what: str) -> str:
     Raises:
         ValueError: The path is empty, absolute or contains "..".
     """
-    if not isinstance(path, str) or not path or PurePosixPath(path).is_absolute():
+    # Windows paths split at both kinds of slashes and have an anchor for drives as well.
+    if not isinstance(path, str) or not path or PureWindowsPath(path).anchor:
         raise ValueError(f"{what} is a path relative to the folder, got {path!r}")
-    if ".." in PurePosixPath(path).parts:
+    if ".." in PureWindowsPath(path).parts:
         raise ValueError(f"{what} stays inside the folder, got {path!r}")
     return path
 
