@@ -26,9 +26,9 @@ class Inspect:
 
     def run(self) -> int:
         """Read the recording and some of its images."""
-        from evercal.recordings.inspection import inspect_scene
+        from evercal.recordings.inspection import inspect_recording
 
-        found = inspect_scene(self.reading.recording(self.scene))
+        found = inspect_recording(self.reading.recording(self.scene))
         if self.json:
             print_json(asdict(found))
             return 0

@@ -138,11 +138,8 @@ def _read_poses(path: Path, role: str, convention: str | None) -> RobotPoses:
     """Read a table of poses; messages name its role and its own option."""
     if not path.exists():
         raise InputError(f"{path}: file of {role} poses is missing; check --{role}-poses")
-    try:
-        return read_robot_poses(path, convention)
-    except InputError as error:
-        message = str(error).replace("--convention", f"--{role}-convention")
-        raise InputError(message.replace("robot poses", f"{role} poses")) from None
+    what = f"file of {role} poses"
+    return read_robot_poses(path, convention, what=what, option=f"--{role}-convention")
 
 
 def _is_board_file(path: Path) -> bool:
