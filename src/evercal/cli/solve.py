@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import arg
 
 from evercal.cli.calibrate import calibration_lines
-from evercal.cli.console import print_json, print_next
-from evercal.cli.output_file import require_writable
+from evercal.cli.console import print_json, print_next, require_writable
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
@@ -47,7 +46,7 @@ class Solve:
 
     def run(self) -> int:
         """Solve, write the calibration and print it."""
-        require_writable(self.out)
+        require_writable(self.out, "--out")
         from evercal.calibration.verdict import tier
 
         source = {
