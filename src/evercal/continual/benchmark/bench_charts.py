@@ -66,7 +66,7 @@ def scene_bars(methods: Mapping[str, ArrayLike], scenes: Sequence[str]) -> bytes
     Raises:
         ValueError: The number of accuracies differs from the number of scenes.
     """
-    figure = new_figure(1.6 + 0.22 * len(scenes) * (len(methods) + 1), 3.2)
+    figure = new_figure(max(5.4, 1.6 + 0.22 * len(scenes) * (len(methods) + 1)), 3.2)
     panel = figure.subplots()
     width = 1.0 / (len(methods) + 1)
     for index, (name, values) in enumerate(methods.items()):
