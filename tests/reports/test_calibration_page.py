@@ -129,8 +129,8 @@ def test_checks_ellipsoid_and_source_are_shown() -> None:
     assert reader.row("difference between two halves of the data")[1:] == ["0.31", "0.013"]
     assert reader.row("error on held-out data")[1:] == ["2.25", "-"]
     # sqrt of 7.815, the 95 % point of chi squared, times the standard deviations.
-    assert "half axes are 0.84, 0.56 and 0.28 mm" in reader.text("p")
-    assert "along (0.00, 0.00, 1.00) of panda_link0, 0 deg from" in reader.text("p")
+    assert "half axes are 0.84, 0.56 and 0.28 mm" in reader.text("figcaption")
+    assert "along (0.00, 0.00, 1.00) of panda_link0, 0 deg from" in reader.text("figcaption")
     assert "landmarks and lens; scatter" in reader.text("figcaption")
     for name, value in (
         ("command", "calibrate"),

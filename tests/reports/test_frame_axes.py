@@ -25,12 +25,16 @@ GREY = np.full((480, 640, 3), 128, np.uint8)
 @given(seed=st.integers(0, 10_000), camera=st.sampled_from([PINHOLE, DISTORTED]))
 def test_projections_agree_with_opencv(seed: int, camera: Camera) -> None:
     rng = np.random.default_rng(seed)
-    camera_from_frame = pose(rng.normal(0, 1, 4), [*rng.uniform(-0.2, 0.2, 2), rng.uniform(0.8, 2.0)])
+    camera_from_frame = pose(
+        rng.normal(0, 1, 4), [*rng.uniform(-0.2, 0.2, 2), rng.uniform(0.8, 2.0)]
+    )
     axes = axes_in_view(camera, camera_from_frame, 0.1)
     corners = np.vstack([np.zeros(3), 0.1 * np.eye(3)])
     rotation, _ = cv2.Rodrigues(camera_from_frame.rotation_matrix())
     distortion = np.array(camera.distortion or (0.0,) * 4)
-    expected, _ = cv2.projectPoints(corners, rotation, camera_from_frame.translation_m, camera.matrix(), distortion)
+    expected, _ = cv2.projectPoints(
+        corners, rotation, camera_from_frame.translation_m, camera.matrix(), distortion
+    )
     assert axes.origin_px == pytest.approx(expected[0, 0], abs=1e-6)
     for line, end in zip(axes.lines, expected[1:, 0], strict=True):
         assert line[0] == pytest.approx(expected[0, 0], abs=1e-6)

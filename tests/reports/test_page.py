@@ -80,7 +80,9 @@ def test_records_are_rows() -> None:
         error_deg: float
         moved: bool
 
-    table = Table.of_records([Record("a", 3, 1.234, 0.0567, True), Record("b", 0, None, 1.0, False)])
+    table = Table.of_records(
+        [Record("a", 3, 1.234, 0.0567, True), Record("b", 0, None, 1.0, False)]
+    )
     assert list(table.header) == ["room", "images used", "error mm", "error deg", "moved"]
     assert table.rows == [["a", "3", "1.23", "0.057", "yes"], ["b", "0", "-", "1.000", "no"]]
 

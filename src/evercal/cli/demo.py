@@ -3,7 +3,8 @@
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
     from evercal.recordings import Frame, Recording
     from evercal.recordings.samples import SampleRoom
-    from evercal.reports.demo_page import DemoResult, FixedCamera, LearnedRoom
+    from evercal.reports.demo_page import DemoResult, FixedCamera
     from evercal.reports.page import Picture
 
 STORE, QUERY, REPORT = "store", "query.png", "report.html"
@@ -86,11 +87,12 @@ def run_demo(
         for room in rooms:
             if result.learned:
                 _localize_unknown(_open(work / STORE, device), room.scene, result)
-            learned = _learn(work / STORE, room.scene, device, result)
+            _learn(work / STORE, room.scene, device, result)
+            room_map = result.learned[-1]
             if not quiet:
                 print(
-                    f"mapped {learned.room}: {learned.images} images, {learned.keyframes} keyframes,"
-                    f" {learned.landmarks} landmarks, {learned.seconds:.0f} s"
+                    f"mapped {room_map.room}: {room_map.images} images, {room_map.keyframes}"
+                    f" keyframes, {room_map.landmarks} landmarks, {room_map.seconds:.0f} s"
                 )
         replace_folder(work / STORE, store)
     finally:
@@ -117,8 +119,8 @@ def _open(store: Path, device: str) -> "Localizer":
     return Localizer.open(store, device=device)
 
 
-def _learn(store: Path, scene: "Recording", device: str, result: "DemoResult") -> "LearnedRoom":
-    """Add a room to the store and record the size of its map."""
+def _learn(store: Path, scene: "Recording", device: str, result: "DemoResult") -> None:
+    """Add a room to the store."""
     from evercal.cli.learn_bars import LearnBars
     from evercal.continual.learn_scene import LearnOptions, learn_scene
     from evercal.continual.presets import preset
@@ -126,17 +128,17 @@ def _learn(store: Path, scene: "Recording", device: str, result: "DemoResult") -
 
     with LearnBars() as bars:
         report = learn_scene(store, scene, LearnOptions(preset("fast"), device=device), bars)
-    learned = LearnedRoom(
-        report.scene,
-        report.train_frames,
-        report.frames_kept,
-        report.landmarks,
-        float("nan") if report.adjusted is None else report.adjusted.residual_px,
-        report.seconds,
+    result.learned.append(
+        LearnedRoom(
+            report.scene,
+            report.train_frames,
+            report.frames_kept,
+            report.landmarks,
+            None if report.adjusted is None else report.adjusted.residual_px,
+            report.seconds,
+        )
     )
-    result.learned.append(learned)
     result.memory_bytes = report.memory_bytes
-    return learned
 
 
 def _localize_unknown(localizer: "Localizer", scene: "Recording", result: "DemoResult") -> None:
@@ -169,12 +171,11 @@ def _fixed_camera(localizer: "Localizer", room: "SampleRoom") -> "FixedCamera":
     assert fixed is not None and bumped is not None, "the rooms of a demo have a fixed camera"
     true_shift_mm, _ = pose_distance_mm_deg(_pose(fixed), _pose(bumped))
     camera = FixedCamera(name, len(fixed.test), true_shift_mm=true_shift_mm)
-    with progress_bar(f"camera in {name}", len(fixed.test) + len(bumped.test), "image") as bar:
-        try:
-            images = Images(_images(fixed), fixed.test[0].camera)
-            calibration = calibrate(localizer, images, "eye_to_hand", on_image=bar.update)
-        except InputError:  # no image was localized
-            return camera
+    count = len(fixed.test) + len(bumped.test)
+    # An InputError means that no image was localized.
+    with progress_bar(f"camera in {name}", count, "image") as bar, suppress(InputError):
+        images = Images(_images(fixed), fixed.test[0].camera)
+        calibration = calibrate(localizer, images, "eye_to_hand", on_image=bar.update)
         if calibration.source["scene"] != name:
             return camera
         mm, deg = pose_distance_mm_deg(calibration.parent_from_child, _pose(fixed))
@@ -185,11 +186,9 @@ def _fixed_camera(localizer: "Localizer", room: "SampleRoom") -> "FixedCamera":
             error_deg=deg,
             sigma_mm=calibration.sigma_mm,
         )
-        try:
-            shift, _ = check(localizer, _images(bumped), calibration, on_image=bar.update)
-        except InputError:  # no image was localized
-            return camera
-    return replace(camera, shift_mm=shift.translation_mm, bump_detected=shift.moved)
+        shift, _ = check(localizer, _images(bumped), calibration, on_image=bar.update)
+        camera = replace(camera, shift_mm=shift.translation_mm, bump_detected=shift.moved)
+    return camera
 
 
 def _images(recording: "Recording") -> list[tuple[str, np.ndarray]]:

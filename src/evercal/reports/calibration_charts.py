@@ -98,7 +98,7 @@ def residual_bars(
 ) -> bytes:
     """Plot the residual of each image, numbered from 1; rejected ones are hatched.
 
-    Bars that would dwarf those of the used images are cut and labelled with their length.
+    Bars much larger than all bars of used images are cut and labelled with their length.
 
     Args:
         millimetres: Translation residuals; None if unknown.

@@ -3,16 +3,14 @@
 import json
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.located import deviations, length_mm_deg
-from evercal.calibration.verdict import TIERS, expected_error, tier
-from evercal.calibration.verdict import verdict as verdict_text
+from evercal.calibration.verdict import TIERS, expected_error, tier, verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.reports.calibration_charts import ellipsoid_projections, error_terms, residual_bars
@@ -93,33 +91,35 @@ def calibration_page(
     calibration = file.calibration
     checks = Table(("check", "mm", "deg"), _check_rows(calibration))
     missing = (*images.missing, *_missing(calibration))
-    parent, child = calibration.parent_frame, calibration.child_frame
-    certain = not _has_uncertainty(calibration)
+    text = calibration.verdict or verdict(calibration)
+    headline, _, details = text.partition(". ")
+    sigma = np.sqrt(np.clip(np.diag(calibration.covariance), 0.0, None))
     html = render(
         "calibration.html",
-        title=f"{file.name}: {parent}_from_{child}",
+        title=f"{file.name}: {calibration.parent_frame}_from_{calibration.child_frame}",
         calibration=calibration,
-        parent=parent,
-        child=child,
-        verdict=_verdict(calibration),
-        transform=_transform_table(calibration),
-        matrix="\n".join(
-            " ".join(f"{v:13.8f}" for v in row) for row in calibration.parent_from_child.matrix()
-        ),
-        sigmas=None if certain else _sigma_table(calibration),
+        parent=calibration.parent_frame,
+        child=calibration.child_frame,
+        level=_level(calibration),
+        headline=headline,
+        details=details,
+        expected_error=expected_error(calibration),
+        tiers=TIERS,
+        best=tier(calibration),
+        matrix=calibration.parent_from_child.matrix(),
+        uncertain=_has_uncertainty(calibration),
+        sigma_mm=1000 * sigma[:3],
+        sigma_deg=np.rad2deg(sigma[3:]),
         older=older,
         difference=None if older is None else difference(calibration, older.calibration),
         pixel_shift=_pixel_shift(images),
         same_map=older is not None and _same_map(calibration, older.calibration),
-        pictures=_pictures(images, parent),
+        pictures=_pictures(images, calibration.parent_frame),
         images=images,
-        axes=images.axes,
-        origin_px=None if images.axes is None else tuple(images.axes.origin_px),
-        older_drawn=images.older_axes is not None and not images.older_axes.outside,
         store=store,
         residuals=_residuals(calibration),
         uses=_use_table(calibration),
-        ellipsoid=None if certain else _ellipsoid(calibration),
+        ellipsoid=_ellipsoid(calibration) if _has_uncertainty(calibration) else None,
         terms=_terms(calibration),
         checks=checks,
         source=Table(("property", "value"), _source_rows(file)),
@@ -128,55 +128,12 @@ def calibration_page(
     return CalibrationPage(html, missing)
 
 
-@dataclass(frozen=True)
-class _Verdict:
-    """Content of the coloured box at the top."""
-
-    level: Literal["good", "fair", "bad", ""]
-    """Colour; empty without any measure of quality."""
-    headline: str
-    details: str
-    expected_error: tuple[float, float]
-    """Millimetres and degrees."""
-    tiers: Table
-
-
-def _verdict(calibration: Calibration) -> _Verdict:
-    best = tier(calibration)
-    level = "bad" if best is None else "fair" if best is TIERS[-1] else "good"
+def _level(calibration: Calibration) -> Literal["good", "fair", "bad", ""]:
+    """Colour of the verdict; empty without any measure of quality."""
     if not _has_uncertainty(calibration) and not _check_rows(calibration):
-        level = ""
-    headline, _, details = (calibration.verdict or verdict_text(calibration)).partition(". ")
-    rows = [
-        (t.name, f"{t.mm:g}", f"{t.deg:g}", "yes" if best and t.mm >= best.mm else "no")
-        for t in TIERS
-    ]
-    header = ("use", "position error below (mm)", "rotation error below (deg)", "suitable")
-    return _Verdict(level, headline, details, expected_error(calibration), Table(header, rows))
-
-
-def _transform_table(calibration: Calibration) -> Table:
-    pose = calibration.parent_from_child
-    w, x, y, z = (f"{value:.8f}" for value in pose.rotation_wxyz)
-    position = ", ".join(f"{1000 * value:.3f}" for value in pose.translation_m)
-    rows = [("translation x, y, z (mm)", position), ("quaternion x, y, z, w", f"{x}, {y}, {z}, {w}")]
-    return Table(("", ""), rows)
-
-
-def _sigma_table(calibration: Calibration) -> Table:
-    sigma = np.sqrt(np.clip(np.diag(calibration.covariance), 0.0, None))
-    millimetres, degrees = 1000 * sigma[:3], np.rad2deg(sigma[3:])
-    rows = [
-        (
-            f"position along the axes of {calibration.parent_frame} (mm)",
-            *(f"{value:.3f}" for value in (*millimetres, calibration.sigma_mm)),
-        ),
-        (
-            f"rotation about the axes of {calibration.child_frame} (deg)",
-            *(f"{value:.4f}" for value in (*degrees, calibration.sigma_deg)),
-        ),
-    ]
-    return Table(("", "x", "y", "z", "root mean square"), rows, "Standard deviations")
+        return ""
+    best = tier(calibration)
+    return "bad" if best is None else "fair" if best is TIERS[-1] else "good"
 
 
 def _pixel_shift(images: AnnotatedImages) -> float | None:
@@ -202,24 +159,16 @@ def _pictures(images: AnnotatedImages, parent: str) -> list[Picture]:
     return pictures
 
 
-def _use_table(calibration: Calibration) -> Table:
-    folders = {image.name[: image.name.rfind("/") + 1] for image in calibration.images}
+def _use_table(calibration: Calibration) -> Table | None:
+    images = calibration.images
+    if not images:
+        return None
+    folders = {image.name[: image.name.rfind("/") + 1] for image in images}
     folder = folders.pop() if len(folders) == 1 else ""
-    rows = [
-        (
-            number,
-            image.name.removeprefix(folder),
-            "yes" if image.used else "no",
-            image.reason,
-            "-" if image.residual_mm is None else f"{image.residual_mm:.2f}",
-            "-" if image.residual_deg is None else f"{image.residual_deg:.3f}",
-        )
-        for number, image in enumerate(calibration.images, 1)
-    ]
-    used = sum(image.used for image in calibration.images)
-    caption = f"{used} of {len(rows)} images used" + (f", all in {folder}" if folder else "")
-    header = ("no.", "image", "used", "reason", "residual (mm)", "residual (deg)")
-    return Table(header, rows, caption)
+    used = sum(image.used for image in images)
+    caption = f"{used} of {len(images)} images used" + (f", all in {folder}" if folder else "")
+    rows = [replace(image, name=image.name.removeprefix(folder)) for image in images]
+    return Table.of_records(rows, caption)
 
 
 def _residuals(calibration: Calibration) -> Picture | None:
@@ -234,32 +183,23 @@ def _residuals(calibration: Calibration) -> Picture | None:
     return Picture(bars, "Residual of each image")
 
 
-@dataclass(frozen=True, eq=False)
-class _Ellipsoid:
-    """The 95 % ellipsoid of the position."""
-
-    half_axes_mm: tuple[float, float, float]
-    """The longest first."""
-    longest: tuple[float, float, float]
-    """Unit vector along the longest axis, parent frame."""
-    angle_deg: float
-    """Angle between the longest axis and the viewing direction."""
-    picture: Picture
-
-
-def _ellipsoid(calibration: Calibration) -> _Ellipsoid:
+def _ellipsoid(calibration: Calibration) -> Picture:
     from scipy import stats
 
-    covariance: NDArray[np.float64] = calibration.covariance[:3, :3]
+    covariance = calibration.covariance[:3, :3]
     values, vectors = np.linalg.eigh(covariance)
-    c, b, a = (1000 * np.sqrt(stats.chi2.ppf(_SHARE, 3) * np.clip(values, 0.0, None))).tolist()
+    c, b, a = 1000 * np.sqrt(stats.chi2.ppf(_SHARE, 3) * np.clip(values, 0.0, None))
     longest = vectors[:, 2] * np.sign(vectors[np.argmax(np.abs(vectors[:, 2])), 2])
+    x, y, z = longest + 0.0  # no negative zeros
     forward = calibration.parent_from_child.rotation_matrix()[:, 2]
     angle = np.rad2deg(np.arccos(np.clip(abs(longest @ forward), 0.0, 1.0)))
-    chart = ellipsoid_projections(1e6 * covariance, calibration.parent_frame, _SHARE)
-    caption = f"95 % ellipsoid of the position, seen along each axis of {calibration.parent_frame}"
-    x, y, z = (longest + 0.0).tolist()
-    return _Ellipsoid((a, b, c), (x, y, z), float(angle), Picture(chart, caption))
+    frame = calibration.parent_frame
+    caption = (
+        f"95 % ellipsoid of the position, seen along each axis of {frame}. Its half axes are"
+        f" {a:.2f}, {b:.2f} and {c:.2f} mm. The longest one points along ({x:.2f}, {y:.2f},"
+        f" {z:.2f}) of {frame}, {angle:.0f} deg from the viewing direction of the camera."
+    )
+    return Picture(ellipsoid_projections(1e6 * covariance, frame, _SHARE), caption)
 
 
 def _terms(calibration: Calibration) -> Picture | None:
@@ -283,7 +223,9 @@ def _check_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
             rows.append((title, _fixed(mm, 2), _fixed(deg, 3)))
     scatter = _scatter(calibration.checks.get("image_scatter"))
     if scatter is not None:
-        rows.append(("scatter of single images, per axis", _fixed(scatter[0], 2), _fixed(scatter[1], 3)))
+        rows.append(
+            ("scatter of single images, per axis", _fixed(scatter[0], 2), _fixed(scatter[1], 3))
+        )
     return rows
 
 

@@ -1,7 +1,7 @@
 """Charts as PNG bytes: error curves, histograms and trajectories.
 
-The colours are those of Okabe and Ito, distinguishable with colour blindness. No pyplot and no
-global state is used.
+The Okabe-Ito colours are distinguishable with colour blindness. No pyplot and no global state is
+used.
 """
 
 import io

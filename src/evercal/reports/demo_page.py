@@ -19,10 +19,10 @@ class LearnedRoom:
     images: int
     """Posed training images."""
     keyframes: int
-    """Images kept in the map."""
+    """Images in the map."""
     landmarks: int
     """Landmarks of all keyframes."""
-    residual_px: float
+    residual_px: float | None
     """Median reprojection error after bundle adjustment."""
     seconds: float
     """Wall time."""
@@ -120,41 +120,10 @@ def demo_page(result: DemoResult, pictures: Sequence[Picture]) -> str:
         headlines=result.headlines(),
         histogram=Picture(error_histogram(errors), "Position errors of the test images"),
         pictures=pictures,
-        localization=Table.of_records(
-            [*_localization(result.test), *_localization(result.changed, " after a change")]
-        ),
+        scores={"": scores(result.test), "after a change": scores(result.changed)},
         cameras=Table.of_records(result.cameras),
         maps=Table.of_records(result.learned),
     )
-
-
-@dataclass(frozen=True)
-class _Localization:
-    """One row of the table of localization."""
-
-    room: str
-    localized: str
-    median_mm: float
-    median_deg: float
-    within_5_mm_and_half_deg: str
-    wrong_room: str
-
-
-def _localization(results: Sequence[FrameResult], condition: str = "") -> list[_Localization]:
-    rows = []
-    for name, row in scores(results).scenes.items():
-        located = sum(r.scene == name and math.isfinite(r.translation_error_m) for r in results)
-        rows.append(
-            _Localization(
-                name + condition,
-                f"{located} of {row.frames}",
-                10 * row.median_translation_cm,
-                row.median_rotation_deg,
-                f"{row.accuracy_5mm_05deg:.0f} %",
-                f"{row.wrong_scene:.0f} %",
-            )
-        )
-    return rows
 
 
 def _median(values: Iterable[float | None]) -> str:

@@ -151,7 +151,7 @@ def _lines_with_letters(image: Image, lines: Sequence[Array], width: int) -> Ima
 
 
 def _clip_depth(start: Array, end: Array) -> tuple[Array, Array]:
-    """The part of a segment in front of the camera, or the whole segment if there is none."""
+    """Clip a segment to the part in front of the camera. A segment behind it is unchanged."""
     ends = [start, end]
     depths = start[2] - _NEAR_M, end[2] - _NEAR_M
     if depths[0] * depths[1] < 0:

@@ -64,7 +64,7 @@ def test_methods_without_a_size_have_no_point(figures: list[Figure]) -> None:
     panel = figures[0].axes[0]
     points = [tuple(np.array(line.get_xydata())[0]) for line in panel.lines]
     assert points == [(3.2, 80.0), (40.0, 85.0)]
-    # Colours are those of the same methods in the other charts.
+    # A method has the same colour in all charts.
     assert [line.get_color() for line in panel.lines] == list(bench_charts.COLOURS[1:3])
 
 
