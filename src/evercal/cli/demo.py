@@ -157,7 +157,11 @@ def _evaluate(localizer: "Localizer", scenes: "dict[str, Recording]") -> "list[F
 
     count = sum(len(scene.test) for scene in scenes.values())
     with progress_bar("localizing", count, "image") as bar:
-        return evaluate(localizer, scenes, on_frame=lambda *_: bar.update())
+
+        def advance(_done: int, _total: int) -> None:
+            bar.update()
+
+        return evaluate(localizer, scenes, on_frame=advance)
 
 
 def _fixed_camera(localizer: "Localizer", room: "SampleRoom") -> "FixedCamera":
@@ -168,7 +172,8 @@ def _fixed_camera(localizer: "Localizer", room: "SampleRoom") -> "FixedCamera":
     from evercal.reports.demo_page import FixedCamera
 
     name, fixed, bumped = room.scene.name, room.fixed, room.bumped
-    assert fixed is not None and bumped is not None, "the rooms of a demo have a fixed camera"
+    assert fixed is not None, "rooms of a demo have a fixed camera"
+    assert bumped is not None, "rooms of a demo have a bumped camera"
     true_shift_mm, _ = pose_distance_mm_deg(_pose(fixed), _pose(bumped))
     camera = FixedCamera(name, len(fixed.test), true_shift_mm=true_shift_mm)
     count = len(fixed.test) + len(bumped.test)
