@@ -31,9 +31,10 @@ def paragraphs(text: str) -> Iterator[str]:
 def docstrings(text: str) -> Iterator[str]:
     """Paragraphs of the docstrings of a module, attribute docstrings included."""
     for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            if isinstance(node.value.value, str):
-                yield from re.split(r"\n\s*\n", node.value.value)
+        if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Constant):
+            continue
+        if isinstance(node.value.value, str):
+            yield from re.split(r"\n\s*\n", node.value.value)
 
 
 def long_sentences(texts: Iterator[str]) -> list[str]:

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from evercal.mapping.scene_maps import SceneRecord
 from numpy.typing import ArrayLike
 
 from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.continual.networks.atlas import Cell
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
-from evercal.mapping.scene_maps import SceneRecord
 from evercal.recordings.images import write_image
 from evercal.reports.calibration_images import annotate_images, select_images
 

@@ -4,11 +4,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from evercal.mapping.scene_maps import SceneRecord
 
 from evercal.continual.networks.atlas import Cell
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
-from evercal.mapping.scene_maps import SceneRecord
 from evercal.reports.pictures import draw_landmarks
 
 LENS = Camera(320, 240, 300, 300, 159.5, 119.5)

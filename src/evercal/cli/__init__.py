@@ -140,8 +140,9 @@ def _help() -> str:
             lines.append(f"  {name:13s} {summary.split('; ')[0].rstrip('.')}")
     lines += [
         "",
-        "'evercal VERB --help' lists the options of a verb, with an example. Every verb has --json.",
-        "Exit codes: 0 done, 1 the answer is no, 2 misuse or bad input. --version prints the version.",
+        "'evercal VERB --help' lists the options of a verb. Every verb has --json.",
+        "Exit codes: 0 done, 1 the answer is no, 2 misuse or bad input.",
+        "'evercal --version' prints the version.",
         "Shell completion: evercal --tyro-print-completion bash|zsh|tcsh.",
     ]
     return "\n".join(lines)

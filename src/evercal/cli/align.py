@@ -122,8 +122,8 @@ class Align:
             )
             return
         print(
-            f"aligned {self.scene}: standard deviation {mm:.2f} mm and {deg:.3f} deg per axis in the"
-            f" middle of the scene; scale {similarity.scale:.5f}; {alignment.used} of"
+            f"aligned {self.scene}: standard deviation {mm:.2f} mm and {deg:.3f} deg per axis in"
+            f" the middle of the scene; scale {similarity.scale:.5f}; {alignment.used} of"
             f" {alignment.given} are inliers, residual {alignment.residual}"
         )
         print_next("evercal", "calibrate", self.store, "IMAGE...")

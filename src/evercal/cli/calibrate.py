@@ -77,8 +77,8 @@ class Calibrate:
         named = [word for word in self.images if "=" in word and not Path(word).exists()]
         if named and len(named) < len(self.images):
             raise InputError(
-                f"{named[0]}: NAME=FOLDER and plain images cannot be mixed; give NAME=FOLDER for every"
-                " camera of the rig"
+                f"{named[0]}: NAME=FOLDER and plain images cannot be mixed; give NAME=FOLDER for"
+                " every camera of the rig"
             )
         if named and self.robot_poses is not None:
             raise InputError("--robot-poses: the cameras of a rig are fixed; omit the option")
@@ -128,8 +128,8 @@ def calibration_lines(calibration: "Calibration") -> list[str]:
         "  quaternion   "
         + " ".join(f"{value:+.6f}" for value in calibration.parent_from_child.rotation_wxyz)
         + " wxyz",
-        f"  uncertainty  {calibration.sigma_mm:.2f} mm, {calibration.sigma_deg:.3f} deg (standard deviation per"
-        " axis)",
+        f"  uncertainty  {calibration.sigma_mm:.2f} mm, {calibration.sigma_deg:.3f} deg"
+        " (standard deviation per axis)",
     ]
     lines += [
         f"    of it      {term.translation_mm:.2f} mm, {term.rotation_deg:.3f} deg: {term.name}"
@@ -156,6 +156,6 @@ def _rig_lines(rig: "Rig") -> list[str]:
         x, y, z = 1000 * pair.first_from_second.translation_m
         lines.append(
             f"{pair.first}_from_{pair.second}: {x:+.2f} {y:+.2f} {z:+.2f} mm, standard deviation at"
-            f" most {pair.sigma_mm:.2f} mm and {pair.sigma_deg:.3f} deg (errors taken as independent)"
+            f" most {pair.sigma_mm:.2f} mm and {pair.sigma_deg:.3f} deg (independent errors assumed)"
         )
     return lines

@@ -3,7 +3,7 @@
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TextIO
 
 from tyro.conf import arg
 
@@ -57,7 +57,7 @@ class LearnRequest:
 
 
 def learn_into_networks(
-    request: LearnRequest, recording: "Recording", start: str, stream: object
+    request: LearnRequest, recording: "Recording", start: str, stream: TextIO
 ) -> "LearnReport":
     """Train a network on a recording, with progress bars.
 
@@ -96,7 +96,7 @@ class Bars:
         stream: where the line goes; stdout by default.
     """
 
-    def __init__(self, start: str = "", stream: object = None):
+    def __init__(self, start: str = "", stream: TextIO | None = None):
         self._start, self._stream = start, stream or sys.stdout
         self._bar: tqdm | None = None
         self._step = ""
@@ -110,7 +110,7 @@ class Bars:
     def step(self, name: str, done: int, total: int) -> "tqdm":
         """Show that part of a step is done; a new step gets a new bar."""
         if self._start:
-            print(self._start, file=self._stream, flush=True)  # pyright: ignore[reportArgumentType]
+            print(self._start, file=self._stream, flush=True)
             self._start = ""
         bar = self._bar
         if bar is None or name != self._step or total != bar.total or done < bar.n:

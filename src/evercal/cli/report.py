@@ -8,8 +8,8 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar
 from evercal.cli.device import Device
-from evercal.cli.image_words import image_files
 from evercal.cli.output import check_output
+from evercal.recordings.image_files import image_files
 
 if TYPE_CHECKING:
     from evercal.reports.calibration_images import AnnotatedImages

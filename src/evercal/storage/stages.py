@@ -6,7 +6,7 @@
       stages/0001-NAME/     files of one stage
 
 A file that the manifest does not list is not part of the store. One process writes at a time, under
-a lock beside the folder. Readers need no lock: they read again if a writer replaced files meanwhile.
+a lock beside the folder. Readers need no lock: they read again if a writer replaced files.
 What the files mean is up to the kind of store: a map or networks.
 """
 

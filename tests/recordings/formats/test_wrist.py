@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evercal.cli.image_words import image_files
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings import ReadOptions, Recording, load_recording, write_image
 from evercal.recordings.formats import wrist
+from evercal.recordings.image_files import image_files
 from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import natural_key, times_in_names
