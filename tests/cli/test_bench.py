@@ -45,8 +45,9 @@ def test_bench_and_its_report(
     assert report.code == 0
     assert "| evercal " in (tmp_path / "out" / "tables.md").read_text()
     page = (tmp_path / "out" / "report.html").read_text()
-    assert page.count("<img ") == 8
-    assert "seen from the estimated pose" in page
+    assert page.count("<img ") == 12
+    assert "Scenes at the estimated poses" in page
+    assert "<dt>TFR</dt>" in page
     assert "evercal - finetune" in page
     assert r"\multicolumn{3}{c}{finetune}" in (tmp_path / "out" / "table.tex").read_text()
 
