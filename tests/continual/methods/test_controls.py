@@ -16,9 +16,10 @@ from ..stages import continued, outcome, weights
 from .by_hand import stage_start, wave_head
 
 if TYPE_CHECKING:
+    from evercal.mapping.scene_maps import SceneMaps
+
     from evercal.continual.networks.head import Head
     from evercal.continual.stage import StageOptions
-    from evercal.mapping.scene_maps import SceneMaps
 
     from ..stages import Rooms
 

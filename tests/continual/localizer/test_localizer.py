@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from evercal.mapping.scene_maps import SceneMaps
 
 from evercal.errors import InputError
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import pose_distance
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
-from evercal.mapping.scene_maps import SceneMaps
 from evercal.recordings.frame import Recording
 from evercal.simulation.box_room import default_camera
 

@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord, with_fit
 
 from evercal.continual.networks.atlas import Atlas
 from evercal.geometry.se3 import SE3
 from evercal.localization import acceptance
-from evercal.localization.acceptance import MAX_SUPPORT, MIN_SUPPORT
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord, with_fit
 from evercal.recordings.frame import Frame, Recording
 from evercal.simulation.box_room import BoxRoom, default_camera
 
@@ -126,33 +125,3 @@ def test_unknown_places_are_told_from_known_ones(
     views.append(np.random.default_rng(0).integers(0, 256, (120, 160, 3)).astype(np.uint8))
     wrong = [localizer.localize(view).status for view in views]
     assert wrong.count("ok") <= 1
-
-
-@pytest.mark.parametrize(
-    ("wrong", "bound"),
-    [(0, MAX_SUPPORT), (3, 0.4), (4, MAX_SUPPORT)],  # without a right one nothing is known
-)
-def test_frames_that_are_found_elsewhere_do_not_lower_the_bound(
-    wrong: int, bound: float, hall: Recording, hall_maps: SceneMaps, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of four frames the first are found a metre off, with little support."""
-    frames = hall.test[:4]
-    said = dict(zip((f.name for f in frames), (0.2, 0.2, 0.2, 0.8), strict=True))
-
-    class Fake:
-        def __init__(self, maps: SceneMaps) -> None:
-            assert maps.scenes[0].min_support == MIN_SUPPORT
-
-        def localize(self, image: Frame, camera: object) -> PoseEstimate:
-            pose, support = image.base_from_camera, said[image.name]
-            assert pose is not None
-            if image in frames[:wrong]:
-                pose = SE3.exp([1.0, 0, 0, 0, 0, 0]) @ pose
-            elif not wrong:
-                support = 2.0
-            return PoseEstimate("ok", "", "hall", pose, np.eye(6), 9, 0.5, 1.0, support=support)
-
-    monkeypatch.setattr(acceptance, "Localizer", Fake)
-    monkeypatch.setattr(Frame, "read_image", lambda frame: frame)
-    record = acceptance.fitted_record(hall_maps, frames)
-    assert record.min_support == pytest.approx(bound)
