@@ -1,9 +1,9 @@
 """Recordings of small rooms and a map, each made once.
 
-`rooms` are 64x48 pixels, for tests that need no pose. `arcs` are short camera arcs at 160x120. `hall`
-is an arc at 320x240 with fine textures: its map locates images to a millimetre. torch is imported
-inside the fixtures, after its number of threads is set: tests run side by side, and small matrix
-products are slower with more threads.
+`rooms` are 64x48 pixels, for tests that need no pose. `arcs` are short camera arcs at 160x120.
+`hall` is an arc at 320x240 with fine textures: its map locates images to a millimetre. torch is
+imported inside the fixtures, after its number of threads is set: tests run side by side, and small
+matrix products are slower with more threads.
 """
 
 from __future__ import annotations
