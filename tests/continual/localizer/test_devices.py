@@ -14,7 +14,7 @@ from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.recordings.frame import Recording
 
-from ...one_device import made_where_inputs_lie
+from ...one_device import tensors_stay_on_their_device
 
 
 def moved(maps: SceneMaps, device: torch.device) -> SceneMaps:
@@ -68,6 +68,6 @@ def test_nothing_is_made_on_the_default_device(known: tuple[SceneMaps, Recording
     maps, scene = known
     frame = scene.test[7]
     expected = numbers(Localizer(maps).localize(frame.read_image(), frame.camera))
-    with made_where_inputs_lie():
+    with tensors_stay_on_their_device():
         found = Localizer(moved(maps, torch.device("cpu")))
         assert numbers(found.localize(frame.read_image(), frame.camera)) == expected

@@ -18,7 +18,7 @@ from evercal.features.views import ViewOptions
 from evercal.geometry import SE3
 from evercal.simulation.box_room import box_room_scene
 
-from ...one_device import META, OneDevice, made_where_inputs_lie
+from ...one_device import META, OneDevice, tensors_stay_on_their_device
 
 SHAPES = [
     HeadOptions(width=12, condition="code", offsets="per_centre"),
@@ -158,7 +158,7 @@ def test_nothing_is_made_on_the_default_device(options: HeadOptions, one_scene: 
 
     made = nullcontext()
     expected = whole()
-    made = made_where_inputs_lie()
+    made = tensors_stay_on_their_device()
     found = whole()
     assert found.keys() == expected.keys()
     for name, value in found.items():
@@ -182,7 +182,7 @@ def test_nothing_is_left_on_the_cpu(options: HeadOptions, monkeypatch: pytest.Mo
 
 def test_the_guard_finds_what_it_is_for() -> None:
     ones = torch.ones(3)
-    with pytest.raises(AssertionError, match="meta"), made_where_inputs_lie():
+    with pytest.raises(AssertionError, match="meta"), tensors_stay_on_their_device():
         torch.nn.functional.linear(ones[None], torch.zeros(2, 3))
     with pytest.raises(AssertionError, match="meta"), OneDevice():
         torch.mm(torch.zeros(3, 3, device=META), ones[:, None])
@@ -220,7 +220,7 @@ def test_views_are_encoded_where_the_networks_lie(device: torch.device, rows_on:
 def test_encoding_makes_nothing_on_the_default_device() -> None:
     expected = encoded(CPU, CPU).tensors
     both, buffer = networks(CPU), FeatureBuffer(0, SE3.identity())
-    with made_where_inputs_lie():
+    with tensors_stay_on_their_device():
         for _ in encode_frames(buffer, FRAMES, PLAN, *both):
             pass
     for name, value in buffer.tensors.items():
