@@ -143,9 +143,7 @@ def test_aligning_again_starts_from_the_map_and_leaves_the_localizer_unchanged(
     assert pose_distance(alignment.similarity.base_from_map, BASE_FROM_MAP)[0] < 0.01
     assert before.base_from_camera is not None
     assert after.base_from_camera is not None
-    np.testing.assert_array_equal(
-        before.base_from_camera.matrix(), after.base_from_camera.matrix()
-    )
+    np.testing.assert_array_equal(before.base_from_camera.matrix(), after.base_from_camera.matrix())
     truth = elsewhere.pose(map_from_camera[4])
     assert pose_distance(after.base_from_camera, truth)[0] < 0.006
 

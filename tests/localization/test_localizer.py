@@ -270,7 +270,9 @@ def test_portrait_image_of_a_given_camera(localizer: Localizer, hall_room: BoxRo
     truth = hall_view(hall_room)
     estimate = localizer.localize(hall_room.render(camera, truth), camera)
     assert error(estimate, truth)[0] < 0.02
-    with pytest.raises(InputError, match=r"image 240x320: no scene .* \(hall 320x240\); .*--camera"):
+    with pytest.raises(
+        InputError, match=r"image 240x320: no scene .* \(hall 320x240\); .*--camera"
+    ):
         localizer.localize(hall_room.render(camera, truth))
 
 

@@ -85,7 +85,9 @@ def test_covariance_follows_the_residuals() -> None:
     white = np.tile(np.eye(2) / 0.3, (200, 1, 1))
     right = refined(project(points_m) + noise, points_m, white)
     overconfident = refined(project(points_m) + noise, points_m, 10 * white)
-    np.testing.assert_allclose(overconfident.pose.covariance, right.pose.covariance, rtol=0.05, atol=1e-12)
+    np.testing.assert_allclose(
+        overconfident.pose.covariance, right.pose.covariance, rtol=0.05, atol=1e-12
+    )
 
 
 def test_translation_covariance_is_in_the_parent_frame() -> None:
