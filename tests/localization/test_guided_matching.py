@@ -6,8 +6,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-from torch import Tensor
 
+from evercal.features.encode import encode_features
+from evercal.features.views import ViewOptions, plain_view
 from evercal.geometry import SE3, UncertainPose, pose_distance
 from evercal.localization.acceptance import support
 from evercal.localization.localizer import Localizer
@@ -81,10 +82,10 @@ def frame(hall: Recording) -> Frame:
 
 
 @pytest.fixture(scope="module")
-def query(localizer: Localizer, frame: Frame) -> Query:
-    image = frame.read_image()
-    features: Tensor = localizer._encode(image)
-    return Query(image, features, 480)
+def query(hall_map: MapContents, frame: Frame) -> Query:
+    image, encoder = frame.read_image(), hall_map.encoder
+    view = plain_view(image, frame.camera, encoder.stride, ViewOptions(short_side=240))
+    return Query(image, encode_features([view], encoder)[0], 480)
 
 
 def truth_of(frame: Frame) -> SE3:

@@ -68,12 +68,19 @@ def _check(root: Path, manifest: Manifest) -> None:
     problems = manifest.problems(root)
     if problems:
         raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
-    for name in manifest.payload.get("networks", []):
+    for name in _listed(root, manifest, "networks"):
         if name not in manifest.files:
             raise InputError(f"store {root}: network {name!r} is not in the manifest; restore it")
-    for name in manifest.payload.get("stages", []):
+    for name in _listed(root, manifest, "stages"):
         if not isinstance(name, str) or not _STAGE.fullmatch(name):
             raise InputError(f"store {root}: stage {name!r} is not a stage's name; restore it")
+
+
+def _listed(root: Path, manifest: Manifest, key: str) -> list[object]:
+    names = manifest.payload.get(key, [])
+    if not isinstance(names, list):
+        raise InputError(f"store {root}: {key!r} in the manifest is not a list; restore it")
+    return names
 
 
 class StageStore:
