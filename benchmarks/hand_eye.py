@@ -9,7 +9,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from evercal.calibration.calibration import Mount
-from evercal.calibration.pose_pairs.closed_form import daniilidis, motions, park, shah
+from evercal.calibration.pose_pairs.closed_form import motions, park, shah
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve
 from evercal.evaluation.metrics import share_inside
@@ -142,7 +142,7 @@ def trials(setting: Setting, count: int, first_seed: int = 0) -> dict[str, float
 
 def closed_forms(setting: Setting, count: int) -> dict[str, tuple[float, float]]:
     """Median errors (mm, deg) of the classical methods alone, without any robustness."""
-    errors: dict[str, list[tuple[float, float]]] = {"Park": [], "Daniilidis": [], "Shah": []}
+    errors: dict[str, list[tuple[float, float]]] = {"Park": [], "Shah": []}
     for seed in range(count):
         drawn = recording(setting, seed)
         robot = drawn.pairs.base_from_gripper
@@ -150,8 +150,7 @@ def closed_forms(setting: Setting, count: int) -> dict[str, tuple[float, float]]
         a, b = motions(fixed_from_parent, drawn.pairs.camera_from_board)
         found = {
             "Park": park(a, b)[0],
-            "Daniilidis": daniilidis(a, b),
-            "Shah": shah(fixed_from_parent, drawn.pairs.camera_from_board)[0],
+            "Shah": shah(fixed_from_parent, drawn.pairs.camera_from_board).parent_from_camera,
         }
         for name, answer in found.items():
             metres, radians = pose_distance(answer, drawn.parent_from_camera)

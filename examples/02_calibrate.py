@@ -9,8 +9,7 @@ import tempfile
 from pathlib import Path
 
 import evercal
-from evercal.calibration.export.formats import FORMATS, write_content
-from evercal.calibration.export.request import Export
+from evercal.calibration.export import export_calibration
 from evercal.recordings.samples import FOLDER
 
 
@@ -25,7 +24,7 @@ def main(out: Path) -> None:
     calibration.write(out / "calibration.json")
     print(calibration.meaning)
     print(calibration.verdict)
-    write_content(out / "tripod.calib", FORMATS["easy_handeye2"].write(Export(calibration)))
+    export_calibration(calibration, "easy_handeye2", out / "tripod.calib")
 
     later = FOLDER / "bedroom/calibration/bumped/images"
     images = evercal.Images.read(sorted(later.iterdir())[:5]).images

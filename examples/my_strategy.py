@@ -1,9 +1,9 @@
-"""A method of one's own for `evercal bench`.
+"""A custom method for `evercal bench`.
 
     evercal bench sim-mini --plugin examples/my_strategy.py --strategies spread,er,finetune
 
-It remembers the frames that are farthest from one another, which covers a scene better than random
-ones, and replays them with their true poses and, half as strong, the old network's points.
+It remembers the frames farthest from each other, which cover a scene better than random frames. The
+replay loss is reprojection to the known poses plus the distance to the old network's points.
 """
 
 from dataclasses import dataclass
@@ -20,12 +20,12 @@ from evercal.mapping.selection import select_farthest
 
 @dataclass(frozen=True)
 class Spread(Replay):
-    """Farthest-point sampling with truth and distillation."""
+    """Farthest-point sampling with reprojection and distillation."""
 
     citation: ClassVar[str] = "farthest-point sampling (Gonzalez, 1985)"
 
     def select(self, frames: FrameStatistics, capacity: int) -> np.ndarray:
-        """Which frames stay: indices in recorded order, at most `capacity`."""
+        """Select at most `capacity` frames; return sorted indices."""
         return select_farthest(frames.positions_m, frames.quaternions_wxyz, capacity)
 
 

@@ -270,7 +270,7 @@ class Map:
         """
         from evercal.evaluation.score_scenes import evaluate
 
-        return evaluate(self.localizer, recordings, lambda *_: on_frame())
+        return evaluate(self.localizer, recordings, on_frame)
 
 
 def _sized(options: MapOptions, budget: MemoryBudget, short_side: int) -> MapOptions:

@@ -94,8 +94,8 @@ def test_misuse_is_one_line(run: Any, wave: Path, tmp_path: Path, verb: str) -> 
     for scene, words, message in (
         (wave, [], "no camera file in it"),
         (wave, ["--camera", tmp_path / "no"], "camera file is missing"),
-        (wave, ["--camera", lens, "--image-topic", "/a"], "--image-topic: means nothing to"),
-        (room, ["--camera", lens], "--camera: means nothing to a recording of format generic"),
+        (wave, ["--camera", lens, "--image-topic", "/a"], "--image-topic: not used by"),
+        (room, ["--camera", lens], "--camera: not used by recordings of format generic"),
         (room, ["--every", 0], "--every 0: give a number >= 1"),
         (tmp_path / "file", [], "a file, not a folder"),
         (tmp_path / "no", [], "no such folder"),

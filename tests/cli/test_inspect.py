@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from evercal.recordings import load_recording
-from evercal.recordings.inspection import Inspection, inspect_scene
+from evercal.recordings.inspection import Inspection, inspect_recording
 
 
 def test_a_sound_scene_is_described_without_a_warning(run: Any, rooms: Any) -> None:
@@ -23,7 +23,7 @@ def test_a_sound_scene_is_described_without_a_warning(run: Any, rooms: Any) -> N
 def test_the_same_files_in_both_splits_are_found(rooms: Any) -> None:
     recorded = load_recording(rooms[0])
     both = dataclasses.replace(recorded, test=recorded.train[:6])
-    assert "test frames have the pose or the file" in "\n".join(inspect_scene(both).warnings)
+    assert "test frames have the pose or the file" in "\n".join(inspect_recording(both).warnings)
 
 
 def test_bad_input_is_one_line(run: Any, rooms: Any, tmp_path: Path) -> None:

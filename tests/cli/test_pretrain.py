@@ -1,4 +1,4 @@
-"""`evercal pretrain`: the options of the training are its own."""
+"""`evercal pretrain` and its options."""
 
 import dataclasses
 import json
@@ -27,7 +27,7 @@ def test_options_reach_the_training(
     ]
 
 
-def test_every_option_is_explained(run: Any) -> None:
+def test_every_option_is_documented(run: Any) -> None:
     text = run("pretrain", "--help").out
     for field in dataclasses.fields(PretrainOptions):
         assert f"--{field.name.replace('_', '-')} " in text

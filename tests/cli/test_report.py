@@ -1,4 +1,4 @@
-"""`evercal report`: the page, its JSON, and complaints in one line."""
+"""`evercal report`: the HTML file, the JSON object and the error messages."""
 
 import json
 import re
@@ -14,86 +14,91 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.images import write_image
 
 
-def placed(quaternion: ArrayLike, translation: ArrayLike) -> SE3:
+def pose(quaternion: ArrayLike, translation: ArrayLike) -> SE3:
     return SE3(np.array(quaternion, np.float64), np.array(translation, np.float64))
 
 
-LENS = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-POSE = placed([0.0, 1.0, 0.0, 0.0], [0.1, 0.05, 1.0])
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+POSE = pose([0.0, 1.0, 0.0, 0.0], [0.1, 0.05, 1.0])
 
 
 @pytest.fixture
 def calibration(tmp_path: Path) -> Path:
     write_image(tmp_path / "a.png", np.full((48, 64, 3), 90, np.uint8))
     images = (ImageUse("a.png", True, "", 0.5, 0.01), ImageUse("b.png", False, "too dark"))
-    found = Calibration("eye_to_hand", POSE, 1e-8 * np.eye(6), camera=LENS, images=images)
-    found.write(tmp_path / "c.json")
+    own = Calibration("eye_to_hand", POSE, 1e-8 * np.eye(6), camera=CAMERA, images=images)
+    own.write(tmp_path / "c.json")
     return tmp_path / "c.json"
 
 
-def test_one_file_with_everything_in_it(run: Any, calibration: Path, tmp_path: Path) -> None:
+def test_report_is_one_self_contained_file(run: Any, calibration: Path, tmp_path: Path) -> None:
     ran = run("report", calibration, "--out", tmp_path / "r.html")
     assert ran.code == 0
     assert "Good for precision assembly" in ran.out
     assert "No held-out error" in ran.out
     assert ran.out.splitlines()[-1].startswith("next: evercal export ")
     page = (tmp_path / "r.html").read_text()
-    # The sheet of one image, its close-up, residuals and ellipsoid.
-    assert page.count('<img src="data:image/') == 4
+    # The image, its close-up, residuals and ellipsoid.
+    assert page.count('src="data:image/') == 4
     assert not re.search(r"(?:src|href)=\"(?!data:)|https?://", page)
 
 
-def test_json_and_an_older_one(run: Any, calibration: Path, tmp_path: Path) -> None:
+def test_json_with_an_older_calibration(run: Any, calibration: Path, tmp_path: Path) -> None:
     moved = SE3.exp([0.003, 0.0, 0.004, 0, 0, 0]) @ POSE
     Calibration("eye_to_hand", moved, 1e-8 * np.eye(6)).write(tmp_path / "old.json")
     out = tmp_path / "r.html"
     words = ("--images", tmp_path / "a.png", "--against", tmp_path / "old.json", "--out", out)
     ran = run("report", calibration, *words, "--json")
-    told = json.loads(ran.out)
+    record = json.loads(ran.out)
     assert ran.code == 0
-    assert told["tier"] == "precision assembly"
-    assert told["pictures"] == [str(tmp_path / "a.png")]
-    assert told["against"]["translation_mm"] == pytest.approx(5.0)
-    assert told["against"]["rotation_deg"] == pytest.approx(0.0, abs=1e-6)
-    assert told["expected_error_mm"] == pytest.approx(0.1732, abs=1e-4)
-    assert any("No landmarks" in sentence for sentence in told["missing"])
-    assert "from where old.json has it" in out.read_text()
+    assert record["tier"] == "precision assembly"
+    assert record["pictures"] == [str(tmp_path / "a.png")]
+    assert record["against"]["translation_mm"] == pytest.approx(5.0)
+    assert record["against"]["rotation_deg"] == pytest.approx(0.0, abs=1e-6)
+    assert record["expected_error_mm"] == pytest.approx(0.1732, abs=1e-4)
+    assert any("No landmarks" in sentence for sentence in record["missing"])
+    assert "from old.json" in out.read_text()
 
 
 @pytest.mark.parametrize(
-    ("camera", "said"), [(None, "no intrinsics"), (LENS, "names no images; give some")]
+    ("camera", "message"), [(None, "no intrinsics"), (CAMERA, "names no images; pass some")]
 )
-def test_a_calibration_without_images_or_lens(
-    run: Any, tmp_path: Path, camera: Camera | None, said: str
+def test_calibration_without_images_or_camera(
+    run: Any, tmp_path: Path, camera: Camera | None, message: str
 ) -> None:
-    found = Calibration("eye_in_hand", POSE, 1e-4 * np.eye(6), "gripper", camera=camera)
-    found.write(tmp_path / "s.json")
+    own = Calibration("eye_in_hand", POSE, 1e-4 * np.eye(6), "gripper", camera=camera)
+    own.write(tmp_path / "s.json")
     ran = run("report", tmp_path / "s.json", "--out", tmp_path / "r.html", "--json")
     assert ran.code == 0
-    told = json.loads(ran.out)
-    assert told["tier"] is None
-    assert told["pictures"] == []
-    assert any(said in sentence for sentence in told["missing"])
+    record = json.loads(ran.out)
+    assert record["tier"] is None
+    assert record["pictures"] == []
+    assert any(message in sentence for sentence in record["missing"])
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("gone.json",), "calibration file is missing"),
         (("c.json", "--against", "gone.json"), "calibration file is missing"),
         (("c.json", "--images", "gone.png"), "image file is missing"),
         (("c.json", "--store", "gone"), "gone"),
-        (("c.json", "--out", "gone/r.html"), "its folder does not exist"),
+        (("c.json", "--out", "gone/r.html"), "gone does not exist"),
+        (("c.json", "--out", "."), "it is a folder"),
         (("c.json", "--against", "hand.json"), "same mount"),
     ],
 )
-def test_misuse_is_named_and_writes_nothing(
-    run: Any, calibration: Path, words: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch
+def test_misuse_is_refused_and_writes_nothing(
+    run: Any,
+    calibration: Path,
+    words: tuple[str, ...],
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(calibration.parent)
     Calibration("eye_in_hand", POSE, 1e-8 * np.eye(6), "gripper").write("hand.json")
     ran = run("report", *words)
     assert ran.code == 2
     assert len(ran.err) == 1
-    assert said in ran.err[0]
+    assert message in ran.err[0]
     assert not Path("report.html").exists()

@@ -1,4 +1,4 @@
-"""`evercal simulate`: what it refuses, and a tiny suite from end to end."""
+"""`evercal simulate`: bad input, and a tiny suite from end to end."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from evercal.simulation.cell import Suite
 
 
 @pytest.mark.parametrize(
-    ("words", "named"),
+    ("words", "message"),
     [
         (("lab", "--out", "x"), "lab"),
         (("sim",), "--out"),
@@ -23,9 +23,9 @@ from evercal.simulation.cell import Suite
         (("sim", "--out", "x", "--frames", "1000000000"), "GB are free"),
     ],
 )
-def test_bad_input_is_named_and_nothing_written(
+def test_bad_input_is_refused_and_nothing_is_written(
     words: tuple[str, ...],
-    named: str,
+    message: str,
     run: Any,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -33,11 +33,11 @@ def test_bad_input_is_named_and_nothing_written(
     monkeypatch.chdir(tmp_path)
     ran = run("simulate", *words)
     assert (ran.code, ran.out) == (2, "")
-    assert any(named in line for line in ran.err)
+    assert any(message in line for line in ran.err)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_suite_is_rendered_and_taken_up_again(
+def test_a_finished_suite_is_not_rendered_again(
     run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("mitsuba", reason="the extra 'sim' is not installed")
@@ -47,8 +47,8 @@ def test_a_suite_is_rendered_and_taken_up_again(
     out = tmp_path / "rooms"
     first = run("simulate", "sim-mini", "--out", out, "--json")
     assert first.code == 0, first.err
-    said = json.loads(first.out)
-    assert (said["scenes"], said["frames"]) == ([str(out / "den")], 6)
+    report = json.loads(first.out)
+    assert (report["scenes"], report["frames"]) == ([str(out / "den")], 6)
     scene = load_recording(out / "den")
     assert (len(scene.train), len(scene.test)) == (2, 1)
     assert scene.train[0].read_image().shape == (24, 32, 3)

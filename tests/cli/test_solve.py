@@ -17,7 +17,7 @@ from ..calibration.boards.printed import CAMERA, CHESSBOARD, photographed, view_
 
 @pytest.fixture(autouse=True)
 def tiny() -> None:
-    """Nothing here is trained."""
+    """Replace the fixture that prepares training; no test here trains."""
 
 
 def write_poses(path: Path, poses: SE3, names: list[str] | None = None) -> None:
@@ -29,48 +29,51 @@ def write_poses(path: Path, poses: SE3, names: list[str] | None = None) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def files(folder: Path, drawn: SimulatedPairs, names: list[str] | None = None) -> list[Any]:
-    write_poses(folder / "robot.csv", drawn.pairs.base_from_gripper, names)
-    write_poses(folder / "camera.csv", drawn.pairs.camera_from_board, names)
-    found = ["--robot-poses", folder / "robot.csv", "--camera-poses", folder / "camera.csv"]
-    return ["solve", *found, "--out", folder / "out.json"]
+def files(folder: Path, simulated: SimulatedPairs, names: list[str] | None = None) -> list[Any]:
+    write_poses(folder / "robot.csv", simulated.pairs.base_from_gripper, names)
+    write_poses(folder / "camera.csv", simulated.pairs.camera_from_board, names)
+    poses = ["--robot-poses", folder / "robot.csv", "--camera-poses", folder / "camera.csv"]
+    return ["solve", *poses, "--out", folder / "out.json"]
 
 
-def test_an_answer_is_written_and_told(run: Any, tmp_path: Path) -> None:
-    drawn = recording(Setting(noise_mm=0.5, noise_deg=0.05, outliers=2), 0)
-    words = [*files(tmp_path, drawn), "--mount", "eye_in_hand"]
+def test_a_calibration_is_written_and_printed(run: Any, tmp_path: Path) -> None:
+    simulated = recording(Setting(noise_mm=0.5, noise_deg=0.05, outliers=2), 0)
+    words = [*files(tmp_path, simulated), "--mount", "eye_in_hand"]
     ran = run(*words)
     assert ran.code == 0
     assert ran.out.startswith("gripper_from_camera: the pose of camera in gripper")
     assert "23 of 25 used" in ran.out
-    assert f"left out   row {drawn.spoiled[0] + 1}: disagrees with the others" in ran.out
+    assert f"left out   row {simulated.spoiled[0] + 1}: disagrees with the others" in ran.out
     assert ran.out.splitlines()[-1].startswith("next: evercal export")
-    found = read_calibration(tmp_path / "out.json")
-    assert np.linalg.norm(error(found.parent_from_child, drawn.parent_from_camera)[:3]) < 0.001
-    assert found.source["command"] == "solve"
-    told = json.loads(run(*words, "--json").out)
-    assert told["matrix"] == found.to_dict()["matrix"]
-    assert told["checks"]["poses_used"] == 23
+    calibration = read_calibration(tmp_path / "out.json")
+    assert (
+        np.linalg.norm(error(calibration.parent_from_child, simulated.parent_from_camera)[:3])
+        < 0.001
+    )
+    assert calibration.source["command"] == "solve"
+    record = json.loads(run(*words, "--json").out)
+    assert record["matrix"] == calibration.to_dict()["matrix"]
+    assert record["checks"]["poses_used"] == 23
 
 
-def test_what_is_not_good_enough_exits_with_1(run: Any, tmp_path: Path) -> None:
-    drawn = recording(Setting("eye_to_hand", noise_mm=12, noise_deg=1.0, path="table"), 1)
-    ran = run(*files(tmp_path, drawn), "--mount", "eye_to_hand")
+def test_an_unusable_calibration_exits_with_1(run: Any, tmp_path: Path) -> None:
+    simulated = recording(Setting("eye_to_hand", noise_mm=12, noise_deg=1.0, path="table"), 1)
+    ran = run(*files(tmp_path, simulated), "--mount", "eye_to_hand")
     assert ran.code == 1
     assert "Unusable" in ran.out
 
 
 def test_mistakes_are_one_line_and_exit_with_2(run: Any, tmp_path: Path) -> None:
-    drawn = recording(Setting(), 2)
-    words = files(tmp_path, drawn)
-    inverted = drawn.pairs.base_from_gripper.inverse()
+    simulated = recording(Setting(), 2)
+    words = files(tmp_path, simulated)
+    inverted = simulated.pairs.base_from_gripper.inverse()
     write_poses(tmp_path / "robot.csv", inverted)
     ran = run(*words, "--mount", "eye_in_hand")
     assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
     assert "--invert robot" in ran.err[0]
     assert not (tmp_path / "out.json").exists()
     assert json.loads(run(*words, "--mount", "eye_in_hand", "--json").out).keys() == {"error"}
-    # What the message says puts it right.
+    # The advice of the message solves it.
     assert run(*words, "--mount", "eye_in_hand", "--invert", "robot").code == 0
     write_poses(tmp_path / "robot.csv", inverted[:20])
     ran = run(*words, "--mount", "eye_in_hand")
@@ -79,31 +82,35 @@ def test_mistakes_are_one_line_and_exit_with_2(run: Any, tmp_path: Path) -> None
     assert run(*words, "--mount", "beside").code == 2
     ran = run(*words[:3], "--camera-poses", tmp_path / "no.csv", "--mount", "eye_in_hand")
     assert (ran.code, len(ran.err)) == (2, 1)
+    assert "no.csv: file of camera poses is missing; check --camera-poses" in ran.err[0]
 
 
-def test_unknown_scale_is_asked_for(run: Any, tmp_path: Path) -> None:
-    drawn = recording(Setting(scale=0.37), 3)
-    words = [*files(tmp_path, drawn), "--mount", "eye_in_hand"]
+def test_unknown_scale_is_estimated_on_request(run: Any, tmp_path: Path) -> None:
+    simulated = recording(Setting(scale=0.37), 3)
+    words = [*files(tmp_path, simulated), "--mount", "eye_in_hand"]
     assert run(*words).code == 2
     ran = run(*words, "--scale", "unknown", "--json")
     assert ran.code == 0
     assert json.loads(ran.out)["checks"]["scale"] == pytest.approx(0.37, rel=0.005)
 
 
-def test_rows_go_by_name_where_there_are_names(run: Any, tmp_path: Path) -> None:
-    drawn = recording(Setting(noise_mm=0.1, noise_deg=0.01), 4)
+def test_named_rows_are_paired_by_name(run: Any, tmp_path: Path) -> None:
+    simulated = recording(Setting(noise_mm=0.1, noise_deg=0.01), 4)
     names = [f"shot-{i}.png" for i in range(25)]
-    words = files(tmp_path, drawn, names)
+    words = files(tmp_path, simulated, names)
     order = np.random.default_rng(0).permutation(25)
     write_poses(
-        tmp_path / "robot.csv", drawn.pairs.base_from_gripper[order], [names[i] for i in order]
+        tmp_path / "robot.csv", simulated.pairs.base_from_gripper[order], [names[i] for i in order]
     )
     assert run(*words, "--mount", "eye_in_hand").code == 0
-    found = read_calibration(tmp_path / "out.json")
-    assert np.linalg.norm(error(found.parent_from_child, drawn.parent_from_camera)[:3]) < 0.001
+    calibration = read_calibration(tmp_path / "out.json")
+    assert (
+        np.linalg.norm(error(calibration.parent_from_child, simulated.parent_from_camera)[:3])
+        < 0.001
+    )
 
 
-def test_time_offset_takes_times(run: Any, tmp_path: Path) -> None:
+def test_time_offset_requires_times(run: Any, tmp_path: Path) -> None:
     words = files(tmp_path, recording(Setting(), 5))
     ran = run(*words, "--mount", "eye_in_hand", "--time-offset")
     assert ran.code == 2
@@ -111,7 +118,7 @@ def test_time_offset_takes_times(run: Any, tmp_path: Path) -> None:
 
 
 def photographs(folder: Path, count: int) -> tuple[list[Path], SE3, SE3]:
-    """Images of a board, their gripper poses in robot.csv, and where the camera is."""
+    """Write images of a board and the gripper poses; return paths, camera pose and board poses."""
     views = SE3.stack([view_of(CHESSBOARD, seed) for seed in range(count)])
     gripper_from_camera = SE3.exp([0.05, -0.02, 0.08, 0.1, 0.3, 1.5])
     base_from_board = SE3.exp([0.5, 0.1, 0.0, 3.0, 0.2, 0.1])
@@ -129,45 +136,45 @@ def test_from_photographs_to_a_calibration(run: Any, tmp_path: Path) -> None:
     paths, truth, _ = photographs(tmp_path, 11)
     board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
     out = tmp_path / "board.json"
-    # As a shell lists them: image-10 before image-2.
+    # Sorted like in a shell: image-10 before image-2.
     ran = run("detect", *sorted(paths), *board, "--camera", tmp_path / "camera.json", "--out", out)
     assert ran.code == 0
     assert "11 of 11 images show the board" in ran.out
     words = ["solve", "--robot-poses", tmp_path / "robot.csv", "--camera-poses", out]
     solved = run(*words, "--mount", "eye_in_hand", "--out", tmp_path / "out.json")
     assert solved.code == 0, solved
-    found = read_calibration(tmp_path / "out.json")
-    off = error(found.parent_from_child, truth)
-    assert np.linalg.norm(off[:3]) < 0.0005
-    assert np.linalg.norm(off[3:]) < np.deg2rad(0.1)
-    assert found.camera == CAMERA
-    assert found.checks["corner_sigma_px"] < 0.1
+    calibration = read_calibration(tmp_path / "out.json")
+    difference = error(calibration.parent_from_child, truth)
+    assert np.linalg.norm(difference[:3]) < 0.0005
+    assert np.linalg.norm(difference[3:]) < np.deg2rad(0.1)
+    assert calibration.camera == CAMERA
+    assert calibration.checks["corner_sigma_px"] < 0.1
 
 
-def test_detect_tells_which_images_lack_a_board(run: Any, tmp_path: Path) -> None:
+def test_detect_reports_images_without_a_board(run: Any, tmp_path: Path) -> None:
     paths, truth, _ = photographs(tmp_path, 9)
     write_image(paths[3], np.full((480, 640, 3), 90, np.uint8))
     board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
     out = tmp_path / "board.json"
     ran = run("detect", *paths, *board, "--out", out, "--json")
     assert ran.code == 0
-    told = json.loads(ran.out)
-    assert told == json.loads(out.read_text())
-    assert told["camera_from"] == "board"
-    assert told["camera"]["fx"] == pytest.approx(600, abs=6)
-    assert [image["camera_from_board"] is None for image in told["images"]] == [
+    record = json.loads(ran.out)
+    assert record == json.loads(out.read_text())
+    assert record["camera_from"] == "board"
+    assert record["camera"]["fx"] == pytest.approx(600, abs=6)
+    assert [image["camera_from_board"] is None for image in record["images"]] == [
         i == 3 for i in range(9)
     ]
-    assert "no chessboard with 9x6 inner corners" in told["images"][3]["reason"]
-    # The robot's row of that image is left alone, the others keep theirs.
+    assert "no chessboard with 9x6 inner corners" in record["images"][3]["reason"]
+    # The robot pose of that image is skipped.
     words = ["solve", "--robot-poses", tmp_path / "robot.csv", "--camera-poses", out]
     assert run(*words, "--mount", "eye_in_hand", "--out", tmp_path / "out.json").code == 0
-    found = read_calibration(tmp_path / "out.json")
-    assert len(found.images) == 8
-    assert np.linalg.norm(error(found.parent_from_child, truth)[:3]) < 0.005
+    calibration = read_calibration(tmp_path / "out.json")
+    assert len(calibration.images) == 8
+    assert np.linalg.norm(error(calibration.parent_from_child, truth)[:3]) < 0.005
 
 
-def test_detect_refuses_what_it_cannot_use(run: Any, tmp_path: Path) -> None:
+def test_detect_refuses_unusable_input(run: Any, tmp_path: Path) -> None:
     paths, _, _ = photographs(tmp_path, 1)
     board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
     small = tmp_path / "small.json"
@@ -186,10 +193,65 @@ def test_detect_refuses_what_it_cannot_use(run: Any, tmp_path: Path) -> None:
         assert reason in ran.err[-1], ran.err
 
 
-def test_matrices_that_are_no_poses_are_refused(run: Any, tmp_path: Path) -> None:
-    drawn = recording(Setting(), 6)
-    words = files(tmp_path, drawn)
-    matrices = drawn.pairs.base_from_gripper.matrix()
+def test_report_finds_the_images_of_detect(run: Any, tmp_path: Path) -> None:
+    for folder in ("images", "poses", "results"):
+        (tmp_path / folder).mkdir()
+    photographs(tmp_path / "images", 7)
+    board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
+    poses, out = tmp_path / "poses" / "board.json", tmp_path / "results" / "calibration.json"
+    camera, robot = tmp_path / "images" / "camera.json", tmp_path / "images" / "robot.csv"
+    assert run("detect", tmp_path / "images", *board, "--camera", camera, "--out", poses).code == 0
+    names = [image["name"] for image in json.loads(poses.read_text())["images"]]
+    assert names[0] == "../images/image-1.png"
+    words = ["--robot-poses", robot, "--camera-poses", poses, "--mount", "eye_in_hand"]
+    assert run("solve", *words, "--out", out).code == 0
+    assert read_calibration(out).images[0].name == "../images/image-1.png"
+    page = tmp_path / "page.html"
+    pictures = json.loads(run("report", out, "--out", page, "--json").out)["pictures"]
+    assert len(pictures) > 0
+
+
+def test_files_with_bare_image_names_are_read(run: Any, tmp_path: Path) -> None:
+    photographs(tmp_path, 7)
+    board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
+    poses, camera = tmp_path / "board.json", tmp_path / "camera.json"
+    assert run("detect", tmp_path, *board, "--camera", camera, "--out", poses).code == 0
+    (tmp_path / "elsewhere").mkdir()
+    moved = poses.rename(tmp_path / "elsewhere" / "board.json")
+    words = ["--robot-poses", tmp_path / "robot.csv", "--camera-poses", moved]
+    out = tmp_path / "out.json"
+    assert run("solve", *words, "--mount", "eye_in_hand", "--out", out).code == 0
+    assert read_calibration(out).images[0].name == "image-1.png"
+
+
+def test_output_is_checked_before_the_work(run: Any, tmp_path: Path) -> None:
+    missing = tmp_path / "no" / "out.json"
+    # The inputs do not exist either; the output is reported first.
+    solve = ["solve", "--robot-poses", "a.csv", "--camera-poses", "b.csv", "--mount", "eye_in_hand"]
+    detect = ["detect", "c.png", "--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
+    for words in (solve, detect):
+        ran = run(*words, "--out", missing)
+        assert (ran.code, len(ran.err)) == (2, 1)
+        assert f"folder {tmp_path / 'no'} does not exist" in ran.err[0]
+        assert "is a folder; give a file" in run(*words, "--out", tmp_path).err[0]
+
+
+def test_a_broken_camera_file_is_refused_before_detection(run: Any, tmp_path: Path) -> None:
+    paths, _, _ = photographs(tmp_path, 1)
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(b"no image")
+    (tmp_path / "bad.json").write_text("{}")
+    board = ["--board", "chessboard", "--size", "9x6", "--square-mm", "30"]
+    words = ["--camera", tmp_path / "bad.json", "--out", tmp_path / "board.json"]
+    ran = run("detect", paths[0], broken, *board, *words)
+    assert ran.code == 2
+    assert "bad.json" in ran.err[-1]
+
+
+def test_matrices_that_are_not_rigid_are_refused(run: Any, tmp_path: Path) -> None:
+    simulated = recording(Setting(), 6)
+    words = files(tmp_path, simulated)
+    matrices = simulated.pairs.base_from_gripper.matrix()
     (tmp_path / "robot.json").write_text(json.dumps(matrices.tolist()))
     words[2] = tmp_path / "robot.json"
     assert run(*words, "--mount", "eye_in_hand").code == 0
@@ -198,7 +260,7 @@ def test_matrices_that_are_no_poses_are_refused(run: Any, tmp_path: Path) -> Non
     ran = run(*words, "--mount", "eye_in_hand")
     assert (ran.code, len(ran.err)) == (2, 1)
     assert "rotation" in ran.err[0]
-    # Millimetres in both files: nothing is guessed.
+    # Millimetres in both files are refused, not guessed.
     for name in ("robot", "camera"):
         rows = np.loadtxt(tmp_path / f"{name}.csv", delimiter=",", skiprows=1)
         rows[:, :3] *= 1000
@@ -207,4 +269,4 @@ def test_matrices_that_are_no_poses_are_refused(run: Any, tmp_path: Path) -> Non
     words[2] = tmp_path / "robot.csv"
     ran = run(*words, "--mount", "eye_in_hand")
     assert (ran.code, len(ran.err)) == (2, 1)
-    assert "millimetre" in ran.err[0]
+    assert "look like millimetres" in ran.err[0]

@@ -1,4 +1,4 @@
-"""What selectors see of frames: means over the right rows, parts that overlap, true gradients."""
+"""Statistics of frames: features, parts of the scene, gradients."""
 
 from dataclasses import replace
 
@@ -19,10 +19,10 @@ from .stages import Blank, Rooms
 
 
 @pytest.fixture(scope="module")
-def seen(
+def captured(
     blank: Blank, rooms: Rooms, quick: StageOptions
 ) -> tuple[FrameStatistics, Head, FeatureBuffer]:
-    """Frames of `alpha` after some learning, with two views of each in the buffer."""
+    """Frames of `alpha` after some training, with two views of each in the buffer."""
     options = replace(quick, fit=replace(quick.fit, iterations=60))
     *_, stage = learn(blank("finetune"), STRATEGIES["finetune"], rooms[0], options)
     assert isinstance(stage, Stage)
@@ -33,28 +33,30 @@ def seen(
     return FrameStatistics(rooms[0].train, head, lambda: buffer, 5), head, buffer
 
 
-def test_features_are_means_over_a_frame(seen: tuple[FrameStatistics, Head, FeatureBuffer]) -> None:
-    candidates, head, buffer = seen
-    found = candidates.features()
-    assert found.shape == (len(candidates), head.options.width) == (30, 16)
+def test_features_are_means_over_a_frame(
+    captured: tuple[FrameStatistics, Head, FeatureBuffer],
+) -> None:
+    candidates, head, buffer = captured
+    actual = candidates.features()
+    assert actual.shape == (len(candidates), head.options.width) == (30, 16)
     for frame in (0, 7, 29):
         where = torch.nonzero(buffer.tensors["view"] == frame)[:, 0]
         rows = buffer.rows(where)
         with torch.no_grad():
             mean = head.hidden(rows.features.float(), 0, rows.descriptor).mean(0)
-        np.testing.assert_allclose(found[frame], mean.numpy(), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(actual[frame], mean.numpy(), rtol=1e-5, atol=1e-6)
 
 
-def test_parts_are_shared_by_neighbours(
-    seen: tuple[FrameStatistics, Head, FeatureBuffer], monkeypatch: pytest.MonkeyPatch
+def test_neighbouring_frames_share_parts(
+    captured: tuple[FrameStatistics, Head, FeatureBuffer], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    candidates, _, _ = seen
+    candidates, _, _ = captured
     monkeypatch.setattr("evercal.continual.frame_statistics.RELIABLE_PX", 1e3)
     monkeypatch.setattr("evercal.continual.frame_statistics.PARTS", 40)
     parts = candidates.visible_parts()
     assert len(parts) == 30
-    assert all((np.diff(found) > 0).all() and found.min() >= 0 for found in parts)
-    assert max(found.max() for found in parts) < 40 < PARTS
+    assert all((np.diff(actual) > 0).all() and actual.min() >= 0 for actual in parts)
+    assert max(actual.max() for actual in parts) < 40 < PARTS
 
     def overlap(a: np.ndarray, b: np.ndarray) -> float:
         return len(np.intersect1d(a, b)) / len(np.union1d(a, b))
@@ -64,11 +66,11 @@ def test_parts_are_shared_by_neighbours(
     assert near > far
 
 
-def test_a_gradient_says_how_the_loss_falls(
-    seen: tuple[FrameStatistics, Head, FeatureBuffer], monkeypatch: pytest.MonkeyPatch
+def test_gradient_predicts_the_change_of_the_loss(
+    captured: tuple[FrameStatistics, Head, FeatureBuffer], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A small step against a frame's gradient lowers the loss by its squared length."""
-    candidates, head, buffer = seen
+    """A small step against the gradient lowers the loss by the predicted amount."""
+    candidates, head, buffer = captured
     gradient = candidates.gradients()[3]
     where = torch.nonzero(buffer.tensors["view"] == 3)[:, 0]
     generator = torch.Generator().manual_seed(5)
@@ -83,27 +85,27 @@ def test_a_gradient_says_how_the_loss_falls(
             points = head(rows.features.float(), 0, rows.descriptor).points
             return float(reprojection_loss(points, rows.target, 5.0, LossOptions())[0].mean())
 
-    before, kept = loss(), head.logit.detach().clone()
+    before, selected = loss(), head.logit.detach().clone()
     part = torch.from_numpy(gradient[: head.logit.numel()]).float().view_as(head.logit)
     step = 1e-3 / float(part.norm())
     with torch.no_grad():
         head.logit.sub_(step * part)
     after = loss()
     with torch.no_grad():
-        head.logit.copy_(kept)
+        head.logit.copy_(selected)
     assert before - after == pytest.approx(step * float(part.norm()) ** 2, rel=0.1)
 
 
-def test_where_centres_are_known_in_advance_all_of_them_give_gradients(
-    seen: tuple[FrameStatistics, Head, FeatureBuffer], rooms: Rooms
+def test_fixed_centres_all_have_gradients(
+    captured: tuple[FrameStatistics, Head, FeatureBuffer], rooms: Rooms
 ) -> None:
-    """They belong to no scene: those of a later scene would have none of its own."""
-    _, known, buffer = seen
+    """Fixed centres belong to no scene, so all of them are used."""
+    _, learned_head, buffer = captured
     torch.manual_seed(0)
     options = HeadOptions(
         width=16, blocks=1, condition="descriptor", centres="fixed", centres_per_scene=6
     )
-    head = Head(known.features, known.descriptor, options)
+    head = Head(learned_head.features, 8, options)
     head.grow(torch.randn(6, 3) + torch.tensor([0.0, 0.0, 2.0]), seed=0)
     later = FeatureBuffer(1, buffer.atlas_from_base)
     later.restore(dict(buffer.tensors))
@@ -112,7 +114,7 @@ def test_where_centres_are_known_in_advance_all_of_them_give_gradients(
     assert np.abs(gradients).max() > 0
 
 
-def test_poses_are_those_of_the_frames_and_draws_repeat(rooms: Rooms) -> None:
+def test_poses_match_the_frames_and_draws_are_reproducible(rooms: Rooms) -> None:
     frames = rooms[1].train
 
     def never() -> FeatureBuffer:

@@ -28,7 +28,7 @@ def _restored() -> object:
     STRATEGIES.update(before)
 
 
-def test_the_example_is_short_and_can_be_loaded_twice() -> None:
+def test_example_is_short_and_can_be_loaded_twice() -> None:
     assert len(EXAMPLE.read_text().splitlines()) <= 40
     assert load_plugin(EXAMPLE) == ("spread",)
     method = STRATEGIES["spread"].method
@@ -38,14 +38,17 @@ def test_the_example_is_short_and_can_be_loaded_twice() -> None:
         positions_m = np.linspace(0, 1, 11)[:, None] * [1.0, 0, 0]
         quaternions_wxyz = np.tile([1.0, 0, 0, 0], (11, 1))
 
-    kept = method.select(Line(), 3)  # pyright: ignore[reportArgumentType]
-    assert kept is not None
-    assert kept.tolist() == [0, 5, 10]
-    # What it is made of is recorded like ours.
-    told = STRATEGIES["spread"].description()["method"]
-    assert isinstance(told, dict)
-    assert (told["kind"], told["penalty"]) == ("Spread", {"kind": "OldOutput", "px_per_m": 25.0})
-    with pytest.raises(InputError, match="'spread' is evercal's own"):
+    selected = method.select(Line(), 3)  # pyright: ignore[reportArgumentType]
+    assert selected is not None
+    assert selected.tolist() == [0, 5, 10]
+    # Its hyper-parameters are recorded.
+    records = STRATEGIES["spread"].description()["method"]
+    assert isinstance(records, dict)
+    assert (records["kind"], records["penalty"]) == (
+        "Spread",
+        {"kind": "OldOutput", "px_per_m": 25.0},
+    )
+    with pytest.raises(InputError, match="'spread' exists"):
         load_plugin(EXAMPLE)
 
 
@@ -65,7 +68,7 @@ def test_the_example_is_short_and_can_be_loaded_twice() -> None:
         ("def :", "SyntaxError"),
     ],
 )
-def test_files_that_are_no_plugins(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_plugins_are_refused(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "mine.py"
     path.write_text(text)
     before = dict(STRATEGIES)
@@ -74,13 +77,13 @@ def test_files_that_are_no_plugins(tmp_path: Path, text: str, message: str) -> N
     assert before == STRATEGIES
 
 
-def test_names_of_ours_are_taken(tmp_path: Path) -> None:
+def test_existing_names_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
     path.write_text(
         "from evercal.continual.strategies import Strategy\n"
         "STRATEGIES = {'finetune': Strategy('finetune', source='mine')}"
     )
-    with pytest.raises(InputError, match="'finetune' is evercal's own"):
+    with pytest.raises(InputError, match="'finetune' exists"):
         load_plugin(path)
     with pytest.raises(InputError, match="no such file"):
         load_plugin(tmp_path / "none.py")
@@ -89,13 +92,13 @@ def test_names_of_ours_are_taken(tmp_path: Path) -> None:
         load_plugin(tmp_path / "mine.txt")
 
 
-def test_the_example_learns_two_scenes(blank: Blank, rooms: Rooms, quick: StageOptions) -> None:
-    """Its frames are replayed, with its penalty: without a weight it ends elsewhere."""
+def test_example_learns_two_scenes(blank: Blank, rooms: Rooms, quick: StageOptions) -> None:
+    """The penalty of the example changes the training."""
     (name,) = load_plugin(EXAMPLE)
     strategy = strategy_named(name)
     before = outcome(learn(blank(name), strategy, rooms[0], quick))
     maps = outcome(learn(before, strategy, rooms[1], quick))
-    assert [len(kept) for kept in maps.keyframes if kept is not None] == [3, 3]
+    assert [len(selected) for selected in maps.keyframes if selected is not None] == [3, 3]
     method = strategy.method
     assert method is not None
     assert method.penalty == OldOutput(25.0)  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,4 +1,4 @@
-"""Which frames stay: within the capacity, in recorded order, whatever the rule."""
+"""All selectors: capacity and order."""
 
 import numpy as np
 import pytest
@@ -11,8 +11,8 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame
 
 
-class Known(FrameStatistics):
-    """Frames of a camera that moves by random steps; what a head would say is made up."""
+class SyntheticFrames(FrameStatistics):
+    """Frames of a moving camera, with synthetic outputs of a head."""
 
     def __init__(self, positions: np.ndarray, quaternions: np.ndarray):
         camera, image = Camera(8, 8, 8, 8, 3.5, 3.5), np.zeros((8, 8, 3), np.uint8)
@@ -36,24 +36,27 @@ class Known(FrameStatistics):
 
 @pytest.mark.parametrize("count", [10, 37, 100, 256])
 @pytest.mark.parametrize("name", SELECTORS)
-def test_no_selection_exceeds_its_capacity(name: str, count: int) -> None:
+def test_selection_is_sorted_and_within_capacity(name: str, count: int) -> None:
     rng = np.random.default_rng(count)
     positions = np.cumsum(rng.normal(0, 0.05, (count, 3)), axis=0)
-    turns = np.array([1.0, 0, 0, 0]) + np.cumsum(rng.normal(0, 0.1, (count, 4)), axis=0)
-    quaternions = turns / np.linalg.norm(turns, axis=1, keepdims=True)
+    rotations = np.array([1.0, 0, 0, 0]) + np.cumsum(rng.normal(0, 0.1, (count, 4)), axis=0)
+    quaternions = rotations / np.linalg.norm(rotations, axis=1, keepdims=True)
     capacity = count // 10
-    kept = SELECTORS[name](Known(positions, quaternions), capacity)
-    assert 1 <= len(kept) <= capacity
-    assert np.issubdtype(kept.dtype, np.integer)
-    assert (np.diff(kept) > 0).all()
-    assert kept[0] >= 0
-    assert kept[-1] < count
+    selected = SELECTORS[name](SyntheticFrames(positions, quaternions), capacity)
+    assert 1 <= len(selected) <= capacity
+    assert np.issubdtype(selected.dtype, np.integer)
+    assert (np.diff(selected) > 0).all()
+    assert selected[0] >= 0
+    assert selected[-1] < count
 
 
-def test_only_the_papers_own_radius_leaves_memory_unused() -> None:
-    # A camera that moves little relative to its turning stays within r = 0.5 of few frames.
+def test_only_sars_may_leave_memory_unused() -> None:
+    # On a straight path few frames are 0.5 apart.
     positions = np.linspace(0, 1, 200)[:, None] * [1.0, 0, 0]
     quaternions = np.tile([1.0, 0, 0, 0], (200, 1))
-    kept = {name: len(rule(Known(positions, quaternions), 20)) for name, rule in SELECTORS.items()}
-    assert kept.pop("sars") < 20
-    assert set(kept.values()) == {20}
+    selected = {
+        name: len(rule(SyntheticFrames(positions, quaternions), 20))
+        for name, rule in SELECTORS.items()
+    }
+    assert selected.pop("sars") < 20
+    assert set(selected.values()) == {20}

@@ -1,9 +1,9 @@
 """Corrections that go together in places are taken back; noise is not."""
 
 import numpy as np
+from evercal.mapping.frame_correction import fit_correction
 
 from evercal.geometry.se3 import SE3, pose_distance
-from evercal.mapping.frame_correction import fit_correction
 
 
 def _walk(n: int, rng: np.random.Generator) -> SE3:

@@ -1,4 +1,4 @@
-"""Images keep their pixels and colours; what is wrong with a file is told apart."""
+"""Images keep pixels and colours, are turned upright, and broken files are refused."""
 
 import struct
 from pathlib import Path
@@ -9,7 +9,16 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.recordings import Frame, image_size, read_image, write_image
+from evercal.recordings import (
+    Frame,
+    as_rgb,
+    generic,
+    image_size,
+    load_recording,
+    read_image,
+    write_image,
+)
+from evercal.recordings.frame import Recording
 
 
 def test_png_round_trip_is_exact(tmp_path: Path) -> None:
@@ -22,35 +31,89 @@ def test_png_round_trip_is_exact(tmp_path: Path) -> None:
     assert image_size(tmp_path / "ünï.png") == (30, 20)
 
 
-def test_red_is_the_first_channel(tmp_path: Path) -> None:
-    red_in_opencv = np.zeros((4, 4, 3), np.uint8)
-    red_in_opencv[:, :, 2] = 255
-    cv2.imwrite(str(tmp_path / "red.png"), red_in_opencv)
-    assert read_image(tmp_path / "red.png")[0, 0].tolist() == [255, 0, 0]
+RAMP = np.arange(0, 65536, 257, dtype=np.uint16).reshape(16, 16)
+RGB16 = np.stack([RAMP, RAMP[::-1], RAMP.T], axis=2) + np.uint16(100)
 
 
-def test_grey_and_transparent_images_become_rgb(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "grey.png"), np.full((4, 6), 7, np.uint8))
-    cv2.imwrite(str(tmp_path / "alpha.png"), np.full((4, 6, 4), 7, np.uint8))
-    for name in ("grey.png", "alpha.png"):
-        assert read_image(tmp_path / name).shape == (4, 6, 3)
+@pytest.mark.parametrize(
+    "image",
+    [
+        (RAMP >> 8).astype(np.uint8),
+        RAMP,
+        (RGB16 >> 8).astype(np.uint8),
+        RGB16,
+        np.dstack([(RGB16 >> 8).astype(np.uint8), np.full((16, 16), 7, np.uint8)]),
+        np.dstack([RGB16, np.full((16, 16), 7, np.uint16)]),
+    ],
+    ids=["grey8", "grey16", "rgb8", "rgb16", "rgba8", "rgba16"],
+)
+def test_files_and_arrays_convert_alike(tmp_path: Path, image: np.ndarray) -> None:
+    stored = image if image.ndim == 2 else image[:, :, [2, 1, 0, 3][: image.shape[2]]]
+    cv2.imwrite(str(tmp_path / "a.png"), stored)
+    rgb = as_rgb(image)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), rgb)
+    colours = image[:, :, None] if image.ndim == 2 else image[:, :, :3]
+    expected = colours / 257 if image.dtype == np.uint16 else colours
+    np.testing.assert_array_equal(rgb, np.broadcast_to(np.round(expected), (16, 16, 3)))
+    camera = Camera(16, 16, 20.0, 20.0, 7.5, 7.5)
+    np.testing.assert_array_equal(Frame("a", image, camera, None).read_image(), rgb)
 
 
-def test_an_exif_rotation_is_not_applied(tmp_path: Path) -> None:
-    write_image(tmp_path / "a.jpg", np.zeros((16, 32, 3), np.uint8))
-    data = (tmp_path / "a.jpg").read_bytes()
-    # A TIFF header with the one entry "orientation = 6 (rotated by 90 degrees)".
-    tiff = b"II*\0" + struct.pack("<IHHHIII", 8, 1, 0x0112, 3, 1, 6, 0)
+def test_nested_lists_and_single_channels_are_images() -> None:
+    assert as_rgb([[0, 255], [7, 8]])[1, 1].tolist() == [8, 8, 8]
+    assert as_rgb(np.full((2, 3, 1), 9, np.uint8)).shape == (2, 3, 3)
+    image = np.zeros((4, 4, 3), np.uint8)
+    assert np.shares_memory(as_rgb(image), image)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((4, 4, 3), np.float32), r"shape \(4, 4, 3\) and type float32"),
+        (np.zeros((4, 4, 2), np.uint8), r"shape \(4, 4, 2\) and type uint8"),
+        (np.zeros((0, 4, 3), np.uint8), r"shape \(0, 4, 3\)"),
+        (np.zeros(4, np.uint8), r"shape \(4,\)"),
+        ([[0, 256]], "type int64"),
+        ([[1], [1, 2]], "not an array"),
+        ("image.png", "shape"),
+        (None, "type object"),
+    ],
+)
+def test_other_arrays_are_refused(image: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        as_rgb(image)  # pyright: ignore[reportArgumentType]
+
+
+def rotated_jpeg(path: Path, orientation: int) -> None:
+    """A JPEG with 32x16 stored pixels, bright at the top, and an EXIF orientation."""
+    image = np.zeros((16, 32, 3), np.uint8)
+    image[:8] = 255
+    write_image(path, image)
+    data = path.read_bytes()
+    tiff = b"II*\0" + struct.pack("<IHHHIII", 8, 1, 0x0112, 3, 1, orientation, 0)
     exif = b"Exif\0\0" + tiff
     segment = b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif
-    (tmp_path / "b.jpg").write_bytes(data[:2] + segment + data[2:])
-    rotated = cv2.imread(str(tmp_path / "b.jpg"))
-    assert rotated is not None
-    assert rotated.shape == (32, 16, 3)  # the tag is there
-    assert read_image(tmp_path / "b.jpg").shape == (16, 32, 3)
+    path.write_bytes(data[:2] + segment + data[2:])
 
 
-def test_missing_unreadable_and_folder_are_told_apart(tmp_path: Path) -> None:
+def test_exif_orientation_is_applied(tmp_path: Path) -> None:
+    file = tmp_path / "a.jpg"
+    rotated_jpeg(file, 6)  # to be rotated by 90 degrees clockwise
+    image = read_image(file)
+    assert image_size(file) == (16, 32)
+    assert image.shape == (32, 16, 3)
+    assert image[:, 12:].min() > 200
+    assert image[:, :4].max() < 50
+    rotated_jpeg(file, 3)
+    assert read_image(file)[12:].min() > 200
+    # A copy keeps the orientation of its file.
+    rotated_jpeg(file, 6)
+    frame = Frame("a", file, Camera(16, 32, 20.0, 20.0, 7.5, 15.5), SE3.identity())
+    generic.write(tmp_path / "out", Recording("x", (frame,), ()))
+    np.testing.assert_array_equal(load_recording(tmp_path / "out").train[0].read_image(), image)
+
+
+def test_broken_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "empty.png").write_bytes(b"")
     (tmp_path / "text.png").write_bytes(b"hello")
     with pytest.raises(InputError, match=r"none\.png: image file is missing"):
@@ -63,14 +126,14 @@ def test_missing_unreadable_and_folder_are_told_apart(tmp_path: Path) -> None:
         read_image(tmp_path)
 
 
-def test_write_refuses_what_is_no_image(tmp_path: Path) -> None:
+def test_writer_refuses_other_arrays_and_endings(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"'\.xyz' is no image format"):
         write_image(tmp_path / "a.xyz", np.zeros((2, 2, 3), np.uint8))
     with pytest.raises(ValueError, match="float32"):
         write_image(tmp_path / "a.png", np.zeros((2, 2, 3), np.float32))  # pyright: ignore[reportArgumentType]
 
 
-def test_a_frame_refuses_an_image_of_another_size(tmp_path: Path) -> None:
+def test_image_of_another_size_than_its_camera_is_refused(tmp_path: Path) -> None:
     camera = Camera(32, 16, 20.0, 20.0, 15.5, 7.5)
     image = np.zeros((16, 32, 3), np.uint8)
     write_image(tmp_path / "a.png", image)

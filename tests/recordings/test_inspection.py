@@ -1,18 +1,18 @@
-"""A sound recording raises no warning, what is planted is found."""
+"""A correct recording gives no warning, and planted faults are reported."""
 
 import numpy as np
 import pytest
 
 from evercal.geometry import SE3, Camera
 from evercal.recordings import Frame, Recording
-from evercal.recordings.inspection import inspect_scene, turning_shares
+from evercal.recordings.inspection import inspect_recording, rotation_shares
 from evercal.simulation.box_room import BoxRoom, look_at
 
 LENS = Camera(32, 24, 26, 26, 15.5, 11.5)
 PICTURE = np.zeros((24, 32, 3), np.uint8)
 
 
-def scene(train: SE3, test: SE3, camera: Camera = LENS, untracked: int = 0) -> Recording:
+def recording_of(train: SE3, test: SE3, camera: Camera = LENS, untracked: int = 0) -> Recording:
     def frames(poses: SE3, split: str) -> tuple[Frame, ...]:
         count = len(poses)
         return tuple(Frame(f"{split}{i}", PICTURE, camera, poses[i]) for i in range(count))
@@ -20,64 +20,66 @@ def scene(train: SE3, test: SE3, camera: Camera = LENS, untracked: int = 0) -> R
     return Recording("planted", frames(train, "a"), frames(test, "b"), untracked)
 
 
-def warned(scene: Recording) -> str:
-    return "\n".join(inspect_scene(scene).warnings)
+def warned(recording: Recording) -> str:
+    return "\n".join(inspect_recording(recording).warnings)
 
 
 ROOM = BoxRoom(41, furniture=0, texture_px=16)
 TRAIN, TEST = ROOM.path(200, 1), ROOM.path(40, 2)
 
 
-def test_numbers_are_those_of_a_known_path() -> None:
+def test_summary_of_a_straight_path() -> None:
     x = np.linspace(0, 1.9, 20)
     path = SE3.stack([look_at(np.array([v, 0, 1]), np.array([v, 5, 1.5])) for v in x])
-    found = inspect_scene(scene(path, path[::4], untracked=3))
-    np.testing.assert_allclose(found.extent_m, (1.9, 0, 0), atol=1e-12)
-    assert found.step_median_m == pytest.approx(0.1)
-    assert found.step_largest_m == pytest.approx(0.1)
-    assert found.near_training == 100
-    assert found.untracked == 3
+    inspection = inspect_recording(recording_of(path, path[::4], untracked=3))
+    np.testing.assert_allclose(inspection.extent_m, (1.9, 0, 0), atol=1e-12)
+    assert inspection.step_median_m == pytest.approx(0.1)
+    assert inspection.step_largest_m == pytest.approx(0.1)
+    assert inspection.near_training == 100
+    assert inspection.untracked == 3
 
 
-def test_planted_faults_are_found() -> None:
-    assert warned(scene(TRAIN, TEST)) == ""
+def test_planted_faults_are_reported() -> None:
+    assert warned(recording_of(TRAIN, TEST)) == ""
     still = SE3(TRAIN.rotation_wxyz, np.zeros((200, 3)))
     rigid = SE3(np.tile(TRAIN.rotation_wxyz[0], (200, 1)), TRAIN.translation_m)
     millimetres = SE3(TRAIN.rotation_wxyz, 1000 * TRAIN.translation_m)
     kilometres = SE3(TRAIN.rotation_wxyz, 0.001 * TRAIN.translation_m)
     shuffled = TRAIN[np.random.default_rng(0).permutation(200)]
-    assert "stand at one point" in warned(scene(still, TEST))
-    assert "look the same way" in warned(scene(rigid, TEST))
-    assert "millimetres" in warned(scene(millimetres, TEST))
-    assert "in metres" in warned(scene(kilometres, TEST))
-    assert "recorded order" in warned(scene(shuffled, TEST))
-    assert "test frames have the pose" in warned(scene(TRAIN, TRAIN[:40]))
-    assert "have no pose" in warned(scene(TRAIN, TEST, untracked=300))
-    assert "16 or more" in warned(scene(TRAIN[:5], TEST))
-    assert "nothing to measure" in warned(scene(TRAIN, TEST[:0]))
-    assert "far from the middle" in warned(scene(TRAIN, TEST, Camera(32, 24, 26, 26, 25, 11)))
-    assert "sees" in warned(scene(TRAIN, TEST, Camera(32, 24, 525, 525, 15.5, 11.5)))
-    assert "square pixels" in warned(scene(TRAIN, TEST, Camera(32, 24, 26, 40, 15.5, 11.5)))
+    assert "stand at one point" in warned(recording_of(still, TEST))
+    assert "look the same way" in warned(recording_of(rigid, TEST))
+    assert "millimetres" in warned(recording_of(millimetres, TEST))
+    assert "in metres" in warned(recording_of(kilometres, TEST))
+    assert "recorded order" in warned(recording_of(shuffled, TEST))
+    assert "test frames have the pose" in warned(recording_of(TRAIN, TRAIN[:40]))
+    assert "have no pose" in warned(recording_of(TRAIN, TEST, untracked=300))
+    assert "16 or more" in warned(recording_of(TRAIN[:5], TEST))
+    assert "nothing to measure" in warned(recording_of(TRAIN, TEST[:0]))
+    assert "far from the middle" in warned(
+        recording_of(TRAIN, TEST, Camera(32, 24, 26, 26, 25, 11))
+    )
+    assert "sees" in warned(recording_of(TRAIN, TEST, Camera(32, 24, 525, 525, 15.5, 11.5)))
+    assert "square pixels" in warned(recording_of(TRAIN, TEST, Camera(32, 24, 26, 40, 15.5, 11.5)))
 
 
-def test_other_conventions_are_found() -> None:
+def test_other_conventions_are_reported() -> None:
     for shift in (1, -1):
         wrong = SE3(np.roll(TRAIN.rotation_wxyz, shift, axis=1), TRAIN.translation_m)
-        assert "w x y z" in warned(scene(wrong, TEST))
-    assert "not their inverse" in warned(scene(TRAIN.inverse(), TEST))
+        assert "w x y z" in warned(recording_of(wrong, TEST))
+    assert "not their inverse" in warned(recording_of(TRAIN.inverse(), TEST))
     body = np.eye(4)
     body[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]  # camera_from_body, x forward and z up
-    assert "forward" in warned(scene(TRAIN @ SE3.from_matrix(body), TEST))
+    assert "forward" in warned(recording_of(TRAIN @ SE3.from_matrix(body), TEST))
 
 
-def test_turning_is_told_apart_by_axis() -> None:
+def test_rotation_is_attributed_to_axes() -> None:
     eye, angles = np.zeros(3), np.linspace(0, 6, 100)
     pan = [look_at(eye, np.array([np.cos(a), np.sin(a), 0.0])) for a in angles]
-    np.testing.assert_allclose(turning_shares(SE3.stack(pan)), (0, 1, 0), atol=1e-9)
+    np.testing.assert_allclose(rotation_shares(SE3.stack(pan)), (0, 1, 0), atol=1e-9)
     # Looking down by 45 deg, half of a pan is a roll: no reason for a warning.
     down = [look_at(eye, np.array([np.cos(a), np.sin(a), -1.0])) for a in angles]
-    np.testing.assert_allclose(turning_shares(SE3.stack(down)), (0, 0.5, 0.5), atol=1e-9)
+    np.testing.assert_allclose(rotation_shares(SE3.stack(down)), (0, 0.5, 0.5), atol=1e-9)
     roll = [look_at(eye, np.array([1.0, 0, 0]), a) for a in angles]
-    np.testing.assert_allclose(turning_shares(SE3.stack(roll)), (0, 0, 1), atol=1e-9)
+    np.testing.assert_allclose(rotation_shares(SE3.stack(roll)), (0, 0, 1), atol=1e-9)
     leaps = SE3.stack([pose for i in range(10) for pose in (pan[i], roll[50 + i])])
-    assert turning_shares(leaps) == (1 / 3, 1 / 3, 1 / 3)
+    assert rotation_shares(leaps) == (1 / 3, 1 / 3, 1 / 3)

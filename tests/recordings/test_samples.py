@@ -1,15 +1,20 @@
-"""The rooms that come with the package: complete, small, honest; grey views lie over them."""
+"""The packaged recordings: complete, small, and equal to what the simulator states."""
+
+import json
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from evercal.geometry import SE3, pose_distance
-from evercal.recordings.samples import FOLDER, SampleRoom, sample_rooms
+from evercal.errors import InputError
+from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
+from evercal.recordings import load_recording
+from evercal.recordings.samples import CELL, FOLDER, SampleRoom, copy_samples, sample_rooms
 from evercal.simulation.cell import SUITES
 from evercal.simulation.cell_paths import changed_shots
 from evercal.simulation.changed_room import changed_room
-from evercal.simulation.furnished.rooms import room as simulated
+from evercal.simulation.furnished.rooms import room as simulated_room
 from evercal.simulation.untextured import untextured_renders
 
 
@@ -22,8 +27,8 @@ def poses(frames: tuple) -> SE3:
     return SE3.stack([frame.base_from_camera for frame in frames])
 
 
-def alike(a: np.ndarray, b: np.ndarray) -> float:
-    """How well the edges of two images lie over each other; 1 is the same image."""
+def edge_correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Correlation of the edge strengths of two images; 1 for the same image."""
 
     def edges(image: np.ndarray) -> np.ndarray:
         grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 1.5)
@@ -32,78 +37,108 @@ def alike(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(edges(a).ravel(), edges(b).ravel())[0, 1])
 
 
-def test_three_rooms_in_thirteen_megabytes(rooms: tuple[SampleRoom, ...]) -> None:
+def test_rooms_are_complete_and_small(rooms: tuple[SampleRoom, ...]) -> None:
     assert [room.scene.name for room in rooms] == ["bedroom", "kitchen", "living"]
     for room in rooms:
         assert (len(room.scene.train), len(room.scene.test)) == (91, 39)
         assert room.scene.test[7].read_image().shape == (240, 320, 3)
         assert room.fixed is not None
-        assert len(room.fixed.test) == 25
-        apart, angle = pose_distance(poses(room.fixed.test), poses(room.fixed.test)[0])
-        assert max(apart.max(), angle.max()) < 1e-9
         assert len({frame.joints_rad for frame in room.fixed.test}) == 25
+        metres, radians = pose_distance(poses(room.fixed.test), poses(room.fixed.test)[0])
+        assert max(metres.max(), radians.max()) < 1e-9
     assert sum(path.stat().st_size for path in FOLDER.rglob("*")) <= 13e6
 
 
-def test_a_bump_and_a_change_were_recorded(rooms: tuple[SampleRoom, ...]) -> None:
+def test_bumped_and_changed_recordings_match_the_simulator(rooms: tuple[SampleRoom, ...]) -> None:
     for room, (name, kind, seed) in zip(rooms, SUITES["sim-mini"].rooms, strict=True):
         assert room.fixed is not None
         assert room.bumped is not None
-        metres, angle = pose_distance(poses(room.fixed.test), poses(room.bumped.test))
+        metres, radians = pose_distance(poses(room.fixed.test), poses(room.bumped.test))
         np.testing.assert_allclose(metres, 0.005, atol=1e-9)
-        assert angle.max() < 1e-9
+        assert radians.max() < 1e-9
         assert room.changed is not None
         assert (room.changed.name, len(room.changed.train)) == (f"{name}-changed", 0)
-        assert {frame.read_image().shape for frame in room.changed.test} == {(240, 320, 3)}
-        # What is in the package is what the simulator's room and paths are today.
-        after, train = changed_room(simulated(kind, seed), 0), poses(room.scene.train)
+        after, train = changed_room(simulated_room(kind, seed), 0), poses(room.scene.train)
         shots = changed_shots(after, 20, train, seed=0)
-        found = poses(room.changed.test).matrix()
-        np.testing.assert_allclose(
-            found, [shot.base_from_camera.matrix() for shot in shots], atol=1e-6
-        )
-        assert not np.allclose(found, poses(room.scene.test[:20]).matrix(), atol=1e-2)
-        joints = {frame.joints_rad for frame in room.scene.train + room.scene.test}
-        assert not joints & {frame.joints_rad for frame in room.changed.test}
-    assert (SampleRoom(rooms[0].scene).bumped, SampleRoom(rooms[0].scene).changed) == (None, None)
+        expected = [shot.base_from_camera.matrix() for shot in shots]
+        np.testing.assert_allclose(poses(room.changed.test).matrix(), expected, atol=1e-6)
 
 
-def test_untextured_renders_lie_less_well_over_a_changed_room(
-    rooms: tuple[SampleRoom, ...],
-) -> None:
-    pytest.importorskip("mitsuba", reason="the extra 'sim' is not installed")
-    room = rooms[2]
-    assert room.changed is not None
-    agreement = []
-    for scene in (room.scene, room.changed):
-        frames = list(scene.test[:20:10])
-        views = untextured_renders(
-            SUITES["sim-mini"].rooms[2][1:], frames, list(poses(tuple(frames)))
-        )
-        pairs = zip(frames, views, strict=True)
-        agreement.append(np.mean([alike(frame.read_image(), view) for frame, view in pairs]))
-    # The furniture still does.
-    assert 0.2 < agreement[1] < agreement[0]
-
-
-def test_test_frames_are_not_training_frames(rooms: tuple[SampleRoom, ...]) -> None:
+def test_test_frames_differ_from_training_frames(rooms: tuple[SampleRoom, ...]) -> None:
     for room in rooms:
-        train, test = poses(room.scene.train), poses(room.scene.test)
+        test, train = poses(room.scene.test), poses(room.scene.train)
         metres, radians = pose_distance(test[:, None], train[None])
         near = ((metres < 0.05) & (radians < np.deg2rad(5))).any(1)
-        same = (metres < 0.01) & (radians < np.deg2rad(1))
         assert near.mean() <= 0.1
-        assert not same.any()
+        assert not ((metres < 0.01) & (radians < np.deg2rad(1))).any()
 
 
-def test_untextured_renders_lie_over_the_images(rooms: tuple[SampleRoom, ...]) -> None:
+def test_untextured_renders_align_with_the_images(rooms: tuple[SampleRoom, ...]) -> None:
     pytest.importorskip("mitsuba", reason="the extra 'sim' is not installed")
-    room = rooms[1]
-    frame = room.scene.test[5]
+    frame = rooms[1].scene.test[5]
     pose = frame.base_from_camera
     assert pose is not None
-    off = pose @ SE3.exp([0.1, 0.05, 0, 0, 0, 0.05])
-    right, wrong = untextured_renders(SUITES["sim-mini"].rooms[1][1:], [frame, frame], [pose, off])
-    assert right.shape == frame.read_image().shape
-    seen = frame.read_image()
-    assert alike(seen, right) > alike(seen, wrong) + 0.2
+    wrong_pose = pose @ SE3.exp([0.1, 0.05, 0, 0, 0, 0.05])
+    right, wrong = untextured_renders(
+        SUITES["sim-mini"].rooms[1][1:], [frame, frame], [pose, wrong_pose]
+    )
+    image = frame.read_image()
+    assert right.shape == image.shape
+    assert edge_correlation(image, right) > edge_correlation(image, wrong) + 0.2
+
+
+def true_pose(name: str) -> SE3:
+    pose = json.loads((CELL / "truth.json").read_text())[name]
+    return SE3(np.array(pose["quaternion_wxyz"]), np.array(pose["translation_m"]))
+
+
+def test_cell_is_complete_and_small() -> None:
+    wrist = load_recording(CELL / "wrist")
+    assert len(wrist.train) == 60
+    assert all(frame.base_from_camera is None for frame in wrist.train)
+    assert len(list((CELL / "tripod").glob("*.jpg"))) == 12
+    assert sum(path.stat().st_size for path in CELL.rglob("*")) < 2.5e6
+    millimetres, degrees = pose_distance_mm_deg(
+        true_pose("base_from_camera"), true_pose("base_from_bumped_camera")
+    )
+    assert millimetres == pytest.approx(5, abs=0.01)
+    assert degrees == pytest.approx(0.3, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_readme_commands_calibrate_the_cell(tmp_path: Path) -> None:
+    from evercal.calibration.calibration import read_transform
+    from evercal.cli import main
+
+    def run(*words: object) -> int:
+        return main([str(word) for word in words])
+
+    store, wrist, tripod = (tmp_path / name for name in ("c.evercal", "wrist.json", "tripod.json"))
+    images = sorted((CELL / "tripod").glob("*.jpg"))
+    assert run("learn", store, CELL / "wrist", "--calibration", wrist) == 0
+    assert run("calibrate", store, *images, "--out", tripod) == 0
+    assert run("check", store, images[3], "--reference", tripod) == 0
+    assert run("check", store, CELL / "bumped.jpg", "--reference", tripod) == 1
+    for path, name in ((wrist, "gripper_from_camera"), (tripod, "base_from_camera")):
+        millimetres, degrees = pose_distance_mm_deg(read_transform(path), true_pose(name))
+        assert millimetres < 2
+        assert degrees < 0.1
+    calibration = json.loads(tripod.read_text())
+    assert sum(use["used"] for use in calibration["images"]) == 12
+
+
+def test_copies_are_complete_and_never_overwrite(tmp_path: Path) -> None:
+    target = tmp_path / "new" / "samples"
+    copy_samples(target)
+    assert sorted(path.name for path in target.iterdir()) == [
+        "bedroom",
+        "cell",
+        "kitchen",
+        "living",
+    ]
+    assert len(load_recording(target / "kitchen").train) == 91
+    assert len(load_recording(target / "cell/wrist").train) == 60
+    with pytest.raises(InputError, match="not empty"):
+        copy_samples(target)
+    with pytest.raises(InputError, match="is a file"):
+        copy_samples(target / "cell/bumped.jpg")

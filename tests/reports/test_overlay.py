@@ -1,10 +1,10 @@
-"""Dots land where they should and carry the colour they were given."""
+"""Points and lines are drawn at their pixels in their colours."""
 
 import cv2
 import numpy as np
 import pytest
 
-from evercal.reports import contact_sheet, encode_image, overlay_lines, overlay_points
+from evercal.reports.overlay import encode_image, overlay_lines, overlay_points
 
 GREY = np.full((60, 80, 3), 128, np.uint8)
 
@@ -13,7 +13,7 @@ def changed(image: np.ndarray) -> np.ndarray:
     return np.argwhere((image != GREY).any(axis=2))
 
 
-def test_a_dot_is_centred_on_its_pixel_and_has_its_area() -> None:
+def test_dot_is_centred_with_the_area_of_its_radius() -> None:
     drawn = overlay_points(GREY, [[40.0, 20.0]], np.array([[255, 0, 0]], np.uint8), radius=5)
     weight = (drawn[..., 0].astype(float) - 128) / 127
     y, x = np.indices(weight.shape)
@@ -24,7 +24,7 @@ def test_a_dot_is_centred_on_its_pixel_and_has_its_area() -> None:
     assert (GREY == 128).all()
 
 
-def test_a_fraction_of_a_pixel_shifts_the_dot() -> None:
+def test_dots_are_placed_with_subpixel_accuracy() -> None:
     centres = []
     for x in (40.0, 40.25, 40.5):
         drawn = overlay_points(GREY, [[x, 20.0]], [[255, 255, 255]], radius=4)
@@ -38,7 +38,7 @@ def test_later_points_cover_earlier_ones() -> None:
     assert overlay_points(GREY, at, [[255, 0, 0], [0, 255, 0]])[20, 40].tolist() == [0, 255, 0]
 
 
-def test_points_off_the_image_or_not_finite_leave_it_alone() -> None:
+def test_points_outside_or_not_finite_are_omitted() -> None:
     away = [[-9, 20], [40, 1e12], [np.nan, 3], [np.inf, 3], [40, -np.inf], [89, 20]]
     assert len(changed(overlay_points(GREY, away, np.zeros((6, 3), np.uint8)))) == 0
     edge = overlay_points(GREY, [[-1, 20]], [[0, 0, 0]], radius=3)
@@ -59,12 +59,12 @@ def test_values_run_from_dark_to_light_and_are_clipped() -> None:
     assert len(set(colours[5])) == 1
 
 
-def test_below_values_the_photograph_is_grey() -> None:
+def test_image_below_values_is_grey() -> None:
     photo = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)
     drawn = overlay_points(photo, [[10, 10]], [1.0])
     assert (drawn[30:, :, 0] == drawn[30:, :, 2]).all()
-    kept = overlay_points(photo, [[10, 10]], [[1, 2, 3]])
-    np.testing.assert_array_equal(kept[30:], photo[30:])
+    coloured = overlay_points(photo, [[10, 10]], [[1, 2, 3]])
+    np.testing.assert_array_equal(coloured[30:], photo[30:])
 
 
 @pytest.mark.parametrize("shape", [(240, 320), (40, 60), (12, 400), (3, 3)])
@@ -86,50 +86,13 @@ def test_a_legend_stays_in_the_corner_of_any_image(shape: tuple[int, int]) -> No
         (np.zeros((2, 2)), np.zeros((2, 3)), "depth"),
     ],
 )
-def test_shapes_that_do_not_fit_are_refused(
+def test_mismatched_shapes_are_refused(
     pixels: np.ndarray, colours: np.ndarray, legend: str | None
 ) -> None:
     with pytest.raises(ValueError, match=r"\(n, 2\)|colours of 2 points"):
         overlay_points(GREY, pixels, colours, legend=legend)
     with pytest.raises(ValueError, match="uint8 RGB"):
         overlay_points(np.zeros((5, 5)), np.zeros((1, 2)), [1.0])  # pyright: ignore[reportArgumentType]
-
-
-def test_a_sheet_shows_every_image_in_reading_order() -> None:
-    images = [np.full((30, 40, 3), 10 * (i + 1), np.uint8) for i in range(5)]
-    sheet = contact_sheet(images, 2)
-    seen = [value for value in dict.fromkeys(sheet[..., 0].ravel().tolist()) if value != 255]
-    assert seen == [10, 20, 30, 40, 50]
-    for value in seen:
-        assert (sheet[..., 0] == value).sum() == 30 * 40
-
-
-def test_images_are_scaled_without_changing_their_shape() -> None:
-    wide, tall = np.full((30, 60, 3), 10, np.uint8), np.full((60, 30, 3), 20, np.uint8)
-    sheet = contact_sheet([wide, tall], 2, cell_width=120)[..., 0]
-    for value, ratio in ((10, 2.0), (20, 0.5)):
-        rows, columns = np.nonzero(sheet == value)
-        assert np.ptp(columns) + 1 == pytest.approx(ratio * (np.ptp(rows) + 1), abs=2)
-    assert np.ptp(np.nonzero(sheet == 10)[1]) + 1 == 120
-
-
-def test_captions_are_written_below_and_cut_to_the_cell() -> None:
-    images = [np.full((30, 100, 3), 90, np.uint8)] * 2
-    bare = contact_sheet(images, 2)
-    short = contact_sheet(images, 2, ["", "é"])
-    long = contact_sheet(images, 2, ["word " * 50, ""])
-    assert short.shape[0] > bare.shape[0]
-    middle = short.shape[1] // 2
-    text = short.min(axis=2) < 80
-    assert not text[:, :middle].any()
-    assert text[:, middle:].any()
-    assert not (long[:, middle:] < 80).any()
-
-
-def test_a_sheet_of_nothing_is_refused() -> None:
-    for images, columns, captions in (([], 2, None), ([GREY], 0, None), ([GREY], 1, ["a", "b"])):
-        with pytest.raises(ValueError, match="contact sheet"):
-            contact_sheet(images, columns, captions)
 
 
 def test_encoded_images_read_back() -> None:
@@ -144,7 +107,7 @@ def test_encoded_images_read_back() -> None:
     assert np.abs(lossy[..., ::-1].astype(int) - flat).max() < 6
 
 
-def test_a_line_has_its_colour_its_rim_and_its_gaps() -> None:
+def test_line_has_colour_rim_and_gaps() -> None:
     line = [[10, 30], [40, 30], [np.nan, 30], [60, 30], [70, 30]]
     drawn = overlay_lines(GREY, [line], [(200, 10, 20)], width=3)
     assert drawn[30, 25].tolist() == [200, 10, 20]
@@ -162,7 +125,7 @@ def test_half_of_a_dashed_line_is_drawn() -> None:
     assert switches == 10  # five dashes
 
 
-def test_lines_that_are_nowhere_leave_the_image_alone() -> None:
+def test_lines_without_finite_points_are_omitted() -> None:
     for line in ([[np.nan, 1], [np.inf, 2]], [[3, 3]], np.zeros((0, 2)), [[1e9, 1], [1e12, 5]]):
         assert len(changed(overlay_lines(GREY, [line], [(0, 0, 0)]))) == 0
         assert len(changed(overlay_lines(GREY, [line], [(0, 0, 0)], dash=3))) == 0

@@ -1,94 +1,94 @@
-"""The page is well-formed, self-contained and shows text as text."""
+"""Reports are well-formed and self-contained; all values are escaped."""
 
 import base64
-from html.parser import HTMLParser
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from evercal.reports import Picture, Section, Table, encode_image, html_page
+from evercal.reports.overlay import encode_image
+from evercal.reports.page import Picture, Table, render
+
+from .html_reader import HtmlReader
 
 PNG = encode_image(np.zeros((2, 3, 3), np.uint8))
 JPG = encode_image(np.zeros((2, 3, 3), np.uint8), "jpg")
-NASTY = "<script>alert(\"1\")</script> & 'x'"
+MARKUP = "<script>alert(\"1\")</script> & 'x'"
 
 
-class Reader(HTMLParser):
-    """Collects tags and text, and fails on a tag closed out of turn."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.text: list[tuple[str, str]] = []
-        self.feed(text)
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if data.strip():
-            self.text.append((self.open[-1], data))
-
-    def said(self, tag: str) -> list[str]:
-        return [text for where, text in self.text if where == tag]
-
-
-def test_everything_given_is_text_and_in_order() -> None:
-    page = Reader(
-        html_page(
-            NASTY,
-            [
-                Section(NASTY, [NASTY, Picture(PNG, NASTY), "then"]),
-                Section("", [Table([NASTY], [[NASTY]], NASTY)]),
-            ],
-        )
+def page(table: Table, picture: Picture, title: str = "title") -> str:
+    """A report with one table and one picture, through the template of `evercal bench`."""
+    tables = dict.fromkeys(["thresholds", "scenes", "ablation", "grid", "differences"])
+    return render(
+        "benchmark.html",
+        title=title,
+        tables={"methods": table, **tables},
+        scene_bars=picture,
+        errors=picture,
+        memory=picture,
+        forgetting=None,
+        views={},
+        keyframes=[],
     )
-    for tag in ("title", "h1", "h2", "figcaption", "th", "td", "caption"):
-        assert page.said(tag) == [NASTY], tag
-    assert page.said("p") == [NASTY, "then"]
-    names = [tag for tag, _ in page.tags]
-    assert "script" not in names
-    assert names.count("h2") == 1  # an empty heading is none
-    (image,) = (attributes for tag, attributes in page.tags if tag == "img")
-    assert image["alt"] == NASTY
-    assert names.index("img") > names.index("p")
+
+
+def test_values_are_escaped() -> None:
+    reader = HtmlReader(page(Table([MARKUP], [[MARKUP]], MARKUP), Picture(PNG, MARKUP), MARKUP))
+    for tag in ("title", "h1", "th", "td", "caption"):
+        assert reader.text(tag) == MARKUP, tag
+    assert reader.text("figcaption").splitlines() == [MARKUP] * 3
+    assert "script" not in reader.tags
+    assert [image["alt"] for image in reader.images] == [MARKUP] * 3
 
 
 @pytest.mark.parametrize(("data", "kind"), [(PNG, "png"), (JPG, "jpeg")])
-def test_pictures_travel_inside_the_page(data: bytes, kind: str) -> None:
-    page = Reader(html_page("t", [Section("s", [Picture(data)])]))
-    (image,) = (attributes for tag, attributes in page.tags if tag == "img")
-    head, _, body = (image["src"] or "").partition(",")
+def test_pictures_are_embedded(data: bytes, kind: str) -> None:
+    source = HtmlReader(page(Table([], []), Picture(data))).images[0]["src"] or ""
+    head, _, body = source.partition(",")
     assert head == f"data:image/{kind};base64"
     assert base64.b64decode(body) == data
 
 
-def test_nothing_is_fetched_from_elsewhere() -> None:
-    text = html_page("t", [Section("s", ["p", Picture(PNG), Table(["a"], [[1]])])])
-    assert "http://" not in text
-    assert "https://" not in text
-    assert "url(" not in text
+def test_report_refers_to_no_other_file() -> None:
+    text = page(Table(["a"], [[1]]), Picture(PNG))
+    for reference in ("http://", "https://", "url(", "href", "<link", "<script"):
+        assert reference not in text
     assert "default-src 'none'" in text
     assert "prefers-color-scheme: dark" in text
+    assert "@media print" in text
 
 
-def test_numbers_stand_to_the_right_and_titles_over_them() -> None:
-    rows = [["chess", 97.5, "12 %", "-"], ["stairs", "inf", 3, "7.1"]]
-    page = Reader(html_page("t", [Section("s", [Table(["scene", "acc", "share", "cm"], rows)])]))
-    right = [(tag, "class" in attrs) for tag, attrs in page.tags if tag in ("th", "td")]
-    assert right == [("th", i > 0) for i in range(4)] + [("td", i > 0) for i in range(4)] * 2
-    assert page.said("td") == ["chess", "97.5", "12 %", "-", "stairs", "inf", "3", "7.1"]
+def test_columns_of_numbers_are_aligned_right() -> None:
+    rows = [["chess", 97.5, "12 ± 1", "-"], ["stairs", "inf", 3, "7.1"]]
+    reader = HtmlReader(page(Table(["scene", "accuracy", "share", "mm"], rows), Picture(PNG)))
+    assert reader.numeric == [[False, True, True, True]] * 3
+    assert reader.rows[1] == ["chess", "97.5", "12 ± 1", "-"]
 
 
-def test_misuse_is_refused() -> None:
+def test_columns_without_values_are_hidden() -> None:
+    table = Table(["scene", "reason", "mm"], [["a", "", "-"], ["b", "-", "2.0"]])
+    assert HtmlReader(page(table, Picture(PNG))).rows == [["scene", "mm"], ["a", "-"], ["b", "2.0"]]
+    assert Table(["a", "b"], []).columns == [0, 1]
+
+
+def test_records_are_rows() -> None:
+    @dataclass
+    class Record:
+        room: str
+        images_used: int
+        error_mm: float | None
+        error_deg: float
+        moved: bool
+
+    table = Table.of_records(
+        [Record("a", 3, 1.234, 0.0567, True), Record("b", 0, None, 1.0, False)]
+    )
+    assert list(table.header) == ["room", "images used", "error mm", "error deg", "moved"]
+    assert table.rows == [["a", "3", "1.23", "0.057", "yes"], ["b", "0", "-", "1.000", "no"]]
+
+
+def test_invalid_contents_are_refused() -> None:
     with pytest.raises(ValueError, match="PNG or JPEG"):
-        html_page("t", [Section("s", [Picture(b"GIF89a")])])
+        Picture(b"GIF89a")
     with pytest.raises(ValueError, match="2 cells"):
-        html_page("t", [Section("s", [Table(["a", "b"], [["x"]])])])
+        Table(["a", "b"], [["x"]])

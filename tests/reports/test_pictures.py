@@ -1,14 +1,14 @@
-"""Landmarks are drawn where they were found, coloured by how far from there they should be."""
+"""Landmarks are drawn at their detections, coloured by reprojection error."""
 
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from evercal.mapping.scene_maps import SceneRecord
 
 from evercal.continual.networks.atlas import Cell
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
-from evercal.mapping.scene_maps import SceneRecord
 from evercal.reports.pictures import draw_landmarks
 
 LENS = Camera(320, 240, 300, 300, 159.5, 119.5)
@@ -39,7 +39,7 @@ def test_landmarks_are_coloured_by_their_reprojection_error() -> None:
     exact, off = (
         drawn[tuple(np.round(2 * at + 0.5).astype(int)[::-1])].astype(int) for at in pixels
     )
-    assert exact[2] > exact[1]  # dark blue is none
-    assert off[0] > 200  # yellow is a pixel
+    assert exact[2] > exact[1]  # dark blue: no error
+    assert off[0] > 200  # yellow: one pixel
     assert off[1] > 200
     assert (draw_landmarks(image, answer(None, None, None), localizer(common)) == 90).all()

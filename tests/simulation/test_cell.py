@@ -1,4 +1,4 @@
-"""A suite on disk: complete, the same again, continued after a stop; bad input named."""
+"""Suites on disk: complete, reproducible, continued after an interruption; bad input is refused."""
 
 import sys
 from dataclasses import replace
@@ -26,7 +26,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("small")
-def test_a_run_cut_off_goes_on_and_ends_the_same(tmp_path: Path) -> None:
+def test_an_interrupted_run_continues_with_the_same_result(tmp_path: Path) -> None:
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     steps = list(simulate("sim", whole, TINY))
     assert [step.done for step in steps] == list(range(1, 11))
@@ -36,7 +36,7 @@ def test_a_run_cut_off_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     run.close()
     with pytest.raises(InputError, match="no known scene format"):
         load_recording(cut / "kitchen")
-    # Half-written: an image without its depth is rendered again.
+    # An image without its depth is rendered again.
     (cut / "kitchen/depth/000001.png").unlink()
     (cut / "kitchen/images/000002.jpg").unlink()
     list(simulate("sim", cut, TINY))
@@ -58,14 +58,14 @@ def test_a_run_cut_off_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     for frame in hand:
         assert frame.base_from_gripper is not None
         assert frame.base_from_camera is not None
-        found = frame.base_from_gripper.inverse() @ frame.base_from_camera
-        np.testing.assert_allclose(found.matrix(), truth, atol=1e-9)
+        camera = frame.base_from_gripper.inverse() @ frame.base_from_camera
+        np.testing.assert_allclose(camera.matrix(), truth, atol=1e-9)
     with pytest.raises(InputError, match="begun with other settings"):
         next(simulate("sim", cut, SimulateOptions(frames=4, size=(32, 24), samples=2)))
 
 
 @pytest.mark.usefixtures("small")
-def test_a_change_is_recorded_after_the_rest(
+def test_changed_recordings_leave_existing_files_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "rooms"
@@ -87,7 +87,7 @@ def test_a_change_is_recorded_after_the_rest(
 
 
 @pytest.mark.usefixtures("small")
-def test_frames_that_are_there_take_no_more_room(
+def test_existing_frames_need_no_disk_space(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frame = 32 * 24 * 4
@@ -96,17 +96,17 @@ def test_frames_that_are_there_take_no_more_room(
         next(run)
     run.close()
     usage = cell.shutil.disk_usage(tmp_path)
-    for free, enough in ((7 * frame, True), (7 * frame - 1, False)):
-        left = usage._replace(free=free)
-        monkeypatch.setattr(cell.shutil, "disk_usage", lambda _, left=left: left)
-        if enough:
+    for free, is_enough in ((7 * frame, True), (7 * frame - 1, False)):
+        remaining = usage._replace(free=free)
+        monkeypatch.setattr(cell.shutil, "disk_usage", lambda _, usage=remaining: usage)
+        if is_enough:
             assert next(simulate("sim", tmp_path / "rooms", TINY)).done == 1
         else:
             with pytest.raises(InputError, match="GB are free"):
                 next(simulate("sim", tmp_path / "rooms", TINY))
 
 
-def test_bad_input_is_named(tmp_path: Path) -> None:
+def test_bad_input_is_refused(tmp_path: Path) -> None:
     for name, options, message in (
         ("lab", TINY, "use one of sim, sim-7, sim-12, sim-mini"),
         ("sim", SimulateOptions(seed=9000), "reserved"),
@@ -122,7 +122,7 @@ def test_bad_input_is_named(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_missing_extra_says_how_to_get_it(
+def test_a_missing_extra_is_named_in_the_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     renderer.mitsuba.cache_clear()

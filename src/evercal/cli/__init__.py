@@ -1,7 +1,7 @@
-"""The command line: one verb, one file; `main` finds the verb, runs it and turns errors into lines.
+"""The command line: one verb per file; `main` runs a verb and prints errors as one line.
 
-No verb imports torch before it runs, so that help and complaints about arguments come at once. Only
-`pretrain`, whose options are those of the training, does so for its own help.
+No verb imports torch before it runs, so that help and argument errors appear at once. The exception
+is `pretrain`, whose options are those of the training.
 """
 
 import contextlib
@@ -13,47 +13,52 @@ from typing import Any, Protocol
 
 from evercal.errors import InputError
 
-_DESCRIPTION = """Tells a robot where its camera is, from one image, and keeps learning new places.
-
-Exit codes: 0 done, 1 the answer is no, 2 misuse or bad input. 'evercal --version' prints the
-version."""
+_GROUPS = {
+    "Map": ("learn", "localize", "evaluate", "info", "verify"),
+    "Calibrate": ("calibrate", "check", "watch", "audit", "align"),
+    "Boards and pose pairs": ("detect", "solve"),
+    "Results": ("export", "report"),
+    "Recordings": ("inspect", "convert", "simulate", "demo"),
+    "Networks": ("bench", "bench-report", "pretrain"),
+}
+"""Verbs by purpose, in the order of the help."""
 
 
 class Command(Protocol):
     """A verb with its arguments."""
 
     def run(self) -> int:
-        """Does it and gives the exit code."""
+        """Run and return the exit code."""
         ...
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command.
+    """Run one command.
 
     Args:
-        argv: the words after `evercal`; those of the process when None.
+        argv: words after `evercal`. Default: those of the process.
 
     Returns:
         The exit code: 0 done, 1 the answer is no, 2 misuse or bad input, 130 interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     if words == ["--version"]:
-        # Folders do not import the public face above them; it is loaded before they are.
+        # `evercal` is loaded before its folders, which do not import it.
         print(f"evercal {sys.modules['evercal'].__version__}")
         return 0
     as_json = "--json" in words
-    # Threads of torch that wait for each other by spinning take up to ten times as long where other
-    # programs use the cores, and save a tenth where none does. Read once, when torch is loaded.
+    # Spinning threads of torch take up to ten times as long when other programs use the cores, and
+    # save a tenth otherwise. Read once, when torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
         command = _parse(words, as_json)
         code = command if isinstance(command, int) else command.run()
-        sys.stdout.flush()  # here, where a closed pipe is understood
+        sys.stdout.flush()  # here, where a closed pipe is handled
         return code
     except InputError as error:
         return _complain(str(error), as_json)
     except BrokenPipeError:
-        # The reader of our output has seen enough; a second attempt to write must not fail at exit.
+        # The reader closed the pipe; a second attempt to write must not fail at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:  # a full disk, a folder that may not be written
@@ -123,17 +128,39 @@ def _verbs(first: str) -> dict[str, Any]:
     }
 
 
+def _help() -> str:
+    """The overview of `evercal --help`: verbs by purpose, one line each."""
+    verbs = _verbs("")
+    lines = ["usage: evercal VERB ...", ""]
+    lines.append("Camera poses in the robot base frame from single images; hand-eye calibration.")
+    for group, names in _GROUPS.items():
+        lines += ["", f"{group}:"]
+        for name in names:
+            summary = " ".join((verbs[name].__doc__ or "").split("\n\n")[0].split())
+            lines.append(f"  {name:13s} {summary.split('; ')[0].rstrip('.')}")
+    lines += [
+        "",
+        "'evercal VERB --help' lists the options of a verb. Every verb has --json.",
+        "Exit codes: 0 done, 1 the answer is no, 2 misuse or bad input.",
+        "'evercal --version' prints the version.",
+        "Shell completion: evercal --tyro-print-completion bash|zsh|tcsh.",
+    ]
+    return "\n".join(lines)
+
+
 def _parse(words: list[str], as_json: bool) -> Command | int:
-    """The command that the words make, or the exit code where they make none."""
+    """The command that the words make, or an exit code."""
     import tyro
 
+    if words in ([], ["--help"], ["-h"]):
+        print(_help())
+        return 0 if words else 2
     caught = io.StringIO()
     try:
         with contextlib.redirect_stderr(caught):
             return tyro.extras.subcommand_cli_from_dict(
-                _verbs(words[0] if words else ""),
+                _verbs(words[0]),
                 prog="evercal",
-                description=_DESCRIPTION,
                 args=words,
                 config=(tyro.conf.FlagCreatePairsOff,),
             )

@@ -9,52 +9,54 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, progress_bar
 from evercal.cli.device import Device
+from evercal.cli.stores import open_map
 from evercal.errors import InputError
 
 
 @dataclass(frozen=True)
 class Audit:
-    """List the recorded episodes whose stated camera pose disagrees with their images.
+    """List recorded episodes whose stated camera pose disagrees with their images.
 
-    Exit code 1 when there are some.
+    Exit code 1 if there are any.
+
+    Example: evercal audit cell.evercal episodes/ --calibration tripod.json
     """
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
-    """Folder of the store."""
+    """Folder of the map."""
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder whose folders are the episodes: recorded scenes, or images beside a calibration.json
     or a 4x4 matrix base_from_camera.txt."""
-    calibration: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    calibration: Annotated[Path | None, arg(metavar="FILE")] = None
     """Pose of the camera in episodes that state none themselves."""
     images: Annotated[int, arg(metavar="N")] = 5
-    """Images of an episode that are looked at."""
+    """Images per episode that are located."""
     most_mm: Annotated[float, arg(metavar="MM")] = 5.0
-    """Largest difference of position that is still right."""
+    """Tolerance of the position."""
     most_deg: Annotated[float, arg(metavar="DEG")] = 0.5
-    """Largest difference of rotation that is still right."""
+    """Tolerance of the rotation."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Looks at every episode and prints the table."""
+        """Audit every episode and print a table."""
         if self.images < 1 or self.most_mm <= 0 or self.most_deg <= 0:
             raise InputError("--images is at least 1, --most-mm and --most-deg are above 0")
         from evercal.calibration.audit import AuditOptions, audit, episode_folders
         from evercal.calibration.calibration import read_transform
-        from evercal.localization.localizer import Localizer
 
         stated = None if self.calibration is None else read_transform(self.calibration)
         total = len(episode_folders(self.folder))
-        localizer = Localizer.open(self.store, device=self.device)
+        localizer = open_map(self.store, self.device)
         options = AuditOptions(self.images, self.most_mm, self.most_deg)
         with progress_bar("episodes", total, "episode") as bar:
-            found = audit(localizer, self.folder, stated, options, on_episode=bar.update)
-        wrong = [episode for episode in found if episode.verdict == "wrong"]
+            episodes = audit(localizer, self.folder, stated, options, on_episode=bar.update)
+        wrong = [episode for episode in episodes if episode.verdict == "wrong"]
         if self.json:
-            print_json({"episodes": [dataclasses.asdict(episode) for episode in found]})
+            print_json({"episodes": [dataclasses.asdict(episode) for episode in episodes]})
         else:
-            for episode in found:
+            for episode in episodes:
                 print(f"{episode.verdict:8s} {episode.name}: {episode.reason}")
-            print(f"{len(wrong)} of {len(found)} episodes state a wrong camera pose")
+            print(f"{len(wrong)} of {len(episodes)} episodes state a wrong camera pose")
         return 1 if wrong else 0

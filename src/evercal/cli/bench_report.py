@@ -58,8 +58,8 @@ def show_report(
     write_bytes(folder / TABLES, (text("markdown") + "\n").encode())
     suite = SUITES.get(report.suite)
     rooms = {name: (kind, seed) for name, kind, seed in suite.rooms} if suite else {}
-    pictures = view_pictures(folder, report.plotted, rooms)
-    write_bytes(folder / PAGE, bench_page(report, tables, pictures).encode())
+    views = view_pictures(folder, report.plotted, rooms)
+    write_bytes(folder / PAGE, bench_page(report, tables, views).encode())
     latex = paper_tables(report.runs, report.suite, tables.ablation)
     write_bytes(folder / LATEX, (latex + "\n").encode())
     if as_json:

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.console import print_json, print_next, progress_bar, require_writable
 from evercal.cli.device import Device
-from evercal.cli.image_words import camera_for, image_files, read_images
+from evercal.cli.image_words import camera_for, read_images
+from evercal.cli.stores import open_map
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,66 +21,67 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Calibrate:
-    """Calibrate a camera from images of a scene that the store knows; no marker is needed.
+    """Calibrate a camera from images of a mapped scene; no marker is needed.
 
-    A camera that stands still gives base_from_camera. With --robot-poses, a camera on the gripper
-    gives gripper_from_camera. NAME=FOLDER words, one for each camera, calibrate several cameras
-    and their poses relative to each other.
+    A fixed camera gives base_from_camera. With --robot-poses, a camera on the gripper gives
+    gripper_from_camera. NAME=FOLDER, once for each camera, calibrates several cameras and their
+    poses relative to each other.
+
+    Example: evercal calibrate cell.evercal tripod/ --camera camera.json --out tripod.json
     """
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
-    """Folder of the store."""
-    images: Annotated[Positional[tuple[str, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
+    """Folder of the map."""
+    images: Annotated[Positional[tuple[str, ...]], arg(metavar="IMAGE...")]
     """Image files or folders of them, all of one camera; or NAME=FOLDER for each camera of a
     rig."""
-    robot_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """The gripper's pose in the base at every image, in the order of the images."""
-    convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """How the numbers of the robot poses are meant, where the file does not say it."""
+    robot_poses: Annotated[Path | None, arg(metavar="FILE")] = None
+    """base_from_gripper of every image: a pose table, JSON or NPY."""
+    convention: Annotated[str | None, arg(metavar="NAME")] = None
+    """Format of the robot poses, if the file does not state it."""
     mount: Literal["eye_to_hand", "eye_in_hand"] | None = None
-    """Whether the camera stands still (eye_to_hand) or the gripper carries it (eye_in_hand); found
-    out when left out."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """File of the intrinsics; those of the scene that is found when left out."""
+    """eye_to_hand for a fixed camera, eye_in_hand for one on the gripper. Default: decided from
+    the camera's motion."""
+    camera: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Intrinsics of these images. Default: those of the camera that recorded the scene."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("calibration.json")
-    """Where the calibration is written."""
+    """Output file."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Calibrates, writes the file and says what it is good for."""
+        """Calibrate, write the file and print the verdict."""
+        require_writable(self.out, "--out")
         named = {word.split("=", 1)[0]: Path(word.split("=", 1)[1]) for word in self._named()}
-        from evercal.localization.localizer import Localizer
+        from evercal.recordings.image_files import image_files
 
         if named:
-            return self._rig(Localizer.open(self.store, device=self.device), named)
+            return self._rig(open_map(self.store, self.device), named)
         files = image_files([Path(word) for word in self.images])
         given = self._given(files)
-        localizer = Localizer.open(self.store, device=self.device)
-        found = self._calibrated(localizer, given)
-        found.write(self.out)
+        localizer = open_map(self.store, self.device)
+        calibration = self._calibrated(localizer, given)
+        calibration.write(self.out)
         if self.json:
-            print_json(found.to_dict())
+            print_json(calibration.to_dict())
         else:
-            for line in calibration_lines(found):
+            for line in calibration_lines(calibration):
                 print(line)
             print_next("evercal", "export", self.out, "--format", "easy_handeye2")
         from evercal.calibration.verdict import tier
 
-        return 0 if tier(found) else 1
+        return 0 if tier(calibration) else 1
 
     def _named(self) -> list[str]:
         named = [word for word in self.images if "=" in word and not Path(word).exists()]
         if named and len(named) < len(self.images):
             raise InputError(
-                f"{named[0]}: NAME=FOLDER words and plain images do not go together; give"
-                " NAME=FOLDER for every camera of the rig"
+                f"{named[0]}: NAME=FOLDER and plain images cannot be mixed; give NAME=FOLDER for"
+                " every camera of the rig"
             )
         if named and self.robot_poses is not None:
-            raise InputError(
-                "--robot-poses: the cameras of a rig stand still; leave the option out"
-            )
+            raise InputError("--robot-poses: the cameras of a rig are fixed; omit the option")
         return named
 
     def _given(self, files: list[Path]) -> "Images":
@@ -96,11 +98,12 @@ class Calibrate:
         from evercal.calibration.from_images import calibrate
 
         with progress_bar("localizing", len(given.images), "image") as bar:
-            found = calibrate(localizer, given, self.mount, on_image=bar.update)
-        return replace(found, source={**found.source, "store": str(self.store)})
+            calibration = calibrate(localizer, given, self.mount, on_image=bar.update)
+        return replace(calibration, source={**calibration.source, "store": str(self.store)})
 
     def _rig(self, localizer: "Localizer", folders: dict[str, Path]) -> int:
         from evercal.calibration.rig import rig_of
+        from evercal.recordings.image_files import image_files
 
         cameras = {}
         for name, folder in folders.items():
@@ -115,44 +118,44 @@ class Calibrate:
         return 0
 
 
-def calibration_lines(found: "Calibration") -> list[str]:
-    """A calibration for people."""
-    used = sum(image.used for image in found.images)
-    x, y, z = 1000 * found.parent_from_child.translation_m
+def calibration_lines(calibration: "Calibration") -> list[str]:
+    """A calibration in lines."""
+    used = sum(image.used for image in calibration.images)
+    x, y, z = 1000 * calibration.parent_from_child.translation_m
     lines = [
-        f"{found.parent_frame}_from_{found.child_frame}: the {found.meaning}",
+        f"{calibration.parent_frame}_from_{calibration.child_frame}: the {calibration.meaning}",
         f"  translation  {x:+.2f} {y:+.2f} {z:+.2f} mm",
         "  quaternion   "
-        + " ".join(f"{value:+.6f}" for value in found.parent_from_child.rotation_wxyz)
+        + " ".join(f"{value:+.6f}" for value in calibration.parent_from_child.rotation_wxyz)
         + " wxyz",
-        f"  uncertainty  {found.sigma_mm:.2f} mm, {found.sigma_deg:.3f} deg (standard deviation per"
-        " axis)",
+        f"  uncertainty  {calibration.sigma_mm:.2f} mm, {calibration.sigma_deg:.3f} deg"
+        " (standard deviation per axis)",
     ]
     lines += [
         f"    of it      {term.translation_mm:.2f} mm, {term.rotation_deg:.3f} deg: {term.name}"
-        for term in found.error_terms
+        for term in calibration.error_terms
     ]
-    if "repeatability_mm" in found.checks:
-        checks = found.checks
+    if "repeatability_mm" in calibration.checks:
+        checks = calibration.checks
         lines.append(
             f"  two halves   of the images differ by {checks['repeatability_mm']:.2f} mm and"
             f" {checks['repeatability_deg']:.3f} deg"
         )
-    if found.images:
-        lines.append(f"  images       {used} of {len(found.images)} used")
-    lines += [f"    left out   {i.name}: {i.reason}" for i in found.images if not i.used]
-    return [*lines, f"  verdict      {found.verdict}"]
+    if calibration.images:
+        lines.append(f"  images       {used} of {len(calibration.images)} used")
+    lines += [f"    rejected   {i.name}: {i.reason}" for i in calibration.images if not i.used]
+    return [*lines, f"  verdict      {calibration.verdict}"]
 
 
 def _rig_lines(rig: "Rig") -> list[str]:
     lines = []
-    for name, found in rig.cameras.items():
-        first, *rest = calibration_lines(found)
+    for name, calibration in rig.cameras.items():
+        first, *rest = calibration_lines(calibration)
         lines += [f"{name}: {first}", *rest]
     for pair in rig.relative:
         x, y, z = 1000 * pair.first_from_second.translation_m
         lines.append(
-            f"{pair.first}_from_{pair.second}: {x:+.2f} {y:+.2f} {z:+.2f} mm, standard deviation"
-            f" {pair.sigma_mm:.2f} mm and {pair.sigma_deg:.3f} deg"
+            f"{pair.first}_from_{pair.second}: {x:+.2f} {y:+.2f} {z:+.2f} mm, standard deviation at"
+            f" most {pair.sigma_mm:.2f} mm and {pair.sigma_deg:.3f} deg (independent errors assumed)"
         )
     return lines

@@ -8,7 +8,8 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar
 from evercal.cli.device import Device
-from evercal.cli.image_words import camera_for, image_files, read_images
+from evercal.cli.image_words import camera_for, read_images
+from evercal.cli.stores import open_map
 
 if TYPE_CHECKING:
     from evercal.calibration.drift import Shift
@@ -16,41 +17,44 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Check:
-    """Say whether a camera has been moved since it was calibrated; exit code 1 when it has."""
+    """Test whether a fixed camera has moved since it was calibrated; exit code 1 if it has.
+
+    Example: evercal check cell.evercal now.png --reference tripod.json
+    """
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
-    """Folder of the store."""
-    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
-    """New images of one camera, or a folder of them; five or more see smaller shifts than one."""
+    """Folder of the map."""
+    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...")]
+    """New images of one camera, or a folder of them; five or more reveal smaller shifts."""
     reference: Annotated[Path, arg(metavar="FILE")]
-    """The camera's calibration, as 'evercal calibrate' wrote it."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """File of the intrinsics; those in the reference when left out."""
+    """The camera's calibration from 'evercal calibrate'."""
+    camera: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Intrinsics. Default: those of the reference."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Compares; says the shift and how sure it is."""
+        """Compare and print the shift."""
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.drift import check
-        from evercal.localization.localizer import Localizer
+        from evercal.recordings.image_files import image_files
 
         files = image_files(self.images)
         reference = read_calibration(self.reference)
-        lens = camera_for(self.camera, files) or reference.camera
+        camera = camera_for(self.camera, files)
         images = read_images(files)
-        localizer = Localizer.open(self.store, device=self.device)
+        localizer = open_map(self.store, self.device)
         with progress_bar("localizing", len(images), "image") as bar:
-            shift, uses = check(localizer, images, reference, lens, on_image=bar.update)
+            shift = check(localizer, images, reference, camera, on_image=bar.update)
         if self.json:
-            left_out = [vars(use) for use in uses if not use.used]
-            print_json({**shift_dict(shift), "images": len(uses), "left_out": left_out})
+            rejected = [vars(use) for use in shift.images if not use.used]
+            print_json({**shift_dict(shift), "images": len(shift.images), "left_out": rejected})
         else:
             print(shift_line(shift))
-            for use in uses:
+            for use in shift.images:
                 if not use.used:
-                    print(f"  left out  {use.name}: {use.reason}")
+                    print(f"  rejected  {use.name}: {use.reason}")
             if shift.moved:
                 print_next("evercal", "calibrate", self.store, *self.images[:1])
         return 1 if shift.moved else 0
@@ -60,10 +64,10 @@ def shift_line(shift: "Shift") -> str:
     """The answer in one sentence."""
     size = f"{shift.translation_mm:.2f} mm and {shift.rotation_deg:.3f} deg"
     spread = f"standard deviation {shift.sigma_mm:.2f} mm and {shift.sigma_deg:.3f} deg per axis"
-    sure = f"confidence {100 * shift.confidence:.1f} %"
+    confidence = f"confidence {100 * shift.confidence:.1f} %"
     if shift.moved:
-        return f"The camera has moved by {size} ({sure}; {spread}). Calibrate it again."
-    return f"The camera has not moved: it was found {size} from its reference ({spread})."
+        return f"The camera has moved by {size} ({confidence}; {spread}). Calibrate it again."
+    return f"The camera has not moved: it is within {size} of its reference ({spread})."
 
 
 def shift_dict(shift: "Shift") -> dict[str, object]:

@@ -1,30 +1,34 @@
-"""What every verb prints alike: JSON on stdout, the next command, progress on stderr."""
+"""Output that all verbs share: JSON, the next command, progress bars, checks of output paths."""
 
 import json
+import os
 import shlex
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from evercal.errors import InputError
 
 if TYPE_CHECKING:
     from tqdm import tqdm
 
 
 def print_json(record: object) -> None:
-    """One JSON object on one line of stdout.
+    """Print one JSON object on one line of stdout.
 
     Raises:
-        ValueError: inf or nan in it, which JSON has no word for.
+        ValueError: It contains inf or nan, which JSON cannot represent.
     """
     print(json.dumps(record, allow_nan=False))
 
 
 def print_next(*words: object) -> None:
-    """The last line of a command: what to run next; capitals stand for what the user puts in."""
+    """Print the command to run next; words in capitals are placeholders."""
     print("next: " + shlex.join(str(word) for word in words))
 
 
 def progress_bar(what: str, total: int, unit: str, done: int = 0) -> "tqdm":
-    """A bar on stderr with the time left; rare lines where stderr is a file; none for one step."""
+    """A progress bar on stderr; occasional lines if stderr is a file, nothing for a single step."""
     from tqdm import tqdm
 
     return tqdm(
@@ -40,9 +44,46 @@ def progress_bar(what: str, total: int, unit: str, done: int = 0) -> "tqdm":
 
 
 def size(count: float) -> str:
-    """Bytes for people: 1.2 MB."""
+    """Format bytes: 1.2 MB."""
     for unit in ("B", "kB", "MB"):
         if count < 1000:
             return f"{count:.0f} B" if unit == "B" else f"{count:.1f} {unit}"
         count /= 1000
     return f"{count:.1f} GB"
+
+
+def require_writable(path: Path | None, option: str) -> None:
+    """Refuse an output file that cannot be written, before any work is done.
+
+    Args:
+        path: the file; None if the option was omitted.
+        option: its name, for the message.
+
+    Raises:
+        InputError: The path is a folder, or its folder is missing or not writable.
+    """
+    if path is None:
+        return
+    folder = path.resolve().parent
+    if path.is_dir():
+        raise InputError(f"{option} {path}: is a folder; give a file name")
+    if not folder.is_dir():
+        raise InputError(f"{option} {path}: folder {folder} does not exist; create it first")
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"{option} {path}: folder {folder} is not writable")
+
+
+def require_folder(path: Path | None, option: str) -> None:
+    """Create an output folder, before any work is done.
+
+    Raises:
+        InputError: It cannot be created or written.
+    """
+    if path is None:
+        return
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{option} {path}: cannot be created ({error.strerror})") from None
+    if not os.access(path, os.W_OK):
+        raise InputError(f"{option} {path}: is not writable")

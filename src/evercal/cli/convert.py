@@ -13,28 +13,31 @@ from evercal.errors import InputError
 
 @dataclass(frozen=True)
 class Convert:
-    """Write a recording of any format as evercal's own folder: one scene.json and the images."""
+    """Convert a recording of any format to evercal's own: one scene.json and the images.
+
+    Example: evercal convert recording.mcap kitchen/
+    """
 
     scene: Annotated[Positional[Path], arg(metavar="IN")]
     """Folder of the recording, or file of a bag."""
     out: Annotated[Positional[Path], arg(metavar="OUT")]
-    """Folder to write; made when it is missing."""
+    """Output folder; created if it is missing."""
     reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
-    """How it is read."""
-    name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """What the scene is called; its own name when left out."""
+    """How the recording is read."""
+    name: Annotated[str | None, arg(metavar="NAME")] = None
+    """Name of the scene. Default: the recording's own name."""
     hard_link: bool = False
-    """Link image files instead of copying them: no room is taken, a change shows in both."""
+    """Link image files instead of copying them; changes then affect both."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Reads, writes, and says what came along."""
-        from evercal.recordings import generic
+        """Read, write and print a summary."""
+        from evercal.recordings.formats import generic
 
         if self.out.exists() and not self.out.is_dir():
             raise InputError(f"{self.out}: is a file; give a folder to write to")
-        scene = self.reading.scene(self.scene, self.name)
+        scene = self.reading.recording(self.scene, self.name)
         frames = (*scene.train, *scene.test)
         if not frames:
             raise InputError(f"{self.scene}: no frame to write; see 'evercal inspect {self.scene}'")

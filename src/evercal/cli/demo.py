@@ -3,11 +3,13 @@
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 from tyro.conf import arg
 
 from evercal.cli.console import print_json, print_next, progress_bar, size
@@ -15,203 +17,212 @@ from evercal.cli.device import Device
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.continual.learn_scene import LearnReport
-    from evercal.continual.stage import StageOptions
+    from evercal.evaluation import FrameResult
+    from evercal.geometry import SE3
     from evercal.localization.localizer import Localizer
-    from evercal.recordings import Recording
+    from evercal.recordings import Frame, Recording
     from evercal.recordings.samples import SampleRoom
-    from evercal.reports.demo_outcome import DemoOutcome
+    from evercal.reports.demo_page import DemoResult, FixedCamera
+    from evercal.reports.page import Picture
 
-STORE = "store"
-QUERY = "query.png"
-
-Say = Callable[[str], None]
+STORE, QUERY, REPORT = "store", "query.png", "report.html"
+UNKNOWN_IMAGES = 12
+"""Images of each room that are localized before the room is learned."""
+PICTURES = 3
+"""Images of each room that the report shows."""
 
 
 @dataclass(frozen=True)
 class Demo:
-    """Learn three rendered rooms, locate cameras in them to the millimetre, and write a report."""
+    """Map three rendered rooms, localize images, calibrate cameras and detect a bump."""
 
     out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-demo")
-    """Folder for report.html, overview.png, the store and an image to try it with."""
-    compare: bool = False
-    """Train two networks on the same rooms as well, and compare what they remember; this takes some
-    minutes more."""
+    """Folder for report.html, the store and a query image."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Takes about a minute on two cores, and some minutes more with --compare."""
-        options = DemoOptions(self.compare, device=self.device)
-        outcome = run_demo(self.out, options, _quiet if self.json else _say)
+        """Run the demo; takes about a minute on two cores."""
+        from evercal.recordings.samples import sample_rooms
+
+        result = run_demo(self.out, sample_rooms(), self.device, quiet=self.json)
         if self.json:
-            print_json(outcome.to_dict())
+            print_json(result.to_dict())
             return 0
-        print(f"wrote {self.out / 'report.html'} and {self.out / 'overview.png'}")
+        for number, explanation in result.headlines().items():
+            print(f"{number:>12}  {explanation}")
+        print(f"wrote {self.out / REPORT} in {result.seconds:.0f} s")
         print_next("evercal", "localize", self.out / STORE, self.out / QUERY)
         return 0
 
 
-@dataclass(frozen=True)
-class DemoOptions:
-    """How much the demo does."""
-
-    compare: bool = False
-    """Train the networks of fine-tuning and of SARS + SPDD as well."""
-    rooms: "tuple[SampleRoom, ...] | None" = None
-    """Two or more; those that come with the package when None."""
-    device: str = "auto"
-    """What networks run on, see `features.device.device_of`."""
-
-
-def _say(line: str) -> None:
-    print(line, flush=True)
-
-
-def _quiet(line: str) -> None:
-    """In place of `print` where stdout is for JSON."""
-
-
-def run_demo(out: Path, options: DemoOptions, say: Say = _quiet) -> "DemoOutcome":
-    """Learns the rooms, measures, and writes pictures and report.
+def run_demo(
+    out: Path, rooms: "Sequence[SampleRoom]", device: str = "auto", quiet: bool = True
+) -> "DemoResult":
+    """Map the rooms, measure, and write the report.
 
     Args:
-        out: folder for the results; made when missing, results of an earlier demo are replaced.
-        options: how much.
-        say: told in a line what happens and what came out.
+        out: Output folder; results of an earlier demo are replaced.
+        rooms: Rooms with a fixed camera, a bump and a change.
+        device: Device of the networks, see `features.device.device_of`.
+        quiet: Whether to print nothing but progress bars.
 
     Raises:
-        InputError: `out` holds something else under a name that the demo needs, or no such device.
+        InputError: The folder contains other data, or the device does not exist.
     """
     from evercal.features.device import device_of
-    from evercal.localization.localizer import Localizer
     from evercal.recordings import write_image
-    from evercal.recordings.samples import sample_rooms
-    from evercal.reports.demo_outcome import MAP, METHODS, DemoOutcome
-    from evercal.reports.demo_page import write_pictures
-    from evercal.storage import MANIFEST, replace_folder
+    from evercal.reports.demo_page import DemoResult, demo_page
+    from evercal.storage import MANIFEST, replace_folder, write_bytes
 
     began, store = time.perf_counter(), out / STORE
     if store.exists() and not (store / MANIFEST).is_file():
-        raise InputError(f"{store}: exists and is not an evercal store; give another --out")
-    device_of(options.device)  # refused before anything is learned
+        raise InputError(f"{store}: exists and is not an evercal store; pass another --out")
+    device_of(device)
     out.mkdir(parents=True, exist_ok=True)
-    rooms = options.rooms or sample_rooms()
-    scenes = [room.scene for room in rooms]
-    outcome = DemoOutcome([scene.name for scene in scenes])
+    result = DemoResult()
     work = Path(tempfile.mkdtemp(prefix=".demo-", dir=out))
     try:
-        for method in METHODS if options.compare else (MAP,):
-            _learn_rooms(work / method, method, scenes, _Teller(outcome, say, options))
-        replace_folder(work / MAP, store)
+        for room in rooms:
+            if result.learned:
+                _localize_unknown(_open(work / STORE, device), room.scene, result)
+            _learn(work / STORE, room.scene, device, result)
+            room_map = result.learned[-1]
+            if not quiet:
+                print(
+                    f"mapped {room_map.room}: {room_map.images} images, {room_map.keyframes}"
+                    f" keyframes, {room_map.landmarks} landmarks, {room_map.seconds:.0f} s"
+                )
+        replace_folder(work / STORE, store)
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    localizer = Localizer.open(store, device=options.device)
-    _measure(localizer, rooms, outcome, say)
-    write_pictures(out, localizer, rooms, outcome)
-    middle = scenes[0].test[len(scenes[0].test) // 2]
-    write_image(out / QUERY, middle.read_image())
-    outcome.seconds = time.perf_counter() - began
-    say(f"all of this took {outcome.seconds:.0f} s")
-    return outcome
+    if not quiet:
+        print(f"size of all maps: {size(result.memory_bytes)}")
+    localizer = _open(store, device)
+    result.test = _evaluate(localizer, {room.scene.name: room.scene for room in rooms})
+    result.changed = _evaluate(
+        localizer,
+        {r.scene.name: replace(r.changed, train=r.scene.train) for r in rooms if r.changed},
+    )
+    result.cameras = [_fixed_camera(localizer, room) for room in rooms]
+    pictures = [picture for room in rooms for picture in _pictures(localizer, room.scene)]
+    write_image(out / QUERY, _spread(rooms[0].scene.test, 1)[0].read_image())
+    result.seconds = time.perf_counter() - began
+    write_bytes(out / REPORT, demo_page(result, pictures).encode())
+    return result
 
 
-@dataclass(frozen=True)
-class _Teller:
-    """Where results go."""
+def _open(store: Path, device: str) -> "Localizer":
+    from evercal.localization.localizer import Localizer
 
-    outcome: "DemoOutcome"
-    say: Say
-    options: DemoOptions
+    return Localizer.open(store, device=device)
 
 
-def _learn_rooms(store: Path, method: str, scenes: "Sequence[Recording]", teller: _Teller) -> None:
-    """Learns the rooms one after the other; where methods are compared, evaluates after each."""
+def _learn(store: Path, scene: "Recording", device: str, result: "DemoResult") -> None:
+    """Add a room to the store."""
     from evercal.cli.learn_bars import LearnBars
     from evercal.continual.learn_scene import LearnOptions, learn_scene
-    from evercal.continual.strategies import STRATEGIES
-    from evercal.localization.localizer import Localizer
-    from evercal.reports.demo_outcome import MAP, METHODS
-
-    outcome, say, seconds = teller.outcome, teller.say, 0.0
-    for i, scene in enumerate(scenes):
-        say(f"{METHODS[method]}: learning {scene.name} from {len(scene.train)} posed images")
-        began = time.perf_counter()
-        options = LearnOptions(_stage(method), STRATEGIES[method], device=teller.options.device)
-        with LearnBars() as bars:
-            report = learn_scene(store, scene, options, bars)
-        seconds += time.perf_counter() - began
-        if method == MAP:
-            _note_map(report, outcome, say)
-        else:
-            say(f"  {report.iterations} training steps in {report.seconds / 60:.1f} minutes")
-        if teller.options.compare:
-            localizer = Localizer.open(store, device=teller.options.device)
-            row = _accuracies(localizer, scenes[: i + 1])
-            outcome.accuracy.setdefault(method, []).append(row)
-    outcome.minutes[method] = seconds / 60
-
-
-def _stage(method: str) -> "StageOptions":
     from evercal.continual.presets import preset
-    from evercal.reports.demo_outcome import MAP
+    from evercal.reports.demo_page import LearnedRoom
 
-    return preset("fast" if method == MAP else "demo")
-
-
-def _note_map(report: "LearnReport", outcome: "DemoOutcome", say: Say) -> None:
-    from evercal.reports.demo_outcome import LearnedRoom
-
-    adjusted = report.adjusted
-    residual = adjusted.residual_px if adjusted is not None else float("nan")
-    frames, kept, marks = report.train_frames, report.frames_kept, report.landmarks
-    room = LearnedRoom(report.scene, frames, kept, marks, residual, report.seconds)
-    outcome.learned.append(room)
-    outcome.memory_bytes = report.memory_bytes
-    say(
-        f"  {kept} keyframes with {marks} landmarks in {report.seconds:.0f} s; after bundle"
-        f" adjustment the median reprojection error is {residual:.2f} px; all rooms take"
-        f" {size(report.memory_bytes)}"
-    )
-
-
-def _accuracies(localizer: "Localizer", scenes: "Sequence[Recording]") -> list[float]:
-    """Per cent of test images within 5 cm and 5 deg, for each scene."""
-    from evercal.evaluation import evaluate, scores
-
-    count = sum(len(scene.test) for scene in scenes)
-    with progress_bar("evaluating", count, "image") as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.update(done - bar.n)
-
-        named = {scene.name: scene for scene in scenes}
-        results = evaluate(localizer, named, on_frame=show)
-    rows = scores(results).scenes
-    return [rows[scene.name].accuracy_5cm_5deg for scene in scenes]
-
-
-def _measure(
-    localizer: "Localizer", rooms: "Sequence[SampleRoom]", outcome: "DemoOutcome", say: Say
-) -> None:
-    """Asks the map everything that the report shows, and says it in sentences."""
-    from evercal.reports import demo_sentences as told
-    from evercal.reports.demo_measurements import Look
-
-    if outcome.accuracy:
-        say(outcome.table())
-    with progress_bar("locating", 0, "image") as bar:
-        look = Look(localizer, rooms, bar.update)
-        bar.total = look.images()
-        steps = (
-            (look.locate_test_images, told.about_test_images),
-            (look.locate_changed_rooms, told.about_changed_rooms),
-            (look.find_fixed_cameras, told.about_fixed_cameras),
-            (look.show_unknown_room, told.about_unknown_room),
+    with LearnBars() as bars:
+        report = learn_scene(store, scene, LearnOptions(preset("fast"), device=device), bars)
+    result.learned.append(
+        LearnedRoom(
+            report.scene,
+            report.train_frames,
+            report.frames_kept,
+            report.landmarks,
+            None if report.adjusted is None else report.adjusted.residual_px,
+            report.seconds,
         )
-        for measure, sentences in steps:
-            measure(outcome)
-            bar.clear()
-            for line in sentences(outcome):
-                say(line)
+    )
+    result.memory_bytes = report.memory_bytes
+
+
+def _localize_unknown(localizer: "Localizer", scene: "Recording", result: "DemoResult") -> None:
+    """Localize images of a room that is not in the store yet."""
+    frames = _spread(scene.test, UNKNOWN_IMAGES)
+    with progress_bar(f"images of unknown room {scene.name}", len(frames), "image") as bar:
+        for frame in frames:
+            estimate = localizer.localize(frame.read_image(), frame.camera)
+            result.unknown_images += 1
+            result.unknown_refused += estimate.status != "ok"
+            bar.update()
+
+
+def _evaluate(localizer: "Localizer", scenes: "dict[str, Recording]") -> "list[FrameResult]":
+    from evercal.evaluation import evaluate
+
+    count = sum(len(scene.test) for scene in scenes.values())
+    with progress_bar("localizing", count, "image") as bar:
+
+        def advance(_done: int, _total: int) -> None:
+            bar.update()
+
+        return evaluate(localizer, scenes, on_frame=advance)
+
+
+def _fixed_camera(localizer: "Localizer", room: "SampleRoom") -> "FixedCamera":
+    """Calibrate the fixed camera of a room, and check it after the bump."""
+    from evercal.calibration.drift import check
+    from evercal.calibration.from_images import Images, calibrate
+    from evercal.geometry import pose_distance_mm_deg
+    from evercal.reports.demo_page import FixedCamera
+
+    name, fixed, bumped = room.scene.name, room.fixed, room.bumped
+    assert fixed is not None, "rooms of a demo have a fixed camera"
+    assert bumped is not None, "rooms of a demo have a bumped camera"
+    true_shift_mm, _ = pose_distance_mm_deg(_pose(fixed), _pose(bumped))
+    camera = FixedCamera(name, len(fixed.test), true_shift_mm=true_shift_mm)
+    count = len(fixed.test) + len(bumped.test)
+    # An InputError means that no image was localized.
+    with progress_bar(f"camera in {name}", count, "image") as bar, suppress(InputError):
+        images = Images(_images(fixed), fixed.test[0].camera)
+        calibration = calibrate(localizer, images, "eye_to_hand", on_image=bar.update)
+        if calibration.source["scene"] != name:
+            return camera
+        mm, deg = pose_distance_mm_deg(calibration.parent_from_child, _pose(fixed))
+        camera = replace(
+            camera,
+            images_used=sum(image.used for image in calibration.images),
+            error_mm=mm,
+            error_deg=deg,
+            sigma_mm=calibration.sigma_mm,
+        )
+        shift, _ = check(localizer, _images(bumped), calibration, on_image=bar.update)
+        camera = replace(camera, shift_mm=shift.translation_mm, bump_detected=shift.moved)
+    return camera
+
+
+def _images(recording: "Recording") -> list[tuple[str, np.ndarray]]:
+    return [(frame.name, frame.read_image()) for frame in recording.test]
+
+
+def _pose(recording: "Recording") -> "SE3":
+    pose = recording.test[0].base_from_camera
+    assert pose is not None, "rendered images have poses"
+    return pose
+
+
+def _pictures(localizer: "Localizer", scene: "Recording") -> "list[Picture]":
+    """Test images with detected landmarks."""
+    from evercal.reports.overlay import encode_image
+    from evercal.reports.page import Picture
+    from evercal.reports.pictures import draw_landmarks
+
+    pictures = []
+    for frame in _spread(scene.test, PICTURES):
+        image = frame.read_image()
+        estimate = localizer.localize(image, frame.camera)
+        drawn = draw_landmarks(image, estimate, localizer)
+        caption = f"{estimate.scene or estimate.status}: {estimate.inliers} landmarks"
+        pictures.append(Picture(encode_image(drawn, "jpg"), caption))
+    return pictures
+
+
+def _spread(frames: "Sequence[Frame]", count: int) -> "list[Frame]":
+    """At most `count` frames, evenly spread."""
+    indices = (np.arange(count) + 0.5) * len(frames) / count
+    return [frames[i] for i in np.unique(indices.astype(int))]

@@ -1,4 +1,4 @@
-"""The word that says what the networks run on, alike for every verb."""
+"""The option --device of all verbs."""
 
 from typing import Annotated, Literal
 
@@ -6,5 +6,5 @@ from tyro.conf import arg
 
 Device = Annotated[
     Literal["auto", "cpu", "cuda"],
-    arg(help="What networks run on; auto takes a CUDA device where there is one, else the CPU."),
+    arg(help="Device of the encoder and networks; auto uses a CUDA device if there is one."),
 ]

@@ -1,22 +1,23 @@
 """`evercal info`."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, size
 
-if TYPE_CHECKING:
-    from evercal.mapping.keyframes import Keyframes
-    from evercal.mapping.scene_maps import SceneRecord
+MEMORY_FILES = ("keyframes.safetensors", "state.safetensors")
 
 
 @dataclass(frozen=True)
 class Info:
-    """Say what a store knows, how large it is, and what bundle adjustment changed."""
+    """Describe a store: its scenes, its size, and what bundle adjustment changed.
+
+    Example: evercal info cell.evercal
+    """
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the store."""
@@ -24,36 +25,37 @@ class Info:
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Opens the store and describes it."""
-        from evercal.mapping.stage_files import head_bytes
-        from evercal.mapping.store import Store
+        """Open the store and describe it."""
+        from evercal.cli.stores import MAP, strategy_of
 
-        store = Store.open(self.store)
-        maps, used = store.maps, store.bytes()
-        entries = zip(maps.scenes, maps.keyframes, store.reports(), strict=True)
-        scenes = [_scene(*entry) for entry in entries]
-        heads = sum(head_bytes(head) for head in maps.heads)
+        strategy = strategy_of(self.store)
+        if strategy in (MAP, None):
+            scenes, short_side, heads, sizes = _map(self.store)
+        else:
+            from evercal.continual.info import describe
+
+            scenes, short_side, heads, sizes = describe(self.store)
+        total = sum(sizes.values())
+        memory = sum(bytes for file, bytes in sizes.items() if file.endswith(MEMORY_FILES))
         content = {
             "store": str(self.store),
-            "strategy": maps.strategy,
-            "short_side": maps.short_side,
+            "strategy": strategy,
+            "short_side": short_side,
             "head_bytes": heads,
-            "memory_bytes": used["memory"],
-            "total_bytes": used["memory"] + used["rest"],
+            "memory_bytes": memory,
+            "total_bytes": total,
             "scenes": scenes,
         }
         if self.json:
             print_json(content)
             return 0
+        plural = "s" if len(scenes) != 1 else ""
         print(
-            f"{self.store}: {len(scenes)} scene{'s' if len(scenes) != 1 else ''}, strategy"
-            f" {maps.strategy}, images at {maps.short_side} px"
+            f"{self.store}: {len(scenes)} scene{plural}, strategy {strategy}, images at"
+            f" {short_side} px"
         )
-        network = f"the network {size(heads)}, " if heads else ""
-        print(
-            f"{size(used['memory'] + used['rest'])} in all: keyframes {size(used['memory'])},"
-            f" {network}the rest is the encoder and what describes scenes"
-        )
+        network = f"networks {size(heads)}, " if heads else ""
+        print(f"{size(total)} in all: keyframes {size(memory)}, {network}the rest is the encoder")
         for lines in (_content_table(scenes), _adjusted_table(scenes)):
             if lines:
                 print(lines)
@@ -61,24 +63,25 @@ class Info:
         return 0
 
 
-def _scene(
-    record: "SceneRecord", keyframes: "Keyframes | None", report: dict[str, Any]
-) -> dict[str, Any]:
-    """One scene for JSON; what only a map or only a network has is there for these alone."""
-    scene: dict[str, Any] = {
-        "name": record.name,
-        "train_frames": record.train_frames,
-        "memory_bytes": keyframes.bytes if keyframes is not None else 0,
-        "keyframes": len(keyframes) if keyframes is not None else 0,
-        "camera": record.camera.to_dict(),
-    }
-    if keyframes is not None and keyframes.landmarks:
-        return scene | {
-            "landmarks": sum(map(len, keyframes.landmarks)),
-            "min_support": record.min_support,
+def _map(path: Path) -> tuple[list[dict[str, Any]], int, int, dict[str, int]]:
+    """Scenes for JSON, working size, size of networks, and files with their sizes."""
+    from evercal.mapping.store import MapStore
+
+    store = MapStore.open(path)
+    scenes = [
+        {
+            "name": scene.name,
+            "train_frames": scene.train_frames,
+            "memory_bytes": scene.keyframes.bytes,
+            "keyframes": len(scene.keyframes),
+            "camera": scene.camera.to_dict(),
+            "landmarks": scene.landmarks,
+            "min_support": scene.min_support,
             "adjusted": report.get("adjusted"),
         }
-    return scene | {"inlier_threshold": record.inlier_threshold, "cell": asdict(record.cell)}
+        for scene, report in zip(store.contents.scenes, store.reports(), strict=True)
+    ]
+    return scenes, store.contents.short_side, 0, store.size_bytes()
 
 
 def _content_table(scenes: Sequence[dict[str, Any]]) -> str:
@@ -95,34 +98,34 @@ def _content_table(scenes: Sequence[dict[str, Any]]) -> str:
         ]
         for scene in scenes
     ]
-    header = ["scene", "frames learned", "keyframes", *(["landmarks"] if maps else [])]
-    return _table([*header, "memory", "unknown_scene below", "camera"], rows)
+    header = ["scene", "frames", "keyframes", *(["landmarks"] if maps else [])]
+    return _table([*header, "memory", "rejected below", "camera"], rows)
 
 
 def _threshold(scene: dict[str, Any]) -> str:
-    """What a pose needs to be accepted."""
+    """Threshold of acceptance."""
     if "min_support" in scene:
         return f"support {scene['min_support']:.2f}"
     return f"{100 * scene['inlier_threshold']:.0f} % inliers"
 
 
 def _adjusted_table(scenes: Sequence[dict[str, Any]]) -> str:
-    """What bundle adjustment changed; empty where no scene was adjusted."""
+    """Changes by bundle adjustment; empty if no scene was adjusted."""
     rows = []
     for scene in scenes:
         adjusted = scene.get("adjusted")
         if not adjusted:
             continue
-        shift, turn = (
+        shift, rotation = (
             sum(x * x for x in adjusted[key]) ** 0.5
             for key in ("common_translation_mm", "common_rotation_deg")
         )
         rows.append(
             [
                 scene["name"],
-                f"{adjusted['residual_px']:.2f} px",
+                _pixels(adjusted["residual_px"]),
                 f"{adjusted['pose_sigma_mm']:.2f} mm, {adjusted['pose_sigma_deg']:.3f} deg",
-                f"{shift:.2f} mm, {turn:.3f} deg",
+                f"{shift:.2f} mm, {rotation:.3f} deg",
                 f"{adjusted['focal_percent']:+.2f} %",
                 f"{len(adjusted['wrong_poses'])} left out",
             ]
@@ -131,6 +134,10 @@ def _adjusted_table(scenes: Sequence[dict[str, Any]]) -> str:
         return ""
     header = ["bundle adjustment", "median residual", "error of stated poses", "common transform"]
     return "\n" + _table([*header, "focal length", "wrong poses"], rows)
+
+
+def _pixels(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f} px"
 
 
 def _table(header: list[str], rows: list[list[Any]]) -> str:

@@ -12,20 +12,23 @@ from evercal.cli.reading import Reading
 
 @dataclass(frozen=True)
 class Inspect:
-    """Describe a recorded scene and point out what looks wrong, before it is learned."""
+    """Check a recording before it is learned: frames, cameras, motion, and likely mistakes.
 
-    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
-    """Folder of the recorded scene, or file of a bag."""
+    Example: evercal inspect wrist_recording/
+    """
+
+    scene: Annotated[Positional[Path], arg(metavar="RECORDING")]
+    """Folder of the recording, or file of a bag."""
     reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
-    """How it is read."""
+    """How the recording is read."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Reads the scene and some of its images."""
-        from evercal.recordings.inspection import inspect_scene
+        """Read the recording and some of its images."""
+        from evercal.recordings.inspection import inspect_recording
 
-        found = inspect_scene(self.reading.scene(self.scene))
+        found = inspect_recording(self.reading.recording(self.scene))
         if self.json:
             print_json(asdict(found))
             return 0

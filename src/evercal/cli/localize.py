@@ -1,5 +1,6 @@
 """`evercal localize`."""
 
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,112 +8,123 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.console import print_json, print_next, progress_bar, require_folder
 from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for
-from evercal.errors import InputError
+from evercal.cli.stores import open_localizer
 
 if TYPE_CHECKING:
     import numpy as np
 
     from evercal.geometry import Camera
     from evercal.localization.estimate import PoseEstimate
-    from evercal.localization.localizer import Localizer
+    from evercal.localization.localizer import SceneLocalizer
 
 
 @dataclass(frozen=True)
 class Localize:
-    """Say where the camera was that took an image, in the base frame of the scene it shows."""
+    """Estimate the camera pose of images, in the base frame of the scene they show.
+
+    Exit code 1 if no image was located.
+
+    Example: evercal localize cell.evercal image.jpg --overlay overlays/
+    """
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the store."""
-    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
-    """Image files, one or more."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """File of the intrinsics: a 3x3 matrix as text, our JSON, or a ROS camera_info YAML. Without it
-    they are those of the scene that is found."""
-    overlay: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Folder for copies of the images with the landmarks that were found drawn in."""
+    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...")]
+    """Image files or folders of them."""
+    camera: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Intrinsics: 3x3 matrix as text, JSON, or ROS camera_info YAML. Default: those of the camera
+    that recorded the scene."""
+    overlay: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Output folder for copies of the images with their inliers."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Localizes every image; nothing is printed before all of them could be read."""
-        if not self.images:
-            raise InputError("no image given; name one or more image files after the store")
-        for path in self.images:
-            if not path.is_file():
-                raise InputError(f"{path}: image file is missing; check the path")
-        camera = camera_for(self.camera, self.images)
-        from evercal.localization.localizer import Localizer
+        """Locate every image; nothing is printed before all of them were read."""
+        from evercal.recordings.image_files import image_files
 
-        localizer = Localizer.open(self.store, device=self.device)
-        if self.overlay is not None:
-            self.overlay.mkdir(parents=True, exist_ok=True)
-        answers = self._answers(localizer, camera)
-        found = sum(estimate.status == "ok" for _, estimate, _ in answers)
+        files = image_files(self.images)
+        camera = camera_for(self.camera, files)
+        require_folder(self.overlay, "--overlay")
+        localizer = open_localizer(self.store, self.device)
+        answers = self._answers(localizer, files, camera)
+        located = sum(answer.estimate.status == "ok" for answer in answers)
         if self.json:
-            print_json({"images": [as_dict(path, answer, ms) for path, answer, ms in answers]})
+            print_json({"images": [as_dict(answer) for answer in answers]})
         else:
-            for path, answer, ms in answers:
-                print(as_text(path, answer, ms))
-            self._next(found)
-        return 0 if found else 1
+            for answer in answers:
+                print(as_text(answer))
+            self._next(files, located)
+        return 0 if located else 1
 
     def _answers(
-        self, localizer: "Localizer", camera: "Camera | None"
-    ) -> list[tuple[Path, "PoseEstimate", float]]:
-        """Per image its path, the answer and the milliseconds that it took, decoding included."""
+        self, localizer: "SceneLocalizer", files: list[Path], camera: "Camera | None"
+    ) -> "list[Answer]":
+        """The answer for each image; times include decoding."""
         from evercal.localization.parallel import in_parallel
         from evercal.recordings import read_image, write_image
         from evercal.reports.pictures import draw_estimate, scene_camera
 
-        def answer(number: int) -> tuple[Path, "PoseEstimate", float]:
-            path, began = self.images[number], time.perf_counter()
+        def answer(number: int) -> Answer:
+            path, began = files[number], time.perf_counter()
             image = read_image(path)
             estimate = localizer.localize(image, camera)
-            ms = 1000 * (time.perf_counter() - began)
+            milliseconds = 1000 * (time.perf_counter() - began)
             if self.overlay is not None and estimate.scene is not None:
-                lens = camera or scene_camera(localizer, estimate.scene)
-                drawn = draw_estimate(image, estimate, lens)
-                write_image(self.overlay / self._overlay_name(number), drawn)
-            return path, estimate, ms
+                intrinsics = camera or scene_camera(localizer, estimate.scene)
+                drawn = draw_estimate(image, estimate, intrinsics)
+                write_image(self.overlay / _overlay_name(files, number), drawn)
+            return Answer(path, estimate, milliseconds)
 
         answers = []
-        with progress_bar("localizing", len(self.images), "image") as bar:
-            for found in in_parallel(answer, range(len(self.images))):
-                answers.append(found)
+        with progress_bar("localizing", len(files), "image") as bar:
+            for item in in_parallel(answer, range(len(files))):
+                answers.append(item)
                 bar.update()
         return answers
 
-    def _overlay_name(self, number: int) -> str:
-        """A file name; images of the same name from two folders do not overwrite each other."""
-        stems = [path.stem for path in self.images]
-        again = f"-{number + 1}" if stems.count(stems[number]) > 1 else ""
-        return f"{stems[number]}{again}-overlay.png"
-
-    def _next(self, found: int) -> None:
-        if not found:
-            print_next("evercal", "learn", self.store, "SCENE")
+    def _next(self, files: list[Path], located: int) -> None:
+        if not located:
+            print_next("evercal", "learn", self.store, "RECORDING")
         elif self.overlay is None:
-            print_next("evercal", "localize", self.store, *self.images[:1], "--overlay", "DIR")
+            print_next("evercal", "localize", self.store, files[0], "--overlay", "DIR")
         else:
-            print_next("evercal", "evaluate", self.store, "SCENE")
+            print_next("evercal", "evaluate", self.store, "RECORDING")
 
 
-def as_dict(path: Path, estimate: "PoseEstimate", milliseconds: float) -> dict[str, object]:
-    """One image's entry in the JSON answer; null where there is no pose."""
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """One image and its estimate."""
+
+    path: Path
+    estimate: "PoseEstimate"
+    milliseconds: float
+
+
+def _overlay_name(files: list[Path], number: int) -> str:
+    """A file name; images of one name from two folders get different ones."""
+    stems = [path.stem for path in files]
+    again = f"-{number + 1}" if stems.count(stems[number]) > 1 else ""
+    return f"{stems[number]}{again}-overlay.png"
+
+
+def as_dict(answer: Answer) -> dict[str, object]:
+    """One image's entry in the JSON output; null without a pose."""
     import numpy as np
 
     from evercal.recordings.formats.generic import pose_to_dict
 
+    estimate = answer.estimate
     pose, covariance = pose_to_dict(estimate.base_from_camera), estimate.covariance
     if pose is not None and estimate.base_from_camera is not None:
         pose["matrix"] = estimate.base_from_camera.matrix().tolist()
     usable = covariance is not None and bool(np.isfinite(covariance).all())
     return {
-        "path": str(path),
+        "path": str(answer.path),
         "status": estimate.status,
         "reason": estimate.reason,
         "scene": estimate.scene,
@@ -120,27 +132,28 @@ def as_dict(path: Path, estimate: "PoseEstimate", milliseconds: float) -> dict[s
         "covariance": covariance.tolist() if covariance is not None and usable else None,
         "inliers": int(estimate.inliers),
         "inlier_ratio": float(estimate.inlier_ratio),
-        "ms": milliseconds,
+        "ms": answer.milliseconds,
     }
 
 
-def as_text(path: Path, estimate: "PoseEstimate", milliseconds: float) -> str:
-    """One image's block for people."""
-    import numpy as np
-
-    share = f"{estimate.inliers} ({100 * estimate.inlier_ratio:.0f} %), {milliseconds:.0f} ms"
+def as_text(answer: Answer) -> str:
+    """One image's block of text."""
+    estimate = answer.estimate
+    share = (
+        f"{estimate.inliers} ({100 * estimate.inlier_ratio:.0f} %), {answer.milliseconds:.0f} ms"
+    )
     if estimate.base_from_camera is None:
         no = estimate.status.replace("_", " ")
-        return f"{path}\n  {no}: {estimate.reason}\n  inliers      {share}"
+        return f"{answer.path}\n  {no}: {estimate.reason}\n  inliers      {share}"
     pose = estimate.base_from_camera
     spread = [""] * 2
     if estimate.covariance is not None:
-        sd = np.sqrt(np.maximum(np.diag(estimate.covariance), 0))
-        spread = [_numbers(100 * sd[:3], ".2f"), _numbers(np.rad2deg(sd[3:]), ".2f")]
-        spread = [f"  sd {spread[0]} cm", f"  sd {spread[1]} deg"]
+        sd = estimate.covariance.diagonal().clip(0) ** 0.5
+        spread = [_numbers(1000 * sd[:3], ".2f"), _numbers(sd[3:] * 180 / math.pi, ".3f")]
+        spread = [f"  sd {spread[0]} mm", f"  sd {spread[1]} deg"]
     return "\n".join(
         [
-            str(path),
+            str(answer.path),
             f"  scene        {estimate.scene}",
             f"  translation  {_numbers(pose.translation_m, '+.4f')} m{spread[0]}",
             f"  quaternion   {_numbers(pose.rotation_wxyz, '+.4f')} wxyz{spread[1]}",

@@ -12,27 +12,27 @@ from evercal.cli.console import print_json, print_next
 
 @dataclass(frozen=True)
 class Pretrain:
-    """Make the weights of encoder and descriptor anew from procedural images; takes hours."""
+    """Train the encoder and the descriptor on procedural images (hours)."""
 
     out: Annotated[Path, arg(metavar="FOLDER")]
-    """Folder for encoder.safetensors, descriptor.safetensors and pretrain.log."""
+    """Output folder of encoder.safetensors, descriptor.safetensors and pretrain.log."""
     work: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """Folder for checkpoints, from which the same command continues; OUT/work when left out."""
+    """Folder of checkpoints, from which the same command resumes (default: OUT/work)."""
     json: bool = False
     """Print one JSON object."""
 
 
 def pretrain_with_options() -> type:
-    """The verb with the options of the training, whose module imports torch."""
+    """Return the verb with the training options, whose module imports torch."""
     from evercal.continual.pretraining.contrastive import PretrainOptions
 
     @dataclass(frozen=True)
     class PretrainWithOptions(Pretrain):
         options: Annotated[PretrainOptions, arg(name="")] = field(default_factory=PretrainOptions)
-        """What is trained."""
+        """Training options."""
 
         def run(self) -> int:
-            """Trains; the log goes to stderr."""
+            """Train; the log is printed to stderr."""
             from evercal.continual.pretraining.make import pretrain
 
             began = time.perf_counter()

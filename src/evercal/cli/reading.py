@@ -1,4 +1,4 @@
-"""The flags with which a verb reads a recording, the same for all that take one."""
+"""Options for reading a recording, shared by all verbs that take one."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -12,36 +12,36 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Reading:
-    """How a recording is read; what a format has no use for is refused."""
+    """How the recording is read; options that do not apply to its format are refused."""
 
-    format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    format: Annotated[str | None, arg(metavar="NAME")] = None
     """Format of the recording: generic, 7scenes, 12scenes, nerfstudio, colmap, wrist, lerobot or
-    rosbag; it is recognised when left out."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """File of the intrinsics of all images, where the recording has none: 3x3 matrix as text, JSON,
-    ROS camera_info YAML or OpenCV's storage."""
-    image_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="")] = None
-    """Which images of a bag or a LeRobot dataset; needed where there are several."""
-    pose_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="")] = None
-    """Which tf or joint states of a bag; needed where several topics say where the arm was."""
-    base_frame: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    rosbag. Default: recognised from its files."""
+    camera: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Intrinsics of all images, if the recording has none: 3x3 matrix as text, JSON, ROS
+    camera_info YAML or OpenCV's storage."""
+    image_topic: Annotated[str | None, arg(metavar="TOPIC")] = None
+    """Images of a bag or a LeRobot dataset; required if there are several topics."""
+    pose_topic: Annotated[str | None, arg(metavar="TOPIC")] = None
+    """tf or joint states of a bag; required if there are several topics."""
+    base_frame: Annotated[str | None, arg(metavar="NAME")] = None
     """The robot's base, a tf frame of a bag or a link of the URDF."""
-    gripper_frame: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    gripper_frame: Annotated[str | None, arg(metavar="NAME")] = None
     """The gripper: a tf frame of a bag, a link of the URDF, or a feature or arm of a LeRobot
     dataset."""
-    urdf: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """URDF of the robot, where the recording has joint angles and no poses."""
-    pose_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """How a file of gripper poses is written, where its header does not say; of joint angles rad or
-    deg."""
-    every: Annotated[int, arg(metavar="N", help_behavior_hint="")] = 1
-    """Take every N-th image only."""
+    urdf: Annotated[Path | None, arg(metavar="FILE")] = None
+    """URDF of the robot, for recordings with joint angles."""
+    pose_convention: Annotated[str | None, arg(metavar="NAME")] = None
+    """Format of the gripper poses, if the file's header does not state it; rad or deg for joint
+    angles."""
+    every: Annotated[int, arg(metavar="N")] = 1
+    """Use every N-th image."""
 
-    def scene(self, path: Path, name: str | None = None) -> "Recording":
-        """Reads the recording.
+    def recording(self, path: Path, name: str | None = None) -> "Recording":
+        """Read the recording.
 
         Raises:
-            InputError: It cannot be read, or a flag means nothing to its format.
+            InputError: It cannot be read, or an option does not apply to its format.
         """
         from evercal.recordings import ReadOptions, load_recording
 
@@ -49,9 +49,9 @@ class Reading:
         return load_recording(path, self.format, name, ReadOptions(**given))
 
     def words(self) -> list[str]:
-        """The flags that were given, as words of a command."""
-        found = []
+        """The options that were given, as words of a command."""
+        words = []
         for field in fields(self):
             if (value := getattr(self, field.name)) != field.default:
-                found += ["--" + field.name.replace("_", "-"), str(value)]
-        return found
+                words += ["--" + field.name.replace("_", "-"), str(value)]
+        return words

@@ -8,106 +8,100 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar
 from evercal.cli.device import Device
-from evercal.cli.image_words import image_files
-from evercal.errors import InputError
+from evercal.cli.output import check_output
+from evercal.recordings.image_files import image_files
 
 if TYPE_CHECKING:
-    from evercal.calibration.calibration import Calibration
-    from evercal.reports.calibration_comparison import Older
-    from evercal.reports.calibration_page import Page, Subject
-    from evercal.reports.calibration_views import Views
+    from evercal.reports.calibration_images import AnnotatedImages
+    from evercal.reports.calibration_page import NamedCalibration
 
 
 @dataclass(frozen=True)
 class Report:
-    """Write a page about a calibration: what it is good for, and the pictures that prove it."""
+    """Write an HTML report of a calibration: verdict, uncertainty, residuals and overlays."""
 
     calibration: Annotated[Positional[Path], arg(metavar="CALIBRATION.json")]
-    """File of the calibration."""
+    """Calibration file."""
     store: Annotated[Path | None, arg(metavar="STORE", help_behavior_hint="")] = None
-    """Folder of the store: landmarks are found in the images and drawn with their residuals."""
-    images: Annotated[tuple[Path, ...], arg(metavar="IMAGE...", help_behavior_hint="")] = ()
-    """Images of the camera to draw into, or a folder of them; else those it was made from."""
+    """Folder of the store. Its landmarks are drawn with their residuals."""
+    images: Annotated[
+        tuple[Path, ...],
+        arg(metavar="IMAGE...", help_behavior_hint="(default: images of the calibration)"),
+    ] = ()
+    """Images of the camera, or a folder of them."""
     against: Annotated[Path | None, arg(metavar="OLD_CALIBRATION.json", help_behavior_hint="")] = (
         None
     )
-    """An older calibration of the camera, to be compared with."""
+    """Older calibration of the same camera, to compare with."""
     out: Annotated[Path, arg(metavar="FILE.html")] = Path("report.html")
-    """Where the page is written; it holds all its pictures."""
+    """The report, one file including its pictures."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Writes the page."""
-        if not self.out.absolute().parent.is_dir():
-            raise InputError(f"--out {self.out}: its folder does not exist; make it first")
+        """Write the report."""
+        check_output(self.out, "--out")
         from evercal.calibration.calibration import read_calibration
-        from evercal.calibration.verdict import verdict
-        from evercal.reports.calibration_page import Subject, calibration_page
+        from evercal.calibration.verdict import expected_error, tier, verdict
+        from evercal.reports.calibration_page import NamedCalibration, calibration_page, difference
         from evercal.storage import write_bytes
 
-        found, older = read_calibration(self.calibration), self._older()
+        calibration = read_calibration(self.calibration)
+        older = None
+        if self.against is not None:
+            older = NamedCalibration(self.against.name, read_calibration(self.against))
+        file = NamedCalibration(self.calibration.name, calibration)
+        images = self._images(file, older)
         store = None if self.store is None else str(self.store)
-        views = self._views(found, older)
-        subject = Subject(self.calibration.name, found, views, store, older)
-        page = calibration_page(subject)
+        page = calibration_page(file, images, store, older)
         write_bytes(self.out, page.html.encode())
-        if self.json:
-            print_json(_as_dict(self.out, subject, page))
+        text = calibration.verdict or verdict(calibration)
+        if not self.json:
+            print("\n".join([text, *(f"  {sentence}" for sentence in page.missing)]))
+            print(f"wrote {self.out}")
+            print_next("evercal", "export", self.calibration, "--format", "easy_handeye2")
             return 0
-        print(found.verdict or verdict(found))
-        for sentence in page.missing:
-            print(f"  {sentence}")
-        print(f"wrote {self.out}")
-        print_next("evercal", "export", self.calibration, "--format", "easy_handeye2")
+        against = None
+        if older is not None:
+            change = difference(calibration, older.calibration)
+            against = {"translation_mm": change.mm, "rotation_deg": change.deg}
+        best, (mm, deg) = tier(calibration), expected_error(calibration)
+        print_json(
+            {
+                "report": str(self.out),
+                "verdict": text,
+                "tier": None if best is None else best.name,
+                "expected_error_mm": mm,
+                "expected_error_deg": deg,
+                "pictures": [image.name for image in images.images],
+                "against": against,
+                "missing": list(page.missing),
+            }
+        )
         return 0
 
-    def _older(self) -> "Older | None":
-        if self.against is None:
-            return None
-        from evercal.calibration.calibration import read_calibration
-        from evercal.reports.calibration_comparison import Older
+    def _images(
+        self, file: "NamedCalibration", older: "NamedCalibration | None"
+    ) -> "AnnotatedImages":
+        from evercal.reports.calibration_images import (
+            AnnotatedImages,
+            annotate_images,
+            select_images,
+        )
 
-        return Older(self.against.name, read_calibration(self.against))
-
-    def _views(self, found: "Calibration", older: "Older | None") -> "Views":
-        from evercal.reports.calibration_views import Views, readable_images, views_of
-
+        calibration = file.calibration
         given = image_files(self.images) if self.images else []
-        if found.camera is None:
-            return views_of(found, [])
-        files, none = readable_images(found, self.calibration.parent, given)
+        if calibration.camera is None:
+            return annotate_images(calibration, [])
+        files, reason = select_images(calibration, self.calibration.parent, given)
         if not files:
-            return Views(missing=(none,))
+            return AnnotatedImages(missing=(reason,))
         localizer = None
         if self.store is not None:
             from evercal.localization.localizer import Localizer
 
             localizer = Localizer.open(self.store, device=self.device)
-        before = None if older is None else older.found
+        before = None if older is None else older.calibration
         with progress_bar("drawing", len(files), "image") as bar:
-            return views_of(found, files, before, localizer, on_image=bar.update)
-
-
-def _as_dict(out: Path, subject: "Subject", page: "Page") -> dict[str, object]:
-    """The report as JSON values."""
-    from evercal.calibration.verdict import expected_error, tier, verdict
-    from evercal.reports.calibration_comparison import difference
-
-    found, good = subject.found, tier(subject.found)
-    millimetres, degrees = expected_error(found)
-    against = None
-    if subject.older is not None:
-        apart = difference(found, subject.older.found)
-        against = {"translation_mm": apart[0], "rotation_deg": apart[1]}
-    return {
-        "report": str(out),
-        "verdict": found.verdict or verdict(found),
-        "tier": None if good is None else good.name,
-        "expected_error_mm": millimetres,
-        "expected_error_deg": degrees,
-        "pictures": [view.name for view in subject.views.views],
-        "against": against,
-        "missing": list(page.missing),
-    }
+            return annotate_images(calibration, files, before, localizer, on_image=bar.update)

@@ -14,42 +14,42 @@ from evercal.errors import InputError
 
 @dataclass(frozen=True)
 class Simulate:
-    """Render photorealistic rooms with a robot arm, poses and depth; this needs evercal[sim]."""
+    """Render furnished rooms with a robot arm, poses and depth. This needs evercal[sim]."""
 
     suite: Annotated[Positional[Literal["sim", "sim-7", "sim-12", "sim-mini"]], arg(name="SUITE")]
-    """Three rooms (sim), seven, twelve, or the three small ones that are shipped (sim-mini)."""
+    """Rooms to render: three (sim), seven, twelve, or the three packaged ones (sim-mini)."""
     out: Annotated[Path, arg(metavar="DIR")]
-    """New folder for the scenes; the same command continues a run that was cut off."""
+    """Output folder. The same command continues an interrupted run."""
     frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Frames of each room, training and test together; the suite's own number when left out."""
+    """Training and test frames of each room; default: as the suite defines."""
     size: Annotated[str | None, arg(metavar="WxH", help_behavior_hint="")] = None
-    """Image size in pixels, such as 640x480; the suite's own when left out."""
+    """Image size in pixels, such as 640x480; default: as the suite defines."""
     seed: int = 0
-    """Seed of the camera paths and the noise; the rooms of a suite stay the same."""
+    """Seed of the camera paths and the noise. Rooms do not depend on it."""
     samples: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Paths per pixel: more is slower and truer in fine detail; the suite's own when left out."""
+    """Light paths per pixel; more is slower and more exact. Default: as the suite defines."""
     exposure_ev: float = 0.0
-    """Exposure in stops: above 0 is brighter, below 0 is darker."""
+    """Exposure in stops; positive is brighter."""
     noise: float = 0.0
-    """Sensor noise as a share of full scale; a good camera has 0.01."""
+    """Sensor noise as a fraction of full scale; a good camera has 0.01."""
     blur_steps: int = 1
-    """How many poses a frame has while the shutter is open; with 1 there is no motion blur."""
+    """Camera poses per exposure; 1 disables motion blur."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Renders what is missing."""
+        """Render the missing frames."""
         from evercal.simulation.cell import SUITES, SimulateOptions, simulate
 
         began = time.perf_counter()
         options = SimulateOptions(
-            self.frames,
-            _size(self.size),
-            self.seed,
-            self.samples,
-            self.exposure_ev,
-            self.noise,
-            self.blur_steps,
+            frames=self.frames,
+            size=_size(self.size),
+            seed=self.seed,
+            samples=self.samples,
+            exposure_ev=self.exposure_ev,
+            noise=self.noise,
+            blur_steps=self.blur_steps,
         )
         with progress_bar("rendering", 0, "frame") as bar:
             for progress in simulate(self.suite, self.out, options):
@@ -71,5 +71,5 @@ def _size(text: str | None) -> tuple[int, int] | None:
         return None
     width, cross, height = text.partition("x")
     if not (cross and width.isdecimal() and height.isdecimal()):
-        raise InputError(f"size {text!r} is not WIDTHxHEIGHT in pixels, such as 640x480")
+        raise InputError(f"--size {text}: give WIDTHxHEIGHT in pixels, such as 640x480")
     return int(width), int(height)

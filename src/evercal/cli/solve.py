@@ -1,5 +1,6 @@
 """`evercal solve`."""
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -7,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import arg
 
 from evercal.cli.calibrate import calibration_lines
-from evercal.cli.console import print_json, print_next
+from evercal.cli.console import print_json, print_next, require_writable
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
@@ -15,39 +16,37 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Solve:
-    """Find a camera on the gripper, or beside the robot, from pairs of poses.
+    """Calibrate a camera on the gripper or beside the robot from pairs of poses.
 
-    Both unknown transforms are found together, robust against wrong poses, with their uncertainty.
+    Both unknown transforms are estimated jointly, robust to outliers, with their uncertainty.
     """
 
     robot_poses: Annotated[Path, arg(metavar="FILE")]
     """base_from_gripper of every image: CSV, JSON, NPY or TUM."""
     camera_poses: Annotated[Path, arg(metavar="FILE")]
-    """camera_from_board of every image: what 'evercal detect' wrote, or a file like the robot
-    poses."""
+    """camera_from_board of every image: from 'evercal detect', or CSV, JSON, NPY, TUM."""
     mount: Literal["eye_in_hand", "eye_to_hand"]
-    """eye_in_hand: the gripper carries the camera. eye_to_hand: the camera stands still and the
-    gripper holds the board."""
+    """eye_in_hand: camera on the gripper. eye_to_hand: fixed camera, board in the gripper."""
     scale: Literal["known", "unknown"] = "known"
-    """unknown: the camera's translations are not in metres (structure from motion)."""
+    """unknown: estimate the scale of the camera poses, for structure from motion."""
     time_offset: bool = False
-    """The clocks of robot and camera differ: find by how much. Both files need times."""
+    """Estimate the offset between the clocks of robot and camera; both files need times."""
     robot_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """How the numbers of the robot poses are meant, where the file does not say it."""
+    """Pose convention of robot poses without a header: ur, kuka, xyzw:mm, ..."""
     camera_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """The same of the camera poses."""
+    """Pose convention of camera poses without a header."""
     invert: Annotated[
-        Literal["robot", "camera", "both"] | None, arg(metavar="WHOSE", help_behavior_hint="")
+        Literal["robot", "camera", "both"] | None, arg(metavar="FILE", help_behavior_hint="")
     ] = None
-    """Poses that their file holds inverted (gripper_from_base, board_from_camera): robot, camera or
-    both."""
+    """Invert the poses of a file: robot, camera or both."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("calibration.json")
-    """Where the calibration is written."""
+    """Calibration file to write."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Solves, writes the file and says what it is good for."""
+        """Solve, write the calibration and print it."""
+        require_writable(self.out, "--out")
         from evercal.calibration.verdict import tier
 
         source = {
@@ -61,15 +60,15 @@ class Solve:
             "camera_convention": self.camera_convention,
             "invert": self.invert,
         }
-        found = replace(self._solved(), source=source)
-        found.write(self.out)
+        calibration = self._with_image_paths(replace(self._solved(), source=source))
+        calibration.write(self.out)
         if self.json:
-            print_json(found.to_dict())
+            print_json(calibration.to_dict())
         else:
-            for line in [*calibration_lines(found), *_check_lines(found)]:
+            for line in [*calibration_lines(calibration), *_check_lines(calibration)]:
                 print(line)
             print_next("evercal", "export", self.out, "--format", "easy_handeye2")
-        return 0 if tier(found) else 1
+        return 0 if tier(calibration) else 1
 
     def _solved(self) -> "Calibration":
         from evercal.calibration.pose_pairs.pair_files import PairFiles, read_pairs, read_streams
@@ -77,11 +76,11 @@ class Solve:
         from evercal.calibration.pose_pairs.time_offset import solve_with_offset
 
         files = PairFiles(
-            self.robot_poses,
-            self.camera_poses,
-            self.robot_convention,
-            self.camera_convention,
-            self.invert,
+            robot=self.robot_poses,
+            camera=self.camera_poses,
+            robot_convention=self.robot_convention,
+            camera_convention=self.camera_convention,
+            invert=self.invert,
         )
         scale_known = self.scale == "known"
         if self.time_offset:
@@ -89,9 +88,20 @@ class Solve:
         pairs, corners = read_pairs(files)
         return solve(pairs, self.mount, scale_known, corners)
 
+    def _with_image_paths(self, calibration: "Calibration") -> "Calibration":
+        """Make image paths relative to the calibration, where `evercal report` looks them up."""
+        folder, target = self.camera_poses.absolute().parent, self.out.absolute().parent
+        images = tuple(
+            replace(image, name=Path(os.path.relpath(folder / image.name, target)).as_posix())
+            if (folder / image.name).is_file()
+            else image
+            for image in calibration.images
+        )
+        return replace(calibration, images=images)
 
-def _check_lines(found: "Calibration") -> list[str]:
-    checks, lines = found.checks, []
+
+def _check_lines(calibration: "Calibration") -> list[str]:
+    checks, lines = calibration.checks, []
     if "held_out_mm" in checks:
         lines.append(
             f"  left out     half of the poses are predicted within {checks['held_out_mm']:.2f} mm"
@@ -108,8 +118,5 @@ def _check_lines(found: "Calibration") -> list[str]:
         lines.append(f"  scale        {scale:.6g} +- {sigma:.2g} metres per unit of the camera")
     if "time_offset_s" in checks:
         offset, sigma = 1000 * checks["time_offset_s"], 1000 * checks["time_offset_sigma_s"]
-        lines.append(
-            f"  clocks       add {offset:+.1f} +- {sigma:.1f} ms to the camera's times to get the"
-            f" robot's"
-        )
-    return [*lines, *(f"warning: {sentence}" for sentence in checks.get("warnings", ()))]
+        lines.append(f"  clocks       robot time = camera time {offset:+.1f} +- {sigma:.1f} ms")
+    return [*lines, *(f"warning: {warning}" for warning in checks.get("warnings", ()))]

@@ -11,7 +11,10 @@ from evercal.cli.console import print_json, print_next
 
 @dataclass(frozen=True)
 class Verify:
-    """Check every file of a store against its checksum."""
+    """Check every file of a store against its checksum.
+
+    Example: evercal verify cell.evercal
+    """
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the store."""
@@ -19,7 +22,7 @@ class Verify:
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Names every problem; exit code 1 if there is one."""
+        """Print every problem; exit code 1 if there is one."""
         from evercal.storage import verify
 
         problems = verify(self.store)
@@ -33,6 +36,6 @@ class Verify:
             print(f"{files} damaged; restore from a copy of the store")
             print_next("evercal", "verify", self.store)
             return 1
-        print(f"{self.store}: all files are as they were written")
+        print(f"{self.store}: all files match their checksums")
         print_next("evercal", "localize", self.store, "IMAGE")
         return 0

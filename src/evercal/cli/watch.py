@@ -1,11 +1,12 @@
 """`evercal watch`."""
 
+import math
 import time
 from collections import deque
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
@@ -13,85 +14,123 @@ from evercal.cli.check import shift_dict, shift_line
 from evercal.cli.console import print_json
 from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for
+from evercal.cli.stores import open_map
 from evercal.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from evercal.geometry import Camera
+
+FALSE_ALARMS = 0.01
+"""Probability of any false alarm while a folder is watched."""
 
 
 @dataclass(frozen=True)
 class Watch:
-    """Watch a folder that a camera writes images to, and stop with exit code 1 when it has moved.
+    """Watch a folder that a camera writes images to; stop with exit code 1 when it has moved.
 
-    The newest images are checked together, so that one strange image raises no alarm.
+    The newest images are tested together, so that a single outlier raises no alarm.
+
+    Example: evercal watch cell.evercal incoming/ --reference tripod.json
     """
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
-    """Folder of the store."""
+    """Folder of the map."""
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder that images arrive in."""
     reference: Annotated[Path, arg(metavar="FILE")]
-    """The camera's calibration, as 'evercal calibrate' wrote it."""
+    """The camera's calibration from 'evercal calibrate'."""
     window: Annotated[int, arg(metavar="N")] = 5
-    """How many of the newest images are checked together."""
+    """Newest images that are tested together."""
     interval: Annotated[float, arg(metavar="SECONDS")] = 1.0
-    """How often the folder is looked at."""
-    idle: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None
-    """Stop with exit code 0 when no image has come for so long; never when left out."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """File of the intrinsics; those in the reference when left out."""
+    """Interval between scans of the folder."""
+    idle: Annotated[float | None, arg(metavar="SECONDS")] = None
+    """Stop with exit code 0 after this time without a new image. Default: never."""
+    camera: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Intrinsics. Default: those of the reference."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object for every image."""
 
     def run(self) -> int:
-        """Looks at the folder until the camera has moved."""
+        """Check new images until the camera has moved."""
         if not self.folder.is_dir():
             raise InputError(f"{self.folder}: no such folder; give the one that images arrive in")
         if self.window < 1 or self.interval <= 0:
             raise InputError("--window is at least 1 and --interval is above 0")
         from evercal.calibration.calibration import read_calibration
-        from evercal.calibration.drift import shift_between
+        from evercal.calibration.drift import DriftOptions, shift_between
         from evercal.calibration.located import Located, fuse, locate
-        from evercal.localization.localizer import Localizer
-        from evercal.recordings import read_image
 
         reference = read_calibration(self.reference)
-        localizer = Localizer.open(self.store, device=self.device)
+        localizer = open_map(self.store, self.device)
         recent: deque[Located] = deque(maxlen=self.window)
-        seen: set[Path] = set()
-        last = time.monotonic()
+        done: set[Path] = set()
+        tests, last = 0, time.monotonic()
         while self.idle is None or time.monotonic() - last < self.idle:
-            for path in self._new(seen):
+            for path in self._new(done):
+                image = self._read(path, reference.camera)
+                if image is None:
+                    continue  # still being written: it is read again
+                done.add(path)
                 last = time.monotonic()
-                lens = camera_for(self.camera, [path]) or reference.camera
-                try:
-                    image = read_image(path)
-                except InputError:
-                    continue  # still being written: it is looked at again
-                seen.add(path)
-                recent.extend(locate(localizer, [(path.name, image)], lens))
-                if not any(item.found for item in recent):
-                    self._tell(path, {"moved": None, "reason": recent[-1].estimate.reason})
+                recent.extend(locate(localizer, [(path.name, image.pixels)], image.camera))
+                if not any(item.is_located for item in recent):
+                    self._print(path, {"moved": None, "reason": recent[-1].estimate.reason})
                     continue
-                shift = shift_between(reference, fuse(recent), list(recent), localizer)
-                self._tell(path, shift_dict(shift), shift_line(shift))
+                tests += 1
+                options = DriftOptions(confidence=1 - false_alarm_share(tests))
+                shift = shift_between(reference, fuse(recent), list(recent), localizer, options)
+                self._print(path, shift_dict(shift), shift_line(shift))
                 if shift.moved and len(recent) >= min(3, self.window):
                     return 1
             time.sleep(self.interval)
         return 0
 
-    def _new(self, seen: set[Path]) -> list[Path]:
-        """Images that were not looked at yet, oldest first."""
+    def _read(self, path: Path, camera: "Camera | None") -> "_Image | None":
+        """An image with its intrinsics; None if the file is incomplete or broken."""
+        from evercal.recordings import read_image
+
+        try:
+            given = camera_for(self.camera, [path])
+            return _Image(read_image(path), given or camera)
+        except (InputError, OSError):
+            if self.camera is not None and not self.camera.is_file():
+                raise
+            return None
+
+    def _new(self, done: set[Path]) -> list[Path]:
+        """Images that were not checked yet, oldest first."""
         from evercal.recordings.images import IMAGE_ENDINGS
 
-        found = [
+        paths = [
             path
             for path in self.folder.iterdir()
-            if path.suffix.lower() in IMAGE_ENDINGS and path not in seen
+            if path.suffix.lower() in IMAGE_ENDINGS and path not in done
         ]
-        return sorted(found, key=lambda path: (path.stat().st_mtime, path.name))
+        return sorted(paths, key=lambda path: (path.stat().st_mtime, path.name))
 
-    def _tell(self, path: Path, record: dict[str, object], line: str = "") -> None:
+    def _print(self, path: Path, record: dict[str, object], line: str = "") -> None:
         if self.json:
             print_json({"image": path.name, **record})
             return
         now = datetime.now(UTC).strftime("%H:%M:%S")
         print(f"{now} {path.name}: {line or record['reason']}", flush=True)
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """An image that arrived."""
+
+    pixels: "np.ndarray"
+    camera: "Camera | None"
+
+
+def false_alarm_share(test: int) -> float:
+    """Probability of a false alarm that the n-th test may have, n from 1.
+
+    The sum over all tests is 1 %, however long the folder is watched and however windows overlap
+    (Bonferroni with weights 6 / (pi n)^2).
+    """
+    return FALSE_ALARMS * 6 / (math.pi * test) ** 2

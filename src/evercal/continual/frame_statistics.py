@@ -1,4 +1,4 @@
-"""What selectors may ask about the frames of a scene that was just learned."""
+"""Statistics of the frames of a learned scene, for selectors."""
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -14,19 +14,19 @@ from evercal.recordings.frame import Frame, stated_poses
 
 RELIABLE_PX = 10.0
 PARTS = 625
-"""Of a scene, for coverage: as many as the 25 x 25 clusters of HSCNet that Buff-CS counts."""
+"""Largest number of parts of a scene: the 25 x 25 clusters of HSCNet that Buff-CS uses."""
 PART_POINTS = 20_000
 GRADIENT_ROWS = 256
 
 
 class FrameStatistics:
-    """Frames of one scene in recorded order; everything but poses is computed when asked for.
+    """Frames of one scene in recorded order; everything but the poses is computed lazily.
 
     Args:
         frames: n posed training frames.
-        head: as it is after learning them.
-        rows: gives a buffer whose first n views are these frames as they are.
-        seed: of whatever a selector draws.
+        head: Head after learning the scene.
+        rows: Returns a buffer whose first n views are the plain views of these frames.
+        seed: Seed of a selector's random draws.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class FrameStatistics:
         return len(self.positions_m)
 
     def rng(self) -> np.random.Generator:
-        """A generator for a selector that draws; the same with every call."""
+        """Create the generator of a selector, with the same state at every call."""
         return np.random.default_rng([self._seed, 31])
 
     @cached_property
@@ -52,13 +52,13 @@ class FrameStatistics:
 
     @cached_property
     def _first_rows(self) -> Tensor:
-        """(n + 1,) where the rows of each frame begin, and where the last end."""
+        """(n + 1,) first row of each frame, and the end of the last."""
         count = torch.bincount(self._buffer.tensors["view"].cpu().long(), minlength=len(self))
         return torch.cat(
             [torch.zeros(1, dtype=torch.long, device="cpu"), count[: len(self)].cumsum(0)]
         )
 
-    def _of(self, frame: int) -> Rows:
+    def _rows_of(self, frame: int) -> Rows:
         start, end = self._first_rows[frame : frame + 2].tolist()
         return self._buffer.rows(torch.arange(start, end, device="cpu"))
 
@@ -67,44 +67,44 @@ class FrameStatistics:
 
     @torch.no_grad()
     def features(self) -> np.ndarray:
-        """(n, width) activations of the last hidden layer, mean over each image."""
-        pooled = [self._hidden(self._of(i)).mean(0) for i in range(len(self))]
+        """Compute (n, width) activations of the last hidden layer, averaged over each image."""
+        pooled = [self._hidden(self._rows_of(i)).mean(0) for i in range(len(self))]
         return torch.stack(pooled).double().cpu().numpy()
 
     @torch.no_grad()
     def visible_parts(self) -> list[np.ndarray]:
-        """For each frame the numbers of the parts of the scene that it shows.
+        """Return the numbers of the scene's parts that each frame shows.
 
-        Parts are at most 625 k-means cells of the points that the head predicts and that reproject
-        within 10 px; they stand in for the labels of Buff-CS, which few scenes have.
+        Parts are at most 625 k-means cells of predicted points that reproject within 10 px. They
+        replace the labels of Buff-CS, which few scenes have.
         """
         from scipy.cluster.vq import kmeans, vq
 
-        found = []
+        reliable = []
         for i in range(len(self)):
-            rows = self._of(i)
+            rows = self._rows_of(i)
             points = self._head.decode(self._hidden(rows).float(), self._buffer.scene).points
             _, error = fixed_clamp_loss(points, rows.target)
-            found.append(points[error < RELIABLE_PX].double().cpu().numpy())
-        every = np.concatenate(found)
+            reliable.append(points[error < RELIABLE_PX].double().cpu().numpy())
+        every = np.concatenate(reliable)
         if not len(every):
-            return [np.zeros(0, dtype=np.int64) for _ in found]
+            return [np.zeros(0, dtype=np.int64) for _ in reliable]
         rng = self.rng()
         some = every[rng.permutation(len(every))[:PART_POINTS]]
         start = some[rng.permutation(len(some))[:PARTS]]
         centres, _ = kmeans(some, start, thresh=1e-3)
-        return [np.unique(vq(points, centres)[0]) for points in found]
+        return [np.unique(vq(points, centres)[0]) for points in reliable]
 
     def gradients(self) -> np.ndarray:
-        """(n, p) gradients of each frame's loss by the scene's own logits and offsets.
+        """Compute (n, p) gradients of each frame's loss by the scene's logits and offsets.
 
-        Centres that are known in advance belong to no scene; then by all logits and offsets.
+        Fixed centres belong to no scene; with them, gradients are by all logits and offsets.
         """
         head, generator = self._head, torch.Generator().manual_seed(self._seed)
         parameters = (head.logit, head.offset)
         shared_centres = head.options.centres != "grow"
         own = torch.nonzero(shared_centres | (head.centre_scene == self._buffer.scene))[:, 0]
-        found = []
+        gradients = []
         for i in range(len(self)):
             start, end = self._first_rows[i : i + 2].tolist()
             drawn = torch.randint(start, end, (GRADIENT_ROWS,), generator=generator, device="cpu")
@@ -116,5 +116,5 @@ class FrameStatistics:
             by_logit, by_offset = torch.autograd.grad(loss.mean(), parameters)
             shared = len(by_offset) != len(by_logit)
             parts = (by_logit[own], by_offset if shared else by_offset[own])
-            found.append(torch.cat([part.flatten() for part in parts]))
-        return torch.stack(found).double().cpu().numpy()
+            gradients.append(torch.cat([part.flatten() for part in parts]))
+        return torch.stack(gradients).double().cpu().numpy()

@@ -1,72 +1,67 @@
 """`learn`: one more scene, as a generator of progress, checkpoints and the finished stage."""
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import torch
 
-from evercal.continual.finish_scene import (
-    Learned,
-    correct_lens,
-    finished_stage,
-    mapped_record,
-    trained_record,
-)
+from evercal.continual.finish_scene import Learned, correct_lens, finished_stage, trained_record
 from evercal.continual.methods.method import StageStart
 from evercal.continual.networks.trainer import HeadTrainer
+from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.continual.stage import Event, Stage, StageOptions
 from evercal.continual.stage_head import head_for_scene, whiten
-from evercal.continual.stage_map import stage_map
 from evercal.continual.stage_rows import Pacer, encoded, remembered, scene_buffer, view_plan
+from evercal.continual.store import Checkpoint, Resume
 from evercal.continual.strategies import Strategy
-from evercal.localization.fewest_keyframes import AutoMemoryOptions, fewest_keyframes
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord
-from evercal.mapping.store import Checkpoint, Resume
-from evercal.recordings.frame import Recording, stated_poses
+from evercal.mapping.build import BuiltMap, OnProgress, build_map
+from evercal.recordings.frame import Frame, Recording, stated_poses
 
 
 def learn(
-    maps: SceneMaps,
+    scenes: LearnedScenes,
     strategy: Strategy,
-    scene: Recording,
+    recording: Recording,
     options: StageOptions,
     resume: Resume | None = None,
+    on_progress: OnProgress = lambda *_: None,
 ) -> Iterator[Event]:
-    """Learns one more scene.
+    """Learn one more scene.
 
     Args:
-        maps: what is known so far; not changed.
-        strategy: what is learned; one that learns jointly has its own function, `learn_jointly`.
-        scene: its training frames are learned, its test frames are not looked at.
-        options: how.
-        resume: where an interrupted run of the same call stood.
+        scenes: what was learned before; not changed.
+        strategy: a method, a map or both; a joint strategy has its own function, `learn_jointly`.
+        recording: its training frames are learned, its test frames are not read.
+        options: of the stage.
+        resume: checkpoints of an interrupted run of the same call.
+        on_progress: called while a map is built.
 
     Yields:
-        `Encoding` and `Progress` as it goes, a `Checkpoint` every 10 seconds, a `Stage` at the end.
+        `Encoding` and `Progress`, a `Checkpoint` every 10 seconds, and a `Stage` at the end.
     """
     method = strategy.method
     if method is None:
-        yield from _learn_map(maps, scene, options)
+        yield _learn_map(scenes, recording, options, on_progress)
         return
-    after, frames, scene_map = maps.copy_for_training(), scene.train, None
+    after, frames, built = scenes.copy_for_training(), recording.train, None
     if strategy.builds_map:
-        scene_map = yield from stage_map(after, frames, options)
-        frames = scene_map.adjusted_frames(frames)
+        built = build_scene_map(scenes, recording, options, on_progress)
+        frames = adjusted_frames(built, frames)
     teacher = copy.deepcopy(after.heads[-1]).eval() if after.heads else None
     positions = stated_poses(frames).translation_m
     cell = after.atlas(options.grid_scenes).place(positions)
     in_atlas = cell.atlas_from_base.apply(positions)
     head, local = head_for_scene(after, method.head_per_scene, options, in_atlas)
-    buffer, pacer = scene_buffer(local, cell, frames, maps.device), Pacer()
-    plan = view_plan(options, maps.short_side)
-    yield from encoded(buffer, frames, plan, maps, resume, pacer)
+    buffer, pacer = scene_buffer(local, cell, frames, scenes.device), Pacer()
+    plan = view_plan(options, scenes.short_side)
+    yield from encoded(buffer, frames, plan, scenes, resume, pacer)
     if teacher is None:
         whiten(head, [buffer], options.seed)
-    memories = (yield from remembered(maps, options)) if method.replays else []
-    rows, states = options.fit.replay_batch, maps.method_states
+    memories = (yield from remembered(scenes, options)) if method.replays else []
+    rows, states = options.fit.replay_batch, scenes.method_states
     hooks = method.begin(StageStart(head, teacher, memories, states, rows, options.seed))
-    fit = options.fit if scene_map is None else options.fit.with_known_lens()
+    fit = options.fit if built is None else options.fit.with_known_lens()
     trainer = HeadTrainer(head, [buffer], fit, options.seed, hooks)
     if resume is not None and resume.trainer:
         trainer.load(dict(resume.trainer))
@@ -74,26 +69,50 @@ def learn(
         yield progress
         if pacer.due():
             yield Checkpoint({}, trainer.state())
-    after.scenes.append(trained_record(scene, cell, trainer, 0, len(frames)))
+    after.scenes.append(trained_record(recording, cell, trainer, 0, len(frames)))
     correct_lens(buffer, after.scenes[-1])
-    done = Learned(frames, lambda: buffer, hooks, scene_map)
+    done = Learned(frames, lambda: buffer, hooks, built)
     yield finished_stage(after, method, done, options)
 
 
-def _learn_map(maps: SceneMaps, scene: Recording, options: StageOptions) -> Iterator[Event]:
-    """Learns a scene by building its map; nothing is trained."""
-    after, frames = maps.copy_for_training(), scene.train
+def build_scene_map(
+    scenes: LearnedScenes, recording: Recording, options: StageOptions, on_progress: OnProgress
+) -> BuiltMap:
+    """Build the map of a scene with a stage's options."""
+    sized = options.map_options(scenes.short_side)
+    return build_map(recording.name, recording.train, scenes.encoder, sized, on_progress)
+
+
+def adjusted_frames(built: BuiltMap, frames: Sequence[Frame]) -> list[Frame]:
+    """Frames with the poses and intrinsics of their map, so that a network learns the same points.
+
+    Frames whose pose contradicts the images are left out.
+
+    Args:
+        built: the map of the recording.
+        frames: the posed frames that it was built from, in recorded order.
+    """
+    scene, adjusted = built.scene, []
+    for frame in frames:
+        if frame.name in built.adjusted.wrong_poses or frame.base_from_camera is None:
+            continue
+        camera = scene.adjusted_camera if frame.camera == scene.camera else frame.camera
+        pose = scene.frame.from_base(frame.base_from_camera)
+        adjusted.append(replace(frame, base_from_camera=pose, camera=camera))
+    return adjusted
+
+
+def _learn_map(
+    scenes: LearnedScenes, recording: Recording, options: StageOptions, on_progress: OnProgress
+) -> Stage:
+    """Learn a scene by building its map; nothing is trained."""
+    after, frames = scenes.copy_for_training(), recording.train
+    built = build_scene_map(scenes, recording, options, on_progress)
     cell = after.atlas(options.grid_scenes).place(stated_poses(frames).translation_m)
-    if options.memory_auto:
-        options = replace(options, memory_share=AutoMemoryOptions().most, memory_bytes=None)
-    scene_map = yield from stage_map(after, frames, options)
-    nothing = torch.zeros(0, after.descriptor.width).half()
-    record = SceneRecord(scene.name, frames[0].camera, cell, nothing, len(frames))
-    after.scenes.append(mapped_record(record, scene_map))
-    after.keyframes.append(scene_map.keyframes)
+    empty = torch.zeros(0, after.descriptor.width).half()
+    after.scenes.append(
+        SceneRecord(recording.name, frames[0].camera, cell, empty, len(frames), map=built.scene)
+    )
+    after.keyframes.append(built.scene.keyframes)
     after.method_states.append({})
-    if options.memory_auto:
-        others = [frame for frame in frames if frame.name not in scene_map.names]
-        scene_map = scene_map.take((yield from fewest_keyframes(after, others)))
-        after.keyframes[-1] = scene_map.keyframes
-    yield Stage(after, 0, len(scene_map.keyframes), scene_map)
+    return Stage(after, 0, len(built.scene.keyframes), built)

@@ -1,265 +1,246 @@
-"""`learn_scene`: what the command line, the API and the benchmarks call to learn a scene."""
+"""`learn_networks`: what the command line calls to learn a scene into a store of networks."""
 
 import hashlib
 import json
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import torch
+from torch import nn
 
-from evercal.calibration.eye_in_hand import (
-    HandEyeReport,
-    hand_eye_report,
-    lacks_camera_poses,
-    posed_by_gripper,
-)
+from evercal.calibration.eye_in_hand import hand_eye_report, lacks_camera_poses, posed_by_gripper
 from evercal.continual.finish_scene import memory_bytes
 from evercal.continual.learn import learn
 from evercal.continual.networks.feature_cache import cache_features
 from evercal.continual.networks.trainer import Progress
+from evercal.continual.presets import preset, short_side
+from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.continual.stage import Encoding, Stage, StageOptions
-from evercal.continual.strategies import STRATEGIES, Strategy
+from evercal.continual.store import Checkpoint, NetworkStore, Resume, head_bytes
+from evercal.continual.strategies import Strategy, strategy_named
+from evercal.continual.threshold import fit_threshold
 from evercal.errors import InputError
 from evercal.features.device import device_of
 from evercal.features.weights_file import network_bytes
-from evercal.geometry.se3 import SE3
-from evercal.localization.acceptance import fitted_record
-from evercal.mapping.build import Adjusted, Mapping
-from evercal.mapping.stage_files import head_bytes
-from evercal.mapping.store import Checkpoint, Resume, Store
-from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording, posed_recording
-from evercal.storage.manifest import MANIFEST
-
-HELD_OUT_EVERY = 100
-HELD_OUT_BLOCK = 4
+from evercal.geometry import SE3
+from evercal.localization.acceptance import fit_acceptance
+from evercal.map import LearnReport
+from evercal.recordings.frame import Recording, posed_recording
+from evercal.recordings.held_out import named_recording, require_frames, split_held_out
+from evercal.storage.stages import is_store
 
 
 @dataclass(frozen=True)
-class LearnOptions:
-    """How a scene is learned into a store."""
+class MapProgress:
+    """A map is being built."""
 
-    stage: StageOptions = field(default_factory=StageOptions)
-    """Network and training."""
-    strategy: Strategy = STRATEGIES["evercal"]
-    """What is learned; a store keeps the strategy it was made with."""
-    encoder: Path | torch.nn.Module | None = None
-    """Another encoder than the shipped one: a file for a new store, or a module of one's own."""
-    short_side: int = 240
-    """Working size of images in a new store, pixels."""
+    step: str
+    """Name of the step."""
+    done: int
+    """How much of it is done."""
+    total: int
+    """How much there is."""
+
+
+OnEvent = Callable[[Encoding | MapProgress | Progress | Checkpoint], object]
+
+
+@dataclass(frozen=True)
+class NetworkLearnOptions:
+    """How a scene is learned into a store of networks."""
+
+    strategy: str = "evercal_network"
+    """Name of the strategy; a store keeps the one it was made with."""
+    preset: str = "fast"
+    """Amount of training, see `presets`."""
+    memory: str | int = "10%"
+    """Keyframes of a scene, see `MemoryBudget.parse`."""
+    centres: int | None = None
+    """Cluster centres that a scene adds; those of the preset by default."""
+    encoder: Path | nn.Module | None = None
+    """A weights file for a new store, or a module of the caller's own."""
     gripper_from_camera: SE3 | None = None
-    """Where the camera roughly sits on the gripper (CAD), for recordings of gripper poses alone:
-    what is found is compared with it."""
-    device: str | torch.device = "auto"
-    """What the networks run on, see `device_of`."""
+    """A rough one, such as from CAD, that the estimate is compared with."""
+    device: str = "auto"
+    """Device of the networks, see `device_of`."""
+    seed: int = 0
+    """Seed of everything that is drawn at random."""
+    stage: StageOptions | None = None
+    """Options of the stage in place of preset, memory and centres."""
     cache: Path | None = None
-    """Folder for features of views, for many runs over the same frames (`cache_features`)."""
+    """Folder for features of views, for many runs over the same frames."""
+
+    def stage_options(self) -> StageOptions:
+        """Options of the stage."""
+        if self.stage is not None:
+            return self.stage
+        stage = preset(self.preset, self.seed).with_memory(self.memory)
+        if self.centres is None:
+            return stage
+        if self.centres < 1:
+            raise InputError(f"--centres {self.centres}: give a number >= 1")
+        return replace(stage, head=replace(stage.head, centres_per_scene=self.centres))
 
 
-@dataclass(frozen=True)
-class LearnReport:
-    """What came out."""
-
-    scene: str
-    """Its name in the store."""
-    seconds: float
-    """Wall time of this call; a resumed run counts from the resumption."""
-    iterations: int
-    """Optimiser steps of the stage."""
-    memory_bytes: int
-    """What replay keeps of all scenes."""
-    head_bytes: int
-    """All heads, as stored."""
-    frames_kept: int
-    """Frames of this scene in memory."""
-    train_frames: int
-    """Frames learned."""
-    held_out_frames: int
-    """Frames held out to calibrate the unknown-scene threshold."""
-    inlier_threshold: float
-    """Poses with a smaller inlier ratio are reported as unknown_scene."""
-    resumed: bool
-    """Whether an interrupted run was continued."""
-    landmarks: int = 0
-    """Landmarks of this scene's map."""
-    adjusted: Adjusted | None = None
-    """What bundle adjustment changed about the recording; None where no map was built."""
-    hand_eye: HandEyeReport | None = None
-    """Where the camera was found on the gripper; None where the recording states camera poses."""
-
-
-OnEvent = Callable[[Encoding | Mapping | Progress | Checkpoint], None]
-
-
-def learn_scene(
-    store: Path, scene: Recording, options: LearnOptions, on_event: OnEvent | None = None
+def learn_networks(
+    store: Path,
+    recording: Recording,
+    options: NetworkLearnOptions,
+    on_event: OnEvent = lambda _: None,
 ) -> LearnReport:
-    """Learns a scene into a store, or goes on where an interrupted call of the same kind stopped.
+    """Learn a scene into a store, or continue an interrupted call of the same kind.
 
     Args:
-        store: folder of the store; made when missing.
-        scene: its training frames are learned; a few of them are held out to calibrate the
-            unknown-scene threshold. Its test frames are not looked at.
-        options: how.
-        on_event: called with everything that happens, for progress bars.
+        store: folder of the store; created if it is missing.
+        recording: its training frames are learned; a few are held out to fit the threshold.
+        options: strategy and amount of training.
+        on_event: called with every event, for progress bars.
 
     Raises:
-        InputError: no such device, too few frames, a name that the store knows already, another
-            strategy than the store's, a store that is none or that another process is learning
-            into.
+        InputError: No such device or strategy, too few frames, a name that is taken, another
+            strategy than the store's, or another process is writing into the store.
     """
     began = time.perf_counter()
-    opened = open_or_create(store, options)
+    strategy, stage = strategy_named(options.strategy), options.stage_options()
+    opened = _opened(store, strategy, stage, options)
     with opened.writing():
-        return _learn_scene(opened, scene, options, on_event, began)
-
-
-def _learn_scene(
-    opened: Store, scene: Recording, options: LearnOptions, on_event: OnEvent | None, began: float
-) -> LearnReport:
-    wrist = lacks_camera_poses(scene)
-    scene = scene if wrist else posed_recording(scene)
-    device = device_of(options.device)
-    _check(opened, scene, options)
-    opened.maps.to(device)
-    stage_options, start = options.stage, None
-    if wrist:
-        scene, start = posed_by_gripper(scene, opened.maps.encoder, on_event or (lambda _: None))
-        stage_options = replace(stage_options, map=stage_options.map.for_hand_eye())
-    if options.cache is not None and isinstance(opened.maps.encoder, torch.nn.Module):
-        cache_features(opened.maps.encoder, options.cache)
-    train, held_out = validation_split(scene.train)
-    train_split = replace(scene, train=train)
-    resume = opened.begin(_identity(opened, scene, options))
-    try:
-        stage = run_stage(
-            opened, train_split, replace(options, stage=stage_options), resume, on_event
+        contents = opened.contents.to(device_of(options.device))
+        names = [record.name for record in contents.scenes]
+        recording, start = named_recording(recording, None, names), None
+        if lacks_camera_poses(recording):
+            _require_map(recording, strategy)
+            posed = posed_by_gripper(recording, contents.encoder, _on_map(on_event))
+            recording, start = posed.recording, posed.start
+            stage = replace(stage, map=stage.map.for_hand_eye())
+        recording = posed_recording(recording)
+        require_frames(recording)
+        if options.cache is not None and isinstance(contents.encoder, nn.Module):
+            cache_features(contents.encoder, options.cache)
+        split = split_held_out(recording.train)
+        train = replace(recording, train=split.train)
+        resume = opened.begin(_identity(opened, recording, strategy, stage))
+        try:
+            done = run_stage(opened, strategy, train, stage, resume, on_event)
+        except InputError:
+            opened.abandon()  # bad input: nothing to resume
+            raise
+        done.scenes.scenes[-1] = with_fitted_threshold(done.scenes, split.held_out)
+        record, keyframes = done.scenes.scenes[-1], done.scenes.keyframes[-1]
+        report = LearnReport(
+            scene=recording.name,
+            seconds=time.perf_counter() - began,
+            memory_bytes=memory_bytes(done.scenes, strategy),
+            frames_kept=done.frames_kept,
+            train_frames=len(split.train),
+            held_out_frames=len(split.held_out),
+            min_support=record.map.min_support if record.map else record.inlier_threshold,
+            landmarks=sum(map(len, keyframes.landmarks)) if keyframes else 0,
+            adjusted=done.built.adjusted if done.built else None,
+            hand_eye=hand_eye_report(start, done.built, options.gripper_from_camera)
+            if start and done.built
+            else None,
+            iterations=done.iterations,
+            head_bytes=sum(head_bytes(head) for head in done.scenes.heads),
         )
-    except InputError:
-        opened.abandon()  # bad input: no interrupted stage worth going on with
-        raise
-    maps = stage.maps
-    maps.scenes[-1] = fitted_record(maps, held_out)
-    kept, scene_map = maps.keyframes[-1], stage.scene_map
-    report = LearnReport(
-        scene.name,
-        time.perf_counter() - began,
-        stage.iterations,
-        memory_bytes(maps, options.strategy),
-        sum(head_bytes(head) for head in maps.heads),
-        stage.frames_kept,
-        len(train),
-        len(held_out),
-        maps.scenes[-1].inlier_threshold,
-        resume is not None,
-        sum(map(len, kept.landmarks)) if kept else 0,
-        scene_map.adjusted if scene_map else None,
-        hand_eye_report(start, scene_map, options.gripper_from_camera)
-        if start and scene_map
-        else None,
-    )
-    opened.commit(maps, asdict(report))
+        opened.commit(done.scenes, asdict(report))
     return report
 
 
-def open_or_create(store: Path, options: LearnOptions) -> Store:
-    """The store at a path, or a new one when there is none yet.
-
-    Raises:
-        InputError: as `Store.open` and `Store.create`.
-    """
-    if (store / MANIFEST).exists():
-        own = options.encoder if isinstance(options.encoder, torch.nn.Module) else None
-        return Store.open(store, own)
-    return Store.create(store, options.strategy.name, options.short_side, options.encoder)
-
-
-def _check(opened: Store, scene: Recording, options: LearnOptions) -> None:
-    names = [record.name for record in opened.maps.scenes]
-    if scene.name in names:
-        raise InputError(
-            f"scene {scene.name!r}: the store has a scene of this name; give another with --name"
-        )
-    if not scene.name or set(scene.name) & set("/\\") or scene.name.startswith("."):
-        raise InputError(
-            f"scene name {scene.name!r}: names become folders; give one without slashes (--name)"
-        )
-    strategy = options.strategy
-    if opened.maps.strategy != strategy.name:
-        raise InputError(
-            f"strategy {strategy.name!r}: the store was made with {opened.maps.strategy!r}; "
-            "go on with that one or start a new store"
-        )
-    if strategy.jointly:
-        raise InputError(
-            f"strategy {strategy.name!r}: learns all scenes at once, so a store cannot grow by it; "
-            "take another strategy, or compare it with 'evercal bench'"
-        )
-    if lacks_camera_poses(scene) and not strategy.builds_map:
-        raise InputError(
-            f"scene {scene.name!r}: only gripper poses are known, and strategy"
-            f" {strategy.name!r} builds no map that could find the camera on the gripper;"
-            " use strategy evercal"
-        )
-    if options.stage.memory_auto and strategy.method is not None:
-        raise InputError(
-            f"memory auto: strategy {strategy.name!r} trains a network; give a share or bytes"
-        )
-    if len(scene.train) < MIN_TRAIN_FRAMES:
-        raise InputError(
-            f"scene {scene.name!r}: {len(scene.train)} training frames are too few; "
-            f"give at least {MIN_TRAIN_FRAMES}"
-        )
-
-
-def _identity(opened: Store, scene: Recording, options: LearnOptions) -> dict[str, object]:
-    """Whatever changes the outcome of a stage: only the same identity may be resumed."""
-    poses = hashlib.sha256()
-    for frame in scene.train:
-        assert frame.base_from_camera is not None, "frames without a pose are left out before"
-        poses.update(frame.name.encode())
-        poses.update(frame.base_from_camera.matrix().tobytes())
-    networks = hashlib.sha256()
-    for kind in ("encoder", "descriptor"):
-        module = getattr(opened.maps, kind)
-        assert isinstance(module, torch.nn.Module)
-        networks.update(network_bytes(module, kind))
-    # Another version of a stage is the same scene, laid elsewhere by `evercal align`.
-    stages = [name.partition("~")[0] for name in opened.stages]
-    return {
-        "scene": scene.name,
-        "networks": networks.hexdigest(),
-        "frames": poses.hexdigest(),
-        "camera": scene.train[0].camera.to_dict(),
-        "stage": json.loads(json.dumps(asdict(options.stage))),
-        "strategy": options.strategy.description(),
-        "stages": stages,
-    }
+def with_fitted_threshold(scenes: LearnedScenes, held_out: tuple) -> SceneRecord:
+    """The newest record with its threshold: of the map, if there is one, else of the network."""
+    record = scenes.scenes[-1]
+    if record.map is None:
+        return fit_threshold(scenes, held_out)
+    return replace(record, map=fit_acceptance(scenes.map_contents(), held_out))
 
 
 def run_stage(
-    opened: Store,
-    train_split: Recording,
-    options: LearnOptions,
+    opened: NetworkStore,
+    strategy: Strategy,
+    recording: Recording,
+    options: StageOptions,
     resume: Resume | None,
-    on_event: OnEvent | None,
+    on_event: OnEvent = lambda _: None,
 ) -> Stage:
-    """Drives `learn` to its end, writing checkpoints to the store."""
-    for event in learn(opened.maps, options.strategy, train_split, options.stage, resume):
+    """Run `learn` to its end, writing checkpoints to the store."""
+    events = learn(opened.contents, strategy, recording, options, resume, _on_map(on_event))
+    for event in events:
         if isinstance(event, Stage):
             return event
         if isinstance(event, Checkpoint):
             opened.checkpoint(event)
-        if on_event is not None:
-            on_event(event)
+        on_event(event)
     raise AssertionError("learn() ends with a Stage")
 
 
-def validation_split(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
-    """Splits recorded frames: those to learn, and blocks of 4 in every 100 (at least one)."""
-    every = min(HELD_OUT_EVERY, len(frames))
-    middle = every // 2
-    aside = [middle <= i % every < middle + HELD_OUT_BLOCK for i in range(len(frames))]
-    learned = tuple(f for f, out in zip(frames, aside, strict=True) if not out)
-    return learned, tuple(f for f, out in zip(frames, aside, strict=True) if out)
+def _on_map(on_event: OnEvent) -> Callable[[str, int, int], object]:
+    return lambda step, done, total: on_event(MapProgress(step, done, total))
+
+
+def _opened(
+    store: Path, strategy: Strategy, stage: StageOptions, options: NetworkLearnOptions
+) -> NetworkStore:
+    """The store, checked against the options."""
+    if strategy.jointly:
+        raise InputError(
+            f"strategy {strategy.name!r}: learns all scenes at once, so a store cannot grow by it;"
+            " use another strategy, or compare it with 'evercal bench'"
+        )
+    if stage.memory.auto:
+        raise InputError("memory auto: only a map selects its keyframes; give a share or bytes")
+    if not is_store(store):
+        side = short_side(options.preset)
+        return NetworkStore.create(store, strategy.name, side, options.encoder)
+    if isinstance(options.encoder, Path):
+        raise InputError(
+            f"encoder {options.encoder}: store {store} keeps the encoder it was made with"
+        )
+    opened = NetworkStore.open(store, options.encoder)
+    if opened.contents.strategy != strategy.name:
+        raise InputError(
+            f"strategy {strategy.name!r}: the store was made with {opened.contents.strategy!r};"
+            " use that one or start a new store"
+        )
+    heads, method = opened.contents.heads, strategy.method
+    shared = method is not None and not method.head_per_scene and heads
+    if shared and options.centres not in (None, heads[-1].options.centres_per_scene):
+        raise InputError(
+            f"--centres {options.centres}: {store} was made with"
+            f" {heads[-1].options.centres_per_scene} per scene; leave the option out or start a new"
+            " store"
+        )
+    return opened
+
+
+def _require_map(recording: Recording, strategy: Strategy) -> None:
+    if not strategy.builds_map:
+        raise InputError(
+            f"scene {recording.name!r}: only gripper poses are stated, and strategy"
+            f" {strategy.name!r} builds no map to estimate the camera on the gripper; use strategy"
+            " evercal"
+        )
+
+
+def _identity(
+    opened: NetworkStore, recording: Recording, strategy: Strategy, stage: StageOptions
+) -> dict[str, object]:
+    """Everything that decides the outcome of a stage: only the same identity is resumed."""
+    poses, networks = hashlib.sha256(), hashlib.sha256()
+    for frame in recording.train:
+        assert frame.base_from_camera is not None, "frames without a pose are left out before"
+        poses.update(frame.name.encode())
+        poses.update(frame.base_from_camera.matrix().tobytes())
+    for kind in ("encoder", "descriptor"):
+        module = getattr(opened.contents, kind)
+        assert isinstance(module, nn.Module)
+        networks.update(network_bytes(module, kind))
+    return {
+        "scene": recording.name,
+        "networks": networks.hexdigest(),
+        "frames": poses.hexdigest(),
+        "camera": recording.train[0].camera.to_dict(),
+        "stage": json.loads(json.dumps(asdict(stage))),
+        "strategy": strategy.description(),
+        "stages": opened.stages,
+    }

@@ -1,4 +1,4 @@
-"""Strategies from a user's own file."""
+"""Strategies from a user's file."""
 
 import importlib.util
 import sys
@@ -9,17 +9,16 @@ from evercal.errors import InputError
 
 
 def load_plugin(path: Path) -> tuple[str, ...]:
-    """Runs a Python file and adds the strategies that it names to `STRATEGIES`.
+    """Run a Python file and add its strategies to `STRATEGIES`.
 
     Args:
-        path: a file with a dict `STRATEGIES` of its own, names to `Strategy` records of these
-            names.
+        path: File that defines a dict `STRATEGIES` from names to `Strategy` records.
 
     Returns:
-        The names added.
+        The added names.
 
     Raises:
-        InputError: no such file, an error in it, no such dict, or a name that is taken.
+        InputError: The file is missing, fails, defines no such dict, or reuses a name.
     """
     if not path.is_file():
         raise InputError(f"plugin {path}: no such file")
@@ -27,22 +26,23 @@ def load_plugin(path: Path) -> tuple[str, ...]:
     if spec is None or spec.loader is None:
         raise InputError(f"plugin {path}: not a Python file; give one that ends in .py")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses and pickles look for their module there
+    sys.modules[spec.name] = module  # dataclasses and pickle look up the module
     try:
         spec.loader.exec_module(module)
     except Exception as error:
         raise InputError(f"plugin {path}: {type(error).__name__}: {error}") from error
-    found = getattr(module, "STRATEGIES", None)
-    usable = isinstance(found, dict) and all(
-        isinstance(v, Strategy) and v.name == name for name, v in found.items()
+    strategies = getattr(module, "STRATEGIES", None)
+    usable = isinstance(strategies, dict) and all(
+        isinstance(strategy, Strategy) and strategy.name == name
+        for name, strategy in strategies.items()
     )
-    if not usable or not found:
+    if not usable or not strategies:
         raise InputError(
-            f"plugin {path}: defines no STRATEGIES; give a dict of names to Strategy records of"
-            " these names"
+            f"plugin {path}: defines no STRATEGIES; define a dict from names to Strategy records"
+            " of these names"
         )
-    taken = [name for name in found if name in STRATEGIES and STRATEGIES[name] is not found[name]]
-    if taken:
-        raise InputError(f"plugin {path}: strategy {taken[0]!r} is evercal's own; choose another")
-    STRATEGIES.update(found)
-    return tuple(found)
+    for name, strategy in strategies.items():
+        if STRATEGIES.get(name, strategy) is not strategy:
+            raise InputError(f"plugin {path}: strategy {name!r} exists; choose another name")
+    STRATEGIES.update(strategies)
+    return tuple(strategies)

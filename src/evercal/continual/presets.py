@@ -1,4 +1,4 @@
-"""Presets: how much work a scene gets."""
+"""Presets of the training effort per scene."""
 
 from dataclasses import replace
 from typing import Literal
@@ -12,30 +12,30 @@ from evercal.continual.stage import StageOptions
 Preset = Literal["fast", "demo", "bench", "paper"]
 
 PRESETS: dict[str, StageOptions] = {
-    # 2 cores, at most 240 s a scene.
+    # At most 240 s per scene on two cores.
     "fast": StageOptions(
         head=HeadOptions(width=384),
         fit=FitOptions(iterations=2400, batch=2048, replay_batch=1024),
         encode=EncodePlan(views_per_frame=4),
     ),
-    # At most 45 s a scene of about 100 frames.
+    # At most 45 s per scene of about 100 frames.
     "demo": StageOptions(
         head=HeadOptions(width=256),
         fit=FitOptions(iterations=1000, batch=2048, replay_batch=1024),
         encode=EncodePlan(views_per_frame=3),
         replay_views_per_frame=4,
     ),
-    # At most 45 s a stage on one core. Twice the rows cost twice the time and are as accurate on
-    # held-out frames; half the steps are not.
+    # At most 45 s per stage on one core. On held-out frames twice the rows are not more accurate,
+    # and half the steps are less accurate.
     "bench": StageOptions(
         head=HeadOptions(width=256),
         fit=FitOptions(iterations=600, batch=1024, replay_batch=512),
         encode=EncodePlan(views_per_frame=1),
         replay_views_per_frame=2,
     ),
-    # The paper's settings, for a GPU: AdamW at 0.005, 15,000 steps a scene, SARS and SPDD as their
-    # options say. The rows of a step are GLACE's; the paper says "a mini-batch of replay samples",
-    # here as many. The lens is left as it is stated.
+    # The paper's settings, for a GPU: AdamW at 0.005 and 15,000 steps per scene. The rows of a step
+    # are GLACE's. The paper does not state the number of replayed rows; here it is the same. The
+    # stated intrinsics are not corrected.
     "paper": StageOptions(
         head=HeadOptions(
             width=768,
@@ -60,27 +60,32 @@ PRESETS: dict[str, StageOptions] = {
 
 
 def preset(name: str, seed: int = 0) -> StageOptions:
-    """A preset with everything drawn from `seed`."""
+    """Return a preset with a seed for all random draws."""
     options = PRESETS[name]
     return replace(options, seed=seed, encode=replace(options.encode, seed=seed))
 
 
 PAPER_SIM_STEPS = 5_000
-"""Steps a scene of preset `paper` on the paper's own simulation."""
+"""Steps per scene of preset `paper` on the paper's simulation."""
 
 
 def short_side(name: str) -> int:
-    """Working size of images, pixels: the paper's is 480."""
+    """Return the short side of the working images, pixels; 480 for the paper."""
     return 480 if name == "paper" else 240
 
 
 def on_paper_backbone(options: StageOptions) -> StageOptions:
-    """As much work with the paper's network and optimiser in place of ours.
+    """Replace network and optimiser by the paper's; width, steps and rows of a step stay.
 
-    The descriptor in the input, centres that are known in advance (`fixed_centres_m`), no
-    whitening, and every stage at the full peak rate; width, steps and rows of a step stay.
+    The head reads the descriptor, has fixed centres (`fixed_centres_m`) and no whitening. Every
+    stage has the full peak rate.
     """
     paper = PRESETS["paper"]
     head = replace(paper.head, width=options.head.width, centres="fixed")
-    work = {name: getattr(options.fit, name) for name in ("iterations", "batch", "replay_batch")}
-    return replace(options, head=head, fit=replace(paper.fit, **work))
+    fit = replace(
+        paper.fit,
+        iterations=options.fit.iterations,
+        batch=options.fit.batch,
+        replay_batch=options.fit.replay_batch,
+    )
+    return replace(options, head=head, fit=fit)

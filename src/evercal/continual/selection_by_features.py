@@ -1,8 +1,7 @@
-"""Which frames of a scene stay in memory, decided from what the learned head makes of them.
+"""Keyframe selection by features of the learned head, after other methods.
 
-Selectors of other methods, each over one scene with its own quota. Where a rule was made for
-classes, a class is a scene here and its feature a mean over the image; the docstrings say what
-that leaves of the original. All return kept indices in recorded order.
+Each rule selects frames of one scene up to a capacity. Rules designed for classes treat a scene as
+a class and the mean over an image as its feature. All return sorted indices.
 """
 
 from __future__ import annotations
@@ -14,40 +13,40 @@ import numpy as np
 
 ROUNDING = 1e-9
 GSS_COMPARED = 10
-"""Remembered frames that gradient-based selection compares a new one with."""
+"""Buffered frames with which gradient-based selection compares a new frame."""
 
 
 def select_reservoir(count: int, capacity: int, rng: np.random.Generator) -> np.ndarray:
-    """Reservoir sampling: every frame of the stream stays with the same probability.
+    """Reservoir sampling: every frame is selected with the same probability.
 
-    The n-th frame is appended while there is room; later it draws a place among n and, if that
-    lies in the buffer, takes it (Vitter, 1985, algorithm R).
+    Frames are appended until the buffer is full. Later the n-th frame draws one of n slots and
+    replaces its frame if the slot is in the buffer (Vitter, 1985, algorithm R).
 
     Args:
-        count: frames in the stream.
-        capacity: places.
-        rng: of the draws.
+        count: Frames in the stream.
+        capacity: Frames to select.
+        rng: Source of the random draws.
     """
-    kept = list(range(min(count, capacity)))
+    selected = list(range(min(count, capacity)))
     for frame in range(capacity, count):
-        place = int(rng.integers(frame + 1))
-        if place < capacity:
-            kept[place] = frame
-    return np.sort(np.array(kept, dtype=np.int64))
+        slot = int(rng.integers(frame + 1))
+        if slot < capacity:
+            selected[slot] = frame
+    return np.sort(np.array(selected, dtype=np.int64))
 
 
 def select_hybrid(features: np.ndarray, capacity: int, rng: np.random.Generator) -> np.ndarray:
-    """A reservoir of novel frames, after the hybrid replay of Bahadir et al. (MVA 2024).
+    """Reservoir of novel frames, after the hybrid replay of Bahadir et al. (MVA 2024).
 
-    A frame enters the stream of the reservoir only if it is novel: less alike to the last one that
-    did than the median of neighbouring frames is. What is known of the original is its abstract
-    (reservoir, and a test of new data for novelty); the measure is ours. Places that are left when
-    too few frames are novel are filled with a reservoir of the others.
+    Only novel frames enter the reservoir's stream: their distance to the last novel frame exceeds
+    the median distance of neighbouring frames. The measure is ours, because only the abstract of
+    the original was available. If too few frames are novel, a reservoir of the others fills the
+    rest.
 
     Args:
         features: (n, c) of the frames in recorded order; rows are scaled to unit length.
-        capacity: frames to keep.
-        rng: of the draws.
+        capacity: Frames to select.
+        rng: Source of the random draws.
     """
     unit = _unit(features)
     step = 1 - (unit[1:] * unit[:-1]).sum(1)
@@ -56,43 +55,43 @@ def select_hybrid(features: np.ndarray, capacity: int, rng: np.random.Generator)
     for frame in range(len(unit)):
         if not novel or 1 - float(unit[frame] @ unit[novel[-1]]) > floor + ROUNDING:
             novel.append(frame)
-    kept = np.array(novel, dtype=np.int64)[select_reservoir(len(novel), capacity, rng)]
+    selected = np.array(novel, dtype=np.int64)[select_reservoir(len(novel), capacity, rng)]
     others = np.setdiff1d(np.arange(len(unit)), novel)
-    more = select_reservoir(len(others), capacity - len(kept), rng)
-    return np.sort(np.concatenate([kept, others[more]]))
+    more = select_reservoir(len(others), capacity - len(selected), rng)
+    return np.sort(np.concatenate([selected, others[more]]))
 
 
 def select_herding(features: np.ndarray, capacity: int) -> np.ndarray:
     """Herding of iCaRL (Rebuffi et al., CVPR 2017, Algorithm 4).
 
-    Frames are taken one after another so that the mean of those taken stays nearest to the mean of
-    all. Ties go to the earlier frame.
+    Each next frame is the one that brings the mean of the selection closest to the mean of all
+    frames. Ties go to the earlier frame.
 
     Args:
         features: (n, c) of the frames; rows are scaled to unit length.
-        capacity: frames to keep.
+        capacity: Frames to select.
     """
     unit = _unit(features)
     mean = unit.mean(0) if len(unit) else np.zeros(features.shape[1])
-    free, total, kept = np.ones(len(unit), dtype=bool), np.zeros(unit.shape[1]), []
+    free, total, selected = np.ones(len(unit), dtype=bool), np.zeros(unit.shape[1]), []
     for taken in range(1, min(capacity, len(unit)) + 1):
         gap = np.linalg.norm(mean - (total + unit) / taken, axis=1)
         chosen = int(np.where(free, gap, np.inf).argmin())
         free[chosen] = False
         total += unit[chosen]
-        kept.append(chosen)
-    return np.sort(np.array(kept, dtype=np.int64))
+        selected.append(chosen)
+    return np.sort(np.array(selected, dtype=np.int64))
 
 
 def leverage_scores(features: np.ndarray, rank: int) -> np.ndarray:
-    """Rank-r leverage of rows: squared norms of the rows of the first r left singular vectors.
+    """Compute rank-r leverage: squared row norms of the first r left singular vectors.
 
-    They add up to the rank. Of the full left factor every row has norm 1, so the thin one is meant
-    (FedCBDR prints the full one).
+    The scores sum to the rank. FedCBDR prints the full left factor, whose rows all have norm 1; the
+    thin one is used here.
 
     Args:
         features: (n, c).
-        rank: at most this many singular vectors; fewer where the matrix has fewer.
+        rank: Largest number of singular vectors.
     """
     left, values, _ = np.linalg.svd(np.asarray(features, np.float64), full_matrices=False)
     used = int((values > values.max(initial=0) * 1e-9).sum())
@@ -102,22 +101,22 @@ def leverage_scores(features: np.ndarray, rank: int) -> np.ndarray:
 def select_leverage(
     features: np.ndarray, capacity: int, rng: np.random.Generator, rank: int = 32
 ) -> np.ndarray:
-    """Global-perspective data replay (GDR of FedCBDR, Qi et al., NeurIPS 2025), in one place.
+    """Global-perspective data replay (GDR of FedCBDR, Qi et al., NeurIPS 2025) for one party.
 
-    Frames are drawn without replacement with probabilities proportional to their leverage. What
-    serves several parties (encryption, weights against bias) has no part with one.
+    Frames are drawn without replacement, with probabilities proportional to their leverage.
+    Encryption and bias weights, which serve several parties, are omitted.
 
     Args:
         features: (n, c) of the frames.
-        capacity: frames to keep.
-        rng: of the draws.
-        rank: see `leverage_scores`.
+        capacity: Frames to select.
+        rng: Source of the random draws.
+        rank: See `leverage_scores`.
     """
     score = leverage_scores(features, rank)
-    # Frames without any leverage may fill what is left.
+    # Frames without leverage can still fill the capacity.
     share = (score + 1e-12) / (score + 1e-12).sum()
-    kept = rng.choice(len(score), size=min(capacity, len(score)), replace=False, p=share)
-    return np.sort(kept)
+    count = min(capacity, len(score))
+    return np.sort(rng.choice(len(score), size=count, replace=False, p=share))
 
 
 def select_coverage(
@@ -128,33 +127,33 @@ def select_coverage(
 ) -> np.ndarray:
     """Coverage score of Buff-CS (Wang et al., ICCV 2021) inside one scene.
 
-    The frames stream by in random order. While there is room all stay. Later a frame stays if it
-    shows a part of the scene that no kept frame shows, or else with probability m / n as in a
-    reservoir (m kept, n seen before); then a kept frame leaves.
+    Frames arrive in random order and are appended until the buffer is full. Later a frame enters if
+    it shows a part of the scene that no buffered frame shows. Otherwise it enters with probability
+    m / n as in a reservoir (m buffered, n earlier frames). Each entering frame replaces another.
 
     Args:
-        visible: for each frame the numbers of the parts that it shows.
-        capacity: frames to keep.
-        rng: of the order and the draws.
-        victim: who leaves: a random frame as in the released code, or the one that shares most with
-            the others, which that code computes and does not use.
+        visible: Numbers of the parts that each frame shows.
+        capacity: Frames to select.
+        rng: Source of the order and the random draws.
+        victim: Frame to replace: a random one as in the released code, or the one that shares most
+            parts with the others, which that code computes but does not use.
     """
-    parts = 1 + max((int(found.max()) for found in visible if len(found)), default=-1)
-    shows = np.zeros((len(visible), parts), dtype=bool)
-    for frame, found in enumerate(visible):
-        shows[frame, found] = True
-    kept: list[int] = []
-    for seen, frame in enumerate(rng.permutation(len(visible)).tolist()):
-        if len(kept) < capacity:
-            kept.append(frame)
+    count = 1 + max((int(parts.max()) for parts in visible if len(parts)), default=-1)
+    shows = np.zeros((len(visible), count), dtype=bool)
+    for frame, parts in enumerate(visible):
+        shows[frame, parts] = True
+    selected: list[int] = []
+    for earlier, frame in enumerate(rng.permutation(len(visible)).tolist()):
+        if len(selected) < capacity:
+            selected.append(frame)
             continue
-        novel = bool((shows[frame] & ~shows[kept].any(0)).any())
-        if kept and (novel or rng.random() <= len(kept) / seen):
-            kept[_leaving(shows[kept], rng, victim)] = frame
-    return np.sort(np.array(kept, dtype=np.int64))
+        novel = bool((shows[frame] & ~shows[selected].any(0)).any())
+        if selected and (novel or rng.random() <= len(selected) / earlier):
+            selected[_replaced(shows[selected], rng, victim)] = frame
+    return np.sort(np.array(selected, dtype=np.int64))
 
 
-def _leaving(shows: np.ndarray, rng: np.random.Generator, victim: str) -> int:
+def _replaced(shows: np.ndarray, rng: np.random.Generator, victim: str) -> int:
     if victim == "random":
         return int(rng.integers(len(shows)))
     signed = np.where(shows, 1.0, -1.0)
@@ -164,31 +163,31 @@ def _leaving(shows: np.ndarray, rng: np.random.Generator, victim: str) -> int:
 def select_gradients(gradients: np.ndarray, capacity: int, rng: np.random.Generator) -> np.ndarray:
     """Gradient-based sample selection, greedy (GSS, Aljundi et al., NeurIPS 2019, Algorithm 2).
 
-    A frame's score is one plus its largest cosine with a few kept frames. While there is room all
-    stay. Later only a frame that points away from all of those (score below 1) may enter: it
-    challenges a kept frame, drawn by score, and wins with the share of that score in both.
+    A frame's score c is one plus its largest cosine with a few buffered frames. Frames are appended
+    until the buffer is full. Later a frame enters only if c < 1, which means opposed gradients. It
+    then replaces a buffered frame i, drawn by its score c_i, with probability c_i / (c_i + c).
 
     Args:
-        gradients: (n, p) of the loss on each frame.
-        capacity: frames to keep.
-        rng: of the draws.
+        gradients: (n, p) gradient of the loss on each frame.
+        capacity: Frames to select.
+        rng: Source of the random draws.
     """
     unit = _unit(gradients)
-    kept: list[int] = []
+    selected: list[int] = []
     scores = np.zeros(min(capacity, len(unit)))
     for frame in range(len(unit) if capacity else 0):
-        compared = rng.permutation(len(kept))[:GSS_COMPARED]
-        likeness = unit[[kept[i] for i in compared]] @ unit[frame] if kept else np.array([-0.9])
-        score = float(likeness.max()) + 1.0
-        if len(kept) < capacity:
-            scores[len(kept)] = score
-            kept.append(frame)
+        compared = [selected[i] for i in rng.permutation(len(selected))[:GSS_COMPARED]]
+        cosines = unit[compared] @ unit[frame] if selected else np.array([-0.9])
+        score = float(cosines.max()) + 1.0
+        if len(selected) < capacity:
+            scores[len(selected)] = score
+            selected.append(frame)
         elif score < 1.0:
             total = scores.sum()
-            place = int(rng.choice(len(kept), p=scores / total)) if total > 0 else 0
-            if rng.random() * (scores[place] + score) < scores[place]:
-                kept[place], scores[place] = frame, score
-    return np.sort(np.array(kept, dtype=np.int64))
+            slot = int(rng.choice(len(selected), p=scores / total)) if total > 0 else 0
+            if rng.random() * (scores[slot] + score) < scores[slot]:
+                selected[slot], scores[slot] = frame, score
+    return np.sort(np.array(selected, dtype=np.int64))
 
 
 def _unit(rows: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Which frames of a finished scene stay, by name: the rules of `mapping` and of the features."""
+"""Rules that select keyframes, by name."""
 
 from collections.abc import Callable
 
@@ -16,55 +16,21 @@ from evercal.continual.selection_by_features import (
 from evercal.mapping.selection import SarsOptions, select_sars
 
 Select = Callable[[FrameStatistics, int], np.ndarray]
-"""(frames of a finished scene, capacity) -> indices of those that stay, in recorded order."""
-
-
-def _sars(frames: FrameStatistics, capacity: int) -> np.ndarray:
-    return select_sars(frames.positions_m, frames.quaternions_wxyz, capacity, SarsOptions())
-
-
-def _sars_filled(frames: FrameStatistics, capacity: int) -> np.ndarray:
-    fill = SarsOptions(fill=True)
-    return select_sars(frames.positions_m, frames.quaternions_wxyz, capacity, fill)
-
-
-def _reservoir(frames: FrameStatistics, capacity: int) -> np.ndarray:
-    return select_reservoir(len(frames), capacity, frames.rng())
-
-
-def _hybrid(frames: FrameStatistics, capacity: int) -> np.ndarray:
-    return select_hybrid(frames.features(), capacity, frames.rng())
-
-
-def _herding(frames: FrameStatistics, capacity: int) -> np.ndarray:
-    return select_herding(frames.features(), capacity)
-
-
-def _leverage(frames: FrameStatistics, capacity: int) -> np.ndarray:
-    return select_leverage(frames.features(), capacity, frames.rng())
-
-
-def _coverage(frames: FrameStatistics, capacity: int) -> np.ndarray:
-    return select_coverage(frames.visible_parts(), capacity, frames.rng())
-
-
-def _coverage_redundant(frames: FrameStatistics, capacity: int) -> np.ndarray:
-    return select_coverage(frames.visible_parts(), capacity, frames.rng(), "redundant")
-
-
-def _gradients(frames: FrameStatistics, capacity: int) -> np.ndarray:
-    return select_gradients(frames.gradients(), capacity, frames.rng())
-
+"""Maps the frames of a finished scene and a capacity to sorted indices of the keyframes."""
 
 SELECTORS: dict[str, Select] = {
-    "reservoir": _reservoir,
-    "hybrid": _hybrid,
-    "herding": _herding,
-    "coverage": _coverage,
-    "coverage_redundant": _coverage_redundant,
-    "leverage": _leverage,
-    "gradients": _gradients,
-    "sars": _sars,
-    "sars_filled": _sars_filled,
+    "reservoir": lambda f, capacity: select_reservoir(len(f), capacity, f.rng()),
+    "hybrid": lambda f, capacity: select_hybrid(f.features(), capacity, f.rng()),
+    "herding": lambda f, capacity: select_herding(f.features(), capacity),
+    "coverage": lambda f, capacity: select_coverage(f.visible_parts(), capacity, f.rng()),
+    "coverage_redundant": lambda f, capacity: select_coverage(
+        f.visible_parts(), capacity, f.rng(), "redundant"
+    ),
+    "leverage": lambda f, capacity: select_leverage(f.features(), capacity, f.rng()),
+    "gradients": lambda f, capacity: select_gradients(f.gradients(), capacity, f.rng()),
+    "sars": lambda f, capacity: select_sars(f.positions_m, f.quaternions_wxyz, capacity),
+    "sars_filled": lambda f, capacity: select_sars(
+        f.positions_m, f.quaternions_wxyz, capacity, SarsOptions(fill=True)
+    ),
 }
-"""`sars` keeps the paper's fixed radius, `sars_filled` takes the largest that fills the memory."""
+"""`sars` uses the paper's fixed radius, `sars_filled` the largest radius that fills the memory."""

@@ -1,4 +1,4 @@
-"""The head that a stage trains: a new one, the last one grown by a scene, or a copy of it."""
+"""The head of a stage: a new one, the last one grown by a scene, or a copy of it."""
 
 from collections.abc import Sequence
 
@@ -9,19 +9,19 @@ from torch import Tensor
 from evercal.continual.networks.atlas import camera_clusters
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.head import Head
+from evercal.continual.scenes import LearnedScenes
 from evercal.continual.stage import StageOptions
-from evercal.mapping.scene_maps import SceneMaps
 
 WHITENING_ROWS = 20_000
 
 
 def head_for_scene(
-    maps: SceneMaps, own: bool, options: StageOptions, positions_m: np.ndarray
+    scenes: LearnedScenes, own: bool, options: StageOptions, positions_m: np.ndarray
 ) -> tuple[Head, int]:
-    """The head to train, which is put in its place among those of `maps`.
+    """The head to train, added to those of `scenes`.
 
     Args:
-        maps: with the heads of earlier scenes; changed.
+        scenes: with the heads of earlier scenes; changed.
         own: whether every scene has a head of its own; it starts from the last one's weights.
         options: of the stage.
         positions_m: (n, 3) camera positions of the scene in the atlas.
@@ -29,35 +29,39 @@ def head_for_scene(
     Returns:
         The head, grown by this scene, and the scene's index in it.
     """
-    if not maps.heads:
-        head = fresh_head(maps, options)
+    if not scenes.heads:
+        head = fresh_head(scenes, options)
     elif own:
-        head = maps.heads[-1].without_scenes()
+        head = scenes.heads[-1].without_scenes()
     else:
-        head = maps.heads.pop()
+        head = scenes.heads.pop()
     local = head.scenes
-    head.grow(_new_centres(head, options, positions_m), options.seed + len(maps.scenes))
-    maps.heads.append(head)
+    head.grow(_new_centres(head, options, positions_m), options.seed + len(scenes.scenes))
+    scenes.heads.append(head)
     return head, local
 
 
-def head_for_all(maps: SceneMaps, options: StageOptions, positions_m: Sequence[np.ndarray]) -> Head:
+def head_for_all(
+    scenes: LearnedScenes, options: StageOptions, positions_m: Sequence[np.ndarray]
+) -> Head:
     """A new head with room for several scenes, from the camera positions of each in the atlas."""
-    head = fresh_head(maps, options)
-    for number, places in enumerate(positions_m):
-        head.grow(_new_centres(head, options, places), options.seed + number)
-    maps.heads = [head]
+    head = fresh_head(scenes, options)
+    for number, positions in enumerate(positions_m):
+        head.grow(_new_centres(head, options, positions), options.seed + number)
+    scenes.heads = [head]
     return head
 
 
-def fresh_head(maps: SceneMaps, options: StageOptions) -> Head:
-    """A head that knows no scene."""
-    torch.manual_seed(options.seed)
-    return Head(maps.encoder.width, maps.descriptor.width, options.head).to(maps.device)
+def fresh_head(scenes: LearnedScenes, options: StageOptions) -> Head:
+    """A head without scenes."""
+    with torch.random.fork_rng(devices=[]):  # the caller's random numbers do not change
+        torch.manual_seed(options.seed)
+        head = Head(scenes.encoder.width, scenes.descriptor.width, options.head)
+    return head.to(scenes.device)
 
 
 def whiten(head: Head, buffers: Sequence[FeatureBuffer], seed: int) -> None:
-    """Fits the whitening of a new head's inputs to rows of all buffers, where it has any."""
+    """Fit the whitening of a new head's inputs to rows of all buffers, if it has one."""
     if not head.options.whiten:
         return
     generator = torch.Generator().manual_seed(seed)

@@ -1,4 +1,4 @@
-"""Feature rows for a stage: those of the new scene's frames, and of remembered keyframes."""
+"""Feature rows of a stage: of the new scene's frames, and of remembered keyframes."""
 
 import time
 from collections.abc import Generator, Sequence
@@ -8,23 +8,23 @@ import torch
 
 from evercal.continual.networks.atlas import Cell
 from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, encode_frames
+from evercal.continual.scenes import LearnedScenes
 from evercal.continual.stage import Encoding, Event, StageOptions
+from evercal.continual.store import Checkpoint, Resume
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.scene_maps import SceneMaps
-from evercal.mapping.store import Checkpoint, Resume
 from evercal.recordings.frame import Frame
 
 CHECKPOINT_SECONDS = 10.0
 
 
 class Pacer:
-    """Says when a checkpoint is due."""
+    """Decides when a checkpoint is due."""
 
     def __init__(self) -> None:
         self._last = time.monotonic()
 
     def due(self) -> bool:
-        """Whether the last one is long enough ago; then this counts as one."""
+        """Whether the interval has passed; if so, it starts again."""
         now = time.monotonic()
         if now - self._last < CHECKPOINT_SECONDS:
             return False
@@ -39,9 +39,9 @@ def scene_buffer(
 
     Args:
         number: of the scene in the head.
-        cell: where the scene lies in the atlas.
-        frames: whose camera may be corrected if one without known distortion took them all.
-        device: where its rows are used.
+        cell: of the scene in the atlas.
+        frames: their camera can be corrected if they share one without distortion.
+        device: of the rows.
     """
     one = all(frame.camera == frames[0].camera for frame in frames)
     correctable = one and not frames[0].camera.distortion
@@ -52,24 +52,24 @@ def encoded(
     buffer: FeatureBuffer,
     frames: Sequence[Frame],
     plan: EncodePlan,
-    maps: SceneMaps,
+    scenes: LearnedScenes,
     resume: Resume | None = None,
     pacer: Pacer | None = None,
 ) -> Generator[Event, None, None]:
-    """Encodes frames into a buffer, those that an interrupted run left to do.
+    """Encode frames into a buffer; rows of an interrupted run are restored.
 
     Args:
-        buffer: filled.
-        frames: posed.
-        plan: which views.
-        maps: whose encoder and descriptor.
+        buffer: to fill.
+        frames: posed frames.
+        plan: views per frame.
+        scenes: with encoder and descriptor.
         resume: rows that an interrupted run had encoded.
-        pacer: when to yield checkpoints of what is new; None never.
+        pacer: when to yield checkpoints of new rows; None for never.
     """
     for rows in resume.rows if resume else ():
         buffer.restore(rows)
     total = len(frames) * plan.views_per_frame
-    for done in encode_frames(buffer, frames, plan, maps.encoder, maps.descriptor):
+    for done in encode_frames(buffer, frames, plan, scenes.encoder, scenes.descriptor):
         yield Encoding(done, total)
         if pacer is not None and pacer.due():
             yield Checkpoint(buffer.take_new(), {})
@@ -80,30 +80,30 @@ def encoded(
 
 
 def view_plan(options: StageOptions, short_side: int) -> EncodePlan:
-    """Views at the size at which the localizer will see images."""
+    """Views at the working size of the localizer."""
     return replace(options.encode, view=replace(options.encode.view, short_side=short_side))
 
 
 def remembered(
-    maps: SceneMaps, options: StageOptions
+    scenes: LearnedScenes, options: StageOptions
 ) -> Generator[Event, None, list[FeatureBuffer]]:
-    """Encodes the keyframes of all scenes, as they are replayed: one buffer a scene."""
+    """Encode the keyframes of all scenes for replay: one buffer per scene."""
     buffers = []
-    for number, keyframes in enumerate(maps.keyframes):
+    for number, keyframes in enumerate(scenes.keyframes):
         if keyframes is None or not keyframes.images:
             continue
-        buffers.append((yield from keyframe_rows(maps, number, keyframes, options)))
+        buffers.append((yield from keyframe_rows(scenes, number, keyframes, options)))
     return buffers
 
 
 def keyframe_rows(
-    maps: SceneMaps, number: int, keyframes: Keyframes, options: StageOptions
+    scenes: LearnedScenes, number: int, keyframes: Keyframes, options: StageOptions
 ) -> Generator[Event, None, FeatureBuffer]:
-    """Encodes a scene's keyframes as they are replayed; the first pass shows them as they are."""
-    _, local = maps.head_for(number)
-    place = maps.scenes[number].cell.atlas_from_base
-    buffer = FeatureBuffer(local, place, device=maps.device)
-    plan = view_plan(options, maps.short_side)
+    """Encode a scene's keyframes for replay; the first views are not augmented."""
+    _, local = scenes.head_for(number)
+    atlas_from_base = scenes.scenes[number].cell.atlas_from_base
+    buffer = FeatureBuffer(local, atlas_from_base, device=scenes.device)
+    plan = view_plan(options, scenes.short_side)
     plan = replace(plan, views_per_frame=options.replay_views_per_frame)
-    yield from encoded(buffer, keyframes.frames(), plan, maps)
+    yield from encoded(buffer, keyframes.frames(), plan, scenes)
     return buffer

@@ -1,4 +1,4 @@
-"""Strategies by name: a method that trains the network, a map, or both."""
+"""Strategies by name; a strategy is a method that trains the network, a map, or both."""
 
 from dataclasses import dataclass
 
@@ -21,38 +21,38 @@ from evercal.errors import InputError
 
 @dataclass(frozen=True)
 class Strategy:
-    """What is learned of a scene."""
+    """What learning a scene does."""
 
     name: str
-    """By which stores and results know it."""
+    """Name in stores and results."""
     method: Method | None = None
-    """Trains the network; None trains none."""
+    """Method that trains the network; None for a map alone."""
     builds_map: bool = False
-    """Whether keyframes become a map with landmarks, which answers alone or beside the network."""
+    """Whether a map with landmarks is built from the keyframes."""
     jointly: bool = False
-    """Whether all frames of all scenes are trained on at once: the reference for the others."""
+    """Whether all scenes are trained at once, as a reference for the others."""
     source: str = ""
-    """Where it comes from; that of the method where it is empty."""
+    """Source of the strategy; by default that of its method."""
 
     @property
     def citation(self) -> str:
-        """Where it comes from."""
+        """Source of the strategy."""
         return self.source or (self.method.citation if self.method else "")
 
     def description(self) -> dict[str, object]:
-        """All that makes it what it is, as plain data: method, hyper-parameters, map."""
+        """Convert to plain data: method with hyper-parameters, map, joint training."""
         method = None if self.method is None else described(self.method)
-        found: dict[str, object] = {"method": method, "map": self.builds_map}
+        plain: dict[str, object] = {"method": method, "map": self.builds_map}
         if self.jointly:
-            found["jointly"] = True
-        return found
+            plain["jointly"] = True
+        return plain
 
 
 def _named(*strategies: Strategy) -> dict[str, Strategy]:
     return {strategy.name: strategy for strategy in strategies}
 
 
-# Settings with the largest mean of `benchmarks tune` over its suites; see docs/methods.md.
+# Settings with the best mean over the suites of `benchmarks tune`; see docs/methods.md.
 STRATEGIES: dict[str, Strategy] = _named(
     Strategy(
         "evercal",
@@ -122,16 +122,16 @@ STRATEGIES: dict[str, Strategy] = _named(
         FineTuning(),
         builds_map=True,
         jointly=True,
-        source="the same beside the map: what evercal_hybrid could reach",
+        source="all frames of all scenes at once, beside the map",
     ),
 )
 
 
 def strategy_named(name: str) -> Strategy:
-    """The strategy of a name.
+    """Return a strategy by name.
 
     Raises:
-        InputError: there is none.
+        InputError: The name is unknown.
     """
     if name not in STRATEGIES:
         names = ", ".join(STRATEGIES)

@@ -8,11 +8,13 @@ another scene, has infinite errors.
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from evercal.geometry import SE3
 
 Status = Literal["ok", "unknown_scene", "failed"]
 
@@ -56,6 +58,8 @@ class FrameResult:
     squared_mahalanobis: float = math.nan
     """Squared error of the pose in units of its own covariance; NaN without a pose in the right
     scene or without a covariance."""
+    estimated: SE3 | None = field(default=None, compare=False)
+    """Estimated camera pose in the base frame of `found_scene`."""
 
     @property
     def wrong_scene(self) -> bool:

@@ -145,6 +145,7 @@ def _result(
         inliers=int(estimate.inliers),
         inlier_ratio=float(estimate.inlier_ratio),
         squared_mahalanobis=squared,
+        estimated=found,
     )
 
 

@@ -271,7 +271,7 @@ class Camera:
         return radial, steeper / below
 
     def _undistorted(self, distorted: Array) -> Array:
-        """(..., 2) distorted to ideal points of the plane z = 1; NaN outside the range of the distortion."""
+        """(..., 2) distorted to ideal points of the plane z = 1; NaN outside their range."""
         plane, lost = distorted, np.ones(distorted.shape[:-1], bool)
         for _ in range(50):  # Newton's method: a few steps but close to `widest`
             far = np.sqrt((plane**2).sum(-1, keepdims=True))

@@ -171,7 +171,7 @@ class SE3:
         return (self.rotation_matrix() @ points[..., None])[..., 0] + self.translation_m
 
     def adjoint(self) -> Array:
-        """(..., 6, 6) matrices A with `self @ exp(x) == exp(A x) @ self` for tangents x = (v, w)."""
+        """(..., 6, 6) matrices A with `self @ exp(x) == exp(A x) @ self` for tangents x."""
         rotation = self.rotation_matrix()
         adjoint = np.zeros((*self.shape, 6, 6))
         adjoint[..., :3, :3] = adjoint[..., 3:, 3:] = rotation

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from evercal.errors import InputError
 from evercal.features.device import device_of
 from evercal.features.encode import encode_features
+from evercal.features.encoder import Encoder
 from evercal.features.views import ViewOptions, plain_view
 from evercal.geometry import SE3, Camera, resize_pixels
 from evercal.localization.acceptance import accepted, rejection, support, widened
@@ -98,8 +99,7 @@ class Localizer:
 
         None for the stated intrinsics of a scene's own recording: the map has adjusted them.
         """
-        mapped = any(stated == scene.camera for scene in self.contents.scenes)
-        return None if mapped else stated
+        return own_or_stated(stated, [scene.camera for scene in self.contents.scenes])
 
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         """Estimate the camera pose of one image.
@@ -118,9 +118,10 @@ class Localizer:
                 camera given and no scene was recorded at this aspect ratio.
         """
         began = time.perf_counter()
-        image = as_rgb(image)
-        cameras = self._cameras(camera, image.shape[1], image.shape[0])
-        query = Query(image, self._encode(image), self.options.patches_short_side)
+        image, contents = as_rgb(image), self.contents
+        cameras = camera_in_scenes(camera, image, contents.scenes)
+        features = encode_image(image, contents.encoder, contents.short_side)
+        query = Query(image, features, self.options.patches_short_side)
         best = self._best_hypothesis(query, cameras)
         return self._answer(best, 1000 * (time.perf_counter() - began))
 
@@ -130,36 +131,6 @@ class Localizer:
         """`localize` for many images in parallel; the answers are the same to the last bit."""
         pairs = list(zip(images, cameras, strict=True))
         return list(in_parallel(lambda pair: self.localize(*pair), pairs))
-
-    def _cameras(self, camera: Camera | None, width: int, height: int) -> list[Camera | None]:
-        """Intrinsics of the image in each scene; None where the aspect ratio does not fit."""
-        if camera is not None:
-            if not camera.fits(width, height):
-                raise InputError(
-                    f"camera {camera.width}x{camera.height} does not fit the image"
-                    f" {width}x{height}: give intrinsics of the same aspect ratio"
-                )
-            return [camera.resized(width, height)] * len(self.contents.scenes)
-        own = [scene.adjusted_camera for scene in self.contents.scenes]
-        cameras = [c.resized(width, height) if c.fits(width, height) else None for c in own]
-        if not any(cameras):
-            mapped = ", ".join(
-                f"{scene.name} {scene.camera.width}x{scene.camera.height}"
-                for scene in self.contents.scenes
-            )
-            raise InputError(
-                f"image {width}x{height}: no scene was recorded at this aspect ratio ({mapped});"
-                " give the image's intrinsics with --camera"
-            )
-        return cameras
-
-    def _encode(self, image: np.ndarray) -> Tensor:
-        """(channels, rows, columns) features of an image, on the encoder's device."""
-        height, width = image.shape[:2]
-        plain = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
-        options = ViewOptions(short_side=self.contents.short_side)
-        view = plain_view(image, plain, self.contents.encoder.stride, options)
-        return encode_features([view], self.contents.encoder)[0]
 
     def _best_hypothesis(self, query: Query, cameras: list[Camera | None]) -> Hypothesis:
         """The pose with the most support, from as few attempts as it takes."""
@@ -267,6 +238,69 @@ class Localizer:
             points_m=scene.frame.points_to_base(best.points_m),
             support=support(best),
         )
+
+
+def own_or_stated(stated: Camera, recorded: Sequence[Camera]) -> Camera | None:
+    """None for intrinsics that a scene's recording states, else the stated ones."""
+    return None if stated in recorded else stated
+
+
+class MappedCamera(Protocol):
+    """The camera that recorded a scene."""
+
+    @property
+    def name(self) -> str:
+        """Name of the scene."""
+        ...
+
+    @property
+    def adjusted_camera(self) -> Camera:
+        """Its intrinsics."""
+        ...
+
+
+def camera_in_scenes(
+    camera: Camera | None, image: np.ndarray, scenes: Sequence[MappedCamera]
+) -> list[Camera | None]:
+    """Intrinsics of an image in each scene; None where the aspect ratio does not fit.
+
+    Args:
+        camera: intrinsics that were given.
+        image: (H, W, 3).
+        scenes: with the cameras that recorded them.
+
+    Raises:
+        InputError: A camera with another aspect ratio than the image's, or no camera given and no
+            scene was recorded at this aspect ratio.
+    """
+    height, width = image.shape[:2]
+    if camera is not None:
+        if not camera.fits(width, height):
+            raise InputError(
+                f"camera {camera.width}x{camera.height} does not fit the image {width}x{height}:"
+                " give intrinsics of the same aspect ratio"
+            )
+        return [camera.resized(width, height)] * len(scenes)
+    own = [scene.adjusted_camera for scene in scenes]
+    cameras = [c.resized(width, height) if c.fits(width, height) else None for c in own]
+    if not any(cameras):
+        recorded = ", ".join(
+            f"{scene.name} {scene.adjusted_camera.width}x{scene.adjusted_camera.height}"
+            for scene in scenes
+        )
+        raise InputError(
+            f"image {width}x{height}: no scene was recorded at this aspect ratio ({recorded});"
+            " give the image's intrinsics with --camera"
+        )
+    return cameras
+
+
+def encode_image(image: np.ndarray, encoder: Encoder, short_side: int) -> Tensor:
+    """(channels, rows, columns) features of an image, on the encoder's device."""
+    height, width = image.shape[:2]
+    plain = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
+    view = plain_view(image, plain, encoder.stride, ViewOptions(short_side=short_side))
+    return encode_features([view], encoder)[0]
 
 
 def _from_pnp(scene: int, matches: Matches, rough: PnpResult) -> Hypothesis:

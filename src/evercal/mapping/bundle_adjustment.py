@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 from scipy.spatial.transform import Rotation
 
-from evercal.geometry.camera import Camera
 from evercal.geometry import cross_matrix
+from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.mapping.jacobians import (
     COMMON,

@@ -1,4 +1,4 @@
-"""How many keyframes a scene keeps: a share of its frames, a size in bytes, or the fewest needed."""
+"""Keyframes that a scene keeps: a share of its frames, a size in bytes, or the fewest needed."""
 
 import re
 from collections.abc import Sequence

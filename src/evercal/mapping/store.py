@@ -171,17 +171,17 @@ def is_free(root: Path) -> bool:
     )
 
 
-def write_encoder(root: Path, encoder: Encoder) -> tuple[str, ...]:
+def write_encoder(root: Path, encoder: Encoder, centroids: bool = True) -> tuple[str, ...]:
     """Write an encoder and, if it is not the shipped one, its centroids; return the file names."""
     assert isinstance(encoder, nn.Module), "only modules have weights"
     data = network_bytes(encoder, "encoder")
     name = f"encoder-{hashlib.sha256(data).hexdigest()[:12]}.safetensors"
     write_bytes(root / name, data)
-    if shipped_centroids(encoder) is not None:
+    if not centroids or shipped_centroids(encoder) is not None:
         return (name,)
-    centroids = name.replace("encoder", "vlad", 1)
-    save_centroids(encoder, root / centroids)
-    return name, centroids
+    vlad = name.replace("encoder", "vlad", 1)
+    save_centroids(encoder, root / vlad)
+    return name, vlad
 
 
 def write_scene(folder: Path, scene: SceneMap) -> None:

@@ -1,4 +1,4 @@
-"""What every dataset yields: frames with a camera and poses, in scenes with a train/test split."""
+"""Frames with camera and poses, in recordings with a split into training and test frames."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.recordings.images import StoredImage, read_image
+from evercal.recordings.images import StoredImage, as_rgb, read_image
 
 MIN_TRAIN_FRAMES = 16
 """Posed training frames that a scene needs to be learned."""
@@ -17,37 +17,38 @@ MIN_TRAIN_FRAMES = 16
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image and what is known about it."""
+    """One image with its camera and poses."""
 
     name: str
-    """Unique within its scene."""
+    """Unique within its recording."""
     image: Path | NDArray[np.uint8] | StoredImage
-    """A file, (H, W, 3) uint8 RGB, or one inside a bag or video."""
+    """A file, an array that `as_rgb` accepts, or an image inside a bag or video."""
     camera: Camera
     """Intrinsics at the size of `image`."""
     base_from_camera: SE3 | None
-    """Camera pose in the scene's base frame; None if it is not known."""
+    """Camera pose in the base frame, if stated."""
     base_from_gripper: SE3 | None = None
-    """Gripper pose in the robot's base frame when the image was taken; None if there is no arm."""
+    """Gripper pose in the robot's base frame at the time of the image, if there is an arm."""
     depth: Path | None = None
     """16-bit PNG of the image's size: millimetres along the optical axis, 0 where unknown."""
     joints_rad: tuple[float, ...] | None = None
-    """The arm's joint angles when the image was taken."""
+    """Joint angles of the arm at the time of the image, if stated."""
 
     def read_image(self) -> NDArray[np.uint8]:
-        """Reads the pixels.
+        """Read the pixels.
 
         Returns:
             (H, W, 3) uint8 RGB.
 
         Raises:
-            InputError: The file is missing or broken, or its size is not the camera's.
+            InputError: The file is missing or broken, or its size differs from the camera's.
         """
-        image = self.image
-        if isinstance(image, Path):
-            image = read_image(image)
-        elif isinstance(image, StoredImage):
-            image = image.read()
+        if isinstance(self.image, Path):
+            image = read_image(self.image)
+        elif isinstance(self.image, StoredImage):
+            image = self.image.read()
+        else:
+            image = as_rgb(self.image)
         if image.shape[:2] != (self.camera.height, self.camera.width):
             where = self.image if isinstance(self.image, Path) else self.name
             raise InputError(
@@ -58,7 +59,7 @@ class Frame:
 
 
 def posed_frames(frames: Iterable[Frame]) -> tuple[Frame, ...]:
-    """The frames whose pose is known."""
+    """Frames with a camera pose."""
     return tuple(frame for frame in frames if frame.base_from_camera is not None)
 
 
@@ -69,24 +70,24 @@ def stated_poses(frames: Iterable[Frame]) -> SE3:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One place: frames in the order they were recorded, all poses in one base frame."""
+    """Frames of one place in recorded order, with all poses in one base frame."""
 
     name: str
-    """What the scene is called."""
+    """Name of the scene."""
     train: tuple[Frame, ...]
     """Frames to learn from."""
     test: tuple[Frame, ...]
-    """Frames to score on; never learned from."""
+    """Frames to evaluate on; never learned from."""
     untracked: int = 0
-    """How many recorded frames were left out because they have no valid pose."""
+    """Number of recorded frames left out for lack of a valid pose."""
     base: str | None = None
-    """What its base frame is called, where scenes share one; None if it is the scene's own."""
+    """Name of the base frame, if several scenes share it."""
     notes: tuple[str, ...] = ()
-    """What its reader chose, left out or could not know, one sentence each."""
+    """Choices and omissions of the reader, one sentence each."""
 
 
-def posed_recording(scene: Recording) -> Recording:
-    """The scene without training frames that have no pose, which count as untracked."""
-    train = posed_frames(scene.train)
-    lost = len(scene.train) - len(train)
-    return replace(scene, train=train, untracked=scene.untracked + lost)
+def posed_recording(recording: Recording) -> Recording:
+    """Drop training frames without a pose and count them as untracked."""
+    train = posed_frames(recording.train)
+    lost = len(recording.train) - len(train)
+    return replace(recording, train=train, untracked=recording.untracked + lost)

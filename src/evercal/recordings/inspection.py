@@ -1,4 +1,4 @@
-"""What a recorded scene looks like, and what looks wrong about it."""
+"""Summary and plausibility checks of a recording."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -10,27 +10,27 @@ import numpy as np
 
 from evercal.geometry import SE3, Camera, near_training, pose_distance
 from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording, posed_frames
-from evercal.recordings.poses.pose_evidence import doubts
+from evercal.recordings.poses.pose_evidence import rotation_warnings
 
 SAME_M, SAME_DEG = 0.001, 0.1
 LARGEST_EXTENT_M = 100.0
 LARGEST_STEP_M = 0.5
 SMALLEST_EXTENT_M = 0.05
-SMALLEST_TURN_DEG = 60.0
-LARGEST_TURN_DEG = 30.0
+LEAST_ROTATION_DEG = 60.0
+LARGEST_ROTATION_STEP_DEG = 30.0
 LARGEST_REACH_M = 5.0
-MOST_CAMERAS_TOLD = 4
+MOST_CAMERAS_LISTED = 4
 LARGEST_PITCH_SHARE, LARGEST_ROLL_SHARE = 0.6, 0.8
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """What a recorded scene looks like."""
+    """Summary of a recording."""
 
     name: str
-    """Its own name."""
+    """Name of the scene."""
     poses: Literal["camera", "gripper", "none"]
-    """Whose poses it states; those of the camera where it has both."""
+    """Owner of the stated poses; the camera if both are stated."""
     train: int
     """Training frames with a pose."""
     test: int
@@ -44,27 +44,27 @@ class Inspection:
     step_median_m: float | None
     """Median distance between consecutive training frames, metres; None for fewer than two."""
     step_median_deg: float | None
-    """The same as an angle."""
+    """Median rotation between consecutive training frames, degrees; None for fewer than two."""
     step_largest_m: float | None
-    """Largest distance between consecutive training frames, metres."""
+    """Largest distance between consecutive training frames, metres; None for fewer than two."""
     near_training: float | None
-    """Per cent of test frames with a training frame within 5 cm and 5 deg; None without any."""
+    """Per cent of test frames with a training frame within 5 cm and 5 deg; None without frames."""
     notes: tuple[str, ...]
-    """What its reader chose, left out or could not know."""
+    """Choices and omissions of the reader."""
     warnings: tuple[str, ...]
-    """What looks wrong."""
+    """Suspected errors."""
 
 
-def inspect_scene(scene: Recording) -> Inspection:
-    """Looks at a scene's poses and cameras and at some of its images.
+def inspect_recording(recording: Recording) -> Inspection:
+    """Check poses, cameras and some images of a recording.
 
     Raises:
-        InputError: An image that cannot be read or has not its camera's size.
+        InputError: An image cannot be read, or its size differs from the camera's.
     """
-    both = (*scene.train, *scene.test)
-    whose = "camera" if posed_frames(both) else "gripper" if any(map(_of_gripper, both)) else "none"
-    pose_of = _of_gripper if whose == "gripper" else _of_camera
-    train, test = (tuple(filter(pose_of, frames)) for frames in (scene.train, scene.test))
+    both = (*recording.train, *recording.test)
+    owner = "camera" if posed_frames(both) else "gripper" if any(map(_of_gripper, both)) else "none"
+    pose_of = _of_gripper if owner == "gripper" else _of_camera
+    train, test = (tuple(filter(pose_of, part)) for part in (recording.train, recording.test))
     cameras = Counter(frame.camera for frame in both)
     for size in {(camera.width, camera.height) for camera in cameras}:
         next(f for f in both if (f.camera.width, f.camera.height) == size).read_image()
@@ -73,29 +73,28 @@ def inspect_scene(scene: Recording) -> Inspection:
     if len(train) > 1:
         metres, radians = pose_distance(poses[:-1], poses[1:])
     extent = np.ptp(poses.translation_m, axis=0) if len(train) else np.zeros(3)
-    near = 100 * float(near_training(poses, tested).mean()) if train and test else None
-    lost = scene.untracked + len(both) - len(train) - len(test)
-    warnings = [*_warn_frames(len(train), len(test), lost, whose), *_warn_cameras(cameras)]
-    if len(train) > 1 and metres is not None:
-        warnings += _warn_motion(poses, extent, float(np.median(metres)), whose == "camera")
-        warnings += doubts(train, poses, whose == "camera")
+    untracked = recording.untracked + len(both) - len(train) - len(test)
+    warnings = [*_warn_frames(len(train), len(test), untracked, owner), *_warn_cameras(cameras)]
+    if metres is not None:
+        warnings += _warn_motion(poses, extent, float(np.median(metres)), owner == "camera")
+        warnings += rotation_warnings(train, poses, owner == "camera")
     if train and test:
         warnings += _warn_copies(train, test, poses, tested)
     x, y, z = extent.tolist()
     return Inspection(
-        scene.name,
-        whose,
-        len(train),
-        len(test),
-        lost,
-        _described(cameras),
-        (x, y, z),
-        float(np.median(metres)) if metres is not None else None,
-        float(np.rad2deg(np.median(radians))) if radians is not None else None,
-        float(metres.max()) if metres is not None else None,
-        near,
-        scene.notes,
-        tuple(warnings),
+        name=recording.name,
+        poses=owner,
+        train=len(train),
+        test=len(test),
+        untracked=untracked,
+        cameras=_camera_lines(cameras),
+        extent_m=(x, y, z),
+        step_median_m=None if metres is None else float(np.median(metres)),
+        step_median_deg=None if radians is None else float(np.rad2deg(np.median(radians))),
+        step_largest_m=None if metres is None else float(metres.max()),
+        near_training=100 * float(near_training(poses, tested).mean()) if train and test else None,
+        notes=recording.notes,
+        warnings=tuple(warnings),
     )
 
 
@@ -107,10 +106,10 @@ def _of_gripper(frame: Frame) -> SE3 | None:
     return frame.base_from_gripper
 
 
-def _described(cameras: Counter[Camera]) -> tuple[str, ...]:
-    """One line a camera; one for all of a size where every frame has its own."""
-    if len(cameras) <= MOST_CAMERAS_TOLD:
-        return tuple(_describe(camera, count) for camera, count in cameras.items())
+def _camera_lines(cameras: Counter[Camera]) -> tuple[str, ...]:
+    """One line per camera, or one line per image size if there are many cameras."""
+    if len(cameras) <= MOST_CAMERAS_LISTED:
+        return tuple(_camera_line(camera, count) for camera, count in cameras.items())
     lines = []
     for size in dict.fromkeys((camera.width, camera.height) for camera in cameras):
         group = {c: n for c, n in cameras.items() if (c.width, c.height) == size}
@@ -122,112 +121,112 @@ def _described(cameras: Counter[Camera]) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _describe(camera: Camera, count: int) -> str:
-    lens = f"distortion {' '.join(f'{k:g}' for k in camera.distortion)}"
+def _camera_line(camera: Camera, count: int) -> str:
+    distortion = f"distortion {' '.join(f'{k:g}' for k in camera.distortion)}"
     return (
         f"{camera.width}x{camera.height}, fx {camera.fx:.1f} fy {camera.fy:.1f} cx {camera.cx:.1f}"
-        f" cy {camera.cy:.1f}, {lens if any(camera.distortion) else 'no distortion'};"
+        f" cy {camera.cy:.1f}, {distortion if camera.distortion else 'no distortion'};"
         f" {count} frames"
     )
 
 
-def _warn_frames(train: int, test: int, lost: int, whose: str) -> list[str]:
-    found = []
+def _warn_frames(train: int, test: int, untracked: int, owner: str) -> list[str]:
+    warnings = []
     if train < MIN_TRAIN_FRAMES:
-        found.append(
+        warnings.append(
             f"{train} training frames with a pose; learning takes {MIN_TRAIN_FRAMES} or more"
         )
-    if not test and whose != "gripper":
-        found.append("no test frame with a pose; 'evercal evaluate' has nothing to measure on")
-    if lost > (train + test + lost) / 2:
-        found.append(f"{lost} of {train + test + lost} frames have no pose; check the tracking")
-    return found
+    if not test and owner != "gripper":
+        warnings.append("no test frame with a pose; 'evercal evaluate' has nothing to measure on")
+    total = train + test + untracked
+    if untracked > total / 2:
+        warnings.append(f"{untracked} of {total} frames have no pose; check the tracking")
+    return warnings
 
 
 def _warn_cameras(cameras: Counter[Camera]) -> list[str]:
-    found = []
+    warnings = []
     for camera in cameras:
         name = f"camera {camera.width}x{camera.height}"
-        off = (
+        offset = max(
             abs((camera.cx + 0.5) / camera.width - 0.5),
             abs((camera.cy + 0.5) / camera.height - 0.5),
         )
         view = np.rad2deg(2 * np.arctan(camera.width / (2 * camera.fx)))
-        if max(off) > 0.2:
-            found.append(
+        if offset > 0.2:
+            warnings.append(
                 f"{name}: principal point ({camera.cx:.0f}, {camera.cy:.0f}) is far from the"
                 f" middle; are the intrinsics those of this image size?"
             )
         if not 20 < view < 150:
-            found.append(
+            warnings.append(
                 f"{name}: sees {view:.0f} deg across; are the intrinsics those of this image size?"
             )
         if not 0.8 < camera.fx / camera.fy < 1.25:
-            found.append(
+            warnings.append(
                 f"{name}: fx {camera.fx:.0f} and fy {camera.fy:.0f} differ; square pixels?"
             )
-    return found
+    return warnings
 
 
 def _warn_motion(poses: SE3, extent: np.ndarray, step: float, of_camera: bool) -> list[str]:
-    found = []
-    _, turned = pose_distance(poses[0], poses)
-    if not of_camera:
-        found += _warn_reach(poses)
+    warnings = [] if of_camera else _warn_reach(poses)
+    rotation_deg = np.rad2deg(pose_distance(poses[0], poses)[1].max())
     if extent.max() < SAME_M:
-        found.append(
-            f"all training frames stand at one point, turning by {np.rad2deg(turned.max()):.0f}"
+        warnings.append(
+            f"all training frames stand at one point, rotating by {rotation_deg:.0f}"
             f" deg; a map takes views from several. Are the translations there, and in metres?"
         )
     elif extent.max() < SMALLEST_EXTENT_M:
-        found.append(
+        warnings.append(
             f"the training camera moves by {100 * extent.max():.1f} cm only; points may get no"
             f" depth. Are the translations in metres?"
         )
-    if np.rad2deg(turned.max()) < SAME_DEG:
-        found.append("all training frames look the same way; are the rotations missing?")
+    if rotation_deg < SAME_DEG:
+        warnings.append("all training frames look the same way; are the rotations missing?")
     if extent.max() > LARGEST_EXTENT_M:
-        found.append(f"the camera moves over {extent.max():.0f} m; are the poses in millimetres?")
+        warnings.append(
+            f"the camera moves over {extent.max():.0f} m; are the poses in millimetres?"
+        )
     elif step > LARGEST_STEP_M and of_camera:
-        found.append(
+        warnings.append(
             f"consecutive frames are {step:.2f} m apart; are they in recorded order and in metres?"
         )
-    about_x, _, about_z = turning_shares(poses)
-    if of_camera and np.rad2deg(turned.max()) > SMALLEST_TURN_DEG:
+    if of_camera and rotation_deg > LEAST_ROTATION_DEG:
+        about_x, _, about_z = rotation_shares(poses)
         if about_x > LARGEST_PITCH_SHARE:
-            found.append(
-                f"{100 * about_x:.0f} % of the turning is a nod about the image's x axis; are"
+            warnings.append(
+                f"{100 * about_x:.0f} % of the rotation is a nod about the image's x axis; are"
                 f" quaternions in the order w x y z, and camera axes right, down, forward?"
             )
         if about_z > LARGEST_ROLL_SHARE:
-            found.append(
-                f"{100 * about_z:.0f} % of the turning is a roll about the viewing axis; are poses"
+            warnings.append(
+                f"{100 * about_z:.0f} % of the rotation is a roll about the viewing axis; are poses"
                 f" base_from_camera, not their inverse, and camera axes right, down, forward?"
             )
-    return found
+    return warnings
 
 
 def _warn_reach(poses: SE3) -> list[str]:
-    """Gripper poses that no arm has."""
     reach = float(np.median(np.linalg.norm(poses.translation_m, axis=1)))
-    if reach > LARGEST_REACH_M:
-        return [
-            f"the gripper is {reach:.1f} m from the robot's base, farther than arms reach; are the"
-            f" poses in millimetres?"
-        ]
-    return []
+    if reach <= LARGEST_REACH_M:
+        return []
+    return [
+        f"the gripper is {reach:.1f} m from the robot's base, farther than arms reach; are the"
+        f" poses in millimetres?"
+    ]
 
 
-def turning_shares(poses: SE3) -> tuple[float, float, float]:
-    """About which camera axes (x, y, z) the camera turns from frame to frame; the three sum to 1.
+def rotation_shares(poses: SE3) -> tuple[float, float, float]:
+    """Shares of the camera's x, y and z axis in the rotation from frame to frame; their sum is 1.
 
-    A camera that is carried about turns mostly about its y axis, as it pans. Inverted poses seem to
-    roll, and quaternions in another order or a body's axes (x forward) seem to nod. Leaps between
-    recordings are passed over. Thirds where nothing turns.
+    A camera that is carried about mostly pans about its y axis. Inverted poses appear to roll, and
+    quaternions in another order or body axes (x forward) appear to nod. Jumps between recordings
+    are ignored. Without rotation, all shares are a third.
     """
-    turns = (poses[:-1].inverse() @ poses[1:]).log()[:, 3:]
-    turns = turns[np.linalg.norm(turns, axis=1) < np.deg2rad(LARGEST_TURN_DEG)]
-    squares = np.square(turns).sum(axis=0)
+    rotations = (poses[:-1].inverse() @ poses[1:]).log()[:, 3:]
+    small = np.linalg.norm(rotations, axis=1) < np.deg2rad(LARGEST_ROTATION_STEP_DEG)
+    squares = np.square(rotations[small]).sum(axis=0)
     if squares.sum() < 1e-12:
         return 1 / 3, 1 / 3, 1 / 3
     x, y, z = (squares / squares.sum()).tolist()
@@ -237,20 +236,21 @@ def turning_shares(poses: SE3) -> tuple[float, float, float]:
 def _warn_copies(
     train: Sequence[Frame], test: Sequence[Frame], poses: SE3, tested: SE3
 ) -> list[str]:
-    """Test frames that are training frames: the same file, or the very same pose."""
+    """Warn of test frames with the file or the pose of a training frame."""
     from scipy.spatial import KDTree
 
     files = {f.image for f in train if isinstance(f.image, Path)}
     close = KDTree(poses.translation_m).query_ball_point(tested.translation_m, SAME_M)
     copies = 0
     for i, frame in enumerate(test):
-        same = isinstance(frame.image, Path) and frame.image in files
-        if not same and close[i]:
-            same = bool(np.rad2deg(pose_distance(tested[i], poses[close[i]])[1]).min() < SAME_DEG)
-        copies += same
+        copied = isinstance(frame.image, Path) and frame.image in files
+        if not copied and close[i]:
+            radians = pose_distance(tested[i], poses[close[i]])[1]
+            copied = bool(np.rad2deg(radians.min()) < SAME_DEG)
+        copies += copied
     if copies < max(1, len(test) / 10):
         return []
     return [
         f"{copies} of {len(test)} test frames have the pose or the file of a training frame;"
-        f" accuracy on them says nothing"
+        f" accuracy on them means nothing"
     ]

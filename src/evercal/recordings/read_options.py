@@ -1,4 +1,4 @@
-"""What a user may tell the reader of a recording that the recording does not say itself."""
+"""Choices for reading a recording that lacks some information."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -6,35 +6,32 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """Choices for reading a recording; a format uses some of them and refuses the others."""
+    """Options for reading a recording; each format uses some of them and refuses the others."""
 
     camera: Path | None = None
-    """File of the intrinsics of all images, as `read_camera` takes them; None for those that the
-    recording has."""
+    """Camera file for all images, see `read_camera`. If omitted, the recording's intrinsics."""
     image_topic: str | None = None
-    """Which images: a topic of a bag, or a camera's key in a LeRobot dataset; None for the only
-    one."""
+    """Image topic of a bag, or camera key of a LeRobot dataset. Required if there are several."""
     pose_topic: str | None = None
-    """The tf or joint state topic of a bag that holds where several say where the arm was; None
-    where each frame or joint is on one only."""
+    """tf or joint state topic of a bag. Required if several topics move the same frame or joint."""
     base_frame: str | None = None
-    """The robot's base: a tf frame of a bag or a link of the URDF; None for the usual one."""
+    """The robot's base: a tf frame of a bag or a link of the URDF. If omitted, the usual one."""
     gripper_frame: str | None = None
-    """What carries the camera or the target: a tf frame, a link of the URDF, or a feature or arm of
-    a LeRobot dataset; None for the usual one."""
+    """The gripper: a tf frame, a link of the URDF, or a feature or arm of a LeRobot dataset. If
+    omitted, the usual one."""
     urdf: Path | None = None
-    """The robot's URDF, where the recording has joint angles; None for the one beside them."""
+    """URDF of the robot, for joint angles. If omitted, the file beside them."""
     pose_convention: str | None = None
-    """How a pose file is written, a name that `read_robot_poses` knows; of joint angles rad or deg.
-    None where the file says so."""
+    """Convention of a pose file, see `read_robot_poses`; rad or deg for joint angles. If omitted,
+    the file defines it."""
     every: int = 1
-    """Every how manyeth image is taken, 1 for all; of use for video."""
+    """Take every N-th image; 1 for all."""
 
     def given(self) -> tuple[str, ...]:
-        """The names of the fields that are not at their defaults."""
+        """Names of the fields that differ from their defaults."""
         return tuple(f.name for f in fields(self) if getattr(self, f.name) != f.default)
 
 
 def flag(name: str) -> str:
-    """How the command line writes a field: `image_topic` is `--image-topic`."""
+    """Command line option of a field: `image_topic` is `--image-topic`."""
     return "--" + name.replace("_", "-")

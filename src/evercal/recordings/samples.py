@@ -1,14 +1,19 @@
-"""The sample rooms that come with the package: three rendered rooms, made by `evercal simulate`."""
+"""Sample recordings in the package: three rendered rooms and a robot cell with known answers."""
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from evercal.errors import InputError
 from evercal.recordings import Recording, load_recording
 
 FOLDER = Path(__file__).parent / "sample_rooms"
-"""One folder for each room."""
+"""One folder for each room, rendered by `evercal simulate sim-mini`."""
 ROOMS = ("bedroom", "kitchen", "living")
 """Names of the rooms, in order of learning."""
+CELL = Path(__file__).parent / "sample_cell"
+"""A robot cell: `wrist` (images and gripper poses), `tripod` (images of a fixed camera),
+`bumped.jpg` (the fixed camera after a bump) and `truth.json` (true poses)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,13 +21,13 @@ class SampleRoom:
     """The recordings of one sample room."""
 
     scene: Recording
-    """From a moving camera: frames to learn from and frames to test on."""
+    """A moving camera: training and test frames."""
     fixed: Recording | None = None
-    """From a camera that stands still while the arm moves; all frames are test frames."""
+    """A fixed camera while the arm moves: test frames."""
     bumped: Recording | None = None
-    """Like `fixed`, after a bump moved the camera; all frames are test frames."""
+    """The fixed camera after a bump: test frames."""
     changed: Recording | None = None
-    """From a moving camera after small objects moved and lamps switched; all are test frames."""
+    """A moving camera after small objects moved and lamps switched: test frames."""
 
 
 def sample_rooms() -> tuple[SampleRoom, ...]:
@@ -36,3 +41,27 @@ def sample_rooms() -> tuple[SampleRoom, ...]:
         )
         for name in ROOMS
     )
+
+
+def copy_samples(target: Path) -> None:
+    """Copy the sample recordings to a folder: `bedroom`, `kitchen`, `living` and `cell`.
+
+    Args:
+        target: A new or empty folder.
+
+    Raises:
+        InputError: `target` is a file, is not empty, or cannot be written.
+    """
+    if target.exists() and not target.is_dir():
+        raise InputError(f"{target}: is a file; name a new folder for the sample recordings")
+    sources = {name: FOLDER / name for name in ROOMS} | {"cell": CELL}
+    try:
+        if target.is_dir() and any(target.iterdir()):
+            raise InputError(
+                f"{target}: is not empty; name a new or empty folder for the sample recordings"
+            )
+        for name, source in sources.items():
+            # Installed packages can be read-only; copyfile leaves the copies writable.
+            shutil.copytree(source, target / name, copy_function=shutil.copyfile)
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written ({error})") from None

@@ -1,162 +1,99 @@
 """The HTML report of `evercal evaluate`."""
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from evercal.evaluation import scores
+from evercal.evaluation.tables import SCENE_HEADER, scene_rows
+from evercal.reports.charts import error_curve, trajectory
+from evercal.reports.overlay import encode_image
+from evercal.reports.page import Picture, Table, render
 from evercal.reports.pictures import draw_estimate
 
 if TYPE_CHECKING:
-    from evercal.evaluation import FrameResult, Scores
-    from evercal.geometry import SE3, Camera
-    from evercal.localization.estimate import PoseEstimate
+    from evercal.evaluation import FrameResult
     from evercal.localization.localizer import Localizer
-    from evercal.recordings import Frame, Recording
-    from evercal.reports import Section, Table
+    from evercal.recordings import Recording
 
 _WORST = 12
-_AXES_CM = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
-
-
-class Watch:
-    """A localizer that remembers the poses it gave, frame by frame.
-
-    `evaluate` shows images in random order and keeps errors only. Frames are told apart by their
-    camera object, of which every frame of `watched` has its own.
-
-    Args:
-        localizer: does the work.
-        scenes: by name; their frames stay as they are.
-    """
-
-    def __init__(self, localizer: "Localizer", scenes: "Mapping[str, Recording]"):
-        self.localizer = localizer
-        self.watched = {name: _with_own_cameras(scene) for name, scene in scenes.items()}
-        self._poses: dict[int, SE3] = {}
-
-    @property
-    def scenes(self) -> Sequence[str]:
-        """Names of the scenes that the localizer knows."""
-        return self.localizer.scenes
-
-    def localize(self, image: "NDArray[np.uint8]", camera: "Camera", /) -> "PoseEstimate":
-        """The localizer's answer."""
-        estimate = self.localizer.localize(image, camera)
-        if estimate.base_from_camera is not None:
-            self._poses[id(camera)] = estimate.base_from_camera
-        return estimate
-
-    def found(self, frame: "Frame") -> "SE3 | None":
-        """The pose that was given for a frame of `watched`, in the frame of the scene it named."""
-        return self._poses.get(id(frame.camera))
-
-
-def _with_own_cameras(scene: "Recording") -> "Recording":
-    frames = (dataclasses.replace(f, camera=dataclasses.replace(f.camera)) for f in scene.test)
-    return dataclasses.replace(scene, test=tuple(frames))
+_AXES_MM = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
 
 
 def evaluation_page(
-    watch: Watch, results: "Sequence[FrameResult]", summary: "Scores", store: str
+    localizer: "Localizer",
+    scenes: "Mapping[str, Recording]",
+    results: "Sequence[FrameResult]",
+    store: str,
 ) -> str:
-    """Everything that `evaluate` found out, on one page.
+    """Write the report of an evaluation.
 
     Args:
-        watch: what answered.
-        results: for each frame.
-        summary: of the results.
-        store: its path, for the title.
+        localizer: Localizer of the store; draws the worst frames.
+        scenes: Evaluated recordings by scene name.
+        results: Result of `evaluate`.
+        store: Path of the store, for the title.
     """
-    from evercal.reports import Picture, Section, html_page
-
-    errors: dict[str, list[float]] = {}
-    for result in results:
-        errors.setdefault(result.scene, []).append(result.translation_error_m)
-    sections = [
-        Section("", [_summary(summary), _table(summary)]),
-        Section("Errors", [Picture(_curve(errors), "Share of frames within an error")]),
-    ]
-    for name in errors:
-        rows = [result for result in results if result.scene == name]
-        sections.append(_trajectory(watch, name, rows))
-    sections.append(_worst(watch, results))
-    return html_page(f"{store}: evaluation", sections)
-
-
-def _curve(errors: "Mapping[str, Sequence[float]]") -> bytes:
-    """The error curve, with an axis that shows 95 % of the errors."""
-    from evercal.reports import error_curve
-
-    finite = [100 * e for values in errors.values() for e in values if math.isfinite(e)]
-    most = float(np.quantile(finite, 0.95)) if finite else math.inf
-    limit = next((cm for cm in _AXES_CM if cm >= most), _AXES_CM[-1])
-    return error_curve(errors, limit, 5.0 if limit > 5 else None)
-
-
-def _summary(summary: "Scores") -> str:
-    frames = sum(row.frames for row in summary.scenes.values())
-    return (
-        f"{frames} test frames of {len(summary.scenes)} scenes, mixed; the localizer saw images"
-        f" and cameras only. Mean accuracy at 5 cm, 5 deg: {summary.mean_accuracy_5cm_5deg:.1f} %,"
-        f" at 1 cm, 1 deg: {summary.mean_accuracy_1cm_1deg:.1f} %."
-        f" {summary.ms_per_image:.0f} ms per image, decoding included. A frame without a pose, or"
-        f" in another scene, counts as wrong."
+    summary = scores(results)
+    by_scene = {name: [r for r in results if r.scene == name] for name in summary.scenes}
+    return render(
+        "evaluate.html",
+        title=f"{store}: evaluation",
+        frames=len(results),
+        summary=summary,
+        median_mm=1000 * float(np.median([r.translation_error_m for r in results])),
+        median_deg=math.degrees(float(np.median([r.rotation_error_rad for r in results]))),
+        scores=Table(SCENE_HEADER, scene_rows(summary)),
+        curve=_curve(by_scene),
+        trajectories=[_trajectory(scenes[name], rows) for name, rows in by_scene.items()],
+        worst=_worst(localizer, scenes, results),
     )
 
 
-def _table(summary: "Scores") -> "Table":
-    from evercal.evaluation.tables import SCENE_HEADER, scene_rows
-    from evercal.reports import Table
-
-    return Table(SCENE_HEADER, scene_rows(summary))
-
-
-def _trajectory(watch: Watch, name: str, rows: "list[FrameResult]") -> "Section":
-    from evercal.reports import Picture, Section, trajectory
-
-    frames = {frame.name: frame for frame in watch.watched[name].test}
-    truth, estimated, ok = [], [], []
-    for row in rows:
-        frame = frames[row.frame]
-        found, right_scene = watch.found(frame), row.status == "ok" and row.found_scene == name
-        assert frame.base_from_camera is not None, "only posed frames have results"
-        truth.append(frame.base_from_camera.translation_m)
-        ok.append(found is not None and right_scene)
-        estimated.append(found.translation_m if found is not None else np.zeros(3))
-    # The two axes along which the camera moved most: which way is up is not known here.
-    spread = np.ptp(np.array(truth), axis=0)
-    first, second = sorted(np.argsort(-spread, kind="stable")[:2].tolist())
-    picture = trajectory(truth, estimated, ok, (first, second))
-    return Section(name, [Picture(picture, f"{name}: where the camera was and where it was found")])
+def _curve(by_scene: "Mapping[str, Sequence[FrameResult]]") -> Picture:
+    """The error curve with an axis that contains 95 % of the finite errors."""
+    errors = {name: [r.translation_error_m for r in rows] for name, rows in by_scene.items()}
+    finite = [1000 * e for values in errors.values() for e in values if math.isfinite(e)]
+    most = float(np.quantile(finite, 0.95)) if finite else math.inf
+    limit = next((mm for mm in _AXES_MM if mm >= most), _AXES_MM[-1])
+    curve = error_curve(errors, limit, 50.0 if limit > 50 else None)
+    return Picture(curve, "Share of frames below each error")
 
 
-def _worst(watch: Watch, results: "Sequence[FrameResult]") -> "Section":
-    from evercal.reports import Picture, Section, contact_sheet, encode_image
+def _trajectory(scene: "Recording", rows: "Sequence[FrameResult]") -> Picture:
+    poses = {frame.name: frame.base_from_camera for frame in scene.test}
+    truth = [pose.translation_m for row in rows if (pose := poses[row.frame]) is not None]
+    estimated = [
+        row.estimated.translation_m
+        if row.estimated is not None and row.found_scene == row.scene and row.status == "ok"
+        else np.full(3, np.nan)
+        for row in rows
+    ]
+    caption = f"{rows[0].scene}: true and estimated camera positions"
+    return Picture(trajectory(truth, estimated), caption)
 
-    chosen = sorted(results, key=lambda r: (-r.translation_error_m, r.inlier_ratio))[:_WORST]
-    images, captions = [], []
-    for result in chosen:
-        frames = watch.watched[result.scene].test
-        frame = next(frame for frame in frames if frame.name == result.frame)
+
+def _worst(
+    localizer: "Localizer",
+    scenes: "Mapping[str, Recording]",
+    results: "Sequence[FrameResult]",
+) -> list[Picture]:
+    pictures = []
+    for result in sorted(results, key=lambda r: (-r.translation_error_m, r.inlier_ratio))[:_WORST]:
+        frame = next(f for f in scenes[result.scene].test if f.name == result.frame)
         image = frame.read_image()
-        estimate = watch.localizer.localize(image, frame.camera)
-        images.append(draw_estimate(image, estimate, frame.camera, legend=False))
-        captions.append(f"{result.scene} {result.frame}: {_verdict(result)}")
-    sheet = encode_image(contact_sheet(images, 3, captions, cell_width=320), "jpg")
-    caption = "The frames with the largest errors; points are those that agree with the pose"
-    return Section("Worst frames", [Picture(sheet, caption)])
+        estimate = localizer.localize(image, frame.camera)
+        drawn = encode_image(draw_estimate(image, estimate, frame.camera), "jpg")
+        pictures.append(Picture(drawn, f"{result.scene} {result.frame}: {_outcome(result)}"))
+    return pictures
 
 
-def _verdict(result: "FrameResult") -> str:
-    from evercal.evaluation.tables import distance
-
+def _outcome(result: "FrameResult") -> str:
     if math.isfinite(result.translation_error_m):
         degrees = math.degrees(result.rotation_error_rad)
-        return f"{distance(result.translation_error_m)}, {degrees:.2f} deg"
+        return f"{1000 * result.translation_error_m:.2f} mm, {degrees:.3f} deg"
     if result.wrong_scene:
-        return f"taken for {result.found_scene}"
+        return f"wrong scene: {result.found_scene}"
     return result.status.replace("_", " ")

@@ -1,164 +1,157 @@
-"""The axes of a frame drawn into an image: seen where they should be, they prove a calibration."""
+"""The axes of a frame drawn into an image, as visual evidence for a calibration."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evercal.geometry import SE3, Camera
-from evercal.reports import overlay_lines
+from evercal.reports.overlay import overlay_lines
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]
 
 LENGTH_M = 0.1
-"""Of the axes that are drawn."""
+"""Length of the drawn axes."""
 _COLOURS = ((214, 39, 40), (44, 160, 44), (31, 95, 220))
 """x red, y green, z blue."""
+_PALE = ((237, 158, 158), (160, 212, 160), (154, 183, 239))
 _NEAR_M = 0.005
-"""What lies closer to the plane of the lens than this is cut off."""
+"""Depth below which axes are cut off."""
 _STEPS = 32
 _BEYOND = 1.3
-"""A lens model holds up to this many times the distance of the image's corners from its middle."""
+"""Range of validity of a distortion model, as a multiple of the distance to the image corners."""
 
 
 @dataclass(frozen=True, eq=False)
 class AxesInView:
-    """The three axes of a frame as a camera sees them."""
+    """The projected axes of a frame."""
 
     lines: tuple[Array, ...]
-    """(n, 2) pixels along x, y and z, from the origin on; nan where nothing is seen."""
+    """(n, 2) pixels along x, y and z, starting at the origin; NaN where not visible."""
     origin_px: Array
-    """(2,) where the origin is seen, inside the image or not; nan behind the camera."""
-    where: str
-    """Where the origin lies if it is not in the image, for people; empty if it is."""
+    """(2,) projected origin, inside the image or not; NaN behind the camera."""
+    outside: str
+    """Position of an origin outside the image, in words; empty inside."""
     directions: Array
-    """(3, 2) right and down, of the unit vectors as the camera sees them, without perspective."""
+    """(3, 2) orthographic projections of the unit vectors, right and down."""
 
-    def placed(self, scale: float, shift: ArrayLike | None = None) -> "AxesInView":
-        """The same axes in an image that is a resized or cut-out copy of the camera's.
+    def scaled(self, scale: float, offset: ArrayLike | None = None) -> "AxesInView":
+        """The same axes in a resized or cropped copy of the image.
 
         Args:
-            scale: pixels of the copy for each pixel of the camera's image.
-            shift: (2,) pixels of the copy at which pixel (0, 0) lies; None for the whole image.
+            scale: Pixels of the copy per pixel of the original.
+            offset: (2,) position of the original's pixel (0, 0) in the copy; None for a resized
+                copy of the whole image.
         """
-        # Resizing scales about the image's corner, which lies at -0.5.
-        by = np.full(2, 0.5 * scale - 0.5) if shift is None else np.asarray(shift, np.float64)
-        lines = tuple(scale * line + by for line in self.lines)
-        return replace(self, lines=lines, origin_px=scale * self.origin_px + by)
+        # Resizing scales about the image corner at -0.5.
+        shift = np.full(2, 0.5 * scale - 0.5) if offset is None else np.asarray(offset, np.float64)
+        lines = tuple(scale * line + shift for line in self.lines)
+        return replace(self, lines=lines, origin_px=scale * self.origin_px + shift)
 
 
 def axes_in_view(camera: Camera, camera_from_frame: SE3, length_m: float = LENGTH_M) -> AxesInView:
-    """Projects the axes of a frame, clipped to what the lens can see.
+    """Project the axes of a frame.
 
     Args:
-        camera: intrinsics.
-        camera_from_frame: single pose.
-        length_m: of the axes, metres.
+        camera: Intrinsics.
+        camera_from_frame: Single pose.
+        length_m: Length of the axes.
     """
     origin = camera_from_frame.translation_m
-    turn = camera_from_frame.rotation_matrix()
+    rotation = camera_from_frame.rotation_matrix()
     share = np.linspace(0.0, 1.0, _STEPS + 1)
     lines = []
-    for axis in turn.T:
-        start, end = _in_front(origin, origin + length_m * axis)
-        points = start + share[:, None] * (end - start)
-        lines.append(_seen(camera, points))
-    [pixel] = _seen(camera, origin[None])
-    return AxesInView(tuple(lines), pixel, _where(camera, origin, pixel), turn[:2].T)
+    for axis in rotation.T:
+        start, end = _clip_depth(origin, origin + length_m * axis)
+        lines.append(_project(camera, start + share[:, None] * (end - start)))
+    [pixel] = _project(camera, origin[None])
+    return AxesInView(tuple(lines), pixel, _outside(camera, origin, pixel), rotation[:2].T)
 
 
 def draw_axes(image: Image, axes: AxesInView, name: str = "", older: bool = False) -> Image:
-    """Draws the axes of a frame into an image.
+    """Draw the axes of a frame into a copy of an image.
 
     Args:
         image: (H, W, 3) uint8 RGB.
-        axes: in pixels of this image (`AxesInView.placed`).
-        name: of the frame, written at its origin; ASCII.
-        older: draws them pale and dashed, to lie beside others.
-
-    Returns:
-        A new image of the same size.
+        axes: In pixels of this image (`AxesInView.scaled`).
+        name: Name of the frame, written at its origin; ASCII.
+        older: Draw them pale and dashed.
     """
-    thick = max(2, round(image.shape[1] / 220))
+    width = max(2, round(image.shape[1] / 220))
     if older:
-        pale = [_mixed(colour, 0.55) for colour in _COLOURS]
-        return overlay_lines(image, axes.lines, pale, thick, dash=4.0 * thick)
-    drawn = overlay_lines(image, axes.lines, list(_COLOURS), thick)
-    for letter, line, colour in zip("xyz", axes.lines, _COLOURS, strict=True):
-        if np.isfinite(line[-1]).all():
-            _write(drawn, letter, line[-1] + _away(line[-1] - line[0], 5 * thick), colour)
-    if name and not axes.where:
+        return overlay_lines(image, axes.lines, _PALE, width, dash=4.0 * width)
+    drawn = _lines_with_letters(image, axes.lines, width)
+    if name and not axes.outside:
         ends = np.array([line[-1] for line in axes.lines])
-        away = _away(axes.origin_px - np.nanmean(ends, axis=0), 14 * thick)
-        _write(drawn, name, axes.origin_px + away, (0, 0, 0))
+        offset = _away(axes.origin_px - np.nanmean(ends, axis=0), 14 * width)
+        _write(drawn, name, axes.origin_px + offset, (0, 0, 0))
     return drawn
 
 
 def close_up(
     image: Image, camera: Camera, axes: AxesInView, older: AxesInView | None, width: int
 ) -> Image | None:
-    """The part of an image around the origin of a frame, enlarged, with its axes.
+    """Enlarge the part of an image around the origin of a frame and draw its axes.
 
     Args:
         image: (H, W, 3) uint8 RGB.
-        camera: whose pixels the axes are in, of any size of the same proportions.
-        axes: to draw.
-        older: to draw pale and dashed beside them; may be None.
-        width: of the part and its height, pixels.
+        camera: Intrinsics of any size with the aspect ratio of the image; unit of the axes.
+        axes: Axes to draw.
+        older: Axes to draw pale and dashed.
+        width: Width and height of the result, pixels.
 
     Returns:
-        (width, width, 3); None where the origin is not in the image, or the axes fill much of it.
+        (width, width, 3); None if the origin is outside the image or the axes are large anyway.
     """
     import cv2
 
-    if axes.where:
+    if axes.outside:
         return None
     ends = np.array([line[-1] for line in axes.lines]) - axes.origin_px
     half = 1.5 * float(np.nanmax(np.linalg.norm(ends, axis=1), initial=0.0))
     if not 4.0 < half < 0.2 * camera.width:
         return None
     scale = width / (2 * half)
-    shift = (width - 1) / 2 - scale * axes.origin_px
-    own = camera.width / image.shape[1]  # of the camera's pixels for each of the image's
-    enlarge = scale * own
-    corner = shift + scale * (0.5 * own - 0.5)
-    matrix = np.array([[enlarge, 0.0, corner[0]], [0.0, enlarge, corner[1]]])
+    offset = (width - 1) / 2 - scale * axes.origin_px
+    own = camera.width / image.shape[1]  # camera pixels per image pixel
+    corner = offset + scale * (0.5 * own - 0.5)
+    matrix = np.array([[scale * own, 0.0, corner[0]], [0.0, scale * own, corner[1]]])
     part = cv2.warpAffine(image, matrix, (width, width), flags=cv2.INTER_CUBIC)
-    part = np.asarray(part, dtype=np.uint8)
-    drawn = draw_axes(part, axes.placed(scale, shift))
-    return drawn if older is None else draw_axes(drawn, older.placed(scale, shift), older=True)
+    drawn = draw_axes(np.asarray(part, dtype=np.uint8), axes.scaled(scale, offset))
+    return drawn if older is None else draw_axes(drawn, older.scaled(scale, offset), older=True)
 
 
 def draw_directions(image: Image, axes: AxesInView, name: str = "") -> Image:
-    """Draws in the lower left corner which way the axes point, where they themselves are not seen.
+    """Draw the directions of the axes in the lower left corner of a copy of an image.
 
     Args:
         image: (H, W, 3) uint8 RGB.
-        axes: of the frame.
-        name: of the frame; ASCII.
-
-    Returns:
-        A new image of the same size.
+        axes: Axes of the frame.
+        name: Name of the frame; ASCII.
     """
     height, width = image.shape[:2]
-    reach = 0.09 * min(width, height)
-    middle = np.array([1.6 * reach, height - 2.0 * reach])
-    ends = middle + reach * axes.directions
-    thick = max(2, round(width / 220))
-    lines = [np.stack([middle, end]) for end in ends]
-    drawn = overlay_lines(image, lines, list(_COLOURS), thick)
-    for letter, end, colour in zip("xyz", ends, _COLOURS, strict=True):
-        _write(drawn, letter, end + _away(end - middle, 5 * thick), colour)
+    length = 0.09 * min(width, height)
+    origin = np.array([1.6 * length, height - 2.0 * length])
+    lines = [np.stack([origin, origin + length * direction]) for direction in axes.directions]
+    drawn = _lines_with_letters(image, lines, max(2, round(width / 220)))
     if name:
-        words = f"directions of {name}"
-        _write(drawn, words, np.array([4.0, height - 12.0]), (0, 0, 0), middle=False)
+        text = f"directions of {name}"
+        _write(drawn, text, np.array([4.0, height - 12.0]), (0, 0, 0), centred=False)
     return drawn
 
 
-def _in_front(start: Array, end: Array) -> tuple[Array, Array]:
-    """The part of a segment that lies in front of the camera; the segment itself if none does."""
+def _lines_with_letters(image: Image, lines: Sequence[Array], width: int) -> Image:
+    drawn = overlay_lines(image, lines, _COLOURS, width)
+    for letter, line, colour in zip("xyz", lines, _COLOURS, strict=True):
+        _write(drawn, letter, line[-1] + _away(line[-1] - line[0], 5 * width), colour)
+    return drawn
+
+
+def _clip_depth(start: Array, end: Array) -> tuple[Array, Array]:
+    """Clip a segment to the part in front of the camera. A segment behind it is unchanged."""
     ends = [start, end]
     depths = start[2] - _NEAR_M, end[2] - _NEAR_M
     if depths[0] * depths[1] < 0:
@@ -167,66 +160,62 @@ def _in_front(start: Array, end: Array) -> tuple[Array, Array]:
     return ends[0], ends[1]
 
 
-def _seen(camera: Camera, points: Array) -> Array:
-    """(n, 2) pixels; nan behind the camera and where the lens model no longer holds."""
-    # A distortion polynomial folds back far outside the image: it would show what is not there.
+def _project(camera: Camera, points: Array) -> Array:
+    """(n, 2) pixels; NaN behind the camera and outside the range of the distortion model."""
+    # Far outside the image, a distortion polynomial can fold points back into it.
     corners = [[x, y] for x in (-0.5, camera.width - 0.5) for y in (-0.5, camera.height - 0.5)]
     corner = np.linalg.norm(camera.unproject(corners)[:, :2], axis=1)
     limit = _BEYOND * float(np.nan_to_num(corner, nan=camera.widest).max())
     depth = np.where(points[:, 2] >= 0.999 * _NEAR_M, points[:, 2], math.nan)
-    slope = np.linalg.norm(points[:, :2], axis=1) / depth
+    valid = np.linalg.norm(points[:, :2], axis=1) / depth <= limit
     pixels = np.full((len(points), 2), math.nan)
-    ok = slope <= limit
-    pixels[ok] = camera.project(points[ok])
+    pixels[valid] = camera.project(points[valid])
     return pixels
 
 
-def _where(camera: Camera, origin: Array, pixel: Array) -> str:
-    """Where an origin lies that is not in the image; empty if it is."""
+def _outside(camera: Camera, origin: Array, pixel: Array) -> str:
+    """Position of an origin outside the image, in words; empty inside."""
     if origin[2] < _NEAR_M:
-        return f"behind the camera, {max(0.0, -1000 * origin[2]):.0f} mm from the plane of its lens"
-    far = not np.isfinite(pixel).all()  # beyond the lens model: a pinhole gives the direction
+        return f"behind the camera, {max(0.0, -1000 * origin[2]):.0f} mm from its principal plane"
+    undefined = not np.isfinite(pixel).all()  # outside the distortion model: assume a pinhole
     pinhole = Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    x, y = pinhole.project(origin) if far else pixel
-    beyond = {
+    x, y = pinhole.project(origin) if undefined else pixel
+    tests = {
         "left of": x < -0.5,
         "right of": x > camera.width - 0.5,
         "above": y < -0.5,
         "below": y > camera.height - 0.5,
     }
-    sides = [side for side, so in beyond.items() if so]
+    sides = [side for side, beyond in tests.items() if beyond]
     if sides:
         return f"outside the image, {' and '.join(sides)} it"
-    return "outside the image" if far else ""
-
-
-def _mixed(colour: tuple[int, int, int], white: float) -> tuple[int, int, int]:
-    r, g, b = (round(value + white * (255 - value)) for value in colour)
-    return r, g, b
+    return "outside the image" if undefined else ""
 
 
 def _away(direction: Array, distance: float) -> Array:
-    """(2,) so far along a direction; none where there is none."""
+    """(2,) vector of a length along a direction; zero for a zero direction."""
     length = float(np.linalg.norm(direction))
     return direction * (distance / length) if length > 1e-6 else np.zeros(2)
 
 
 def _write(
-    image: Image, text: str, at: Array, colour: tuple[int, int, int], middle: bool = True
+    image: Image, text: str, pixel: Array, colour: tuple[int, int, int], centred: bool = True
 ) -> None:
-    """A letter with a white rim, or a name on white, its middle or its left end at a pixel."""
+    """Write a letter with a white rim, or a name on a white box."""
     import cv2
 
-    if not (np.isfinite(at).all() and (np.abs(at) < 1e5).all()):
+    if not (np.isfinite(pixel).all() and (np.abs(pixel) < 1e5).all()):
         return
     size = max(0.45, image.shape[1] / 1000)
-    words = text.encode("ascii", "replace").decode()
-    (wide, high), below = cv2.getTextSize(words, 0, size, 1)
-    left, line = round(float(at[0]) - (wide / 2 if middle else 0)), round(float(at[1]) + high / 2)
+    text = text.encode("ascii", "replace").decode()
+    (width, height), below = cv2.getTextSize(text, 0, size, 1)
+    left = round(float(pixel[0]) - (width / 2 if centred else 0))
+    line = round(float(pixel[1]) + height / 2)
     white = (255, 255, 255)
-    if len(words) == 1:
-        cv2.putText(image, words, (left, line), 0, size, white, 5, cv2.LINE_AA)
-        cv2.putText(image, words, (left, line), 0, size, colour, 2, cv2.LINE_AA)
+    if len(text) == 1:
+        cv2.putText(image, text, (left, line), 0, size, white, 5, cv2.LINE_AA)
+        cv2.putText(image, text, (left, line), 0, size, colour, 2, cv2.LINE_AA)
         return
-    cv2.rectangle(image, (left - 3, line - high - 3), (left + wide + 3, line + below), white, -1)
-    cv2.putText(image, words, (left, line), 0, size, colour, 1, cv2.LINE_AA)
+    corners = (left - 3, line - height - 3), (left + width + 3, line + below)
+    cv2.rectangle(image, *corners, white, -1)
+    cv2.putText(image, text, (left, line), 0, size, colour, 1, cv2.LINE_AA)

@@ -1,146 +1,129 @@
-"""A page in one file: text, tables and pictures, readable offline and for ever."""
+"""HTML reports from templates: one self-contained file each, readable offline."""
 
 import base64
-import html
+import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+_TEMPLATES = Path(__file__).parent / "templates"
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """An image with what it shows."""
+    """A chart (PNG) or a photograph (JPEG). Dark mode inverts charts only.
+
+    Raises:
+        ValueError: The data are neither PNG nor JPEG.
+    """
 
     data: bytes
-    """A PNG or JPEG file."""
+    """Content of the image file."""
     caption: str = ""
-    """Below the picture, and read aloud in its place."""
+    """Text below the picture, also its alternative text."""
+
+    def __post_init__(self) -> None:
+        if not self.data.startswith((b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")):
+            raise ValueError(f"a picture is a PNG or JPEG file, got {self.data[:8]!r}")
+
+    @property
+    def kind(self) -> Literal["png", "jpeg"]:
+        """File type."""
+        return "png" if self.data.startswith(b"\x89PNG") else "jpeg"
+
+    @property
+    def uri(self) -> str:
+        """The file as a data URI."""
+        return f"data:image/{self.kind};base64,{base64.b64encode(self.data).decode()}"
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Cells in rows; numbers stand to the right, by what the cell is or reads as."""
-
-    header: Sequence[str]
-    """One title per column."""
-    rows: Sequence[Sequence[str | int | float]]
-    """As many cells each; numbers are written as `str` writes them, so round them before."""
-    caption: str = ""
-    """Above the table."""
-
-
-@dataclass(frozen=True, eq=False)
-class Section:
-    """A heading and what follows, in order; a string is a paragraph."""
-
-    heading: str
-    """Empty for none."""
-    blocks: Sequence[str | Picture | Table]
-    """Paragraphs, pictures and tables."""
-
-
-_STYLE = """
-:root { color-scheme: light dark; --text: #1b1f24; --quiet: #59636e; --line: #d1d9e0;
-  --back: #fff; }
-@media (prefers-color-scheme: dark) {
-  :root { --text: #e6edf3; --quiet: #9198a1; --line: #3d444d; --back: #0d1117; } }
-body { margin: 2.5rem auto; padding: 0 1.2rem; max-width: 62rem; background: var(--back);
-  color: var(--text); font: 16px/1.55 system-ui, sans-serif; }
-h1 { font-size: 1.7rem; margin: 0 0 1.5rem; } h2 { font-size: 1.2rem; margin: 2.2rem 0 .6rem; }
-p { max-width: 44rem; white-space: pre-line; }
-.wide { overflow-x: auto; margin: 1rem 0; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; }
-caption, figcaption { color: var(--quiet); font-size: .9rem; text-align: left; }
-caption { padding-bottom: .4rem; }
-th, td { padding: .3rem .8rem; border-bottom: 1px solid var(--line); text-align: left; }
-th { font-weight: 600; vertical-align: bottom; } .n { text-align: right; }
-td.n { white-space: nowrap; }
-figure { margin: 1.2rem 0; }
-img { max-width: 100%; height: auto; border-radius: 4px; background: #fff; }
-""".strip()
-
-
-def html_page(title: str, sections: Sequence[Section]) -> str:
-    """One HTML document that refers to nothing outside itself.
-
-    Everything given is text, never markup: `<`, `&` and quotes show as they are.
-
-    Args:
-        title: At the top and in the browser's tab.
-        sections: In order.
+    """A table. Columns of numbers are aligned right, columns without any value are hidden.
 
     Raises:
-        ValueError: A picture that is neither PNG nor JPEG, or a row that does not fit its header.
+        ValueError: The length of a row differs from that of the header.
     """
-    body = "\n".join(_section(section) for section in sections)
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        # The page can fetch and run nothing, whatever a scene's name may contain.
-        '<meta http-equiv="Content-Security-Policy"'
-        " content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'\">\n"
-        f"<title>{html.escape(title)}</title>\n<style>\n{_STYLE}\n</style>\n</head>\n"
-        f"<body>\n<h1>{html.escape(title)}</h1>\n{body}\n</body>\n</html>\n"
+
+    header: Sequence[str]
+    """Column titles."""
+    rows: Sequence[Sequence[str | int | float]]
+    """Cells. Numbers are written by `str`, so round them first."""
+    caption: str = ""
+    """Title of the table."""
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.header):
+                raise ValueError(f"a row of this table has {len(self.header)} cells, got {row}")
+
+    @classmethod
+    def of_records(cls, records: Sequence[Any], caption: str = "") -> Self:
+        """One row for each dataclass record, one column for each field."""
+        header = [field.name.replace("_", " ") for field in fields(records[0])]
+        return cls(header, [[_cell(*item) for item in vars(r).items()] for r in records], caption)
+
+    @property
+    def columns(self) -> list[int]:
+        """Indices of the columns to show."""
+        count = len(self.header)
+        return [
+            i for i in range(count) if not self.rows or not all(_blank(row[i]) for row in self.rows)
+        ]
+
+    @property
+    def numeric(self) -> set[int]:
+        """Indices of the columns that hold only numbers and blanks."""
+        return {i for i in self.columns if self.rows and all(_number(row[i]) for row in self.rows)}
+
+
+def render(template: str, **values: object) -> str:
+    """Fill in a template; all values are escaped.
+
+    Args:
+        template: Name of a file in the folder `templates`.
+        values: Variables of the template.
+
+    Returns:
+        An HTML document without references to other files.
+    """
+    return _environment().get_template(template).render(values)
+
+
+@functools.cache
+def _environment() -> "Environment":
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    return Environment(
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
 
 
-def _section(section: Section) -> str:
-    parts = [f"<h2>{html.escape(section.heading)}</h2>"] if section.heading else []
-    for block in section.blocks:
-        if isinstance(block, Picture):
-            parts.append(_picture(block))
-        elif isinstance(block, Table):
-            parts.append(_table(block))
-        else:
-            parts.append(f"<p>{html.escape(block)}</p>")
-    return "<section>\n" + "\n".join(parts) + "\n</section>"
+def _cell(name: str, value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.{3 if name.endswith('_deg') else 2}f}"
+    return "-" if value is None else str(value)
 
 
-def _picture(picture: Picture) -> str:
-    if picture.data.startswith(b"\x89PNG\r\n\x1a\n"):
-        kind = "png"
-    elif picture.data.startswith(b"\xff\xd8\xff"):
-        kind = "jpeg"
-    else:
-        raise ValueError(f"a picture is a PNG or JPEG file, got {picture.data[:8]!r}")
-    caption = html.escape(picture.caption)
-    source = f"data:image/{kind};base64,{base64.b64encode(picture.data).decode()}"
-    below = f"<figcaption>{caption}</figcaption>" if caption else ""
-    return f'<figure><img src="{source}" alt="{caption}">{below}</figure>'
+def _blank(cell: str | int | float) -> bool:
+    return str(cell).strip() in ("", "-")
 
 
-def _table(table: Table) -> str:
-    for row in table.rows:
-        if len(row) != len(table.header):
-            raise ValueError(f"a row has {len(table.header)} cells, as the header; got {row}")
-    # A column's title stands over its cells: to the right if they are numbers.
-    numeric = [
-        bool(table.rows) and all(_is_number(row[i]) for row in table.rows)
-        for i in range(len(table.header))
-    ]
-    caption = f"<caption>{html.escape(table.caption)}</caption>" if table.caption else ""
-    head = _row("th", table.header, numeric)
-    body = "\n".join(_row("td", row, [_is_number(cell) for cell in row]) for row in table.rows)
-    return (
-        f'<div class="wide"><table>{caption}\n<thead>{head}</thead>\n'
-        f"<tbody>\n{body}\n</tbody></table></div>"
-    )
-
-
-def _row(tag: str, cells: Sequence[str | int | float], numeric: Sequence[bool]) -> str:
-    classes = [' class="n"' if flag else "" for flag in numeric]
-    inner = "".join(
-        f"<{tag}{mark}>{html.escape(str(cell))}</{tag}>"
-        for cell, mark in zip(cells, classes, strict=True)
-    )
-    return f"<tr>{inner}</tr>"
-
-
-def _is_number(cell: str | int | float) -> bool:
-    """Whether a cell reads as a number; a blank and a dash stand for a missing one."""
-    if not isinstance(cell, str) or cell.strip() in ("", "-"):
+def _number(cell: str | int | float) -> bool:
+    if _blank(cell):
         return True
     try:
-        float(cell.strip().removesuffix("%").removesuffix(" mm").removesuffix(" cm"))
+        float(str(cell).removesuffix("%").partition("±")[0])
     except ValueError:
         return False
     return True

@@ -1,4 +1,4 @@
-"""An answer drawn into its image."""
+"""Pose estimates drawn into their images."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -6,42 +6,44 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.reports.overlay import overlay_points
+
 if TYPE_CHECKING:
     from evercal.geometry import SE3, Camera
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import Localizer
+    from evercal.mapping.scene_maps import SceneRecord
 
 
 def scene_camera(localizer: "Localizer", scene: str) -> "Camera":
-    """The camera that a scene was recorded with."""
-    return next(record.camera for record in localizer.maps.scenes if record.name == scene)
+    """The camera of a scene's recording."""
+    return _record(localizer, scene).camera
 
 
 def draw_estimate(
     image: NDArray[np.uint8], estimate: "PoseEstimate", camera: "Camera", legend: bool = True
 ) -> NDArray[np.uint8]:
-    """The inlying scene points, seen from the estimated pose, coloured by depth.
+    """Draw the inlier scene points at the estimated pose, coloured by depth.
 
     Args:
         image: (H, W, 3) uint8 RGB.
-        estimate: the answer for it; without a pose nothing is drawn.
-        camera: its intrinsics at any size of the same proportions.
-        legend: whether to write down what the colours mean.
+        estimate: Estimate for this image; without a pose nothing is drawn.
+        camera: Intrinsics, of any size with the aspect ratio of the image.
+        legend: Whether to draw a colour bar.
 
     Returns:
         A new image of the same size.
     """
-    from evercal.reports import overlay_points
-
     height, width = image.shape[:2]
     if estimate.base_from_camera is None or estimate.points_m is None:
         return image.copy()
     points = estimate.base_from_camera.inverse().apply(estimate.points_m)
-    points = points[np.argsort(-points[:, 2])]  # far first: near points cover them
+    points = points[np.argsort(-points[:, 2])]  # near points cover far ones
     pixels = camera.resized(width, height).project(points)
     radius = max(1.5, min(width, height) / 110)
-    words = "depth (m)" if legend else None
-    return overlay_points(image, pixels, points[:, 2], radius, legend=words)
+    return overlay_points(
+        image, pixels, points[:, 2], radius, legend="depth (m)" if legend else None
+    )
 
 
 def draw_landmarks(
@@ -50,42 +52,40 @@ def draw_landmarks(
     localizer: "Localizer",
     legend: bool = True,
 ) -> NDArray[np.uint8]:
-    """The landmarks that were found in an image, coloured by their reprojection error.
+    """Draw the landmarks detected in an image, coloured by reprojection error.
 
     Args:
         image: (H, W, 3) uint8 RGB.
-        estimate: the answer for it, where no camera was given or the scene's own; without a pose
+        estimate: Estimate for this image, made with the camera of the scene. Without a pose
             nothing is drawn.
-        localizer: that gave it.
-        legend: whether to write down what the colours mean.
+        localizer: Localizer of the estimate.
+        legend: Whether to draw a colour bar.
 
     Returns:
-        A new image, twice as large so that landmarks can be told apart.
+        A new image of twice the size.
     """
     import cv2
 
-    from evercal.reports import overlay_points
-
     height, width = 2 * image.shape[0], 2 * image.shape[1]
     large = cv2.resize(image, (width, height), interpolation=cv2.INTER_CUBIC).astype(np.uint8)
-    found = landmark_errors(estimate, localizer)
-    if found is None:
+    errors = landmark_errors(estimate, localizer)
+    if errors is None:
         return large
-    at = (found.pixels + 0.5) * (height / found.height) - 0.5
-    words = "reprojection error (px)" if legend else None
-    return overlay_points(large, at, found.errors_px, 3.0, (0.0, 1.0), words)
+    pixels = (errors.pixels + 0.5) * (height / errors.height) - 0.5
+    text = "reprojection error (px)" if legend else None
+    return overlay_points(large, pixels, errors.errors_px, 3.0, (0.0, 1.0), text)
 
 
 @dataclass(frozen=True, eq=False)
 class LandmarkErrors:
-    """How far the landmarks of an image lie from where a camera pose puts them."""
+    """Reprojection errors of the landmarks in an image."""
 
     pixels: NDArray[np.float64]
-    """(n, 2) where they were found in the working image."""
+    """(n, 2) detections in the working image."""
     errors_px: NDArray[np.float64]
-    """(n,) pixels of the working image; nan where the pose puts one behind the camera."""
+    """(n,) pixels of the working image; NaN behind the camera."""
     height: int
-    """Of the working image."""
+    """Height of the working image."""
 
 
 def landmark_errors(
@@ -94,21 +94,28 @@ def landmark_errors(
     camera: "Camera | None" = None,
     base_from_camera: "SE3 | None" = None,
 ) -> LandmarkErrors | None:
-    """Reprojection errors of the landmarks that were found in an image.
+    """Compute the reprojection errors of the landmarks detected in an image.
 
     Args:
-        estimate: the answer for the image; None is returned without a pose.
-        localizer: that gave it.
-        camera: the intrinsics that it was located with; None for the scene's own.
-        base_from_camera: the pose to judge by; that of the answer when None.
+        estimate: Estimate for the image.
+        localizer: Localizer of the estimate.
+        camera: Intrinsics used for the estimate; None stands for the camera of the scene.
+        base_from_camera: Pose to project with, by default that of the estimate.
+
+    Returns:
+        None if the estimate has no pose or no landmarks.
     """
     pose = base_from_camera or estimate.base_from_camera
-    if estimate.pixels is None or estimate.points_m is None or estimate.base_from_camera is None:
+    if pose is None or estimate.scene is None or estimate.base_from_camera is None:
         return None
-    assert pose is not None, "the answer has one"
-    record = next(r for r in localizer.maps.scenes if r.name == estimate.scene)
-    lens = record.query_camera(camera).short_side_resized(localizer.maps.short_side)
-    among = record.camera_among_landmarks(pose)
-    expected = lens.project(among.inverse().apply(estimate.points_m))
-    errors = np.linalg.norm(estimate.pixels - expected, axis=1)
-    return LandmarkErrors(estimate.pixels, errors, lens.height)
+    if estimate.pixels is None or estimate.points_m is None:
+        return None
+    record = _record(localizer, estimate.scene)
+    working_camera = record.query_camera(camera).short_side_resized(localizer.maps.short_side)
+    points = record.camera_among_landmarks(pose).inverse().apply(estimate.points_m)
+    errors = np.linalg.norm(estimate.pixels - working_camera.project(points), axis=1)
+    return LandmarkErrors(estimate.pixels, errors, working_camera.height)
+
+
+def _record(localizer: "Localizer", scene: str) -> "SceneRecord":
+    return next(record for record in localizer.maps.scenes if record.name == scene)

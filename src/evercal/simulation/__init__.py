@@ -1,1 +1,1 @@
-"""Frames from a virtual cell instead of a disk."""
+"""Rendered rooms and robot cells with exact poses."""

@@ -1,9 +1,8 @@
-"""Box rooms: textured rectangles with exact poses, drawn in milliseconds, no extra dependency.
+"""Box rooms: textured rectangles with exact poses, rendered in milliseconds without extras.
 
-A room is a box with furniture boxes in it and pictures on its walls. Every surface is a rectangle,
-so an image is a set of perspective warps put together by depth, and a ray meets the room in closed
-form.
-The robot base frame: origin on the floor in the middle of the room, z up, metres.
+A room is a box with furniture boxes and pictures on its walls. Every surface is a rectangle, so an
+image is a set of perspective warps combined by depth, and rays intersect the room in closed form.
+Base frame: origin on the floor in the middle of the room, z up, metres.
 """
 
 from dataclasses import dataclass
@@ -21,31 +20,31 @@ NEAR_M = 0.05
 
 @dataclass(frozen=True)
 class Surface:
-    """One textured rectangle, seen from the side its normal points to."""
+    """One textured rectangle, visible from the side of its normal."""
 
     corner_m: np.ndarray
-    """(3,) corner of texture pixel (0, 0) in the base frame, metres."""
+    """Corner of texture pixel (0, 0), shape (3,), base frame."""
     edge_u_m: np.ndarray
-    """(3,) edge along texture columns, metres."""
+    """Edge along texture columns, shape (3,)."""
     edge_v_m: np.ndarray
-    """(3,) edge along texture rows, metres."""
+    """Edge along texture rows, shape (3,)."""
     pyramid: tuple[np.ndarray, ...]
     """Texture (h, w, 3) uint8 and its halvings, against aliasing."""
 
     @cached_property
     def normal(self) -> np.ndarray:
-        """(3,) unit normal."""
+        """Unit normal, shape (3,)."""
         cross = np.cross(self.edge_u_m, self.edge_v_m)
         return cross / np.linalg.norm(cross)
 
 
 class BoxRoom:
-    """A room made from a seed.
+    """A room generated from a seed.
 
     Args:
-        seed: same seed, same room. Seeds 9000 to 9999 are reserved for benchmarks.
-        furniture: number of boxes standing in the room; drawn when None.
-        texture_px: side of one texture in pixels.
+        seed: Seed of the room. Seeds 9000 to 9999 are reserved for benchmarks.
+        furniture: Number of furniture boxes; random if omitted.
+        texture_px: Side of one texture in pixels.
     """
 
     def __init__(self, seed: int, furniture: int | None = None, texture_px: int = 384):
@@ -58,14 +57,13 @@ class BoxRoom:
         self._add_box(np.array([-x / 2, -y / 2, 0]), self.size_m, rng, inward=True)
         for _ in range(int(rng.integers(5, 14)) if furniture is None else furniture):
             size = np.array([rng.uniform(0.2, 1.2), rng.uniform(0.2, 1.2), rng.uniform(0.2, 1.4)])
-            # Furniture stands along the walls: the middle of the room stays free for cameras.
+            # Along the walls: the middle of the room stays free for cameras.
             side = rng.integers(4)
-            place = rng.uniform(-0.5, 0.5, 2) * (self.size_m[:2] - size[:2])
+            centre = rng.uniform(-0.5, 0.5, 2) * (self.size_m[:2] - size[:2])
             axis, sign = side // 2, 1 - 2 * (side % 2)
-            place[axis] = sign * (self.size_m[axis] - size[axis]) / 2 * rng.uniform(0.85, 0.999)
-            # On the floor or on the wall.
-            hung = max(0.0, rng.uniform(-1.0, self.size_m[2] - size[2]))
-            self._add_box(np.array([*(place - size[:2] / 2), hung]), size, rng, inward=False)
+            centre[axis] = sign * (self.size_m[axis] - size[axis]) / 2 * rng.uniform(0.85, 0.999)
+            height = max(0.0, rng.uniform(-1.0, self.size_m[2] - size[2]))
+            self._add_box(np.array([*(centre - size[:2] / 2), height]), size, rng, inward=False)
         for _ in range(int(rng.integers(4, 13))):
             self._add_picture(rng)
 
@@ -81,7 +79,7 @@ class BoxRoom:
         picture = np.clip(picture * shade, 0, 255).astype(np.uint8)
         pyramid = [picture]
         while pyramid[-1].shape[0] > 16:
-            # Not pyrDown: its pixel k is centred on 2k, not on 2k + 0.5, which moves the picture.
+            # pyrDown centres pixel k on 2k instead of 2k + 0.5, which shifts the picture.
             half = pyramid[-1].shape[0] // 2
             smaller = cv2.resize(pyramid[-1], (half, half), interpolation=cv2.INTER_AREA)
             pyramid.append(smaller.astype(np.uint8))
@@ -117,20 +115,22 @@ class BoxRoom:
         self.surfaces.append(Surface(corner, unit_u * size[0], unit_v * size[1], pyramid))
 
     def render(self, camera: Camera, base_from_camera: SE3) -> np.ndarray:
-        """Draws what an ideal pinhole sees.
+        """Render an image of an ideal pinhole camera.
 
         Args:
-            camera: intrinsics; must have no distortion.
-            base_from_camera: camera pose in the base frame, metres, OpenCV axes.
+            camera: Intrinsics without distortion.
+            base_from_camera: Camera pose.
 
         Returns:
-            (camera.height, camera.width, 3) uint8 RGB.
+            RGB image, uint8, shape (camera.height, camera.width, 3).
 
         Raises:
-            ValueError: the camera has distortion.
+            ValueError: The camera has distortion.
         """
         if camera.distortion:
-            raise ValueError("box rooms are drawn through an ideal pinhole: distortion must be ()")
+            raise ValueError(
+                "box rooms are rendered through an ideal pinhole: distortion must be ()"
+            )
         image = np.zeros((camera.height, camera.width, 3), np.uint8)
         nearness = np.zeros((camera.height, camera.width), np.float32)  # 1 / depth
         camera_from_base = base_from_camera.inverse()
@@ -142,15 +142,15 @@ class BoxRoom:
         return image
 
     def intersect(self, origin_m: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """First hit of rays with the room, in closed form.
+        """Intersect rays with the room in closed form.
 
         Args:
-            origin_m: (3,) or (n, 3) ray origins in the base frame, metres.
-            rays: (n, 3) directions, any length.
+            origin_m: Ray origins in the base frame, shape (3,) or (n, 3).
+            rays: Directions of any length, shape (n, 3).
 
         Returns:
-            points (n, 3) in the base frame, NaN where nothing is hit, and depth (n,) in units of
-            each ray's length.
+            First intersections (n, 3) in the base frame, NaN for rays that miss, and their depths
+            (n,) in units of the ray length, inf for rays that miss.
         """
         origin = np.broadcast_to(origin_m, rays.shape)
         best = np.full(len(rays), np.inf)
@@ -169,7 +169,7 @@ class BoxRoom:
         return points, best
 
     def random_view(self, rng: np.random.Generator) -> SE3:
-        """A camera somewhere in the free middle of the room, looking outwards, near upright."""
+        """A random base_from_camera in the middle of the room, looking outwards, nearly upright."""
         half = self.size_m / 2
         centre = rng.uniform(-0.45, 0.45, 2) * half[:2]
         position = np.array([*centre, rng.uniform(0.5, 0.8 * self.size_m[2])])
@@ -178,26 +178,23 @@ class BoxRoom:
         return look_at(position, position + target, rng.uniform(-0.25, 0.25))
 
     def path(self, frames: int, seed: int) -> SE3:
-        """A smooth hand-held sweep once round the room.
+        """A smooth hand-held sweep once around the room.
 
         Args:
-            frames: number of poses.
-            seed: another seed walks the same way through the room as another person would: off by
-                some 10 to 20 cm and 10 degrees, smoothly.
+            frames: Number of poses.
+            seed: Seed of the deviation from the room's common sweep, about 10 to 20 cm and 10 deg.
 
         Returns:
-            `base_from_camera` with shape (frames,).
+            base_from_camera, shape (frames,).
         """
-        way, walker = (
-            np.random.default_rng([self.seed, 0]),
-            np.random.default_rng([self.seed, seed]),
-        )
+        common = np.random.default_rng([self.seed, 0])
+        walker = np.random.default_rng([self.seed, seed])
         t = np.linspace(0, 2 * np.pi, frames, endpoint=False)
         half = self.size_m / 2
 
-        def wave(low: float, high: float, cycles: int, off: float) -> np.ndarray:
-            own = np.sin(3 * t + walker.uniform(0, 2 * np.pi)) + walker.uniform(-1, 1)
-            return low + (high - low) * _wave(t, cycles, way) + 0.6 * off * own
+        def wave(low: float, high: float, cycles: int, deviation: float) -> np.ndarray:
+            change = np.sin(3 * t + walker.uniform(0, 2 * np.pi)) + walker.uniform(-1, 1)
+            return low + (high - low) * _wave(t, cycles, common) + 0.6 * deviation * change
 
         x = wave(-0.24 * half[0], 0.24 * half[0], 1, 0.15)
         y = wave(-0.24 * half[1], 0.24 * half[1], 1, 0.15)
@@ -210,18 +207,18 @@ class BoxRoom:
 
 
 def _wave(t: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
-    """A random smooth periodic function of t (n,) whose values over [0, 2 pi] fill [0, 1]."""
+    """A random smooth periodic function of t, shape (n,), with range [0, 1] over [0, 2 pi]."""
     parts = [(k, rng.uniform(0.4, 1) / k, rng.uniform(0, 2 * np.pi)) for k in (1, 2, 3)]
 
-    def total(where: np.ndarray) -> np.ndarray:
-        return sum((a * np.sin(k * cycles * where + p) for k, a, p in parts), np.zeros_like(where))
+    def total(x: np.ndarray) -> np.ndarray:
+        return sum((a * np.sin(k * cycles * x + p) for k, a, p in parts), np.zeros_like(x))
 
     whole = total(np.linspace(0, 2 * np.pi, 720))
     return (total(t) - whole.min()) / np.ptp(whole)
 
 
 def look_at(position_m: np.ndarray, target_m: np.ndarray, roll_rad: float = 0.0) -> SE3:
-    """`base_from_camera` of a camera at `position_m` that looks at `target_m`, base z up."""
+    """base_from_camera of a camera at `position_m` that looks at `target_m`, with base z up."""
     forward = target_m - position_m
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -235,30 +232,30 @@ def look_at(position_m: np.ndarray, target_m: np.ndarray, roll_rad: float = 0.0)
 
 
 def default_camera(width: int = 320, height: int = 240) -> Camera:
-    """A 63 degree pinhole, like the depth cameras that indoor data sets are recorded with."""
+    """A pinhole with a 63 deg field of view, as in common indoor data sets."""
     focal = 525.0 / 640.0 * max(width, height)
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def box_room_scene(seed: int, train: int, test: int, camera: Camera | None = None) -> Recording:
-    """A box room as a scene: two different sweeps, one to learn and one to be judged on.
+    """Record a box room: one sweep of training frames and another of test frames.
 
     Args:
-        seed: of the room.
-        train: number of training frames.
-        test: number of test frames.
-        camera: intrinsics of every frame; 320x240 when None.
+        seed: Seed of the room.
+        train: Number of training frames.
+        test: Number of test frames.
+        camera: Intrinsics of every frame; `default_camera()` if omitted.
 
     Returns:
-        A scene named `box-room-SEED` whose frames hold their images in memory.
+        A recording `box-room-SEED` with images in memory.
     """
     room = BoxRoom(seed)
-    lens = camera or default_camera()
+    intrinsics = camera or default_camera()
 
     def record(split: str, count: int, path_seed: int) -> tuple[Frame, ...]:
         poses = room.path(count, path_seed)
         return tuple(
-            Frame(f"{split}-{i:06d}", room.render(lens, poses[i]), lens, poses[i])
+            Frame(f"{split}-{i:06d}", room.render(intrinsics, poses[i]), intrinsics, poses[i])
             for i in range(count)
         )
 
@@ -274,11 +271,14 @@ def _draw(
     edges: np.ndarray,
     camera: Camera,
 ) -> None:
-    """Warps one rectangle (camera coordinates) into `image` where it is nearest; updates both."""
+    """Warp a rectangle in camera coordinates into `image` where it is nearest.
+
+    `nearness` is the inverse depth of `image`; both are updated.
+    """
     import cv2
 
     normal = np.cross(edges[:, 0], edges[:, 1])
-    if normal @ corner >= 0:  # seen from behind
+    if normal @ corner >= 0:  # back side
         return
     corners = corner + np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) @ edges.T
     if corners[:, 2].max() < NEAR_M:
@@ -299,20 +299,22 @@ def _draw(
     with np.errstate(divide="ignore", invalid="ignore"):
         s, t = a / w, b / w
         front = nearness[top:bottom, left:right]
-        seen = (w > front) & (w < 1 / NEAR_M) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
-    if not seen.any():
+        visible = (w > front) & (w < 1 / NEAR_M) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
+    if not visible.any():
         return
-    # Texture pixels per image pixel decide the pyramid level: area of the seen part in both.
-    span = np.ptp(s[seen]) * np.ptp(t[seen]) * pyramid[0].shape[0] ** 2 / max(seen.sum(), 1)
+    # The pyramid level follows from texture pixels per image pixel over the visible area.
+    span = (
+        np.ptp(s[visible]) * np.ptp(t[visible]) * pyramid[0].shape[0] ** 2 / max(visible.sum(), 1)
+    )
     level = int(np.clip(np.round(0.5 * np.log2(max(span, 1.0))), 0, len(pyramid) - 1))
     texture = pyramid[level]
     height, width = texture.shape[:2]
     warped = cv2.remap(
         texture,
-        np.where(seen, s * width - 0.5, 0).astype(np.float32),
-        np.where(seen, t * height - 0.5, 0).astype(np.float32),
+        np.where(visible, s * width - 0.5, 0).astype(np.float32),
+        np.where(visible, t * height - 0.5, 0).astype(np.float32),
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    np.copyto(image[top:bottom, left:right], warped, where=seen[..., None])
-    np.copyto(front, w, where=seen)
+    np.copyto(image[top:bottom, left:right], warped, where=visible[..., None])
+    np.copyto(front, w, where=visible)

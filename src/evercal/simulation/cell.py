@@ -1,17 +1,17 @@
 """Suites of rendered rooms, written frame by frame in the generic folder format.
 
-    OUT/bedroom/scene.json, images/, depth/            the moving camera: train and test
-    OUT/bedroom/calibration/fixed, bumped, hand        25 frames each, scenes of their own
+    OUT/bedroom/scene.json, images/, depth/            moving camera: train and test
+    OUT/bedroom/calibration/fixed, bumped, hand        25 frames each, recordings of their own
     OUT/bedroom/calibration/truth.json                 the bump and gripper_from_camera
     OUT/bedroom/changed                                sim-mini: test frames after a change
 
-A frame appears under its name only when it is whole, and scene.json comes last: a run that was cut
-off goes on where it stopped. Rooms have fixed seeds; `seed` draws the paths.
+Frames are written atomically and scene.json last, so an interrupted run continues with the first
+missing frame. Rooms have fixed seeds; the option `seed` varies the paths.
 """
 
 import shutil
 from collections.abc import Generator, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,6 @@ from evercal.simulation.cell_paths import (
     fixed_shots,
     hand_camera,
     hand_joints,
-    hand_shots,
     sees_work_area,
     sweep_shots,
 )
@@ -41,22 +40,22 @@ CALIBRATION_FRAMES = 25
 
 @dataclass(frozen=True)
 class Suite:
-    """What one name stands for."""
+    """Rooms and default settings."""
 
     rooms: tuple[tuple[str, str, int], ...]
-    """Scene name, room kind, room seed."""
+    """Recording name, room kind, room seed."""
     frames: int
     """Frames per room, train and test together."""
     size: tuple[int, int]
     """Width and height in pixels."""
     samples: int
-    """Paths per pixel."""
+    """Light paths per pixel."""
     depth: bool = True
     """Whether depth is written."""
     jpeg_quality: int = 95
-    """Of the colour images."""
+    """JPEG quality of the colour images."""
     changed: int = 0
-    """Test frames per room after small things were moved and lamps switched; see `changed_room`."""
+    """Test frames per room after small objects moved and lamps switched; see `changed_room`."""
 
 
 _CYCLE = ("bedroom", "kitchen", "living")
@@ -79,59 +78,58 @@ SUITES: dict[str, Suite] = {
 
 @dataclass(frozen=True)
 class SimulateOptions:
-    """What a run may change of its suite; None keeps the suite's own."""
+    """Settings of a run. None selects the suite's default."""
 
     frames: int | None = None
     """Frames per room, train and test together."""
     size: tuple[int, int] | None = None
     """Width and height in pixels."""
     seed: int = 0
-    """Of the camera and arm paths and of the noise; below 9000."""
+    """Seed of camera paths, arm paths and noise; below 9000."""
     samples: int | None = None
-    """Paths per pixel."""
+    """Light paths per pixel."""
     exposure_ev: float = 0.0
-    """Brighter (> 0) or darker, in stops."""
+    """Exposure in stops; positive is brighter."""
     noise: float = 0.0
-    """Sensor noise at mid grey in parts of full scale; 0.01 is a good camera."""
+    """Standard deviation of sensor noise at mid grey, as a fraction of full scale."""
     blur_steps: int = 1
-    """Poses per frame while the shutter is open; 1 is no motion blur."""
+    """Poses per exposure; 1 disables motion blur."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """After a frame: how many are done of how many, and where the last one went."""
+    """State of a run after one frame."""
 
     done: int
-    """Frames that are there, this run's and earlier ones."""
+    """Completed frames, including those of earlier runs."""
     total: int
     """Frames of the whole suite."""
     scene: Path
-    """The recording's folder."""
+    """Folder of the current recording."""
     renderer: str
-    """Which Mitsuba variant draws, and why that one."""
+    """Mitsuba version and variant, with the reason for the choice."""
 
 
 def simulate(
     name: str, out: Path, options: SimulateOptions | None = None
 ) -> Generator[Progress, None, None]:
-    """Renders a suite; a generator that says after each frame how far it is.
+    """Render a suite and yield the progress after each frame.
 
     Args:
-        name: one of `SUITES`.
-        out: a new folder, or one that the same call began.
-        options: what differs from the suite.
+        name: One of `SUITES`.
+        out: A new folder, or the folder of an interrupted run with the same settings.
+        options: Deviations from the suite's defaults.
 
     Raises:
-        InputError: Unknown suite, unusable options, no room on the disk, a folder begun with other
-            settings, or the extra `sim` is missing.
+        InputError: The suite is unknown, an option is out of range, the disk is too small, `out`
+            was begun with other settings, or the extra `sim` is not installed.
     """
     options = options or SimulateOptions()
     suite = _checked(name, options)
     frames = options.frames or suite.frames
     width, height = options.size or suite.size
-    per_room = frames + 3 * CALIBRATION_FRAMES + suite.changed
-    total, done = per_room * len(suite.rooms), 0
-    taken = RenderOptions(
+    total = (frames + 3 * CALIBRATION_FRAMES + suite.changed) * len(suite.rooms)
+    render = RenderOptions(
         samples=suite.samples if options.samples is None else options.samples,
         exposure_ev=options.exposure_ev,
         noise=options.noise,
@@ -143,86 +141,78 @@ def simulate(
         "size": [width, height],
         "seed": options.seed,
         "jpeg_quality": suite.jpeg_quality,
-        **asdict(taken),
+        **asdict(render),
     }
-    there = sum(1 for scene, *_ in suite.rooms for _ in (out / scene).glob("**/images/*.jpg"))
-    _refuse_full_disk(out, (total - there) * width * height * (4 if suite.depth else 2))
+    existing = sum(1 for scene, *_ in suite.rooms for _ in (out / scene).glob("**/images/*.jpg"))
+    _refuse_full_disk(out, (total - existing) * width * height * (4 if suite.depth else 2))
     mi = mitsuba()
     settings["renderer"] = f"mitsuba {mi.__version__} {mi.variant()}"
     lock_settings(out / "render.json", settings)
-    said = f"Mitsuba {mi.__version__}, {': '.join(choose_variant())}"
-    camera = default_camera(width, height)
-    panda = Panda()
+    renderer = f"Mitsuba {mi.__version__}, {': '.join(choose_variant())}"
+    panda, done = Panda(), 0
     for scene, kind, room_seed in suite.rooms:
-        place = room(kind, room_seed)
-        recordings = _recordings(place, panda, frames, options.seed, out / scene)
-        plans = [(place, recordings)]
+        before = room(kind, room_seed)
+        recordings = _recordings(before, panda, frames, options.seed, out / scene)
+        plans = [(before, recordings)]
         if suite.changed:
-            later, sweep = changed_room(place, options.seed), recordings[0][1]
+            after, sweep = changed_room(before, options.seed), recordings[0][1]
             train = SE3.stack([shot.base_from_camera for shot in sweep if shot.split == "train"])
-            shots = changed_shots(later, suite.changed, train, options.seed)
-            plans.append((later, [(out / scene / "changed", shots)]))
-        for where, recordings in plans:
-            writer = _Writer(where, panda, camera, suite, options.seed, taken, settings)
+            shots = changed_shots(after, suite.changed, train, options.seed)
+            plans.append((after, [(out / scene / "changed", shots)]))
+        for state, recordings in plans:
+            writer = _Writer(
+                room=state,
+                panda=panda,
+                camera=default_camera(width, height),
+                suite=suite,
+                seed=options.seed,
+                options=render,
+                settings=settings,
+            )
             for root, shots in recordings:
                 for _ in writer.record(root, scene, shots):
                     done += 1
-                    yield Progress(done, total, root, said)
+                    yield Progress(done, total, root, renderer)
 
 
 def _checked(name: str, options: SimulateOptions) -> Suite:
     if name not in SUITES:
         raise InputError(f"suite {name!r} is not known; use one of {', '.join(SUITES)}")
     if not 0 <= options.seed < RESERVED:
-        raise InputError(f"seed {options.seed}: use 0 to {RESERVED - 1}; later ones are reserved")
+        raise InputError(f"seed {options.seed}: use 0 to {RESERVED - 1}; higher ones are reserved")
     if options.frames is not None and options.frames < 2:
         raise InputError(f"frames {options.frames}: a room takes at least 2, one per split")
     if options.size is not None and min(options.size) < 16:
         raise InputError(f"size {options.size[0]}x{options.size[1]}: at least 16x16")
-    for what, count in (("samples", options.samples), ("blur steps", options.blur_steps)):
+    for option, count in (("samples", options.samples), ("blur steps", options.blur_steps)):
         if count is not None and count < 1:
-            raise InputError(f"{what} {count}: at least 1")
+            raise InputError(f"{option} {count}: at least 1")
     if not options.noise >= 0:  # also nan
         raise InputError(f"noise {options.noise:g}: at least 0")
     return SUITES[name]
 
 
 def _refuse_full_disk(out: Path, needed: int) -> None:
-    """A generous guess of what is yet to be written, before hours of rendering fill the disk."""
-    place = out.resolve()
-    while not place.exists():
-        place = place.parent
-    free = shutil.disk_usage(place).free
+    """Refuse before hours of rendering fill the disk; `needed` is a generous estimate in bytes."""
+    folder = out.resolve()
+    while not folder.exists():
+        folder = folder.parent
+    free = shutil.disk_usage(folder).free
     if needed > free:
         raise InputError(
             f"{out}: the frames take up to {needed / 1e9:.1f} GB and {free / 1e9:.1f} GB are free;"
-            f" ask for fewer --frames, a smaller --size, or another --out"
+            f" use fewer --frames, a smaller --size, or another --out"
         )
 
 
 def _recordings(
-    place: Room, panda: Panda, frames: int, seed: int, root: Path
+    before: Room, panda: Panda, frames: int, seed: int, root: Path
 ) -> list[tuple[Path, list[Shot]]]:
-    """All recordings of a room; writes the truth of the calibration ones."""
-    fixed, bumped, bump = fixed_shots(place, CALIBRATION_FRAMES, seed)
+    """Plan all recordings of a room and write the true calibration."""
+    fixed, bumped, bump = fixed_shots(before, CALIBRATION_FRAMES, seed)
     gripper_from_camera = hand_camera(seed)
-    joints, flanges = [], []
-    for angles in hand_joints(40 * CALIBRATION_FRAMES, seed):
-        flange = panda.base_from_flange(angles)
-        camera = flange @ gripper_from_camera
-        eye = camera.translation_m
-        if eye[2] > 0.2 and sees_work_area(camera) and place.is_free(eye[None], 0.05).all():
-            joints.append(angles)
-            flanges.append(flange)
-        if len(joints) == CALIBRATION_FRAMES:
-            break
-    else:
-        raise InputError(
-            f"seed {seed}: too few free arm poses for a hand camera in {place.kind} {place.seed};"
-            f" take another seed"
-        )
-    hand = hand_shots(flanges, np.array(joints), gripper_from_camera)
     folder = root / "calibration"
+    hand = _hand_shots(before, panda, gripper_from_camera, seed)
     folder.mkdir(parents=True, exist_ok=True)
     write_json(
         folder / "truth.json",
@@ -232,47 +222,59 @@ def _recordings(
         },
     )
     return [
-        (root, sweep_shots(place, frames, seed)),
+        (root, sweep_shots(before, frames, seed)),
         (folder / "fixed", fixed),
         (folder / "bumped", bumped),
         (folder / "hand", hand),
     ]
 
 
+def _hand_shots(before: Room, panda: Panda, gripper_from_camera: SE3, seed: int) -> list[Shot]:
+    """Select free arm poses whose hand camera sees the work area."""
+    shots: list[Shot] = []
+    for joints in hand_joints(40 * CALIBRATION_FRAMES, seed):
+        camera = panda.base_from_flange(joints) @ gripper_from_camera
+        eye = camera.translation_m
+        if eye[2] > 0.2 and sees_work_area(camera) and before.is_free(eye[None], 0.05).all():
+            shots.append(Shot(f"hand-{len(shots):06d}", "test", camera, joints))
+        if len(shots) == CALIBRATION_FRAMES:
+            return shots
+    raise InputError(
+        f"seed {seed}: too few free arm poses for a hand camera in {before.kind} {before.seed};"
+        f" use another seed"
+    )
+
+
+@dataclass(kw_only=True, eq=False)
 class _Writer:
     """Renders the missing frames of recordings in one room."""
 
-    def __init__(
-        self,
-        place: Room,
-        panda: Panda,
-        camera: Camera,
-        suite: Suite,
-        seed: int,
-        options: RenderOptions,
-        settings: dict[str, object],
-    ):
-        self._place, self._panda, self._camera = place, panda, camera
-        self._suite, self._seed, self._options, self._settings = suite, seed, options, settings
-        self._renderer: Renderer | None = None
-        self._joints: np.ndarray | None = None
+    room: Room
+    panda: Panda
+    camera: Camera
+    suite: Suite
+    seed: int
+    options: RenderOptions
+    settings: dict[str, object]
+    _renderer: Renderer | None = field(default=None, init=False)
+    _joints_rad: np.ndarray = field(default_factory=lambda: np.empty(0), init=False)
 
     def record(self, root: Path, scene: str, shots: list[Shot]) -> Iterator[None]:
-        """Renders what is not there yet, then writes scene.json; yields after each frame."""
+        """Render missing frames, then write scene.json. Yields after each frame."""
         frames = []
         for i, shot in enumerate(shots):
             image, depth = root / f"images/{i:06d}.jpg", root / f"depth/{i:06d}.png"
-            if not (image.exists() and (depth.exists() or not self._suite.depth)):
+            if not (image.exists() and (depth.exists() or not self.suite.depth)):
                 following = shots[i + 1] if i + 1 < len(shots) else shot
                 self._render(shot, following, i, image, depth)
             frames.append(
                 Frame(
                     shot.name,
                     image,
-                    self._camera,
+                    self.camera,
                     shot.base_from_camera,
-                    self._panda.base_from_flange(shot.joints_rad),
-                    depth if self._suite.depth else None,
+                    self.panda.base_from_flange(shot.joints_rad),
+                    depth if self.suite.depth else None,
                     tuple(float(angle) for angle in shot.joints_rad),
                 )
             )
@@ -281,38 +283,44 @@ class _Writer:
             return
         name = scene if root.name == scene else f"{scene}-{root.name}"
         with generic.SceneWriter(root, name) as writer:
-            writer.render = {**self._settings, "room_seed": self._place.seed}
+            writer.render = {**self.settings, "room_seed": self.room.seed}
             for frame, shot in zip(frames, shots, strict=True):
                 writer.add(frame, shot.split)
 
     def _render(self, shot: Shot, following: Shot, i: int, image: Path, depth: Path) -> None:
         import cv2
 
-        options = self._options
         if self._renderer is None:
-            arm = self._panda.meshes(shot.joints_rad)
-            self._renderer = Renderer(self._place.meshes() + arm)
-        elif self._joints is None or (self._joints != shot.joints_rad).any():
-            self._renderer.move({m.name: m for m, _ in self._panda.meshes(shot.joints_rad)})
-        self._joints = shot.joints_rad
-        path = _shutter(shot, following, options.blur_steps)
-        # No two frames have one pattern of noise.
-        origin = [self._place.seed, self._seed, i, *shot.name.encode()]
+            self._renderer = Renderer(self.room.meshes() + self.panda.meshes(shot.joints_rad))
+        elif not np.array_equal(self._joints_rad, shot.joints_rad):
+            arm = self.panda.meshes(shot.joints_rad)
+            self._renderer.move({mesh.name: mesh for mesh, _ in arm})
+        self._joints_rad = shot.joints_rad
+        path = _shutter(shot, following, self.options.blur_steps)
+        # Every frame has its own noise pattern.
+        origin = [self.room.seed, self.seed, i, *shot.name.encode()]
         seed = int(np.random.default_rng(origin).integers(2**31))
-        colour = self._renderer.render(self._camera, path, options, seed)
-        if self._suite.depth:
-            metres = self._renderer.depth(self._camera, shot.base_from_camera)
+        colour = self._renderer.render(self.camera, path, self.options, seed)
+        if self.suite.depth:
+            metres = self._renderer.depth(self.camera, shot.base_from_camera)
             millimetres = np.round(np.minimum(metres, 65.0) * 1000).astype(np.uint16)
             depth.parent.mkdir(parents=True, exist_ok=True)
             write_bytes(depth, cv2.imencode(".png", millimetres)[1].tobytes())
-        quality = [cv2.IMWRITE_JPEG_QUALITY, self._suite.jpeg_quality]
-        bgr = np.ascontiguousarray(colour[..., ::-1])
-        image.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(image, cv2.imencode(".jpg", bgr, quality)[1].tobytes())
+        write_jpeg(image, colour, self.suite.jpeg_quality)
+
+
+def write_jpeg(path: Path, image: np.ndarray, quality: int) -> None:
+    """Write a (H, W, 3) uint8 RGB image; missing folders are created."""
+    import cv2
+
+    bgr = np.ascontiguousarray(image[..., ::-1])
+    encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, encoded.tobytes())
 
 
 def _shutter(shot: Shot, following: Shot, steps: int) -> SE3:
-    """Poses over a third of the way to the next frame, centred on the frame's own pose."""
+    """Poses over a third of the motion to the next frame, centred on the frame's own pose."""
     pose = shot.base_from_camera
     if steps <= 1 or following.split != shot.split:
         return pose

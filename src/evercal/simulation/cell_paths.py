@@ -1,12 +1,12 @@
-"""Where cameras go: smooth sweeps to learn from and to be judged on, and calibration recordings.
+"""Camera paths: smooth training and test sweeps, and calibration recordings.
 
-A sweep moves over a dome round the work area. Train and test take the same kind of way with other
-phases; test poses that come too near a training pose are left out, and the sweep is drawn finer
-until enough remain.
+A sweep moves on a dome around the work area. Training and test sweeps differ in their phases. Test
+poses close to a training pose are removed, and the sweep is sampled more densely until enough
+poses remain.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -17,11 +17,11 @@ from evercal.simulation.furnished.panda import HOME_RAD
 from evercal.simulation.furnished.rooms import Room
 
 WORK_AREA_M = np.array([0.45, 0.0, 0.15])
-"""What cameras look towards, base frame."""
+"""Centre of the work area that cameras look at, base frame."""
 NEAR_M, NEAR_RAD = 0.05, np.deg2rad(5.0)
 TOO_NEAR_M, TOO_NEAR_RAD = 0.012, np.deg2rad(1.2)
 NEAR_SHARE = 0.08
-"""At most this share of test frames lies within NEAR of a training frame; the promise is 0.10."""
+"""Largest fraction of test frames within NEAR_M and NEAR_RAD of a training frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Shot:
     name: str
     """Unique within the recording."""
     split: Literal["train", "test"]
-    """What the frame is for."""
+    """Training or test."""
     base_from_camera: SE3
     """Camera pose, shape ()."""
     joints_rad: np.ndarray
@@ -39,15 +39,15 @@ class Shot:
 
 
 def sweep_shots(room: Room, frames: int, seed: int) -> list[Shot]:
-    """A moving camera: seven in ten frames to learn from, three to be judged on.
+    """Plan a moving camera: 70 % training frames, 30 % test frames.
 
     Args:
-        room: what the camera must not fly into.
-        frames: train and test together.
-        seed: of both paths.
+        room: The room whose objects the camera avoids.
+        frames: Number of training and test frames together.
+        seed: Seed of both paths.
 
     Raises:
-        InputError: The room leaves no free way.
+        InputError: The room has no free path.
     """
     train_count = max(1, round(0.7 * frames))
     train = _free_path(room, train_count, [seed, 1])
@@ -61,65 +61,66 @@ def sweep_shots(room: Room, frames: int, seed: int) -> list[Shot]:
 
 
 def changed_shots(room: Room, frames: int, train: SE3, seed: int) -> list[Shot]:
-    """A moving camera in a room that was changed, on a test path of its own draw.
+    """Plan the test frames of a moving camera in a changed room.
 
     Args:
-        room: after the change.
-        frames: all of them test frames.
-        train: (n,) base_from_camera of the training frames, taken before the change.
-        seed: of the paths of camera and arm.
+        room: The room after the change.
+        frames: Number of test frames.
+        train: base_from_camera of the training frames before the change, shape (n,).
+        seed: Seed of the camera and arm paths.
 
     Raises:
-        InputError: The room leaves no free way.
+        InputError: The room has no free path.
     """
     path = _far_from(room, frames, train, [seed, 10])
     arm = _arm_path(frames, [seed, 11], hold=12)
     return [Shot(f"changed-{i:06d}", "test", path[i], arm[i]) for i in range(frames)]
 
 
-def fixed_shots(room: Room, frames: int, seed: int) -> tuple[list[Shot], list[Shot], SE3]:
-    """A fixed camera with the arm moving; the same after a bump.
+class FixedShots(NamedTuple):
+    """Frames of a fixed camera before and after a bump."""
 
-    Returns:
-        Shots before, shots after, and camera_before_from_camera_after, the bump: 5 mm along a
-        random direction for even seeds, 0.5 deg about a random axis for odd ones.
+    before: list[Shot]
+    """Frames before the bump."""
+    after: list[Shot]
+    """Frames after the bump."""
+    bump: SE3
+    """camera_before_from_camera_after."""
+
+
+def fixed_shots(room: Room, frames: int, seed: int) -> FixedShots:
+    """Plan a fixed camera with a moving arm, before and after a bump.
+
+    The bump is 5 mm in a random direction for even seeds, 0.5 deg about a random axis for odd ones.
     """
     rng = np.random.default_rng([seed, 4])
     pose = _free_path(room, 200, [seed, 5])[int(rng.integers(200))]
-    way = rng.standard_normal(3)
-    way /= np.linalg.norm(way)
+    direction = rng.standard_normal(3)
+    direction /= np.linalg.norm(direction)
     tangent = np.zeros(6)
     if seed % 2 == 0:
-        tangent[:3] = 0.005 * way
+        tangent[:3] = 0.005 * direction
     else:
-        tangent[3:] = np.deg2rad(0.5) * way
+        tangent[3:] = np.deg2rad(0.5) * direction
     bump = SE3.exp(tangent)
     arms = _arm_path(2 * frames, [seed, 6], hold=1, cycles=3.0)
     before = [Shot(f"fixed-{i:06d}", "test", pose, arms[i]) for i in range(frames)]
     moved = pose @ bump
     after = [Shot(f"bumped-{i:06d}", "test", moved, arms[frames + i]) for i in range(frames)]
-    return before, after, bump
-
-
-def hand_shots(panda_flange: list[SE3], joints: np.ndarray, gripper_from_camera: SE3) -> list[Shot]:
-    """A camera on the flange."""
-    return [
-        Shot(f"hand-{i:06d}", "test", pose @ gripper_from_camera, joints[i])
-        for i, pose in enumerate(panda_flange)
-    ]
+    return FixedShots(before, after, bump)
 
 
 def hand_camera(seed: int) -> SE3:
-    """gripper_from_camera: 8 cm beside the flange, looking along the fingers, a little askew."""
+    """gripper_from_camera: 8 cm beside the flange, along the fingers, slightly tilted."""
     rng = np.random.default_rng([seed, 7])
     tangent = np.concatenate([rng.uniform(-0.01, 0.01, 3), rng.uniform(-0.12, 0.12, 3)])
     return SE3(np.array([1.0, 0, 0, 0]), np.array([0.085, 0.0, 0.02])) @ SE3.exp(tangent)
 
 
 def hand_joints(frames: int, seed: int) -> np.ndarray:
-    """(frames, 7) joint angles with the flange high and tilted, its camera looking over the table.
+    """Random joint angles with the flange high and tilted over the table, shape (frames, 7).
 
-    Not every one shows the work area: see `sees_work_area`.
+    Filter them with `sees_work_area`.
     """
     rng = np.random.default_rng([seed, 8])
     start = np.array([0.0, -0.9, 0.0, -2.1, 0.0, 2.0, 0.785])
@@ -128,14 +129,14 @@ def hand_joints(frames: int, seed: int) -> np.ndarray:
 
 
 def sees_work_area(base_from_camera: SE3) -> bool:
-    """Whether the middle of the work area is near the optical axis (25 deg) and 0.5 m away."""
+    """Whether the work area is within 25 deg of the optical axis and at least 0.5 m away."""
     middle = base_from_camera.inverse().apply(WORK_AREA_M)
     distance = float(np.linalg.norm(middle))
     return distance > 0.5 and middle[2] > np.cos(np.deg2rad(25.0)) * distance
 
 
 def _arm_path(frames: int, seed: list[int], hold: int, cycles: float | None = None) -> np.ndarray:
-    """(frames, 7) joint angles round the ready position; the arm rests `hold` frames at a time."""
+    """Joint angles around the ready position, constant for `hold` frames, shape (frames, 7)."""
     rng = np.random.default_rng(seed)
     step = np.arange(frames) // hold * hold
     t = step * (2 * np.pi * (cycles or 1.0 + frames / 400) / max(frames, 1))
@@ -146,24 +147,24 @@ def _arm_path(frames: int, seed: list[int], hold: int, cycles: float | None = No
 
 
 def _free_path(room: Room, frames: int, seed: list[int]) -> SE3:
-    """A sweep that keeps out of everything, shape (frames,)."""
+    """A sweep that avoids all objects, shape (frames,)."""
     for attempt in range(300):
         path = _sweep(frames, np.random.default_rng([*seed, room.seed, attempt]))
         if is_clear(room, path.translation_m).all():
             return path
-    raise InputError(f"{room.kind} {room.seed}: no free camera path; take another seed")
+    raise InputError(f"{room.kind} {room.seed}: no free camera path; use another seed")
 
 
 def is_clear(room: Room, points: np.ndarray) -> np.ndarray:
-    """Outside all things, and out of the arm's reach above its table."""
+    """Whether points (n, 3) are outside all objects and outside the arm's reach above its table."""
     near_arm = np.linalg.norm(points - (0.2, 0.0, 0.45), axis=-1) < 0.62
     return room.is_free(points) & ~near_arm
 
 
 def _sweep(frames: int, rng: np.random.Generator) -> SE3:
-    """Smooth in direction, distance, height and gaze; one turn per some hundred frames."""
-    turns = 1.0 + frames / 500
-    t = np.linspace(0, 2 * np.pi * turns, max(frames, 2), endpoint=False)[:frames]
+    """A path that is smooth in direction, distance, height and gaze, shape (frames,)."""
+    cycles = 1.0 + frames / 500
+    t = np.linspace(0, 2 * np.pi * cycles, max(frames, 2), endpoint=False)[:frames]
 
     def wave(low: float, high: float, speed: float) -> np.ndarray:
         phase = rng.uniform(0, 2 * np.pi, 2)
@@ -177,31 +178,25 @@ def _sweep(frames: int, rng: np.random.Generator) -> SE3:
         [wave(-0.45, 0.15, 0.9), wave(-0.35, 0.35, 1.2), wave(-0.1, 0.3, 1.4)], -1
     )
     roll = wave(-0.12, 0.12, 0.8)
-    way = np.stack(
-        [
-            np.cos(azimuth) * np.cos(elevation),
-            np.sin(azimuth) * np.cos(elevation),
-            np.sin(elevation),
-        ],
-        -1,
-    )
-    position = WORK_AREA_M + distance[:, None] * way
-    return SE3.stack([look_at(*given) for given in zip(position, target, roll, strict=True)])
+    x, y = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
+    direction = np.stack([x, y, np.sin(elevation)], -1)
+    position = WORK_AREA_M + distance[:, None] * direction
+    return SE3.stack([look_at(*view) for view in zip(position, target, roll, strict=True)])
 
 
 def _far_from(room: Room, frames: int, train: SE3, seed: list[int]) -> SE3:
-    """A sweep of which few frames lie near a training frame, none very near, shape (frames,)."""
+    """A sweep with few poses near a training pose and none very near, shape (frames,)."""
     if frames == 0:
         return SE3.stack([])
-    for finer in (1.0, 1.15, 1.3, 1.6, 2.0, 3.0):
+    for density in (1.0, 1.15, 1.3, 1.6, 2.0, 3.0):
         for attempt in range(4):
-            path = _free_path(room, int(np.ceil(frames * finer)), [*seed, attempt])
+            path = _free_path(room, int(np.ceil(frames * density)), [*seed, attempt])
             metres, radians = pose_distance(path[:, None], train[None])
             too_near = ((metres < TOO_NEAR_M) & (radians < TOO_NEAR_RAD)).any(1)
             near = ((metres < NEAR_M) & (radians < NEAR_RAD)).any(1)
             far = np.flatnonzero(~near)
             allowed = np.flatnonzero(near & ~too_near)[: int(NEAR_SHARE * frames)]
-            kept = np.sort(np.concatenate([far, allowed]))
-            if len(kept) >= frames and near[kept[:frames]].mean() <= NEAR_SHARE:
-                return path[kept[:frames]]
-    raise InputError(f"{room.kind} {room.seed}: no test path apart from training; another seed may")
+            selected = np.sort(np.concatenate([far, allowed]))
+            if len(selected) >= frames and near[selected[:frames]].mean() <= NEAR_SHARE:
+                return path[selected[:frames]]
+    raise InputError(f"{room.kind} {room.seed}: no test path away from training; use another seed")

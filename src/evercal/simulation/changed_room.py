@@ -1,7 +1,7 @@
-"""The same room on another day: some small things moved or gone, other lamps on.
+"""A room after a change: some small objects moved or removed, other lamps on.
 
-Walls, windows, furniture and what hangs on the walls stay as they were, so that the base frame and
-most of what a camera sees still hold.
+Walls, windows, furniture and wall objects stay, so the base frame and most of the view are
+unchanged.
 """
 
 from dataclasses import replace
@@ -18,30 +18,30 @@ SMALL = frozenset(
         "mug", "plant", "plates", "pot", "radio", "vase",
     )
 )  # fmt: skip
-"""Kinds of things that people pick up; everything else in a room is furniture or hangs."""
+"""Kinds of objects that people pick up; all others are furniture or wall objects."""
 CHANGED_SHARE = 1 / 3
-"""Of the small things; every second one of them moves, the others go."""
+"""Fraction of small objects that change; every second one moves, the others are removed."""
 MOVED_M = 0.15
-"""A thing that moves goes at least this far."""
+"""Smallest distance that an object moves."""
 
 _GAP_M = np.array([0.004, 0.004, 0.0])
-"""Between things side by side; a thing may touch what it stands on."""
+"""Gap between neighbouring objects; an object may touch the surface below it."""
 _FOOT_M = np.array([[-0.2, -0.2, 0.0], [0.2, 0.2, 1.26]])
-"""Stays free for the arm's foot, base frame."""
+"""Box that stays free for the foot of the arm, base frame."""
 _WORK_M = np.array([0.45, 0.0])
-"""Middle of the work area on the robot's table, base frame; 0.16 m round it stay free."""
+"""Centre of the work area on the robot's table, base frame; 0.16 m around it stay free."""
 
 
 def changed_room(before: Room, seed: int) -> Room:
-    """The room after a change; the same room and seed give the same change.
+    """Change a room. The same room and seed give the same change.
 
     Args:
-        before: is left as it is.
-        seed: of the change.
+        before: The room before the change; it is not modified.
+        seed: Seed of the change.
 
     Returns:
-        A room of the same kind and seed in the same base frame. Things that nobody touched keep
-        their order; lamps that are off or dimmed have new materials.
+        A room of the same kind and seed in the same base frame. Unchanged objects keep their
+        order; lamps that are off or dimmed have new materials.
     """
     items = _rearranged(before, np.random.default_rng([seed, 12, before.seed]))
     lamps = [i for i, item in enumerate(items) if any(mat.emission > 0 for _, mat in item.parts)]
@@ -57,10 +57,10 @@ def changed_room(before: Room, seed: int) -> Room:
 
 
 def _factors(lamps: int, rng: np.random.Generator) -> list[float]:
-    """For each lamp its light in parts of what it was; 0 is off.
+    """Brightness factor of each lamp; 0 is off.
 
-    At least one goes off, and one stays on if there are several. All that stay on are dimmed or
-    turned up alike (0.44 to 2.3), as surfaces whose materials have one name are drawn as one.
+    At least one lamp goes off, and one of several stays on. Lamps that stay on share one factor
+    (0.44 to 2.3), because surfaces whose materials have the same name are rendered as one.
     """
     off = rng.permutation(lamps) < rng.integers(1, max(2, lamps))
     strength = float(2 ** rng.uniform(-1.2, 1.2))
@@ -68,7 +68,7 @@ def _factors(lamps: int, rng: np.random.Generator) -> list[float]:
 
 
 def _dimmed(material: Material, factor: float) -> Material:
-    """With `factor` times the light; 0 is off, and nothing happens to what is no lamp."""
+    """The material with `factor` times its emission; other materials are returned unchanged."""
     if material.emission == 0:
         return material
     name = material.name if factor > 0 else f"{material.name} off"
@@ -76,53 +76,54 @@ def _dimmed(material: Material, factor: float) -> Material:
 
 
 def _rearranged(before: Room, rng: np.random.Generator) -> list[Item]:
-    """The items with a share of the small ones at other places or left out."""
+    """The items after a share of the small ones moved or were removed."""
     small = [i for i, item in enumerate(before.items) if item.kind in SMALL]
     touched = rng.choice(small, round(CHANGED_SHARE * len(small)), replace=False)
-    left: dict[int, Item] = dict(enumerate(before.items))
+    remaining: dict[int, Item] = dict(enumerate(before.items))
     for number, i in enumerate(touched.tolist()):
-        thing = left.pop(i)
-        moved = _elsewhere(thing, before, list(left.values()), rng) if number % 2 == 0 else None
+        item = remaining.pop(i)
+        rest = list(remaining.values())
+        moved = _moved(item, before, rest, rng) if number % 2 == 0 else None
         if moved is not None:
-            left[i] = moved
-    return [left[i] for i in sorted(left)]
+            remaining[i] = moved
+    return [remaining[i] for i in sorted(remaining)]
 
 
-def _elsewhere(thing: Item, place: Room, rest: list[Item], rng: np.random.Generator) -> Item | None:
-    """At a free place: on the floor for what stood there, else on a top; None if none is found."""
-    low, high = thing.bounds_m()
+def _moved(item: Item, room: Room, rest: list[Item], rng: np.random.Generator) -> Item | None:
+    """The item at a free position on the floor or on furniture; None after 60 failed attempts."""
+    low, high = item.bounds_m()
     middle = (low + high)[:2] / 2
-    at_origin = thing.placed(-float(middle[0]), -float(middle[1]), -float(low[2]))
-    on_floor = low[2] < place.low_m[2] + 0.01
-    tops = [(item, top) for item in rest for top in item.tops]
+    at_origin = item.placed(-float(middle[0]), -float(middle[1]), -float(low[2]))
+    on_floor = low[2] < room.low_m[2] + 0.01
+    tops = [(other, top) for other in rest for top in other.tops]
     area = np.array([(x1 - x0) * (y1 - y0) for _, (x0, x1, y0, y1, _) in tops])
     for _ in range(60):
-        host, z = None, float(place.low_m[2])
+        host, z = None, float(room.low_m[2])
         if on_floor:
-            inner = place.low_m[:2] + 0.25, place.high_m[:2] - 0.25
+            inner = room.low_m[:2] + 0.25, room.high_m[:2] - 0.25
             spot = rng.uniform(*inner)
-            # As when the room was furnished: along the walls, not where people walk.
-            if np.minimum(spot - place.low_m[:2], place.high_m[:2] - spot).min() >= 0.9:
+            # Along the walls, as in furnishing: people walk in the middle of the room.
+            if np.minimum(spot - room.low_m[:2], room.high_m[:2] - spot).min() >= 0.9:
                 continue
         else:
             host, (x0, x1, y0, y1, z) = tops[rng.choice(len(tops), p=area / area.sum())]
             spot = rng.uniform((x0, y0), (x1, y1))
             z += 0.001
-        turn = float(rng.uniform(0, 2 * np.pi))
-        moved = at_origin.placed(float(spot[0]), float(spot[1]), z, turn)
-        in_the_way = host is rest[0] and np.hypot(*(spot - _WORK_M)) < 0.16
+        yaw = float(rng.uniform(0, 2 * np.pi))
+        moved = at_origin.placed(float(spot[0]), float(spot[1]), z, yaw)
+        blocks_work = host is rest[0] and np.hypot(*(spot - _WORK_M)) < 0.16
         far = np.hypot(*(spot - middle)) >= MOVED_M
-        if far and not in_the_way and _fits(moved, place, rest, host):
+        if far and not blocks_work and _fits(moved, room, rest, host):
             return moved
     return None
 
 
-def _fits(thing: Item, place: Room, rest: list[Item], host: Item | None) -> bool:
-    """Whether it is in the room and in no other thing; of its host, the parts count one by one."""
-    bounds = thing.bounds_m()
-    if (bounds[0, :2] < place.low_m[:2]).any() or (bounds[1, :2] > place.high_m[:2]).any():
+def _fits(item: Item, room: Room, rest: list[Item], host: Item | None) -> bool:
+    """Whether the item is inside the room and overlaps no other item and no part of its host."""
+    bounds = item.bounds_m()
+    if (bounds[0, :2] < room.low_m[:2]).any() or (bounds[1, :2] > room.high_m[:2]).any():
         return False
-    boxes = [_FOOT_M, *(item.bounds_m() for item in rest if item is not host)]
+    boxes = [_FOOT_M, *(other.bounds_m() for other in rest if other is not host)]
     if host is not None:
         boxes += [Item("part", [part]).bounds_m() for part in host.parts]
     low, high = np.stack(boxes).swapaxes(0, 1)

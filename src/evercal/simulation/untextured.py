@@ -1,4 +1,4 @@
-"""A room of the simulator without its textures, to lay over images of it."""
+"""Untextured renderings of a simulated room, for comparison with images of it."""
 
 import numpy as np
 
@@ -14,15 +14,15 @@ from evercal.simulation.furnished.rooms import room
 def untextured_renders(
     model: tuple[str, int], frames: list[Frame], poses: list[SE3]
 ) -> list[np.ndarray]:
-    """Render the bare shapes of a room.
+    """Render a room and its robot in one colour.
 
     Args:
-        model: kind and seed of the room.
-        frames: their cameras and joint angles are used.
-        poses: base_from_camera, one for each frame.
+        model: Kind and seed of the room.
+        frames: Frames with the cameras and joint angles to use.
+        poses: base_from_camera for each frame.
 
     Returns:
-        (H, W, 3) uint8 images; an empty list where the extra `sim` is not installed.
+        Images (H, W, 3) uint8; an empty list if the extra `sim` is not installed.
     """
     try:
         panda = Panda()

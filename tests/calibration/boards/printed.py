@@ -1,4 +1,4 @@
-"""Boards printed and photographed: images with known corners."""
+"""Simulated photographs of printed boards with known corners."""
 
 import cv2
 import numpy as np
@@ -11,15 +11,21 @@ CAMERA = Camera(640, 480, 600, 602, 318, 242)
 CHESSBOARD = Board("chessboard", 0.03, 9, 6)
 CHARUCO = Board("charuco", 0.04, 6, 5, 0.03, "4X4_50")
 TAG = Board("apriltag", 0.08, dictionary="APRILTAG_36h11", tag=3)
-MIDDLE = {"chessboard": (0.12, 0.075, 0), "charuco": (0.12, 0.1, 0), "apriltag": (0, 0, 0)}
+CENTRE = {"chessboard": (0.12, 0.075, 0), "charuco": (0.12, 0.1, 0), "apriltag": (0, 0, 0)}
 _PER_METRE = 6000
 
 
+def grid(columns: int, rows: int) -> np.ndarray:
+    """Return (columns * rows, 3) chessboard corners with squares of 30 mm."""
+    x, y = np.meshgrid(np.arange(columns), np.arange(rows))
+    return 0.03 * np.stack([x, y, 0 * x], -1).reshape(-1, 3).astype(float)
+
+
 def printed(board: Board) -> tuple[np.ndarray, np.ndarray]:
-    """A print of a board and the (3, 3) map from its metres to the print's pixels."""
+    """Return the print of a board and the (3, 3) map from metres to pixels of the print."""
     side = board.size_m * _PER_METRE
     if board.kind == "chessboard":
-        # A square more than inner corners each way, and a white rim of one square.
+        # One square more than inner corners, and a white margin of one square.
         columns, rows = board.columns + 3, board.rows + 3
         y, x = np.mgrid[: int(rows * side), : int(columns * side)]
         i, j = (np.floor((v + 0.5) / side).astype(int) - 1 for v in (x, y))
@@ -28,26 +34,28 @@ def printed(board: Board) -> tuple[np.ndarray, np.ndarray]:
         image = np.where(inside & ((i + j) % 2 == 1), 20, 230).astype(np.uint8)
         start = 2 * side - 0.5
         return image, np.array([[_PER_METRE, 0, start], [0, _PER_METRE, start], [0, 0, 1.0]])
-    words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{board.dictionary}"))
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{board.dictionary}"))
     if board.kind == "charuco":
         page = cv2.aruco.CharucoBoard(
-            (board.columns, board.rows), board.size_m, board.marker_m, words
+            (board.columns, board.rows), board.size_m, board.marker_m, dictionary
         )
-        rim = int(side)
-        size = (int(board.columns * side) + 2 * rim, int(board.rows * side) + 2 * rim)
-        start = rim - 0.5
-        image = page.generateImage(size, marginSize=rim)
+        margin = int(side)
+        size = (int(board.columns * side) + 2 * margin, int(board.rows * side) + 2 * margin)
+        start = margin - 0.5
+        image = page.generateImage(size, marginSize=margin)
         return image, np.array([[_PER_METRE, 0, start], [0, _PER_METRE, start], [0, 0, 1.0]])
     count = int(side)
-    rim = count // 3
-    image = np.full((count + 2 * rim, count + 2 * rim), 255, np.uint8)
-    image[rim:-rim, rim:-rim] = cv2.aruco.generateImageMarker(words, board.tag or 0, count)
-    middle = rim + count / 2 - 0.5
-    return image, np.array([[_PER_METRE, 0, middle], [0, -_PER_METRE, middle], [0, 0, 1.0]])
+    margin = count // 3
+    image = np.full((count + 2 * margin, count + 2 * margin), 255, np.uint8)
+    image[margin:-margin, margin:-margin] = cv2.aruco.generateImageMarker(
+        dictionary, board.tag or 0, count
+    )
+    centre = margin + count / 2 - 0.5
+    return image, np.array([[_PER_METRE, 0, centre], [0, -_PER_METRE, centre], [0, 0, 1.0]])
 
 
 def photographed(board: Board, camera_from_board: SE3, seed: int = 0) -> np.ndarray:
-    """(480, 640, 3) uint8 RGB of a print, somewhat blurred and noisy."""
+    """Return a blurred and noisy image of a print, (480, 640, 3) uint8 RGB."""
     image, to_print = printed(board)
     rotation = camera_from_board.rotation_matrix()
     plane = np.column_stack([rotation[:, 0], rotation[:, 1], camera_from_board.translation_m])
@@ -64,13 +72,13 @@ def photographed(board: Board, camera_from_board: SE3, seed: int = 0) -> np.ndar
 
 
 def view_of(board: Board, seed: int) -> SE3:
-    """camera_from_board of a board seen from some side, rolled by any angle."""
+    """Return camera_from_board of a tilted board with a random roll."""
     rng = np.random.default_rng(seed)
-    turn = Rotation.from_rotvec(np.array([0, 0, rng.uniform(-3, 3)]))
-    turn = Rotation.from_rotvec(rng.normal(0, 0.3, 3)) * turn
+    rotation = Rotation.from_rotvec(np.array([0, 0, rng.uniform(-3, 3)]))
+    rotation = Rotation.from_rotvec(rng.normal(0, 0.3, 3)) * rotation
     if board.kind == "apriltag":
-        turn = turn * Rotation.from_euler("x", np.pi)  # its z axis looks at the camera
-    middle = np.array([0, 0, 0.4 if board.kind == "apriltag" else 0.55])
-    middle = middle + rng.normal(0, 0.02, 3)
-    place = middle - turn.apply(MIDDLE[board.kind])
-    return SE3(turn.as_quat(scalar_first=True), place)
+        rotation = rotation * Rotation.from_euler("x", np.pi)  # z points towards the camera
+    centre = np.array([0, 0, 0.4 if board.kind == "apriltag" else 0.55])
+    centre = centre + rng.normal(0, 0.02, 3)
+    translation = centre - rotation.apply(CENTRE[board.kind])
+    return SE3(rotation.as_quat(scalar_first=True), translation)

@@ -1,4 +1,4 @@
-"""What ROS reads: flags of tf2_ros, launch files that run, fields of messages, URDF."""
+"""Formats of ROS, read the way tf2_ros, launch, yourdfpy and easy_handeye read them."""
 
 import argparse
 import io
@@ -17,52 +17,48 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evercal.calibration.calibration import Mount
-from evercal.calibration.export import ros
-from evercal.calibration.export.request import Export
-from evercal.calibration.export.urdf import urdf
+from evercal.calibration.export import export_calibration
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.poses.camera_file import read_camera
 
-from .drawn import CAMERA, made, poses, quaternion_matrix
+from .random_poses import calibration_of, poses, quaternion_matrix
 
-mounts = st.sampled_from(["eye_to_hand", "eye_in_hand"])
-drawn = given(poses(), mounts)
+poses_and_mounts = given(poses(), st.sampled_from(["eye_to_hand", "eye_in_hand"]))
 few = settings(deadline=None, max_examples=40)
-
-
-def tf2_flags(words: list[str]) -> argparse.Namespace:
-    """As static_transform_publisher takes them."""
-    parser = argparse.ArgumentParser()
-    for name in ("x", "y", "z", "qx", "qy", "qz", "qw"):
-        parser.add_argument(f"--{name}", type=float, required=True)
-    parser.add_argument("--frame-id", required=True)
-    parser.add_argument("--child-frame-id", required=True)
-    return parser.parse_args(words)
-
-
-def check_flags(words: list[str], pose: SE3, parent: str) -> None:
-    # argparse takes -1e-05 for an option, tf2 does not.
-    parsed = tf2_flags([f"{a}={b}" for a, b in zip(words[::2], words[1::2], strict=True)])
-    assert (parsed.frame_id, parsed.child_frame_id) == (parent, "cam/optical-frame")
-    position = (parsed.x, parsed.y, parsed.z)
-    matrix = quaternion_matrix(parsed.qx, parsed.qy, parsed.qz, parsed.qw, position)
-    np.testing.assert_allclose(matrix, pose.matrix(), atol=1e-9)
+CHILD = "cam/optical-frame"
 
 
 def parent_of(mount: Mount) -> str:
     return "base_link" if mount == "eye_to_hand" else "tool0"
 
 
-@drawn
+def check_flags(words: list[str], pose: SE3, parent: str) -> None:
+    """Parse the flags of static_transform_publisher."""
+    parser = argparse.ArgumentParser()
+    for name in ("x", "y", "z", "qx", "qy", "qz", "qw"):
+        parser.add_argument(f"--{name}", type=float, required=True)
+    parser.add_argument("--frame-id", required=True)
+    parser.add_argument("--child-frame-id", required=True)
+    # argparse would read -1e-05 as an option; tf2 does not.
+    pairs = zip(words[::2], words[1::2], strict=True)
+    parsed = parser.parse_args([f"{flag}={value}" for flag, value in pairs])
+    assert (parsed.frame_id, parsed.child_frame_id) == (parent, CHILD)
+    position = (parsed.x, parsed.y, parsed.z)
+    matrix = quaternion_matrix(parsed.qx, parsed.qy, parsed.qz, parsed.qw, position)
+    np.testing.assert_allclose(matrix, pose.matrix(), atol=1e-9)
+
+
+@poses_and_mounts
 @few
-def test_shell_line(pose: SE3, mount: Mount) -> None:
-    words = shlex.split(ros.static_transform_publisher(Export(made(pose, mount))))
+def test_shell_command(pose: SE3, mount: Mount) -> None:
+    text = export_calibration(calibration_of(pose, mount), "static_transform_publisher")
+    words = shlex.split(text)
     assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
     check_flags(words[4:], pose, parent_of(mount))
 
 
-@drawn
+@poses_and_mounts
 @few
 def test_launch_file_runs(pose: SE3, mount: Mount) -> None:
     launch, actions = types.ModuleType("launch"), types.ModuleType("launch_ros.actions")
@@ -70,10 +66,11 @@ def test_launch_file_runs(pose: SE3, mount: Mount) -> None:
     actions.Node = dict  # pyright: ignore[reportAttributeAccessIssue]
     stand_ins = {"launch": launch, "launch_ros": types.ModuleType("launch_ros")}
     namespace: dict[str, Any] = {}
+    text = export_calibration(calibration_of(pose, mount), "launch_py")
     with pytest.MonkeyPatch.context() as patch:
         for name, module in {**stand_ins, "launch_ros.actions": actions}.items():
             patch.setitem(sys.modules, name, module)
-        exec(compile(ros.launch_py(Export(made(pose, mount))), "x.launch.py", "exec"), namespace)
+        exec(compile(text, "x.launch.py", "exec"), namespace)
         (node,) = namespace["generate_launch_description"]()
     assert node["package"] == "tf2_ros"
     assert node["executable"] == "static_transform_publisher"
@@ -81,93 +78,162 @@ def test_launch_file_runs(pose: SE3, mount: Mount) -> None:
     check_flags(node["arguments"], pose, parent_of(mount))
 
 
-@drawn
+@poses_and_mounts
 @few
 def test_ros1_launch_file(pose: SE3, mount: Mount) -> None:
-    node = ElementTree.fromstring(ros.ros1_launch(Export(made(pose, mount)))).find("node")
+    text = export_calibration(calibration_of(pose, mount), "ros1_launch")
+    node = ElementTree.fromstring(text).find("node")
     assert node is not None
     assert (node.get("pkg"), node.get("type")) == ("tf2_ros", "static_transform_publisher")
     *words, parent, child = str(node.get("args")).split()
-    assert (parent, child) == (parent_of(mount), "cam/optical-frame")
+    assert (parent, child) == (parent_of(mount), CHILD)
     x, y, z, *quaternion = map(float, words)
     matrix = quaternion_matrix(*quaternion, translation=(x, y, z))
     np.testing.assert_allclose(matrix, pose.matrix(), atol=1e-9)
 
 
-@drawn
+def matrix_of(transform: dict[str, dict[str, float]]) -> np.ndarray:
+    """Return the matrix of a geometry_msgs/Transform, which has fields of type float only."""
+    position = [transform["translation"][axis] for axis in "xyz"]
+    assert all(type(v) is float for v in (*position, *transform["rotation"].values()))
+    return quaternion_matrix(**transform["rotation"], translation=position)
+
+
+@poses_and_mounts
 @few
 def test_transform_stamped_has_the_fields_of_the_message(pose: SE3, mount: Mount) -> None:
-    message = yaml.safe_load(ros.transform_stamped(Export(made(pose, mount))))
+    message = yaml.safe_load(export_calibration(calibration_of(pose, mount), "transform_stamped"))
     assert message.keys() == {"header", "child_frame_id", "transform"}
-    assert message["header"] == {
-        "stamp": {"sec": 0, "nanosec": 0},
-        "frame_id": parent_of(mount),
-    }
-    assert message["child_frame_id"] == "cam/optical-frame"
-    translation, rotation = message["transform"]["translation"], message["transform"]["rotation"]
-    assert all(type(v) is float for v in (*translation.values(), *rotation.values()))
-    matrix = quaternion_matrix(**rotation, translation=[translation[axis] for axis in "xyz"])
+    stamp = {"sec": 0, "nanosec": 0}
+    assert message["header"] == {"stamp": stamp, "frame_id": parent_of(mount)}
+    assert message["child_frame_id"] == CHILD
+    np.testing.assert_allclose(matrix_of(message["transform"]), pose.matrix(), atol=1e-9)
+
+
+# The fields of easy_handeye2_msgs/HandeyeCalibration in its .msg files.
+PARAMETERS = {
+    "name": str,
+    "calibration_type": str,
+    "robot_base_frame": str,
+    "robot_effector_frame": str,
+    "tracking_base_frame": str,
+    "tracking_marker_frame": str,
+    "freehand_robot_movement": bool,
+    "move_group_namespace": str,
+    "move_group": str,
+}
+
+
+@poses_and_mounts
+@few
+def test_easy_handeye2(tmp_path_factory: pytest.TempPathFactory, pose: SE3, mount: Mount) -> None:
+    path = tmp_path_factory.getbasetemp() / "cell.calib"
+    text = export_calibration(
+        calibration_of(pose, mount), "easy_handeye2", path, robot_frame="other_frame"
+    )
+    message = yaml.full_load(text)
+    assert message.keys() == {"parameters", "transform"}
+    parameters = message["parameters"]
+    assert {key: type(value) for key, value in parameters.items()} == PARAMETERS
+    # The publisher selects the parent by the type of the calibration.
+    in_hand = parameters["calibration_type"] == "eye_in_hand"
+    assert in_hand or parameters["calibration_type"] == "eye_on_base"
+    frames = [parameters["robot_effector_frame"], parameters["robot_base_frame"]]
+    parent, other = frames if in_hand else frames[::-1]
+    assert (parent, other) == (parent_of(mount), "other_frame")
+    assert parameters["tracking_base_frame"] == CHILD
+    assert parameters["name"] == "cell"
+    np.testing.assert_allclose(matrix_of(message["transform"]), pose.matrix(), atol=1e-9)
+
+
+def read_easy_handeye(
+    namespace: str,
+    move_group_namespace: str = "/",
+    move_group: str = "manipulator",
+    eye_on_hand: bool | None = None,
+    robot_base_frame: str | None = None,
+    robot_effector_frame: str | None = None,
+    tracking_base_frame: str | None = None,
+    tracking_marker_frame: str | None = None,
+) -> tuple[str | None, str | None]:
+    """Take the keyword arguments of easy_handeye's reader and return parent and child."""
+    return robot_effector_frame if eye_on_hand else robot_base_frame, tracking_base_frame
+
+
+@poses_and_mounts
+@few
+def test_easy_handeye(pose: SE3, mount: Mount) -> None:
+    data = yaml.safe_load(export_calibration(calibration_of(pose, mount), "easy_handeye"))
+    assert data.keys() == {"parameters", "transformation"}
+    assert read_easy_handeye(**data["parameters"]) == (parent_of(mount), CHILD)
+    assert data["parameters"]["eye_on_hand"] is (mount == "eye_in_hand")
+    assert data["parameters"]["namespace"] == "/evercal/"
+    t = data["transformation"]
+    assert t.keys() == {"x", "y", "z", "qx", "qy", "qz", "qw"}
+    matrix = quaternion_matrix(t["qx"], t["qy"], t["qz"], t["qw"], (t["x"], t["y"], t["z"]))
     np.testing.assert_allclose(matrix, pose.matrix(), atol=1e-9)
 
 
-@drawn
+@poses_and_mounts
 @few
-def test_urdf_by_yourdfpy(pose: SE3, mount: Mount) -> None:
+def test_urdf_is_read_by_yourdfpy(pose: SE3, mount: Mount) -> None:
     parent = parent_of(mount)
-    robot = f"""<robot name="r"><link name="{parent}"/><link name="cam/optical-frame"/>
-        {urdf(Export(made(pose, mount)))}</robot>"""
-    read = yourdfpy.URDF.load(io.BytesIO(robot.encode()))
-    found = read.get_transform("cam/optical-frame", parent)
-    # At gimbal lock scipy's angles are right to 2e-7 rad.
-    np.testing.assert_allclose(found, pose.matrix(), atol=3e-7)
-    if abs(abs(pose.rotation_matrix()[2, 0]) - 1) > 1e-9:
-        np.testing.assert_allclose(found, pose.matrix(), atol=1e-9)
+    robot = f"""<robot name="r"><link name="{parent}"/><link name="{CHILD}"/>
+        {export_calibration(calibration_of(pose, mount), "urdf")}</robot>"""
+    model = yourdfpy.URDF.load(io.BytesIO(robot.encode()))
+    # At gimbal lock scipy's angles are accurate to 2e-7 rad.
+    locked = abs(abs(pose.rotation_matrix()[2, 0]) - 1) <= 1e-9
+    matrix = model.get_transform(CHILD, parent)
+    np.testing.assert_allclose(matrix, pose.matrix(), atol=3e-7 if locked else 1e-9)
 
 
-def test_urdf_angles_turn_about_fixed_axes() -> None:
+def test_urdf_angles_rotate_about_fixed_axes() -> None:
     """Rz(0.5) Ry(0.4) Rx(0.3) is written 0.3 0.4 0.5."""
-    half = np.array([0.3, 0.4, 0.5]) / 2
-    (cx, cy, cz), (sx, sy, sz) = np.cos(half), np.sin(half)
-    about = SE3(
-        np.array([[cx, sx, 0, 0], [cy, 0, sy, 0], [cz, 0, 0, sz]]),
-        np.zeros((3, 3)),
-    )
-    text = urdf(Export(made(about[2] @ about[1] @ about[0])))
+    about = [SE3.exp([0, 0, 0, *angles]) for angles in np.diag([0.3, 0.4, 0.5])]
+    text = export_calibration(calibration_of(about[2] @ about[1] @ about[0]), "urdf")
     origin = ElementTree.fromstring(text).find("origin")
     assert origin is not None
     np.testing.assert_allclose([*map(float, str(origin.get("rpy")).split())], [0.3, 0.4, 0.5])
 
 
-LENSES = [
-    ((), "plumb_bob", 5),
-    ((0.1, 0.2, 0.3, 0.4), "plumb_bob", 5),
-    ((0.1, 0.2, 0.3, 0.4, 1e-7), "plumb_bob", 5),
-    ((0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8), "rational_polynomial", 8),
-]
-
-
-@pytest.mark.parametrize(("lens", "model", "count"), LENSES)
-def test_camera_info(tmp_path: Path, lens: tuple[float, ...], model: str, count: int) -> None:
-    camera = Camera(640, 480, 600.25, 601.5, 319.75, 240.5, lens)
-    text = ros.camera_info(Export(made(SE3.identity(), camera=camera)))
-    info = yaml.safe_load(text)
+@pytest.mark.parametrize(
+    ("distortion", "model", "count"),
+    [
+        ((), "plumb_bob", 5),
+        ((0.1, 0.2, 0.3, 0.4), "plumb_bob", 5),
+        ((0.1, 0.2, 0.3, 0.4, 1e-7), "plumb_bob", 5),
+        ((0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8), "rational_polynomial", 8),
+    ],
+)
+def test_camera_info(tmp_path: Path, distortion: tuple[float, ...], model: str, count: int) -> None:
+    camera = Camera(640, 480, 600.25, 601.5, 319.75, 240.5, distortion)
+    calibration = calibration_of(SE3.identity(), camera=camera)
+    info = yaml.safe_load(export_calibration(calibration, "camera_info", tmp_path / "info.yaml"))
     assert info["distortion_model"] == model
     assert len(info["distortion_coefficients"]["data"]) == count
     assert info["projection_matrix"]["data"][3::4] == [0.0, 0.0, 0.0]
     assert info["rectification_matrix"]["data"] == np.eye(3).ravel().tolist()
     for key in ("camera_matrix", "projection_matrix", "distortion_coefficients"):
-        matrix = info[key]
-        assert matrix["rows"] * matrix["cols"] == len(matrix["data"])
-    (tmp_path / "info.yaml").write_text(text)
+        assert info[key]["rows"] * info[key]["cols"] == len(info[key]["data"])
     read = read_camera(tmp_path / "info.yaml")
     np.testing.assert_array_equal(read.matrix(), camera.matrix())
     assert (read.width, read.height) == (640, 480)
-    assert read.distortion[: len(lens)] == lens
-    assert not any(read.distortion[len(lens) :])
+    assert read.distortion[: len(distortion)] == distortion
+    assert not any(read.distortion[len(distortion) :])
 
 
-def test_no_intrinsics_no_camera_info() -> None:
-    with pytest.raises(InputError, match="holds no intrinsics"):
-        ros.camera_info(Export(made(SE3.identity(), camera=None)))
-    with pytest.raises(InputError, match="leave --via out"):
-        ros.camera_info(Export(made(SE3.identity(), camera=CAMERA), optical=False))
+def test_camera_info_requires_intrinsics() -> None:
+    with pytest.raises(InputError, match="camera_info: intrinsics are required"):
+        export_calibration(calibration_of(SE3.identity(), camera=None), "camera_info")
+
+
+@pytest.mark.parametrize("name", ["/camera", "my camera", "a\nb", "a/", "a//b", '"', "-x", "<"])
+def test_invalid_frame_names_are_refused(name: str) -> None:
+    with pytest.raises(InputError, match="is no name of a tf frame"):
+        export_calibration(calibration_of(SE3.identity()), "urdf", child=name)
+
+
+@pytest.mark.parametrize("name", ["camera", "robot1/camera_link", "panda_link0", "0", "a.b-c"])
+def test_valid_frame_names_are_written(name: str) -> None:
+    text = export_calibration(calibration_of(SE3.identity()), "transform_stamped", child=name)
+    assert yaml.safe_load(text)["child_frame_id"] == name

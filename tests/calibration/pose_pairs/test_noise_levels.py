@@ -1,4 +1,4 @@
-"""Estimated noise against textbook cases."""
+"""Variance components in textbook cases."""
 
 import numpy as np
 import pytest
@@ -14,34 +14,34 @@ from evercal.calibration.pose_pairs.noise_levels import (
 
 
 def mean_of(n: int) -> np.ndarray:
-    """(n, 6, 6) derivatives of a mean of vectors."""
+    """Return the (n, 6, 6) derivatives of residuals by the mean of n vectors."""
     return np.broadcast_to(np.eye(6), (n, 6, 6))
 
 
-def test_one_kind_is_the_sample_variance() -> None:
+def test_one_kind_equals_the_sample_variance() -> None:
     rng = np.random.default_rng(0)
     values = rng.normal(0, 0.003, (20, 6))
     residual = values - values.mean(0)
     directions = {"all": mean_of(20)}
     levels = estimate_levels(residual, mean_of(20), directions, np.zeros((20, 6, 6)))
-    # With the degree of freedom that each mean took.
+    # Each mean takes one degree of freedom.
     assert levels.variance[0] == pytest.approx(values.var(0, ddof=1).mean(), rel=1e-3)
-    # A variance of nu degrees of freedom is itself uncertain by sqrt(2 / nu).
+    # The relative deviation of a variance with nu degrees of freedom is sqrt(2 / nu).
     nu = 6 * 19
     assert np.sqrt(levels.uncertainty[0, 0]) == pytest.approx(
         levels.variance[0] * np.sqrt(2 / nu), rel=1e-2
     )
 
 
-def test_kinds_are_told_apart_and_absent_ones_are_zero() -> None:
+def test_kinds_are_separated_and_absent_kinds_are_zero() -> None:
     rng = np.random.default_rng(1)
     n = 50
     lever = rng.normal(size=(n, 6, 1))
     shift = np.broadcast_to(np.eye(6, 3), (n, 6, 3))
-    turn = np.broadcast_to(np.eye(6)[:, 3:], (n, 6, 3))
+    rotation = np.broadcast_to(np.eye(6)[:, 3:], (n, 6, 3))
     values = 2e-3 * (shift @ rng.normal(size=(n, 3, 1)))[..., 0]
-    values += 5e-3 * (turn @ rng.normal(size=(n, 3, 1)))[..., 0]
-    directions = {"shift": shift, "turn": turn, "lever": lever}
+    values += 5e-3 * (rotation @ rng.normal(size=(n, 3, 1)))[..., 0]
+    directions = {"shift": shift, "rotation": rotation, "lever": lever}
     residual = values - values.mean(0)
     levels = estimate_levels(residual, mean_of(n), directions, np.zeros((n, 6, 6)))
     sigma = np.sqrt(levels.variance)
@@ -50,11 +50,11 @@ def test_kinds_are_told_apart_and_absent_ones_are_zero() -> None:
     assert sigma[2] < 5e-4
 
 
-def test_known_noise_is_not_counted_again() -> None:
+def test_known_noise_is_subtracted() -> None:
     rng = np.random.default_rng(2)
     n = 50
     known = np.broadcast_to(9e-6 * np.eye(6), (n, 6, 6))
-    values = rng.normal(0, 5e-3, (n, 6))  # 25e-6 in all
+    values = rng.normal(0, 5e-3, (n, 6))  # total variance 25e-6
     levels = estimate_levels(values - values.mean(0), mean_of(n), {"rest": mean_of(n)}, known)
     assert levels.variance[0] == pytest.approx(16e-6, rel=0.3)
     total = levels.covariances({"rest": mean_of(n)}, known)
@@ -70,7 +70,7 @@ def test_one_estimated_variance_gives_the_f_distribution(freedom: float) -> None
     assert factor == pytest.approx(6 * f.ppf(0.95, 6, freedom) / chi2.ppf(0.95, 6), rel=1e-6)
 
 
-def test_sure_levels_need_no_factor() -> None:
+def test_certain_levels_have_factor_one() -> None:
     assert ellipsoid_factor(np.eye(6), np.eye(6)[None], np.zeros((1, 1))) == pytest.approx(
         1.0, 1e-4
     )
@@ -88,7 +88,7 @@ def test_gain_is_weighted_least_squares() -> None:
     for i in range(n):
         weight[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = np.linalg.inv(noise[i])
     assert best.covariance == pytest.approx(np.linalg.inv(stacked.T @ weight @ stacked), rel=1e-9)
-    # Weights that are not the noise give a larger covariance, and the true one of that fit.
+    # Other weights give a larger covariance, which matches sampled noise.
     plain = Gain.of(jacobian, np.broadcast_to(np.eye(6), noise.shape), noise)
     draws = np.stack([r @ rng.normal(size=(6, 40000)) for r in np.linalg.cholesky(noise)])
     steps = np.einsum("npi,nid->pd", plain.gain, draws)
@@ -98,14 +98,14 @@ def test_gain_is_weighted_least_squares() -> None:
     assert np.trace(plain.covariance) > np.trace(best.covariance)
 
 
-def test_working_noise_is_the_estimate_made_more_even() -> None:
+def test_working_noise_is_more_even() -> None:
     noise = np.stack([np.diag([1.0, 2, 3, 4, 5, 6]), np.diag([3.0, 2, 1, 6, 5, 4])])
-    evened = working_noise(noise, np.array([True, True]))
-    assert np.trace(evened.mean(0)) == pytest.approx(np.trace(noise.mean(0)))
-    assert np.ptp(np.diag(evened[0])[:3]) < np.ptp(np.diag(noise[0])[:3])
+    even = working_noise(noise, np.array([True, True]))
+    assert np.trace(even.mean(0)) == pytest.approx(np.trace(noise.mean(0)))
+    assert np.ptp(np.diag(even[0])[:3]) < np.ptp(np.diag(noise[0])[:3])
 
 
-def test_levels_without_a_kind_are_floors() -> None:
+def test_zero_levels_give_a_positive_covariance() -> None:
     levels = NoiseLevels(("a",), np.zeros(1), np.zeros((1, 1)))
-    found = levels.covariances({"a": mean_of(3)}, np.zeros((3, 6, 6)))
-    assert (np.linalg.eigvalsh(found) > 0).all()
+    covariance = levels.covariances({"a": mean_of(3)}, np.zeros((3, 6, 6)))
+    assert (np.linalg.eigvalsh(covariance) > 0).all()

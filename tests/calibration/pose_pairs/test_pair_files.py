@@ -1,4 +1,4 @@
-"""Rows of two pose files that belong together: by the names of their images."""
+"""Pairing of two pose files, and messages that name the right file and option."""
 
 from pathlib import Path
 
@@ -9,22 +9,34 @@ from evercal.calibration.pose_pairs.pair_files import PairFiles, read_pairs
 from evercal.errors import InputError
 
 
-def written(file: Path, names: list[str]) -> Path:
-    """Poses half a metre from the base; the i-th is i centimetres along y."""
+def write(file: Path, names: list[str]) -> Path:
+    """Write poses half a metre from the base; pose i is at i centimetres along y."""
     rows = [f"{name},0.5,{i / 100},0.2,1,0,0,0" for i, name in enumerate(names)]
     file.write_text("\n".join(["image,x,y,z,qw,qx,qy,qz", *rows]))
     return file
 
 
-def test_names_that_are_times_may_lack_their_ending(tmp_path: Path) -> None:
-    robot = written(tmp_path / "robot.csv", ["1.25", "1.50", "1.75"])
-    camera = written(tmp_path / "camera.csv", ["rgb/1.75.png", "rgb/1.25.png", "rgb/1.50.png"])
+def test_names_are_paired_without_folder_and_suffix(tmp_path: Path) -> None:
+    robot = write(tmp_path / "robot.csv", ["1.25", "1.50", "1.75"])
+    camera = write(tmp_path / "camera.csv", ["rgb/1.75.png", "rgb/1.25.png", "rgb/1.50.png"])
     pairs, _ = read_pairs(PairFiles(robot, camera))
     np.testing.assert_allclose(pairs.base_from_gripper.translation_m[:, 1], [0.02, 0, 0.01])
 
 
-def test_names_that_are_the_same_but_for_their_folders_are_refused(tmp_path: Path) -> None:
-    robot = written(tmp_path / "robot.csv", ["left/1.png", "right/1.png"])
-    camera = written(tmp_path / "camera.csv", ["1.png"])
+def test_names_that_differ_only_in_their_folder_are_refused(tmp_path: Path) -> None:
+    robot = write(tmp_path / "robot.csv", ["left/1.png", "right/1.png"])
+    camera = write(tmp_path / "camera.csv", ["1.png"])
     with pytest.raises(InputError, match=r"robot\.csv: 'left/1\.png' comes twice, apart from"):
+        read_pairs(PairFiles(robot, camera))
+
+
+@pytest.mark.parametrize("role", ["robot", "camera"])
+def test_messages_name_the_file_and_its_option(tmp_path: Path, role: str) -> None:
+    robot, camera = (write(tmp_path / f"{name}.csv", ["1", "2"]) for name in ("robot", "camera"))
+    broken = tmp_path / f"{role}.csv"
+    broken.write_text("1 2 3 4 5 6\n")
+    with pytest.raises(InputError, match=rf"{role}\.csv: .*--{role}-convention"):
+        read_pairs(PairFiles(robot, camera))
+    broken.unlink()
+    with pytest.raises(InputError, match=f"file of {role} poses is missing; check --{role}-poses"):
         read_pairs(PairFiles(robot, camera))

@@ -1,4 +1,4 @@
-"""Rows, outputs and scenes small enough to do by hand."""
+"""Rows, outputs and scenes for calculations by hand."""
 
 import torch
 from torch import Tensor
@@ -6,7 +6,7 @@ from torch.nn.functional import normalize
 
 from evercal.continual.methods.method import MethodState, StageStart
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
-from evercal.continual.networks.head import Head, HeadOptions, HeadOutput
+from evercal.continual.networks.head import Head, HeadOptions, HeadOutput, fresh_head
 from evercal.continual.networks.loss import Target
 from evercal.geometry import SE3
 
@@ -14,7 +14,7 @@ DEPTH_M, FOCAL_PX = 2.0, 100.0
 
 
 def rows(count: int, scene: int = 0) -> Rows:
-    """Rows seen by a camera at the origin, each of which must project to the image centre."""
+    """Create rows of a camera at the origin; the target is always the image centre."""
     target = Target(
         torch.full((count, 2), 50.0),
         torch.tensor([FOCAL_PX, FOCAL_PX, 50.0, 50.0]).repeat(count, 1),
@@ -26,16 +26,16 @@ def rows(count: int, scene: int = 0) -> Rows:
 
 
 def off_by(pixels: float) -> list[float]:
-    """A point that projects `pixels` to the right of where it must."""
+    """Return a point that projects `pixels` to the right of its target."""
     return [pixels / FOCAL_PX * DEPTH_M, 0.0, DEPTH_M]
 
 
-def says(points: list[list[float]], hidden: list[list[float]] | None = None) -> HeadOutput:
-    """A head's output with these points (camera frame, metres)."""
+def head_output(points: list[list[float]], hidden: list[list[float]] | None = None) -> HeadOutput:
+    """Create a head's output with given points (camera frame, metres)."""
     where = torch.tensor(points, requires_grad=True)
     zero = torch.zeros(len(points), 2)
-    felt = zero if hidden is None else torch.tensor(hidden)
-    return HeadOutput(zero, torch.zeros(len(points), 1, 3), where, felt)
+    activations = zero if hidden is None else torch.tensor(hidden)
+    return HeadOutput(zero, torch.zeros(len(points), 1, 3), where, activations)
 
 
 def wave_buffer(scene: int, views: int = 4, shift_px: float = 0.0, few: int = 0) -> FeatureBuffer:
@@ -64,11 +64,20 @@ def wave_buffer(scene: int, views: int = 4, shift_px: float = 0.0, few: int = 0)
 
 
 def wave_head(scenes: int, options: HeadOptions | None = None) -> Head:
-    """A head with room for such scenes."""
-    torch.manual_seed(0)
-    head = Head(9, 4, options or HeadOptions(width=16, blocks=1, whiten=False))
+    """Create a head for scenes of `wave_buffer`."""
+    options = options or HeadOptions(width=16, blocks=1, whiten=False)
+    head = fresh_head(9, 4, options, seed=0)
     for scene in range(scenes):
         head.grow(torch.tensor([[0.3, 0.0, 4.0], [-0.3, 0.2, 3.5]]), seed=scene)
+    return head
+
+
+def head_at_cameras(buffers: list[FeatureBuffer]) -> Head:
+    """Create a head for scenes of `learnable`, with centres at three cameras of each."""
+    head = fresh_head(48, 6, HeadOptions(width=32), seed=0)
+    for buffer in buffers:
+        matrix = buffer.tensors["camera_from_atlas"][:3].double()
+        head.grow((-matrix[:, :, :3].mT @ matrix[:, :, 3:])[..., 0].float(), seed=buffer.scene)
     return head
 
 
@@ -80,16 +89,16 @@ def stage_start(
     states: list[MethodState] | None = None,
     replay_rows: int = 64,
 ) -> StageStart:
-    """A stage that begins with these memories."""
-    kept: list[MethodState] = [{} for _ in memories] if states is None else states
-    return StageStart(head, teacher, memories, kept, replay_rows, 0)
+    """Create the start of a stage."""
+    selected: list[MethodState] = [{} for _ in memories] if states is None else states
+    return StageStart(head, teacher, memories, selected, replay_rows, 0)
 
 
 def flat(head: Head) -> Tensor:
-    """(p,) a copy of all weights."""
+    """Copy all weights, (p,)."""
     return torch.cat([value.detach().flatten() for value in head.parameters()]).clone()
 
 
 def flat_of(head: Head, named: dict[str, Tensor]) -> Tensor:
-    """(p,) tensors by parameter name, in the order of `flat`."""
+    """Concatenate tensors by parameter name, in the order of `flat`."""
     return torch.cat([named[name].flatten() for name, _ in head.named_parameters()]).clone()

@@ -1,4 +1,4 @@
-"""Isolation: a head of its own for every scene, which begins where the last one stands."""
+"""The controls: fine-tuning, and isolation with a head per scene."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 
 def saved(head: Head) -> bytes:
-    """The head as a file."""
+    """Serialise a head."""
     file = io.BytesIO()
     torch.save(head.state_dict(), file)
     return file.getvalue()
 
 
-def test_neither_adds_anything_to_training() -> None:
+def test_controls_add_nothing_to_training() -> None:
     for method in (FineTuning(), Isolation()):
         hooks = method.begin(stage_start(wave_head(1), []))
         assert type(hooks) is TrainingHooks
@@ -40,10 +40,10 @@ def test_neither_adds_anything_to_training() -> None:
 
 @pytest.mark.parametrize("offsets", ["per_centre", "shared"])
 @pytest.mark.parametrize("condition", ["code", "descriptor"])
-def test_new_heads_start_from_the_last_trunk_and_earlier_ones_stay(
+def test_new_head_starts_from_the_shared_weights_of_the_last(
     condition: str, offsets: str, first: dict[str, SceneMaps], rooms: Rooms, quick: StageOptions
 ) -> None:
-    """With no step at all, the second head is the first one but for what the scene owns."""
+    """Without training, the second head differs from the first only in the scene's parameters."""
     from evercal.continual.learn import learn
     from evercal.continual.strategies import STRATEGIES
 

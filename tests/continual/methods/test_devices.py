@@ -1,4 +1,4 @@
-"""Every method keeps to one device: what it makes lies where its inputs lie."""
+"""Every method creates tensors only on the device of its inputs."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ BACKBONES = {
 
 
 def learned(
-    method: Method, options: HeadOptions, made: AbstractContextManager[None]
+    method: Method, options: HeadOptions, context: AbstractContextManager[None]
 ) -> tuple[dict[str, Tensor], np.ndarray | None]:
-    """A second scene is learned and finished: all tensors that come of it, and the frames kept."""
+    """Learn and finish a second scene; return all resulting tensors and the selected frames."""
     own, memory = wave_buffer(1), wave_buffer(0, views=2)
     head = wave_head(2, options)
     teacher = copy.deepcopy(head).eval()
     pose = SE3.identity()
     frames = [Frame(str(i), IMAGE, CAMERA, pose) for i in range(own.views)]
-    with made:
+    with context:
         alone = method.begin(stage_start(teacher, []))
         first = FinishedScene(teacher, 0, lambda: memory, lambda: memory, 2, [], alone, 0.1)
         states: list[MethodState] = [method.after_scene(first)]
@@ -60,18 +60,18 @@ def learned(
         trainer.load(trainer.state())
         chosen = method.select(FrameStatistics(frames, head, lambda: own, 0), 2)
         last = FinishedScene(head, 1, lambda: own, lambda: memory, 2, states, hooks, 0.1)
-        kept = method.after_scene(last)
-    return dict(head.state_dict()) | {f"kept.{k}": v for k, v in kept.items()}, chosen
+        selected = method.after_scene(last)
+    return dict(head.state_dict()) | {f"state.{k}": v for k, v in selected.items()}, chosen
 
 
 @pytest.mark.parametrize("backbone", BACKBONES)
 @pytest.mark.parametrize("name", METHODS)
-def test_nothing_is_made_on_the_default_device(name: str, backbone: str) -> None:
-    # The default device is `meta`, the inputs lie on the CPU: numbers must come out, and the same.
+def test_no_tensor_is_created_on_the_default_device(name: str, backbone: str) -> None:
+    # With `meta` as the default device and inputs on the CPU, results are the same.
     expected, frames = learned(METHODS[name], BACKBONES[backbone], nullcontext())
-    found, again = learned(METHODS[name], BACKBONES[backbone], tensors_stay_on_their_device())
-    assert found.keys() == expected.keys()
-    for key, value in found.items():
+    actual, again = learned(METHODS[name], BACKBONES[backbone], tensors_stay_on_their_device())
+    assert actual.keys() == expected.keys()
+    for key, value in actual.items():
         assert value.device.type == "cpu", key
         torch.testing.assert_close(value, expected[key], msg=key)
     assert (frames is None) == (again is None)

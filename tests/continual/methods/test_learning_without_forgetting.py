@@ -1,4 +1,4 @@
-"""LwF: new rows asked as if they showed an old scene, held where the old head put them."""
+"""LwF: new rows with the index of an old scene keep the output of the old head."""
 
 import copy
 
@@ -15,83 +15,51 @@ from .by_hand import stage_start, wave_buffer, wave_head
 
 
 def grown(scenes: int) -> tuple[Head, Head]:
-    """A teacher of these scenes, and a student with room for one more."""
+    """Create a teacher, and a student with one more scene."""
     teacher = wave_head(scenes)
     student = copy.deepcopy(teacher)
     student.grow(torch.ones(2, 3), seed=9)
     return teacher, student
 
 
-def asked(hooks: TrainingHooks, scene: int = 9):
+def calls(hooks: TrainingHooks, scene: int = 9):
     fresh = wave_buffer(scene).draw(32, torch.Generator().manual_seed(0))
     return fresh, hooks.replayed(fresh, 0, 1e-3, torch.Generator().manual_seed(1))
 
 
 @pytest.mark.parametrize("scenes", [1, 2, 3])
-def test_new_rows_are_asked_as_every_old_scene(scenes: int) -> None:
+def test_new_rows_are_replayed_with_every_old_scene(scenes: int) -> None:
     teacher, student = grown(scenes)
     start = stage_start(student, [], teacher=teacher, replay_rows=60)
-    fresh, parts = asked(LearningWithoutForgetting().begin(start))
+    fresh, parts = calls(LearningWithoutForgetting().begin(start))
     assert [set(part.scene.tolist()) for part in parts] == [{i} for i in range(scenes)]
     for part in parts:
         assert len(part.scene) == 60 // scenes
         new = {tuple(row) for row in fresh.features.tolist()}
         assert {tuple(row) for row in part.features.tolist()} <= new
-    assert set(fresh.scene.tolist()) == {9}  # the rows themselves stay those of the new scene
+    assert set(fresh.scene.tolist()) == {9}  # the new rows are unchanged
 
 
-def test_the_cost_by_hand_and_nothing_where_student_and_teacher_agree() -> None:
+def test_cost_by_hand() -> None:
     teacher, student = grown(2)
     start = stage_start(student, [], teacher=teacher, replay_rows=60)
     method = LearningWithoutForgetting(weight=0.5, px_per_m=20.0)
     hooks = method.begin(start)
-    _, parts = asked(hooks)
+    _, parts = calls(hooks)
     rows = join(parts)
     output = student(rows.features.float(), rows.scene, rows.descriptor)
-    found = hooks.cost(output, rows, 0.3)
-    assert found is not None
-    assert float(found.detach()) == pytest.approx(0.0, abs=0.5)  # bfloat16 on some processors
+    actual = hooks.cost(output, rows, 0.3)
+    assert actual is not None
+    assert float(actual.detach()) == pytest.approx(0.0, abs=0.5)  # some processors use bfloat16
     away = HeadOutput(output.logits, output.offsets, output.points + 0.3, output.hidden)
-    found = hooks.cost(away, rows, 0.3)
-    assert found is not None
-    # Each of two old scenes costs 0.5 x 20 px/m x (3 x 0.3 m).
-    assert float(found.detach()) == pytest.approx(2 * 0.5 * 20 * 0.9, rel=0.03)
+    actual = hooks.cost(away, rows, 0.3)
+    assert actual is not None
+    # Loss of each old scene: 0.5 x 20 px/m x (3 x 0.3 m).
+    assert float(actual.detach()) == pytest.approx(2 * 0.5 * 20 * 0.9, rel=0.03)
 
 
-def test_the_first_scene_has_nothing_to_forget() -> None:
-    start = stage_start(wave_head(1), [], replay_rows=60)
-    assert type(LearningWithoutForgetting().begin(start)) is TrainingHooks
-
-
-def test_what_only_the_new_scene_owns_is_not_touched() -> None:
-    teacher, student = grown(2)
-    hooks = LearningWithoutForgetting().begin(stage_start(student, [], teacher=teacher))
-    with torch.no_grad():  # else the gradient is zero everywhere
-        for value in student.parameters():
-            value.add_(0.02)
-    _, parts = asked(hooks)
-    rows = join(parts)
-    cost = hooks.cost(student(rows.features.float(), rows.scene, rows.descriptor), rows, 0.5)
-    assert cost is not None
-    cost.backward()
-    own = student.centre_scene == 2
-    for name, mine in (
-        ("code", torch.tensor([False, False, True])),
-        ("logit", own),
-        ("logit_bias", own),
-        ("offset", own),
-        ("offset_bias", own),
-    ):
-        gradient = student.get_parameter(name).grad
-        assert gradient is not None
-        assert float(gradient[mine].abs().max()) == 0.0 < float(gradient[~mine].abs().max())
-    shared = student.get_parameter("first.1.weight").grad
-    assert shared is not None
-    assert float(shared.abs().max()) > 0
-
-
-def test_old_answers_to_new_images_stay() -> None:
-    """Beside plain training, from the same start."""
+def test_distillation_reduces_drift_on_new_images() -> None:
+    """Compared with plain training from the same start."""
     drift = {}
     options = FitOptions(iterations=40, batch=64, peak_rate=1e-2)
     new = wave_buffer(1, shift_px=-12.0)

@@ -1,4 +1,4 @@
-"""What replayed rows cost, on rows small enough to do by hand."""
+"""Losses of replayed rows, calculated by hand."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ from evercal.continual.methods.penalties import (
 from evercal.continual.methods.spdd import SpddOptions, spdd_loss
 from evercal.continual.networks.head import HeadOutput
 
-from .by_hand import DEPTH_M, off_by, rows, says
+from .by_hand import DEPTH_M, head_output, off_by, rows
 
 PX_PER_M = 50.0
 WITH_TRUTH: list[Penalty] = [
@@ -40,64 +40,72 @@ def cost(
 
 
 @pytest.mark.parametrize("tau", [100.0, 10.0, 1.0])
-def test_plain_replay_costs_what_new_rows_cost(tau: float) -> None:
-    found = cost(Reprojection(), says([off_by(3.0), off_by(0.0)]), None, rows(2), tau)
-    assert found == pytest.approx(tau * math.tanh(3.0 / tau) / 2, rel=1e-5)
+def test_reprojection_costs_the_loss_of_new_rows(tau: float) -> None:
+    actual = cost(Reprojection(), head_output([off_by(3.0), off_by(0.0)]), None, rows(2), tau)
+    assert actual == pytest.approx(tau * math.tanh(3.0 / tau) / 2, rel=1e-5)
 
 
 def test_old_output_by_hand() -> None:
-    # The student is 3 px (6 cm) right of the truth, the teacher 2 px (4 cm) left of it.
-    found = cost(OldOutput(), says([off_by(3.0)]), says([off_by(-2.0)]), rows(1), 1.0)
-    assert found == pytest.approx(math.tanh(3.0) + PX_PER_M * 0.10, rel=1e-5)
-    half = cost(OldOutput(px_per_m=25.0), says([off_by(3.0)]), says([off_by(-2.0)]), rows(1), 1.0)
-    assert found - half == pytest.approx(2.5, rel=1e-5)
+    # The student is 3 px (6 cm) right of the target, the teacher 2 px (4 cm) left.
+    actual = cost(
+        OldOutput(), head_output([off_by(3.0)]), head_output([off_by(-2.0)]), rows(1), 1.0
+    )
+    assert actual == pytest.approx(math.tanh(3.0) + PX_PER_M * 0.10, rel=1e-5)
+    half = cost(
+        OldOutput(px_per_m=25.0),
+        head_output([off_by(3.0)]),
+        head_output([off_by(-2.0)]),
+        rows(1),
+        1.0,
+    )
+    assert actual - half == pytest.approx(2.5, rel=1e-5)
 
 
-def test_a_teacher_bounds_only_who_is_worse_than_it() -> None:
-    # Row 0: student 3 px, teacher 1 px off: pulled by 4 cm. Row 1: the teacher is worse: free.
-    student = says([off_by(3.0), off_by(1.0)])
-    teacher = says([off_by(1.0), off_by(2.0)])
+def test_teacher_bounds_only_a_worse_student() -> None:
+    # Row 0: errors 3 px (student) and 1 px (teacher), 4 cm apart. Row 1: the teacher is worse.
+    student = head_output([off_by(3.0), off_by(1.0)])
+    teacher = head_output([off_by(1.0), off_by(2.0)])
     truth = (math.tanh(3.0) + math.tanh(1.0)) / 2
     expected = 0.5 * truth + 0.5 * PX_PER_M * 0.04 / 2
     assert cost(BoundedByTeacher(), student, teacher, rows(2), 1.0) == pytest.approx(expected)
 
 
 def test_stored_output_by_hand() -> None:
-    # Two rows 3 px (6 cm) off; what was said of the first is the truth, of the second nothing: the
-    # distance is a mean over rows of which something was said.
-    told = replace(rows(2), stored=torch.tensor([off_by(0.0), [math.nan] * 3]))
-    found = cost(StoredOutput(), says([off_by(3.0)] * 2), None, told, 1.0)
-    assert found == pytest.approx(0.5 * math.tanh(3.0) + 0.5 * PX_PER_M * 0.06, rel=1e-5)
+    # Two rows with errors of 3 px (6 cm). The stored point of the first is correct, the second has
+    # no stored point and is excluded from the mean distance.
+    records = replace(rows(2), stored=torch.tensor([off_by(0.0), [math.nan] * 3]))
+    actual = cost(StoredOutput(), head_output([off_by(3.0)] * 2), None, records, 1.0)
+    assert actual == pytest.approx(0.5 * math.tanh(3.0) + 0.5 * PX_PER_M * 0.06, rel=1e-5)
 
 
 def test_relations_by_hand() -> None:
-    # To the teacher rows 0 and 1 are alike and row 2 differs; the student has 1 and 2 alike.
+    # For the teacher rows 0 and 1 are equal, for the student rows 1 and 2.
     right = [off_by(0.0)] * 3
-    teacher = says(right, [[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    student = says(right, [[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+    teacher = head_output(right, [[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    student = head_output(right, [[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
     near = 1 / (1 + math.exp(-1 / 0.2))
-    # Row 0: teacher near and far, student halves. Row 1: swapped. Row 2: halves, student far, near.
+    # Probabilities of row 0: teacher (near, far), student (1/2, 1/2). Row 1: swapped.
     row_0 = near * math.log(2 * near) + (1 - near) * math.log(2 * (1 - near))
     row_1 = near * math.log(near / (1 - near)) + (1 - near) * math.log((1 - near) / near)
     row_2 = -0.5 * (math.log(2 * near) + math.log(2 * (1 - near)))
-    found = cost(Relations(), student, teacher, rows(3), 1.0)
-    assert found == pytest.approx((row_0 + row_1 + row_2) / 3, rel=1e-4)
+    actual = cost(Relations(), student, teacher, rows(3), 1.0)
+    assert actual == pytest.approx((row_0 + row_1 + row_2) / 3, rel=1e-4)
     assert cost(Relations(), teacher, teacher, rows(3), 1.0) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("scene", range(4))
-def test_relations_take_part_in_every_remembered_scene(scene: int) -> None:
-    """Rows come scene by scene, 700 of each; what changes in one of them must cost something."""
+def test_relations_cover_every_remembered_scene(scene: int) -> None:
+    """Rows are ordered by scene, 700 of each; a change in any scene has a loss."""
     generator = torch.Generator().manual_seed(1)
-    felt = torch.randn(2800, 8, generator=generator)
+    activations = torch.randn(2800, 8, generator=generator)
     right = [off_by(0.0)] * 2800
-    teacher = says(right, felt.tolist())
-    moved = felt.clone()
+    teacher = head_output(right, activations.tolist())
+    moved = activations.clone()
     moved[700 * scene : 700 * (scene + 1), 0] += 2.0
-    found = cost(Relations(), says(right, moved.tolist()), teacher, rows(2800), 1.0)
-    assert found > 1e-2
-    # Each scene has its share of the 512 rows that are compared.
-    student = says(right, felt.tolist())
+    actual = cost(Relations(), head_output(right, moved.tolist()), teacher, rows(2800), 1.0)
+    assert actual > 1e-2
+    # Each scene has a quarter of the 512 compared rows.
+    student = head_output(right, activations.tolist())
     student.hidden.requires_grad_()
     student.hidden.data += 0.1 * torch.randn(2800, 8, generator=generator)
     Relations()(student, teacher, rows(2800), 1.0).backward()
@@ -107,40 +115,42 @@ def test_relations_take_part_in_every_remembered_scene(scene: int) -> None:
 
 
 def test_anchored_reprojection_by_hand() -> None:
-    # Row 0: the teacher is right, the student 3 px (6 cm) off: it pays for both.
-    # Row 1: the teacher is far off, the student right: it pays nothing, however far they are apart.
+    # Row 0: the teacher is exact, the student has an error of 3 px (6 cm): both terms apply.
+    # Row 1: the teacher is wrong and ignored, the student is exact.
     penalty = AnchoredReprojection(clamp_px=5.0, teacher_limit_px=10.0)
-    teacher = says([off_by(0.0), off_by(40.0)])
-    student = says([off_by(3.0), off_by(0.0)])
+    teacher = head_output([off_by(0.0), off_by(40.0)])
+    student = head_output([off_by(3.0), off_by(0.0)])
     expected = 5 * math.tanh(3.0 / 5) / 2 + PX_PER_M * 0.06 / 2
-    for tau_px in (100.0, 1.0):  # its clamp does not follow the schedule
+    for tau_px in (100.0, 1.0):  # the clamp is fixed
         assert cost(penalty, student, teacher, rows(2), tau_px) == pytest.approx(expected)
 
 
-def test_depth_that_no_pixel_sees_is_held_by_a_teacher_who_is_right() -> None:
-    student, right = says([[0.0, 0.0, DEPTH_M + 0.1]]), says([off_by(0.0)])
+def test_accurate_teacher_constrains_the_depth() -> None:
+    student, right = head_output([[0.0, 0.0, DEPTH_M + 0.1]]), head_output([off_by(0.0)])
     penalty = AnchoredReprojection()
     assert cost(penalty, student, right, rows(1), 0.0) == pytest.approx(PX_PER_M * 0.1, rel=1e-5)
-    wrong = says([off_by(20.0)])
+    wrong = head_output([off_by(20.0)])
     assert cost(penalty, student, wrong, rows(1), 0.0) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_teacher_behind_the_camera_holds_nothing() -> None:
-    behind = says([[0.0, 0.0, -DEPTH_M]])  # projects to the very pixel, if one divides blindly
-    found = cost(AnchoredReprojection(), says([off_by(0.0)]), behind, rows(1), 0.0)
-    assert found == pytest.approx(0.0, abs=1e-6)
+def test_teacher_behind_the_camera_is_ignored() -> None:
+    behind = head_output([[0.0, 0.0, -DEPTH_M]])  # division by its depth gives the target pixel
+    actual = cost(AnchoredReprojection(), head_output([off_by(0.0)]), behind, rows(1), 0.0)
+    assert actual == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("penalty", WITH_TRUTH, ids=lambda p: type(p).__name__)
-def test_the_teacher_is_frozen_and_agreement_with_the_truth_is_free(penalty: Penalty) -> None:
-    told = replace(rows(3), stored=torch.tensor([off_by(0.0)] * 3))
-    teacher, student = says([off_by(0.0)] * 3), says([off_by(1.0)] * 3)
-    now = penalty(student, teacher, told, 0.3)
+def test_accurate_student_has_no_loss(penalty: Penalty) -> None:
+    records = replace(rows(3), stored=torch.tensor([off_by(0.0)] * 3))
+    teacher, student = head_output([off_by(0.0)] * 3), head_output([off_by(1.0)] * 3)
+    now = penalty(student, teacher, records, 0.3)
     now.backward()
     assert student.points.grad is not None
-    assert bool((student.points.grad[:, 0] > 0).all())  # back towards the truth
+    assert bool((student.points.grad[:, 0] > 0).all())  # towards the target
     assert teacher.points.grad is None
-    assert cost(penalty, says([off_by(0.0)] * 3), teacher, told, 0.3) == pytest.approx(0, abs=1e-6)
+    assert cost(penalty, head_output([off_by(0.0)] * 3), teacher, records, 0.3) == pytest.approx(
+        0, abs=1e-6
+    )
     assert float(now.detach()) > 1e-3
 
 
@@ -151,14 +161,14 @@ def output(centres: int, generator: torch.Generator) -> HeadOutput:
     return HeadOutput(draw(5, centres), draw(5, centres, 3), draw(5, 3), draw(5, 4))
 
 
-def test_the_papers_penalty_is_spdd_with_its_defaults_and_a_scale() -> None:
+def test_distillation_is_spdd_with_a_scale() -> None:
     generator = torch.Generator().manual_seed(0)
     teacher, student = output(6, generator), output(8, generator)
     expected = float(spdd_loss(student, teacher, SpddOptions()).total)
     assert cost(Distillation(), student, teacher, rows(5), 0.7) == pytest.approx(expected)
     ten = cost(Distillation(scale=10.0), student, teacher, rows(5), 0.7)
     assert ten == pytest.approx(10 * expected, rel=1e-6)
-    # Without the first two terms it is the L1 distance of the points alone.
+    # Without the first two terms it is the L1 distance of the points.
     alone = Distillation(SpddOptions(prior_weight=0.0, metric_weight=0.0))
     drift = float((student.points - teacher.points).abs().sum(-1).mean())
     assert cost(alone, student, teacher, rows(5), 0.7) == pytest.approx(drift, rel=1e-6)

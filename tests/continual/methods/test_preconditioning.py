@@ -1,4 +1,4 @@
-"""Protection: exact in a linear case, less drift of old scenes, and the same after a resumption."""
+"""Preconditioned steps: the formula, fixed parameters, less drift, resuming."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from evercal.continual.methods.penalties import Penalty
-from evercal.continual.methods.preconditioning import PreconditionedReplay, held_rows
+from evercal.continual.methods.preconditioning import PreconditionedReplay, owned_rows
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
 from evercal.continual.networks.head import Head, HeadOptions, HeadOutput
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 
-from .by_hand import stage_start, wave_buffer, wave_head
+from .by_hand import head_at_cameras, stage_start, wave_buffer, wave_head
 
 Learnable = Callable[..., tuple[FeatureBuffer, Tensor]]
 OPTIONS = FitOptions(iterations=30, batch=128, replay_batch=128)
@@ -22,42 +22,33 @@ OPTIONS = FitOptions(iterations=30, batch=128, replay_batch=128)
 
 @dataclass(frozen=True)
 class Free(Penalty):
-    """Replayed rows cost nothing."""
+    """No loss on replayed rows."""
 
     needs_teacher = False
 
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """Zero."""
+        """Return zero."""
         return torch.zeros(())
 
 
 @dataclass(frozen=True)
 class Short(Penalty):
-    """Points near the middle cost less: a pull on everything."""
+    """The mean length of points, which depends on all parameters."""
 
     needs_teacher = False
 
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """Mean length."""
+        """Compute the mean."""
         return student.points.abs().mean()
 
 
 def hooks_for(head: Head, memories: list[FeatureBuffer], penalty: Penalty, strength: float):
     method = PreconditionedReplay(penalty=penalty, strength=strength)
     return method.begin(stage_start(head, memories, replay_rows=128))
-
-
-def head_of(buffers: list[FeatureBuffer]) -> Head:
-    torch.manual_seed(0)
-    head = Head(48, 6, HeadOptions(width=32))
-    for buffer in buffers:
-        matrix = buffer.tensors["camera_from_atlas"][:3].double()
-        head.grow((-matrix[:, :, :3].mT @ matrix[:, :, 3:])[..., 0].float(), seed=buffer.scene)
-    return head
 
 
 def edited(hooks: TrainingHooks, head: Head, changes: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -68,37 +59,35 @@ def edited(hooks: TrainingHooks, head: Head, changes: dict[str, Tensor]) -> dict
 
 
 @pytest.mark.parametrize("scenes", [1, 2])
-def test_changes_are_damped_as_the_formula_says(learnable: Learnable, scenes: int) -> None:
+def test_changes_are_damped_by_the_formula(learnable: Learnable, scenes: int) -> None:
     buffers = [learnable(scene)[0] for scene in range(scenes)]
-    head, strength = head_of(buffers), 3.0
-    seen: list[Tensor] = []
+    head, strength = head_at_cameras(buffers), 3.0
+    captured: list[Tensor] = []
     first = head.first[0]
     assert isinstance(first, torch.nn.Linear)
-    hook = first.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0]))
+    hook = first.register_forward_hook(lambda _, inputs, __: captured.append(inputs[0]))
     hooks = hooks_for(head, buffers, Free(), strength)
     hook.remove()
-    moments = [x.double().T @ x.double() / len(x) for x in seen]
+    moments = [x.double().T @ x.double() / len(x) for x in captured]
     assert len(moments) == scenes
     moment = torch.stack([m / m.diagonal().mean() for m in moments]).sum(0)
     expected = torch.linalg.inv(torch.eye(48) + strength * moment)
     change = torch.randn(32, 48, generator=torch.Generator().manual_seed(2))
     bias = torch.ones(32)
-    found = edited(hooks, head, {"first.0.weight": change.clone(), "first.0.bias": bias.clone()})
-    damped = found["first.0.weight"]
+    actual = edited(hooks, head, {"first.0.weight": change.clone(), "first.0.bias": bias.clone()})
+    damped = actual["first.0.weight"]
     torch.testing.assert_close(damped.double(), change.double() @ expected, atol=1e-4, rtol=1e-4)
-    torch.testing.assert_close(found["first.0.bias"], bias)
-    # A direction that the scene uses moves less than one that it hardly uses.
+    torch.testing.assert_close(actual["first.0.bias"], bias)
+    # The main input direction is damped more than the least used one.
     _, axes = torch.linalg.eigh(moment)
-    kept = [float((damped.double() @ a).norm() / (change.double() @ a).norm()) for a in axes.T]
-    assert kept[-1] < 0.3 < 0.9 < kept[0]
+    selected = [float((damped.double() @ a).norm() / (change.double() @ a).norm()) for a in axes.T]
+    assert selected[-1] < 0.3 < 0.9 < selected[0]
 
 
 @pytest.mark.parametrize("strength", [0.0, 0.5])
-def test_what_one_remembered_scene_owns_does_not_move(
-    learnable: Learnable, strength: float
-) -> None:
+def test_parameters_of_remembered_scenes_are_fixed(learnable: Learnable, strength: float) -> None:
     buffers = [learnable(scene)[0] for scene in range(3)]
-    head = head_of(buffers)
+    head = head_at_cameras(buffers)
     before = {name: value.clone() for name, value in head.state_dict().items()}
     hooks = hooks_for(head, buffers[:2], Short(), strength)
     list(HeadTrainer(head, buffers[2:], OPTIONS, 0, hooks).run())
@@ -114,12 +103,12 @@ def test_what_one_remembered_scene_owns_does_not_move(
     assert (after["last.1.weight"] != before["last.1.weight"]).any()
 
 
-def test_centres_that_belong_to_no_scene_are_free_to_learn() -> None:
-    """On the paper's network the first scene's centres are those of all."""
+def test_shared_centres_are_trained() -> None:
+    """With fixed centres, all scenes share the centres of the first stage."""
     options = HeadOptions(width=16, condition="descriptor", centres="fixed", whiten=False)
     head = wave_head(1, options)
     head.grow(torch.zeros(0, 3), seed=1)
-    assert held_rows(head, [wave_buffer(0)]) == {}
+    assert owned_rows(head, [wave_buffer(0)]) == {}
     before = {name: value.clone() for name, value in head.state_dict().items()}
     hooks = hooks_for(head, [wave_buffer(0)], Free(), 0.5)
     list(HeadTrainer(head, [wave_buffer(1, shift_px=9.0)], OPTIONS, 0, hooks).run())
@@ -127,11 +116,11 @@ def test_centres_that_belong_to_no_scene_are_free_to_learn() -> None:
         assert not torch.equal(head.state_dict()[name], before[name])
 
 
-def test_an_old_scene_drifts_less(learnable: Learnable) -> None:
+def test_damping_reduces_drift(learnable: Learnable) -> None:
     old, new = learnable(0)[0], learnable(1)[0]
     drift = {}
     for strength in (0.0, 30.0):
-        head = head_of([old, new])
+        head = head_at_cameras([old, new])
         rows = old.draw(500, torch.Generator().manual_seed(0))
         with torch.no_grad():
             before = head(rows.features.float(), 0, None).points
@@ -144,12 +133,12 @@ def test_an_old_scene_drifts_less(learnable: Learnable) -> None:
 
 
 @pytest.mark.parametrize("stop", [1, 17])
-def test_a_resumed_run_protects_the_same_directions(learnable: Learnable, stop: int) -> None:
-    """The matrices are those of the head before the stage, though they are made anew."""
+def test_resumed_run_has_the_same_damping(learnable: Learnable, stop: int) -> None:
+    """The damping is computed from the head before the stage."""
     old, new = learnable(0)[0], learnable(1)[0]
 
     def trainer(strength: float = 5.0) -> HeadTrainer:
-        head = head_of([old, new])
+        head = head_at_cameras([old, new])
         return HeadTrainer(head, [new], OPTIONS, 0, hooks_for(head, [old], Free(), strength))
 
     whole, part, rest = trainer(), trainer(), trainer()

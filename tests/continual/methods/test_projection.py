@@ -1,4 +1,4 @@
-"""GPM: what is read from a subspace does not move, and the bases hold what they promise."""
+"""GPM: bases, and outputs for inputs in the basis."""
 
 import copy
 
@@ -11,7 +11,6 @@ from evercal.continual.methods.projection import (
     OUTPUTS,
     GradientProjectionMemory,
     grown_basis,
-    hidden_moment,
 )
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.head import Head, HeadOptions
@@ -24,7 +23,7 @@ OPTIONS = FitOptions(iterations=60, batch=64, peak_rate=1e-2)
 
 
 def moment_of(values: list[float], seed: int = 0) -> Tensor:
-    """(n, n) with these eigenvalues and random axes."""
+    """Create an (n, n) matrix with given eigenvalues and random axes."""
     generator = torch.Generator().manual_seed(seed)
     axes = torch.linalg.qr(
         torch.randn(len(values), len(values), generator=generator, dtype=torch.float64)
@@ -33,24 +32,24 @@ def moment_of(values: list[float], seed: int = 0) -> Tensor:
 
 
 def held(basis: Tensor, moment: Tensor) -> float:
-    """Share of the squared inputs that lie within the columns."""
+    """Compute the share of the squared inputs that a basis holds."""
     return float(torch.trace(basis.T @ moment @ basis) / moment.trace())
 
 
 @pytest.mark.parametrize(
     ("share", "count"), [(0.45, 1), (0.5, 1), (0.55, 2), (0.79, 2), (0.85, 3), (0.97, 4)]
 )
-def test_a_new_basis_has_as_many_columns_as_it_takes(share: float, count: int) -> None:
+def test_new_basis_has_the_fewest_columns(share: float, count: int) -> None:
     moment = moment_of([50.0, 30.0, 10.0, 8.0, 1.5, 0.5])
-    found = grown_basis(torch.zeros(6, 0, dtype=torch.float64), moment, share - 1e-9)
-    assert found.shape == (6, count)
-    torch.testing.assert_close(found.T @ found, torch.eye(count, dtype=torch.float64))
-    # The best that so many columns can hold: the largest eigenvalues.
-    assert held(found, moment) == pytest.approx(sum([50, 30, 10, 8][:count]) / 100)
+    actual = grown_basis(torch.zeros(6, 0, dtype=torch.float64), moment, share - 1e-9)
+    assert actual.shape == (6, count)
+    torch.testing.assert_close(actual.T @ actual, torch.eye(count, dtype=torch.float64))
+    # The optimum is the sum of the largest eigenvalues.
+    assert held(actual, moment) == pytest.approx(sum([50, 30, 10, 8][:count]) / 100)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_grown_basis_keeps_the_old_columns_and_holds_the_share(seed: int) -> None:
+def test_grown_basis_contains_the_old_one_and_holds_the_share(seed: int) -> None:
     first, second = (
         moment_of([9.0, 5, 1, 0.1, 0.1, 0.1, 0.01, 0.01], seed),
         moment_of([4.0, 4, 4, 1, 0.2, 0.1, 0.01, 0.01], seed + 50),
@@ -60,15 +59,15 @@ def test_a_grown_basis_keeps_the_old_columns_and_holds_the_share(seed: int) -> N
     count = grown.shape[1]
     assert old.shape[1] < count < 8
     torch.testing.assert_close(grown.T @ grown, torch.eye(count, dtype=torch.float64))
-    # Old directions are within the new ones.
+    # The span contains the old basis.
     torch.testing.assert_close(grown @ (grown.T @ old), old)
     assert held(grown, second) >= 0.9 - 1e-9
-    # And no column is more than needed: what is added are the main directions of what is left.
+    # One column fewer would not reach the share.
     free = torch.eye(8, dtype=torch.float64) - old @ old.T
     left = torch.linalg.eigvalsh(free @ second @ free).flip(0)
     fewer = held(old, second) + float(left[: count - old.shape[1] - 1].sum() / second.trace())
     assert fewer < 0.9
-    assert torch.equal(grown_basis(grown, second, 0.9), grown)  # nothing is missing now
+    assert torch.equal(grown_basis(grown, second, 0.9), grown)  # the share is reached
 
 
 def state_of(head: Head, buffer: FeatureBuffer, share: float) -> dict[str, Tensor]:
@@ -77,25 +76,25 @@ def state_of(head: Head, buffer: FeatureBuffer, share: float) -> dict[str, Tenso
 
 
 def exact_state(head: Head, buffer: FeatureBuffer) -> dict[str, Tensor]:
-    """The same in full precision, from the singular vectors of the inputs themselves."""
-    found: dict[str, Tensor] = {}
+    """Compute the bases in full precision from the singular vectors of the inputs."""
+    actual: dict[str, Tensor] = {}
     handles = []
     for name, layer in head.named_modules():
         if isinstance(layer, torch.nn.Linear):
 
             def look(_: object, inputs: tuple[Tensor, ...], __: object, name: str = name) -> None:
                 u, s, _ = torch.linalg.svd(inputs[0].double().T, full_matrices=False)
-                found[f"basis.{name}.weight"] = u[:, s > 1e-6 * s[0]].float()
+                actual[f"basis.{name}.weight"] = u[:, s > 1e-6 * s[0]].float()
 
             handles.append(layer.register_forward_hook(look))
     rows = buffer.rows(torch.arange(len(buffer)))
     with torch.no_grad():
         hidden = head.hidden(rows.features.float(), rows.scene, rows.descriptor)
     u, s, _ = torch.linalg.svd(hidden.double().T, full_matrices=False)
-    found[f"basis.{OUTPUTS}"] = u[:, s > 1e-6 * s[0]].float()
+    actual[f"basis.{OUTPUTS}"] = u[:, s > 1e-6 * s[0]].float()
     for handle in handles:
         handle.remove()
-    return found
+    return actual
 
 
 SHAPES = [
@@ -107,7 +106,7 @@ SHAPES = [
 
 
 def trained(hooks: TrainingHooks | None, head: Head) -> float:
-    """Learns a scene that contradicts the first; the fall of its loss."""
+    """Train on a scene that contradicts the first; return the last loss."""
     new = wave_buffer(1, shift_px=-12.0)
     *_, last = HeadTrainer(head, [new], OPTIONS, 0, hooks).run()
     return float(last.loss)
@@ -125,16 +124,16 @@ def two_scenes(options: HeadOptions) -> Head:
 
 
 @pytest.mark.parametrize("options", SHAPES, ids=lambda o: f"{o.condition}-{o.offsets}-{o.centres}")
-def test_answers_about_inputs_in_the_subspace_do_not_move(options: HeadOptions) -> None:
-    """The old scene shows five different points: every layer's inputs span five directions."""
+def test_output_for_inputs_in_the_basis_is_unchanged(options: HeadOptions) -> None:
+    """The old scene has five distinct rows, so the inputs of every layer span five directions."""
     old = wave_buffer(0, few=5)
     rows = old.rows(torch.arange(5))
 
-    def said(head: Head) -> Tensor:
-        # Before the softmax mixes in centres of later scenes.
+    def lines(head: Head) -> Tensor:
+        # Outputs of the old scene's centres only.
         with torch.no_grad():
-            found = head(rows.features.float(), rows.scene, rows.descriptor)
-        return torch.cat([found.points, found.offsets[:, 0], found.logits[:, :2]], 1)
+            actual = head(rows.features.float(), rows.scene, rows.descriptor)
+        return torch.cat([actual.points, actual.offsets[:, 0], actual.logits[:, :2]], 1)
 
     def drift(state: dict[str, Tensor] | None) -> tuple[float, float, bool]:
         head = two_scenes(options)
@@ -145,7 +144,7 @@ def test_answers_about_inputs_in_the_subspace_do_not_move(options: HeadOptions) 
             hooks = GradientProjectionMemory().begin(stage_start(head, [], states=states))
         loss = trained(hooks, head)
         moved = not torch.equal(head.first[1].weight, before.first[1].weight)  # pyright: ignore
-        return float((said(head) - said(before)).abs().max()), loss, moved
+        return float((lines(head) - lines(before)).abs().max()), loss, moved
 
     head = two_scenes(options)
     free, _, _ = drift(None)
@@ -153,12 +152,12 @@ def test_answers_about_inputs_in_the_subspace_do_not_move(options: HeadOptions) 
     stored, _, _ = drift(state_of(head, old, 1 - 1e-9))
     assert free > 0.1
     assert exact < 1e-4
-    assert stored < 0.02 * free  # directions are kept in half precision
+    assert stored < 0.02 * free  # bases are stored in half precision
     assert moved
-    assert loss < 60  # and something is learned in what is left
+    assert loss < 60  # the new scene is learned
 
 
-def test_only_directions_of_the_basis_are_taken_out() -> None:
+def test_only_directions_of_the_basis_are_removed() -> None:
     head, old = two_scenes(SHAPES[0]), wave_buffer(0, few=5)
     state = state_of(head, old, 0.97)
     before = copy.deepcopy(head)
@@ -170,7 +169,7 @@ def test_only_directions_of_the_basis_are_taken_out() -> None:
         assert 0 < basis.shape[1] <= 5
         assert float((change @ basis).norm()) < 1e-4 * float(change.norm())
         assert float(change.norm()) > 0
-    # What the first scene owns alone did not move; what the second owns did.
+    # Parameters of the first scene are fixed, those of the second are trained.
     own = head.centre_scene == 0
     for name in ("logit", "logit_bias", "offset", "offset_bias"):
         moved = (head.get_parameter(name) - before.get_parameter(name)).detach()
@@ -180,7 +179,7 @@ def test_only_directions_of_the_basis_are_taken_out() -> None:
     assert not torch.equal(head.code[1], before.code[1])
 
 
-def test_bases_of_later_scenes_hold_those_of_earlier_ones() -> None:
+def test_later_basis_contains_earlier_bases() -> None:
     head = wave_head(3)
     method, states = GradientProjectionMemory(kept_share=0.9), []
     for scene in range(2):
@@ -196,18 +195,3 @@ def test_bases_of_later_scenes_hold_those_of_earlier_ones() -> None:
         inside = second.float() @ (second.float().T @ first.float())
         torch.testing.assert_close(inside, first.float(), atol=5e-3, rtol=0)
     assert f"basis.{OUTPUTS}" in states[0]
-
-
-def test_the_moment_of_the_last_hidden_layer(monkeypatch: pytest.MonkeyPatch) -> None:
-    head, buffer = wave_head(1), wave_buffer(0, few=1)
-    rows = buffer.rows(torch.arange(1))
-    with torch.no_grad():
-        hidden = head.hidden(rows.features.float(), rows.scene, rows.descriptor).double()
-    monkeypatch.setattr("evercal.continual.methods.projection.ROWS", 10)
-    torch.testing.assert_close(
-        hidden_moment(head, buffer), 10 * hidden.T @ hidden, rtol=1e-5, atol=1e-6
-    )
-
-
-def test_the_first_scene_is_learned_freely() -> None:
-    assert type(GradientProjectionMemory().begin(stage_start(wave_head(1), []))) is TrainingHooks

@@ -1,4 +1,4 @@
-"""Replay: rows of which scenes, what they cost together, and what is stored beside them."""
+"""Replay: division of rows, weights, and stored points."""
 
 import copy
 from dataclasses import dataclass, replace
@@ -14,25 +14,24 @@ from evercal.continual.methods.replay import (
     Replay,
     ReplayHooks,
     by_scene,
-    teacher_output,
 )
 from evercal.continual.networks.buffer import Rows, join
 from evercal.continual.networks.head import HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
 
-from .by_hand import off_by, says, stage_start, wave_buffer, wave_head
+from .by_hand import head_output, off_by, stage_start, wave_buffer, wave_head
 
 
 @dataclass(frozen=True)
 class OneEach(Penalty):
-    """One per row, whatever the head says."""
+    """A constant loss of one per row."""
 
     needs_teacher = False
 
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """The mean of ones."""
+        """Return one."""
         assert teacher is None
         return torch.ones(len(rows.scene)).mean()
 
@@ -44,19 +43,19 @@ def drawn(hooks: TrainingHooks, step: int = 0) -> list[Rows]:
 
 @pytest.mark.parametrize("scenes", [1, 2, 3, 6])
 @pytest.mark.parametrize("every_scene", [True, False])
-def test_remembered_scenes_cost_each_or_together(scenes: int, every_scene: bool) -> None:
+def test_weight_applies_per_scene_or_in_total(scenes: int, every_scene: bool) -> None:
     method = Replay(penalty=OneEach(), weight=0.3, every_scene=every_scene)
     memories = [wave_buffer(i) for i in range(scenes)]
     hooks = method.begin(stage_start(wave_head(scenes + 1), memories))
     replayed = join(drawn(hooks))
-    cost = hooks.cost(says([off_by(0.0)] * len(replayed.scene)), replayed, 0.0)
+    cost = hooks.cost(head_output([off_by(0.0)] * len(replayed.scene)), replayed, 0.0)
     assert cost is not None
-    # S scenes cost S times the mean over their rows, as if each were added up on its own.
+    # S scenes have S times the mean over their rows, the sum of the scenes' means.
     assert float(cost) == pytest.approx(0.3 * (scenes if every_scene else 1))
 
 
 @pytest.mark.parametrize(("scenes", "each"), [(1, 60), (2, 30), (3, 20), (4, 15), (7, 8), (90, 1)])
-def test_rows_are_shared_out_evenly_and_a_step_does_not_grow(scenes: int, each: int) -> None:
+def test_replayed_rows_are_divided_among_scenes(scenes: int, each: int) -> None:
     memories = [wave_buffer(i % 4) for i in range(scenes)]
     start = stage_start(wave_head(4), memories, replay_rows=60)
     hooks = Replay().begin(start)
@@ -67,58 +66,38 @@ def test_rows_are_shared_out_evenly_and_a_step_does_not_grow(scenes: int, each: 
     assert sum(len(part.scene) for part in drawn(hooks)) <= max(60, scenes)
 
 
-def test_the_weighted_cost_equals_each_scene_on_its_own() -> None:
-    """For a penalty that is a mean of rows: S x mean of all = sum of the scenes' own means."""
-    memories = [wave_buffer(i) for i in range(3)]
-    head, teacher = wave_head(4), wave_head(4)
-    with torch.no_grad():
-        for value in teacher.parameters():
-            value.add_(0.01)
-    method = Replay(penalty=OldOutput(), weight=0.5)
-    hooks = method.begin(stage_start(head, memories, teacher=teacher, replay_rows=60))
-    parts = drawn(hooks)
-    replayed = join(parts)
-    output = head(replayed.features.float(), replayed.scene, replayed.descriptor)
-    found = hooks.cost(output, replayed, 0.4)
-    assert found is not None
-    expected = 0.0
-    for said, part in by_scene(output, replayed, memories):
-        expected += 0.5 * method.penalty(said, teacher_output(teacher, part), part, 0.4)
-    torch.testing.assert_close(found, torch.as_tensor(expected), rtol=1e-3, atol=1e-3)
-
-
-def test_rows_are_told_apart_by_scene() -> None:
+def test_rows_are_split_by_scene() -> None:
     memories = [wave_buffer(i) for i in range(3)]
     parts = [memory.draw(4, torch.Generator().manual_seed(i)) for i, memory in enumerate(memories)]
-    output = says([[float(i), 0.0, 1.0] for i in range(12)])
-    found = by_scene(output, join(parts), memories)
-    for i, (said, part) in enumerate(found):
+    output = head_output([[float(i), 0.0, 1.0] for i in range(12)])
+    actual = by_scene(output, join(parts), memories)
+    for i, (lines, part) in enumerate(actual):
         assert part.index.tolist() == parts[i].index.tolist()
-        assert said.points[:, 0].tolist() == list(range(4 * i, 4 * i + 4))
+        assert lines.points[:, 0].tolist() == list(range(4 * i, 4 * i + 4))
 
 
-def test_the_first_scene_replays_nothing() -> None:
+def test_first_scene_has_no_replay() -> None:
     hooks = Replay().begin(stage_start(wave_head(1), []))
     assert type(hooks) is TrainingHooks
     assert drawn(hooks) == []
 
 
-def test_the_teacher_is_asked_only_where_it_is_needed() -> None:
+def test_teacher_runs_only_if_needed() -> None:
     head = wave_head(2)
     start = stage_start(head, [wave_buffer(0)], teacher=copy.deepcopy(head))
     assert start.teacher is not None
-    asked = []
-    start.teacher.register_forward_hook(lambda *_: asked.append(1))
-    output, some = says([off_by(1.0)] * 2), wave_buffer(0).rows(torch.arange(2))
+    calls = []
+    start.teacher.register_forward_hook(lambda *_: calls.append(1))
+    output, some = head_output([off_by(1.0)] * 2), wave_buffer(0).rows(torch.arange(2))
     for penalty, times in ((Reprojection(), 0), (OldOutput(), 1)):
         hooks = Replay(penalty=penalty).begin(start)
         assert isinstance(hooks, ReplayHooks)
         hooks.cost(output, some, 0.5)
-        assert len(asked) == times
+        assert len(calls) == times
 
 
-def test_stored_points_are_what_the_head_says_of_plain_views() -> None:
-    """Four views, of which the first two show keyframes as they are."""
+def test_stored_points_are_the_output_for_plain_views() -> None:
+    """The first two of four views are plain."""
     head, buffer = wave_head(2), wave_buffer(1, views=4)
     scene = FinishedScene(head, 1, lambda: buffer, lambda: buffer, 2, [], None)
     state = DarkExperienceReplay().after_scene(scene)
@@ -126,14 +105,14 @@ def test_stored_points_are_what_the_head_says_of_plain_views() -> None:
     assert len(state["points"]) == 100
     some = buffer.rows(torch.arange(100))
     with torch.no_grad():
-        said = head(some.features.float(), 1, some.descriptor).points
-    spread = float((said - said.mean(0)).abs().max())
-    kept = state["points"].float() + state["origin"]
-    torch.testing.assert_close(kept, said, atol=spread * 2**-10, rtol=0)
+        lines = head(some.features.float(), 1, some.descriptor).points
+    spread = float((lines - lines.mean(0)).abs().max())
+    selected = state["points"].float() + state["origin"]
+    torch.testing.assert_close(selected, lines, atol=spread * 2**-10, rtol=0)
 
 
-def test_stored_points_meet_their_own_rows_again() -> None:
-    """In a later stage rows are drawn at random, also those of augmented views."""
+def test_stored_points_return_to_their_rows() -> None:
+    """Drawn rows of augmented views have no stored point."""
     head = wave_head(3)
     buffers = [wave_buffer(i, views=4) for i in range(2)]
     method, states = DarkExperienceReplay(), []
@@ -148,17 +127,19 @@ def test_stored_points_meet_their_own_rows_again() -> None:
     for part, plain in zip(parts, (100, 150), strict=True):
         assert part.stored is not None
         with torch.no_grad():
-            said = head(part.features.float(), part.scene, part.descriptor).points
-        known = part.index < plain
-        assert 0.3 < float(known.float().mean()) < 0.9
-        torch.testing.assert_close(part.stored[known], said[known], atol=5e-3, rtol=0)
-        assert bool(part.stored[~known].isnan().all())
-    # The cost is that of a student who has not moved: the truth alone.
+            lines = head(part.features.float(), part.scene, part.descriptor).points
+        learned_head = part.index < plain
+        assert 0.3 < float(learned_head.float().mean()) < 0.9
+        torch.testing.assert_close(
+            part.stored[learned_head], lines[learned_head], atol=5e-3, rtol=0
+        )
+        assert bool(part.stored[~learned_head].isnan().all())
+    # An unchanged student has only the reprojection loss.
     replayed = join(parts)
     output = head(replayed.features.float(), replayed.scene, replayed.descriptor)
     hooks = method.begin(start)
     truth = 2 * 0.5 * float(Reprojection()(output, None, replayed, 0.5).detach())
-    found = hooks.cost(output, replayed, 0.5)
-    assert found is not None
-    assert float(found.detach()) == pytest.approx(truth, abs=2 * 0.5 * 50 * 3 * 5e-3)
+    actual = hooks.cost(output, replayed, 0.5)
+    assert actual is not None
+    assert float(actual.detach()) == pytest.approx(truth, abs=2 * 0.5 * 50 * 3 * 5e-3)
     assert replace(method, weight=2.0).weight == 2.0

@@ -1,4 +1,4 @@
-"""EWC, SI and MAS: the cost by hand, importances where they are known in closed form."""
+"""EWC, SI and MAS: cost and importances against closed forms."""
 
 import copy
 from dataclasses import replace
@@ -15,9 +15,8 @@ from evercal.continual.methods.weight_regularization import (
     WeightRegularization,
     mean_over_images,
     scaled_to_mean_one,
-    tie_cost,
 )
-from evercal.continual.networks.head import Head, HeadOptions
+from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import ProposedStep
 from evercal.continual.networks.loss import LossOptions, reprojection_loss
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer
@@ -28,7 +27,7 @@ OPTIONS = FitOptions(iterations=8, batch=64, peak_rate=1e-2)
 
 
 def tied(head: Head, importance: float, shift: float = 0.0) -> dict[str, Tensor]:
-    """A state whose anchors lie `shift` beside the weights."""
+    """Create a state whose anchors differ from the weights by `shift`."""
     state = {f"anchor.{n}": v.detach() + shift for n, v in head.named_parameters()}
     return state | {
         f"importance.{n}": torch.full_like(v.detach(), importance)
@@ -37,34 +36,20 @@ def tied(head: Head, importance: float, shift: float = 0.0) -> dict[str, Tensor]
 
 
 def cost(method: WeightRegularization, head: Head, states: list[MethodState]) -> float:
-    found = method.begin(stage_start(head, [], states=states)).regularizer()
-    return 0.0 if found is None else float(found.detach())
+    actual = method.begin(stage_start(head, [], states=states)).regularizer()
+    return 0.0 if actual is None else float(actual.detach())
 
 
-def test_the_cost_of_moving_by_hand() -> None:
+def test_cost_by_hand() -> None:
     head = wave_head(1)
     ewc = ElasticWeightConsolidation(strength=7.0)
     assert cost(ewc, head, [tied(head, 3.0)]) == 0.0
-    # Every weight 0.1 away, importance 3 once and 1 once: strength / 2 (3 + 1) 0.01, a mean.
+    # Two scenes with importances 3 and 1, every weight changed by 0.1.
     states: list[MethodState] = [tied(head, 3.0, 0.1), tied(head, 1.0, -0.1)]
     assert cost(ewc, head, states) == pytest.approx(0.5 * 7 * 4 * 0.01, rel=1e-4)
-    # The running form looks at the newest state alone.
+    # The running form uses the newest state only.
     assert cost(replace(ewc, running=True), head, states) == pytest.approx(0.5 * 7 * 0.01, rel=1e-4)
     assert cost(ewc, head, []) == 0.0
-
-
-def test_one_weight_that_moves_costs_its_own_importance() -> None:
-    head = wave_head(1)
-    state = tied(head, 2.0)
-    state["importance.logit"][1, 3] = 40.0
-    count = sum(value.numel() for value in head.parameters())
-    with torch.no_grad():
-        head.logit[1, 3] += 0.5
-    expected = 0.5 * 40 * 0.25 / count
-    ties = [
-        {n: (state[f"anchor.{n}"], state[f"importance.{n}"]) for n, _ in head.named_parameters()}
-    ]
-    assert float(tie_cost(head, ties).detach()) == pytest.approx(expected, rel=1e-4)
 
 
 def test_rows_of_later_scenes_are_free() -> None:
@@ -82,111 +67,77 @@ def test_rows_of_later_scenes_are_free() -> None:
 
 
 def test_importances_have_mean_one() -> None:
-    found = scaled_to_mean_one({"a": torch.tensor([1.0, 5.0]), "b": torch.tensor([[6.0, 0.0]])})
-    assert found["a"].tolist() == pytest.approx([1 / 3, 5 / 3])
-    assert found["b"].tolist() == [[2.0, 0.0]]
+    actual = scaled_to_mean_one({"a": torch.tensor([1.0, 5.0]), "b": torch.tensor([[6.0, 0.0]])})
+    assert actual["a"].tolist() == pytest.approx([1 / 3, 5 / 3])
+    assert actual["b"].tolist() == [[2.0, 0.0]]
     assert scaled_to_mean_one({"a": torch.zeros(3)})["a"].tolist() == [0, 0, 0]
 
 
 @pytest.fixture
 def finished() -> FinishedScene:
-    """The second of two scenes was learned."""
+    """The second of two scenes after training."""
     head, buffer = wave_head(2), wave_buffer(1)
     list(HeadTrainer(head, [buffer], OPTIONS, 0).run())
     return FinishedScene(head, 1, lambda: buffer, lambda: buffer, 2, [], None)
 
 
 def importances(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    found = {k.removeprefix("importance."): v for k, v in state.items() if k.startswith("imp")}
-    return {name: value.double() for name, value in found.items()}
+    actual = {k.removeprefix("importance."): v for k, v in state.items() if k.startswith("imp")}
+    return {name: value.double() for name, value in actual.items()}
 
 
 @pytest.mark.parametrize(
     "method", [ElasticWeightConsolidation(), MemoryAwareSynapses()], ids=["ewc", "mas"]
 )
-def test_what_a_scene_does_not_use_has_no_importance(
+def test_unused_parameters_have_no_importance(
     method: WeightRegularization, finished: FinishedScene
 ) -> None:
     state = method.after_scene(finished)
-    found = importances(state)
-    count = sum(value.numel() for value in found.values())
-    assert sum(float(v.sum()) for v in found.values()) / count == pytest.approx(1, rel=0.02)
-    assert all(bool((value >= 0).all()) for value in found.values())
-    assert float(found["code"][0].abs().max()) == 0.0 < float(found["code"][1].max())
+    actual = importances(state)
+    count = sum(value.numel() for value in actual.values())
+    assert sum(float(v.sum()) for v in actual.values()) / count == pytest.approx(1, rel=0.02)
+    assert all(bool((value >= 0).all()) for value in actual.values())
+    assert float(actual["code"][0].abs().max()) == 0.0 < float(actual["code"][1].max())
     own = finished.head.centre_scene == 1
-    assert float(found["logit"][~own].abs().max()) == 0.0 < float(found["logit"][own].max())
+    assert float(actual["logit"][~own].abs().max()) == 0.0 < float(actual["logit"][own].max())
     for name, value in finished.head.named_parameters():
         torch.testing.assert_close(state[f"anchor.{name}"], value.detach().half())
 
 
-def test_the_fisher_information_is_the_mean_of_squared_gradients(finished: FinishedScene) -> None:
-    """One image, all of whose rows are alike: the gradient of any draw is the same."""
+def test_fisher_information_is_the_mean_squared_gradient(finished: FinishedScene) -> None:
+    """All rows of the image are equal, so every draw has the same gradient."""
     buffer = wave_buffer(1, views=1, few=1)
     scene = replace(finished, rows=lambda: buffer)
-    found = ElasticWeightConsolidation().importance(scene)
+    actual = ElasticWeightConsolidation().importance(scene)
     row = buffer.rows(torch.arange(1))
     points = finished.head(row.features.float(), 1, row.descriptor).points
     loss, _ = reprojection_loss(points, row.target, 5.0, LossOptions())
     named = dict(finished.head.named_parameters())
     exact = torch.autograd.grad(loss.mean(), list(named.values()), materialize_grads=True)
     for (name, _), slope in zip(named.items(), exact, strict=True):
-        torch.testing.assert_close(found[name], slope.square(), rtol=1e-3, atol=1e-7)
+        torch.testing.assert_close(actual[name], slope.square(), rtol=1e-3, atol=1e-7)
 
 
-def test_running_sums(finished: FinishedScene) -> None:
-    for method, kept in (
+def test_running_sums_by_hand(finished: FinishedScene) -> None:
+    for method, selected in (
         (ElasticWeightConsolidation(running=True), 0.9),
         (MemoryAwareSynapses(), 1.0),
     ):
         first = method.after_scene(finished)
         second = method.after_scene(replace(finished, earlier=[{"other": torch.zeros(1)}, first]))
         name = "importance.logit"
-        expected = first[name].float() * (1 + kept)
+        expected = first[name].float() * (1 + selected)
         torch.testing.assert_close(second[name].float(), expected, rtol=5e-3, atol=1e-3)
         assert set(second) == set(first)
-    # One of each kind a scene: earlier states do not enter.
+    # Without a running sum, earlier states are not used.
     plain = ElasticWeightConsolidation()
     alone = plain.after_scene(finished)
     again = plain.after_scene(replace(finished, earlier=[alone]))
     assert all(torch.equal(alone[key], again[key]) for key in alone)
 
 
-def test_a_weight_that_moves_a_whole_image_matters_to_mas(finished: FinishedScene) -> None:
-    """Points of an image count from the middle of the scene, not from the middle of the image."""
-    one_point = wave_buffer(1, views=2, few=1)
-    two_images = wave_buffer(1, views=4)
-    found = MemoryAwareSynapses().importance(replace(finished, rows=lambda: two_images))
-    assert float(found["offset_bias"].max()) > 0
-    # A scene of one point reacts to nothing: all of it lies in its middle.
-    found = MemoryAwareSynapses().importance(replace(finished, rows=lambda: one_point))
-    assert max(float(value.max()) for value in found.values()) < 1e-4
-    # Two images of a point each, which differ: with a middle of each image's own nothing would
-    # matter.
-    apart = wave_buffer(1, views=2)
-    apart.tensors["features"][:50] = apart.tensors["features"][0]
-    apart.tensors["features"][50:] = apart.tensors["features"][50]
-    found = MemoryAwareSynapses().importance(replace(finished, rows=lambda: apart))
-    assert max(float(value.max()) for value in found.values()) > 1e-3
-
-
-def test_a_running_sum_takes_rows_that_were_appended_as_they_are(finished: FinishedScene) -> None:
-    method = ElasticWeightConsolidation(running=True)
-    earlier = {
-        f"importance.{name}": torch.ones_like(value[: len(value) // 2]).half()
-        for name, value in finished.head.named_parameters()
-    }
-    found = importances(method.after_scene(replace(finished, earlier=[earlier])))
-    alone = importances(method.after_scene(finished))
-    half = len(alone["logit"]) // 2
-    gained = found["logit"] - alone["logit"]
-    torch.testing.assert_close(
-        gained[:half], torch.full_like(gained[:half], 0.9), atol=0.02, rtol=0
-    )
-    torch.testing.assert_close(gained[half:], torch.zeros_like(gained[half:]), atol=0.02, rtol=0)
-
-
 class Linear(torch.nn.Module):
-    """Points that are a linear function of the features: P = F W'."""
+    """Linear points, P = F W'."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -200,7 +151,7 @@ class Linear(torch.nn.Module):
 def test_mas_of_a_linear_function_in_closed_form() -> None:
     """|d/dW of the mean |p - mean p|^2| = |2/n sum_i (p_i - mean p) f_i'|, the mean held fixed."""
     buffer, linear = wave_buffer(1, views=1, few=1), Linear()
-    # Two different rows, as many of each in every draw on average; take the draw's own rows.
+    # The expected value uses the drawn rows.
     drawn = []
 
     def length(some) -> Tensor:
@@ -209,18 +160,18 @@ def test_mas_of_a_linear_function_in_closed_form() -> None:
         return (points - points.mean(0).detach()).square().sum(-1).mean()
 
     buffer = wave_buffer(1, views=3)
-    found = mean_over_images(linear, buffer, 10, length, torch.abs)["weight"]  # pyright: ignore[reportArgumentType]
+    actual = mean_over_images(linear, buffer, 10, length, torch.abs)["weight"]  # pyright: ignore[reportArgumentType]
     assert len(drawn) == 3  # every image once
     expected = torch.zeros(3, 9)
     for features in drawn:
         points = linear.points(features).detach()
         away = points - points.mean(0)
         expected += (2 / len(features) * away.T @ features).abs() / 3
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_mas_does_not_ask_where_the_scene_lies(finished: FinishedScene) -> None:
-    """The length is taken from the mean of the scene: moving all centres changes nothing."""
+def test_mas_does_not_depend_on_the_position_of_the_scene(finished: FinishedScene) -> None:
+    """A translation of all centres does not change the importances."""
     method = MemoryAwareSynapses()
     here = method.importance(finished)
     moved = copy.deepcopy(finished.head)
@@ -230,8 +181,8 @@ def test_mas_does_not_ask_where_the_scene_lies(finished: FinishedScene) -> None:
         torch.testing.assert_close(here[name], there[name], rtol=1e-3, atol=1e-5)
 
 
-def test_the_path_integral_is_the_fall_of_a_quadratic_loss() -> None:
-    """SI's sum over the path of -gradient x change, with small plain gradient steps."""
+def test_path_integral_equals_the_fall_of_a_quadratic_loss() -> None:
+    """The sum of -gradient x change over small gradient steps."""
     head = wave_head(1)
     method = SynapticIntelligence()
     hooks = method.begin(stage_start(head, []))
@@ -260,38 +211,38 @@ def test_the_path_integral_is_the_fall_of_a_quadratic_loss() -> None:
         hooks.edit_step(ProposedStep(changes, gradients, torch.zeros(0), [], step, 1.0))
     path = {k.removeprefix("path."): v for k, v in hooks.state().items() if k.startswith("path.")}
     fell = sum(float(value.sum()) for value in path.values())
-    # The sum takes the gradient at the start of each step: too much by rate x curve / 2 at most.
+    # The gradient at the start of a step overestimates by at most rate x curvature / 2.
     assert fell == pytest.approx(first - loss(), rel=rate)
     assert first - loss() > 0.3 * first
-    # So it is weight by weight.
+    # This also holds for each weight.
     name = "first.1.weight"
     torch.testing.assert_close(path[name], before[name] - share(name), rtol=rate, atol=1e-5)
 
 
-def test_importance_of_a_path_is_its_share_over_the_squared_way() -> None:
+def test_path_importance_by_hand() -> None:
     head = wave_head(1)
     hooks = SynapticIntelligence(damping=0.5).begin(stage_start(head, []))
     named = dict(head.named_parameters())
     changes = {name: torch.zeros_like(value) for name, value in named.items()}
     gradients = {name: torch.zeros_like(value) for name, value in named.items()}
-    # Two weights move: one downhill by 0.2 at a slope of -3, one uphill.
-    for i, (slope, way) in enumerate(((-3.0, 0.2), (2.0, 0.1))):
-        changes["logit"][0, i], gradients["logit"][0, i] = way, slope
+    # One weight moves downhill by 0.2 at a slope of -3, one moves uphill.
+    for i, (slope, distance) in enumerate(((-3.0, 0.2), (2.0, 0.1))):
+        changes["logit"][0, i], gradients["logit"][0, i] = distance, slope
     with torch.no_grad():
         head.logit.add_(changes["logit"])
     hooks.edit_step(ProposedStep(changes, gradients, torch.zeros(0), [], 0, 1.0))
-    found = hooks.importance(head)  # pyright: ignore[reportAttributeAccessIssue]
+    actual = hooks.importance(head)  # pyright: ignore[reportAttributeAccessIssue]
     count = sum(value.numel() for value in named.values())
     floor = 0.5 * (0.04 + 0.01) / count
-    assert float(found["logit"][0, 0]) == pytest.approx(0.6 / (0.04 + floor), rel=1e-4)
-    assert float(found["logit"][0, 1]) == 0.0
-    assert sum(float(value.sum()) for value in found.values()) == pytest.approx(
-        float(found["logit"][0, 0])
+    assert float(actual["logit"][0, 0]) == pytest.approx(0.6 / (0.04 + floor), rel=1e-4)
+    assert float(actual["logit"][0, 1]) == 0.0
+    assert sum(float(value.sum()) for value in actual.values()) == pytest.approx(
+        float(actual["logit"][0, 0])
     )
 
 
-def test_the_pull_of_the_ties_does_not_count_as_a_fall_of_the_loss() -> None:
-    """The new scene's loss is flat here; all that moves the weights are the ties."""
+def test_pull_of_the_ties_is_excluded_from_the_path() -> None:
+    """The loss of the new scene is constant, so only the ties change the weights."""
     head = wave_head(1)
     state = tied(head, 1.0, 0.5)
     hooks = SynapticIntelligence(strength=100.0).begin(stage_start(head, [], states=[state]))
@@ -307,30 +258,12 @@ def test_the_pull_of_the_ties_does_not_count_as_a_fall_of_the_loss() -> None:
         changes = {n: v.detach() - before[n] for n, v in head.named_parameters()}
         hooks.edit_step(ProposedStep(changes, gradients, torch.zeros(0), [], step, 1.0))
     path = torch.cat([v.flatten() for k, v in hooks.state().items() if k.startswith("path.")])
-    fallen = 0.5 * 100 * 0.25  # what the ties cost at first
+    fallen = 0.5 * 100 * 0.25  # initial cost of the ties
     assert float(path.abs().sum()) < 1e-4 * fallen
 
 
-def test_the_path_in_a_real_training_follows_the_loss() -> None:
-    """Importances after plain training: only what the scene uses, and an interruption is unseen."""
-    head, buffer = wave_head(2), wave_buffer(1)
-    method = SynapticIntelligence()
-    twin = copy.deepcopy(head)
-    hooks = method.begin(stage_start(head, []))
-    trainer = HeadTrainer(head, [buffer], OPTIONS, 0, hooks)
-    list(trainer.run())
-    free = HeadTrainer(twin, [buffer], OPTIONS, 0)
-    list(free.run())
-    # Looking on changes nothing but the rounding of sums.
-    torch.testing.assert_close(flat(head), flat(twin), rtol=0, atol=1e-5)
-    scene = FinishedScene(head, 1, lambda: buffer, lambda: buffer, 2, [], hooks)
-    found = method.after_scene(scene)
-    assert float(found["importance.code"][0].abs().max()) == 0.0
-    assert float(found["importance.code"][1].max()) > 0
-
-
 @pytest.mark.parametrize("method", [ElasticWeightConsolidation(), SynapticIntelligence()])
-def test_ties_hold_the_weights_in_training(method: WeightRegularization) -> None:
+def test_ties_constrain_the_weights(method: WeightRegularization) -> None:
     moved = []
     for strength in (0.0, 1e5):
         head, old = wave_head(2), wave_head(2)
@@ -340,12 +273,3 @@ def test_ties_hold_the_weights_in_training(method: WeightRegularization) -> None
         list(HeadTrainer(head, [wave_buffer(1)], OPTIONS, 0, hooks).run())
         moved.append(float((flat(head) - flat(old)).norm()))
     assert moved[1] < 0.5 * moved[0]
-
-
-def test_options_of_the_head_do_not_matter() -> None:
-    options = HeadOptions(width=16, blocks=1, offsets="shared", condition="descriptor")
-    head, buffer = wave_head(1, options), wave_buffer(0)
-    scene = FinishedScene(head, 0, lambda: buffer, lambda: buffer, 2, [], None)
-    for method in (ElasticWeightConsolidation(), MemoryAwareSynapses()):
-        state = method.after_scene(scene)
-        assert cost(method, head, [state]) == pytest.approx(0.0, abs=1e-3)

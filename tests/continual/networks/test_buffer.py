@@ -1,4 +1,4 @@
-"""Rows of the feature buffer: what they must project to, and what an interruption may change."""
+"""The feature buffer: projections of its rows, checkpoints and draws."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -27,7 +27,7 @@ CAMERAS = (
     replace(LANDSCAPE, distortion=(-0.22, 0.07, 0.004, -0.003)),
     Camera(120, 160, 128.0, 131.0, 57.0, 83.0),
 )
-# Nothing in a buffer may rely on the atlas being a mere shift.
+# The buffer must support any pose of the base frame, not only a translation.
 ATLAS_FROM_BASE = SE3.exp([10.0, -5.0, 0.3, 0.2, -0.4, 1.1])
 PLAN = EncodePlan(views_per_frame=3, cells=40, seed=5, view=ViewOptions(short_side=120, gamma=0.0))
 
@@ -56,16 +56,16 @@ def filled(
 
 
 def camera_of(target: module.Target, row: int) -> tuple[Camera, SE3]:
-    """The ideal camera that a row is judged by, and `atlas_from_camera`."""
+    """Return the ideal camera of a row and `atlas_from_camera`."""
     fx, fy, cx, cy = (float(value) for value in target.intrinsics[row])
     matrix = np.vstack([target.camera_from_atlas[row].cpu().double().numpy(), [0, 0, 0, 1]])
     return Camera(400, 400, fx, fy, cx, cy), SE3.from_matrix(matrix).inverse()
 
 
-def test_the_point_that_a_cell_shows_projects_to_its_pixel(
+def test_point_of_a_cell_projects_to_its_pixel(
     box: BoxRoom, frames: list[Frame], filled: Filled
 ) -> None:
-    """Cell -> ray of the frame's real lens -> point of the room -> atlas -> the row's target."""
+    """Cell -> ray of the frame's camera -> point of the room -> atlas -> target of the row."""
     buffer = filled()
     start, checked = 0, 0
     for number in range(PLAN.views_per_frame):
@@ -74,49 +74,51 @@ def test_the_point_that_a_cell_shows_projects_to_its_pixel(
             small = frame.camera.short_side_resized(120)
             if number == 0:
                 view = frame_view(frame, 8, PLAN.view)
-                kept = np.arange(len(view.valid))
+                selected = np.arange(len(view.valid))
                 rays = small.unproject(cell_centres(small.height, small.width, 8))
             else:
                 view = augmented_view(frame, 8, PLAN.view, rng)
-                kept = np.sort(rng.permutation(np.flatnonzero(view.valid))[: PLAN.cells])
-                rays = replace(small, distortion=()).unproject(view.cell_pixels)[kept]
+                selected = np.sort(rng.permutation(np.flatnonzero(view.valid))[: PLAN.cells])
+                rays = replace(small, distortion=()).unproject(view.cell_pixels)[selected]
             pose = frame.base_from_camera
             assert pose is not None
             points, _ = box.intersect(pose.translation_m, rays @ pose.rotation_matrix().T)
             atlas = ATLAS_FROM_BASE.apply(points)
-            rows = buffer.rows(torch.arange(start, start + len(kept)))
-            start += len(kept)
+            rows = buffer.rows(torch.arange(start, start + len(selected)))
+            start += len(selected)
             assert (rows.scene == 4).all()
             ideal, atlas_from_camera = camera_of(rows.target, 0)
-            seen = ideal.project(atlas_from_camera.inverse().apply(atlas))
-            np.testing.assert_allclose(rows.target.pixels.cpu().numpy(), seen, atol=1e-2)
-            checked += len(kept)
+            captured = ideal.project(atlas_from_camera.inverse().apply(atlas))
+            np.testing.assert_allclose(rows.target.pixels.cpu().numpy(), captured, atol=1e-2)
+            checked += len(selected)
     assert start == checked == len(buffer)
     assert buffer.views == PLAN.views_per_frame * len(frames)
 
 
-def test_a_feature_is_that_of_the_cell_its_target_names(
+def test_feature_belongs_to_the_cell_of_its_target(
     box: BoxRoom, frames: list[Frame], filled: Filled
 ) -> None:
-    """The room, drawn with each row's own camera, shows at its pixel what the cell shows."""
+    """A rendering by the row's camera shows the cell's grey value at the row's pixel."""
     buffer = filled(replace(PLAN, view=replace(PLAN.view, zoom=1.1)))
-    found, expected = [], []
+    actual, expected = [], []
     views = buffer.tensors["view"]
     for view in range(buffer.views):
         rows = buffer.rows(torch.nonzero(views == view)[:, 0])
         ideal, atlas_from_camera = camera_of(rows.target, 0)
-        ideal = replace(ideal, cx=ideal.cx + 60, cy=ideal.cy + 60)  # a barrel lens sees more
+        ideal = replace(
+            ideal, cx=ideal.cx + 60, cy=ideal.cy + 60
+        )  # barrel distortion has a wider view
         image = box.render(ideal, ATLAS_FROM_BASE.inverse() @ atlas_from_camera)
         grey = cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (9, 9))
         where = (rows.target.pixels.cpu().numpy() + 60)[:, None].astype(np.float32)
         expected.append(cv2.remap(grey, where, None, cv2.INTER_LINEAR).ravel() / 255)  # type: ignore[call-overload]
-        found.append(rows.features[:, 0].cpu().float().numpy())
-        assert np.corrcoef(found[-1], expected[-1])[0, 1] > 0.9
-    difference = np.abs(np.concatenate(found) - np.concatenate(expected))
+        actual.append(rows.features[:, 0].cpu().float().numpy())
+        assert np.corrcoef(actual[-1], expected[-1])[0, 1] > 0.9
+    difference = np.abs(np.concatenate(actual) - np.concatenate(expected))
     assert np.median(difference) < 0.015
 
 
-def test_rows_carry_the_descriptor_of_their_image(
+def test_rows_have_the_descriptor_of_their_image(
     frames: list[Frame], filled: Filled, block_mean: Encoder, describe: GlobalDescriptor
 ) -> None:
     buffer = filled(replace(PLAN, views_per_frame=1))
@@ -129,25 +131,13 @@ def test_rows_carry_the_descriptor_of_their_image(
         torch.testing.assert_close(own.cpu(), expected.expand_as(own), atol=2e-3, rtol=0)
 
 
-def test_encode_is_the_encoder_on_grey_values_from_0_to_1(
-    frames: list[Frame], block_mean: Encoder, describe: GlobalDescriptor
-) -> None:
-    views = [frame_view(frame, 8, PLAN.view) for frame in frames[3:5]]
-    features, descriptors = encode(views, block_mean, describe)
-    for view, found in zip(views, features, strict=True):
-        blocks = view.grey.reshape(15, 8, 20, 8).mean((1, 3)) / 255
-        np.testing.assert_allclose(found[0].numpy(), blocks, atol=4e-3)  # 4e-3: bfloat16
-        assert float(found.mean()) == pytest.approx(blocks.mean(), rel=1e-3)
-    assert descriptors.shape == (2, describe.width)
-
-
 def same(a: FeatureBuffer, b: FeatureBuffer) -> bool:
     return a.tensors.keys() == b.tensors.keys() and all(
         torch.equal(value, b.tensors[name]) for name, value in a.tensors.items()
     )
 
 
-def test_rows_depend_on_the_seed_alone(filled: Filled) -> None:
+def test_rows_depend_on_the_seed_only(filled: Filled) -> None:
     first = filled()
     np.random.default_rng(0).random(100)
     torch.rand(7)
@@ -159,30 +149,19 @@ def test_rows_depend_on_the_seed_alone(filled: Filled) -> None:
 
 
 def plain_views(buffer: FeatureBuffer) -> list[Tensor]:
-    """Row numbers of the views of the first pass."""
+    """Return the row numbers of each view of the first pass."""
     return [torch.nonzero(buffer.tensors["view"] == view)[:, 0] for view in range(7)]
 
 
-def test_rows_do_not_depend_on_the_batch(filled: Filled, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = filled().tensors
-    monkeypatch.setattr(module, "ENCODE_BATCH", 3)
-    second = filled().tensors
-    for name in ("pixels", "view", "intrinsics", "camera_from_atlas"):
-        assert torch.equal(first[name], second[name]), name
-    torch.testing.assert_close(first["features"], second["features"], atol=4e-3, rtol=0)
-
-
-def test_a_view_does_not_depend_on_the_frames_around_it(
-    frames: list[Frame], filled: Filled
-) -> None:
-    """Position and pass count, not how many other frames there are."""
+def test_view_does_not_depend_on_other_frames(frames: list[Frame], filled: Filled) -> None:
+    """A view depends on position and pass, not on the number of frames."""
     whole, few = filled(), filled(some=frames[:2])
     last = whole.rows(torch.nonzero(whole.tensors["view"] == 7)[:, 0])  # frame 0, pass 1
     alone = few.rows(torch.nonzero(few.tensors["view"] == 2)[:, 0])
     assert torch.equal(last.target.pixels, alone.target.pixels)
 
 
-def test_augmented_views_keep_as_many_cells_as_planned_and_valid_ones_only(
+def test_augmented_views_have_the_planned_number_of_valid_cells(
     frames: list[Frame], filled: Filled
 ) -> None:
     plan = replace(PLAN, cells=25)
@@ -193,14 +172,14 @@ def test_augmented_views_keep_as_many_cells_as_planned_and_valid_ones_only(
     for number, position in ((1, 0), (2, 3)):
         rng = np.random.default_rng([plan.seed, number, position])
         valid = augmented_view(frames[position], 8, plan.view, rng).valid
-        # All valid cells, when more are asked for than there are.
+        # A larger plan selects all valid cells.
         buffer = filled(replace(plan, cells=10_000))
         count = int((buffer.tensors["view"] == number * 7 + position).sum())
         assert count == valid.sum() <= len(valid)
 
 
 @pytest.mark.parametrize("stop", [1, 2, 3])
-def test_an_interrupted_fill_ends_where_an_uninterrupted_one_does(
+def test_resumed_encoding_equals_uninterrupted_encoding(
     frames: list[Frame],
     filled: Filled,
     block_mean: Encoder,
@@ -208,7 +187,7 @@ def test_an_interrupted_fill_ends_where_an_uninterrupted_one_does(
     device: torch.device,
     stop: int,
 ) -> None:
-    """`take_new` is asked after every batch, as checkpoints do."""
+    """Like checkpoints, call `take_new` after every batch."""
     first, saved = FeatureBuffer(4, ATLAS_FROM_BASE, device=device), []
     for _ in islice(encode_frames(first, frames, PLAN, block_mean, describe), stop):
         saved.append(first.take_new())
@@ -217,54 +196,14 @@ def test_an_interrupted_fill_ends_where_an_uninterrupted_one_does(
     for rows in saved:
         resumed.restore(rows)
     assert resumed.views == first.views
-    assert resumed.take_new() == {}  # what was restored is saved already
+    assert resumed.take_new() == {}  # restored rows are already saved
     done = list(encode_frames(resumed, frames, PLAN, block_mean, describe))
     assert done[-1] == PLAN.views_per_frame * len(frames)
+    assert list(encode_frames(resumed, frames, PLAN, block_mean, describe)) == []
     assert same(resumed, filled())
 
 
-def test_taking_gives_every_row_once(
-    frames: list[Frame],
-    filled: Filled,
-    block_mean: Encoder,
-    describe: GlobalDescriptor,
-    device: torch.device,
-) -> None:
-    buffer, parts = FeatureBuffer(4, ATLAS_FROM_BASE, device=device), []
-    assert buffer.take_new() == {}
-    for i, _ in enumerate(encode_frames(buffer, frames, PLAN, block_mean, describe)):
-        if i % 2:
-            parts.append(buffer.take_new())
-    parts.append(buffer.take_new())
-    assert buffer.take_new() == {}
-    whole = filled().tensors
-    for name, value in whole.items():
-        assert torch.equal(torch.cat([part[name] for part in parts if part]), value.cpu())
-
-
-def test_taking_gives_every_row_once_even_if_someone_looked(
-    frames: list[Frame], block_mean: Encoder, describe: GlobalDescriptor, device: torch.device
-) -> None:
-    buffer, rows = FeatureBuffer(4, ATLAS_FROM_BASE, device=device), 0
-    for i, _ in enumerate(encode_frames(buffer, frames, PLAN, block_mean, describe)):
-        if i % 2 == 0:
-            rows += len(buffer.take_new()["features"])
-        else:
-            assert len(buffer) > rows
-    rows += len(buffer.take_new().get("features", ()))
-    assert rows == len(buffer)
-
-
-def test_a_complete_buffer_is_not_filled_again(
-    frames: list[Frame], filled: Filled, block_mean: Encoder, describe: GlobalDescriptor
-) -> None:
-    buffer = filled()
-    rows = len(buffer)
-    assert list(encode_frames(buffer, frames, PLAN, block_mean, describe)) == []
-    assert len(buffer) == rows
-
-
-def test_draws_repeat_with_the_generator_and_cover_the_buffer(filled: Filled) -> None:
+def test_draws_are_reproducible_and_cover_the_buffer(filled: Filled) -> None:
     buffer = filled(replace(PLAN, views_per_frame=1))
     seeded = torch.Generator().manual_seed(3)
     first = buffer.draw(20_000, seeded)
@@ -277,7 +216,7 @@ def test_draws_repeat_with_the_generator_and_cover_the_buffer(filled: Filled) ->
     assert not torch.equal(buffer.draw(50, seeded).index, first.index[:50])
 
 
-def test_rows_part_and_join_are_inverse(filled: Filled) -> None:
+def test_part_and_join_are_inverse(filled: Filled) -> None:
     buffer = filled(replace(PLAN, views_per_frame=1))
     rows = buffer.draw(30, torch.Generator().manual_seed(1))
     again = join([rows.part(slice(0, 7)), rows.part(slice(7, 8)), rows.part(slice(8, None))])
@@ -289,7 +228,7 @@ def test_rows_part_and_join_are_inverse(filled: Filled) -> None:
     assert torch.equal(straight.features, rows.features)
 
 
-def test_rows_of_a_corrected_lens_are_those_of_an_ideal_pinhole() -> None:
+def test_corrected_rows_follow_an_ideal_pinhole() -> None:
     points = torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
     points[:, 2] = points[:, 2].abs() + 3
     correction = torch.tensor([0.02, 0.01, -0.02, -0.12, 0.03])
@@ -304,10 +243,10 @@ def test_rows_of_a_corrected_lens_are_those_of_an_ideal_pinhole() -> None:
     }
     buffer.restore(rows)
     each = torch.arange(60)
-    # Pixels that the corrected lens sees the points at.
-    seen, _ = reprojection_error(points, buffer.rows(each).target, correction.expand(60, 5))
+    # Pixels of the points in the corrected camera.
+    captured, _ = reprojection_error(points, buffer.rows(each).target, correction.expand(60, 5))
     buffer = FeatureBuffer(0, SE3.identity())
-    buffer.restore({**rows, "pixels": seen})
+    buffer.restore({**rows, "pixels": captured})
     assert reprojection_error(points, buffer.rows(each).target)[0].abs().max() > 3
     buffer.correct_lens(correction)
     assert reprojection_error(points, buffer.rows(each).target)[0].abs().max() < 0.01

@@ -1,4 +1,4 @@
-"""Head, buffer and loss on any device: the CPU's answers, and no tensor made elsewhere."""
+"""Head, buffer and loss on any device: equal results, and no tensor on another device."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from evercal.continual.networks import buffer as module
 from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, Rows, encode_frames, join
 from evercal.continual.networks.descriptor import GlobalDescriptor
-from evercal.continual.networks.head import Head, HeadOptions
+from evercal.continual.networks.head import Head, HeadOptions, fresh_head
 from evercal.continual.networks.loss import LossOptions, reprojection_loss
 from evercal.features.encoder import LocalEncoder
 from evercal.features.views import ViewOptions
@@ -35,9 +35,8 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 
 
 def head_of(options: HeadOptions, device: torch.device) -> Head:
-    """A head for three scenes that was moved before it grew and was whitened there."""
-    torch.manual_seed(5)
-    head = Head(7, 4, options).to(device)
+    """Create a head for three scenes that was moved before growth and whitening."""
+    head = fresh_head(7, 4, options, seed=5).to(device)
     for scene in range(3):
         head.grow(3 * random(2, 3, seed=scene), seed=scene)
     head.whiten((random(60, 7, seed=9) + 1).to(device))
@@ -45,10 +44,10 @@ def head_of(options: HeadOptions, device: torch.device) -> Head:
 
 
 def buffer_of(device: torch.device, scene: int = 1) -> FeatureBuffer:
-    """Forty rows of two views; points were kept of the first thirty."""
+    """Create forty rows of two views, with stored points for the first thirty."""
     buffer = FeatureBuffer(scene, SE3.identity(), device=device)
     matrix = torch.eye(4, device="cpu")[None, :3] + 0.1 * random(2, 3, 4, seed=2)
-    matrix[:, 2, 3] += 8  # most points lie before the camera
+    matrix[:, 2, 3] += 8  # most points are in front of the camera
     buffer.restore(
         {
             "features": random(40, 7).half(),
@@ -83,7 +82,7 @@ def everything(rows: Rows) -> dict[str, Tensor]:
 
 
 def step(head: Head, rows: Rows, scene: Tensor | int) -> dict[str, Tensor]:
-    """Loss and error of rows, and the gradient of every parameter, in fp32."""
+    """Compute loss and error of rows, and the gradient of every parameter, in fp32."""
     output = head(rows.features.float(), scene, rows.descriptor)
     correction = 0.01 * rows.features[:, :5].float()
     loss, error = reprojection_loss(output.points, rows.target, 7.0, LossOptions(), correction)
@@ -94,7 +93,7 @@ def step(head: Head, rows: Rows, scene: Tensor | int) -> dict[str, Tensor]:
     return gradients | {"loss": loss.detach(), "error": error, "points": output.points.detach()}
 
 
-def test_rows_are_the_same_on_every_device(device: torch.device) -> None:
+def test_rows_are_equal_on_every_device(device: torch.device) -> None:
     expected = everything(drawn([buffer_of(CPU), buffer_of(CPU, 2)]))
     for name, value in everything(drawn([buffer_of(device), buffer_of(device, 2)])).items():
         assert value.device == device, name
@@ -103,20 +102,20 @@ def test_rows_are_the_same_on_every_device(device: torch.device) -> None:
 
 
 @pytest.mark.parametrize("options", SHAPES)
-def test_a_step_is_the_same_on_every_device(options: HeadOptions, device: torch.device) -> None:
+def test_step_is_equal_on_every_device(options: HeadOptions, device: torch.device) -> None:
     for scene in (None, 1):
-        found = []
+        actual = []
         for where in (CPU, device):
             rows = drawn([buffer_of(where), buffer_of(where, 2)])
-            found.append(step(head_of(options, where), rows, rows.scene if scene is None else 1))
-        for name, expected in found[0].items():
-            value = found[1][name]
+            actual.append(step(head_of(options, where), rows, rows.scene if scene is None else 1))
+        for name, expected in actual[0].items():
+            value = actual[1][name]
             assert value.device == device, name
             size = float(expected[expected.isfinite()].abs().max()) + 1e-6
             torch.testing.assert_close(value.cpu(), expected, atol=1e-3 * size, rtol=1e-3)
 
 
-def test_rows_that_a_device_has_no_room_for_are_the_same(
+def test_rows_are_equal_if_the_device_has_no_room(
     device: torch.device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected = everything(drawn([buffer_of(device)]))
@@ -128,7 +127,7 @@ def test_rows_that_a_device_has_no_room_for_are_the_same(
         assert torch.equal(value.nan_to_num(-7), expected[name].nan_to_num(-7)), name
 
 
-def test_a_quarter_of_a_gpu_is_spared_and_what_the_allocator_holds_is_free(
+def test_quarter_of_the_gpu_memory_stays_free(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     gpu, rows = torch.device("cuda", 0), {"a": torch.zeros(100, dtype=torch.uint8)}
@@ -144,43 +143,43 @@ def test_a_quarter_of_a_gpu_is_spared_and_what_the_allocator_holds_is_free(
 
 @pytest.mark.parametrize("options", SHAPES)
 @pytest.mark.parametrize("one_scene", [False, True])
-def test_nothing_is_made_on_the_default_device(options: HeadOptions, one_scene: bool) -> None:
-    """The default device is `meta`, the inputs lie on the CPU: both must give the same numbers."""
+def test_no_tensor_is_created_on_the_default_device(options: HeadOptions, one_scene: bool) -> None:
+    """With `meta` as the default device and inputs on the CPU, results are the same."""
 
     def whole() -> dict[str, Tensor]:
         head, buffers = head_of(options, CPU), [buffer_of(CPU), buffer_of(CPU, 2)]
-        with made:
+        with context:
             rows = drawn(buffers)
             more = step(head, rows, 1 if one_scene else rows.scene)
             head.grow(torch.ones(2, 3, device="cpu"), seed=8)
             head.whiten(rows.features)
         return everything(rows) | more | dict(head.state_dict())
 
-    made = nullcontext()
+    context = nullcontext()
     expected = whole()
-    made = tensors_stay_on_their_device()
-    found = whole()
-    assert found.keys() == expected.keys()
-    for name, value in found.items():
+    context = tensors_stay_on_their_device()
+    actual = whole()
+    assert actual.keys() == expected.keys()
+    for name, value in actual.items():
         assert value.device == CPU, name
         assert torch.equal(value.nan_to_num(-7), expected[name].nan_to_num(-7)), name
 
 
 @pytest.mark.parametrize("options", SHAPES)
-def test_nothing_is_left_on_the_cpu(options: HeadOptions, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Head and rows lie on `meta`, the default device is the CPU; no operation takes both."""
-    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # has none for meta
+def test_no_tensor_stays_on_the_cpu(options: HeadOptions, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Head and rows are on `meta`, the default device is the CPU; no operation mixes them."""
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # not available for meta
     head, buffers = Head(7, 4, options).to(META), [buffer_of(META), buffer_of(META, 2)]
     with OneDevice():
         for scene in range(3):
             head.grow(random(2, 3), seed=scene)
         rows = drawn(buffers)
-        found = step(head, rows, rows.scene)
-    for name, value in (everything(rows) | found | dict(head.state_dict())).items():
+        actual = step(head, rows, rows.scene)
+    for name, value in (everything(rows) | actual | dict(head.state_dict())).items():
         assert value.device == META, name
 
 
-def test_the_guard_finds_what_it_is_for() -> None:
+def test_device_guard_detects_mixed_devices() -> None:
     ones = torch.ones(3)
     with pytest.raises(AssertionError, match="meta"), tensors_stay_on_their_device():
         torch.nn.functional.linear(ones[None], torch.zeros(2, 3))
@@ -197,7 +196,7 @@ def networks(device: torch.device) -> tuple[LocalEncoder, GlobalDescriptor]:
 
 
 def encoded(device: torch.device, rows_on: torch.device) -> FeatureBuffer:
-    """A buffer that networks on a device filled; someone looked in between."""
+    """Fill a buffer by networks on a device, reading it after every batch."""
     buffer, taken = FeatureBuffer(0, SE3.identity(), device=rows_on), 0
     for _ in encode_frames(buffer, FRAMES, PLAN, *networks(device)):
         new = buffer.take_new()
@@ -208,16 +207,18 @@ def encoded(device: torch.device, rows_on: torch.device) -> FeatureBuffer:
 
 
 @pytest.mark.parametrize("rows_on", ["cpu", "device"])
-def test_views_are_encoded_where_the_networks_lie(device: torch.device, rows_on: str) -> None:
+def test_views_are_encoded_on_the_device_of_the_networks(
+    device: torch.device, rows_on: str
+) -> None:
     expected = encoded(CPU, CPU).tensors
     where = CPU if rows_on == "cpu" else device
     for name, value in encoded(device, where).tensors.items():
         assert value.device == where, name
-        # Features in half precision, made in bfloat16 where that is fast.
+        # Features have half precision, and bfloat16 is used if it is fast.
         torch.testing.assert_close(value.cpu(), expected[name], atol=0.03, rtol=0.03)
 
 
-def test_encoding_makes_nothing_on_the_default_device() -> None:
+def test_encoding_creates_no_tensor_on_the_default_device() -> None:
     expected = encoded(CPU, CPU).tensors
     both, buffer = networks(CPU), FeatureBuffer(0, SE3.identity())
     with tensors_stay_on_their_device():

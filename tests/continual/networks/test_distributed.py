@@ -1,10 +1,10 @@
-"""Two processes with half a batch each leave the gradients that one has with the whole batch.
+"""Two processes with half a batch each have the gradients of one process with the whole batch.
 
 They start with the weights of the first, and encode each view once between them.
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -21,7 +21,6 @@ from evercal.continual.networks.buffer import (
     Rows,
     encode_batches,
     encode_frames,
-    own_share,
 )
 from evercal.continual.networks.descriptor import GlobalDescriptor
 from evercal.continual.networks.distributed import (
@@ -36,7 +35,6 @@ from evercal.continual.networks.distributed import (
 )
 from evercal.continual.networks.head import Head, HeadOptions, HeadOutput
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
-from evercal.continual.networks.loss import Target
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 from evercal.errors import InputError
 from evercal.features.encoder import LocalEncoder
@@ -47,14 +45,14 @@ from evercal.simulation.box_room import default_camera
 
 OPTIONS = FitOptions(iterations=4, batch=64)
 RULES = ("cost", "constraints", "descriptor")
-"""What remembered rows do; with the last they cost something and the head sees descriptors."""
+"""Use of remembered rows: as a loss, as constraints, as a loss with descriptor input."""
 STOPS = (0, 2)
-"""Rounds of encoding after which a run is interrupted."""
+"""Rounds of encoding before an interruption."""
 Made = list[dict[str, dict[str, Tensor]]]
 
 
 def buffer_of(scene: int) -> FeatureBuffer:
-    """Rows of points in front of two cameras; features are the points themselves."""
+    """Create rows of points in front of two cameras; the features are functions of the points."""
     generator = torch.Generator().manual_seed(scene)
     buffer = FeatureBuffer(scene, SE3.identity(), correctable=True)
     points = torch.randn(200, 3, generator=generator) + torch.tensor([0.0, 0, 4])
@@ -72,11 +70,11 @@ def buffer_of(scene: int) -> FeatureBuffer:
     return buffer
 
 
-class Both(TrainingHooks):
-    """Remembered scenes cost something, or constrain the step; keeps what it was shown."""
+class ReplayOrConstrain(TrainingHooks):
+    """Uses remembered rows as a loss or as constraints, and records the proposed step."""
 
     def __init__(self, rule: str, memories: list[FeatureBuffer]):
-        self.rule, self.memories, self.seen = rule, memories, dict[str, Tensor]()
+        self.rule, self.memories, self.captured = rule, memories, dict[str, Tensor]()
         self.edits_steps = rule == "constraints"
 
     def replayed(
@@ -97,13 +95,13 @@ class Both(TrainingHooks):
         return [off[:each].mean(), off[each:].mean()]
 
     def edit_step(self, proposed: ProposedStep) -> None:
-        self.seen = {"losses": proposed.losses}
+        self.captured = {"losses": proposed.losses}
         for i, constraint in enumerate(proposed.constraints):
-            self.seen |= {f"{i}.{name}": value.clone() for name, value in constraint.items()}
+            self.captured |= {f"{i}.{name}": value.clone() for name, value in constraint.items()}
 
 
 def gradients(rule: str, steps: int = 1) -> dict[str, Tensor]:
-    """What is in `.grad` after some steps of training, and what the hooks were shown."""
+    """Return all gradients after some steps, and the constraints that the hooks received."""
     torch.manual_seed(0)
     torch.set_num_threads(1)
     buffers = [buffer_of(scene) for scene in range(3)]
@@ -111,29 +109,29 @@ def gradients(rule: str, steps: int = 1) -> dict[str, Tensor]:
     head = Head(9, 4, HeadOptions(width=16, blocks=1, condition=condition, whiten=False))
     for scene in range(3):
         head.grow(torch.randn(2, 3), seed=scene)
-    hooks = Both(rule, buffers[:2])
+    hooks = ReplayOrConstrain(rule, buffers[:2])
     trainer = HeadTrainer(head, buffers[2:], OPTIONS, 1, hooks)
     run = trainer.run()
     for _ in range(steps):
         next(run)
-    found = {name: value.grad for name, value in head.named_parameters()}
-    return {name: value for name, value in found.items() if value is not None} | hooks.seen
+    actual = {name: value.grad for name, value in head.named_parameters()}
+    return {name: value for name, value in actual.items() if value is not None} | hooks.captured
 
 
 def _worker(number: int, folder: str) -> None:
     rendezvous = f"file://{folder}/rendezvous"
     distributed.init_process_group("gloo", init_method=rendezvous, rank=number, world_size=2)
     assert (processes(), rank()) == (2, number)
-    made = {f"gradients {rule}": gradients(rule) for rule in RULES}
-    made |= {f"encoded {stop}": encoded(stop) for stop in STOPS}
-    torch.save(made | {"exchanged": exchanged()}, f"{folder}/{number}.pt")
+    context = {f"gradients {rule}": gradients(rule) for rule in RULES}
+    context |= {f"encoded {stop}": encoded(stop) for stop in STOPS}
+    torch.save(context | {"exchanged": exchanged()}, f"{folder}/{number}.pt")
     wait_for_all()
     distributed.destroy_process_group()
 
 
 @pytest.fixture(scope="module")
 def by_two(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """What each of two processes that work together has made; starting them is what takes time."""
+    """Results of two processes that train together, started once because that is slow."""
     folder = tmp_path_factory.mktemp("processes")
     os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
     spawn(_worker, (str(folder),), nprocs=2)
@@ -141,60 +139,38 @@ def by_two(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 @pytest.mark.parametrize("rule", list(RULES))
-def test_two_processes_leave_the_gradients_of_one(rule: str, by_two: Made) -> None:
-    found = [made[f"gradients {rule}"] for made in by_two]
+def test_two_processes_have_the_gradients_of_one(rule: str, by_two: Made) -> None:
+    actual = [context[f"gradients {rule}"] for context in by_two]
     alone = gradients(rule)
-    assert found[0].keys() == found[1].keys() == alone.keys()
+    assert actual[0].keys() == actual[1].keys() == alone.keys()
     assert ("losses" in alone) == (rule == "constraints")
     for name, value in alone.items():
-        assert torch.equal(found[0][name], found[1][name]), name
-        # Products in half precision differ with the shape of the batch.
+        assert torch.equal(actual[0][name], actual[1][name]), name
+        # Rounding in half precision depends on the batch size.
         size = float(value.abs().max()) + 1e-6
-        torch.testing.assert_close(found[0][name], value, atol=0.02 * size, rtol=0.02)
-
-
-def test_alone_a_process_keeps_every_row() -> None:
-    zero = torch.zeros(5, dtype=torch.long)
-    target = Target(torch.zeros(5, 2), torch.zeros(5, 4), torch.zeros(5, 3, 4))
-    rows = Rows(torch.zeros(5, 1), zero, torch.zeros(5, 1), target, zero)
-    assert own_share(rows) is rows
-    assert (processes(), rank()) == (1, 0)
+        torch.testing.assert_close(actual[0][name], value, atol=0.02 * size, rtol=0.02)
 
 
 def exchanged() -> dict[str, Tensor]:
-    """What averaging, broadcasting and gathering make of tensors that differ by process."""
-    own, carried = rank(), 0
-    whole, shared = distributed.all_reduce, distributed.broadcast
-
-    def counted(exchange: Callable[..., object]) -> Callable[..., object]:
-        def call(*args: object) -> object:
-            nonlocal carried
-            carried += 1
-            return exchange(*args)
-
-        return call
-
-    distributed.all_reduce, distributed.broadcast = counted(whole), counted(shared)
+    """Average, broadcast and gather tensors that differ by process."""
+    own = rank()
     mean = [torch.arange(6.0).view(2, 3).T * (1 + own), torch.tensor(own, dtype=torch.float32)]
     average(mean)
-    assert carried == 1
     layer = torch.nn.Linear(3, 2)
     with torch.no_grad():
         layer.weight.copy_(torch.full((2, 3), 0.1) + own)
         layer.bias.fill_(torch.nan if own == 0 else 1.0)
     steps = torch.tensor([7 + own])
     broadcast([*layer.parameters(), steps])
-    assert carried == 3  # floats, whole numbers
     assert layer.weight.requires_grad
-    distributed.all_reduce, distributed.broadcast = whole, shared
 
     part = {"a": torch.full((3 + own, 2), own).half(), "b": torch.tensor([own == 1])}
     both, last = gather(part), gather(part if own else None)
     assert [set(one) for one in both] == [{"a", "b"}] * 2
     assert len(last) == 1
     assert gather(None) == []
-    found = {f"{i}.{name}": value for i, one in enumerate(both) for name, value in one.items()}
-    return found | {
+    actual = {f"{i}.{name}": value for i, one in enumerate(both) for name, value in one.items()}
+    return actual | {
         "mean": mean[0],
         "number": mean[1],
         "weight": layer.weight.detach(),
@@ -204,24 +180,24 @@ def exchanged() -> dict[str, Tensor]:
     }
 
 
-def test_tensors_are_averaged_broadcast_and_gathered_to_the_last_bit(by_two: Made) -> None:
-    for made in by_two:
-        found = made["exchanged"]
-        assert torch.equal(found["mean"], torch.arange(6.0).view(2, 3).T * 1.5)
-        assert float(found["number"]) == 0.5
-        assert torch.equal(found["weight"], torch.full((2, 3), 0.1))
-        assert found["bias"].isnan().all()
-        assert found["steps"].tolist() == [7]
+def test_tensors_are_averaged_broadcast_and_gathered_exactly(by_two: Made) -> None:
+    for context in by_two:
+        actual = context["exchanged"]
+        assert torch.equal(actual["mean"], torch.arange(6.0).view(2, 3).T * 1.5)
+        assert float(actual["number"]) == 0.5
+        assert torch.equal(actual["weight"], torch.full((2, 3), 0.1))
+        assert actual["bias"].isnan().all()
+        assert actual["steps"].tolist() == [7]
         for number, count in enumerate((3, 4)):
             expected = torch.full((count, 2), number, dtype=torch.half)
-            assert found[f"{number}.a"].dtype == torch.half
-            assert torch.equal(found[f"{number}.a"], expected)
-            assert found[f"{number}.b"].tolist() == [number == 1]
-        assert torch.equal(found["last"], torch.ones(4, 2).half())
+            assert actual[f"{number}.a"].dtype == torch.half
+            assert torch.equal(actual[f"{number}.a"], expected)
+            assert actual[f"{number}.b"].tolist() == [number == 1]
+        assert torch.equal(actual["last"], torch.ones(4, 2).half())
 
 
 def frames_of(sizes: Sequence[tuple[int, int]]) -> list[Frame]:
-    """Frames of noise, of cameras of some sizes."""
+    """Create frames of noise with cameras of given sizes."""
     rng, frames = np.random.default_rng(0), []
     for i, (width, height) in enumerate(sizes):
         image = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
@@ -231,10 +207,10 @@ def frames_of(sizes: Sequence[tuple[int, int]]) -> list[Frame]:
 
 
 def encoded(stop: int = 0) -> dict[str, Tensor]:
-    """A buffer of nine frames of two sizes, and how many views this process encoded itself.
+    """Fill a buffer with nine frames of two sizes, and count the views encoded by this process.
 
     Args:
-        stop: after so many rounds the rows move to another buffer, as after an interruption.
+        stop: Number of rounds after which the rows move to another buffer, as after a resume.
     """
     torch.set_num_threads(1)
     torch.manual_seed(0)
@@ -242,11 +218,11 @@ def encoded(stop: int = 0) -> dict[str, Tensor]:
     descriptor = GlobalDescriptor(8, maps=2, hidden=4, width=8).eval()
     frames = frames_of([(64, 48)] * 5 + [(48, 64)] * 4)
     plan = EncodePlan(views_per_frame=3, cells=20, view=ViewOptions(short_side=48))
-    buffer, rounds, seen = FeatureBuffer(2, SE3.exp([1.0, 2, 0, 0, 0, 1])), 0, 0
+    buffer, rounds, captured = FeatureBuffer(2, SE3.exp([1.0, 2, 0, 0, 0, 1])), 0, 0
 
     def counting(grey: Tensor) -> Tensor:
-        nonlocal seen
-        seen += len(grey)
+        nonlocal captured
+        captured += len(grey)
         return LocalEncoder.forward(encoder, grey)
 
     encoder.forward = counting
@@ -254,23 +230,23 @@ def encoded(stop: int = 0) -> dict[str, Tensor]:
     for rounds, done in enumerate(encode_frames(buffer, frames, plan, encoder, descriptor), 1):
         assert done == buffer.views
         if rounds == stop:
-            kept, buffer = buffer.take_new(), FeatureBuffer(2, buffer.atlas_from_base)
-            buffer.restore(kept)
+            selected, buffer = buffer.take_new(), FeatureBuffer(2, buffer.atlas_from_base)
+            buffer.restore(selected)
             break
     for _ in encode_frames(buffer, frames, plan, encoder, descriptor):
         pass
     buffer_module.ENCODE_BATCH = 8
     assert buffer.views == 27
-    return dict(buffer.tensors) | {"seen": torch.tensor(seen)}
+    return dict(buffer.tensors) | {"encoded": torch.tensor(captured)}
 
 
 @pytest.mark.parametrize("stop", STOPS)
-def test_two_processes_encode_every_view_once_and_both_have_all(stop: int, by_two: Made) -> None:
+def test_two_processes_share_the_encoding(stop: int, by_two: Made) -> None:
     alone = encoded()
-    found = [dict(made[f"encoded {stop}"]) for made in by_two]
-    assert sum(int(one["seen"]) for one in found) == int(alone.pop("seen")) == 27
-    for one in found:
-        assert 27 * 0.35 < int(one.pop("seen")) < 27 * 0.65
+    actual = [dict(context[f"encoded {stop}"]) for context in by_two]
+    assert sum(int(one["encoded"]) for one in actual) == int(alone.pop("encoded")) == 27
+    for one in actual:
+        assert 27 * 0.35 < int(one.pop("encoded")) < 27 * 0.65
         assert one.keys() == alone.keys()
         for name, value in alone.items():
             assert value.dtype == one[name].dtype
@@ -278,15 +254,19 @@ def test_two_processes_encode_every_view_once_and_both_have_all(stop: int, by_tw
 
 
 @given(st.lists(st.integers(), max_size=20), st.integers(1, 5))
-def test_work_is_shared_out_once_and_in_order(work: list[int], count: int) -> None:
+def test_work_is_divided_once_and_in_order(work: list[int], count: int) -> None:
     shares = [shared_out(work, number, count) for number in range(count)]
-    assert len({len(share) for share in shares}) == 1  # all exchange equally often
-    in_turn = [piece for turn in zip(*shares, strict=True) for piece in turn if piece is not None]
+    assert len({len(share) for share in shares}) == 1  # equal numbers of exchanges
+    in_turn = [
+        piece for rotation in zip(*shares, strict=True) for piece in rotation if piece is not None
+    ]
     assert in_turn == work
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=12), st.integers(1, 3), st.integers(0, 40))
-def test_batches_hold_neighbours_of_one_size(sizes: list[bool], passes: int, done: int) -> None:
+def test_batches_contain_consecutive_views_of_one_size(
+    sizes: list[bool], passes: int, done: int
+) -> None:
     frames = frames_of([(24, 16) if size else (16, 16) for size in sizes])
     total = passes * len(frames)
     batches = encode_batches(frames, EncodePlan(views_per_frame=passes), done)
@@ -299,29 +279,29 @@ def test_batches_hold_neighbours_of_one_size(sizes: list[bool], passes: int, don
         assert full or i + 1 == len(batches) or kinds[i] != kinds[i + 1]
 
 
-def test_without_torchrun_there_is_nothing_to_join() -> None:
+def test_without_torchrun_there_is_one_process() -> None:
     assert join_processes("cpu") == torch.device("cpu")
     assert processes() == 1
     with pytest.raises(InputError, match="take auto, cpu or cuda"):
         join_processes("gpu")
 
 
-def test_each_process_of_a_machine_takes_a_gpu_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is asked of torch where there are two GPUs; neither GPU nor process is there."""
-    asked: list[object] = []
+def test_each_process_of_a_machine_has_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Calls to torch on a simulated machine with two GPUs."""
+    calls: list[object] = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
-    monkeypatch.setattr(torch.cuda, "set_device", asked.append)
+    monkeypatch.setattr(torch.cuda, "set_device", calls.append)
     monkeypatch.setattr(distributed, "is_torchelastic_launched", lambda: True)
     monkeypatch.setattr(
-        distributed, "init_process_group", lambda kind, device_id=None: asked.append(kind)
+        distributed, "init_process_group", lambda kind, device_id=None: calls.append(kind)
     )
     monkeypatch.setenv("LOCAL_RANK", "1")
     assert join_processes() == torch.device("cuda", 1)
-    assert asked == [torch.device("cuda", 1), "nccl"]
+    assert calls == [torch.device("cuda", 1), "nccl"]
     assert join_processes("cpu") == torch.device("cpu")
-    assert asked[2:] == ["gloo"]
+    assert calls[2:] == ["gloo"]
     monkeypatch.setenv("LOCAL_RANK", "2")
     with pytest.raises(InputError, match="--nproc-per-node 2"):
         join_processes("cuda")

@@ -1,4 +1,4 @@
-"""Features that were computed before are found again, and what is broken is made again."""
+"""The feature cache: hits, limits, and broken files."""
 
 import os
 import shutil
@@ -14,17 +14,17 @@ from evercal.continual.networks.feature_cache import cache_features
 
 
 class Counting(nn.Module):
-    """Means over 8x8 pixels times a weight; counts the images it has seen."""
+    """Encodes 8x8 means times a weight, and counts the encoded images."""
 
     stride, width = 8, 2
 
     def __init__(self, weight: float = 3.0):
         super().__init__()
         self.weight = nn.Parameter(torch.full((2, 1, 8, 8), weight / 64))
-        self.seen = 0
+        self.captured = 0
 
     def forward(self, grey: Tensor) -> Tensor:
-        self.seen += len(grey)
+        self.captured += len(grey)
         return nn.functional.conv2d(grey, self.weight, stride=8)
 
 
@@ -35,72 +35,59 @@ def test_every_image_is_encoded_once(tmp_path: Path, device: torch.device) -> No
     cache_features(encoder, tmp_path)
     first = encoder(images[:3])
     torch.testing.assert_close(first, plain(images[:3]), atol=1e-3, rtol=0)
-    mixed = encoder(images[[4, 1, 0]])  # one new among known ones, in another order
-    assert encoder.seen == 4
+    mixed = encoder(images[[4, 1, 0]])  # one new and two cached images
+    assert encoder.captured == 4
     assert torch.equal(mixed[1], first[1])
     assert torch.equal(mixed[2], first[0])
     again = Counting().to(device)
     cache_features(again, tmp_path)
     assert torch.equal(again(images[[4, 1, 0]]), mixed)
-    assert again.seen == 0
+    assert again.captured == 0
     with torch.autocast(device.type, torch.bfloat16):
         assert torch.equal(again(images[:3]), first)
     assert first.device == device
 
 
 @torch.inference_mode()
-def test_other_weights_and_other_shapes_are_other_images(tmp_path: Path) -> None:
+def test_cache_depends_on_weights_and_image_shape(tmp_path: Path) -> None:
     one, two = Counting(1.0), Counting(2.0)
     for encoder in (one, two):
         cache_features(encoder, tmp_path)
     image = torch.ones(1, 1, 16, 16)
     assert float(two(image).mean()) == pytest.approx(2 * float(one(image).mean()), rel=1e-3)
     assert one(image.reshape(1, 1, 8, 32)).shape == (1, 2, 1, 4)
-    assert one.seen == 2
+    assert one.captured == 2
 
 
 @torch.inference_mode()
-def test_a_file_cut_short_is_made_again(tmp_path: Path) -> None:
+def test_truncated_file_is_replaced(tmp_path: Path) -> None:
     encoder, image = Counting(), torch.rand(1, 1, 16, 16)
     cache_features(encoder, tmp_path)
     before = encoder(image)
     (file,) = tmp_path.rglob("*.npy")
     file.write_bytes(file.read_bytes()[:-3])
     assert torch.equal(encoder(image), before)
-    assert encoder.seen == 2
+    assert encoder.captured == 2
     assert encoder(image) is not None
-    assert encoder.seen == 2
+    assert encoder.captured == 2
 
 
 @torch.inference_mode()
-def test_a_full_folder_is_read_but_not_written(tmp_path: Path) -> None:
+def test_full_folder_is_read_but_not_written(tmp_path: Path) -> None:
     images = torch.rand(6, 1, 16, 16, generator=torch.Generator().manual_seed(1))
     encoder = Counting()
     cache_features(encoder, tmp_path, limit_bytes=40)  # 16 bytes an image
     before = encoder(images)
-    kept = list(tmp_path.rglob("*.npy"))
-    assert 0 < len(kept) < 6
+    selected = list(tmp_path.rglob("*.npy"))
+    assert 0 < len(selected) < 6
     assert torch.equal(encoder(images), before)
-    assert encoder.seen == 12 - len(kept)
-    assert list(tmp_path.rglob("*.npy")) == kept
+    assert encoder.captured == 12 - len(selected)
+    assert list(tmp_path.rglob("*.npy")) == selected
 
 
 @torch.inference_mode()
-def test_half_of_the_free_disk_is_left_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=80))
-    encoder = Counting()
-    cache_features(encoder, tmp_path)  # 16 bytes an image
-    encoder(torch.rand(6, 1, 16, 16, generator=torch.Generator().manual_seed(1)))
-    assert len(list(tmp_path.rglob("*.npy"))) == 2
-
-
-@torch.inference_mode()
-def test_a_disk_that_others_fill_is_left_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    free = iter([200, 200, 150, *[110] * 9])  # others write too
+def test_half_of_the_free_disk_stays_free(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = iter([200, 200, 150, *[110] * 9])  # another program writes to the disk
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=next(free)))
     encoder = Counting()
     cache_features(encoder, tmp_path)  # 16 bytes an image
@@ -110,7 +97,7 @@ def test_a_disk_that_others_fill_is_left_alone(
 
 @pytest.mark.parametrize("call", ["save", "replace"])
 @torch.inference_mode()
-def test_a_full_disk_stops_caching_and_nothing_else(
+def test_full_disk_only_stops_caching(
     call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     images = torch.rand(4, 1, 16, 16, generator=torch.Generator().manual_seed(1))
@@ -125,8 +112,8 @@ def test_a_full_disk_stops_caching_and_nothing_else(
 
     with monkeypatch.context() as patch:
         patch.setattr(np if call == "save" else os, call, full)
-        found = encoder(images)
-    torch.testing.assert_close(found, plain(images), atol=1e-3, rtol=0)
+        actual = encoder(images)
+    torch.testing.assert_close(actual, plain(images), atol=1e-3, rtol=0)
     encoder(images)
     assert len(tries) == 1
     assert len([path for path in tmp_path.rglob("*") if path.is_file()]) == 1

@@ -1,16 +1,14 @@
-"""Our Muon against that of torch, whose products are in bfloat16."""
+"""Muon against torch.optim.Muon, which multiplies in bfloat16."""
 
 import pytest
 import torch
 
 from evercal.continual.networks import muon
-from evercal.continual.networks.muon import MUON_STEPS, Muon, orthogonalised
+from evercal.continual.networks.muon import MUON_STEPS, Muon
 
 
 @pytest.mark.parametrize(("fast", "tolerance"), [(True, 2e-2), (False, 3e-2)])
-def test_it_goes_where_that_of_torch_goes(
-    fast: bool, tolerance: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_updates_match_torch(fast: bool, tolerance: float, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(muon, "fast_bfloat16", lambda device: fast)
     generator = torch.Generator().manual_seed(0)
     start = [torch.randn(24, 24, generator=generator) for _ in range(3)]
@@ -28,15 +26,5 @@ def test_it_goes_where_that_of_torch_goes(
         moved = (yours - before).norm()
         assert (mine - yours).norm() < tolerance * moved
     assert torch.equal(unused, start[0])
-    # What a checkpoint of one holds, the other understands.
+    # Checkpoints are interchangeable.
     assert one.state[ours[0]].keys() == other.state[theirs[0]].keys()
-
-
-def test_products_are_in_what_the_processor_is_fast_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    matrices = torch.eye(8) + 0.1 * torch.randn(2, 8, 8, generator=torch.Generator().manual_seed(0))
-    for fast, kind in ((True, torch.bfloat16), (False, torch.float32)):
-        monkeypatch.setattr(muon, "fast_bfloat16", lambda device, fast=fast: fast)
-        assert orthogonalised(matrices).dtype == kind
-    values = torch.linalg.svdvals(orthogonalised(matrices))
-    assert values.min() > 0.5
-    assert values.max() < 1.3

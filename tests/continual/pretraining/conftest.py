@@ -26,7 +26,7 @@ def views(coarse: Callable[[int], RoomViews]) -> RoomViews:
 
 @pytest.fixture
 def one_room(monkeypatch: pytest.MonkeyPatch, views: RoomViews) -> RoomViews:
-    """Held-out rooms are all the same one, to save time."""
+    """Use one room for all held-out rooms, to save time."""
     for module in (contrastive, places):
         monkeypatch.setattr(module, "room_views", lambda seed: views)
     return views

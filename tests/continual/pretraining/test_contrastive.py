@@ -1,4 +1,4 @@
-"""Contrastive training: closed forms, an oracle that matches all, and going on after a stop."""
+"""Contrastive training: closed forms, an oracle, resuming."""
 
 import math
 from dataclasses import replace
@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader
 
 from evercal.continual.pretraining import contrastive
 from evercal.continual.pretraining.contrastive import (
+    Batch,
     PairStream,
     PretrainData,
     PretrainOptions,
@@ -40,56 +41,28 @@ def unit(*shape: int, seed: int = 0) -> Tensor:
 
 
 def twice(pixels: Tensor) -> Tensor:
-    """The same pixels in both images."""
+    """Use the same pixels in both images."""
     return torch.stack([pixels, pixels])
 
 
-def test_features_at_cell_centres_are_the_cells_own() -> None:
+def test_features_at_cell_centres_are_exact() -> None:
     maps = unit(2, HEIGHT // 8, WIDTH // 8, 5).permute(0, 3, 1, 2)
     pixels = torch.from_numpy(cell_pixels()).float().expand(2, -1, -1)
-    found = sample_features(maps, pixels)
-    torch.testing.assert_close(found, maps.flatten(2).transpose(1, 2), atol=1e-5, rtol=0)
+    actual = sample_features(maps, pixels)
+    torch.testing.assert_close(actual, maps.flatten(2).transpose(1, 2), atol=1e-5, rtol=0)
 
 
-def test_features_between_cells_are_bilinear_and_unit_vectors() -> None:
+def test_features_between_cells_are_bilinear_unit_vectors() -> None:
     maps = unit(1, HEIGHT // 8, WIDTH // 8, 5).permute(0, 3, 1, 2)
     pixel = torch.tensor([[[8 * 4.25 + 3.5, 8 * 6.5 + 3.5]]])
     grid = maps[0]
     mixed = 0.5 * (0.75 * (grid[:, 6, 4] + grid[:, 7, 4]) + 0.25 * (grid[:, 6, 5] + grid[:, 7, 5]))
-    found = sample_features(maps, pixel)[0, 0]
-    torch.testing.assert_close(found, F.normalize(mixed, dim=0), atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("temperature", [0.07, 0.5, 2.0])
-def test_loss_of_two_orthogonal_points(temperature: float) -> None:
-    eye, valid = torch.eye(2)[None], torch.ones(1, 2, dtype=torch.bool)
-    expected = math.log(1 + math.exp(-1 / temperature))
-    found = contrastive_loss(torch.stack([eye, eye]), twice(FAR[None]), valid, temperature)
-    assert float(found) == pytest.approx(expected, rel=1e-4, abs=1e-6)
-    swapped = contrastive_loss(
-        torch.stack([eye, eye.flip(1)]), twice(FAR[None]), valid, temperature
-    )
-    assert float(swapped) == pytest.approx(expected + 1 / temperature, rel=1e-4)
-
-
-def test_close_points_of_one_image_are_not_held_against_each_other() -> None:
-    valid = torch.ones(1, 2, dtype=torch.bool)
-    near = twice(torch.tensor([[[0.0, 0.0], [6.0, 7.9]]]))  # 9.92 px
-    same = torch.ones(2, 1, 2, 2) / math.sqrt(2)
-    assert float(contrastive_loss(same, near, valid, 0.1)) == pytest.approx(0, abs=1e-6)
-    apart = twice(torch.tensor([[[0.0, 0.0], [6.0, 8.1]]]))  # 10.08 px
-    assert float(contrastive_loss(same, apart, valid, 0.1)) == pytest.approx(math.log(2))
-    # Close in the second images only: rivals count where they are looked for.
-    mixed = torch.stack([apart[0], near[0]])
-    assert float(contrastive_loss(same, mixed, valid, 0.1)) == pytest.approx(math.log(2) / 2)
-    # The same pixels in two images are two places.
-    two = twice(torch.tensor([[[0.0, 0.0]], [[6.0, 7.9]]]))
-    loss = contrastive_loss(same.transpose(1, 2), two, valid.T, 0.1)
-    assert float(loss) == pytest.approx(math.log(2))
+    actual = sample_features(maps, pixel)[0, 0]
+    torch.testing.assert_close(actual, F.normalize(mixed, dim=0), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("dense", [False, True])
-def test_loss_agrees_with_a_slow_twin(dense: bool) -> None:
+def test_loss_matches_a_slow_reference(dense: bool) -> None:
     generator = torch.Generator().manual_seed(3)
     features = unit(2, 3, 5, 4, seed=1)
     pixels = torch.rand(2, 3, 5, 2, generator=generator) * 25
@@ -115,12 +88,12 @@ def test_loss_agrees_with_a_slow_twin(dense: bool) -> None:
                 if j != i or math.dist(truth, where) >= 10
             )
             total -= math.log(right / (right + wrong))
-    found = contrastive_loss(features, pixels, valid, 0.2, cells if dense else None)
-    assert float(found) == pytest.approx(total / len(points) / 2, rel=1e-4)
+    actual = contrastive_loss(features, pixels, valid, 0.2, cells if dense else None)
+    assert float(actual) == pytest.approx(total / len(points) / 2, rel=1e-4)
 
 
 class Oracle(nn.Module):
-    """Gives every cell of the first images a vector of its own; the second ones are moved."""
+    """Gives every cell of the first images a unique vector; the second images are shifted."""
 
     def __init__(self, columns: int):
         super().__init__()
@@ -134,7 +107,7 @@ class Oracle(nn.Module):
 
 
 @pytest.mark.parametrize("columns", [0, 2, -3])
-def test_an_oracle_matches_everything_and_nothing_where_the_truth_is_elsewhere(
+def test_matching_accuracy_of_an_oracle(
     columns: int,
 ) -> None:
     rng = np.random.default_rng(0)
@@ -144,20 +117,20 @@ def test_an_oracle_matches_everything_and_nothing_where_the_truth_is_elsewhere(
     images, valid = torch.zeros(2, 3, 1, HEIGHT, WIDTH), torch.ones(3, 100, dtype=torch.bool)
     oracle = Oracle(columns)
 
-    def judge(moved: float, valid: Tensor = valid) -> float:
+    def evaluate(moved: float, valid: Tensor = valid) -> float:
         truth = there + torch.tensor([0.0, moved])
-        return matching_accuracy(oracle, [(images, torch.stack([pixels, truth]), valid)])
+        return matching_accuracy(oracle, [Batch(images, torch.stack([pixels, truth]), valid)])
 
-    assert judge(0.0) == judge(7.5) == 100.0
-    assert judge(8.5) == judge(-40.0) == 0.0
+    assert evaluate(0.0) == evaluate(7.5) == 100.0
+    assert evaluate(8.5) == evaluate(-40.0) == 0.0
     half = torch.arange(100).expand(3, -1) < 50
     mixed = torch.where(half[..., None], there, there + 40)
-    batch = (images, torch.stack([pixels, mixed]), valid)
+    batch = Batch(images, torch.stack([pixels, mixed]), valid)
     assert matching_accuracy(oracle, [batch]) == 50.0
-    assert matching_accuracy(oracle, [(*batch[:2], half)]) == 100.0
+    assert matching_accuracy(oracle, [batch._replace(valid=half)]) == 100.0
 
 
-def test_batches_depend_on_seed_and_step_alone(data: PretrainData) -> None:
+def test_batches_depend_on_seed_and_step_only(data: PretrainData) -> None:
     stream = PairStream(data, OPTIONS, 0)
     images, pixels, valid = stream.draw(4)
     assert images.shape == (2, 3, 1, HEIGHT, WIDTH)
@@ -175,40 +148,23 @@ def test_batches_depend_on_seed_and_step_alone(data: PretrainData) -> None:
     assert len(list(PairStream(data, OPTIONS, 4))) == 2
 
 
-def test_pairs_in_a_batch_are_of_one_anchor(data: PretrainData, views: RoomViews) -> None:
-    """Views of different anchors may share nothing at all."""
-    drawn = []
-
-    def spy(views: RoomViews, first: int, second: int, rng: np.random.Generator):
-        drawn.append((first, second))
-        return view_pair(views, first, second, rng)
-
-    view_pair = contrastive.view_pair
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contrastive, "view_pair", spy)
-        for step in range(4):
-            PairStream(data, replace(OPTIONS, leaf_pairs=0), 0).draw(step)
-    assert all(a // 4 == b // 4 and a != b for a, b in drawn)
-    assert {a // 4 for a, _ in drawn} == {0, 1}
-
-
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, one_room: RoomViews) -> None:
-    """A small encoder, checkpoints at every other step, and no worker process."""
+    """Use a small encoder, checkpoints every two steps, and no worker process."""
     monkeypatch.setattr(contrastive, "CHECKPOINT_STEPS", 2)
     tiny = partial(LocalEncoder, (4, 4), 8, 1, 8)
     monkeypatch.setattr(contrastive, "LocalEncoder", tiny)
     monkeypatch.setattr(contrastive, "DataLoader", lambda stream, **_: stream)
     draw = PairStream.draw
-    judged: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+    batches: dict[int, Batch] = {}
 
-    def cheap(stream: PairStream, step: int) -> tuple[Tensor, Tensor, Tensor]:
+    def cheap(stream: PairStream, step: int) -> Batch:
         if stream.options.room_pairs != 8:
             return draw(stream, step)
         stream.options = replace(stream.options, room_pairs=1)  # the validation set
-        judged[step] = judged.get(step) or draw(stream, 0)
+        batches[step] = batches.get(step) or draw(stream, 0)
         stream.options = replace(stream.options, room_pairs=8)
-        return judged[step]
+        return batches[step]
 
     monkeypatch.setattr(PairStream, "draw", cheap)
 
@@ -218,7 +174,7 @@ class StopError(Exception):
 
 
 @pytest.mark.usefixtures("small")
-def test_training_goes_on_where_it_was_stopped(data: PretrainData, tmp_path: Path) -> None:
+def test_resumed_training_equals_uninterrupted_training(data: PretrainData, tmp_path: Path) -> None:
     for folder in "ab":
         (tmp_path / folder).mkdir()
     whole = train_encoder(data, OPTIONS, tmp_path / "a", lambda line: None).state_dict()
@@ -229,48 +185,48 @@ def test_training_goes_on_where_it_was_stopped(data: PretrainData, tmp_path: Pat
 
     with pytest.raises(StopError):
         train_encoder(data, OPTIONS, tmp_path / "b", stop)
-    said: list[str] = []
-    again = train_encoder(data, OPTIONS, tmp_path / "b", said.append).state_dict()
-    assert said[0] == "resumed at step 2"
-    assert [line.split()[1] for line in said[1:]] == ["4", "6"]
+    lines: list[str] = []
+    again = train_encoder(data, OPTIONS, tmp_path / "b", lines.append).state_dict()
+    assert lines[0] == "resumed at step 2"
+    assert [line.split()[1] for line in lines[1:]] == ["4", "6"]
     for name, value in whole.items():
         assert torch.equal(value, again[name]), name
-    # Finished: nothing is left to do, and nothing is done.
-    said.clear()
-    third = train_encoder(data, OPTIONS, tmp_path / "b", said.append).state_dict()
-    assert said == ["resumed at step 6"]
+    # A finished run does no further steps.
+    lines.clear()
+    third = train_encoder(data, OPTIONS, tmp_path / "b", lines.append).state_dict()
+    assert lines == ["resumed at step 6"]
     assert all(torch.equal(value, third[name]) for name, value in whole.items())
-    # A checkpoint made with other options is not taken up.
-    said.clear()
-    train_encoder(data, replace(OPTIONS, seed=7, steps=2), tmp_path / "b", said.append)
-    assert not any("resumed" in line for line in said)
+    # A checkpoint with other options is ignored.
+    lines.clear()
+    train_encoder(data, replace(OPTIONS, seed=7, steps=2), tmp_path / "b", lines.append)
+    assert not any("resumed" in line for line in lines)
 
 
 @pytest.mark.usefixtures("small")
 def test_training_lowers_the_loss(data: PretrainData, tmp_path: Path) -> None:
-    said: list[str] = []
+    lines: list[str] = []
     options = replace(OPTIONS, steps=24, peak_rate=1e-2)
-    train_encoder(data, options, tmp_path, said.append)
-    losses = [float(line.split()[3]) for line in said]
+    train_encoder(data, options, tmp_path, lines.append)
+    losses = [float(line.split()[3]) for line in lines]
     assert np.mean(losses[-3:]) < 0.93 * np.mean(losses[:2])
     assert losses[0] < math.log(3 * 64 + len(cell_pixels())) + 1
 
 
 @pytest.mark.usefixtures("small")
-def test_an_earlier_run_can_be_gone_on_from(
+def test_training_starts_from_an_earlier_run(
     data: PretrainData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(contrastive, "DataLoader", DataLoader)  # here with its worker process
-    said: list[str] = []
+    monkeypatch.setattr(contrastive, "DataLoader", DataLoader)  # with a worker process
+    lines: list[str] = []
     first, second = tmp_path / "first", tmp_path / "second"
     for folder in (first, second):
         folder.mkdir()
-    before = train_encoder(data, replace(OPTIONS, steps=2), first, said.append)
+    before = train_encoder(data, replace(OPTIONS, steps=2), first, lines.append)
     start = replace(OPTIONS, steps=1, peak_rate=1e-9, init=str(first / "encoder.pt"))
-    after = train_encoder(data, start, second, said.append)
+    after = train_encoder(data, start, second, lines.append)
     for name, value in after.named_parameters():
         torch.testing.assert_close(value, before.state_dict()[name], atol=1e-6, rtol=0)
     (tmp_path / "nonsense.pt").write_bytes(b"nonsense")
     for bad in (tmp_path / "nonsense.pt", tmp_path / "none.pt"):
         with pytest.raises(InputError, match=r"not the encoder\.pt of a run"):
-            train_encoder(data, replace(start, init=str(bad)), tmp_path, said.append)
+            train_encoder(data, replace(start, init=str(bad)), tmp_path, lines.append)

@@ -1,5 +1,7 @@
-"""Furnished rooms for pretraining: pairs show one point, files are kept, reserved seeds are left
-alone. Rendering needs the extra `sim`."""
+"""Furnished rooms for pretraining: correspondences, cached files, reserved seeds.
+
+Rendering needs the extra `sim`.
+"""
 
 from pathlib import Path
 
@@ -16,8 +18,8 @@ from evercal.continual.pretraining.contrastive import (
 )
 from evercal.continual.pretraining.furnished import (
     FurnishedViews,
+    cached_furnished_views,
     furnished_views,
-    kept_furnished_views,
 )
 from evercal.continual.pretraining.pairs import (
     FIRST_ROOM_SEED,
@@ -36,19 +38,19 @@ CAMERA = Camera(WIDTH, HEIGHT, 200.0, 200.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 
 
 def step() -> FurnishedViews:
-    """A wall 2 m off whose left half stands out by a metre, seen from two places."""
+    """Two views of a wall at 2 m whose left half is at 1 m."""
     depth = np.full((2, HEIGHT, WIDTH), 2.0, np.float16)
     depth[0, :, : WIDTH // 2] = 1.0
     shift = 0.1
-    edge = WIDTH // 2 - round(shift * 200)  # the near half ends 20 pixels further left
+    edge = WIDTH // 2 - round(shift * 200)  # parallax of 20 pixels
     depth[1, :, :edge] = 1.0
-    depth[:, :20] = 0.0  # nothing was hit
+    depth[:, :20] = 0.0  # no surface
     move = SE3(np.array([1.0, 0, 0, 0]), np.array([shift, 0, 0]))
     images = np.zeros((2, HEIGHT, WIDTH), np.uint8)
     return FurnishedViews(images, SE3.stack([SE3.identity(), move]), (CAMERA, CAMERA), depth)
 
 
-def test_depth_maps_say_where_points_lie_and_which_are_hidden() -> None:
+def test_depth_maps_give_points_and_occlusion() -> None:
     views = step()
     pixels = np.array([[40.0, 100.0], [200.0, 100.0], [40.0, 5.0]])
     points = views.hit(0, pixels)
@@ -62,13 +64,13 @@ def test_depth_maps_say_where_points_lie_and_which_are_hidden() -> None:
     np.testing.assert_allclose(parallax[~near], 10.0, atol=1e-3)
     assert min(near.sum(), (~near).sum()) > 100
     assert first[:, 1].min() > 19
-    # From the left, the near half hides a strip of the far one.
+    # The near half occludes a strip of the far half.
     back = view_pair(views, 1, 0, np.random.default_rng(0)).pixels[0]
     strip = WIDTH // 2 - 20
     assert not ((back[:, 0] > strip) & (back[:, 0] < strip + 9)).any()
 
 
-def test_pretraining_keeps_to_its_own_seeds(tmp_path: Path) -> None:
+def test_pretraining_uses_reserved_seeds(tmp_path: Path) -> None:
     shown = max(seed for suite in SUITES.values() for *_, seed in suite.rooms)
     assert shown < FIRST_ROOM_SEED < VALIDATION_ROOM_SEED
     assert VALIDATION_ROOM_SEED + 100 < RESERVED
@@ -81,7 +83,7 @@ def test_pretraining_keeps_to_its_own_seeds(tmp_path: Path) -> None:
             make_data(options, tmp_path)
 
 
-def test_a_batch_takes_its_share_of_furnished_rooms() -> None:
+def test_batch_contains_furnished_rooms() -> None:
     two = step()
     images = np.stack([np.full((HEIGHT, WIDTH), grey, np.uint8) for grey in (80, 81, 82, 83)])
     four = FurnishedViews(
@@ -101,36 +103,36 @@ def test_a_batch_takes_its_share_of_furnished_rooms() -> None:
     shades = (grey[:, :, 0, 96, 128] * 255).round().int()
     assert ((shades[:, :2] >= 80) & (shades[:, :2] <= 83)).all()
     assert (shades[:, 2] == 200).all()
-    # Points of the furnished room keep their parallax: 0, 10 or 20 pixels for these cameras.
+    # The parallax of these cameras is 0, 10 or 20 pixels.
     across = (pixels[0, :2] - pixels[1, :2])[valid[:2]][:, 0].abs()
     assert (across[:, None] - torch.tensor([0.0, 10.0, 20.0])).abs().min(1).values.max() < 1e-2
 
 
-def test_rendered_pairs_look_alike_and_are_kept(tmp_path: Path) -> None:
+def test_rendered_pairs_correspond_and_are_cached(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason="the extra 'sim' is not installed")
     views = furnished_views(1001, anchors=1)
     assert views.images.shape == views.depth_m.shape == (PER_ANCHOR, HEIGHT, WIDTH)
-    rng, seen = np.random.default_rng(0), []
+    rng, captured = np.random.default_rng(0), []
     for first, second in ((0, 1), (2, 3), (1, 2)):
         pair = view_pair(views, first, second, rng)
         assert pair.pixels.shape[1] > 20
         (u, v), (x, y) = np.rint(pair.pixels).astype(int).transpose(0, 2, 1)
-        seen.append(np.stack([pair.images[0, v, u], pair.images[1, y, x]]).astype(float))
-        # The same surface point, found from either side.
+        captured.append(np.stack([pair.images[0, v, u], pair.images[1, y, x]]).astype(float))
+        # Both views give the same surface point.
         gap = views.hit(first, pair.pixels[0]) - views.hit(second, pair.pixels[1])
         assert np.median(np.linalg.norm(gap, axis=-1)) < 0.01
-    left, right = np.concatenate(seen, 1)
+    left, right = np.concatenate(captured, 1)
     assert np.corrcoef(left, right)[0, 1] > 0.8
     patch = pytest.MonkeyPatch()
     with patch.context() as patched:
         patched.setattr(furnished, "furnished_views", lambda seed: views)
-        kept = kept_furnished_views(1001, tmp_path / "new")
+        selected = cached_furnished_views(1001, tmp_path / "new")
         patched.setattr(furnished, "furnished_views", None)
-        again = kept_furnished_views(1001, tmp_path / "new")
-    for found in (kept, again):
-        np.testing.assert_array_equal(found.images, views.images)
-        np.testing.assert_array_equal(found.depth_m, views.depth_m)
+        again = cached_furnished_views(1001, tmp_path / "new")
+    for actual in (selected, again):
+        np.testing.assert_array_equal(actual.images, views.images)
+        np.testing.assert_array_equal(actual.depth_m, views.depth_m)
         np.testing.assert_allclose(
-            found.base_from_camera.matrix(), views.base_from_camera.matrix(), atol=1e-12
+            actual.base_from_camera.matrix(), views.base_from_camera.matrix(), atol=1e-12
         )
-        assert found.cameras == views.cameras
+        assert actual.cameras == views.cameras

@@ -1,4 +1,4 @@
-"""Training of the global descriptor: closed forms, and what it is worth on rooms it never saw."""
+"""Training of the global descriptor, and its accuracy on new rooms."""
 
 import math
 from dataclasses import replace
@@ -16,7 +16,12 @@ from evercal.continual.pretraining import make, places
 from evercal.continual.pretraining.contrastive import PretrainData, PretrainOptions
 from evercal.continual.pretraining.make import pretrain
 from evercal.continual.pretraining.pairs import RoomViews, leaf_picture
-from evercal.continual.pretraining.places import place_accuracy, place_loss, train_descriptor
+from evercal.continual.pretraining.places import (
+    place_accuracy,
+    place_loss,
+    random_crop,
+    train_descriptor,
+)
 from evercal.features.encoder import LocalEncoder, load_encoder
 from evercal.simulation.box_room import BoxRoom, default_camera
 
@@ -30,11 +35,11 @@ def test_loss_of_two_rooms() -> None:
     assert float(place_loss(eye, eye.flip(0), rooms)) == pytest.approx(1 / T, rel=1e-4)
 
 
-def test_places_of_one_room_are_neither_friend_nor_foe() -> None:
+def test_places_of_one_room_are_ignored() -> None:
     same = torch.ones(2, 2) / math.sqrt(2)
     assert float(place_loss(same, same, torch.tensor([3, 3]))) == pytest.approx(0, abs=1e-6)
     assert float(place_loss(same, same, torch.tensor([3, 4]))) == pytest.approx(math.log(2))
-    rooms = torch.tensor([3, 3, 4])  # each of the first two has one rival, the third has two
+    rooms = torch.tensor([3, 3, 4])  # numbers of negatives: 1, 1, 2
     same = torch.ones(3, 2) / math.sqrt(2)
     expected = (math.log(2) + math.log(2) + math.log(3)) / 3
     assert float(place_loss(same, same, rooms)) == pytest.approx(expected)
@@ -45,13 +50,13 @@ class Mean(nn.Module):
         return F.normalize(maps.mean((2, 3)), dim=-1)
 
 
-def test_accuracy_is_the_share_of_queries_whose_nearest_view_is_of_their_room() -> None:
-    """Three rooms, two anchors, four views; view 0 asks, the others answer."""
+def test_accuracy_by_hand() -> None:
+    """Three rooms, two anchors, four views; view 0 is the query."""
     maps = torch.zeros(3, 2, 4, 3, 2, 2)
     for room in range(3):
         maps[room, :, :, room] = 1.0
     assert place_accuracy(Mean(), maps) == 100.0  # pyright: ignore[reportArgumentType]
-    maps[0, 1, 0] = maps[1, 0, 0]  # one query of six looks like room 1
+    maps[0, 1, 0] = maps[1, 0, 0]  # one of six queries is like room 1
     assert place_accuracy(Mean(), maps) == pytest.approx(100 * 5 / 6)  # pyright: ignore[reportArgumentType]
     maps[2, :, 0] = maps[1, :, 0]
     assert place_accuracy(Mean(), maps) == pytest.approx(100 * 3 / 6)  # pyright: ignore[reportArgumentType]
@@ -61,7 +66,7 @@ def test_crops_are_windows_of_the_map() -> None:
     maps = torch.arange(24 * 32.0).view(1, 1, 24, 32)
     rng, sizes = np.random.default_rng(0), set()
     for _ in range(40):
-        crop = places._crop(maps, rng)
+        crop = random_crop(maps, rng)
         height, width = crop.shape[-2:]
         sizes.add((height, width))
         top, left = divmod(int(crop[0, 0, 0, 0]), 32)
@@ -75,30 +80,28 @@ def test_crops_are_windows_of_the_map() -> None:
 def trained(one_room: RoomViews, steps: int) -> tuple[dict[str, Tensor], list[str]]:
     torch.manual_seed(0)
     encoder = LocalEncoder((4, 4), 8, 1, 8).eval()
-    said: list[str] = []
+    lines: list[str] = []
     options = PretrainOptions(descriptor_steps=steps)
     data = PretrainData([one_room, one_room], [])
-    descriptor = train_descriptor(data, options, encoder, said.append)
-    return descriptor.state_dict(), said
+    descriptor = train_descriptor(data, options, encoder, lines.append)
+    return descriptor.state_dict(), lines
 
 
-def test_training_repeats_with_the_seed(
-    one_room: RoomViews, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_is_reproducible(one_room: RoomViews, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(places, "photometric", lambda image, rng: image)
     first, _ = trained(one_room, 5)
     torch.rand(3)
     again, _ = trained(one_room, 5)
     assert all(torch.equal(value, again[name]) for name, value in first.items())
-    longer, said = trained(one_room, 6)
+    longer, lines = trained(one_room, 6)
     assert not torch.equal(first["project.weight"], longer["project.weight"])
-    assert said == []
+    assert lines == []
 
 
-def test_pretrain_writes_what_the_loaders_read(
+def test_pretrain_writes_loadable_files(
     tmp_path: Path, one_room: RoomViews, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With stand-ins for the two long parts: data and the encoder's training."""
+    """Without the two slow parts, rendering and training of the encoder."""
     data = PretrainData([one_room], [leaf_picture(np.random.default_rng(0), 64)])
     unfused = LocalEncoder((4, 4), 8, 1, 8, fused=False)
     monkeypatch.setattr(make, "make_data", lambda options, folder: data)
@@ -120,7 +123,7 @@ def test_pretrain_writes_what_the_loaders_read(
 
 
 @pytest.mark.slow
-def test_the_whole_of_pretrain_in_small_and_once_more(tmp_path: Path) -> None:
+def test_small_pretraining_is_complete_and_resumable(tmp_path: Path) -> None:
     options = PretrainOptions(
         steps=3, rooms=2, furnished=0, furnished_pairs=0, pictures=2, descriptor_steps=2
     )
@@ -144,7 +147,7 @@ def test_the_whole_of_pretrain_in_small_and_once_more(tmp_path: Path) -> None:
 
 
 def ranks(seeds: range, gallery: int, queries: int) -> np.ndarray:
-    """For each query, how many other rooms look more like it than its own does.
+    """Count for each query the rooms that are more similar than its own.
 
     Both come from the shipped networks: a gallery from one sweep through each room, queries from
     another walk along the same way; a room is as like as its likest gallery image.
@@ -160,20 +163,20 @@ def ranks(seeds: range, gallery: int, queries: int) -> np.ndarray:
             return descriptor(encoder(torch.from_numpy(np.stack(images))[:, None].float() / 255))
 
     rooms = [BoxRoom(seed, texture_px=128) for seed in seeds]
-    known = [describe(room, gallery, 1) for room in rooms]
-    found = []
+    learned_head = [describe(room, gallery, 1) for room in rooms]
+    actual = []
     for own, room in enumerate(rooms):
-        asked = describe(room, queries, 2)
-        likeness = torch.stack([(asked @ views.T).amax(1) for views in known], 1)
-        found.append((likeness > likeness[:, own : own + 1]).sum(1).numpy())
-    return np.concatenate(found)
+        calls = describe(room, queries, 2)
+        likeness = torch.stack([(calls @ views.T).amax(1) for views in learned_head], 1)
+        actual.append((likeness > likeness[:, own : own + 1]).sum(1).numpy())
+    return np.concatenate(actual)
 
 
-def test_the_shipped_descriptor_tells_three_rooms_it_never_saw_apart() -> None:
+def test_shipped_descriptor_separates_three_new_rooms() -> None:
     assert (ranks(range(300, 303), gallery=12, queries=4) == 0).mean() >= 0.8
 
 
 @pytest.mark.slow
-def test_the_shipped_descriptor_names_the_right_room_of_twelve() -> None:
-    """Measured: 99 % of images taken half a step beside the gallery's; a guess gives 8 %."""
+def test_shipped_descriptor_separates_twelve_new_rooms() -> None:
+    """Measured: 99 % of images between those of the gallery; chance is 8 %."""
     assert (ranks(range(300, 312), gallery=40, queries=8) == 0).mean() >= 0.9

@@ -20,7 +20,7 @@ from evercal.recordings import ReadOptions, load_recording
 KINDS = ("ros1", "sqlite3", "mcap")
 START_NS = 1_700_000_000_123_456_789
 WIDTH, HEIGHT = 32, 24
-# Not at the times of the transforms; the last two are after the arm was last seen.
+# Not at the times of the transforms; the last two are after the last pose of the arm.
 SHOTS = (0.0, 0.013, 0.5, 0.987, 1.711, 2.0, 2.05, 2.5)
 BASE_FROM_SHOULDER = SE3.exp([0.1, 0.2, 0.3, 0.0, 0.0, 0.5])
 TOOL_FROM_OPTICAL = SE3.exp([0.02, -0.05, 0.03, 0.3, -0.2, 1.2])
@@ -28,12 +28,12 @@ TOOL_FROM_OPTICAL = SE3.exp([0.02, -0.05, 0.03, 0.3, -0.2, 1.2])
 
 def shoulder_from_tool(seconds: float) -> SE3:
     """Turns about a slanted axis and moves on a line, both steadily."""
-    turn = Rotation.from_rotvec(np.array([0.6, -0.3, 0.8]) * seconds)
-    return SE3(turn.as_quat(scalar_first=True), np.array([0.4, 0.1, 0.5]) + 0.2 * seconds)
+    rotation = Rotation.from_rotvec(np.array([0.6, -0.3, 0.8]) * seconds)
+    return SE3(rotation.as_quat(scalar_first=True), np.array([0.4, 0.1, 0.5]) + 0.2 * seconds)
 
 
 def picture(number: int) -> np.ndarray:
-    """A picture that tells which it is and which way round its colours are."""
+    """A picture that differs by number, with distinct red, green and blue."""
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[:, : WIDTH // 2] = (200, 100, 10 + number)
     image[HEIGHT // 2 :, WIDTH // 2 :] = (20, 220, 60)
@@ -49,7 +49,7 @@ class Bag:
 
     def __post_init__(self) -> None:
         self.store = get_typestore(Stores.ROS1_NOETIC if self.kind == "ros1" else Stores.LATEST)
-        if self.kind == "ros1":  # rosbags knows the common messages only
+        if self.kind == "ros1":  # rosbags has the common messages only
             text = "geometry_msgs/TransformStamped[] transforms"
             self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
 
@@ -115,14 +115,14 @@ class Bag:
         content = np.frombuffer(data, np.uint8)
         self.add(topic, kind, seconds, self.make(kind, header=head, format=what, data=content))
 
-    def info(self, topic: str, focal: float = 30.0, lens: Iterable[float] = (0.1, 0, 0, 0, 0),
+    def info(self, topic: str, focal: float = 30.0, distortion: Iterable[float] = (0.1, 0, 0, 0, 0),
              model: str = "plumb_bob", rectified_focal: float = 28.0,
              size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:  # fmt: skip
         """A camera_info."""
         kind = "sensor_msgs/msg/CameraInfo"
         k = [focal, 0, 15.0, 0, focal, 11.0, 0, 0, 1] if focal else [0.0] * 9
         p = [rectified_focal, 0, 16.0, 0, 0, rectified_focal, 12.0, 0, 0, 0, 1, 0]
-        values = {"k": k, "d": list(lens), "r": np.eye(3).reshape(-1), "p": p}
+        values = {"k": k, "d": list(distortion), "r": np.eye(3).reshape(-1), "p": p}
         if self.kind == "ros1":
             values = {name.upper(): value for name, value in values.items()}
         roi = self.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0,
@@ -183,7 +183,7 @@ def arm(bag: Bag, first: float = 0.0, last: float = 2.0, rate: float = 25.0) -> 
     return bag
 
 
-def recording(kind: str) -> Bag:
+def recorded_bag(kind: str) -> Bag:
     """An arm, a camera and its images."""
     bag = arm(Bag(kind))
     for i, at in enumerate(SHOTS):
@@ -198,7 +198,7 @@ def refusal(bag: Bag, root: Path, **options: object) -> str:
 
 
 def refusal_of(path: Path, **options: object) -> str:
-    """The same of a bag that was written."""
+    """Why a written bag cannot be read, in one line that names it."""
     with pytest.raises(InputError) as caught:
         load_recording(path, options=ReadOptions(**options))  # pyright: ignore[reportArgumentType]
     message = str(caught.value)

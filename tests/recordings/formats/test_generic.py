@@ -17,7 +17,7 @@ WIDE = Camera(32, 24, 30.25, 31.5, 15.5, 11.5, (0.1, -0.02, 0.001, 0.002, 0.03))
 TALL = Camera(24, 32, 30.0, 30.0, 11.5, 15.5)
 
 
-def make_scene() -> Recording:
+def make_recording() -> Recording:
     rng = np.random.default_rng(0)
 
     def frame(i: int, camera: Camera, gripper: bool = False) -> Frame:
@@ -48,23 +48,23 @@ def assert_same(a: Recording, b: Recording) -> None:
             np.testing.assert_array_equal(x.read_image(), y.read_image())
 
 
-def test_a_scene_comes_back_as_it_was_written(tmp_path: Path) -> None:
-    scene = make_scene()
-    generic.write(tmp_path / "a", scene)
+def test_round_trip_is_exact(tmp_path: Path) -> None:
+    recording = make_recording()
+    generic.write(tmp_path / "a", recording)
     read = load_recording(tmp_path / "a")
-    assert_same(scene, read)
+    assert_same(recording, read)
     # From files this time: images are copied, not encoded again.
     generic.write(tmp_path / "b", read)
-    assert_same(scene, load_recording(tmp_path / "b"))
+    assert_same(recording, load_recording(tmp_path / "b"))
     assert (tmp_path / "a/scene.json").read_bytes() == (tmp_path / "b/scene.json").read_bytes()
 
 
-def test_depth_and_joint_angles_travel_along(tmp_path: Path) -> None:
-    first = make_scene().train[0]
+def test_depth_and_joint_angles_are_written(tmp_path: Path) -> None:
+    first = make_recording().train[0]
     depth = tmp_path / "depth.png"
     depth.write_bytes(b"any bytes: depth is copied, not decoded")
     frame = dataclasses.replace(first, depth=depth, joints_rad=(0.1, -0.2, 0.3))
-    generic.write(tmp_path / "a", Recording("arm", (frame, make_scene().train[1]), ()))
+    generic.write(tmp_path / "a", Recording("arm", (frame, make_recording().train[1]), ()))
     read = load_recording(tmp_path / "a").train
     copied = tmp_path / "a/depth/000000.png"
     assert read[0].depth == copied
@@ -73,8 +73,8 @@ def test_depth_and_joint_angles_travel_along(tmp_path: Path) -> None:
     assert (read[1].depth, read[1].joints_rad) == (None, None)
 
 
-def test_an_interrupted_recording_is_no_scene(tmp_path: Path) -> None:
-    frame = make_scene().train[0]
+def test_interrupted_recording_has_no_scene_file(tmp_path: Path) -> None:
+    frame = make_recording().train[0]
 
     def record() -> None:
         with generic.SceneWriter(tmp_path, "x") as writer:
@@ -87,15 +87,15 @@ def test_an_interrupted_recording_is_no_scene(tmp_path: Path) -> None:
         load_recording(tmp_path)
 
 
-def test_the_writer_neither_overwrites_nor_repeats(tmp_path: Path) -> None:
-    scene = make_scene()
-    generic.write(tmp_path, scene)
+def test_writer_refuses_existing_scenes_and_repeated_names(tmp_path: Path) -> None:
+    recording = make_recording()
+    generic.write(tmp_path, recording)
     with pytest.raises(InputError, match=r"scene\.json: already there"):
-        generic.write(tmp_path, scene)
+        generic.write(tmp_path, recording)
     with generic.SceneWriter(tmp_path / "other", "x") as writer:
-        writer.add(scene.train[0], "train")
+        writer.add(recording.train[0], "train")
         with pytest.raises(InputError, match="'shot/0': already written"):
-            writer.add(scene.train[0], "test")
+            writer.add(recording.train[0], "test")
 
 
 def numbered(folder: Path, count: int) -> Recording:
@@ -109,19 +109,19 @@ def numbered(folder: Path, count: int) -> Recording:
     return Recording("x", tuple(frames), ())
 
 
-def shown(scene: Recording) -> list[int]:
-    return [int(frame.read_image()[0, 0, 0]) for frame in scene.train]
+def shown(recording: Recording) -> list[int]:
+    return [int(frame.read_image()[0, 0, 0]) for frame in recording.train]
 
 
-def test_images_of_the_source_are_never_written_to(tmp_path: Path) -> None:
-    scene = numbered(tmp_path / "source" / "images", 4)
-    fewer = replace(scene, train=scene.train[::2])
+def test_source_images_are_never_overwritten(tmp_path: Path) -> None:
+    recording = numbered(tmp_path / "source" / "images", 4)
+    fewer = replace(recording, train=recording.train[::2])
     # In place, where image 1 would become image 2.
     with pytest.raises(InputError, match=r"000001\.png: already there; give a new folder"):
         generic.write(tmp_path / "source", fewer)
     # Through hard links that an earlier copy left, whether its scene.json was removed ...
     out = tmp_path / "out"
-    generic.write(out, scene, link=True)
+    generic.write(out, recording, link=True)
     (out / generic.FILE).unlink()
     for _ in range(2):  # a refusal leaves nothing that would allow it afterwards
         with pytest.raises(InputError, match=r"000001\.png: already there"):
@@ -129,18 +129,29 @@ def test_images_of_the_source_are_never_written_to(tmp_path: Path) -> None:
     # ... or it was cut off; then what it left is replaced.
     other = tmp_path / "other"
     writer = generic.SceneWriter(other, "x", link=True)
-    for frame in scene.train:
+    for frame in recording.train:
         writer.add(frame, "train")
     generic.write(other, fewer)
     assert shown(generic.load(other)) == [0, 2]
-    assert shown(scene) == [0, 1, 2, 3]
+    assert shown(recording) == [0, 1, 2, 3]
     assert {path.name for path in other.iterdir()} == {"images", "scene.json"}
     assert not [path for path in (other / "images").iterdir() if path.name.startswith(".")]
 
 
-def test_unknown_keys_are_passed_over(tmp_path: Path) -> None:
-    scene = make_scene()
-    generic.write(tmp_path, scene)
+def test_failed_copies_name_the_source_or_the_target(tmp_path: Path) -> None:
+    recording = numbered(tmp_path / "source", 1)
+    # A folder at the temporary name makes writing fail.
+    (tmp_path / "out/images/.000000.png").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"images/000000\.png: cannot be written \("):
+        generic.write(tmp_path / "out", recording)
+    (tmp_path / "source/000000.png").unlink()
+    with pytest.raises(InputError, match=r"source/000000\.png: cannot be copied \(No such file"):
+        generic.write(tmp_path / "other", recording)
+
+
+def test_unknown_keys_are_ignored(tmp_path: Path) -> None:
+    recording = make_recording()
+    generic.write(tmp_path, recording)
     file = tmp_path / "scene.json"
     data = json.loads(file.read_text())
     data["robot"] = "UR5e"
@@ -152,7 +163,7 @@ def test_unknown_keys_are_passed_over(tmp_path: Path) -> None:
             "covariance": [],
         }
     file.write_text(json.dumps(data))
-    assert_same(scene, load_recording(tmp_path))
+    assert_same(recording, load_recording(tmp_path))
 
 
 FIRST = ("frames", 0)
@@ -166,6 +177,8 @@ BREAKS = [
     (("untracked",), "many", "'untracked' is a count"),
     ((*FIRST, "image"), "images/none.png", r"images/none\.png: named in .*scene\.json but missing"),
     ((*FIRST, "image"), "../secret.png", "stays inside"),
+    ((*FIRST, "image"), "images\\..\\..\\secret.png", "stays inside"),
+    ((*FIRST, "image"), "C:/secret.png", "relative"),
     ((*FIRST, "image"), "/etc/hosts", "relative"),
     ((*FIRST, "camera"), "9", r"frame 0: 'camera' is one of \['0', '1'\], got '9'"),
     ((*FIRST, "camera"), [], "frame 0: 'camera'"),
@@ -182,10 +195,10 @@ BREAKS = [
 
 
 @pytest.mark.parametrize(("where", "value", "message"), BREAKS)
-def test_damage_is_named_in_one_line(
+def test_broken_files_are_refused_in_one_line(
     tmp_path: Path, where: tuple[str | int, ...], value: object, message: str
 ) -> None:
-    generic.write(tmp_path, make_scene())
+    generic.write(tmp_path, make_recording())
     file = tmp_path / "scene.json"
     data = json.loads(file.read_text())
     target = data
@@ -200,14 +213,14 @@ def test_damage_is_named_in_one_line(
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", "\x00"])
-def test_what_is_no_scene_file_is_refused(tmp_path: Path, text: str) -> None:
+def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "scene.json").write_text(text)
     with pytest.raises(InputError, match=r"scene\.json"):
         load_recording(tmp_path)
 
 
-def test_formats_are_named_and_recognised(tmp_path: Path) -> None:
-    generic.write(tmp_path / "a", make_scene())
+def test_formats_are_recognised(tmp_path: Path) -> None:
+    generic.write(tmp_path / "a", make_recording())
     assert load_recording(tmp_path / "a", format="generic", name="lab").name == "lab"
     with pytest.raises(InputError, match="use one of generic, 7scenes"):
         load_recording(tmp_path / "a", format="gopro")

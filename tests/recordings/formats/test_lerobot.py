@@ -4,7 +4,6 @@ The files are as the package lerobot 0.4 (version 3) and 0.3 (version 2) writes 
 """
 
 import json
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.recordings import ReadOptions, generic, load_recording
+from evercal.recordings import ReadOptions, generic, load_recording, write_image
 
 av: Any = pytest.importorskip("av", reason="the extra 'lerobot' is not installed")
 pa: Any = pytest.importorskip("pyarrow", reason="the extra 'lerobot' is not installed")
@@ -148,24 +147,24 @@ def options(root: Path, **more: Any) -> ReadOptions:
         ("v3.0", "image", ""),
     ],
 )
-def test_a_dataset_comes_back(version: str, kind: str, codec: str, tmp_path: Path) -> None:
+def test_datasets_are_read(version: str, kind: str, codec: str, tmp_path: Path) -> None:
     root = make(tmp_path / "wave", version, kind, codec)
-    scene = load_recording(root, options=options(root))
-    assert scene.name == "wave"
-    assert [frame.name for frame in scene.train[6:8]] == [
+    recording = load_recording(root, options=options(root))
+    assert recording.name == "wave"
+    assert [frame.name for frame in recording.train[6:8]] == [
         "episode_000000/000006",
         "episode_000001/000000",
     ]
     where = [divmod(i, LENGTH) for i in range(EPISODES * LENGTH)]
     with ThreadPoolExecutor(3) as pool:  # in any order
-        images = list(pool.map(lambda frame: frame.read_image(), scene.train[::-1]))[::-1]
-    for frame, image, (episode, number) in zip(scene.train, images, where, strict=True):
+        images = list(pool.map(lambda frame: frame.read_image(), recording.train[::-1]))[::-1]
+    for frame, image, (episode, number) in zip(recording.train, images, where, strict=True):
         assert frame.camera == Camera(96, 64, 80, 80, 47.5, 31.5)
         off = np.abs(image[8:24, 8:40].mean((0, 1)) - picture(episode, number)[16, 16])
         assert off.max() < (5 if kind == "video" else 1e-9)  # frames differ by 10
         assert frame.base_from_gripper is not None
         assert max(pose_distance(frame.base_from_gripper, pose(episode, number))) < 1e-6
-    assert scene.notes[0].startswith("gripper poses are observation.ee: ")
+    assert recording.notes[0].startswith("gripper poses are observation.ee: ")
 
 
 def test_joints_and_a_urdf_in_radians_or_degrees(tmp_path: Path) -> None:
@@ -174,11 +173,13 @@ def test_joints_and_a_urdf_in_radians_or_degrees(tmp_path: Path) -> None:
     (root / "arm.urdf").write_text(URDF)
     for convention, unit in ((None, 1.0), ("rad", 1.0), ("deg", np.pi / 180)):
         read = options(root, urdf=root / "arm.urdf", pose_convention=convention, every=4)
-        scene = load_recording(root, options=read)
-        assert len(scene.train) == 6
-        for i, frame in enumerate(scene.train):
-            turn, reach = joints(*divmod(4 * i, LENGTH))
-            expected = SE3.exp([0, 0, 0, 0, 0, turn * unit]) @ SE3.exp([0.5 + reach, 0, 0, 0, 0, 0])
+        recording = load_recording(root, options=read)
+        assert len(recording.train) == 6
+        for i, frame in enumerate(recording.train):
+            shoulder, reach = joints(*divmod(4 * i, LENGTH))
+            expected = SE3.exp([0, 0, 0, 0, 0, shoulder * unit]) @ SE3.exp(
+                [0.5 + reach, 0, 0, 0, 0, 0]
+            )
             assert frame.base_from_gripper is not None
             assert max(pose_distance(frame.base_from_gripper, expected)) < 1e-6
     with pytest.raises(InputError, match="--pose-convention grad: joint angles are rad or deg"):
@@ -199,7 +200,7 @@ def test_poses_in_a_given_convention(tmp_path: Path) -> None:
     for convention, feature, message in (
         ("xyzw", None, r"observation\.state: "),
         ("martian", "observation.ee", "martian"),
-        ("xyzw", "observation.hand", r"no feature 'observation\.hand'; --gripper-frame names one"),
+        ("xyzw", "observation.hand", r"no feature 'observation\.hand'; --gripper-frame is one of"),
     ):
         read = options(root, pose_convention=convention, gripper_frame=feature)
         with pytest.raises(InputError, match=message):
@@ -219,11 +220,11 @@ def two_arms(root: Path, names: Any) -> None:
     change(root, features=features)
 
 
-def test_of_two_arms_one_is_named(tmp_path: Path) -> None:
+def test_one_of_two_arms_is_selected(tmp_path: Path) -> None:
     root, parts = make(tmp_path / "wave", "v2.1", "image"), ["x", "y", "z", "qx", "qy", "qz", "qw"]
     two_arms(root, [f"{side}_ee.{part}" for side in ("left", "right") for part in parts])
-    said = r"observation\.ee: holds several poses .*--gripper-frame left_ee or right_ee"
-    with pytest.raises(InputError, match=said):
+    message = r"observation\.ee: holds several poses .*--gripper-frame left_ee or right_ee"
+    with pytest.raises(InputError, match=message):
         load_recording(root, options=options(root))
     for arm, height in (("left_ee", 0.5), ("right_ee", 5.5)):
         frame = load_recording(root, options=options(root, gripper_frame=arm)).train[0]
@@ -253,7 +254,7 @@ def change_names(root: Path, names: Any, feature: str = "observation.ee") -> Non
     change(root, features=features)
 
 
-def test_joints_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_repeated_joint_names_are_refused(tmp_path: Path) -> None:
     pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
     root = make(tmp_path / "wave", "v2.1", "image")
     (root / "arm.urdf").write_text(URDF)
@@ -266,7 +267,7 @@ def test_joints_of_one_name_are_refused(tmp_path: Path) -> None:
         load_recording(root, options=read)
 
 
-def test_embedded_images_are_written_out(tmp_path: Path) -> None:
+def test_embedded_images_are_copied(tmp_path: Path) -> None:
     root = make(tmp_path / "wave", "v3.0", "image")
     generic.write(tmp_path / "out", load_recording(root, options=options(root, every=5)))
     image = load_recording(tmp_path / "out").train[3].read_image()
@@ -278,7 +279,7 @@ def change(root: Path, **values: Any) -> None:
     file.write_text(json.dumps({**json.loads(file.read_text()), **values}))
 
 
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
+def test_missing_options_and_files_are_named(tmp_path: Path) -> None:
     root = make(tmp_path / "wave", "v2.1")
     with pytest.raises(
         InputError, match=r"2 cameras; name one with --image-topic: observation\.images\.w"
@@ -304,16 +305,16 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
         load_recording(root, options=options(root))
 
 
-def test_a_video_that_ends_early_is_named(tmp_path: Path) -> None:
+def test_truncated_video_is_refused(tmp_path: Path) -> None:
     root = make(tmp_path / "wave", "v2.1")
     video = root / "videos/chunk-000" / WRIST / "episode_000000.mp4"
     write_video(video, [picture(0, n) for n in range(3)], "libx264")
-    scene = load_recording(root, options=options(root))
+    recording = load_recording(root, options=options(root))
     with pytest.raises(InputError, match=r"no frame at 0\.500 s; the video is cut off"):
-        scene.train[5].read_image()
+        recording.train[5].read_image()
     # The others can still be read.
-    assert scene.train[2].read_image().shape == (64, 96, 3)
-    assert scene.train[9].read_image().shape == (64, 96, 3)
+    assert recording.train[2].read_image().shape == (64, 96, 3)
+    assert recording.train[9].read_image().shape == (64, 96, 3)
 
 
 def test_other_versions_and_features_are_refused(tmp_path: Path) -> None:
@@ -334,11 +335,33 @@ def test_other_versions_and_features_are_refused(tmp_path: Path) -> None:
         load_recording(root, options=options(root))
 
 
-@pytest.mark.parametrize("module", ["av", "pyarrow.parquet"])
-def test_without_the_extra_the_install_line_is_named(
-    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize(
+    ("name", "path", "message"),
+    [
+        ("video_path", "../other/{video_key}.mp4", "'video_path' stays inside the folder"),
+        ("video_path", "/tmp/{video_key}.mp4", "'video_path' is a path relative to the folder"),
+        ("data_path", "../../data.parquet", "'data_path' stays inside the folder"),
+        ("video_path", "{nothing}.mp4", "unusable 'video_path': 'nothing'"),
+    ],
+)
+def test_paths_outside_the_dataset_are_refused(
+    version: str, name: str, path: str, message: str, tmp_path: Path
 ) -> None:
-    root = make(tmp_path / "wave", "v2.1")
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(InputError, match=r"pip install 'evercal\[lerobot\]'"):
+    root = make(tmp_path / "wave", version)
+    change(root, **{name: path})
+    with pytest.raises(InputError, match=f"info.json: .*{message}"):
+        load_recording(root, options=options(root))
+
+
+@pytest.mark.parametrize("path", ["../secret.png", "/etc/secret.png"])
+def test_image_paths_outside_the_dataset_are_refused(path: str, tmp_path: Path) -> None:
+    root = make(tmp_path / "wave", "v2.1", "image")
+    write_image(tmp_path / "secret.png", picture(0, 0))
+    for file in root.glob("data/*/*.parquet"):
+        table = pq.read_table(file)
+        cells = pa.array([{"bytes": None, "path": path}] * len(table))
+        table = table.set_column(table.schema.get_field_index(WRIST), WRIST, cells)
+        pq.write_table(table, file)
+    with pytest.raises(InputError, match=f"image '{path}': the path"):
         load_recording(root, options=options(root))

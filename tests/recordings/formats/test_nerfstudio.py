@@ -1,4 +1,4 @@
-"""nerfstudio's transforms.json: points land on the pixels that its own formulas say."""
+"""nerfstudio's transforms.json: projections agree with its documented formulas."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings import Frame, load_recording, nerfstudio, write_image
-from evercal.recordings.inspection import inspect_scene
+from evercal.recordings.inspection import inspect_recording
 
 LENS = {"fl_x": 40.0, "fl_y": 42.0, "cx": 13.0, "cy": 17.5, "w": 24, "h": 36,
         "k1": 0.05, "k2": -0.02, "p1": 0.003, "p2": -0.002}  # fmt: skip
@@ -28,20 +28,24 @@ def look(eye: np.ndarray, target: np.ndarray, up: tuple[float, float, float]) ->
     return matrix
 
 
-def gl_pixel(matrix: np.ndarray, lens: dict[str, float], point: np.ndarray) -> np.ndarray:
-    """Where a point is seen, x to the right and y down from the image's corner.
+def gl_pixel(matrix: np.ndarray, intrinsics: dict[str, float], point: np.ndarray) -> np.ndarray:
+    """Pixel of a point, x to the right and y down from the image's corner.
 
-    The camera looks along -z with y up; the lens is Brown's in the plane at distance one, y down.
+    The camera looks along -z with y up; distortion is Brown's model in the plane z = 1, y down.
     """
     x, y, z = np.linalg.solve(matrix, np.append(point, 1.0))[:3]
     assert z < 0
     u, v = x / -z, -y / -z
     r2 = u * u + v * v
-    radial = 1 + lens["k1"] * r2 + lens["k2"] * r2 * r2 + lens.get("k3", 0.0) * r2**3
-    p1, p2 = lens["p1"], lens["p2"]
+    radial = (
+        1 + intrinsics["k1"] * r2 + intrinsics["k2"] * r2 * r2 + intrinsics.get("k3", 0.0) * r2**3
+    )
+    p1, p2 = intrinsics["p1"], intrinsics["p2"]
     du = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
     dv = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
-    return np.array([lens["fl_x"] * du + lens["cx"], lens["fl_y"] * dv + lens["cy"]])
+    return np.array(
+        [intrinsics["fl_x"] * du + intrinsics["cx"], intrinsics["fl_y"] * dv + intrinsics["cy"]]
+    )
 
 
 def write(
@@ -68,27 +72,29 @@ def entries(matrices: list[np.ndarray], **more: Any) -> list[dict[str, Any]]:
     ]
 
 
-def seen(frame: Frame, point: np.ndarray) -> np.ndarray:
+def pixel_of(frame: Frame, point: np.ndarray) -> np.ndarray:
     """The pixel from the image's corner, by this program's own camera."""
     assert frame.base_from_camera is not None
     return frame.camera.project(frame.base_from_camera.inverse().apply(point)) + 0.5
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_points_land_where_the_files_own_formulas_say(shared: bool, tmp_path: Path) -> None:
+def test_projections_agree_with_the_documented_formulas(shared: bool, tmp_path: Path) -> None:
     matrices = ring()
     if shared:
         write(tmp_path, entries(matrices), camera_model="OPENCV", **LENS)
     else:
         write(tmp_path, entries(matrices, **LENS))
-    scene = load_recording(tmp_path)
-    assert (len(scene.train), scene.test) == (5, ())
+    recording = load_recording(tmp_path)
+    assert (len(recording.train), recording.test) == (5, ())
     points = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 3))
-    for frame, matrix in zip(scene.train, matrices, strict=True):
+    for frame, matrix in zip(recording.train, matrices, strict=True):
         assert frame.read_image().shape == (36, 24, 3)  # portrait
         for point in points:
-            np.testing.assert_allclose(seen(frame, point), gl_pixel(matrix, LENS, point), atol=1e-9)
-    assert "are those of transforms.json" in inspect_scene(scene).notes[0]
+            np.testing.assert_allclose(
+                pixel_of(frame, point), gl_pixel(matrix, LENS, point), atol=1e-9
+            )
+    assert "are those of transforms.json" in inspect_recording(recording).notes[0]
 
 
 @settings(max_examples=20)
@@ -114,30 +120,30 @@ def test_an_applied_transform_is_undone(
         entry = {"file_path": "a.png", "transform_matrix": new.tolist()}
         frame = nerfstudio._frame(Path(), data, 0, entry, undo, divide)
         expected = gl_pixel(matrix, LENS, np.array(point))
-        np.testing.assert_allclose(seen(frame, np.array(point)), expected, atol=1e-6)
+        np.testing.assert_allclose(pixel_of(frame, np.array(point)), expected, atol=1e-6)
 
 
-def test_named_test_files_are_test_frames(tmp_path: Path) -> None:
+def test_test_filenames_are_test_frames(tmp_path: Path) -> None:
     names = [f"images/frame_{i:05d}.png" for i in range(4)]
     splits: dict[str, Any] = {"train_filenames": names[:1], "val_filenames": names[1:2]}
     write(tmp_path, entries(ring()), **LENS, **splits, test_filenames=[f"./{names[3]}"])
-    scene = load_recording(tmp_path)
-    assert [f.name[-6:-4] for f in scene.train] == ["00", "02", "04"]
-    assert [f.name[-6:-4] for f in scene.test] == ["01", "03"]
+    recording = load_recording(tmp_path)
+    assert [f.name[-6:-4] for f in recording.train] == ["00", "02", "04"]
+    assert [f.name[-6:-4] for f in recording.test] == ["01", "03"]
     assert load_recording(tmp_path / "transforms.json").name == tmp_path.name
 
 
-def test_smaller_copies_of_the_images_have_smaller_cameras(tmp_path: Path) -> None:
+def test_downscaled_images_get_scaled_cameras(tmp_path: Path) -> None:
     matrices = ring(2)
     write(tmp_path, entries(matrices), (12, 18), **LENS)
     frame = load_recording(tmp_path).train[1]
     assert (frame.camera.width, frame.camera.height) == (12, 18)
     point = np.array([0.2, -0.1, 0.3])
     # From the corner, every pixel coordinate is simply half.
-    np.testing.assert_allclose(seen(frame, point), gl_pixel(matrices[1], LENS, point) / 2)
+    np.testing.assert_allclose(pixel_of(frame, point), gl_pixel(matrices[1], LENS, point) / 2)
 
 
-def test_names_without_an_ending_and_an_angle_of_view(tmp_path: Path) -> None:
+def test_names_without_ending_and_horizontal_angle_of_view(tmp_path: Path) -> None:
     write(tmp_path, entries(ring(2)), camera_angle_x=0.5, w=24, h=36)
     file = tmp_path / "transforms.json"
     file.write_text(file.read_text().replace(".png", ""))
@@ -147,7 +153,7 @@ def test_names_without_an_ending_and_an_angle_of_view(tmp_path: Path) -> None:
     assert frame.read_image().shape == (36, 24, 3)
 
 
-def test_an_angle_of_view_upwards_and_a_size_that_is_not_stated(tmp_path: Path) -> None:
+def test_vertical_angle_of_view_without_image_size(tmp_path: Path) -> None:
     write(tmp_path, entries(ring(2)), camera_angle_y=0.5)
     camera = load_recording(tmp_path).train[1].camera
     assert (camera.width, camera.height) == (24, 36)
@@ -168,10 +174,10 @@ BREAKS: list[tuple[dict[str, Any], str]] = [
     ({"fl_x": None, "camera_angle_x": 28.0}, "'camera_angle_x' is between 0 and pi radians"),
     ({"fl_x": 0}, "fx is finite"),
     ({"w": None}, "'w' is missing"),
-    ({"test_filenames": ["frame_00001.png"]}, "names 'frame_00001.png', which no frame does"),
+    ({"test_filenames": ["frame_00001.png"]}, "names 'frame_00001.png', which is no frame"),
     ({"fl_x": "wide"}, "'fl_x' is a number"),
     ({"fl_x": -3}, "fx is finite"),
-    ({"w": 36, "h": 24}, "is 24x36, transforms.json says 36x24 .the image was turned"),
+    ({"w": 36, "h": 24}, "is 24x36, transforms.json says 36x24 .the image was rotated"),
     ({"w": 30}, "is 24x36, transforms.json says 30x36 .cropped"),
     ({"applied_scale": 0}, "'applied_scale' is > 0"),
     ({"applied_transform": [[1, 0], [0, 1]]}, "'applied_transform' is 4x4 or 3x4"),
@@ -198,7 +204,7 @@ BREAKS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("change", "message"), BREAKS)
-def test_damage_is_named(change: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_broken_files_are_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
     write(tmp_path, entries(ring(2)), **LENS)
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
@@ -209,7 +215,7 @@ def test_damage_is_named(change: dict[str, Any], message: str, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", "\x00"])
-def test_what_is_no_json_object_is_refused(text: str, tmp_path: Path) -> None:
+def test_other_json_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text(text)
     with pytest.raises(InputError, match=r"transforms\.json"):
         load_recording(tmp_path)

@@ -1,21 +1,20 @@
-"""A folder of images and gripper poses: rows find their images by name, by time or in order."""
+"""A folder of images and gripper poses, paired by name, by time or in order."""
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from evercal.cli.image_words import image_files
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings import ReadOptions, Recording, load_recording, write_image
 from evercal.recordings.formats import wrist
+from evercal.recordings.image_files import image_files
 from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import RobotPoses
-from evercal.recordings.poses.row_files import in_seconds, natural_key, times_in_names
+from evercal.recordings.poses.row_files import natural_key, times_in_names
 
 CAMERA = Camera(32, 24, 30.0, 31.0, 15.0, 11.0, (0.1, 0.0, 0.0, 0.0))
 
@@ -41,9 +40,9 @@ def make_folder(root: Path, names: Sequence[str], poses: SE3 | None, folder: str
     return root
 
 
-def assert_paired(scene: Recording, names: Sequence[str], poses: SE3) -> None:
-    assert [frame.name for frame in scene.train] == list(names)
-    for frame, pose in zip(scene.train, poses, strict=True):
+def assert_paired(recording: Recording, names: Sequence[str], poses: SE3) -> None:
+    assert [frame.name for frame in recording.train] == list(names)
+    for frame, pose in zip(recording.train, poses, strict=True):
         assert frame.base_from_camera is None
         assert frame.base_from_gripper is not None
         assert max(pose_distance(frame.base_from_gripper, pose)) < 1e-9
@@ -51,67 +50,82 @@ def assert_paired(scene: Recording, names: Sequence[str], poses: SE3) -> None:
 
 
 @pytest.mark.parametrize("folder", [".", "images", "rgb"])
-def test_rows_without_names_go_in_natural_order(tmp_path: Path, folder: str) -> None:
+def test_rows_without_names_are_paired_in_natural_order(tmp_path: Path, folder: str) -> None:
     names = [f"image-{i}.png" for i in range(1, 13)]  # image-10 comes after image-9
     poses = some_poses(12)
-    scene = load_recording(make_folder(tmp_path / "wave", names, poses, folder))
-    assert_paired(scene, names, poses)
-    assert (scene.name, scene.test, scene.untracked) == ("wave", (), 0)
-    assert int(scene.train[11].read_image().mean()) == 12
-    assert "in order" in scene.notes[0]
+    recording = load_recording(make_folder(tmp_path / "wave", names, poses, folder))
+    assert_paired(recording, names, poses)
+    assert (recording.name, recording.test, recording.untracked) == ("wave", (), 0)
+    assert int(recording.train[11].read_image().mean()) == 12
+    assert "in order" in recording.notes[0]
 
 
-def test_too_few_rows_are_refused(tmp_path: Path) -> None:
-    make_folder(tmp_path, ["a.png", "b.png", "c.png"], some_poses(2))
-    with pytest.raises(InputError, match="2 poses for 3 images"):
-        load_recording(tmp_path)
-
-
-def test_names_pair_whatever_the_order() -> None:
-    images = [Path(f"rgb/{name}") for name in ("a.png", "b.png", "c.png")]
+def test_names_pair_in_any_order() -> None:
     poses = some_poses(3)
     rows = RobotPoses(("c", "rgb/a.png", "gone.png"), None, poses)
-    found, notes = pair_images(images, rows, None, Path("poses.csv"))
-    assert found[0] is not None
-    assert found[2] is not None
-    assert found[1] is None
-    assert max(pose_distance(found[0], poses[1])) < 1e-12
-    assert max(pose_distance(found[2], poses[0])) < 1e-12
+    images = [Path(f"rgb/{name}") for name in ("a.png", "b.png", "c.png")]
+    (a, b, c), notes = pair_images(images, rows, None, Path("poses.csv"))
+    assert a is not None
+    assert c is not None
+    assert b is None
+    assert max(*pose_distance(a, poses[1]), *pose_distance(c, poses[0])) < 1e-12
     assert notes == [
         "1 image without a row in poses.csv: b.png",
         "1 row of poses.csv without an image: gone.png",
     ]
 
 
-def test_names_of_other_images_and_repeated_names_are_refused() -> None:
-    images = [Path("a.png"), Path("b.png")]
-    with pytest.raises(InputError, match="names no image of"):
-        pair_images(images, RobotPoses(("1", "2"), None, some_poses(2)), None, Path("p.csv"))
-    rows = RobotPoses(("a.png", "a.png"), None, some_poses(2))
-    with pytest.raises(InputError, match=r"'a\.png' comes twice"):
-        pair_images(images, rows, None, Path("p.csv"))
+SECONDS = np.arange(11) / 10
+TIMES = 1305031102.0 + SECONDS
 
 
-def test_image_names_that_are_times_are_interpolated() -> None:
-    stamps = 1305031102.0 + np.arange(11) / 10
-    poses = SE3.exp(np.outer(np.arange(11), [0.01, 0, 0, 0, 0.02, 0]))
-    images = [Path(f"{stamps[0] + t:.6f}.png") for t in (0.25, 0.5, 0.975)]
-    found, _ = pair_images(images, RobotPoses(None, stamps, poses), None, Path("p.tum"))
-    for pose, at in zip(found, (2.5, 5.0, 9.75), strict=True):
+@pytest.mark.parametrize(
+    ("images", "names", "stamps", "message"),
+    [
+        (["a.png", "b.png"], ("1", "2"), None, "names no image of"),
+        (["a.png", "b.png"], ("a.png", "a.png"), None, r"'a\.png' comes twice"),
+        (["image-1.png", "image-10.png", "image-2.png"], None, None, "is given after image-10"),
+        # Frame numbers are not times, even if the clock of the robot starts at 0.
+        (["000001.png", "000002.png"], None, TIMES[:3], r"3 poses for 2 images.*stamps\.csv"),
+        (["20240115_000001.png"], None, SECONDS, r"11 poses for 1 images.*stamps\.csv"),
+        (["20240115000001.png"], None, SECONDS, r"11 poses for 1 images.*stamps\.csv"),
+        (["9.25.png", "9.5.png"], None, SECONDS, "are the clocks the same"),
+        (["1700000000123.png"], None, SECONDS, "are the clocks the same"),
+    ],
+)
+def test_images_that_cannot_be_paired_are_refused(
+    images: list[str], names: tuple[str, ...] | None, stamps: np.ndarray | None, message: str
+) -> None:
+    count = len(images) if stamps is None else len(stamps)
+    rows = RobotPoses(names, stamps, some_poses(count))
+    with pytest.raises(InputError, match=message):
+        pair_images([Path(image) for image in images], rows, None, Path("p.csv"))
+
+
+def test_frame_numbers_and_folders_are_paired_in_order() -> None:
+    rows = RobotPoses(None, TIMES[:3], some_poses(3))
+    for images in (["0.png", "1.png", "2.png"], ["b/1.png", "b/2.png", "a/1.png"]):
+        paired, notes = pair_images([Path(image) for image in images], rows, None, Path("p"))
+        assert None not in paired
+        assert "in order" in notes[0]
+
+
+def test_poses_are_interpolated_at_times_in_image_names() -> None:
+    screw = np.array([0.01, 0, 0, 0, 0.02, 0])
+    poses = SE3.exp(np.outer(np.arange(11), screw))
+    images = [Path(f"{TIMES[0] + t:.6f}.png") for t in (-0.1, 0.25, 0.5, 0.975)]
+    paired, notes = pair_images(images, RobotPoses(None, TIMES, poses), None, Path("p.tum"))
+    assert paired[0] is None
+    assert notes[1].startswith("1 image taken outside the recorded poses")
+    for pose, at in zip(paired[1:], (2.5, 5.0, 9.75), strict=True):
         assert pose is not None
-        expected = SE3.exp(np.array([0.01, 0, 0, 0, 0.02, 0]) * at)
-        # Between the screw's poses a line is followed, not an arc: microns apart here.
-        assert pose_distance(pose, expected)[0] < 1e-4
-        assert pose_distance(pose, expected)[1] < 1e-6
+        # Interpolation follows a line, not the arc of the screw: microns apart here.
+        assert pose_distance(pose, SE3.exp(screw * at))[0] < 1e-4
+        assert pose_distance(pose, SE3.exp(screw * at))[1] < 1e-6
 
 
-def test_nanoseconds_and_a_stamps_file_are_times_too(tmp_path: Path) -> None:
-    assert in_seconds([1403636579763555584])[0] == pytest.approx(1403636579.763556, abs=1e-6)
-    assert in_seconds([1403636579763555])[0] == pytest.approx(1403636579.763555, abs=1e-6)
-    assert in_seconds([1403636579763])[0] == pytest.approx(1403636579.763)
-    assert in_seconds([12.5])[0] == 12.5
-    names = ["x.png", "y.png"]
-    make_folder(tmp_path, names, None)
+def test_poses_are_interpolated_at_times_in_a_stamps_file(tmp_path: Path) -> None:
+    make_folder(tmp_path, ["x.png", "y.png"], None)
     (tmp_path / "base_from_gripper.csv").write_text(
         "stamp_s,x_m,y_m,z_m,rotvec_x,rotvec_y,rotvec_z\n"
         "0.0,0,0,0,0,0,0\n0.1,1,0,0,0,0,0\n0.2,2,0,0,0,0,0\n"
@@ -125,41 +139,12 @@ def test_nanoseconds_and_a_stamps_file_are_times_too(tmp_path: Path) -> None:
     (tmp_path / "stamps.csv").write_text("image,stamp_s\nx.png,0.05\n")
     with pytest.raises(InputError, match=r"y\.png: stamps\.csv has no row"):
         load_recording(tmp_path)
-    (tmp_path / "stamps.csv").write_text("image,stamp_s\nx.png,105\ny.png,106\n")
-    with pytest.raises(InputError, match="are the clocks the same"):
-        load_recording(tmp_path)
-
-
-def test_frame_numbers_are_not_times() -> None:
-    rows = RobotPoses(None, 1.7e9 + np.arange(3.0), some_poses(3))
-    found, notes = pair_images([Path(f"{i:06d}.png") for i in range(3)], rows, None, Path("p"))
-    assert None not in found
-    assert "in order" in notes[0]
-    with pytest.raises(InputError, match=r"3 poses for 2 images.*stamps\.csv"):
-        pair_images([Path("000001.png"), Path("000002.png")], rows, None, Path("p"))
-
-
-def test_frame_numbers_are_no_seconds_among_poses_from_zero() -> None:
-    # A robot's clock often starts at 0: frame 50 was not taken 50 s later.
-    stamps = np.arange(2001) / 10
-    rows = RobotPoses(None, stamps, SE3.exp(np.outer(stamps, [0.001, 0, 0, 0, 0, 0])))
-    for form in ("{:06d}.png", "{}.png", "20240115_{:06d}.png", "20240115{:06d}.png"):
-        images = [Path(form.format(i)) for i in range(100)]
-        with pytest.raises(InputError, match=r"2001 poses for 100 images.*stamps\.csv"):
-            pair_images(images, rows, None, Path("p"))
-
-
-def test_names_that_are_times_of_another_clock_are_refused() -> None:
-    rows = RobotPoses(None, np.arange(3.0), some_poses(3))
-    for names in (("9.25", "9.5", "9.75"), ("1700000000123", "1700000000223", "1700000000323")):
-        images = [Path(f"{name}.png") for name in names]
-        with pytest.raises(InputError, match="are the clocks the same"):
-            pair_images(images, rows, None, Path("p"))
 
 
 def test_times_in_names() -> None:
     for names, times in (
         (("1403636579763555584.png",), [1403636579.763556]),
+        (("1403636579763555.png",), [1403636579.763555]),
         (("rgb/1403636579763.jpg", "1403636579863"), [1403636579.763, 1403636579.863]),
         (("10.png", "10.5"), [10.0, 10.5]),
     ):
@@ -168,46 +153,21 @@ def test_times_in_names() -> None:
         assert times_in_names([name]) is None
 
 
-def test_images_outside_the_poses_times_have_none(tmp_path: Path) -> None:
-    stamps = np.array([10.0, 10.1, 10.2])
-    images = [Path(f"{t}.png") for t in ("9.9", "10.05", "10.3")]
-    rows = RobotPoses(None, stamps, some_poses(3))
-    found, notes = pair_images(images, rows, None, Path("p"))
-    assert [pose is None for pose in found] == [True, False, True]
-    assert notes[1].startswith("2 images lie outside")
+def test_natural_order_of_mixed_names(tmp_path: Path) -> None:
+    names = ["9.png", "10.png", "a.png", "b2.png", "b10.png", "b.png"]
+    assert sorted(set(names), key=natural_key) == names
+    for name in names:
+        (tmp_path / name).touch()
+    assert [file.name for file in image_files([tmp_path])] == names
 
 
-def test_images_in_another_order_than_their_names_are_not_paired_in_order() -> None:
-    rows = RobotPoses(None, None, some_poses(3))
-    images = [Path(f"{name}.png") for name in ("image-1", "image-10", "image-2")]
-    with pytest.raises(InputError, match=r"image-2\.png is given after image-10\.png"):
-        pair_images(images, rows, None, Path("p"))
-    # Every folder has an order of its own.
-    images = [Path(name) for name in ("b/1.png", "b/2.png", "a/1.png")]
-    assert None not in pair_images(images, rows, None, Path("p"))[0]
-
-
-def test_a_folder_given_to_a_command_is_in_natural_order(tmp_path: Path) -> None:
-    for i in range(1, 12):
-        (tmp_path / f"image-{i}.png").touch()
-    names = [file.name for file in image_files([tmp_path])]
-    assert names == [f"image-{i}.png" for i in range(1, 12)]
-
-
-def test_natural_order_takes_any_names() -> None:
-    names = ["b2.png", "10.png", "b10.png", "9.png", "a.png", "b.png"]
-    assert sorted(names, key=natural_key) == [
-        "9.png", "10.png", "a.png", "b2.png", "b10.png", "b.png"
-    ]  # fmt: skip
-
-
-def test_the_camera_may_be_any_file_and_fits_the_images(tmp_path: Path) -> None:
+def test_camera_file_is_chosen_and_must_fit_the_images(tmp_path: Path) -> None:
     make_folder(tmp_path, ["1.png", "2.png"], some_poses(2))
     (tmp_path / "camera.json").rename(tmp_path / "other.json")
     with pytest.raises(InputError, match=r"no camera file in it; name the file .* --camera"):
         load_recording(tmp_path)
-    scene = load_recording(tmp_path, options=ReadOptions(camera=tmp_path / "other.json"))
-    assert scene.train[0].camera == CAMERA
+    recording = load_recording(tmp_path, options=ReadOptions(camera=tmp_path / "other.json"))
+    assert recording.train[0].camera == CAMERA
     (tmp_path / "camera.txt").write_text("30 0 15\n0 31 11\n0 0 1\n")
     assert load_recording(tmp_path).train[0].camera == Camera(32, 24, 30.0, 31.0, 15.0, 11.0)
     (tmp_path / "camera.txt").unlink()
@@ -217,7 +177,7 @@ def test_the_camera_may_be_any_file_and_fits_the_images(tmp_path: Path) -> None:
         load_recording(tmp_path)
 
 
-def test_what_is_missing_or_twice_is_named(tmp_path: Path) -> None:
+def test_missing_and_ambiguous_files_are_refused(tmp_path: Path) -> None:
     make_folder(tmp_path, [], some_poses(2))
     with pytest.raises(InputError, match="no images"):
         load_recording(tmp_path)
@@ -244,7 +204,7 @@ def test_what_is_missing_or_twice_is_named(tmp_path: Path) -> None:
         ("image,stamp_s\nl/a.png,1\nr/a.png,2\n", "'a.png' comes twice"),
     ],
 )
-def test_broken_tables_are_named(tmp_path: Path, text: str, message: str) -> None:
+def test_broken_stamps_are_refused(tmp_path: Path, text: str, message: str) -> None:
     make_folder(tmp_path, ["1.png"], some_poses(1))
     (tmp_path / "stamps.csv").write_text(text)
     with pytest.raises(InputError, match=message) as caught:
@@ -253,7 +213,7 @@ def test_broken_tables_are_named(tmp_path: Path, text: str, message: str) -> Non
     assert "stamps.csv" in str(caught.value)
 
 
-def test_the_formats_of_pose_files_are_read(tmp_path: Path) -> None:
+def test_other_kinds_of_pose_files_are_read(tmp_path: Path) -> None:
     names, poses = ["1.png", "2.png"], some_poses(2)
     make_folder(tmp_path, names, None)
     np.save(tmp_path / "base_from_gripper.npy", poses.matrix())
@@ -263,31 +223,6 @@ def test_the_formats_of_pose_files_are_read(tmp_path: Path) -> None:
     numbers = "\n".join(" ".join(f"{v:.12g}" for v in row) for row in rows)
     (tmp_path / "base_from_gripper.txt").write_text(numbers)
     with pytest.raises(InputError, match=r"base_from_gripper\.txt"):
-        load_recording(tmp_path)  # nothing says how the numbers are meant
-    scene = load_recording(tmp_path, options=ReadOptions(pose_convention="ur:mm"))
-    assert_paired(scene, names, poses)
-
-
-REAL = os.environ.get("EVERCAL_REAL_DATA", "")
-
-
-@pytest.mark.skipif(not REAL, reason="EVERCAL_REAL_DATA names no folder with real recordings")
-@pytest.mark.parametrize(
-    ("name", "count"),
-    [("franka_eye_in_hand", 8), ("franka_eye_to_hand", 8), ("kuka_eye_in_hand", 28)],
-)
-def test_real_recordings_load(name: str, count: int, tmp_path: Path) -> None:
-    root = Path(REAL) / "handeye" / name
-    if not root.is_dir():
-        pytest.skip(f"{root} is not there")
-    lens = tmp_path / "camera.txt"
-    lens.write_text("607.6 0 323.5\n0 607.6 243.3\n0 0 1\n")
-    scene = load_recording(root, options=ReadOptions(camera=lens))
-    assert len(scene.train) == count
-    assert [natural_key(f.name) for f in scene.train] == sorted(
-        natural_key(f.name) for f in scene.train
-    )
-    poses = SE3.stack([f.base_from_gripper for f in scene.train if f.base_from_gripper])
-    # An arm's reach, and a wrist that turns.
-    assert (np.linalg.norm(poses.translation_m, axis=1) < 1.6).all()
-    assert np.rad2deg(pose_distance(poses[0], poses)[1]).max() > 20
+        load_recording(tmp_path)  # the convention is missing
+    recording = load_recording(tmp_path, options=ReadOptions(pose_convention="ur:mm"))
+    assert_paired(recording, names, poses)

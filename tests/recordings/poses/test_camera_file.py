@@ -13,7 +13,7 @@ from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.recordings.poses.camera_file import read_camera
 
-LENS = Camera(640, 480, 525.25, 526.5, 319.5, 239.25, (0.1, -0.02, 0.001, 1e-5, 0.03))
+CAMERA = Camera(640, 480, 525.25, 526.5, 319.5, 239.25, (0.1, -0.02, 0.001, 1e-5, 0.03))
 
 CALIBRATION = """\
 # made by camera_calibration
@@ -62,16 +62,16 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_every_kind_gives_the_same_camera(tmp_path: Path) -> None:
-    ideal = Camera(640, 480, LENS.fx, LENS.fy, LENS.cx, LENS.cy)
+    ideal = Camera(640, 480, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
     matrix = tmp_path / "k.txt"
-    np.savetxt(matrix, LENS.matrix(), header="left camera")
+    np.savetxt(matrix, CAMERA.matrix(), header="left camera")
     assert read_camera(matrix, (640, 480)) == ideal
     commas = written(tmp_path, "525.25, 0, 319.5\n0, 526.5, 239.25\n0, 0, 1  # pixels\n")
     assert read_camera(commas, (640, 480)) == ideal
-    assert read_camera(written(tmp_path, json.dumps(LENS.to_dict()))) == LENS
-    assert read_camera(written(tmp_path, CALIBRATION)) == LENS
+    assert read_camera(written(tmp_path, json.dumps(CAMERA.to_dict()))) == CAMERA
+    assert read_camera(written(tmp_path, CALIBRATION)) == CAMERA
     assert read_camera(written(tmp_path, MESSAGE)) == Camera(
-        640, 480, LENS.fx, LENS.fy, LENS.cx, LENS.cy, (*LENS.distortion, 0.0, 0.0, 0.0)
+        640, 480, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, (*CAMERA.distortion, 0.0, 0.0, 0.0)
     )
 
 
@@ -79,67 +79,76 @@ def stored(folder: Path, ending: str = "yml", size: bool = True, **more: object)
     """What cv2.FileStorage writes of the camera."""
     path = folder / f"stored.{ending}"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    values = {"camera_matrix": LENS.matrix(), "dist_coeffs": np.array([LENS.distortion]), **more}
+    values = {
+        "camera_matrix": CAMERA.matrix(),
+        "dist_coeffs": np.array([CAMERA.distortion]),
+        **more,
+    }
     if size:
-        values |= {"image_Width": LENS.width, "image_Height": LENS.height}
+        values |= {"image_Width": CAMERA.width, "image_Height": CAMERA.height}
     for name, value in values.items():
         storage.write(name, value)  # pyright: ignore[reportArgumentType, reportCallIssue]
     storage.release()
     return path
 
 
-def test_the_storage_of_opencv_is_read(tmp_path: Path) -> None:
-    assert read_camera(stored(tmp_path, "xml")) == LENS
+def test_opencv_storage_is_read(tmp_path: Path) -> None:
+    assert read_camera(stored(tmp_path, "xml")) == CAMERA
     yaml = stored(tmp_path, fisheye_model=0, board="9x6")
-    assert read_camera(yaml, (320, 240)) == LENS
+    assert read_camera(yaml, (320, 240)) == CAMERA
     old = yaml.read_text().replace("%YAML 1.2", "%YAML:1.0")
-    assert read_camera(written(tmp_path, old)) == LENS
-    assert read_camera(stored(tmp_path, size=False), (640, 480)) == LENS
+    assert read_camera(written(tmp_path, old)) == CAMERA
+    assert read_camera(stored(tmp_path, size=False), (640, 480)) == CAMERA
     with pytest.raises(InputError, match="'image_width' is missing"):
         read_camera(stored(tmp_path, size=False))
-    for more, said in (
+    for more, expected in (
         ({"fisheye_model": 1}, "fisheye_model is set"),
         ({"K": np.eye(3)}, "camera_matrix and K are the same; keep one"),
         ({"camera_matrix": np.eye(2)}, "camera_matrix has 9 numbers, got 4"),
     ):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=expected):
             read_camera(stored(tmp_path, **more))  # pyright: ignore[reportArgumentType]
     stereo = old.replace("camera_matrix", "M1").replace("dist_coeffs", "D1")
-    for text, said in (
+    for text, expected in (
         (stereo, "'camera_matrix' is missing, there is M1, D1, fisheye_model"),
         (old[:120], "OpenCV cannot read its storage"),
         ("<opencv_storage><a>", "OpenCV cannot read its storage"),
     ):
-        with pytest.raises(InputError, match=said) as caught:
+        with pytest.raises(InputError, match=expected) as caught:
             read_camera(written(tmp_path, text), (640, 480))
         assert "\n" not in str(caught.value)
 
 
-def test_a_byte_order_mark_is_passed_over(tmp_path: Path) -> None:
+def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "camera.any"
-    for text in (json.dumps(LENS.to_dict()), CALIBRATION, MESSAGE, "525 0 319.5 0 525 239.5 0 0 1"):
+    for text in (
+        json.dumps(CAMERA.to_dict()),
+        CALIBRATION,
+        MESSAGE,
+        "525 0 319.5 0 525 239.5 0 0 1",
+    ):
         path.write_text(text, encoding="utf-8-sig")
         assert read_camera(path, (640, 480)).width == 640
 
 
-def test_a_lens_that_is_called_otherwise_is_not_passed_over(tmp_path: Path) -> None:
+def test_missing_distortion_is_refused(tmp_path: Path) -> None:
     text = CALIBRATION.replace("distortion_coefficients", "dist_coeff")
     with pytest.raises(InputError, match="'distortion_coefficients' is missing"):
         read_camera(written(tmp_path, text))
     assert read_camera(written(tmp_path, text + "d: [0, 0, 0, 0]\n")).distortion == ()
 
 
-def test_the_size_given_does_not_override_what_a_file_says(tmp_path: Path) -> None:
-    assert read_camera(written(tmp_path, CALIBRATION), (320, 240)) == LENS
+def test_size_in_the_file_takes_precedence(tmp_path: Path) -> None:
+    assert read_camera(written(tmp_path, CALIBRATION), (320, 240)) == CAMERA
 
 
-def test_the_message_of_ros_1_and_longer_models_are_read(tmp_path: Path) -> None:
+def test_ros_1_messages_and_longer_models_are_read(tmp_path: Path) -> None:
     old = MESSAGE.replace("d:\n", "D:\n").replace("k: [", "K: [")
-    assert read_camera(written(tmp_path, old)).fx == LENS.fx
+    assert read_camera(written(tmp_path, old)).fx == CAMERA.fx
     longer = CALIBRATION.replace("1e-05, 0.03]", "1e-05, 0.03, 0, 0, 0, 0, 0, 0, 0]")
-    lens = read_camera(written(tmp_path, longer))
-    pixels = lens.project([[0.2, -0.3, 1.0]])
-    np.testing.assert_allclose(pixels, LENS.project([[0.2, -0.3, 1.0]]), atol=1e-12)
+    camera = read_camera(written(tmp_path, longer))
+    pixels = camera.project([[0.2, -0.3, 1.0]])
+    np.testing.assert_allclose(pixels, CAMERA.project([[0.2, -0.3, 1.0]]), atol=1e-12)
 
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -150,18 +159,18 @@ def test_the_message_of_ros_1_and_longer_models_are_read(tmp_path: Path) -> None
     st.floats(-1e3, 1e3),
     st.lists(st.floats(-1, 1), min_size=5, max_size=5),
 )
-def test_ros_numbers_survive_however_yaml_writes_them(
+def test_ros_numbers_in_any_notation_are_exact(
     tmp_path: Path, fx: float, fy: float, cx: float, cy: float, distortion: list[float]
 ) -> None:
-    lens = Camera(640, 480, fx, fy, cx, cy, tuple(distortion))
-    numbers = ", ".join(repr(v) for v in lens.matrix().ravel().tolist())
+    camera = Camera(640, 480, fx, fy, cx, cy, tuple(distortion))
+    numbers = ", ".join(repr(v) for v in camera.matrix().ravel().tolist())
     coefficients = ", ".join(repr(v) for v in distortion)
     text = f"width: 640\nheight: 480\nk: [{numbers}]\nd: [{coefficients}]\n"
-    assert read_camera(written(tmp_path, text)) == lens
+    assert read_camera(written(tmp_path, text)) == camera
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ("1 2 3", "3 numbers, a 3x3 matrix has 9"),
         ("", "0 numbers"),
@@ -183,17 +192,17 @@ def test_ros_numbers_survive_however_yaml_writes_them(
         (MESSAGE.replace("525.25", "0.0"), "fx"),
     ],
 )
-def test_damage_is_named_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+def test_broken_files_are_refused_in_one_line(tmp_path: Path, text: str, expected: str) -> None:
     path = written(tmp_path, text)
     with pytest.raises(InputError) as caught:
         read_camera(path, (640, 480))
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
-    assert said in message
+    assert expected in message
     assert "\n" not in message
 
 
-def test_missing_binary_and_sizeless_files_are_refused(tmp_path: Path) -> None:
+def test_missing_camera_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="missing"):
         read_camera(tmp_path / "none.yaml")
     with pytest.raises(InputError, match="cannot be read"):
@@ -201,11 +210,11 @@ def test_missing_binary_and_sizeless_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "image.png").write_bytes(b"\x89PNG\xff\xfe")
     with pytest.raises(InputError, match="not a text file"):
         read_camera(tmp_path / "image.png")
-    with pytest.raises(InputError, match="does not tell the image size"):
+    with pytest.raises(InputError, match="has no image size"):
         read_camera(written(tmp_path, "1 0 0 0 1 0 0 0 1"))
 
 
-def test_yaml_runs_no_code(tmp_path: Path) -> None:
+def test_yaml_cannot_run_code(tmp_path: Path) -> None:
     bait = tmp_path / "bait"
     text = f"width: !!python/object/apply:os.mkdir ['{bait}']\n"
     with pytest.raises(InputError, match="not valid YAML"):

@@ -1,7 +1,6 @@
 """Gripper poses from joints: a planar arm's closed form, the Panda's published parameters."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -55,25 +54,25 @@ def model(urdf: Path) -> RobotModel:
 
 
 @given(ANGLES, ANGLES, st.floats(0, 1))
-def test_a_planar_arm_is_where_its_closed_form_says(
+def test_planar_arm_agrees_with_its_closed_form(
     model: RobotModel, shoulder: float, elbow: float, reach: float
 ) -> None:
     # In another order than the chain's, with a joint that the arm has not.
     values = np.array([[9.0, reach, shoulder, elbow]])
     names = ["finger", "reach", "shoulder", "elbow"]
-    found = model.base_from_gripper(names, values, "base", "tip")
-    metres, radians = pose_distance(found[0], planar(shoulder, elbow, reach))
+    poses = model.base_from_gripper(names, values, "base", "tip")
+    metres, radians = pose_distance(poses[0], planar(shoulder, elbow, reach))
     assert max(metres, radians) < 1e-7  # trimesh takes 1e-8 for nothing
 
 
-def test_frames_may_be_any_two_links(model: RobotModel) -> None:
+def test_any_two_links_can_be_chosen(model: RobotModel) -> None:
     assert (model.base_link, model.end_link()) == ("base", "tip")
     assert model.joints_between("base", "tip") == ("shoulder", "elbow", "reach")
     assert model.joints_between("upper", "lower") == ("elbow",)
     assert model.joints_between("tip", "lower") == ("reach",)
-    turned = model.base_from_gripper(["elbow"], np.array([[0.7]]), "lower", "upper")[0]
+    pose_in_degrees = model.base_from_gripper(["elbow"], np.array([[0.7]]), "lower", "upper")[0]
     expected = SE3.exp([0.5, 0, 0, 0, 0, 0]) @ SE3.exp([0, 0, 0, 0, 0, 0.7])
-    assert max(pose_distance(turned, expected.inverse())) < 1e-9
+    assert max(pose_distance(pose_in_degrees, expected.inverse())) < 1e-9
 
 
 def panda_flange(q: np.ndarray) -> SE3:
@@ -90,7 +89,7 @@ def panda_flange(q: np.ndarray) -> SE3:
     return base_from_joint
 
 
-def test_the_panda_is_where_its_published_parameters_say() -> None:
+def test_panda_agrees_with_its_published_parameters() -> None:
     spec = pytest.importorskip("importlib.metadata")
     try:
         files = spec.files("example-robot-data") or []
@@ -103,15 +102,15 @@ def test_the_panda_is_where_its_published_parameters_say() -> None:
     joints = model.joints_between("panda_link0", "panda_link8")
     assert joints == tuple(f"panda_joint{i}" for i in range(1, 8))
     q = np.random.default_rng(1).uniform(-1.5, 0.0, (20, 7))
-    found = model.base_from_gripper(joints, q, "panda_link0", "panda_link8")
-    for row, pose in zip(q, found, strict=True):
+    poses = model.base_from_gripper(joints, q, "panda_link0", "panda_link8")
+    for row, pose in zip(q, poses, strict=True):
         assert max(pose_distance(pose, panda_flange(row))) < 1e-6
     # The other way round, and from the hand, which is fixed to the flange.
     back = model.base_from_gripper(joints, q, "panda_link8", "panda_link0")
-    assert max(pose_distance(back, found.inverse())[0]) < 1e-9
+    assert max(pose_distance(back, poses.inverse())[0]) < 1e-9
 
 
-def test_a_folder_with_joints_and_a_urdf_is_a_recording(tmp_path: Path, urdf: Path) -> None:
+def test_folder_with_joints_and_a_urdf_is_a_recording(tmp_path: Path, urdf: Path) -> None:
     for i in range(3):
         write_image(tmp_path / f"{i}.png", np.zeros((24, 32, 3), np.uint8))
     (tmp_path / "camera.txt").write_text("30 0 15.5\n0 30 11.5\n0 0 1\n")
@@ -121,23 +120,23 @@ def test_a_folder_with_joints_and_a_urdf_is_a_recording(tmp_path: Path, urdf: Pa
     with pytest.raises(InputError, match="no URDF is beside it; give --urdf"):
         load_recording(tmp_path)
     options = ReadOptions(urdf=urdf)
-    scene = load_recording(tmp_path, options=options)
+    recording = load_recording(tmp_path, options=options)
     expected = [planar(0.25, np.deg2rad(-30), 0.2), planar(1, np.deg2rad(5), 0)]
     expected.append(planar(0.5, np.pi / 2, 0.1))
-    for frame, pose in zip(scene.train, expected, strict=True):
+    for frame, pose in zip(recording.train, expected, strict=True):
         assert frame.base_from_gripper is not None
         assert max(pose_distance(frame.base_from_gripper, pose)) < 1e-9
     degrees = ReadOptions(urdf=urdf, pose_convention="deg")  # of the column that does not say
-    turned = load_recording(tmp_path, options=degrees).train[0].base_from_gripper
-    assert turned is not None
+    pose_in_degrees = load_recording(tmp_path, options=degrees).train[0].base_from_gripper
+    assert pose_in_degrees is not None
     expected = planar(np.deg2rad(0.25), np.deg2rad(-30), 0.2)
-    assert max(pose_distance(turned, expected)) < 1e-7
-    assert scene.notes[0] == "gripper poses are those of tip in base, from planar.urdf"
+    assert max(pose_distance(pose_in_degrees, expected)) < 1e-7
+    assert recording.notes[0] == "gripper poses are those of tip in base, from planar.urdf"
     with pytest.raises(InputError, match="has no link 'hand'; its links are base, upper"):
         load_recording(tmp_path, options=ReadOptions(urdf=urdf, gripper_frame="hand"))
 
 
-def test_json_and_csv_say_the_same(tmp_path: Path, model: RobotModel) -> None:
+def test_json_and_csv_agree(tmp_path: Path, model: RobotModel) -> None:
     names, rows = ["shoulder", "elbow", "reach"], [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]
     text = "stamp_s," + ",".join(names) + "\n"
     text += "".join(f"{i},{','.join(map(str, row))}\n" for i, row in enumerate(rows))
@@ -191,7 +190,7 @@ def test_angles_beyond_the_limits_are_noted(tmp_path: Path, model: RobotModel) -
     assert "shoulder goes from 3.50 to 3.50, the URDF allows -3.00 to 3.00" in notes[1]
 
 
-def test_turns_without_limits_that_look_like_degrees_are_noted(tmp_path: Path) -> None:
+def test_large_angles_without_limits_are_noted(tmp_path: Path) -> None:
     (tmp_path / "a.urdf").write_text(
         '<robot name="a"><link name="base"/><link name="tip"/>'
         '<joint name="turn" type="continuous"><parent link="base"/><child link="tip"/>'
@@ -204,15 +203,15 @@ def test_turns_without_limits_that_look_like_degrees_are_noted(tmp_path: Path) -
         assert len(notes) == 1 + count
 
 
-def test_joints_are_interpolated_but_not_over_a_turn_or_a_gap() -> None:
+def test_joints_are_not_interpolated_over_gaps() -> None:
     times = np.array([0.0, 0.1, 0.2, 9.0])
     angles = np.array([3.0, -3.0, -2.9, -1.0])  # turns on through pi
-    values, known = interpolate(times, angles, np.array([-0.1, 0.05, 0.2, 5.0, 9.0, 9.1]))
-    assert known.tolist() == [False, True, True, False, True, False]
+    values, valid = interpolate(times, angles, np.array([-0.1, 0.05, 0.2, 5.0, 9.0, 9.1]))
+    assert valid.tolist() == [False, True, True, False, True, False]
     assert values[1] == pytest.approx((3.0 + (2 * np.pi - 3.0)) / 2)
 
 
-def test_files_that_are_no_urdf_are_refused(tmp_path: Path) -> None:
+def test_other_files_are_refused(tmp_path: Path) -> None:
     for name, text in (("a.urdf", "<robot"), ("b.urdf", "<house/>"), ("c.urdf", "")):
         (tmp_path / name).write_text(text)
         with pytest.raises(InputError, match=f"{name}: no usable URDF") as caught:
@@ -223,11 +222,3 @@ def test_files_that_are_no_urdf_are_refused(tmp_path: Path) -> None:
     (tmp_path / "e.urdf.xacro").write_text("")
     with pytest.raises(InputError, match="'xacro' first"):
         RobotModel(tmp_path / "e.urdf.xacro")
-
-
-def test_without_the_extra_the_install_line_is_named(
-    urdf: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "yourdfpy", None)
-    with pytest.raises(InputError, match=r"pip install 'evercal\[urdf\]'"):
-        RobotModel(urdf)

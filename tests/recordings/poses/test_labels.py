@@ -1,4 +1,4 @@
-"""Names of images and times are found under the same names in every kind of file."""
+"""Image names and times have the same labels in every kind of file."""
 
 import json
 from pathlib import Path
@@ -36,24 +36,24 @@ def as_lists(root: Path, label: str, cells: list[object]) -> list[RobotPoses | R
 
 
 @pytest.mark.parametrize("label", NAMES)
-def test_images_are_named(label: str, tmp_path: Path) -> None:
-    found = read_all(tmp_path, label, ["b.png", "a.png"])
-    found += as_lists(tmp_path, f"{label}s", ["b.png", "a.png"])
-    assert [read.names for read in found] == [("b.png", "a.png")] * 5
+def test_image_labels_are_recognised(label: str, tmp_path: Path) -> None:
+    results = read_all(tmp_path, label, ["b.png", "a.png"])
+    results += as_lists(tmp_path, f"{label}s", ["b.png", "a.png"])
+    assert [read.names for read in results] == [("b.png", "a.png")] * 5
 
 
 @pytest.mark.parametrize(("label", "factor"), STAMPS)
-def test_times_are_read(label: str, factor: float, tmp_path: Path) -> None:
-    found = read_all(tmp_path, label, [0.5 * factor, 0.25 * factor])
+def test_time_labels_are_recognised(label: str, factor: float, tmp_path: Path) -> None:
+    results = read_all(tmp_path, label, [0.5 * factor, 0.25 * factor])
     name, mark, unit = label.partition("_")
     if "[" not in label:
-        found += as_lists(tmp_path, f"{name}s{mark}{unit}", [0.5 * factor, 0.25 * factor])
-    for read in found:
+        results += as_lists(tmp_path, f"{name}s{mark}{unit}", [0.5 * factor, 0.25 * factor])
+    for read in results:
         assert read.stamps_s is not None
         np.testing.assert_allclose(read.stamps_s, [0.5, 0.25])
 
 
-def test_what_names_image_files_names_them_whatever_it_is_called(tmp_path: Path) -> None:
+def test_column_of_image_files_may_have_any_name(tmp_path: Path) -> None:
     (tmp_path / "p.csv").write_text(
         "picture,x,y,z,qw,qx,qy,qz\nb.png,0.5,0,0.2,1,0,0,0\na.JPG,0.5,0,0.2,1,0,0,0\n"
     )
@@ -62,11 +62,11 @@ def test_what_names_image_files_names_them_whatever_it_is_called(tmp_path: Path)
     (tmp_path / "p.json").write_text(json.dumps(entries))
     with pytest.raises(InputError, match=r"p\.json: rgb and depth name image files; call the"):
         read_robot_poses(tmp_path / "p.json")
-    found = as_lists(tmp_path, "rgb", ["b.png", "a.png"])
-    assert [read.names for read in found] == [("b.png", "a.png")] * 2
+    results = as_lists(tmp_path, "rgb", ["b.png", "a.png"])
+    assert [read.names for read in results] == [("b.png", "a.png")] * 2
 
 
-def test_of_several_labels_the_plainest_counts(tmp_path: Path) -> None:
+def test_plainest_of_several_labels_is_used(tmp_path: Path) -> None:
     (tmp_path / "r.csv").write_text("frame,t,image,name,stamp_ns\n7,1,b.png,home,2e9\n")
     read = read_rows(tmp_path / "r.csv", "numbers")
     assert (read.names, read.columns) == (("b.png",), ())
@@ -74,7 +74,7 @@ def test_of_several_labels_the_plainest_counts(tmp_path: Path) -> None:
     assert read.stamps_s.tolist() == [2.0]
 
 
-def test_labels_that_are_not_on_every_row_are_refused(tmp_path: Path) -> None:
+def test_labels_missing_from_some_rows_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "p.json"
     file.write_text(json.dumps([{**POSE, "image": "a.png"}, POSE]))
     with pytest.raises(InputError, match=r"p\.json: some poses have 'image', others lack it"):
@@ -84,7 +84,7 @@ def test_labels_that_are_not_on_every_row_are_refused(tmp_path: Path) -> None:
         read_robot_poses(file)
 
 
-def test_a_column_said_to_be_in_seconds_is(tmp_path: Path) -> None:
+def test_column_in_seconds_is_checked(tmp_path: Path) -> None:
     (tmp_path / "r.csv").write_text("a,stamp_s\n1,1.7e18\n")
     with pytest.raises(InputError, match=r"r\.csv: a stamp of 1\.7e\+18 is not in seconds"):
         read_rows(tmp_path / "r.csv", "numbers")

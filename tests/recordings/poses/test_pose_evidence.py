@@ -1,4 +1,4 @@
-"""What images say of stated rotations: sound poses raise no doubt, spoiled ones are named."""
+"""Comparison of stated rotations with images: correct poses pass, wrong ones are reported."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings import Frame, Recording, load_recording, write_image
-from evercal.recordings.inspection import inspect_scene
+from evercal.recordings.inspection import inspect_recording
 from evercal.recordings.poses import pose_evidence
-from evercal.recordings.poses.pose_evidence import doubts
+from evercal.recordings.poses.pose_evidence import rotation_warnings
 from evercal.recordings.samples import FOLDER
 
 GRIPPER_FROM_CAMERA = SE3.exp([0.05, 0.02, 0.08, 0.4, -1.0, 0.7])
@@ -32,26 +32,26 @@ def bedroom() -> tuple[Frame, ...]:
 @pytest.fixture(scope="module", autouse=True)
 def matched_once() -> Iterator[None]:
     """Every pair of images is matched once for all tests."""
-    real, known = pose_evidence.seen_turn, {}
+    real, cache = pose_evidence.measured_rotation, {}
 
     def cached(first: Frame, second: Frame) -> np.ndarray | None:
         key = first.image, second.image
-        if key not in known:
-            known[key] = real(first, second)
-        return known[key]
+        if key not in cache:
+            cache[key] = real(first, second)
+        return cache[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pose_evidence, "seen_turn", cached)
+        patch.setattr(pose_evidence, "measured_rotation", cached)
         yield
 
 
-def test_turns_between_images_are_those_of_the_true_poses(bedroom: tuple[Frame, ...]) -> None:
-    turns = pose_evidence.measure(bedroom, stated(bedroom))
+def test_measured_rotations_agree_with_true_poses(bedroom: tuple[Frame, ...]) -> None:
+    turns = pose_evidence.pair_rotations(bedroom, stated(bedroom))
     assert turns is not None
-    assert len(turns.seen) >= 8
-    off = Rotation.from_rotvec(turns.seen).inv() * Rotation.from_rotvec(turns.stated)
+    assert len(turns.measured) >= 8
+    off = Rotation.from_rotvec(turns.measured).inv() * Rotation.from_rotvec(turns.stated)
     assert np.rad2deg(np.median(off.magnitude())) < 1.0
-    assert np.rad2deg(np.median(np.linalg.norm(turns.seen, axis=1))) > pose_evidence.TURN_DEG
+    assert np.rad2deg(np.median(np.linalg.norm(turns.measured, axis=1))) > pose_evidence.LEAST_DEG
 
 
 def reordered(poses: SE3) -> SE3:
@@ -66,57 +66,57 @@ def as_degrees(poses: SE3) -> SE3:
     return SE3(turned, poses.translation_m)
 
 
-SPOILED: dict[str, tuple[Callable[[SE3], SE3], str]] = {
+WRONG: dict[str, tuple[Callable[[SE3], SE3], str]] = {
     "inverse": (lambda poses: poses.inverse(), "they are camera_from_base, the inverse"),
     "opengl": (lambda poses: poses @ FLIP, "they are with OpenGL's camera axes"),
     "both": (lambda poses: (poses @ FLIP).inverse(), "the inverse with OpenGL's camera axes"),
     "order": (reordered, "they are with quaternions in another order"),
     "body": (lambda poses: poses @ GRIPPER_FROM_CAMERA, "those of another frame, at a fixed angle"),
-    "degrees": (as_degrees, "are angles in the unit and Euler order that was said"),
+    "degrees": (as_degrees, "are angles in the stated unit and Euler order"),
 }
 
 
-@pytest.mark.parametrize("how", SPOILED)
-def test_spoiled_camera_poses_are_named(bedroom: tuple[Frame, ...], how: str) -> None:
-    spoil, message = SPOILED[how]
-    assert doubts(bedroom, stated(bedroom), True) == []
-    (said,) = doubts(bedroom, spoil(stated(bedroom)), True)
-    assert said.startswith("the camera turns otherwise than the images do, by ")
-    assert message in said
+@pytest.mark.parametrize("how", WRONG)
+def test_wrong_camera_poses_are_reported(bedroom: tuple[Frame, ...], how: str) -> None:
+    distort, message = WRONG[how]
+    assert rotation_warnings(bedroom, stated(bedroom), True) == []
+    (warning,) = rotation_warnings(bedroom, distort(stated(bedroom)), True)
+    assert warning.startswith("the camera rotates differently from the images, by ")
+    assert message in warning
 
 
-def test_spoiled_gripper_poses_are_named(bedroom: tuple[Frame, ...]) -> None:
+def test_wrong_gripper_poses_are_reported(bedroom: tuple[Frame, ...]) -> None:
     gripper = stated(bedroom) @ GRIPPER_FROM_CAMERA.inverse()
-    assert doubts(bedroom, gripper, False) == []
+    assert rotation_warnings(bedroom, gripper, False) == []
     # Any frame that is fixed to the gripper is as good.
-    assert doubts(bedroom, gripper @ FLIP, False) == []
-    (said,) = doubts(bedroom, gripper.inverse(), False)
-    assert "they are gripper_from_base, the inverse" in said
-    (said,) = doubts(bedroom, reordered(gripper), False)
-    assert "with quaternions in another order" in said
-    (said,) = doubts(bedroom, as_degrees(gripper), False)
-    assert "are angles in the unit" in said or "the angles in another unit" in said
+    assert rotation_warnings(bedroom, gripper @ FLIP, False) == []
+    (warning,) = rotation_warnings(bedroom, gripper.inverse(), False)
+    assert "they are gripper_from_base, the inverse" in warning
+    (warning,) = rotation_warnings(bedroom, reordered(gripper), False)
+    assert "with quaternions in another order" in warning
+    (warning,) = rotation_warnings(bedroom, as_degrees(gripper), False)
+    assert "are angles in the stated unit" in warning or "the angles in another unit" in warning
 
 
-def test_a_camera_that_stands_still_is_noticed(bedroom: tuple[Frame, ...]) -> None:
+def test_still_camera_is_reported(bedroom: tuple[Frame, ...]) -> None:
     same = tuple(dataclasses.replace(f, image=bedroom[0].image) for f in bedroom)
     gripper = stated(bedroom) @ GRIPPER_FROM_CAMERA.inverse()
-    (said,) = doubts(same, gripper, False)
-    assert said.startswith(
-        "the gripper turns and the images hardly do; does the camera stand still"
+    (warning,) = rotation_warnings(same, gripper, False)
+    assert warning.startswith(
+        "the gripper rotates and the images hardly do; does the camera stand still"
     )
 
 
-def test_images_without_texture_say_nothing(tmp_path: Path) -> None:
+def test_images_without_texture_give_no_warning(tmp_path: Path) -> None:
     camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
     poses = SE3.exp(np.linspace([0, 0, 0, 0, 0, 0], [1, 0, 0, 0, 2, 0], 20))
     blank = tmp_path / "blank.png"
     write_image(blank, np.full((48, 64, 3), 128, np.uint8))
     frames = tuple(Frame(str(i), blank, camera, pose) for i, pose in enumerate(poses))
-    assert doubts(frames, poses, True) == []
+    assert rotation_warnings(frames, poses, True) == []
 
 
-def test_a_wrist_recording_is_inspected_by_its_gripper(bedroom: tuple[Frame, ...]) -> None:
+def test_wrist_recordings_are_inspected_by_gripper_poses(bedroom: tuple[Frame, ...]) -> None:
     gripper = stated(bedroom) @ GRIPPER_FROM_CAMERA.inverse()
 
     def warned(poses: SE3) -> tuple[str, ...]:
@@ -124,26 +124,26 @@ def test_a_wrist_recording_is_inspected_by_its_gripper(bedroom: tuple[Frame, ...
             dataclasses.replace(f, base_from_camera=None, base_from_gripper=pose)
             for f, pose in zip(bedroom, poses, strict=True)
         )
-        found = inspect_scene(Recording("wave", frames, ()))
-        assert (found.poses, found.train) == ("gripper", len(frames))
-        return found.warnings
+        inspection = inspect_recording(Recording("wave", frames, ()))
+        assert (inspection.poses, inspection.train) == ("gripper", len(frames))
+        return inspection.warnings
 
     assert warned(gripper) == ()
     (millimetres,) = warned(SE3(gripper.rotation_wxyz, 1000 * gripper.translation_m))[:1]
     assert "farther than arms reach; are the poses in millimetres?" in millimetres
     (nowhere,) = warned(SE3(gripper.rotation_wxyz, 1e-6 * gripper.translation_m))
-    assert "stand at one point, turning by" in nowhere
+    assert "stand at one point, rotating by" in nowhere
     assert "in metres?" in nowhere
     (inverse,) = warned(gripper.inverse())
     assert "gripper_from_base, the inverse" in inverse
 
 
-def test_many_cameras_take_one_line(bedroom: tuple[Frame, ...]) -> None:
-    lens = bedroom[0].camera
+def test_many_cameras_are_summarised_in_one_line(bedroom: tuple[Frame, ...]) -> None:
+    camera = bedroom[0].camera
     frames = tuple(
-        dataclasses.replace(f, camera=dataclasses.replace(lens, fx=lens.fx + i / 10))
+        dataclasses.replace(f, camera=dataclasses.replace(camera, fx=camera.fx + i / 10))
         for i, f in enumerate(bedroom)
     )
-    (line,) = inspect_scene(Recording("phone", frames, ())).cameras
+    (line,) = inspect_recording(Recording("phone", frames, ())).cameras
     assert f"{len(frames)} sets of intrinsics" in line
     assert pose_distance(stated(frames), stated(bedroom))[0].max() == 0

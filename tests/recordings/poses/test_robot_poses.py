@@ -1,9 +1,8 @@
-"""Files of robot poses: each kind is read as it was written; what is left open is asked for."""
+"""Pose files: every kind is read, and ambiguous files need a convention."""
 
 import csv
 import io
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
@@ -36,8 +34,10 @@ def table(header: str, numbers: NDArray[np.float64], separator: str = ",") -> st
     return text.getvalue()
 
 
-def same(found: SE3, poses: SE3, tolerance: float = 1e-12) -> bool:
-    return found.shape == poses.shape and bool(np.max(pose_distance(found, poses)) < tolerance)
+def same(poses_read: SE3, poses: SE3, tolerance: float = 1e-12) -> bool:
+    return poses_read.shape == poses.shape and bool(
+        np.max(pose_distance(poses_read, poses)) < tolerance
+    )
 
 
 HEADERS = [
@@ -73,7 +73,7 @@ HEADERS = [
 
 @pytest.mark.parametrize(("header", "written", "given"), HEADERS)
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_headers(
+def test_headers_define_columns(
     tmp_path: Path, header: str, written: str, given: str | None, separator: str
 ) -> None:
     numbers = numbers_from_poses(arm(), pose_convention(written))
@@ -86,7 +86,7 @@ def test_headers(
 
 @given(st.permutations(range(9)), st.integers(0, 1000))
 @settings(deadline=None, max_examples=30)
-def test_columns_stand_in_any_order(
+def test_columns_may_be_in_any_order(
     tmp_path_factory: pytest.TempPathFactory, order: list[int], seed: int
 ) -> None:
     header = ["x", "y", "z", "qw", "qx", "qy", "qz", "stamp", "image"]
@@ -104,7 +104,7 @@ def test_columns_stand_in_any_order(
 
 @pytest.mark.parametrize("name", sorted(CONVENTIONS))
 @pytest.mark.parametrize("extra", ["", "name", "stamp", "stamp name", "name stamp"])
-def test_tables_without_a_header(tmp_path: Path, name: str, extra: str) -> None:
+def test_tables_without_header_are_read(tmp_path: Path, name: str, extra: str) -> None:
     lines = ["# made by a robot"]
     for i, row in enumerate(numbers_from_poses(arm(), CONVENTIONS[name])):
         before = {"": "", "name": f"{i}.png ", "stamp": f"{i}.5 "}.get(extra, f"{i}.5 {i}.png ")
@@ -117,14 +117,14 @@ def test_tables_without_a_header(tmp_path: Path, name: str, extra: str) -> None:
     assert (read.stamps_s is not None) == ("stamp" in extra)
 
 
-def test_tum_lines(tmp_path: Path) -> None:
+def test_tum_files_are_read(tmp_path: Path) -> None:
     numbers = numbers_from_poses(arm(), CONVENTIONS["xyzw"])
     lines = [f"{1.7e9 + i} " + " ".join(map(repr, row.tolist())) for i, row in enumerate(numbers)]
     (tmp_path / "a.tum").write_text("\n".join(lines))
     (tmp_path / "b.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines))
     (tmp_path / "c.txt").write_text("# ground truth\n" + "\n".join(lines))
-    for name, said in (("a.tum", None), ("b.txt", None), ("c.txt", "tum")):
-        read = read_robot_poses(tmp_path / name, said)
+    for name, message in (("a.tum", None), ("b.txt", None), ("c.txt", "tum")):
+        read = read_robot_poses(tmp_path / name, message)
         assert same(read.poses, arm())
         assert read.stamps_s is not None
         assert read.stamps_s[2] == 1.7e9 + 2
@@ -134,7 +134,7 @@ def test_tum_lines(tmp_path: Path) -> None:
         read_robot_poses(tmp_path / "c.txt")
 
 
-def test_a_decimal_comma(tmp_path: Path) -> None:
+def test_decimal_commas_are_read(tmp_path: Path) -> None:
     text = table("image,x,y,z,qw,qx,qy,qz", np.array([[0]]), ";").splitlines()[0]
     (tmp_path / "p.csv").write_text(text + "\na,b.png;0,5;0,25;0,1;1;0;0;0\n", encoding="utf-8-sig")
     read = read_robot_poses(tmp_path / "p.csv")
@@ -142,39 +142,22 @@ def test_a_decimal_comma(tmp_path: Path) -> None:
     assert read.names == ("a,b.png",)
 
 
-@pytest.mark.parametrize(
-    ("unit", "factor"), [("_s", 1), ("_ms", 1e3), (" [us]", 1e6), ("_ns", 1e9)]
-)
-def test_units_of_stamps(tmp_path: Path, unit: str, factor: float) -> None:
-    (tmp_path / "p.csv").write_text(f"t{unit},x,y,z,qw,qx,qy,qz\n{1.7e9 * factor},1,0,0,1,0,0,0\n")
-    read = read_robot_poses(tmp_path / "p.csv")
-    assert read.stamps_s == pytest.approx([1.7e9])
-
-
-def test_json_objects(tmp_path: Path) -> None:
+def test_json_objects_are_read(tmp_path: Path) -> None:
+    keys = ("translation_m", "quaternion_wxyz")
     objects = [
-        {
-            "translation_m": pose.translation_m.tolist(),
-            "quaternion_wxyz": pose.rotation_wxyz.tolist(),
-            "image": f"{i}.png",
-            "stamp_s": i / 4,
-        }
-        for i, pose in enumerate(arm())
+        dict(zip(keys, (p.translation_m.tolist(), p.rotation_wxyz.tolist()), strict=True))
+        for p in arm()
     ]
     file = tmp_path / "p.json"
     for data in (objects, {"poses": objects}):
         file.write_text(json.dumps(data))
-        read = read_robot_poses(file)
-        assert same(read.poses, arm())
-        assert read.names == tuple(f"{i}.png" for i in range(COUNT))
-        assert read.stamps_s is not None
-        assert read.stamps_s.tolist() == [i / 4 for i in range(COUNT)]
+        assert same(read_robot_poses(file).poses, arm())
     assert same(read_robot_poses(file, "wxyz:inverse").poses, arm().inverse())
     file.write_text(json.dumps(objects[0]))
     assert same(read_robot_poses(file).poses, arm()[:1])
 
 
-def test_json_matrices_and_numbers(tmp_path: Path) -> None:
+def test_json_matrices_and_numbers_are_read(tmp_path: Path) -> None:
     file = tmp_path / "p.json"
     matrices = arm().matrix()
     file.write_text(json.dumps([{"matrix": m.tolist()} for m in matrices]))
@@ -185,11 +168,11 @@ def test_json_matrices_and_numbers(tmp_path: Path) -> None:
     assert same(read_robot_poses(file).poses, arm())
     file.write_text(json.dumps(numbers_from_poses(arm(), CONVENTIONS["kuka"]).tolist()))
     assert same(read_robot_poses(file, "kuka").poses, arm())
-    with pytest.raises(InputError, match="6 numbers a pose do not say how they are meant"):
+    with pytest.raises(InputError, match="6 numbers do not define a pose"):
         read_robot_poses(file)
 
 
-def test_npy(tmp_path: Path) -> None:
+def test_npy_files_are_read(tmp_path: Path) -> None:
     file = tmp_path / "p.npy"
     np.save(file, arm().matrix())
     assert same(read_robot_poses(file).poses, arm())
@@ -197,23 +180,27 @@ def test_npy(tmp_path: Path) -> None:
     assert same(read_robot_poses(file).poses, arm()[:1])
     np.save(file, arm().matrix().swapaxes(1, 2))
     assert same(read_robot_poses(file, "franka").poses, arm())
-    with pytest.raises(InputError, match="written column after column; give --convention franka"):
+    with pytest.raises(InputError, match="written column after column; give the convention franka"):
         read_robot_poses(file)
     for name in ("wxyz", "xyzw", "ur", "kuka", "franka"):
         np.save(file, numbers_from_poses(arm(), CONVENTIONS[name]))
         assert same(read_robot_poses(file, name).poses, arm())
-        with pytest.raises(InputError, match="do not say how they are meant"):
+        with pytest.raises(InputError, match="do not define a pose"):
             read_robot_poses(file)
 
 
 Q = "0.5,0.1,0.2,1,0,0,0"
 REFUSED = [
-    ("x,y,z,rx,ry,rz\n0.5,0,0,0.1,0.2,0.3", None, "give --convention ur .rotation vector., yask"),
-    ("x,y,z,roll,pitch,yaw\n0.5,0,0,0.1,0.2,0.3", None, "give --convention rpy:rad or rpy:deg"),
-    ("x,y,z,a,b,c\n500,0,0,10,20,30", None, "columns of a, b, c .* give --convention kuka"),
-    ("x,y,z,q1,q2,q3,q4\n" + Q, None, "give --convention abb, wxyz or xyzw"),
-    ("x,y,z,qw,qx,qy,qz,rotvec_x,rotvec_y,rotvec_z\n" + Q + ",0,0,0", None, "say which with"),
-    ("a1,a2,a3,a4,a5,a6,a7\n" + Q, None, "names no pose that is known"),
+    ("x,y,z,rx,ry,rz\n0.5,0,0,0.1,0.2,0.3", None, "give the convention ur .rotation vector., yask"),
+    ("x,y,z,roll,pitch,yaw\n0.5,0,0,0.1,0.2,0.3", None, "give the convention rpy:rad or rpy:deg"),
+    ("x,y,z,a,b,c\n500,0,0,10,20,30", None, "columns a, b, c .* give the convention kuka"),
+    ("x,y,z,q1,q2,q3,q4\n" + Q, None, "give the convention abb, wxyz or xyzw"),
+    (
+        "x,y,z,qw,qx,qy,qz,rotvec_x,rotvec_y,rotvec_z\n" + Q + ",0,0,0",
+        None,
+        "names quaternion and",
+    ),
+    ("a1,a2,a3,a4,a5,a6,a7\n" + Q, None, "names no known pose"),
     ("x,y,z,u,v\n0,0,0,0,0", "kuka", "its 5 columns are not the 6 of kuka"),
     ("x,y,z,qw,qx,qy,qz\n" + Q, "kuka", "no columns for kuka"),
     ("x,y,z,rx,ry,rz\n500,0,0,10,20,30", "kuka", "no columns for kuka .X Y Z A B C"),
@@ -225,8 +212,8 @@ REFUSED = [
     ("x,y,z,qw,qx,qy,qz\n500,100,200,1,0,0,0", None, "look like millimetres.* wxyz:mm"),
     ("x_m,y_m,z_m,qw,qx,qy,qz\n500,100,200,1,0,0,0", None, "look like millimetres.* wxyz:mm"),
     ("x,y,z,rotvec_x,rotvec_y,rotvec_z\n0.5,0,0,100,20,3", None, "looks like degrees.* ur:deg"),
-    ("x_m,y_m,z_m,A,B,C\n0.5,0,0,100,20,3", "kuka", "header says m .* give --convention kuka:m"),
-    ("x,y,z,roll_rad,pitch_rad,yaw_rad\n0,0,0,1,1,1", "fanuc", "give --convention fanuc:rad"),
+    ("x_m,y_m,z_m,A,B,C\n0.5,0,0,100,20,3", "kuka", "header says m .* give the convention kuka:m"),
+    ("x,y,z,roll_rad,pitch_rad,yaw_rad\n0,0,0,1,1,1", "fanuc", "give the convention fanuc:rad"),
     ("x_m,y,z,qw,qx,qy,qz\n" + Q, None, "x_m, y, z differ in unit"),
     ("stamp,x,y,z,qw,qx,qy,qz\n1.7e18," + Q, None, "not in seconds; call the column stamp_ns"),
     ("image,x,y,z,qw,qx,qy,qz\na," + Q + "\na," + Q, None, "'a' comes twice"),
@@ -241,25 +228,31 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("text", "given", "said"), REFUSED)
-def test_what_is_open_or_wrong_is_said(
-    tmp_path: Path, text: str, given: str | None, said: str
+@pytest.mark.parametrize(("text", "given", "message"), REFUSED)
+def test_ambiguous_and_broken_tables_are_refused(
+    tmp_path: Path, text: str, given: str | None, message: str
 ) -> None:
     (tmp_path / "p.csv").write_text(text)
-    with pytest.raises(InputError, match=said) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_robot_poses(tmp_path / "p.csv", given)
     assert str(caught.value).startswith(str(tmp_path / "p.csv"))
     assert "\n" not in str(caught.value)
 
 
-def test_a_header_that_lies_is_overruled_by_the_user(tmp_path: Path) -> None:
+def test_messages_name_the_option_of_the_command(tmp_path: Path) -> None:
+    (tmp_path / "p.csv").write_text("x,y,z,rx,ry,rz\n0.5,0,0,0.1,0.2,0.3")
+    with pytest.raises(InputError, match=r"columns rx, ry, rz .*; give --pose-convention ur "):
+        read_robot_poses(tmp_path / "p.csv", option="--pose-convention")
+
+
+def test_given_convention_overrides_the_header(tmp_path: Path) -> None:
     (tmp_path / "p.csv").write_text("x_m,y_m,z_m,qw,qx,qy,qz\n500,100,200,1,0,0,0")
     read = read_robot_poses(tmp_path / "p.csv", "wxyz:mm")
     np.testing.assert_allclose(read.poses.translation_m, [[0.5, 0.1, 0.2]])
 
 
 @pytest.mark.parametrize(
-    ("data", "given", "said"),
+    ("data", "given", "message"),
     [
         ([{"translation_m": [1, 2, 3]}], None, "'translation_m' and 'quaternion_wxyz'"),
         ([{"translation_m": [1, 2], "quaternion_wxyz": [1, 0, 0, 0]}], None, "three numbers"),
@@ -273,16 +266,20 @@ def test_a_header_that_lies_is_overruled_by_the_user(tmp_path: Path) -> None:
         ("text", None, "a list of objects"),
     ],
 )
-def test_json_that_is_none(tmp_path: Path, data: object, given: str | None, said: str) -> None:
+def test_broken_json_is_refused(
+    tmp_path: Path, data: object, given: str | None, message: str
+) -> None:
     (tmp_path / "p.json").write_text(json.dumps(data))
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         read_robot_poses(tmp_path / "p.json", given)
 
 
-def test_files_that_are_none(tmp_path: Path) -> None:
+def test_missing_and_broken_files_are_refused(tmp_path: Path) -> None:
     for name in ("no.csv", "no.json", "no.npy"):
-        with pytest.raises(InputError, match="missing; check the path"):
+        with pytest.raises(InputError, match="file of robot poses is missing; check the path"):
             read_robot_poses(tmp_path / name)
+        with pytest.raises(InputError, match=f"{name}: camera file is missing"):
+            read_robot_poses(tmp_path / name, what="camera file")
     (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(InputError, match="not a text file"):
         read_robot_poses(tmp_path / "b.csv")
@@ -298,23 +295,3 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     np.save(tmp_path / "v.npy", np.zeros((2, 3, 4, 5)))
     with pytest.raises(InputError, match="got shape"):
         read_robot_poses(tmp_path / "v.npy")
-
-
-REAL = os.environ.get("EVERCAL_REAL_DATA", "")
-
-
-@pytest.mark.skipif(not REAL, reason="EVERCAL_REAL_DATA names no folder with real recordings")
-@pytest.mark.parametrize(
-    ("name", "count"),
-    [("franka_eye_in_hand", 8), ("franka_eye_to_hand", 8), ("kuka_eye_in_hand", 28)],
-)
-def test_real_recordings(name: str, count: int) -> None:
-    file = Path(REAL) / "handeye" / name / "base_from_gripper.csv"
-    if not file.is_file():
-        pytest.skip(f"{file} is not there")
-    read = read_robot_poses(file)
-    assert len(read) == count
-    columns = np.loadtxt(file, delimiter=",", skiprows=1)
-    np.testing.assert_allclose(read.poses.translation_m, columns[:, :3])
-    expected = Rotation.from_rotvec(columns[:, 3:]).as_matrix()
-    np.testing.assert_allclose(read.poses.rotation_matrix(), expected, atol=1e-12)

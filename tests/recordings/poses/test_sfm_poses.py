@@ -18,7 +18,7 @@ def frame(name: str) -> Frame:
     return Frame(name, IMAGE, CAMERA, SE3.identity())
 
 
-SCENE = Recording(
+RECORDING = Recording(
     "heads",
     tuple(frame(f"seq-02/frame-00000{i}") for i in range(3)),
     (frame("seq-01/frame-000000"),),
@@ -33,34 +33,34 @@ def write(folder: Path, train: list[str], test: list[str]) -> None:
     (folder / "heads_test.txt").write_text("\n".join(test) + "\n")
 
 
-def test_poses_are_inverted_and_frames_without_one_left_out(tmp_path: Path) -> None:
+def test_poses_are_replaced_and_other_frames_dropped(tmp_path: Path) -> None:
     # Any order, any extension; frames 1 is not in the reconstruction.
     train = [f"seq-02/frame-00000{i}.color.png {LINE}" for i in (2, 0)]
     write(tmp_path, train, [f"seq-01/frame-000000.color.png {LINE}"])
-    found = with_sfm_poses(SCENE, tmp_path, "heads")
-    assert [f.name for f in found.train] == ["seq-02/frame-000000", "seq-02/frame-000002"]
-    assert found.untracked == 2
-    pose = found.test[0].base_from_camera
+    result = with_sfm_poses(RECORDING, tmp_path, "heads")
+    assert [f.name for f in result.train] == ["seq-02/frame-000000", "seq-02/frame-000002"]
+    assert result.untracked == 2
+    pose = result.test[0].base_from_camera
     assert pose is not None
-    turn = Rotation.from_euler("y", 90, degrees=True)
+    rotation = Rotation.from_euler("y", 90, degrees=True)
     expected = np.eye(4)
-    expected[:3, :3] = turn.inv().as_matrix()
-    expected[:3, 3] = turn.inv().apply([0.0, 0.0, -1.0])
+    expected[:3, :3] = rotation.inv().as_matrix()
+    expected[:3, 3] = rotation.inv().apply([0.0, 0.0, -1.0])
     np.testing.assert_allclose(pose.matrix(), expected, atol=1e-7)
-    assert found.test[0].camera.fx == found.test[0].camera.fy == 527.745
-    # The middle of the image, whatever the original calibration says: its corners are seen under
+    assert result.test[0].camera.fx == result.test[0].camera.fy == 527.745
+    # The middle of the image, independent of the original calibration: its corners are seen under
     # the same angle, and a COLMAP camera with its defaults projects to half a pixel more.
-    camera = found.test[0].camera
+    camera = result.test[0].camera
     corners = camera.unproject([[-0.5, -0.5], [639.5, 479.5]])
     np.testing.assert_allclose(corners[0, :2], -corners[1, :2], atol=1e-12)
     assert (camera.cx + 0.5, camera.cy + 0.5) == (camera.width / 2, camera.height / 2)
 
 
-def test_twelve_scenes_name_no_sequence(tmp_path: Path) -> None:
-    scene = Recording("apt1-kitchen", (frame("frame-000357"),), (frame("frame-000001"),))
+def test_frames_of_12_scenes_have_no_sequence(tmp_path: Path) -> None:
+    recording = Recording("apt1-kitchen", (frame("frame-000357"),), (frame("frame-000001"),))
     (tmp_path / "apt1_kitchen_train.txt").write_text(f"data/frame-000357.color.jpg {LINE}\n")
     (tmp_path / "apt1_kitchen_test.txt").write_text(f"data/frame-000001.color.jpg {LINE}\n")
-    assert len(with_sfm_poses(scene, tmp_path, "apt1_kitchen").train) == 1
+    assert len(with_sfm_poses(recording, tmp_path, "apt1_kitchen").train) == 1
 
 
 @pytest.mark.parametrize(
@@ -72,10 +72,10 @@ def test_twelve_scenes_name_no_sequence(tmp_path: Path) -> None:
         (f"seq-07/frame-000000.color.png {LINE}", "no frame of heads is in it"),
     ],
 )
-def test_broken_files_are_named(tmp_path: Path, line: str, message: str) -> None:
+def test_broken_files_are_refused(tmp_path: Path, line: str, message: str) -> None:
     write(tmp_path, [f"seq-02/frame-000000.color.png {LINE}"], [line])
     with pytest.raises(InputError, match=rf"heads_test\.txt: {message}"):
-        with_sfm_poses(SCENE, tmp_path, "heads")
+        with_sfm_poses(RECORDING, tmp_path, "heads")
     (tmp_path / "heads_test.txt").unlink()
     with pytest.raises(InputError, match=r"heads_test\.txt: missing; get the folder pgt/sfm"):
-        with_sfm_poses(SCENE, tmp_path, "heads")
+        with_sfm_poses(RECORDING, tmp_path, "heads")

@@ -1,4 +1,4 @@
-"""The Panda's forward kinematics against its published DH table."""
+"""Forward kinematics of the Panda against its published DH table."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def dh_flange(joints: np.ndarray) -> np.ndarray:
     return pose
 
 
-def test_the_flange_is_where_the_dh_table_puts_it() -> None:
+def test_forward_kinematics_match_the_dh_table() -> None:
     panda = Panda(meshes=False)
     for joints in (np.zeros(7), np.array(HOME_RAD), np.linspace(-0.8, 0.9, 7)):
         ours = panda.base_from_flange(joints).matrix()

@@ -1,4 +1,4 @@
-"""Pictures against geometry: where small balls land, how deep a plane is. Needs the extra `sim`."""
+"""Renderings against geometry: projected balls and the depth of a plane. Needs `sim`."""
 
 from dataclasses import replace
 
@@ -26,24 +26,24 @@ def balls() -> Renderer:
     return Renderer([(shape, light) for shape in shapes], exposure=1.0)
 
 
-def test_balls_land_where_the_camera_projects_them(balls: Renderer) -> None:
+def test_balls_appear_at_their_projection(balls: Renderer) -> None:
     image = balls.render(CAMERA, POSE, RenderOptions(samples=64))
     depth = balls.depth(CAMERA, POSE)
-    seen = POSE.inverse().apply(CENTRES)
+    centres = POSE.inverse().apply(CENTRES)
     value = image[..., 0] / 255.0
     weight = np.where(value > 0.04045, ((value + 0.055) / 1.055) ** 2.4, value / 12.92)
     v, u = np.mgrid[0:72, 0:96]
-    for centre, pixel in zip(seen, CAMERA.project(seen), strict=True):
+    for centre, pixel in zip(centres, CAMERA.project(centres), strict=True):
         w = weight * (np.hypot(u - pixel[0], v - pixel[1]) < 6)
-        found = np.array([(u * w).sum(), (v * w).sum()]) / w.sum()
-        assert np.abs(found - pixel).max() < 0.2
+        centroid = np.array([(u * w).sum(), (v * w).sum()]) / w.sum()
+        assert np.abs(centroid - pixel).max() < 0.2
         near = np.hypot(u - pixel[0], v - pixel[1]) < 0.71
-        # A ball's front is its radius nearer than its centre.
+        # The front of a ball is one radius in front of its centre.
         front = depth[near][depth[near] > 0].min()
         assert front == pytest.approx(centre[2] * (1 - RADIUS / np.linalg.norm(centre)), abs=2e-3)
 
 
-def test_depth_is_along_the_axis_and_exact() -> None:
+def test_depth_is_exact_along_the_optical_axis() -> None:
     grey = plain("grey", (0.5, 0.5, 0.5))
     renderer = Renderer([(box(4.0, 4.0, 0.5, 1e-3).shifted(0, 0, -0.5), grey)])
     pose = look_at(np.array([0.3, 0.2, 1.5]), np.array([0.0, 0.0, 0.0]), 0.3)
@@ -61,7 +61,7 @@ def test_same_seed_same_pixels(balls: Renderer) -> None:
     assert (a != c).any()
 
 
-def test_moved_meshes_are_seen_where_they_are() -> None:
+def test_moved_meshes_change_the_depth() -> None:
     grey = plain("grey", (0.5, 0.5, 0.5))
     cube = box(0.2, 0.2, 0.2)
     named = type(cube)(cube.vertices_m, cube.faces, cube.normals, cube.uv, "cube")
@@ -91,7 +91,7 @@ def test_pictures_are_neither_mirrored_nor_upside_down(side: int) -> None:
     assert blue[:, -7:].min() > blue[:, :7].max() + 50
 
 
-def test_denoising_brings_few_samples_near_many() -> None:
+def test_denoising_reduces_the_error_of_few_samples() -> None:
     grey, lamp = plain("grey", (0.5, 0.5, 0.5)), plain("lamp", (1, 1, 1), emission=20.0)
     plane = box(6.0, 6.0, 0.1, 1e-3).shifted(0, 0, -0.1)
     scene = Renderer([(plane, grey), (ball(0.2).shifted(1.0, 0.0, 2.0), lamp)])

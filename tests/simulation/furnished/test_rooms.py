@@ -1,4 +1,4 @@
-"""What a room promises, and camera paths in it; needs no renderer."""
+"""Rooms and camera paths in them. Needs no renderer."""
 
 import numpy as np
 import pytest
@@ -11,21 +11,21 @@ from evercal.simulation.furnished.rooms import Room, room
 
 
 @pytest.fixture(scope="module", params=SUITES["sim"].rooms, ids=lambda entry: entry[0])
-def place(request: pytest.FixtureRequest) -> Room:
+def furnished_room(request: pytest.FixtureRequest) -> Room:
     _, kind, seed = request.param
     return room(kind, seed)
 
 
-def test_enough_things_of_enough_kinds(place: Room) -> None:
-    assert len(place.items) >= 25
-    assert len({item.kind for item in place.items}) >= 12
-    assert len({item.kind for item in place.items if item.curved}) >= 8
-    assert (place.low_m < place.high_m).all()
+def test_rooms_have_many_kinds_of_items(furnished_room: Room) -> None:
+    assert len(furnished_room.items) >= 25
+    assert len({item.kind for item in furnished_room.items}) >= 12
+    assert len({item.kind for item in furnished_room.items if item.curved}) >= 8
+    assert (furnished_room.low_m < furnished_room.high_m).all()
 
 
-def test_large_surfaces_are_textured(place: Room) -> None:
+def test_large_surfaces_are_textured(furnished_room: Room) -> None:
     area: dict[str, float] = {}
-    for mesh, material in place.meshes():
+    for mesh, material in furnished_room.meshes():
         corners = mesh.vertices_m[mesh.faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         largest = float(np.linalg.norm(cross, axis=-1).max())
@@ -34,8 +34,8 @@ def test_large_surfaces_are_textured(place: Room) -> None:
     assert all(value < 1.0 for value in area.values()), area
 
 
-def test_paths_keep_train_and_test_apart(place: Room) -> None:
-    shots = sweep_shots(place, 60, seed=0)
+def test_paths_keep_train_and_test_apart(furnished_room: Room) -> None:
+    shots = sweep_shots(furnished_room, 60, seed=0)
     train = [shot.base_from_camera for shot in shots if shot.split == "train"]
     test = [shot.base_from_camera for shot in shots if shot.split == "test"]
     assert (len(train), len(test)) == (42, 18)
@@ -45,21 +45,23 @@ def test_paths_keep_train_and_test_apart(place: Room) -> None:
     assert ((metres < 0.05) & (radians < np.deg2rad(5))).any(1).mean() <= 0.10
     assert not ((metres < 0.01) & (radians < np.deg2rad(1))).any()
     eyes = np.stack([pose.translation_m for pose in train + test])
-    assert place.is_free(eyes, 0.05).all()
+    assert furnished_room.is_free(eyes, 0.05).all()
     reach = np.linalg.norm(eyes - (0.45, 0.0, 0.15), axis=-1)
     assert reach.min() >= 0.8
     assert reach.max() <= 2.5
 
 
-def test_the_bump_is_as_large_as_said(place: Room) -> None:
+def test_bumps_have_their_documented_size(furnished_room: Room) -> None:
     for seed, metres, degrees in ((0, 0.005, 0.0), (1, 0.0, 0.5)):
-        before, after, bump = fixed_shots(place, 25, seed)
+        before, after, bump = fixed_shots(furnished_room, 25, seed)
         assert len(before) == len(after) == 25
-        moved, turned = pose_distance(before[0].base_from_camera, after[-1].base_from_camera)
-        assert moved == pytest.approx(metres, abs=1e-9)
-        assert np.rad2deg(turned) == pytest.approx(degrees, abs=1e-6)
-        again = before[3].base_from_camera @ bump
-        np.testing.assert_allclose(again.matrix(), after[3].base_from_camera.matrix(), atol=1e-12)
+        distance, angle = pose_distance(before[0].base_from_camera, after[-1].base_from_camera)
+        assert distance == pytest.approx(metres, abs=1e-9)
+        assert np.rad2deg(angle) == pytest.approx(degrees, abs=1e-6)
+        expected = before[3].base_from_camera @ bump
+        np.testing.assert_allclose(
+            expected.matrix(), after[3].base_from_camera.matrix(), atol=1e-12
+        )
 
 
 def test_the_same_seed_gives_the_same_room() -> None:

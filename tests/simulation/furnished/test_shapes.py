@@ -11,7 +11,7 @@ def volume(mesh: Mesh) -> float:
     return float((a * np.cross(b, c)).sum() / 6)
 
 
-def test_closed_bodies_have_the_volume_of_their_formula() -> None:
+def test_volumes_match_closed_forms() -> None:
     assert volume(box(0.4, 0.3, 0.2, 1e-4)) == pytest.approx(0.024, rel=2e-3)
     assert volume(ball(0.5, segments=96)) == pytest.approx(np.pi / 6, rel=5e-3)
     assert volume(cylinder(0.3, 0.5, 1e-4, 128)) == pytest.approx(np.pi * 0.09 * 0.5, rel=5e-3)
@@ -33,7 +33,7 @@ def test_closed_bodies_have_the_volume_of_their_formula() -> None:
         sheet((0, 0, 0), (1, 0, 0), (0, 1, 0)),
     ],
 )
-def test_faces_and_normals_look_the_same_way(mesh: Mesh) -> None:
+def test_faces_and_normals_agree(mesh: Mesh) -> None:
     corners = mesh.vertices_m[mesh.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=-1)
@@ -42,7 +42,7 @@ def test_faces_and_normals_look_the_same_way(mesh: Mesh) -> None:
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=-1), 1, atol=1e-6)
 
 
-def test_a_box_stands_on_the_ground_with_its_size() -> None:
+def test_boxes_stand_on_the_ground() -> None:
     points = box(0.4, 0.3, 0.2, 0.03).vertices_m
     np.testing.assert_allclose(points.min(0), (-0.2, -0.15, 0), atol=1e-12)
     np.testing.assert_allclose(points.max(0), (0.2, 0.15, 0.2), atol=1e-12)

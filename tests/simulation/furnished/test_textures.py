@@ -1,4 +1,4 @@
-"""Procedural pictures: same seed, same pixels, and the statistics that they promise."""
+"""Procedural pictures: reproducible pixels and documented statistics."""
 
 import hashlib
 
@@ -33,7 +33,7 @@ def test_noise_tiles() -> None:
     inside = np.abs(np.diff(noise, axis=1)).mean()
     seam = np.abs(noise[:, 0] - noise[:, -1]).mean()
     assert seam < 2 * inside
-    assert np.abs(noise[:, 0] - noise[:, 64]).mean() > 4 * inside  # what no tiling looks like
+    assert np.abs(noise[:, 0] - noise[:, 64]).mean() > 4 * inside
 
 
 @pytest.mark.parametrize("size", [(40, 60), (60, 40), (96, 96)])
@@ -45,8 +45,7 @@ def test_pictures_repeat_with_the_generator(size: tuple[int, int]) -> None:
     assert (first != other).mean() > 0.5
 
 
-def test_a_picture_does_not_depend_on_those_drawn_before() -> None:
-    """What is kept between calls (the noise bank) must not remember anything."""
+def test_pictures_do_not_depend_on_earlier_calls() -> None:
     digest = hashlib.sha256(dead_leaves(48, 48, np.random.default_rng(5)).tobytes()).digest()
     for seed in range(4):
         dead_leaves(32, 48, np.random.default_rng(seed))
@@ -54,12 +53,12 @@ def test_a_picture_does_not_depend_on_those_drawn_before() -> None:
     assert hashlib.sha256(again.tobytes()).digest() == digest
 
 
-def test_pictures_have_range_and_edges_and_differ_in_brightness() -> None:
+def test_pictures_have_contrast_and_edges() -> None:
     pictures = [dead_leaves(128, 128, np.random.default_rng(seed)).mean(-1) for seed in range(12)]
     contrast = [picture.std() for picture in pictures]
     assert min(contrast) > 10
     assert np.ptp([picture.mean() for picture in pictures]) > 30
-    # Shapes one over another: many small steps and some large ones, unlike noise.
+    # Overlapping shapes have many small steps and some large ones, unlike noise.
     steps = np.concatenate([np.abs(np.diff(picture, axis=1)).ravel() for picture in pictures])
     assert np.median(steps) < 10
     assert np.mean(steps > 40) > 0.01

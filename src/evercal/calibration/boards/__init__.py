@@ -1,1 +1,1 @@
-"""Calibration boards: corners, poses and intrinsics."""
+"""Calibration boards: corner detection, board poses and intrinsics."""

@@ -1,4 +1,4 @@
-"""Poses of a board in images, with their corners and intrinsics, and the file that holds them.
+"""Board poses of images with corners and intrinsics, and their file.
 
     {"format": "evercal-board-poses", "version": 1, "board": {"kind": "chessboard", ...},
      "camera": {...}, "camera_from": "board", "corner_sigma_px": x,
@@ -6,8 +6,9 @@
                  "camera_from_board": {"translation_m": [3], "quaternion_wxyz": [4]},
                  "covariance": [6][6], "points_m": [k][3], "pixels": [k][2]}, ...]}
 
-An image without a board has a reason, and null in place of the rest. Covariances are of
-(translation in the camera's axes, metres; rotation about the board's axes, radians).
+Image names are paths relative to the file. An image without a board has a reason, and null for all
+other fields. Covariances are of (translation in the camera frame, metres; rotation about the
+board's axes, radians).
 """
 
 import json
@@ -33,44 +34,44 @@ FORMAT, VERSION = "evercal-board-poses", 1
 
 @dataclass(frozen=True, eq=False)
 class BoardImage:
-    """One image and the board in it."""
+    """One image; without a board, only `name` and `reason` are set."""
 
     name: str
-    """File name of the image."""
+    """Path relative to the file of board poses, or a bare file name."""
     view: BoardView | None
-    """Corners; None without a board."""
+    """Detected corners."""
     camera_from_board: SE3 | None
-    """Single; None without a board."""
+    """A single pose."""
     covariance: Array | None
-    """(6, 6); None without a board."""
+    """(6, 6) covariance of the pose."""
     rms_px: float | None = None
-    """Root mean square distance of the corners from where the pose puts them."""
+    """Root mean square reprojection error of the corners."""
     reason: str = ""
-    """Why there is no pose; empty if there is one."""
+    """Reason for a missing pose, otherwise empty."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoardPoses:
-    """All images of one camera."""
+    """Board poses of all images of one camera."""
 
     board: Board
-    """What they show."""
+    """Board in the images."""
     camera: Camera
-    """Intrinsics of all of them."""
+    """Intrinsics of all images."""
     images: tuple[BoardImage, ...]
-    """In the order that they were given in."""
+    """Images in the given order."""
     corner_sigma_px: float
     """Standard deviation of a corner coordinate."""
     camera_from: str = "file"
-    """`file`, or `board` if the intrinsics were found from these images."""
+    """Source of the intrinsics: `file`, or `board` if they were estimated from these images."""
 
     @property
-    def found(self) -> tuple[BoardImage, ...]:
-        """The images that show the board."""
+    def detected(self) -> tuple[BoardImage, ...]:
+        """Images that show the board."""
         return tuple(image for image in self.images if image.camera_from_board is not None)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values, see the top of this file."""
+        """Return the JSON values described at the top of this file."""
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -83,22 +84,22 @@ class BoardPoses:
 
     @classmethod
     def from_dict(cls, data: object) -> Self:
-        """The reverse of `to_dict`.
+        """Create board poses from the values of `to_dict`.
 
         Raises:
-            ValueError: Something else, of another version, or broken.
+            ValueError: The values have another format or version, or are broken.
         """
         if not isinstance(data, Mapping) or data.get("format") != FORMAT:
-            raise ValueError(f"no board poses: 'format' is not {FORMAT!r}")
+            raise ValueError(f"not board poses: 'format' is not {FORMAT!r}")
         if data.get("version") != VERSION:
             raise ValueError(f"version {data.get('version')!r}; this evercal reads {VERSION}")
         try:
             return cls(
-                Board.from_dict(data["board"]),
-                Camera.from_dict(data["camera"]),
-                tuple(_image_from_dict(image) for image in data["images"]),
-                float(data["corner_sigma_px"]),
-                str(data.get("camera_from", "file")),
+                board=Board.from_dict(data["board"]),
+                camera=Camera.from_dict(data["camera"]),
+                images=tuple(_image_from_dict(image) for image in data["images"]),
+                corner_sigma_px=float(data["corner_sigma_px"]),
+                camera_from=str(data.get("camera_from", "file")),
             )
         except KeyError as error:
             raise ValueError(f"{error} is missing") from None
@@ -106,15 +107,15 @@ class BoardPoses:
             raise ValueError(f"an entry has the wrong kind of value ({error})") from None
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Creates or replaces the file, whole or not at all."""
+        """Write the file atomically."""
         write_json(path, self.to_dict())
 
 
 def read_board_poses(path: str | os.PathLike[str]) -> BoardPoses:
-    """Reads a file that `evercal detect` wrote.
+    """Read a file written by `evercal detect`.
 
     Raises:
-        InputError: Missing, no JSON, or no board poses.
+        InputError: The file is missing or does not hold board poses.
     """
     path = Path(path)
     try:
@@ -133,36 +134,32 @@ def board_poses(
     views: Mapping[str, BoardView | str],
     camera_from: str = "file",
 ) -> BoardPoses:
-    """Fits the pose of the board in every image.
+    """Fit the pose of the board in every image.
 
     Args:
-        board: what the images show.
-        camera: intrinsics of all.
-        views: by name of the image its corners, or why there are none.
+        board: Board in the images.
+        camera: Intrinsics of all images.
+        views: Corners of each image by its name, or the reason for a missing board.
         camera_from: `file` or `board`.
     """
-    fitted: dict[str, BoardPose | str] = {
-        name: view if isinstance(view, str) else _fitted(view, camera)
-        for name, view in views.items()
-    }
-    poses = [pose for pose in fitted.values() if isinstance(pose, BoardPose)]
-    sigma = pixel_sigma(poses) if poses else 0.0
+    poses: dict[str, BoardPose] = {}
+    reasons = {name: view for name, view in views.items() if isinstance(view, str)}
+    for name, view in views.items():
+        if isinstance(view, BoardView):
+            try:
+                poses[name] = board_pose(view, camera)
+            except ValueError:
+                reasons[name] = "the detected corners fit no pose of the board"
+    sigma = pixel_sigma([*poses.values()]) if poses else 0.0
     images = []
-    for name, pose in fitted.items():
-        view = views[name]
-        if isinstance(pose, str) or isinstance(view, str):
-            images.append(BoardImage(name, None, None, None, None, str(pose)))
+    for name, view in views.items():
+        if name in reasons or isinstance(view, str):
+            images.append(BoardImage(name, None, None, None, None, reasons[name]))
             continue
+        pose = poses[name]
         covariance = sigma**2 * pose.unit_covariance
         images.append(BoardImage(name, view, pose.camera_from_board, covariance, pose.rms_px))
     return BoardPoses(board, camera, tuple(images), sigma, camera_from)
-
-
-def _fitted(view: BoardView, camera: Camera) -> BoardPose | str:
-    try:
-        return board_pose(view, camera)
-    except ValueError:
-        return "the corners found fit no pose of the board"
 
 
 def _image_to_dict(image: BoardImage) -> dict[str, Any]:
@@ -189,7 +186,7 @@ def _image_from_dict(data: Mapping[str, Any]) -> BoardImage:
         return BoardImage(name, None, None, None, None, str(data.get("reason", "no board")))
     covariance = np.asarray(data["covariance"], dtype=np.float64)
     if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
-        raise ValueError(f"'covariance' of {name} is 6x6 and finite, got {covariance.shape}")
+        raise ValueError(f"'covariance' of {name} must be finite and 6x6, got {covariance.shape}")
     return BoardImage(
         name,
         BoardView(data["points_m"], data["pixels"]),

@@ -1,13 +1,13 @@
-"""Finds the corners of chessboards, ChArUco boards and AprilTags in images, by OpenCV.
+"""Detect chessboards, ChArUco boards and AprilTags in images with OpenCV.
 
-Frames of the boards, in which their points are given in metres:
+Board frames, in metres:
 
-- chessboard: origin at an inner corner, x along the `columns` inner corners, y along the `rows`, z
-  into the board, away from the camera. Where columns + rows is odd, the origin is the end at which
-  the first square between inner corners is bright, and no roll of the camera changes it.
-- charuco: as OpenCV's `CharucoBoard`: origin at an outer corner, z into the board.
-- apriltag: origin in the middle of the black square, x right and y up as OpenCV draws the tag, z
-  out of it, towards the camera.
+- chessboard: the origin is an inner corner, x follows the columns, y the rows, and z points into
+  the board, away from the camera. If columns + rows is odd, the origin is the corner next to a
+  bright inner square, whatever the roll of the camera.
+- charuco: the frame of OpenCV's `CharucoBoard`: origin at an outer corner, z into the board.
+- apriltag: the origin is the centre of the black square, x right and y up in OpenCV's print, z
+  towards the camera.
 """
 
 from dataclasses import dataclass
@@ -23,42 +23,42 @@ Array = NDArray[np.floating]
 Image = NDArray[np.uint8]
 BoardKind = Literal["chessboard", "charuco", "apriltag"]
 
-_LEAST_CORNERS = 6
-"""Of a ChArUco board; with fewer its pose is loose."""
+_MIN_CORNERS = 6
+"""Minimum number of ChArUco corners for a well determined pose."""
 
 
 @dataclass(frozen=True)
 class Board:
-    """What is printed.
+    """A printed board.
 
     Raises:
-        InputError: Sizes that no board has, or an unknown dictionary.
+        InputError: A size is invalid, or the dictionary is unknown.
     """
 
     kind: BoardKind
     """`chessboard`, `charuco` or `apriltag`."""
     size_m: float
-    """Side of a square of a chessboard, or of the black square of a tag, metres."""
+    """Side of a square, or of the black square of a tag, metres."""
     columns: int = 0
-    """Inner corners along x of a chessboard; squares along x of a ChArUco board."""
+    """Number of inner corners of a chessboard along x, or of squares of a ChArUco board."""
     rows: int = 0
-    """The same along y."""
+    """Number along y."""
     marker_m: float = 0.0
     """Side of a marker of a ChArUco board, metres."""
     dictionary: str = ""
-    """Of the markers or the tag, OpenCV's name without DICT_: 4X4_50, APRILTAG_36h11."""
+    """Marker dictionary, OpenCV's name without DICT_: 4X4_50, APRILTAG_36h11."""
     tag: int | None = None
-    """Number of the tag; any when None."""
+    """Number of the tag; if omitted, any tag."""
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(BoardKind):
-            raise InputError(f"board {self.kind!r} is not known; one of {get_args(BoardKind)}")
+            raise InputError(f"board {self.kind!r} is not known; use one of {get_args(BoardKind)}")
         if not 0 < self.size_m < 10:
-            raise InputError(f"a square or tag side is between 0 and 10 m, got {self.size_m:g} m")
+            raise InputError(f"square or tag side is {self.size_m:g} m; allowed are 0 to 10 m")
         if self.kind != "apriltag" and min(self.columns, self.rows) < 3:
             raise InputError(
-                f"a {self.kind} has a size of 3x3 or more, got {self.columns}x{self.rows}; give"
-                f" --size 9x6, inner corners of a chessboard or squares of a ChArUco board"
+                f"a {self.kind} has a size of 3x3 or more, got {self.columns}x{self.rows}; give for"
+                f" example --size 9x6: inner corners of a chessboard, squares of a ChArUco board"
             )
         if self.kind == "charuco" and not 0 < self.marker_m < self.size_m:
             raise InputError(
@@ -70,37 +70,37 @@ class Board:
 
     @property
     def half_turn(self) -> bool:
-        """Whether it looks the same turned by half a turn."""
+        """Whether the board looks the same after a rotation by 180 degrees."""
         return self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0
 
     def to_dict(self) -> dict[str, object]:
-        """JSON values."""
+        """Return JSON values."""
         return dict(vars(self))
 
     @classmethod
     def from_dict(cls, data: object) -> Self:
-        """The reverse.
+        """Create a board from the values of `to_dict`.
 
         Raises:
-            ValueError: Something else.
+            ValueError: The values describe no valid board.
         """
         if not isinstance(data, dict):
-            raise ValueError("'board' is an object")
+            raise ValueError("'board' must be an object")
         try:
             return cls(**data)
         except (TypeError, InputError) as error:
-            raise ValueError(f"'board' is no board ({error})") from None
+            raise ValueError(f"'board' is invalid ({error})") from None
 
 
 def find_board(image: Image, board: Board) -> BoardView | str:
-    """The corners of a board in one image.
+    """Detect the corners of a board in one image.
 
     Args:
         image: (H, W, 3) uint8 RGB.
-        board: what to look for.
+        board: Board to detect.
 
     Returns:
-        The corners, or in words why there are none.
+        The corners, or the reason why the board was not detected.
     """
     import cv2
 
@@ -117,14 +117,14 @@ def _find_chessboard(grey: NDArray, board: Board) -> BoardView | str:
 
     shape = (board.columns, board.rows)
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE
-    found, pixels = cv2.findChessboardCornersSB(grey, shape, flags=flags)
-    if not found:
+    detected, pixels = cv2.findChessboardCornersSB(grey, shape, flags=flags)
+    if not detected:
         flags |= cv2.CALIB_CB_EXHAUSTIVE
-        found, pixels = cv2.findChessboardCornersSB(grey, shape, flags=flags)
-    if not found:
+        detected, pixels = cv2.findChessboardCornersSB(grey, shape, flags=flags)
+    if not detected:
         return (
-            f"no chessboard with {board.columns}x{board.rows} inner corners in it; the whole board"
-            f" must be seen, sharp and without glare"
+            f"no chessboard with {board.columns}x{board.rows} inner corners; the whole board must"
+            f" be visible, sharp and without glare"
         )
     grid = _sharpened(grey, pixels).reshape(board.rows, board.columns, 2)
     if not board.half_turn and not _first_square_is_bright(grey, grid):
@@ -135,12 +135,12 @@ def _find_chessboard(grey: NDArray, board: Board) -> BoardView | str:
 
 
 def _sharpened(grey: NDArray, pixels: NDArray) -> Array:
-    """The corners to some hundredths of a pixel: three times better than they were found."""
+    """Refine corners to a few hundredths of a pixel, about three times better than detected."""
     import cv2
 
     corners = np.ascontiguousarray(pixels, dtype=np.float32).reshape(-1, 1, 2)
     spacing = float(np.linalg.norm(np.diff(corners[:, 0], axis=0), axis=1).min())
-    # As large as it may be without reaching the next corner.
+    # The largest window that does not reach the next corner.
     half = int(np.clip(0.3 * spacing, 2, 11))
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
     refined = cv2.cornerSubPix(grey, corners.copy(), (half, half), (-1, -1), stop)
@@ -150,7 +150,7 @@ def _sharpened(grey: NDArray, pixels: NDArray) -> Array:
 
 
 def _first_square_is_bright(grey: NDArray, grid: Array) -> bool:
-    """Whether the square between the first four corners is one of the bright ones."""
+    """Return whether the square between the first four corners is bright."""
     import cv2
 
     middle = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
@@ -168,10 +168,10 @@ def _find_charuco(grey: NDArray, board: Board) -> BoardView | str:
         (board.columns, board.rows), board.size_m, board.marker_m, _dictionary(board.dictionary)
     )
     pixels, ids = None, None
-    for legacy in (False, True):  # boards with an even number of rows, printed before OpenCV 4.6
+    for legacy in (False, True):  # even number of rows, printed before OpenCV 4.6
         printed.setLegacyPattern(legacy)
         pixels, ids, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(grey)
-        if ids is not None and len(ids) >= _LEAST_CORNERS:
+        if ids is not None and len(ids) >= _MIN_CORNERS:
             points = np.asarray(printed.getChessboardCorners(), dtype=np.float64)[
                 np.asarray(ids, dtype=np.int64).ravel()
             ]
@@ -179,9 +179,9 @@ def _find_charuco(grey: NDArray, board: Board) -> BoardView | str:
             flat = np.linalg.svd(points - points.mean(0), compute_uv=False)
             if flat[1] > 0.5 * board.size_m:
                 return BoardView(points, corners)
-    seen = 0 if ids is None else len(ids)
+    count = 0 if ids is None else len(ids)
     return (
-        f"{seen} corners of the ChArUco board found, {_LEAST_CORNERS} in two rows are needed; check"
+        f"{count} corners of the ChArUco board; {_MIN_CORNERS} in two rows are required; check"
         f" --size (squares), --dictionary ({board.dictionary}), light and focus"
     )
 
@@ -193,27 +193,26 @@ def _find_tag(grey: NDArray, board: Board) -> BoardView | str:
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(_dictionary(board.dictionary), parameters)
     corners, ids, _ = detector.detectMarkers(grey)
-    found = [] if ids is None else [int(i) for i in np.ravel(ids)]
-    wanted = [k for k, i in enumerate(found) if board.tag is None or i == board.tag]
-    if not wanted:
-        others = f"; it shows {', '.join(map(str, sorted(found)))}" if found else ""
-        what = "no tag" if board.tag is None else f"no tag {board.tag}"
-        return f"{what} of {board.dictionary} in it{others}"
-    if len(wanted) > 1:
-        names = ", ".join(str(found[k]) for k in sorted(wanted, key=lambda k: found[k]))
-        return f"several tags in it ({names}); name the one that counts with --tag"
+    tags = [] if ids is None else [int(i) for i in np.ravel(ids)]
+    matches = [k for k, tag in enumerate(tags) if board.tag is None or tag == board.tag]
+    if not matches:
+        others = f"; it shows {', '.join(map(str, sorted(tags)))}" if tags else ""
+        tag = "no tag" if board.tag is None else f"no tag {board.tag}"
+        return f"{tag} of {board.dictionary}{others}"
+    if len(matches) > 1:
+        names = ", ".join(map(str, sorted(tags[k] for k in matches)))
+        return f"several tags ({names}); select one with --tag"
     half = board.size_m / 2
     points = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
-    square = np.reshape(corners[wanted[0]], (4, 2)).astype(np.float64)
+    square = np.reshape(corners[matches[0]], (4, 2)).astype(np.float64)
     return BoardView(points, _square_by_its_sides(grey, square))
 
 
 def _square_by_its_sides(grey: NDArray, square: Array) -> Array:
-    """Corners of a dark square as crossings of lines through its edges, (4, 2) in and out.
+    """Refine the (4, 2) corners of a dark square by intersecting lines along its edges.
 
-    Sharp outer corners look rounded in an image and are found inside of where they are, by 0.1 px
-    and more with blur; the edges are not moved. OpenCV's refinement by lines is off by half a pixel
-    in some versions.
+    Blur rounds outer corners: they are detected 0.1 px or more too far inside. Edges do not move.
+    OpenCV's refinement by lines is off by half a pixel in some versions.
     """
     import cv2
 
@@ -224,16 +223,16 @@ def _square_by_its_sides(grey: NDArray, square: Array) -> Array:
         across = np.array([along[1], -along[0]])
         reach = float(np.clip(0.04 * length, 2.0, 5.0))
         offsets = np.linspace(-reach, reach, 33)
-        places = start + np.linspace(0.1, 0.9, max(8, int(0.8 * length)))[:, None] * (end - start)
-        grid = (places[:, None] + offsets[:, None] * across).astype(np.float32)
+        points = start + np.linspace(0.1, 0.9, max(8, int(0.8 * length)))[:, None] * (end - start)
+        grid = (points[:, None] + offsets[:, None] * across).astype(np.float32)
         values = cv2.remap(grey, grid[..., 0], grid[..., 1], cv2.INTER_LINEAR).astype(np.float64)
         slope = np.abs(np.gradient(values, axis=1))
-        # The edge alone, not the noise beside it.
+        # Keep the edge and remove the noise beside it.
         slope = np.where(slope > 0.3 * slope.max(1, keepdims=True), slope, 0.0)
         strength = slope.sum(1)
         if strength.min() <= 0:
             return square
-        edge = places + (slope @ offsets / strength)[:, None] * across
+        edge = points + (slope @ offsets / strength)[:, None] * across
         x, y, u, v = np.ravel(
             cv2.fitLine(edge.astype(np.float32), cv2.DIST_HUBER, 0, 0.001, 0.001)
         )[[2, 3, 0, 1]]
@@ -249,6 +248,6 @@ def _dictionary(name: str) -> Any:
 
     code = getattr(cv2.aruco, f"DICT_{name}", None)
     if code is None:
-        known = sorted(key[5:] for key in dir(cv2.aruco) if key.startswith("DICT_"))
-        raise InputError(f"dictionary {name!r} is not known; one of {', '.join(known)}")
+        names = sorted(key[5:] for key in dir(cv2.aruco) if key.startswith("DICT_"))
+        raise InputError(f"dictionary {name!r} is not known; use one of {', '.join(names)}")
     return cv2.aruco.getPredefinedDictionary(code)

@@ -1,4 +1,4 @@
-"""Intrinsics of a camera from views of a board, with as much of a lens model as they support."""
+"""Estimate intrinsics from views of a board, with a lens model that the views support."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,102 +11,105 @@ from evercal.errors import InputError
 from evercal.geometry import Camera
 
 MIN_VIEWS = 5
-"""Views of a flat board from which five parameters and more are found."""
+"""Minimum number of views of a flat board."""
 _FOCAL_SIGMA = 0.01
-"""Share of the focal length that it must be sure to."""
+"""Maximum relative standard deviation of the focal length."""
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A camera and how well the corners fit it."""
+    """A camera and the residuals of the corners."""
 
     camera: Camera
-    """At the size of the images."""
+    """Intrinsics at the size of the images."""
     rms_px: float
-    """Root mean square distance of corners from where they should be."""
+    """Root mean square reprojection error."""
     focal_sigma_px: float
-    """Standard deviation of the focal length, the larger of both."""
+    """Standard deviation of the focal length, the larger of x and y."""
 
 
 def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Intrinsics:
-    """Finds focal lengths, principal point and distortion.
+    """Estimate focal lengths, principal point and distortion.
 
-    Lens models of growing size are fitted, none, k1, k1 k2, those with p1 p2, with k3; the one with
-    the lowest Bayesian information criterion is kept, so that few views get no wild lens.
+    Models of 0, 1 (k1), 2 (k2), 4 (p1 p2) and 5 (k3) distortion coefficients are fitted.
+    The Bayesian information criterion selects one, so that few views do not overfit.
 
     Args:
-        views: of a flat board, five or more, tilted.
-        width: of the images, pixels.
-        height: of the images, pixels.
+        views: Five or more tilted views of a flat board.
+        width: Image width, pixels.
+        height: Image height, pixels.
 
     Raises:
-        InputError: Too few views, or views that leave the focal length open.
+        InputError: There are too few views, or they do not determine the focal length.
     """
     import cv2
 
     if len(views) < MIN_VIEWS:
         raise InputError(
-            f"the board was found in {len(views)} images, intrinsics take at least {MIN_VIEWS};"
+            f"the board was detected in {len(views)} images, intrinsics take at least {MIN_VIEWS};"
             f" take 15 with the board tilted by 20 to 45 deg, or give --camera"
         )
     points = [view.points_m.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
-    free = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    some = free & ~cv2.CALIB_FIX_K1 & ~cv2.CALIB_FIX_K2
-    models = {0: free, 1: some | cv2.CALIB_FIX_K2, 2: some, 4: some & ~cv2.CALIB_ZERO_TANGENT_DIST}
+    none = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    some = none & ~cv2.CALIB_FIX_K1 & ~cv2.CALIB_FIX_K2
+    models = {0: none, 1: some | cv2.CALIB_FIX_K2, 2: some, 4: some & ~cv2.CALIB_ZERO_TANGENT_DIST}
     models[5] = 0
     count = 2 * sum(len(p) for p in points)
     best: tuple[float, Intrinsics] | None = None
-    matrix, lens = cv2.initCameraMatrix2D(points, pixels, (width, height)), np.zeros(5)
+    matrix = cv2.initCameraMatrix2D(points, pixels, (width, height))
+    coefficients = np.zeros(5)
     for extra, flags in models.items():
         try:
-            rms, matrix, lens, turns, shifts = cv2.calibrateCamera(
+            rms, matrix, coefficients, rotvecs, translations = cv2.calibrateCamera(
                 points,
                 pixels,
                 (width, height),
                 matrix.copy(),
-                lens.copy(),
+                coefficients.copy(),
                 flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS,
             )[:5]
-        except cv2.error:  # it ran away, as it does where the views leave the camera open
+        except cv2.error:  # diverged, because the views do not determine the camera
             break
         squared = rms**2 * count / 2
         criterion = count * np.log(max(squared, 1e-12) / count) + extra * np.log(count)
         if best is None or criterion < best[0] - 2:
-            distortion = tuple(float(v) for v in np.ravel(lens)[:5]) if extra else ()
+            distortion = tuple(float(v) for v in np.ravel(coefficients)[:5]) if extra else ()
             camera = Camera.from_matrix(matrix, width, height, distortion)
             sigma = float(np.sqrt(squared / max(count - 4 - extra - 6 * len(views), 1)))
-            focal = sigma * _unit_focal_sigma(
-                points, camera, extra, list(zip(turns, shifts, strict=True))
-            )
+            poses = list(zip(rotvecs, translations, strict=True))
+            focal = sigma * _unit_focal_sigma(points, camera, extra, poses)
             best = (criterion, Intrinsics(camera, float(rms), focal))
-    found = None if best is None else best[1]
-    if found is None or not found.focal_sigma_px < _FOCAL_SIGMA * found.camera.fx:
-        size = "" if found is None else f" ({found.camera.fx:.0f} +- {found.focal_sigma_px:.0f} px)"
+    result = None if best is None else best[1]
+    if result is None or not result.focal_sigma_px < _FOCAL_SIGMA * result.camera.fx:
+        focal = ""
+        if result is not None:
+            focal = f" ({result.camera.fx:.0f} +- {result.focal_sigma_px:.0f} px)"
         raise InputError(
-            f"the images leave the focal length open{size}; tilt the board by 20 to 45 deg in"
+            f"the images leave the focal length open{focal}; tilt the board by 20 to 45 deg in"
             f" several directions, or give --camera"
         )
-    return found
+    return result
 
 
 def _unit_focal_sigma(
     points: list[np.ndarray], camera: Camera, extra: int, poses: list[tuple[np.ndarray, np.ndarray]]
 ) -> float:
-    """Standard deviation of the focal length for corners that are off by a pixel; huge if open.
+    """Return the standard deviation of the focal length for a corner noise of one pixel.
 
-    OpenCV's own deviations come out zero where the views leave a parameter open.
+    It is huge if the views do not determine the focal length; OpenCV's own deviation is then zero.
     """
     import cv2
 
     shared, size = 4 + extra, len(poses)
     normal = np.zeros((shared + 6 * size, shared + 6 * size))
-    lens = np.zeros(5)
-    lens[: len(camera.distortion)] = camera.distortion
-    for i, (corners, (turn, shift)) in enumerate(zip(points, poses, strict=True)):
+    distortion = np.zeros(5)
+    distortion[: len(camera.distortion)] = camera.distortion
+    for i, (corners, (rotvec, translation)) in enumerate(zip(points, poses, strict=True)):
         # Columns: rotation vector, translation, focal lengths, principal point, distortion.
-        slopes = np.asarray(cv2.projectPoints(corners, turn, shift, camera.matrix(), lens)[1])
+        projection = cv2.projectPoints(corners, rotvec, translation, camera.matrix(), distortion)
+        slopes = np.asarray(projection[1])
         columns = np.concatenate([slopes[:, 6 : 6 + shared], slopes[:, :6]], 1)
-        where = np.r_[:shared, shared + 6 * i : shared + 6 * i + 6]
-        normal[np.ix_(where, where)] += columns.T @ columns
+        rows = np.r_[:shared, shared + 6 * i : shared + 6 * i + 6]
+        normal[np.ix_(rows, rows)] += columns.T @ columns
     return float(np.sqrt(np.diag(normal_inverse(normal))[:2].max()))

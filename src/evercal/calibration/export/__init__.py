@@ -1,6 +1,4 @@
-"""Writes a calibration in the formats of other programs; one family of formats, one file.
+"""Export a calibration to the file formats of other programs: ROS, robot controllers, datasets."""
 
-`formats.FORMATS` lists them all. A new one is a function that takes an `Export` and returns text,
-bytes or a folder of texts, and one line there. Every format is read back in the tests by a reader
-that is not ours where there is one.
-"""
+from evercal.calibration.export.formats import FORMATS as FORMATS
+from evercal.calibration.export.formats import export_calibration as export_calibration

@@ -1,10 +1,10 @@
-"""From the camera's optical frame to the driver's root frame.
+"""Move a calibration from the camera's optical frame to the driver's root frame.
 
-tf is a tree: a camera driver already publishes `camera_link` above its optical frames, so a
-calibration that names an optical frame as child would give it two parents. What fits into the tree
-is parent_from_link = parent_from_optical @ optical_from_link. By convention (ROS REP 103) a link
-has x forward, y left, z up and an optical frame x right, y down, z forward. Where its origin lies
-in the link differs from camera to camera and must be known, from `/tf_static` or a data sheet.
+tf is a tree: a camera driver publishes `camera_link` as the parent of its optical frames. A second
+parent of an optical frame would break the tree, so the root frame is published instead:
+parent_from_link = parent_from_optical @ optical_from_link. By ROS REP 103, a link has x forward,
+y left, z up, and an optical frame has x right, y down, z forward. The offset between their origins
+depends on the camera; it is in `/tf_static` or the data sheet.
 """
 
 import os
@@ -17,47 +17,47 @@ import numpy as np
 
 from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
-from evercal.geometry import SE3
+from evercal.geometry import SE3, cross_matrix
 
 LINK_FROM_OPTICAL_WXYZ = (0.5, -0.5, 0.5, -0.5)
-"""The usual rotation: z forward becomes x forward."""
+"""Rotation between the axes of REP 103: z forward becomes x forward."""
 
-Edges = dict[tuple[str, str], SE3]
+_Transforms = dict[tuple[str, str], SE3]
+"""parent_from_child by (parent, child)."""
+_EXPECTED = "give what 'ros2 topic echo --once /tf_static' prints, or a TransformStamped"
 
 
-def standard_link_from_optical(
-    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> SE3:
-    """With the usual rotation.
+def standard_link_from_optical(offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> SE3:
+    """Return the pose of an optical frame with the axes of REP 103.
 
     Args:
-        offset_m: origin of the optical frame in the link: forward, left, up.
+        offset_m: Origin of the optical frame in the link: forward, left, up.
     """
     return SE3(np.array(LINK_FROM_OPTICAL_WXYZ), np.array(offset_m))
 
 
 def published_at(calibration: Calibration, link: str, link_from_optical: SE3) -> Calibration:
-    """The same calibration, told of the driver's root frame.
+    """Return the calibration of the driver's root frame.
 
     Args:
-        calibration: of the optical frame.
-        link: name of the driver's root frame.
-        link_from_optical: pose of the optical frame in it.
+        calibration: Calibration of the optical frame.
+        link: Name of the driver's root frame.
+        link_from_optical: Pose of the optical frame in the root frame.
 
     Returns:
-        With `link` as child; its covariance is that of the link's pose, lever arm included.
+        Calibration with `link` as child frame, and with the covariance of the link's pose.
 
     Raises:
-        InputError: `link` is the parent's name.
+        InputError: `link` is the name of the parent frame.
     """
     if link == calibration.parent_frame:
         raise InputError(f"driver's root frame and parent frame are both called {link!r}")
     optical_from_link = link_from_optical.inverse()
     parent_from_optical = calibration.parent_from_child
     # d(t + R exp(w) a) = dt + R (w x a), and exp(w) R_a = R_a exp(R_a^T w).
+    lever = cross_matrix(optical_from_link.translation_m)
     jacobian = np.eye(6)
-    cross = np.cross(np.eye(3), optical_from_link.translation_m).T  # times w is w x a
-    jacobian[:3, 3:] = parent_from_optical.rotation_matrix() @ cross
+    jacobian[:3, 3:] = -parent_from_optical.rotation_matrix() @ lever
     jacobian[3:, 3:] = optical_from_link.rotation_matrix().T
     covariance = jacobian @ calibration.covariance @ jacobian.T
     return replace(
@@ -69,22 +69,21 @@ def published_at(calibration: Calibration, link: str, link_from_optical: SE3) ->
 
 
 def read_link_from_optical(path: str | os.PathLike[str], link: str, optical: str) -> SE3:
-    """Reads where the optical frame lies in the driver's root frame.
+    """Read the pose of the optical frame in the driver's root frame.
 
     Args:
-        path: YAML or JSON: what `ros2 topic echo --once /tf_static` prints, a TransformStamped, or
-            an object with `parent_frame`, `child_frame`, `translation_m`, `quaternion_wxyz`.
-            Several transforms are chained, in either direction.
-        link: the driver's root frame.
-        optical: the optical frame.
+        path: YAML or JSON: the output of `ros2 topic echo --once /tf_static`, a TransformStamped,
+            or an object with `parent_frame`, `child_frame`, `translation_m`, `quaternion_wxyz`.
+            Several transforms are chained in either direction.
+        link: Name of the driver's root frame.
+        optical: Name of the optical frame.
 
     Raises:
-        InputError: The file is missing, holds no transforms, or none that lead from one frame to
-            the other.
+        InputError: The file is missing or broken, or its transforms do not connect the two frames.
     """
-    path = Path(path)
     import yaml
 
+    path = Path(path)
     try:
         documents = [*yaml.safe_load_all(path.read_text(encoding="utf-8"))]
     except FileNotFoundError:
@@ -93,41 +92,36 @@ def read_link_from_optical(path: str | os.PathLike[str], link: str, optical: str
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except (UnicodeDecodeError, yaml.YAMLError):
         raise InputError(f"{path}: neither YAML nor JSON; {_EXPECTED}") from None
-    edges: Edges = {}
+    transforms: _Transforms = {}
     try:
         for document in documents:
-            edges |= _edges(document)
+            transforms |= _transforms(document)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: a transform is incomplete ({error}); {_EXPECTED}") from None
-    if not edges:
-        raise InputError(f"{path}: no transform in it; {_EXPECTED}")
-    found = _chain(edges, link, optical)
-    if found is None:
-        known = ", ".join(sorted({frame for pair in edges for frame in pair}))
+    if not transforms:
+        raise InputError(f"{path}: contains no transform; {_EXPECTED}")
+    link_from_optical = _chain(transforms, link, optical)
+    if link_from_optical is None:
+        frames = ", ".join(sorted({frame for pair in transforms for frame in pair}))
         raise InputError(
-            f"{path}: no transform leads from {link!r} to {optical!r}; it knows {known}. Name the"
-            f" optical frame with --child and the driver's root frame with --via"
+            f"{path}: no transform leads from {link!r} to {optical!r}; its frames are {frames}."
+            f" Name the optical frame with --child and the driver's root frame with --via"
         )
-    return found
+    return link_from_optical
 
 
-_EXPECTED = "give what 'ros2 topic echo --once /tf_static' prints, or a TransformStamped"
-
-
-def _edges(data: Any) -> Edges:
-    """The transforms of a document as parent_from_child by (parent, child)."""
+def _transforms(data: Any) -> _Transforms:
+    """Return the transforms of a document."""
     if isinstance(data, Mapping) and "transforms" in data:
         data = data["transforms"]
     if isinstance(data, list):
-        return {pair: pose for entry in data for pair, pose in _edges(entry).items()}
-    if not isinstance(data, Mapping):
-        return {}
-    if "transform" in data:
+        return {pair: pose for entry in data for pair, pose in _transforms(entry).items()}
+    if isinstance(data, Mapping) and "transform" in data:
         body = data["transform"]
         pair = data["header"]["frame_id"], data["child_frame_id"]
         translation = [float(body["translation"][axis]) for axis in "xyz"]
         quaternion = [float(body["rotation"][axis]) for axis in "wxyz"]
-    elif "parent_frame" in data:
+    elif isinstance(data, Mapping) and "parent_frame" in data:
         pair = data["parent_frame"], data["child_frame"]
         translation, quaternion = data["translation_m"], data["quaternion_wxyz"]
     else:
@@ -138,14 +132,14 @@ def _edges(data: Any) -> Edges:
     return {(parent, child): SE3(np.array(quaternion), np.array(translation))}
 
 
-def _chain(edges: Edges, start: str, end: str) -> SE3 | None:
-    """start_from_end along the transforms, each in either direction."""
-    steps = edges | {(child, parent): pose.inverse() for (parent, child), pose in edges.items()}
-    reached = {start: SE3.identity()}
+def _chain(transforms: _Transforms, start: str, end: str) -> SE3 | None:
+    """Return start_from_end along the transforms, each in either direction."""
+    inverses = {(child, parent): pose.inverse() for (parent, child), pose in transforms.items()}
+    start_from = {start: SE3.identity()}
     queue = [start]
     for frame in queue:
-        for (here, there), here_from_there in steps.items():
-            if here == frame and there not in reached:
-                reached[there] = reached[frame] @ here_from_there
-                queue.append(there)
-    return reached.get(end)
+        for (parent, child), parent_from_child in (transforms | inverses).items():
+            if parent == frame and child not in start_from:
+                start_from[child] = start_from[frame] @ parent_from_child
+                queue.append(child)
+    return start_from.get(end)

@@ -1,117 +1,157 @@
-"""All formats, by name."""
+"""The table of export formats, and `export_calibration`."""
 
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, TypeAlias, Unpack
 
-from evercal.calibration.export import (
-    camera_views,
-    handeye_tools,
-    plain,
-    robots,
-    ros,
-    urdf,
-)
-from evercal.calibration.export.request import Content, Export
+from evercal.calibration.calibration import Calibration
+from evercal.calibration.export import image_poses, numbers, ros
+from evercal.calibration.export.request import Export, ExportOptions, prepare_export
 from evercal.errors import InputError
 from evercal.storage import write_bytes
+
+Content: TypeAlias = str | bytes | dict[str, str]
+"""Text, bytes, or the texts of a folder by file name."""
 
 
 @dataclass(frozen=True)
 class Format:
-    """How a calibration becomes another program's file."""
+    """One export format; every format takes fixed cameras and cameras on the arm."""
 
+    name: str
+    """Name for `--format`."""
+    frame: Literal["tf", "optical", "any"]
+    """Child frame. `tf`: a frame of the robot's tf tree. `optical`: only the camera's optical
+    frame, so `via` is refused. `any`: plain numbers of either frame."""
+    suffix: str
+    """File suffix; empty for a folder."""
     write: Callable[[Export], Content]
-    """Its content."""
-    ending: str
-    """Of the file; empty for a folder."""
+    """Writer."""
     description: str
-    """One line for people."""
+    """One line for `--format list`."""
 
 
-FORMATS: dict[str, Format] = {
-    "easy_handeye2": Format(
-        handeye_tools.easy_handeye2,
-        ".calib",
-        "easy_handeye2, for ~/.ros2/easy_handeye2/calibrations",
-    ),
-    "easy_handeye": Format(
-        handeye_tools.easy_handeye, ".yaml", "easy_handeye of ROS 1, for ~/.ros/easy_handeye"
-    ),
-    "moveit_samples": Format(
-        handeye_tools.moveit_samples,
+_ROWS = (
+    ("easy_handeye2", "tf", ".calib", ros.easy_handeye2, "for ~/.ros2/easy_handeye2/calibrations"),
+    ("easy_handeye", "tf", ".yaml", ros.easy_handeye, "easy_handeye of ROS 1, ~/.ros/easy_handeye"),
+    (
+        "moveit_samples",
+        "optical",
         ".yaml",
+        image_poses.moveit_samples,
         "MoveIt Calibration's pose pairs (with --robot-poses and --target-poses)",
     ),
-    "static_transform_publisher": Format(
-        ros.static_transform_publisher, ".sh", "shell line that publishes it in ROS 2"
+    (
+        "static_transform_publisher",
+        "tf",
+        ".sh",
+        ros.publisher_command,
+        "shell command that publishes the transform in ROS 2",
     ),
-    "launch_py": Format(ros.launch_py, ".launch.py", "ROS 2 launch file that publishes it"),
-    "ros1_launch": Format(ros.ros1_launch, ".launch", "ROS 1 launch file, as MoveIt Calibration's"),
-    "transform_stamped": Format(ros.transform_stamped, ".yaml", "geometry_msgs/TransformStamped"),
-    "camera_info": Format(ros.camera_info, ".yaml", "the camera's intrinsics for ROS"),
-    "urdf": Format(urdf.urdf, ".xml", "fixed joint for a URDF, rpy about fixed axes"),
-    "opencv": Format(plain.opencv, ".yml", "rvec, tvec (parent to camera) by cv2.FileStorage"),
-    "csv": Format(plain.csv, ".csv", "4x4 matrix, metres, a row a line"),
-    "npy": Format(plain.npy, ".npy", "4x4 matrix, metres, for numpy"),
-    "json": Format(plain.as_json, ".json", "matrix, quaternion w x y z, covariance, frame names"),
-    "tum": Format(camera_views.tum, ".tum", "stamp, translation, quaternion x y z w"),
-    "colmap": Format(camera_views.colmap, "", "folder with cameras.txt, images.txt, points3D.txt"),
-    "nerfstudio": Format(camera_views.nerfstudio, ".json", "transforms.json, OpenGL camera axes"),
-    "zivid": Format(robots.zivid, ".yaml", "4x4 matrix in millimetres, as Zivid's SDK loads it"),
-    "ur": Format(robots.ur, ".txt", "Universal Robots: p[x, y, z, rx, ry, rz]"),
-    "kuka": Format(robots.kuka, ".txt", "KUKA: {X, Y, Z, A, B, C}, mm and degrees"),
-    "abb": Format(robots.abb, ".txt", "ABB: [[x,y,z],[q1,q2,q3,q4]], mm"),
-    "fanuc": Format(robots.fanuc, ".txt", "FANUC: X Y Z W P R, mm and degrees"),
-    "yaskawa": Format(robots.yaskawa, ".txt", "Yaskawa: X Y Z Rx Ry Rz, mm and degrees"),
-    "staubli": Format(robots.staubli, ".txt", "Staubli: X Y Z RX RY RZ, mm and degrees"),
-    "franka": Format(robots.franka, ".json", "Franka: 16 numbers column after column, metres"),
-}
-
-TF_FORMATS = (
-    "easy_handeye2",
-    "easy_handeye",
-    "static_transform_publisher",
-    "launch_py",
-    "ros1_launch",
-    "transform_stamped",
-    "urdf",
+    ("launch_py", "tf", ".launch.py", ros.launch_py, "ROS 2 launch file with a tf publisher"),
+    ("ros1_launch", "tf", ".launch", ros.ros1_launch, "ROS 1 launch file, like MoveIt Calibration"),
+    ("transform_stamped", "tf", ".yaml", ros.transform_stamped, "geometry_msgs/TransformStamped"),
+    ("camera_info", "optical", ".yaml", ros.camera_info, "intrinsics for ROS"),
+    ("urdf", "tf", ".xml", ros.urdf, "fixed joint for a URDF, rpy about fixed axes"),
+    ("opencv", "optical", ".yml", numbers.opencv, "rvec, tvec (parent to camera), FileStorage"),
+    ("csv", "any", ".csv", numbers.csv, "4x4 matrix, metres, one matrix row per line"),
+    ("npy", "any", ".npy", numbers.npy, "4x4 matrix, metres, for numpy"),
+    ("json", "any", ".json", numbers.as_json, "matrix, quaternion w x y z, covariance, frames"),
+    ("tum", "optical", ".tum", image_poses.tum, "stamp, translation, quaternion x y z w"),
+    ("colmap", "optical", "", image_poses.colmap, "cameras.txt, images.txt, points3D.txt (folder)"),
+    ("nerfstudio", "optical", ".json", image_poses.nerfstudio, "transforms.json, OpenGL axes"),
+    ("zivid", "any", ".yaml", numbers.zivid, "4x4 matrix in millimetres for Zivid's SDK"),
+    ("ur", "any", ".txt", numbers.ur, "Universal Robots: p[x, y, z, rx, ry, rz]"),
+    ("kuka", "any", ".txt", numbers.kuka, "KUKA: {X, Y, Z, A, B, C}, mm and degrees"),
+    ("abb", "any", ".txt", numbers.abb, "ABB: [[x,y,z],[q1,q2,q3,q4]], mm"),
+    ("fanuc", "any", ".txt", numbers.fanuc, "FANUC: X Y Z W P R, mm and degrees"),
+    ("yaskawa", "any", ".txt", numbers.yaskawa, "Yaskawa: X Y Z Rx Ry Rz, mm and degrees"),
+    ("staubli", "any", ".txt", numbers.staubli, "Staubli: X Y Z RX RY RZ, mm and degrees"),
+    ("franka", "any", ".json", numbers.franka, "Franka: 16 numbers by column, metres"),
 )
-"""Those that put the child frame into a robot's tf tree."""
+FORMATS = {row[0]: Format(*row) for row in _ROWS}
+"""All formats by name."""
 
 
-def format_name(name: str) -> str:
-    """The name as it stands in `FORMATS`; hyphens count as underscores.
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """A calibration in another format."""
 
-    Raises:
-        InputError: No such format.
-    """
-    found = name.strip().lower().replace("-", "_")
-    if found not in FORMATS:
-        raise InputError(f"export format {name!r} is not known; use one of {', '.join(FORMATS)}")
-    return found
+    format: Format
+    """Row of the table."""
+    calibration: Calibration
+    """Calibration with the exported frames."""
+    text: str
+    """Exported text; empty for a binary file or a folder."""
+    files: tuple[Path, ...]
+    """Files that were written; empty without a path."""
 
 
-def write_content(path: str | os.PathLike[str], content: Content) -> list[Path]:
-    """Writes what a format made; a file is replaced, a folder must not hold such files yet.
+def export_calibration(
+    calibration: Calibration,
+    format: str,
+    path: str | os.PathLike[str] | None = None,
+    **options: Unpack[ExportOptions],
+) -> str:
+    """Export a calibration to the format of another program.
+
+    Args:
+        calibration: Calibration to export.
+        format: Name of a format in `FORMATS`; hyphens count as underscores.
+        path: File to write, or a new folder for COLMAP. If omitted, nothing is written.
+        options: Frame names and further inputs, see `ExportOptions`.
 
     Returns:
-        The files.
+        The exported text; empty for a binary file or a folder.
 
     Raises:
-        InputError: The folder holds one of the files already.
-        OSError: As the system says.
+        InputError: The format is unknown, a required input is missing, or a frame name is invalid.
     """
-    path = Path(path)
+    return export_files(calibration, format, path, **options).text
+
+
+def export_files(
+    calibration: Calibration,
+    format: str,
+    path: str | os.PathLike[str] | None = None,
+    **options: Unpack[ExportOptions],
+) -> Exported:
+    """Export like `export_calibration`, and also return the written files."""
+    row = FORMATS.get(format.strip().lower().replace("-", "_"))
+    if row is None:
+        raise InputError(f"export format {format!r} is not known; use one of {', '.join(FORMATS)}")
+    # easy_handeye2 looks up ~/cell.calib under the name cell.
+    name = "evercal" if path is None else Path(path).name.split(".")[0] or "evercal"
+    export = prepare_export(calibration, name, **options)
+    child = export.child
+    if row.frame == "optical" and options.get("via") is not None:
+        raise InputError(f"{row.name} holds the pose of the camera, not of {child!r}; omit --via")
+    try:
+        content = row.write(export)
+    except InputError as error:
+        raise InputError(f"{row.name}: {error}") from None
+    text = content if isinstance(content, str) else ""
+    if path is None:
+        if not text:
+            raise InputError(f"{row.name} is not text and cannot be printed; give --out")
+        return Exported(row, export.calibration, text, ())
+    return Exported(row, export.calibration, text, _write(Path(path), content))
+
+
+def _write(path: Path, content: Content) -> tuple[Path, ...]:
+    """Write a file, or a folder that does not yet hold such files."""
     if isinstance(content, dict):
         files = {path / name: text for name, text in content.items()}
-        there = next((file for file in files if file.exists()), None)
-        if there is not None:
-            raise InputError(f"{there}: already there; give a new folder with --out")
+        existing = next((file for file in files if file.exists()), None)
+        if existing is not None:
+            raise InputError(f"{existing}: already there; give a new folder with --out")
         path.mkdir(parents=True, exist_ok=True)
     else:
+        if not path.absolute().parent.is_dir():
+            raise InputError(f"--out {path}: its folder does not exist; create it first")
         files = {path: content}
     for file, text in files.items():
         write_bytes(file, text if isinstance(text, bytes) else text.encode())
-    return list(files)
+    return tuple(files)

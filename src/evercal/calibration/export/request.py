@@ -1,51 +1,67 @@
-"""`Export`: what a writer of a format gets, and the names of frames that tf takes."""
+"""`Export`: the input of every format writer, prepared from a calibration and `ExportOptions`."""
 
+import os
 import re
 from dataclasses import dataclass, replace
-from typing import TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
+from pathlib import Path
+from typing import TypeAlias, TypedDict, Unpack
 
 from evercal.calibration.calibration import Calibration
+from evercal.calibration.export.driver_frame import (
+    published_at,
+    read_link_from_optical,
+    standard_link_from_optical,
+)
 from evercal.errors import InputError
-from evercal.geometry import SE3
-from evercal.recordings.poses.robot_poses import RobotPoses
+from evercal.geometry import SE3, Camera
+from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 
-Content: TypeAlias = str | bytes | dict[str, str]
-"""Text, bytes, or a folder of texts by file name."""
+PoseSource: TypeAlias = RobotPoses | str | os.PathLike[str] | None
 
-# tf itself refuses only empty names and a leading slash; blanks, quotes and brackets break the
-# shell lines, launch files and XML that names stand in.
+# tf itself refuses only empty names and a leading slash; blanks, quotes and brackets would break
+# the shell commands, launch files and XML that hold the names.
 _FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(/[A-Za-z0-9_.\-]+)*")
+
+
+class ExportOptions(TypedDict, total=False):
+    """Options of an export; all may be omitted."""
+
+    parent: str | None
+    """New name of the parent frame."""
+    child: str | None
+    """New name of the child frame."""
+    via: str | None
+    """Root frame of the camera driver, which becomes the child frame."""
+    via_transform: str | os.PathLike[str] | None
+    """File with the transforms between the root frame and the optical frame."""
+    via_offset: tuple[float, float, float] | None
+    """Origin of the optical frame in the root frame: forward, left, up, metres."""
+    via_optical: bool
+    """Whether the two frames share their origin."""
+    robot_frame: str | None
+    """The robot frame that is not the parent: the gripper for eye_to_hand, else the base."""
+    robot_poses: PoseSource
+    """base_from_gripper of every image, or a file of them."""
+    target_poses: PoseSource
+    """camera_from_target of every image, or a file of them."""
+    convention: str | None
+    """Pose convention of the file of robot poses."""
 
 
 @dataclass(frozen=True, eq=False)
 class Export:
-    """A calibration on its way into another program's file.
-
-    Raises:
-        InputError: A frame name that tf does not take.
-    """
+    """A calibration with everything that a format writer may need."""
 
     calibration: Calibration
-    """With the frame names that are written."""
-    name: str = "evercal"
-    """What easy_handeye files it under."""
-    other_frame: str | None = None
-    """The robot's frame that is not the parent: the gripper's for eye_to_hand, else the base."""
-    robot_poses: RobotPoses | None = None
-    """base_from_gripper of every image, for formats that hold them."""
-    target_poses: RobotPoses | None = None
-    """camera_from_target of every image, for formats that hold them."""
-    optical: bool = True
-    """Whether the child frame is the camera's optical frame, not the driver's root frame."""
-
-    def __post_init__(self) -> None:
-        check_frame(self.parent, "parent frame")
-        check_frame(self.child, "child frame")
-        if self.other_frame is not None:
-            check_frame(self.other_frame, "robot frame")
+    """Calibration with the exported frames."""
+    name: str
+    """Name of the calibration in easy_handeye."""
+    robot_frame: str | None
+    """The robot frame that is not the parent."""
+    robot_poses: RobotPoses | None
+    """base_from_gripper of every image."""
+    target_poses: RobotPoses | None
+    """camera_from_target of every image."""
 
     @property
     def parent(self) -> str:
@@ -63,86 +79,69 @@ class Export:
         return self.calibration.parent_from_child
 
     @property
-    def sentence(self) -> str:
-        """What the numbers mean, for a comment; the frame names in it are harmless anywhere."""
+    def camera(self) -> Camera:
+        """Intrinsics; raises InputError if the calibration has no intrinsics."""
+        if self.calibration.camera is None:
+            raise InputError("intrinsics are required, but this calibration holds no camera")
+        return self.calibration.camera
+
+    @property
+    def comment(self) -> str:
+        """Meaning of the numbers; the frame names in it are safe in any file."""
         return f"{self.calibration.meaning}. Written by evercal."
 
 
-@dataclass(frozen=True, eq=False)
-class CameraViews:
-    """Where the camera was at every image that is written."""
-
-    names: tuple[str, ...]
-    """Of the images."""
-    stamps_s: NDArray[np.float64]
-    """(n,) seconds; counted from 0 where no stamps are known."""
-    base_from_camera: SE3
-    """(n,)."""
-
-
-def check_frame(name: str, what: str) -> None:
-    """Refuses what tf, or a file that it stands in, does not take.
+def prepare_export(
+    calibration: Calibration, name: str = "evercal", **options: Unpack[ExportOptions]
+) -> Export:
+    """Rename the frames, move the pose to the driver's root frame, and read the files.
 
     Raises:
-        InputError: Empty, a leading slash, or characters other than letters, digits, _ . - and /.
+        InputError: A frame name is invalid, the options contradict each other, or a file is broken.
     """
-    if not _FRAME.fullmatch(name):
-        raise InputError(
-            f"{what} {name!r} is no name of a tf frame; use letters, digits, _ . - and / inside,"
-            f" such as 'camera_color_optical_frame' (--parent and --child rename them)"
-        )
-
-
-def renamed(
-    calibration: Calibration, parent: str | None = None, child: str | None = None
-) -> Calibration:
-    """The calibration with other frame names.
-
-    Raises:
-        InputError: One name for both.
-    """
-    parent, child = parent or calibration.parent_frame, child or calibration.child_frame
+    parent = options.get("parent") or calibration.parent_frame
+    child = options.get("child") or calibration.child_frame
     if parent == child:
         raise InputError(f"parent and child frame are both called {parent!r}; rename one of them")
-    return replace(calibration, parent_frame=parent, child_frame=child)
+    calibration = _at_driver_frame(
+        replace(calibration, parent_frame=parent, child_frame=child), options
+    )
+    other = options.get("robot_frame")
+    frames = {"parent": parent, "child": calibration.child_frame, "robot": other}
+    for role, frame in frames.items():
+        if frame is not None and not _FRAME.fullmatch(frame):
+            raise InputError(
+                f"{role} frame {frame!r} is no name of a tf frame; use letters, digits, _ . - and"
+                f" inner /, such as 'camera_color_optical_frame' (rename with --parent or --child)"
+            )
+    robot = _poses(options.get("robot_poses"), "robot", options.get("convention"))
+    target = _poses(options.get("target_poses"), "target", None)
+    return Export(calibration, name, other, robot, target)
 
 
-def camera_views(export: Export, form: str) -> CameraViews:
-    """The camera's poses in the base, of a fixed camera or along the robot's poses.
-
-    Args:
-        export: what is written.
-        form: the format, for messages.
-
-    Raises:
-        InputError: The camera is on the arm and no robot poses are given, or the calibration was
-            moved to the driver's root frame, which has other axes than a camera.
-    """
-    require_optical(export, form)
-    robot = export.robot_poses
-    if export.calibration.mount == "eye_to_hand":
-        used = tuple(image.name for image in export.calibration.images if image.used)
-        names = used or (f"{export.child.replace('/', '_')}.png",)
-        poses = SE3.stack([export.pose] * len(names))
-        return CameraViews(names, np.arange(len(names), dtype=np.float64), poses)
-    if robot is None:
+def _at_driver_frame(calibration: Calibration, options: ExportOptions) -> Calibration:
+    """Return the calibration of the driver's root frame if the options name one."""
+    link, file, offset = (options.get(key) for key in ("via", "via_transform", "via_offset"))
+    sources = [file is not None, offset is not None, options.get("via_optical", False)]
+    if link is None:
+        if any(sources):
+            raise InputError("name the driver's root frame with --via, such as camera_link")
+        return calibration
+    if sum(sources) != 1:
         raise InputError(
-            f"{form}: a camera on the arm has a pose in the base at every image only; give the"
-            f" gripper's poses with --robot-poses"
+            f"--via {link} needs the pose of the optical frame in it; give one of --via-transform"
+            f" FILE, --via-offset X Y Z, or --via-optical if their origins are the same"
         )
-    count = len(robot)
-    names = robot.names or tuple(f"{i:06d}.png" for i in range(count))
-    stamps = np.arange(count, dtype=np.float64) if robot.stamps_s is None else robot.stamps_s
-    return CameraViews(names, stamps, robot.poses @ export.pose)
+    if file is not None:
+        link_from_optical = read_link_from_optical(file, link, calibration.child_frame)
+    else:
+        link_from_optical = standard_link_from_optical(offset or (0.0, 0.0, 0.0))
+    return published_at(calibration, link, link_from_optical)
 
 
-def require_optical(export: Export, form: str) -> None:
-    """Refuses the driver's root frame where a camera's axes are meant.
-
-    Raises:
-        InputError: The export is of the driver's root frame.
-    """
-    if not export.optical:
-        raise InputError(
-            f"{form} holds the pose of the camera itself, not of {export.child!r}; leave --via out"
-        )
+def _poses(source: PoseSource, role: str, convention: str | None) -> RobotPoses | None:
+    if source is None or isinstance(source, RobotPoses):
+        return source
+    if not Path(source).is_file():
+        raise InputError(f"{source}: file of {role} poses is missing; check the path")
+    return read_robot_poses(source, convention)

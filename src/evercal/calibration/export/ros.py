@@ -1,8 +1,8 @@
-"""ROS: tf as a shell line, a launch file or a message; camera_info.
+"""Formats of ROS: tf, launch files, URDF, easy_handeye and camera_info.
 
-Quaternions are x y z w. Checked against tf2_ros's static_transform_publisher (flags since ROS 2
-Humble, nine bare words in ROS 1), the fields of geometry_msgs/TransformStamped, and the calibration
-files of camera_calibration_parsers.
+Checked against tf2_ros's static_transform_publisher (flags in ROS 2, nine words in ROS 1), the
+fields of geometry_msgs/TransformStamped, camera_calibration_parsers, the messages and test files of
+easy_handeye2, and easy_handeye's reader, which takes exactly the keys below.
 """
 
 import re
@@ -12,24 +12,25 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import yaml
 
-from evercal.calibration.export.request import Export, require_optical
-from evercal.errors import InputError
-from evercal.geometry import SE3
+from evercal.calibration.export.request import Export
 from evercal.recordings.poses.conventions import CONVENTIONS, numbers_from_poses
 
+# evercal uses no marker, but the tools require a frame name.
+_MARKER_FRAME = "no_marker"
 
-def static_transform_publisher(export: Export) -> str:
-    """One shell line for ROS 2."""
-    words = ["ros2", "run", "tf2_ros", "static_transform_publisher", *_flags(export)]
-    return shlex.join(words) + "\n"
+
+def publisher_command(export: Export) -> str:
+    """Write a shell command for ROS 2."""
+    words = ["ros2", "run", "tf2_ros", "static_transform_publisher"]
+    return shlex.join([*words, *(word for pair in _flags(export).items() for word in pair)]) + "\n"
 
 
 def launch_py(export: Export) -> str:
-    """A launch file for ROS 2."""
-    flags = _flags(export)
-    pairs = zip(flags[::2], flags[1::2], strict=True)
-    arguments = "\n".join(f'                    "{flag}", "{value}",' for flag, value in pairs)
-    return f"""# {export.sentence}
+    """Write a launch file for ROS 2."""
+    arguments = "\n".join(
+        f'                    "{flag}", "{value}",' for flag, value in _flags(export).items()
+    )
+    return f"""# {export.comment}
 from launch import LaunchDescription
 from launch_ros.actions import Node
 
@@ -51,79 +52,131 @@ def generate_launch_description():
 
 
 def ros1_launch(export: Export) -> str:
-    """A launch file for ROS 1, as MoveIt Calibration writes its result."""
-    numbers = " ".join(map(repr, _numbers(export.pose)))
-    words = quoteattr(f"{numbers} {export.parent} {export.child}")
+    """Write a launch file for ROS 1 in the form of MoveIt Calibration."""
+    numbers = " ".join(map(repr, _numbers(export)))
+    arguments = quoteattr(f"{numbers} {export.parent} {export.child}")
     return f"""<launch>
-  <!-- {export.sentence.replace("--", "- -")} x y z qx qy qz qw parent child -->
+  <!-- {_xml_comment(export)} x y z qx qy qz qw parent child -->
   <node pkg="tf2_ros" type="static_transform_publisher" name="{_node_name(export)}"
-        args={words} />
+        args={arguments} />
 </launch>
 """
 
 
 def transform_stamped(export: Export) -> str:
-    """geometry_msgs/TransformStamped of ROS 2 as YAML."""
+    """Write a geometry_msgs/TransformStamped of ROS 2 as YAML."""
     message = {
         "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": export.parent},
         "child_frame_id": export.child,
-        "transform": transform_message(export.pose),
+        "transform": _transform(export),
     }
-    return f"# {export.sentence}\n" + yaml.safe_dump(message, sort_keys=False)
+    return f"# {export.comment}\n" + yaml.safe_dump(message, sort_keys=False)
+
+
+def urdf(export: Export) -> str:
+    """Write a fixed joint for a URDF or xacro that defines both links.
+
+    The angles rotate about fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll), in radians.
+    """
+    numbers = _numbers(export, "rpy")
+    xyz, rpy = (" ".join(map(repr, part)) for part in (numbers[:3], numbers[3:]))
+    name = re.sub(r"[^\w.-]", "_", f"{export.parent}_to_{export.child}")
+    return f"""<joint name={quoteattr(name)} type="fixed">
+  <!-- {_xml_comment(export)} -->
+  <parent link={quoteattr(export.parent)}/>
+  <child link={quoteattr(export.child)}/>
+  <origin xyz="{xyz}" rpy="{rpy}"/>
+</joint>
+"""
+
+
+def easy_handeye2(export: Export) -> str:
+    """Write the message HandeyeCalibration of easy_handeye2."""
+    in_hand = export.calibration.mount == "eye_in_hand"
+    parameters = {
+        "name": export.name,
+        "calibration_type": "eye_in_hand" if in_hand else "eye_on_base",
+        **_handeye_frames(export),
+        "freehand_robot_movement": True,
+        "move_group_namespace": "/",
+        "move_group": "manipulator",
+    }
+    calibration = {"parameters": parameters, "transform": _transform(export)}
+    return yaml.safe_dump(calibration, sort_keys=False)
+
+
+def easy_handeye(export: Export) -> str:
+    """Write the YAML of easy_handeye for ROS 1."""
+    parameters = {
+        "namespace": f"/{export.name}/",
+        "move_group_namespace": "/",
+        "move_group": "manipulator",
+        "eye_on_hand": export.calibration.mount == "eye_in_hand",
+        **_handeye_frames(export),
+    }
+    transformation = dict(
+        zip(("x", "y", "z", "qx", "qy", "qz", "qw"), _numbers(export), strict=True)
+    )
+    calibration = {"parameters": parameters, "transformation": transformation}
+    return yaml.safe_dump(calibration, sort_keys=False)
 
 
 def camera_info(export: Export) -> str:
-    """The camera's intrinsics as camera_calibration and camera_info_manager read them.
-
-    Raises:
-        InputError: The calibration holds no intrinsics.
-    """
-    camera = export.calibration.camera
-    if camera is None:
-        raise InputError("camera_info: this calibration holds no intrinsics of its camera")
-    require_optical(export, "camera_info")
-    lens = [*camera.distortion, *(0.0,) * max(0, 5 - len(camera.distortion))]
-    model = "plumb_bob" if len(lens) == 5 else "rational_polynomial"
-    projection = np.hstack([camera.matrix(), np.zeros((3, 1))])
+    """Write the intrinsics for camera_calibration and camera_info_manager."""
+    camera = export.camera
+    distortion = [*camera.distortion, *(0.0,) * max(0, 5 - len(camera.distortion))]
     info = {
         "image_width": camera.width,
         "image_height": camera.height,
         "camera_name": re.sub(r"\W", "_", export.child),
         "camera_matrix": _matrix(camera.matrix()),
-        "distortion_model": model,
-        "distortion_coefficients": _matrix(np.array([lens])),
+        "distortion_model": "plumb_bob" if len(distortion) == 5 else "rational_polynomial",
+        "distortion_coefficients": _matrix(np.array([distortion])),
         "rectification_matrix": _matrix(np.eye(3)),
-        "projection_matrix": _matrix(projection),
+        "projection_matrix": _matrix(np.hstack([camera.matrix(), np.zeros((3, 1))])),
     }
     return yaml.safe_dump(info, sort_keys=False, default_flow_style=None)
 
 
-def transform_message(pose: SE3) -> dict[str, dict[str, float]]:
-    """Fields of geometry_msgs/Transform."""
-    numbers = _numbers(pose)
+def _numbers(export: Export, convention: str = "xyzw") -> list[float]:
+    """Return the pose as numbers, without negative zeros."""
+    return (numbers_from_poses(export.pose, CONVENTIONS[convention]) + 0.0).tolist()
+
+
+def _transform(export: Export) -> dict[str, dict[str, float]]:
+    """Return the fields of geometry_msgs/Transform."""
+    numbers = _numbers(export)
     return {
         "translation": dict(zip("xyz", numbers[:3], strict=True)),
         "rotation": dict(zip("xyzw", numbers[3:], strict=True)),
     }
 
 
-def _numbers(pose: SE3) -> list[float]:
-    """Numbers x y z qx qy qz qw; no minus before a zero."""
-    return (numbers_from_poses(pose, CONVENTIONS["xyzw"]) + 0.0).tolist()
-
-
-def _flags(export: Export) -> list[str]:
+def _flags(export: Export) -> dict[str, str]:
     names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
-    flags = [
-        word
-        for name, value in zip(names, _numbers(export.pose), strict=True)
-        for word in (name, repr(value))
-    ]
-    return [*flags, "--frame-id", export.parent, "--child-frame-id", export.child]
+    flags = dict(zip(names, map(repr, _numbers(export)), strict=True))
+    return {**flags, "--frame-id": export.parent, "--child-frame-id": export.child}
+
+
+def _handeye_frames(export: Export) -> dict[str, str]:
+    """Return the four frames of a hand-eye setup; the calibration itself names two of them."""
+    base, gripper = export.parent, export.robot_frame or "gripper"
+    if export.calibration.mount == "eye_in_hand":
+        base, gripper = export.robot_frame or "base", export.parent
+    return {
+        "robot_base_frame": base,
+        "robot_effector_frame": gripper,
+        "tracking_base_frame": export.child,
+        "tracking_marker_frame": _MARKER_FRAME,
+    }
 
 
 def _node_name(export: Export) -> str:
     return re.sub(r"\W", "_", f"{export.parent}_to_{export.child}")
+
+
+def _xml_comment(export: Export) -> str:
+    return export.comment.replace("--", "- -")
 
 
 def _matrix(values: np.ndarray) -> dict[str, object]:

@@ -1,141 +1,168 @@
-"""A start that outliers do not bend: many answers from three poses each, the most agreed one kept.
+"""A start that is robust to outliers: the best of many solutions from three poses each.
 
-Nothing here depends on the order of the poses as long as the caller sorts them; samples are drawn
-from a fixed seed.
+The samples use a fixed seed, so sorted poses give the same start every time.
 """
 
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.pose_pairs.closed_form import motions, park, shah
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation, Unknowns, se3
-from evercal.geometry import SE3
 
 Array = NDArray[np.floating]
 
 SAMPLES = 150
-"""Sets of three poses; even with half of the poses wrong some 20 of them are sound."""
+"""Number of samples; even with 50 % outliers about 20 samples contain inliers only."""
 _SCORED = 60
-"""Poses that a sample is scored on, at most."""
+"""Maximum number of poses that score a sample."""
 _FLOOR = 1e-9
 
 
+class _Hypotheses(NamedTuple):
+    """h candidates for `parent_from_camera`."""
+
+    rotations: Array
+    """(h, 3, 3)"""
+    translations: Array
+    """(h, 3)"""
+    scales: Array
+    """(h,) metres per unit of the camera's translations."""
+
+
+class _Boards(NamedTuple):
+    """Board poses in the fixed frame: by each hypothesis, or one mean pose for each."""
+
+    rotations: Array
+    translations: Array
+
+
 def consensus_start(equation: PoseEquation) -> Unknowns:
-    """The answer that the better half of the poses agrees on most.
+    """Return the hypothesis that agrees best with the better half of the poses.
 
     Args:
-        equation: three poses or more; rotations about two axes.
+        equation: At least three poses with rotations about two axes.
     """
     n = len(equation)
     scored = equation[np.unique(np.linspace(0, n - 1, _SCORED).round().astype(int))]
-    rotations, translations, scales = _sampled(equation, _triples(n))
-    for found, scale in _from_all(scored):
-        rotations = np.concatenate([rotations, found.rotation_matrix()[None]])
-        translations = np.concatenate([translations, found.translation_m[None]])
-        scales = np.append(scales, scale)
-    cost, turn, middle = _spread(*_boards(scored, rotations, translations, scales))
-    cost[~(scales > 0)] = np.inf
+    sampled, closed = _from_triples(equation, _triples(n)), _from_all_poses(scored)
+    hypotheses = _Hypotheses(*(np.concatenate(pair) for pair in zip(sampled, closed, strict=True)))
+    cost, mean = _spread(_boards(scored, hypotheses))
+    cost[~(hypotheses.scales > 0)] = np.inf
     best = int(np.argmin(cost))
     return Unknowns(
-        np.stack([rotations[best], turn[best]]),
-        np.stack([translations[best], middle[best]]),
-        float(scales[best]),
+        np.stack([hypotheses.rotations[best], mean.rotations[best]]),
+        np.stack([hypotheses.translations[best], mean.translations[best]]),
+        float(hypotheses.scales[best]),
     )
 
 
 def _triples(n: int) -> NDArray[np.int64]:
-    """(h, 3) distinct poses."""
+    """Return (h, 3) indices of distinct poses."""
     if n * (n - 1) * (n - 2) // 6 <= SAMPLES:
         return np.array(list(combinations(range(n), 3)))
     rng = np.random.default_rng(0)
     return np.argsort(rng.random((SAMPLES, n)), 1)[:, :3]
 
 
-def _from_all(equation: PoseEquation) -> list[tuple[SE3, float]]:
-    """Park's and Shah's answers from everything, the best start where there are no outliers."""
+def _from_all_poses(equation: PoseEquation) -> _Hypotheses:
+    """Solve with all poses by Park and by Shah, the best start without outliers."""
     robot = se3(equation.robot_rotation, equation.robot_translation)
     camera = se3(equation.camera_rotation, equation.camera_translation)
     world = shah(robot, camera, equation.scale_known)
-    return [park(*motions(robot, camera), equation.scale_known), (world[0], world[2])]
+    by_motions, scale = park(*motions(robot, camera), equation.scale_known)
+    poses = (by_motions, world.parent_from_camera)
+    return _Hypotheses(
+        np.stack([pose.rotation_matrix() for pose in poses]),
+        np.stack([pose.translation_m for pose in poses]),
+        np.array([scale, world.scale]),
+    )
 
 
-def _sampled(equation: PoseEquation, triples: NDArray[np.int64]) -> tuple[Array, Array, Array]:
-    """Park's answer for every triple: (h, 3, 3) rotations, (h, 3) translations, (h,) scales."""
+def _from_triples(equation: PoseEquation, triples: NDArray[np.int64]) -> _Hypotheses:
+    """Solve each triple of poses by Park's method."""
     h = len(triples)
     first, second = triples[:, [0, 0, 1]], triples[:, [1, 2, 2]]
     robot, camera = equation.robot_rotation, equation.camera_rotation
-    # (h, 3) motions of robot and camera between the poses of a triple.
-    back = robot[first].transpose(0, 1, 3, 2)
-    turn_a, turn_b = back @ robot[second], camera[first] @ camera[second].transpose(0, 1, 3, 2)
+    # (h, 3) motions A of the robot and B of the camera within each triple.
+    inverse = robot[first].transpose(0, 1, 3, 2)
+    rotation_a = inverse @ robot[second]
+    rotation_b = camera[first] @ camera[second].transpose(0, 1, 3, 2)
     shift = equation.robot_translation[second] - equation.robot_translation[first]
-    move_a = (back @ shift[..., None])[..., 0]
-    seen = equation.camera_translation
-    move_b = seen[first] - (turn_b @ seen[second][..., None])[..., 0]
-    rotations = _nearest(_sine_axes(turn_a).transpose(0, 2, 1) @ _sine_axes(turn_b))
-    system, right_side = turn_a - np.eye(3), -move_a
-    moved = move_b @ rotations.transpose(0, 2, 1)
+    translation_a = (inverse @ shift[..., None])[..., 0]
+    board = equation.camera_translation
+    translation_b = board[first] - (rotation_b @ board[second][..., None])[..., 0]
+    rotations = _nearest(_sine_axes(rotation_a).transpose(0, 2, 1) @ _sine_axes(rotation_b))
+    system, right_side = rotation_a - np.eye(3), -translation_a
+    rotated = translation_b @ rotations.transpose(0, 2, 1)
     if equation.scale_known:
-        right_side = right_side + moved
+        right_side = right_side + rotated
     else:
-        system = np.concatenate([system, -moved[..., None]], -1)
+        system = np.concatenate([system, -rotated[..., None]], -1)
     unknowns = system.shape[-1]
     system, right_side = system.reshape(h, 9, unknowns), right_side.reshape(h, 9, 1)
-    gram = system.transpose(0, 2, 1) @ system
-    ridge = 1e-9 * np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-12
+    normal = system.transpose(0, 2, 1) @ system
+    ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12
     projected = system.transpose(0, 2, 1) @ right_side
-    found = np.linalg.solve(gram + ridge * np.eye(unknowns), projected)[..., 0]
-    scales = np.ones(h) if equation.scale_known else found[:, 3]
-    return rotations, found[:, :3], scales
+    solution = np.linalg.solve(normal + ridge * np.eye(unknowns), projected)[..., 0]
+    scales = np.ones(h) if equation.scale_known else solution[:, 3]
+    return _Hypotheses(rotations, solution[:, :3], scales)
 
 
 def _sine_axes(rotations: Array) -> Array:
-    """(..., 3) axes times the sine of the angle."""
+    """Return rotation axes times twice the sine of the angle, (..., 3)."""
     skew = rotations - np.swapaxes(rotations, -1, -2)
     return np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
 
 
-def _boards(
-    equation: PoseEquation, rotations: Array, translations: Array, scales: Array
-) -> tuple[Array, Array]:
-    """Where each answer and each pose put the board: (h, n, 3, 3) and (h, n, 3)."""
-    turned = equation.robot_rotation @ rotations[:, None]
-    placed = turned @ equation.camera_rotation
-    reach = (turned @ equation.camera_translation[..., None])[..., 0] * scales[:, None, None]
-    base = (equation.robot_rotation @ translations[:, None, :, None])[..., 0]
-    return placed, reach + base + equation.robot_translation
+def _boards(equation: PoseEquation, hypotheses: _Hypotheses) -> _Boards:
+    """Return the board pose by each hypothesis and pose: (h, n, 3, 3) and (h, n, 3)."""
+    fixed_from_camera = equation.robot_rotation @ hypotheses.rotations[:, None]
+    scales = hypotheses.scales[:, None, None]
+    board = (fixed_from_camera @ equation.camera_translation[..., None])[..., 0] * scales
+    camera = (equation.robot_rotation @ hypotheses.translations[:, None, :, None])[..., 0]
+    return _Boards(
+        fixed_from_camera @ equation.camera_rotation, board + camera + equation.robot_translation
+    )
 
 
-def _spread(rotations: Array, translations: Array) -> tuple[Array, Array, Array]:
-    """(h,) how far the better half of the boards is spread, and the board in its middle."""
+def _spread(boards: _Boards) -> tuple[Array, _Boards]:
+    """Return the (h,) logarithmic spread of the better half of the boards, and their mean."""
+    rotations, translations = boards
     h, n = translations.shape[:2]
     half = min(n, (n + 4) // 2)
     rows = np.arange(h)[:, None]
-    middle, turn = np.median(translations, 1), _nearest(np.median(rotations, 1))
-    kept = _closest(rotations, translations, turn, middle)[:, :half]
+    mean = _Boards(_nearest(np.median(rotations, 1)), np.median(translations, 1))
+    nearest = _by_distance(boards, mean)[:, :half]
     for _ in range(2):
-        middle = translations[rows, kept].mean(1)
-        turn = _nearest(rotations[rows, kept].mean(1))
-        kept = _closest(rotations, translations, turn, middle)[:, :half]
-    metres2 = ((translations[rows, kept] - middle[:, None]) ** 2).sum(-1).mean(1)
-    radians2 = ((rotations[rows, kept] - turn[:, None]) ** 2).sum((-1, -2)).mean(1)
-    return np.log(metres2 + _FLOOR**2) + np.log(radians2 + _FLOOR**2), turn, middle
+        mean = _Boards(
+            _nearest(rotations[rows, nearest].mean(1)), translations[rows, nearest].mean(1)
+        )
+        nearest = _by_distance(boards, mean)[:, :half]
+    metres2, radians2 = _squared_distances(boards, mean)
+    metres2, radians2 = (np.take_along_axis(d, nearest, 1).mean(1) for d in (metres2, radians2))
+    return np.log(metres2 + _FLOOR**2) + np.log(radians2 + _FLOOR**2), mean
 
 
-def _closest(
-    rotations: Array, translations: Array, turn: Array, middle: Array
-) -> NDArray[np.int64]:
-    """(h, n) the boards from the one closest to the middle to the farthest."""
-    metres2 = ((translations - middle[:, None]) ** 2).sum(-1)
-    radians2 = ((rotations - turn[:, None]) ** 2).sum((-1, -2)) / 2
-    # Both kinds in the unit of their own median, so that they may be added.
-    both = metres2 / (np.median(metres2, 1, keepdims=True) + _FLOOR**2)
-    return np.argsort(both + radians2 / (np.median(radians2, 1, keepdims=True) + _FLOOR**2), 1)
+def _by_distance(boards: _Boards, mean: _Boards) -> NDArray[np.int64]:
+    """Return (h, n) indices of the boards, sorted by distance from the mean."""
+    metres2, radians2 = _squared_distances(boards, mean)
+    radians2 = radians2 / 2
+    # Each distance is divided by its median so that the two can be added.
+    ratio = metres2 / (np.median(metres2, 1, keepdims=True) + _FLOOR**2)
+    return np.argsort(ratio + radians2 / (np.median(radians2, 1, keepdims=True) + _FLOOR**2), 1)
+
+
+def _squared_distances(boards: _Boards, mean: _Boards) -> tuple[Array, Array]:
+    """Return (h, n) squared metres and squared Frobenius norms of the rotation differences."""
+    metres2 = ((boards.translations - mean.translations[:, None]) ** 2).sum(-1)
+    return metres2, ((boards.rotations - mean.rotations[:, None]) ** 2).sum((-1, -2))
 
 
 def _nearest(matrices: Array) -> Array:
-    """(h, 3, 3) rotations nearest to matrices."""
+    """Return the rotations nearest to (h, 3, 3) matrices."""
     left, _, right = np.linalg.svd(matrices)
     left[..., -1] *= np.linalg.det(left @ right)[..., None]
     return left @ right

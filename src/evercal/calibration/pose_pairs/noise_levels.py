@@ -1,9 +1,9 @@
-"""How large each kind of noise is, judged from the residuals of a fit, and what follows for it.
+"""Variance components: estimate the level of each kind of noise from the residuals of a fit.
 
-Residuals are smaller than the noise because the fit followed some of it. Restricted maximum
-likelihood takes that into account: the levels are those for which quadratic forms of the residuals
-have the values that they are expected to have (H. Patterson and R. Thompson, Recovery of
-inter-block information, 1971; C. R. Rao, Estimation of variance and covariance components, 1971).
+Residuals are smaller than the noise because the fit follows part of it. Restricted maximum
+likelihood corrects this: it chooses the levels for which quadratic forms of the residuals equal
+their expectations. See H. Patterson and R. Thompson, Recovery of inter-block information, 1971, and
+C. R. Rao, Estimation of variance and covariance components, 1971.
 """
 
 from collections.abc import Mapping
@@ -18,31 +18,32 @@ from scipy.stats import chi2, f
 Array = NDArray[np.floating]
 
 MAX_POSES = 50
-"""Poses that the levels are judged from; more take longer and hardly change them."""
+"""Maximum number of poses for the estimate; more take longer and hardly change it."""
 _FLOOR = np.diag([1e-14] * 6)
-"""Metres^2 and radians^2 that no pose is better than, so that exact poses can be weighted."""
+"""Minimum variance of a pose, metres^2 and radians^2, so that exact poses have finite weight."""
 _PLAIN_SHARE = 0.25
-"""Of plain noise in what a fit is weighted by."""
+"""Share of isotropic noise in the weights of a fit."""
 _ROUNDS, _HALVINGS = 30, 8
+_COVERAGE = 0.95
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseLevels:
-    """Variances of kinds of noise, and how sure they are."""
+    """Variance of each kind of noise, with its uncertainty."""
 
     kinds: tuple[str, ...]
-    """Names of the kinds."""
+    """(k,) names of the kinds."""
     variance: Array
-    """(k,) metres^2 or radians^2; 0 where a kind does not show."""
+    """(k,) metres^2 or radians^2; zero for kinds that are absent."""
     uncertainty: Array
-    """(k, k) covariance of `variance`; 0 for kinds that do not show."""
+    """(k, k) covariance of `variance`; zero for kinds that are absent."""
 
     def covariances(self, directions: Mapping[str, Array], known: Array) -> Array:
-        """(n, 6, 6) of the residuals.
+        """Return the (n, 6, 6) covariance of the residuals.
 
         Args:
-            directions: by kind (n, 6, c) residuals by errors of one metre or one radian.
-            known: (n, 6, 6) covariance that is there besides.
+            directions: (n, 6, c) residuals due to unit errors, by kind.
+            known: (n, 6, 6) known covariance to add.
         """
         columns = np.concatenate([directions[kind] for kind in self.kinds], 2)
         counts = [directions[kind].shape[2] for kind in self.kinds]
@@ -57,46 +58,46 @@ def estimate_levels(
     known: Array,
     start: NoiseLevels | None = None,
 ) -> NoiseLevels:
-    """The noise for which the residuals of a weighted fit are as large as they should be.
+    """Estimate the noise levels by restricted maximum likelihood.
 
     Args:
-        residual: (n, 6) of a fit.
-        jacobian: (n, 6, p) of its unknowns.
-        directions: by kind (n, 6, c) residuals by errors of one metre or one radian.
-        known: (n, 6, 6) covariance of noise that is known already.
-        start: levels of a similar fit.
+        residual: (n, 6) residuals of a fit.
+        jacobian: (n, 6, p) derivatives by its unknowns.
+        directions: (n, 6, c) residuals due to unit errors (1 m or 1 rad), by kind.
+        known: (n, 6, 6) covariance of known noise.
+        start: Levels of a similar fit.
     """
-    chosen = np.unique(np.linspace(0, len(residual) - 1, MAX_POSES).round().astype(int))
-    residual, jacobian, known = residual[chosen], jacobian[chosen], known[chosen]
-    directions = {kind: columns[chosen] for kind, columns in directions.items()}
+    rows = np.unique(np.linspace(0, len(residual) - 1, MAX_POSES).round().astype(int))
+    residual, jacobian, known = residual[rows], jacobian[rows], known[rows]
+    directions = {kind: columns[rows] for kind, columns in directions.items()}
     problem = _Problem(residual, _basis(jacobian), tuple(directions.values()), known)
     variance = problem.first_guess() if start is None else start.variance
     forms = problem.at(variance)
     for _ in range(_ROUNDS):
-        wanted = _solve_nonnegative(forms.gram, forms.values)
-        change = problem.sizes * np.abs(wanted - variance)
-        if change.max() <= 0.02 * (problem.sizes * wanted).max():
+        proposed = _solve_nonnegative(forms.gram, forms.values)
+        change = problem.sizes * np.abs(proposed - variance)
+        if change.max() <= 0.02 * (problem.sizes * proposed).max():
             break
-        tried = problem.at(wanted)
+        trial = problem.at(proposed)
         for _ in range(_HALVINGS):
-            if tried.log_likelihood >= forms.log_likelihood:
+            if trial.log_likelihood >= forms.log_likelihood:
                 break
-            wanted = (wanted + variance) / 2
-            tried = problem.at(wanted)
-        variance, forms = wanted, tried
+            proposed = (proposed + variance) / 2
+            trial = problem.at(proposed)
+        variance, forms = proposed, trial
     return NoiseLevels(tuple(directions), variance, _level_uncertainty(forms.gram, variance))
 
 
 def working_noise(noise: Array, use: NDArray[np.bool_]) -> Array:
-    """The covariance that a fit is weighted by: the estimated one, made more even.
+    """Return the covariance for the weights of a fit: the estimate, made more even.
 
-    Estimated levels can claim that a certain mixture of shift and turn has hardly any noise, and a
-    fit would then rest on that claim. A share of plain noise, equal in all directions and poses,
-    costs little where the claim is right and keeps the fit sound where it is not.
+    Estimated levels may assign almost no noise to some combination of translation and rotation, and
+    the fit would then depend on it. A share of isotropic noise, equal for all poses, costs little
+    accuracy if the levels are right and makes the fit robust if they are wrong.
 
     Args:
-        noise: (n, 6, 6) as estimated.
-        use: (n,) poses that count.
+        noise: (n, 6, 6) estimated covariance.
+        use: (n,) poses to use.
     """
     mean = noise[use].mean(0)
     metres2, radians2 = np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3
@@ -105,7 +106,7 @@ def working_noise(noise: Array, use: NDArray[np.bool_]) -> Array:
 
 
 def normal_inverse(normal: Array) -> Array:
-    """Inverse of (p, p) normal equations; what they leave open comes out huge, not zero."""
+    """Invert (p, p) normal equations; an unconstrained unknown gets a huge variance."""
     unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-200))
     values, axes = np.linalg.eigh(normal * np.outer(unit, unit))
     return np.outer(unit, unit) * ((axes / np.maximum(values, 1e-14)) @ axes.T)
@@ -113,16 +114,16 @@ def normal_inverse(normal: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """How residuals of n poses move the p unknowns of a weighted fit, and what noise does there."""
+    """Linear response of the p unknowns of a weighted fit to the residuals of n poses."""
 
     gain: Array
-    """(n, p, 6) step of the unknowns by each residual, up to the sign."""
+    """(n, p, 6) derivative of the unknowns by each residual, up to the sign."""
     covariance: Array
-    """(p, p) of the unknowns under the noise, which need not be what the fit was weighted by."""
+    """(p, p) covariance of the unknowns under the actual noise."""
 
     @classmethod
     def of(cls, jacobian: Array, working: Array, noise: Array) -> Self:
-        """From (n, 6, p) derivatives and (n, 6, 6) covariances, assumed and actual."""
+        """Compute it from (n, 6, p) derivatives and (n, 6, 6) assumed and actual covariances."""
         p = jacobian.shape[-1]
         weighted = np.linalg.inv(working) @ jacobian
         normal = weighted.reshape(-1, p).T @ jacobian.reshape(-1, p)
@@ -130,7 +131,7 @@ class Gain:
         return cls(gain, (gain @ noise @ gain.transpose(0, 2, 1)).sum(0))
 
     def slopes(self, directions: Mapping[str, Array]) -> Array:
-        """(k, p, p) how the covariance grows with the variance of each kind of noise."""
+        """Return the (k, p, p) derivatives of the covariance by the variances of the noise."""
         moves = [self.gain @ columns for columns in directions.values()]
         return np.stack([(move @ move.transpose(0, 2, 1)).sum(0) for move in moves])
 
@@ -138,7 +139,7 @@ class Gain:
 def loss_by_weights(
     jacobian: Array, noise: Array, directions: Mapping[str, Array], uncertainty: Array
 ) -> Array:
-    """(p, p) what a fit loses because its weights were estimated from the same residuals.
+    """Return the (p, p) covariance due to weights that were estimated from the same residuals.
 
     M. Kenward and J. Roger, Small sample inference for fixed effects from restricted maximum
     likelihood, 1997.
@@ -146,15 +147,16 @@ def loss_by_weights(
     Args:
         jacobian: (n, 6, p).
         noise: (n, 6, 6) covariance of the residuals.
-        directions: by kind (n, 6, c).
+        directions: (n, 6, c) residuals due to unit errors, by kind.
         uncertainty: (k, k) covariance of the variances.
     """
     best = Gain.of(jacobian, noise, noise)
     inverse = np.linalg.inv(noise)
-    # (k, n, p, 6): how noise of one kind in each residual reaches the unknowns.
-    reached = np.stack([best.gain @ part @ part.transpose(0, 2, 1) for part in directions.values()])
-    whitened = reached @ inverse
-    products = np.einsum("knpi,lnqi->klpq", whitened, reached, optimize=True)
+    # (k, n, p, 6): response of the unknowns to noise of each kind in each residual.
+    parts = directions.values()
+    response = np.stack([best.gain @ part @ part.transpose(0, 2, 1) for part in parts])
+    whitened = response @ inverse
+    products = np.einsum("knpi,lnqi->klpq", whitened, response, optimize=True)
     slopes = best.slopes(directions)
     precision = normal_inverse(best.covariance)
     products -= np.einsum("kpq,qr,lrs->klps", slopes, precision, slopes, optimize=True)
@@ -162,21 +164,18 @@ def loss_by_weights(
     return (loss + loss.T) / 2
 
 
-def ellipsoid_factor(
-    covariance: Array, slopes: Array, uncertainty: Array, share: float = 0.95
-) -> float:
-    """By how much to enlarge a covariance whose noise levels were estimated.
+def ellipsoid_factor(covariance: Array, slopes: Array, uncertainty: Array) -> float:
+    """Return the factor that corrects a covariance for estimated noise levels.
 
-    Squared distances in units of an estimated covariance follow F rather than chi-square. Its
-    degrees of freedom come from how sure the variance along each axis is (A. Fai and P. Cornelius,
-    Approximate F-tests of multiple degree of freedom hypotheses, 1996). Enlarged by this factor,
-    the chi-square quantile of `share` holds the truth as often as it says.
+    Squared distances by an estimated covariance follow an F distribution rather than chi-square.
+    Its degrees of freedom follow from the uncertainty of the variance along each axis (A. Fai and
+    P. Cornelius, Approximate F-tests of multiple degree of freedom hypotheses, 1996). With this
+    factor, the chi-square quantile of 95 % has a coverage of 95 %.
 
     Args:
-        covariance: (d, d).
-        slopes: (k, d, d) its derivatives by the variances of the noise.
-        uncertainty: (k, k) covariance of those variances.
-        share: probability.
+        covariance: (d, d) covariance.
+        slopes: (k, d, d) derivatives of the covariance by the variances of the noise.
+        uncertainty: (k, k) covariance of the variances.
     """
     d = len(covariance)
     variances, axes = np.linalg.eigh(covariance)
@@ -186,44 +185,47 @@ def ellipsoid_factor(
     expected = float(np.sum(np.where(freedom > 2, freedom / np.maximum(freedom - 2, 1e-9), 0.0)))
     freedom_all = 2 * expected / (expected - d) if expected > d else 2.0
     freedom_all = float(np.clip(freedom_all, 2.0, 1e6))
-    return max(1.0, float(d * f.ppf(share, d, freedom_all) / chi2.ppf(share, d)))
+    return max(1.0, float(d * f.ppf(_COVERAGE, d, freedom_all) / chi2.ppf(_COVERAGE, d)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Forms:
-    """Quadratic forms of the residuals, one for each kind of noise, at some levels."""
+    """Quadratic forms of the residuals, one for each kind of noise."""
 
     gram: Array
-    """(k, k) how much a variance adds to the expectation of a form."""
+    """(k, k) derivative of the expected forms by the variances."""
     values: Array
-    """(k,) less what known noise adds to them."""
+    """(k,) forms, less the contribution of known noise."""
     log_likelihood: float
-    """Restricted, up to a constant."""
+    """Restricted log likelihood up to a constant."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What the levels are judged from; m poses."""
+    """Data of the estimate; m poses."""
 
     residual: Array
+    """(m, 6)"""
     basis: Array
-    """(m, 6, r) of what the unknowns can explain."""
+    """(m, 6, r) basis of the residuals that the unknowns can explain."""
     directions: tuple[Array, ...]
+    """(m, 6, c) of each kind."""
     known: Array
+    """(m, 6, 6)"""
 
     @property
     def sizes(self) -> Array:
-        """(k,) what a unit of variance adds to a residual; metres and radians on one footing."""
+        """(k,) squared residual due to a unit of variance, metres and radians together."""
         return np.array([(part**2).sum() / len(part) for part in self.directions])
 
     def first_guess(self) -> Array:
-        """Each kind alone explains a share of the residuals."""
+        """Return variances that explain equal shares of the residuals."""
         metres2, radians2 = (np.mean(part**2) for part in np.split(self.residual, 2, 1))
-        turns = [bool(part[:, 3:].any()) for part in self.directions]
-        return np.where(turns, radians2, metres2) / max(len(turns) / 2, 1) + 1e-18
+        rotations = [bool(part[:, 3:].any()) for part in self.directions]
+        return np.where(rotations, radians2, metres2) / max(len(rotations) / 2, 1) + 1e-18
 
     def at(self, variance: Array) -> _Forms:
-        """The forms where the residuals are weighted by these levels."""
+        """Return the forms with weights of these variances."""
         m = len(self.residual)
         covariance = self.known + _FLOOR
         for part, level in zip(self.directions, variance, strict=True):
@@ -234,7 +236,7 @@ class _Problem:
         projector = -weighted @ np.linalg.solve(normal, weighted.T)
         projector.reshape(m, 6, m, 6)[np.arange(m), :, np.arange(m)] += weight
         error = projector @ self.residual.ravel()
-        # Noise that is known counts as one more kind, whose variance is one.
+        # Known noise is one more kind, with variance one.
         columns = np.concatenate([*self.directions, np.linalg.cholesky(self.known + _FLOOR)], 2)
         starts = np.cumsum([0, *(part.shape[2] for part in self.directions)])
         right = projector.reshape(6 * m, m, 6).transpose(1, 0, 2) @ columns
@@ -242,18 +244,18 @@ class _Problem:
         both = columns.transpose(0, 2, 1)[:, None] @ right
         squares = np.einsum("ijab,ijab->ab", both, both)
         gram = np.add.reduceat(np.add.reduceat(squares, starts, 0), starts, 1)
-        found = (error.reshape(m, 1, 6) @ columns)[:, 0]
-        values = np.add.reduceat((found**2).sum(0), starts)
+        projected = (error.reshape(m, 1, 6) @ columns)[:, 0]
+        values = np.add.reduceat((projected**2).sum(0), starts)
         likelihood = -np.linalg.slogdet(covariance)[1].sum() - np.linalg.slogdet(normal)[1]
         likelihood -= error @ self.residual.ravel()
         return _Forms(gram[:-1, :-1], values[:-1] - gram[:-1, -1], float(likelihood))
 
 
 def _basis(jacobian: Array) -> Array:
-    """(m, 6, r) orthonormal columns in place of those of the unknowns.
+    """Return (m, 6, r) orthonormal columns that span the columns of the unknowns.
 
-    The restricted likelihood depends on the space that the columns span alone. An unknown that the
-    poses leave open adds nothing to it; with its column the normal equations would be singular.
+    The restricted likelihood depends only on this space. The column of an unconstrained unknown
+    would make the normal equations singular.
     """
     columns = jacobian.reshape(-1, jacobian.shape[2])
     columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
@@ -262,9 +264,9 @@ def _basis(jacobian: Array) -> Array:
 
 
 def _solve_nonnegative(gram: Array, forms: Array) -> Array:
-    """Variances that are not negative, nearest in the metric of their uncertainty."""
+    """Return the nonnegative variances nearest to the solution, by their uncertainty."""
     unit = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    # Kinds that look alike in these poses leave the matrix next to singular.
+    # Kinds with similar effects on these poses make the matrix nearly singular.
     values, axes = np.linalg.eigh(gram / np.outer(unit, unit))
     root = axes * np.sqrt(np.maximum(values, 1e-9))
     right = (axes.T @ (forms / unit)) / np.sqrt(np.maximum(values, 1e-9))
@@ -272,11 +274,11 @@ def _solve_nonnegative(gram: Array, forms: Array) -> Array:
 
 
 def _level_uncertainty(gram: Array, variance: Array) -> Array:
-    shows = variance > 0
-    found = np.zeros_like(gram)
-    if shows.any():
-        unit = np.sqrt(np.maximum(np.diag(gram), 1e-300))[shows]
-        scaled = gram[np.ix_(shows, shows)] / np.outer(unit, unit)
+    present = variance > 0
+    uncertainty = np.zeros_like(gram)
+    if present.any():
+        unit = np.sqrt(np.maximum(np.diag(gram), 1e-300))[present]
+        scaled = gram[np.ix_(present, present)] / np.outer(unit, unit)
         inverse = np.linalg.inv(scaled + 1e-9 * np.eye(len(scaled)))
-        found[np.ix_(shows, shows)] = 2.0 * inverse / np.outer(unit, unit)
-    return found
+        uncertainty[np.ix_(present, present)] = 2.0 * inverse / np.outer(unit, unit)
+    return uncertainty

@@ -1,8 +1,8 @@
-"""Pose pairs from two files: robot poses and camera poses, paired by name, by time or in order."""
+"""Read pose pairs from a file of robot poses and a file of camera poses."""
 
 import json
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Literal
 
 import numpy as np
@@ -23,73 +23,81 @@ Inverted = Literal["robot", "camera", "both"]
 
 @dataclass(frozen=True)
 class PairFiles:
-    """Two files and how they are written."""
+    """Files of pose pairs and their conventions."""
 
     robot: Path
     """base_from_gripper: CSV, JSON, NPY or TUM."""
     camera: Path
-    """camera_from_board: what `evercal detect` wrote, or a file like that of the robot."""
+    """camera_from_board: the file of `evercal detect`, or a file like that of the robot."""
     robot_convention: str | None = None
-    """How the robot's numbers are meant, where the file does not say it."""
+    """Pose convention of a robot file without a header."""
     camera_convention: str | None = None
-    """The same of a camera file that `evercal detect` did not write."""
+    """Pose convention of a camera file without a header."""
     invert: Inverted | None = None
-    """Whose poses the files hold inverted: gripper_from_base, board_from_camera."""
+    """Files that hold inverted poses: gripper_from_base, board_from_camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class _CameraPoses:
-    """The images of a camera file, those without a board among them."""
+    """All images of a camera file."""
 
     names: tuple[str, ...] | None
-    """(n,) unless the file has none."""
+    """(n,) image names, if the file has them."""
     stamps_s: NDArray[np.float64] | None
-    """(n,) where the file, or every name, says it."""
+    """(n,) times from the file or from the names."""
     poses: list[SE3 | None]
-    """(n,), None where there is no board."""
+    """(n,) poses, or None if the image shows no board."""
     board: BoardPoses | None
-    """The file, where `evercal detect` wrote it."""
+    """The file of `evercal detect`."""
+
+    def rows(self) -> tuple[str, ...]:
+        """Return the image names, or the row numbers of a file without names."""
+        return self.names or tuple(f"row {i + 1}" for i in range(len(self.poses)))
 
 
 def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
-    """Reads robot and camera poses that belong together.
+    """Read robot and camera poses and pair them.
 
-    Where both files have names, equal names (without folder and ending) go together; else, where
-    both have times, robot poses are interpolated at those of the images; else rows and images are
-    as many and go together in order, the images of `evercal detect` in natural order of their
-    names (image-2 before image-10).
+    If both files have names, equal names are paired, without folder and suffix. Otherwise, if both
+    have times, the robot poses are interpolated at the times of the images. Otherwise rows are
+    paired in order; the images of `evercal detect` are sorted naturally (image-2 before image-10).
 
     Raises:
-        InputError: A file is broken, or they cannot be paired.
+        InputError: A file is broken, or the poses cannot be paired.
     """
-    robot, camera = _robot(files), _camera(files)
+    robot, camera = _read_robot(files), _read_camera(files)
     if robot.names is not None and camera.names is not None:
         rows = _rows_by_name(files, robot.names, camera.names)
     elif robot.stamps_s is not None and camera.stamps_s is not None:
         track = PoseTrack(robot.stamps_s, robot.poses)
-        pairs, seen = interpolated_pairs(track, _track(camera))
-        return pairs, seen.corners
+        pairs, overlapping = interpolated_pairs(track, _camera_track(camera))
+        return pairs, overlapping.corners
+    elif len(robot.poses) == len(camera.poses):
+        rows = [*range(len(robot.poses))]
     else:
-        rows = _rows_in_order(files, robot, camera)
-    seen = [i for i, row in enumerate(rows) if row is not None and camera.poses[i] is not None]
-    if not seen:
-        raise InputError(f"{files.camera}: no image of it has both a board and a robot pose")
-    names = camera.names or robot.names or tuple(f"row {i + 1}" for i in range(len(rows)))
+        raise InputError(
+            f"{files.robot}: {len(robot.poses)} poses for {len(camera.poses)} images of"
+            f" {files.camera}; give one row per image, or name the images in a column 'image'"
+        )
+    paired = [i for i, row in enumerate(rows) if row is not None and camera.poses[i] is not None]
+    if not paired:
+        raise InputError(f"{files.camera}: no image has both a board and a robot pose")
+    names = camera.names or robot.names or camera.rows()
     pairs = PosePairs(
-        tuple(names[i] for i in seen),
-        robot.poses[np.array([rows[i] for i in seen], dtype=np.int64)],
-        SE3.stack([pose for i in seen if (pose := camera.poses[i]) is not None]),
+        tuple(names[i] for i in paired),
+        robot.poses[np.array([rows[i] for i in paired], dtype=np.int64)],
+        SE3.stack([pose for i in paired if (pose := camera.poses[i]) is not None]),
     )
-    return pairs, _corners(camera.board, seen)
+    return pairs, _corners(camera.board, paired)
 
 
 def read_streams(files: PairFiles) -> tuple[PoseTrack, CameraTrack]:
-    """Reads robot and camera poses with times of their own clocks.
+    """Read robot and camera poses with times of separate clocks.
 
     Raises:
         InputError: A file is broken or has no times.
     """
-    robot, camera = _robot(files), _camera(files)
+    robot, camera = _read_robot(files), _read_camera(files)
     if robot.stamps_s is None:
         raise InputError(f"{files.robot}: has no times; --time-offset takes a column stamp_s")
     if camera.stamps_s is None:
@@ -97,33 +105,41 @@ def read_streams(files: PairFiles) -> tuple[PoseTrack, CameraTrack]:
             f"{files.camera}: has no times; --time-offset takes a column stamp_s, or images named"
             f" after their time in seconds"
         )
-    return PoseTrack(robot.stamps_s, robot.poses), _track(camera)
+    return PoseTrack(robot.stamps_s, robot.poses), _camera_track(camera)
 
 
-def _robot(files: PairFiles) -> RobotPoses:
-    found = read_robot_poses(files.robot, files.robot_convention)
+def _read_robot(files: PairFiles) -> RobotPoses:
+    robot = _read_poses(files.robot, "robot", files.robot_convention)
     if files.invert in ("robot", "both"):
-        found = replace(found, poses=found.poses.inverse())
-    return found
+        robot = replace(robot, poses=robot.poses.inverse())
+    return robot
 
 
-def _camera(files: PairFiles) -> _CameraPoses:
+def _read_camera(files: PairFiles) -> _CameraPoses:
     if _is_board_file(files.camera):
         board = read_board_poses(files.camera)
-        natural = sorted(board.images, key=lambda image: natural_key(image.name))
-        board = replace(board, images=tuple(natural))
-        names = tuple(image.name for image in board.images)
-        poses = [image.camera_from_board for image in board.images]
-        found = _CameraPoses(names, times_in_names(names), poses, board)
+        images = sorted(board.images, key=lambda image: natural_key(PurePath(image.name).name))
+        names = tuple(image.name for image in images)
+        poses = [image.camera_from_board for image in images]
+        board = replace(board, images=tuple(images))
+        camera = _CameraPoses(names, times_in_names(names), poses, board)
     else:
-        read = read_robot_poses(files.camera, files.camera_convention)
-        stamps = read.stamps_s
-        if stamps is None and read.names is not None:
-            stamps = times_in_names(read.names)
-        found = _CameraPoses(read.names, stamps, list(read.poses), None)
+        table = _read_poses(files.camera, "camera", files.camera_convention)
+        stamps = table.stamps_s
+        if stamps is None and table.names is not None:
+            stamps = times_in_names(table.names)
+        camera = _CameraPoses(table.names, stamps, list(table.poses), None)
     if files.invert not in ("camera", "both"):
-        return found
-    return replace(found, poses=[p if p is None else p.inverse() for p in found.poses])
+        return camera
+    return replace(camera, poses=[p if p is None else p.inverse() for p in camera.poses])
+
+
+def _read_poses(path: Path, role: str, convention: str | None) -> RobotPoses:
+    """Read a table of poses; messages name its role and its own option."""
+    if not path.exists():
+        raise InputError(f"{path}: file of {role} poses is missing; check --{role}-poses")
+    what = f"file of {role} poses"
+    return read_robot_poses(path, convention, what=what, option=f"--{role}-convention")
 
 
 def _is_board_file(path: Path) -> bool:
@@ -132,21 +148,21 @@ def _is_board_file(path: Path) -> bool:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return False  # the reader of poses says what is wrong with it
+        return False  # read_robot_poses reports the error
     return isinstance(data, dict) and data.get("format") == FORMAT
 
 
 def _rows_by_name(
     files: PairFiles, robot: tuple[str, ...], camera: tuple[str, ...]
 ) -> list[int | None]:
-    where = {without_ending(name): i for i, name in enumerate(robot)}
-    twice = [n for i, n in enumerate(robot) if where[without_ending(n)] != i]
-    if twice:
+    row_of = {without_ending(name): i for i, name in enumerate(robot)}
+    repeated = [name for i, name in enumerate(robot) if row_of[without_ending(name)] != i]
+    if repeated:
         raise InputError(
-            f"{files.robot}: {twice[0]!r} comes twice, apart from folder and ending; give every"
-            f" image a name of its own"
+            f"{files.robot}: {repeated[0]!r} comes twice, apart from folder and suffix; give every"
+            f" image a unique name"
         )
-    rows = [where.get(without_ending(name)) for name in camera]
+    rows = [row_of.get(without_ending(name)) for name in camera]
     if all(row is None for row in rows):
         raise InputError(
             f"{files.robot}: names no image of {files.camera}; its first is {robot[0]!r}, the first"
@@ -155,29 +171,20 @@ def _rows_by_name(
     return rows
 
 
-def _rows_in_order(files: PairFiles, robot: RobotPoses, camera: _CameraPoses) -> list[int | None]:
-    if len(robot.poses) != len(camera.poses):
-        raise InputError(
-            f"{files.robot}: {len(robot.poses)} poses for {len(camera.poses)} images of"
-            f" {files.camera}; give every image its row, or name the images in a column 'image'"
-        )
-    return list(range(len(robot.poses)))
-
-
-def _track(camera: _CameraPoses) -> CameraTrack:
+def _camera_track(camera: _CameraPoses) -> CameraTrack:
     assert camera.stamps_s is not None
-    seen = [i for i, pose in enumerate(camera.poses) if pose is not None]
-    names = camera.names or tuple(f"row {i + 1}" for i in range(len(camera.poses)))
+    detected = [i for i, pose in enumerate(camera.poses) if pose is not None]
+    names = camera.rows()
     return CameraTrack(
-        tuple(names[i] for i in seen),
-        camera.stamps_s[seen],
+        tuple(names[i] for i in detected),
+        camera.stamps_s[detected],
         SE3.stack([pose for pose in camera.poses if pose is not None]),
-        _corners(camera.board, seen),
+        _corners(camera.board, detected),
     )
 
 
-def _corners(board: BoardPoses | None, seen: list[int]) -> BoardCorners | None:
+def _corners(board: BoardPoses | None, rows: list[int]) -> BoardCorners | None:
     if board is None:
         return None
-    views = tuple(view for i in seen if (view := board.images[i].view) is not None)
+    views = tuple(view for i in rows if (view := board.images[i].view) is not None)
     return BoardCorners(board.camera, views, board.board.half_turn)

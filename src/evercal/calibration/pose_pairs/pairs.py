@@ -1,4 +1,4 @@
-"""Pose pairs: where the gripper was and where the board lay, image by image."""
+"""`PosePairs`: pairs of gripper pose and camera pose, one for each image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,38 +21,38 @@ _SAME_CAMERA_M, _SAME_CAMERA_RAD = 5e-3, np.deg2rad(0.5)
 
 @dataclass(frozen=True, eq=False)
 class PosePairs:
-    """n pairs; the board may be any thing whose pose images give: a tag, a map, an SfM model.
+    """n pose pairs; the board may be any object with camera poses: a tag, a map, an SfM model.
 
     Raises:
-        ValueError: Numbers of names and poses that differ.
+        ValueError: The numbers of names and poses differ.
     """
 
     names: tuple[str, ...]
-    """Of the images, or the rows."""
+    """(n,) names of images or rows."""
     base_from_gripper: SE3
-    """(n,) from the robot."""
+    """(n,) poses from the robot."""
     camera_from_board: SE3
-    """(n,) from the images."""
+    """(n,) poses from the images."""
     camera_covariance: Array | None = None
-    """(n, 6, 6) of `camera_from_board`: (translation in the camera's axes, metres; rotation about
-    the board's axes, radians). Without it the noise is judged from the pairs alone."""
+    """(n, 6, 6) covariance of `camera_from_board`: (translation in the camera frame, metres;
+    rotation about the board's axes, radians). If omitted, the noise is estimated from the pairs."""
     velocity: Array | None = None
-    """(n, 6) of the gripper: metres and radians per second in the axes of the base; given where the
-    clocks of robot and camera may differ."""
+    """(n, 6) gripper velocity in the base frame, m/s and rad/s; required to estimate a time
+    offset."""
 
     def __post_init__(self) -> None:
         counts = {len(self.names), len(self.base_from_gripper), len(self.camera_from_board)}
         if self.camera_covariance is not None:
             counts.add(len(self.camera_covariance))
         if len(counts) != 1:
-            raise ValueError(f"pose pairs have as many names as poses, got {sorted(counts)}")
+            raise ValueError(f"names and poses of pose pairs differ in number: {sorted(counts)}")
 
     def __len__(self) -> int:
-        """The number of pairs."""
+        """Return the number of pairs."""
         return len(self.names)
 
     def __getitem__(self, index: NDArray[np.int64] | Mask) -> Self:
-        """Some of the pairs."""
+        """Return a subset of the pairs."""
         rows = np.arange(len(self))[index]
         covariance = self.camera_covariance
         return replace(
@@ -65,16 +65,15 @@ class PosePairs:
         )
 
     def order(self) -> NDArray[np.int64]:
-        """(n,) the pairs sorted by what they say, so that no answer depends on their order."""
+        """Return (n,) indices that sort the pairs by value, whatever their order."""
         keys = [*self.base_from_gripper.translation_m.T, *self.camera_from_board.translation_m.T]
         keys += [*_canonical(self.base_from_gripper).T, *_canonical(self.camera_from_board).T]
         return np.lexsort(keys[::-1])
 
     def repeats(self, scale_known: bool = True) -> NDArray[np.int64]:
-        """(n,) for every pair the first one that says the same; its own number if it is new.
+        """Return (n,) the index of the first equal pair; the own index for a new pair.
 
-        An arm that stands still and sees the same gives no new pair. One that is said to stand
-        still while the camera moved is not taken for a repeat: its pose is stale.
+        Equal robot poses with different camera poses are not repeats: the robot pose is stale.
         """
         first = np.arange(len(self))
         positions = self.base_from_gripper.translation_m
@@ -82,52 +81,57 @@ class PosePairs:
         if len(close) == 0:
             return first
         i, j = np.sort(close, 1).T
-        _, turn = pose_distance(self.base_from_gripper[i], self.base_from_gripper[j])
-        shift, seen = pose_distance(self.camera_from_board[i], self.camera_from_board[j])
+        _, robot_rad = pose_distance(self.base_from_gripper[i], self.base_from_gripper[j])
+        camera_m, camera_rad = pose_distance(self.camera_from_board[i], self.camera_from_board[j])
         if not scale_known:
             size = np.linalg.norm(self.camera_from_board.translation_m, axis=1)
-            shift = shift / max(float(np.median(size)), 1e-12)
-        same = (turn < _SAME_ROBOT_RAD) & (shift < _SAME_CAMERA_M) & (seen < _SAME_CAMERA_RAD)
+            camera_m = camera_m / max(float(np.median(size)), 1e-12)
+        same = (camera_m < _SAME_CAMERA_M) & (camera_rad < _SAME_CAMERA_RAD)
+        same &= robot_rad < _SAME_ROBOT_RAD
         np.minimum.at(first, j[same], i[same])
         while (first[first] != first).any():
             first = first[first]
         return first
 
     def equation(self, mount: Mount, scale_known: bool = True) -> PoseEquation:
-        """The equation to solve.
+        """Return the equation to solve.
 
-        With the camera on the arm the board is fixed in the base, else in the gripper.
+        The board is fixed in the base for a camera on the arm, otherwise in the gripper.
         """
         on_arm, robot = mount == "eye_in_hand", self.base_from_gripper
-        equation = PoseEquation.of(
-            robot if on_arm else robot.inverse(),
-            self.camera_from_board,
-            self.camera_covariance,
-            scale_known,
+        fixed_from_parent = robot if on_arm else robot.inverse()
+        covariance, velocity = self.camera_covariance, self.velocity
+        if velocity is not None and not on_arm:
+            velocity = _inverse_velocity(robot, velocity)
+        return PoseEquation(
+            robot_rotation=fixed_from_parent.rotation_matrix(),
+            robot_translation=fixed_from_parent.translation_m,
+            camera_rotation=self.camera_from_board.rotation_matrix(),
+            camera_translation=self.camera_from_board.translation_m,
+            camera_covariance=np.zeros((len(self), 6, 6)) if covariance is None else covariance,
+            scale_known=scale_known,
             base_is_fixed=on_arm,
+            velocity=velocity,
         )
-        if self.velocity is None:
-            return equation
-        return replace(equation, velocity=self.velocity if on_arm else _inverse_velocity(self))
 
 
 def listed(names: Sequence[str], limit: int = 5) -> str:
-    """Names for a sentence, the first few of many."""
+    """Return the first few names for a message."""
     shown = ", ".join(names[:limit])
     return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"
 
 
-def _inverse_velocity(pairs: PosePairs) -> Array:
-    """(n, 6) of the base in the axes of the gripper: how `gripper_from_base` changes."""
-    assert pairs.velocity is not None
-    shift, spin = np.split(pairs.velocity, 2, 1)
-    back = np.swapaxes(pairs.base_from_gripper.rotation_matrix(), 1, 2)
-    moved = np.cross(spin, pairs.base_from_gripper.translation_m) - shift
-    return np.concatenate([(back @ moved[..., None])[..., 0], -(back @ spin[..., None])[..., 0]], 1)
+def _inverse_velocity(base_from_gripper: SE3, velocity: Array) -> Array:
+    """Return the (n, 6) velocity of the base in the gripper frame."""
+    linear, angular = np.split(velocity, 2, 1)
+    gripper_from_base = np.swapaxes(base_from_gripper.rotation_matrix(), 1, 2)
+    moved = np.cross(angular, base_from_gripper.translation_m) - linear
+    rotated = (gripper_from_base @ v[..., None] for v in (moved, -angular))
+    return np.concatenate([v[..., 0] for v in rotated], 1)
 
 
 def _canonical(pose: SE3) -> Array:
-    """(n, 4) quaternions with one sign for one rotation."""
+    """Return (n, 4) quaternions with a unique sign for each rotation."""
     quaternion = pose.rotation_wxyz
     largest = np.take_along_axis(quaternion, np.abs(quaternion).argmax(-1)[:, None], -1)
     return quaternion * np.where(largest < 0, -1.0, 1.0)

@@ -1,1 +1,1 @@
-"""Methods for learning scenes one after another, one file a family."""
+"""Continual-learning methods, one file per family."""

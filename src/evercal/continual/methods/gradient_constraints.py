@@ -1,9 +1,9 @@
-"""Remembered scenes as constraints: no step may raise their losses.
+"""GEM, A-GEM and GEC: steps that may not raise the losses of remembered scenes.
 
-The originals project the gradient and let plain SGD take the step. Here AdamW and Muon take it, and
-their momentum, scales and decay could oppose the memory although the gradient does not; so what is
-projected is the change of the weights after the optimisers, the step that is really taken. With
-g_t the gradient of scene t's loss, a change u alters that loss by <g_t, u> to first order.
+The originals project the gradient, and plain SGD takes the step. AdamW and Muon can move against
+the memory even if the gradient does not, because of their momentum, scales and decay. So the change
+of the weights is projected after the optimisers. To first order, a change u alters the loss of
+scene t by <g_t, u>, with g_t the gradient of that loss.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,41 +28,41 @@ REFERENCE_ROWS = 8192
 
 @dataclass(frozen=True)
 class ConstrainedStep(EpisodicMemory):
-    """What GEM, A-GEM and GEC share: losses of remembered scenes that are not minimised."""
+    """Base of methods that constrain the losses of remembered scenes."""
 
     clamp_px: float = 50.0
-    """Fixed soft clamp of remembered losses, pixels, so that losses of different times compare.
-    It must be wide: beyond it a row that is forgotten has no gradient left."""
+    """Fixed soft clamp of remembered losses, pixels. A fixed clamp makes losses of different steps
+    comparable; a wide one leaves forgotten rows a gradient."""
 
     def begin(self, start: StageStart) -> TrainingHooks:
-        """Constrained steps; nothing for the first scene."""
+        """Constrain the steps, from the second scene on."""
         return ConstraintHooks(self, start) if start.memories else TrainingHooks()
 
     def edit(
         self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
     ) -> Tensor:
-        """The change that is allowed.
+        """Return an allowed change.
 
         Args:
-            changes: (p,) what the optimisers would change, all weights one after the other.
-            g: (t, p) gradients of the losses that `constrained` gives.
-            proposed: the step.
-            references: (t,) the losses when the scenes were just learned; NaN where not kept.
+            changes: (p,) change by the optimisers, all weights concatenated.
+            g: (t, p) gradients of the losses that `constrained` returns.
+            proposed: The step.
+            references: (t,) losses right after learning the scenes; NaN if unknown.
         """
         raise NotImplementedError
 
     def constrained(self, losses: list[Tensor]) -> list[Tensor]:
-        """The losses that may not rise, made of one loss for each remembered scene."""
+        """Compute the constrained losses from the losses of the remembered scenes."""
         return losses
 
     def loss(self, output: HeadOutput, rows: Rows) -> Tensor:
-        """Mean loss of remembered rows at the fixed clamp."""
+        """Compute the mean loss of remembered rows with the fixed clamp."""
         cost, _ = fixed_clamp_loss(output.points, rows.target, self.clamp_px)
         return cost.mean()
 
 
 class ConstraintHooks(MemoryHooks):
-    """Asks for the gradient of every remembered scene and lets the method edit the step."""
+    """Collects the gradient of every remembered scene and applies the method's rule."""
 
     edits_steps = True
 
@@ -70,16 +70,16 @@ class ConstraintHooks(MemoryHooks):
         super().__init__(start)
         self._rule = method
         unknown = torch.tensor(torch.nan, device="cpu")
-        kept = [start.states[memory.scene].get("reference", unknown) for memory in self.memories]
-        self._references = torch.stack(kept)
+        losses = [start.states[memory.scene].get("reference", unknown) for memory in self.memories]
+        self._references = torch.stack(losses)
 
     def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:
-        """The losses that may not rise."""
+        """Compute the constrained losses."""
         parts = by_scene(output, rows, self.memories)
         return self._rule.constrained([self._rule.loss(o, r) for o, r in parts])
 
     def edit_step(self, proposed: ProposedStep) -> None:
-        """Projects the step."""
+        """Project the step."""
         names = list(proposed.changes)
         g = torch.stack([_flat(constraint, names) for constraint in proposed.constraints])
         references = self._references.to(g)
@@ -93,92 +93,91 @@ class ConstraintHooks(MemoryHooks):
 
 @dataclass(frozen=True)
 class AveragedGem(ConstrainedStep):
-    """A-GEM: the step may not raise the mean of the remembered losses."""
+    """A-GEM: a step may not raise the mean of the remembered losses."""
 
     citation: ClassVar[str] = "Chaudhry et al., Efficient lifelong learning with A-GEM, ICLR 2019"
 
     def constrained(self, losses: list[Tensor]) -> list[Tensor]:
-        """The mean alone."""
+        """Return the mean loss."""
         return [torch.stack(losses).mean()]
 
     def edit(
         self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
     ) -> Tensor:
-        """Takes out of the change what raises the mean loss."""
+        """Remove the component that raises the mean loss."""
         return nearest_change(changes, g, g.new_zeros(1))
 
 
 @dataclass(frozen=True)
 class Gem(ConstrainedStep):
-    """GEM: the step may not raise the loss of any remembered scene.
+    """GEM: a step may not raise the loss of any remembered scene.
 
-    The original keeps the dual variables above a margin, in units of SGD's gradient. Here a step
-    goes down every remembered loss by at least that share of its own length, whether or not it was
-    about to raise one: a constraint holds to first order, and without a margin what the step does
-    to second order adds up.
+    The original keeps the dual variables above a margin, in units of SGD's gradient. Here every
+    step is first moved down each remembered loss by a share of its own length. A constraint holds
+    to first order only, and without a margin second-order effects accumulate.
     """
 
     citation: ClassVar[str] = "Lopez-Paz and Ranzato, Gradient episodic memory, NeurIPS 2017"
     margin: float = 1.0
-    """Least length that is added against every gradient g_t, as a share of the step's."""
+    """Length added against every gradient g_t, as a share of the step's length."""
 
     def edit(
         self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
     ) -> Tensor:
-        """The nearest change with <g_t, u> <= 0 for every scene, beyond the margin."""
+        """Return the nearest change with <g_t, u> <= 0 for every scene, after the margin."""
         pushed = changes - self.margin * changes.norm() * F.normalize(g, dim=1).sum(0)
         return nearest_change(pushed, g, g.new_zeros(len(g)))
 
 
 @dataclass(frozen=True)
 class EpisodicConstraint(ConstrainedStep):
-    """GEC, several constraints, with the references of its appendix.
+    """GEC with several constraints and the references of its appendix.
 
-    With h_t = loss_t - (1 + slack) reference_t, the original asks <v, g_t> >= alpha h_t of a
-    gradient v and steps by -eta v; so a step u has <g_t, u> <= -alpha eta h_t. A remembered scene
-    whose loss has risen by over 5 % since it was learned must get better by that share of what it
-    lost, others may get worse by so much. Both sides are changes of a loss, so nothing has to be
-    normalised. The first steps are plain replay. The original's look-ahead step before each g_t is
-    left out: with one network trained at a rate that changes all the time it has no natural size.
+    With h_t = loss_t - (1 + slack) reference_t, the original requires <v, g_t> >= alpha h_t of a
+    gradient v and steps by -eta v. A step u therefore has <g_t, u> <= -alpha eta h_t. A scene whose
+    loss exceeds its reference by more than the slack must improve, other scenes may get worse. Both
+    sides are changes of a loss, so no normalisation is needed.
+
+    The first steps are plain replay. The original's look-ahead step before each g_t is omitted: it
+    has no natural size when the learning rate changes in every step.
     """
 
     citation: ClassVar[str] = "Lai et al., GEC, NeurIPS 2025, several constraints"
     alpha: float = 512.0
-    """Share of h_t that a step of unit length makes up for (no unit)."""
+    """Share of h_t that a step of unit length recovers (no unit)."""
     eta: float = 0.03
-    """The original's learning rate; here it is only the length that alpha is meant for."""
+    """The original's learning rate; here it only scales alpha."""
     slack: float = 0.05
     """Share by which a remembered loss may rise."""
     longest: float = 1.0
-    """What is added to a step is at most so long as the step itself. A scene whose rows all lie
-    beyond the clamp has lost much and has a short gradient: unbounded, it asks for a step that
-    destroys the network."""
+    """Largest added length, as a share of the step's length. A forgotten scene has a large loss and
+    a short gradient; without this limit the required step would destroy the network."""
     warm_steps: int = 5
     """Steps of plain replay at the start of a stage."""
     moving: bool = False
-    """Compare with the losses of the step before, as the original's Algorithm 1 does; then no step
-    may raise a loss by over 5 %, and nothing stops many small ones."""
+    """Compare with the losses of the previous step, as the original's Algorithm 1 does. Then no
+    single step may raise a loss by more than the slack, but many small rises are allowed."""
 
     def begin(self, start: StageStart) -> TrainingHooks:
-        """Constrained steps after the warm-up."""
+        """Constrain the steps after the warm-up, from the second scene on."""
         return _EpisodicHooks(self, start) if start.memories else TrainingHooks()
 
     def edit(
         self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
     ) -> Tensor:
-        """The nearest change with <g_t, u> <= -alpha eta h_t for every scene."""
+        """Return the nearest change with <g_t, u> <= -alpha eta h_t for every scene."""
         if proposed.step < self.warm_steps:
             return changes
         h = proposed.losses - (1 + self.slack) * references
-        # Warmed up and annealed like every other step: at the end nothing moves any more.
+        # The bound follows the learning rate, which ends at zero.
         most = -self.alpha * self.eta * proposed.schedule * h
-        known = torch.isfinite(h)
-        added = nearest_change(changes, g[known], most[known]) - changes
+        finite = torch.isfinite(h)
+        added = nearest_change(changes, g[finite], most[finite]) - changes
         limit = self.longest * changes.norm() / added.norm().clamp(min=1e-12)
         return changes + limit.clamp(max=1.0) * added
 
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
-        """`reference`: the loss on remembered rows as they are replayed."""
+        """Return `reference`, the loss on remembered rows as they are replayed."""
         buffer = scene.remembered()
         rows = buffer.draw(REFERENCE_ROWS, torch.Generator().manual_seed(scene.number))
         if scene.diffusion:
@@ -197,7 +196,7 @@ class _EpisodicHooks(ConstraintHooks):
             self._references = torch.full_like(self._references, torch.nan)
 
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
-        """Plain replay during the first steps, averaged over the scenes."""
+        """Compute plain replay in the first steps, averaged over the scenes."""
         if self._steps >= self._warm:
             return None
         return Reprojection()(output, None, rows, tau_px)
@@ -216,21 +215,21 @@ class _EpisodicHooks(ConstraintHooks):
 
 
 def nearest_change(changes: Tensor, g: Tensor, most: Tensor) -> Tensor:
-    """The change u nearest to a given one with <g_t, u> <= most_t for every t.
+    """Find the change u nearest to a given one with <g_t, u> <= most_t for every t.
 
     u = changes - sum_t lambda_t g_t with lambda >= 0. The dual, min 1/2 l'Gl - l'b with G = g g'
-    and b = g changes - most, is a least-squares problem in the root of G. Every constraint is
-    first divided by the length of its gradient, which changes nothing about what it allows.
+    and b = g changes - most, is a non-negative least-squares problem in the root of G. Constraints
+    are first divided by the length of their gradient, which does not change the solution.
 
     Args:
         changes: (p,).
         g: (t, p).
-        most: (t,) allowed increase of each loss.
+        most: (t,) largest increase of each loss.
     """
     if not len(g):
         return changes
     size = g.norm(dim=1)
-    some = size > 0  # what no change can alter asks for none
+    some = size > 0  # no change affects a loss without a gradient
     g, most = g[some] / size[some, None], most.to(g)[some] / size[some]
     over = (g @ changes - most).double().cpu().numpy()
     if (over <= 0).all():
@@ -239,12 +238,12 @@ def nearest_change(changes: Tensor, g: Tensor, most: Tensor) -> Tensor:
 
     gram = (g @ g.T).double().cpu().numpy()
     values, vectors = np.linalg.eigh(gram)
-    # Parallel constraints make G singular; this little keeps their answer finite.
+    # G is singular for parallel constraints; the offset keeps the solution finite.
     root = np.sqrt(np.maximum(values, 0) + 1e-9 * max(values.max(), 1e-12))
     weights, _ = nnls((vectors * root).T, (vectors / root).T @ over)
     return changes - torch.from_numpy(weights).to(g) @ g
 
 
 def _flat(named: Mapping[str, Tensor], names: Sequence[str]) -> Tensor:
-    """(p,) all tensors in the order of the names."""
+    """Concatenate tensors in the order of the names, (p,)."""
     return torch.cat([named[name].flatten() for name in names])

@@ -1,4 +1,4 @@
-"""Learning without forgetting: old answers are held on new images."""
+"""Learning without forgetting: distillation of the old head on new images."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -16,28 +16,27 @@ from evercal.continual.networks.hooks import TrainingHooks
 
 @dataclass(frozen=True)
 class LearningWithoutForgetting(Method):
-    """LwF for points: what the old scenes' outputs say about new images stays as it was.
+    """LwF for points: new rows with the code of an old scene keep the output of the old head.
 
-    A step asks the head about rows of the new scene as if they showed an earlier one, and holds the
-    points that the old head gave. That takes outputs of each scene's own (condition `code`); where
-    the image alone decides which scene answers, old and new answers to the same row contradict one
-    another.
+    Each step applies the head to rows of the new scene with the code of every earlier scene. The
+    loss is the distance to the points of the old head. This requires outputs per scene (condition
+    `code`); with condition `descriptor`, old and new targets of a row contradict each other.
     """
 
     citation: ClassVar[str] = "Li and Hoiem, Learning without forgetting, ECCV 2016"
     weight: float = 0.3
-    """What the distance of each earlier scene is multiplied by."""
+    """Weight of each earlier scene's distance."""
     px_per_m: float = PX_PER_M
     """Weight of the distance between old and new points, pixels per metre."""
 
     def begin(self, start: StageStart) -> TrainingHooks:
-        """Distillation on new rows; nothing for the first scene."""
+        """Distil on new rows, from the second scene on."""
         if start.teacher is None:
             return TrainingHooks()
-        return _OldAnswers(self, start.teacher, start.replay_rows)
+        return _DistillationHooks(self, start.teacher, start.replay_rows)
 
 
-class _OldAnswers(TrainingHooks):
+class _DistillationHooks(TrainingHooks):
     def __init__(self, method: LearningWithoutForgetting, teacher: Head, rows: int):
         self.method, self._teacher = method, teacher
         self._each = max(1, rows // teacher.scenes)
@@ -45,7 +44,7 @@ class _OldAnswers(TrainingHooks):
     def replayed(
         self, fresh: Rows, step: int, rate: float, generator: torch.Generator
     ) -> list[Rows]:
-        """New rows once more, each part as if it showed another earlier scene."""
+        """Draw new rows once more, one part with the index of each earlier scene."""
         parts = []
         for scene in range(self._teacher.scenes):
             size = len(fresh.scene), (self._each,)

@@ -1,8 +1,8 @@
-"""A continual-learning method: how scenes that come one after another share a network.
+"""The interface of a continual-learning method.
 
-A method is a frozen dataclass; its fields are its hyper-parameters, which results record. What it
-does is told by four functions: which keyframes stay, what is added to the training of a new scene,
-what is kept beside the keyframes, and whether the head is shared.
+A method is a frozen dataclass whose fields are its hyper-parameters; results record them. Functions
+select the keyframes, extend the training of a new scene, and compute what is stored beside the
+keyframes.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,89 +18,88 @@ from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
 
 MethodState = Mapping[str, Tensor]
-"""What a method keeps of a finished scene beside its keyframes: named tensors, stored with the
-scene and counted as memory."""
+"""Named tensors that a method stores with a finished scene; they count as memory."""
 
 
 @dataclass(frozen=True)
 class StageStart:
-    """A scene is about to be learned."""
+    """Inputs of a method before a scene is learned."""
 
     head: Head
-    """To be trained, with room for the new scene."""
+    """Head to train, already grown by the new scene."""
     teacher: Head | None
-    """A frozen copy as it was before; None for the first scene."""
+    """Frozen copy of the head before the stage; None for the first scene."""
     memories: Sequence[FeatureBuffer]
     """Rows of the keyframes of each remembered scene; empty if the method does not replay."""
     states: Sequence[MethodState]
-    """Of all earlier scenes in order."""
+    """States of all earlier scenes in order."""
     replay_rows: int
-    """Rows to replay in a step, of all remembered scenes together."""
+    """Rows to replay in a step, for all remembered scenes together."""
     seed: int
     """Random seed."""
 
 
 @dataclass(frozen=True)
 class FinishedScene:
-    """A scene was just learned."""
+    """Inputs of a method after a scene was learned."""
 
     head: Head
-    """As it is now."""
+    """The trained head."""
     number: int
-    """The scene's index in the head."""
+    """Index of the scene in the head."""
     rows: Callable[[], FeatureBuffer]
-    """Rows of the scene's training frames."""
+    """Returns the rows of the scene's training frames."""
     remembered: Callable[[], FeatureBuffer]
-    """Rows of the keyframes that stay, as they will be replayed: the plain views come first."""
+    """Returns the rows of the scene's keyframes as they will be replayed, plain views first."""
     keyframes: int
-    """How many keyframes stay, and plain views those rows begin with."""
+    """Number of keyframes, and of plain views at the start of these rows."""
     earlier: Sequence[MethodState]
-    """Of all earlier scenes in order."""
+    """States of all earlier scenes in order."""
     hooks: TrainingHooks | None
-    """Those of the stage; None where the scene was learned by plain training."""
+    """Hooks of the stage; None if the scene was learned by plain training."""
     diffusion: float = 0.0
-    """Noise on the descriptors of rows as they are replayed; 0 where the head sees none."""
+    """Noise on the descriptors of replayed rows; 0 if the head has no descriptor input."""
 
     def output(self, rows: Rows) -> HeadOutput:
-        """What the head says now about rows of this scene."""
+        """Apply the head to rows of this scene."""
         return self.head(rows.features.float(), self.number, rows.descriptor)
 
 
 @dataclass(frozen=True)
 class Method:
-    """Trains on the new scene alone and keeps nothing, unless a subclass says otherwise."""
+    """Base of all methods: trains on the new scene alone and stores nothing."""
 
     citation: ClassVar[str] = ""
-    """Where the rule comes from."""
+    """Source of the method."""
     replays: ClassVar[bool] = False
-    """Whether rows of remembered keyframes are needed while a scene is learned."""
+    """Whether training needs the rows of remembered keyframes."""
     head_per_scene: ClassVar[bool] = False
-    """Whether every scene gets a head of its own."""
+    """Whether every scene gets its own head."""
     first_scene_alike: ClassVar[bool] = True
-    """Whether the first scene is learned as any other method would."""
+    """Whether training on the first scene is the same for all such methods."""
 
     def select(self, frames: FrameStatistics, capacity: int) -> np.ndarray | None:
-        """Indices, in recorded order, of the frames that stay in memory; None keeps none."""
+        """Select the keyframes: sorted indices into the recorded frames, or None for no memory."""
         return None
 
     def begin(self, start: StageStart) -> TrainingHooks:
-        """What is added to the training of a new scene."""
+        """Create the hooks for the training of a new scene."""
         return TrainingHooks()
 
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
-        """What is kept of a finished scene beside its keyframes."""
+        """Compute what is stored beside the keyframes of a finished scene."""
         return {}
 
     def needed(self, states: Sequence[MethodState]) -> Sequence[MethodState]:
-        """Those of the states so far that later stages look at, and that count as memory."""
+        """Select the states that later stages use; only these count as memory."""
         return states
 
 
 def described(record: object) -> dict[str, object]:
-    """A dataclass as plain data: its class under `kind`, and its fields."""
+    """Convert a dataclass to plain data: its class name as `kind`, and its fields."""
     assert is_dataclass(record)
-    found: dict[str, object] = {"kind": type(record).__name__}
+    plain: dict[str, object] = {"kind": type(record).__name__}
     for field in fields(record):
         value = getattr(record, field.name)
-        found[field.name] = described(value) if is_dataclass(value) else value
-    return found
+        plain[field.name] = described(value) if is_dataclass(value) else value
+    return plain

@@ -1,4 +1,4 @@
-"""Maximally interfered retrieval: replay what a step on new rows is about to spoil."""
+"""Maximally interfered retrieval: replay of views that a step on new rows harms most."""
 
 import copy
 from collections.abc import Mapping
@@ -18,41 +18,41 @@ from evercal.continual.networks.loss import fixed_clamp_loss
 
 @dataclass(frozen=True)
 class MaximallyInterferedRetrieval(Replay):
-    """Views are replayed whose loss a virtual step on new rows raises most (Aljundi et al., 2019).
+    """MIR (Aljundi et al., 2019): replays the views whose loss a virtual step raises most.
 
-    A virtual step down the gradient of the new rows is taken; of some views drawn from memory,
-    those are replayed whose loss it raises most.
+    The virtual step follows the negative gradient of the new rows. Candidates are random views of
+    each remembered scene.
     """
 
     citation: ClassVar[str] = "Aljundi et al., Maximally interfered retrieval, NeurIPS 2019"
     candidates: int = 48
-    """Views of a scene that are looked at."""
+    """Candidate views per scene."""
     chosen: int = 8
-    """Views of a scene that are replayed until the next choice."""
+    """Views per scene that are replayed until the next selection."""
     view_rows: int = 64
-    """Rows by which a view is judged."""
+    """Rows from which a view's loss is estimated."""
     every_steps: int = 20
-    """How often views are chosen anew; the original chooses in every step."""
+    """Steps between selections; the original selects in every step."""
     clamp_px: float = 50.0
-    """Fixed soft clamp of the virtual step's loss and of those it raises, pixels: with a narrow one
-    a view that is lost already could not get worse."""
+    """Fixed soft clamp of the virtual step and its losses, pixels. It is wide, because under a
+    narrow clamp the loss of a forgotten view is constant."""
 
     def begin(self, start: StageStart) -> TrainingHooks:
-        """Replay of chosen views; nothing for the first scene."""
+        """Replay the selected views, from the second scene on."""
         return _MirHooks(self, start) if start.memories else TrainingHooks()
 
 
 class _MirHooks(ReplayHooks):
     def __init__(self, method: MaximallyInterferedRetrieval, start: StageStart):
         super().__init__(method, start)
-        self._rule, self._head, self._views = method, start.head, list[Tensor]()
+        self._options, self._head, self._views = method, start.head, list[Tensor]()
 
     def replayed(
         self, fresh: Rows, step: int, rate: float, generator: torch.Generator
     ) -> list[Rows]:
-        if step % self._rule.every_steps == 0 or not self._views:
+        if step % self._options.every_steps == 0 or not self._views:
             self._views = [
-                interfered_views(self._rule, self._head, fresh, memory, rate, generator)
+                interfered_views(self._options, self._head, fresh, memory, rate, generator)
                 for memory in self.memories
             ]
         rows = []
@@ -78,15 +78,18 @@ def interfered_views(
     rate: float,
     generator: torch.Generator,
 ) -> Tensor:
-    """(k,) numbers of the views that a step on new rows would spoil most.
+    """Select the views of a remembered scene that a step on new rows harms most.
 
     Args:
-        method: how many views and rows.
-        head: as it is; not changed.
-        fresh: new rows.
-        memory: rows of a remembered scene.
-        rate: of the virtual step, whose length is that of an optimiser with unit updates.
-        generator: of the draws.
+        method: Numbers of views and rows.
+        head: Current head; not changed.
+        fresh: New rows.
+        memory: Rows of the remembered scene.
+        rate: Root mean square change of each parameter in the virtual step.
+        generator: Source of the random draws.
+
+    Returns:
+        (k,) numbers of the views.
     """
     drawn = torch.randperm(memory.views, generator=generator, device="cpu")[: method.candidates]
     view = memory.tensors["view"].cpu()
@@ -100,18 +103,18 @@ def interfered_views(
     points = moved(fresh.features.float(), fresh.scene, fresh.descriptor).points
     cost, _ = fixed_clamp_loss(points, fresh.target, method.clamp_px)
     parameters = list(moved.parameters())
-    found = torch.autograd.grad(cost.mean(), parameters, materialize_grads=True)
+    gradients = torch.autograd.grad(cost.mean(), parameters, materialize_grads=True)
     with torch.no_grad():
-        for parameter, gradient in zip(parameters, found, strict=True):
+        for parameter, gradient in zip(parameters, gradients, strict=True):
             size = gradient.square().mean().sqrt().clamp(min=1e-12)
             parameter.sub_(rate * gradient / size)
-    spoiled = _losses(method, moved, rows, len(drawn)) - before
-    return drawn[spoiled.topk(min(method.chosen, len(drawn))).indices.cpu()]
+    harm = _losses(method, moved, rows, len(drawn)) - before
+    return drawn[harm.topk(min(method.chosen, len(drawn))).indices.cpu()]
 
 
 @torch.no_grad()
 def _losses(method: MaximallyInterferedRetrieval, head: Head, rows: Rows, views: int) -> Tensor:
-    """(views,) mean loss of each view's rows."""
+    """Compute the (views,) mean loss of each view's rows."""
     points = head(rows.features.float(), rows.scene, rows.descriptor).points
     loss, _ = fixed_clamp_loss(points, rows.target, method.clamp_px)
     return loss.view(views, -1).mean(1)

@@ -1,4 +1,4 @@
-"""What replaying remembered rows costs: small frozen dataclasses, one a rule."""
+"""Losses of replayed rows, each a small frozen dataclass."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -12,51 +12,57 @@ from evercal.continual.networks.head import HeadOutput
 from evercal.continual.networks.loss import LossOptions, fixed_clamp_loss, reprojection_loss
 
 PX_PER_M = 50.0
-"""Weight of a distance in scene coordinates, pixels per metre: about what a metre sideways is
-in the image at 5 m."""
+"""Weight of a distance in scene coordinates, pixels per metre. One metre sideways at a depth of 5 m
+is about as many pixels in the image."""
 
 
 @dataclass(frozen=True)
 class Penalty:
-    """What a replayed row costs; a subclass says how."""
+    """Loss of replayed rows; subclasses implement it."""
 
     needs_teacher: ClassVar[bool] = True
-    """Whether the output of the head before the stage is needed, which costs a forward pass."""
+    """Whether the output of the head before the stage is needed (one more forward pass)."""
 
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """Cost of replayed rows, pixels.
+        """Compute the loss in pixels.
 
         Args:
-            student: what the head says.
-            teacher: what the head said before the stage; None unless `needs_teacher`.
-            rows: the replayed rows.
-            tau_px: soft clamp of the loss on new rows in this step, pixels.
+            student: Output of the head.
+            teacher: Output of the head before the stage; None unless `needs_teacher`.
+            rows: The replayed rows.
+            tau_px: Soft clamp of the loss on new rows in this step, pixels.
         """
         raise NotImplementedError
 
 
+def _distance_m(student: HeadOutput, teacher: HeadOutput | None) -> Tensor:
+    """Compute the L1 distance (n,) between the points of both heads, metres."""
+    assert teacher is not None
+    return (student.points - teacher.points.detach()).abs().sum(-1)
+
+
 @dataclass(frozen=True)
 class Reprojection(Penalty):
-    """Remembered rows cost what new ones cost, the schedule of the clamp included."""
+    """The loss of new rows, with the same schedule of the clamp."""
 
     needs_teacher: ClassVar[bool] = False
 
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """Mean reprojection loss."""
+        """Compute the mean reprojection loss."""
         cost, _ = reprojection_loss(student.points, rows.target, tau_px, LossOptions())
         return cost.mean()
 
 
 @dataclass(frozen=True)
 class OldOutput(Penalty):
-    """iCaRL for points: reprojection, and the L1 distance to the old model's points.
+    """iCaRL for points: reprojection loss plus L1 distance to the old model's points.
 
-    Distillation of class scores becomes a distance in metres, on remembered rows only: what the old
-    model says about rows of a new scene means nothing.
+    The distillation of class scores becomes a distance in metres. It applies to remembered rows
+    only, because the old model's output for rows of a new scene is arbitrary.
     """
 
     px_per_m: float = PX_PER_M
@@ -65,18 +71,17 @@ class OldOutput(Penalty):
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """Mean of both."""
-        assert teacher is not None
-        drift = (student.points - teacher.points.detach()).abs().sum(-1).mean()
-        return Reprojection()(student, None, rows, tau_px) + self.px_per_m * drift
+        """Compute the mean of the sum."""
+        distance = _distance_m(student, teacher).mean()
+        return Reprojection()(student, None, rows, tau_px) + self.px_per_m * distance
 
 
 @dataclass(frozen=True)
 class BoundedByTeacher(Penalty):
-    """Buff-CS: half the truth, half the teacher where the teacher is nearer to the truth.
+    """Buff-CS: reprojection loss, and distance to the teacher where the teacher is more accurate.
 
-    The teacher is the model before the stage, where the original stores its outputs when a frame
-    enters the buffer.
+    The teacher is the model before the stage. The original stores its output when a frame enters
+    the buffer.
     """
 
     px_per_m: float = PX_PER_M
@@ -85,21 +90,22 @@ class BoundedByTeacher(Penalty):
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """Mean of both halves."""
+        """Compute the mean of both terms, each with weight 1/2."""
         assert teacher is not None
         _, error = fixed_clamp_loss(student.points, rows.target)
         _, bound = fixed_clamp_loss(teacher.points, rows.target)
-        drift = (student.points - teacher.points.detach()).abs().sum(-1)
-        pulled = torch.where(error > bound, drift, torch.zeros_like(drift)).mean()
-        truth = Reprojection()(student, None, rows, tau_px)
-        return 0.5 * truth + 0.5 * self.px_per_m * pulled
+        distance = _distance_m(student, teacher)
+        bounded = torch.where(error > bound, distance, torch.zeros_like(distance)).mean()
+        reprojection = Reprojection()(student, None, rows, tau_px)
+        return 0.5 * reprojection + 0.5 * self.px_per_m * bounded
 
 
 @dataclass(frozen=True)
 class StoredOutput(Penalty):
-    """DER++ for points: half the truth, half what was said when the scene was learned.
+    """DER++ for points: reprojection loss, and distance to the points stored with a scene.
 
-    The stored points belong to remembered frames as they are; augmented views have the truth alone.
+    Points are stored for plain views of remembered frames. Rows of augmented views have the
+    reprojection loss only.
     """
 
     needs_teacher: ClassVar[bool] = False
@@ -109,39 +115,39 @@ class StoredOutput(Penalty):
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """Mean of both halves."""
+        """Compute the mean of both terms, each with weight 1/2."""
         assert rows.stored is not None, "the method stores points when a scene is finished"
-        kept = ~rows.stored[:, 0].isnan()
-        drift = (student.points[kept] - rows.stored[kept]).abs().sum(-1)
-        held = drift.sum() / max(len(drift), 1)
-        truth = Reprojection()(student, None, rows, tau_px)
-        return 0.5 * truth + 0.5 * self.px_per_m * held
+        has_point = ~rows.stored[:, 0].isnan()
+        distance = (student.points[has_point] - rows.stored[has_point]).abs().sum(-1)
+        distance = distance.sum() / max(len(distance), 1)
+        reprojection = Reprojection()(student, None, rows, tau_px)
+        return 0.5 * reprojection + 0.5 * self.px_per_m * distance
 
 
 @dataclass(frozen=True)
 class Relations(Penalty):
-    """Co2L for points: the truth, and how alike rows are to one another.
+    """Co2L for points: reprojection loss, and similarity between rows.
 
-    The instance-wise relation distillation of Cha et al. (ICCV 2021): the Kullback-Leibler
-    divergence between softmaxed similarities of the old model's features and of the new one's, at
-    one temperature, so that agreement is free. Its contrastive loss takes classes and has no
-    counterpart.
+    The instance-wise relation distillation of Cha et al. (ICCV 2021) is the Kullback-Leibler
+    divergence between softmaxed feature similarities of the old and the new model. Here both have
+    one temperature, so equal models have no loss. The contrastive loss is omitted, because it needs
+    classes.
     """
 
     related_rows: int = 512
-    """Rows that are compared with one another, spread over all remembered scenes."""
+    """Rows that are compared with each other, evenly from all remembered scenes."""
     temperature: float = 0.2
-    """Of the softmax over cosines (no unit)."""
+    """Temperature of the softmax over cosines (no unit)."""
 
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """Mean reprojection loss and the divergence, nats."""
+        """Compute the mean reprojection loss plus the divergence in nats."""
         assert teacher is not None
-        # Rows come scene by scene; the first ones alone would all be of the oldest scene.
+        # Rows are ordered by scene, so an even spacing covers all scenes.
         count = len(student.hidden)
-        few, where = min(count, self.related_rows), student.hidden.device
-        chosen = torch.linspace(0, count - 1, few, device=where).round().long()
+        few, device = min(count, self.related_rows), student.hidden.device
+        chosen = torch.linspace(0, count - 1, few, device=device).round().long()
 
         def similarity(hidden: Tensor) -> Tensor:
             unit = torch.nn.functional.normalize(hidden[chosen], dim=-1)
@@ -150,18 +156,17 @@ class Relations(Penalty):
             return logits.log_softmax(-1)
 
         old, new = similarity(teacher.hidden.detach()), similarity(student.hidden)
-        moved = (old.exp() * (old - new)).sum(-1).mean()
-        return Reprojection()(student, None, rows, tau_px) + moved
+        divergence = (old.exp() * (old - new)).sum(-1).mean()
+        return Reprojection()(student, None, rows, tau_px) + divergence
 
 
 @dataclass(frozen=True)
 class AnchoredReprojection(Penalty):
-    """Geometric truth, and the teacher's points where they were right.
+    """Reprojection loss, and distance to the teacher's points where these were accurate.
 
-    Reprojection against the known poses with a tight, fixed clamp corrects itself, so errors do not
-    pile up from stage to stage. The L1 distance to the teacher's point holds the depth, which a
-    single reprojection does not see; it counts only where the teacher was right (after Buff-CS's
-    teacher-bounded regression, Wang et al., ICCV 2021).
+    Reprojection to the known poses with a tight, fixed clamp does not accumulate errors over
+    stages. The distance to the teacher constrains the depth, which a single projection does not
+    (after the teacher-bounded regression of Buff-CS, Wang et al., ICCV 2021).
     """
 
     clamp_px: float = 5.0
@@ -169,36 +174,35 @@ class AnchoredReprojection(Penalty):
     px_per_m: float = PX_PER_M
     """Weight of the distance to the teacher's points, pixels per metre."""
     teacher_limit_px: float = 10.0
-    """The teacher is right where it reprojects within so many pixels."""
+    """Reprojection error below which the teacher's point is used."""
 
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """Mean of both."""
+        """Compute the mean of the sum."""
         assert teacher is not None
         cost, _ = fixed_clamp_loss(student.points, rows.target, self.clamp_px)
         _, error = fixed_clamp_loss(teacher.points, rows.target, self.clamp_px)
-        drift = (student.points - teacher.points.detach()).abs().sum(-1)
-        held = torch.where(error < self.teacher_limit_px, drift, torch.zeros_like(drift))
-        return cost.mean() + self.px_per_m * held.mean()
+        distance = _distance_m(student, teacher)
+        anchored = torch.where(error < self.teacher_limit_px, distance, torch.zeros_like(distance))
+        return cost.mean() + self.px_per_m * anchored.mean()
 
 
 @dataclass(frozen=True)
 class Distillation(Penalty):
-    """SPDD, the whole replay cost of the paper (Algorithm 2): no truth, the teacher alone.
+    """SPDD, the complete replay loss of the paper (Algorithm 2), without reprojection.
 
-    Its terms are in nats and metres. The paper adds them up as they are; `scale` says how many
-    pixels of the loss on new rows one of them is worth.
+    Its terms are in nats and metres, which the paper adds without units.
     """
 
     options: SpddOptions = field(default_factory=SpddOptions)
     """Weights of the three terms, temperature and active set."""
     scale: float = 1.0
-    """Pixels per metre and per nat; 1 is the paper's."""
+    """Pixels per metre and per nat; the paper's value is 1."""
 
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """The weighted sum of the three terms."""
+        """Compute the weighted sum of the three terms."""
         assert teacher is not None
         return self.scale * spdd_loss(student, teacher, self.options).total

@@ -1,4 +1,4 @@
-"""Replay, and weight updates that leave alone what remembered scenes use."""
+"""Replay with steps that are damped along the inputs of remembered scenes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,22 +15,22 @@ from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
 
 ROWS = 8192
-"""Of every remembered scene."""
+"""Rows of a scene from which second moments are estimated."""
 
 
 @dataclass(frozen=True)
 class PreconditionedReplay(Replay):
-    """Anchored replay of SARS keyframes, and steps that spare what remembered scenes use."""
+    """Anchored replay of SARS keyframes with preconditioned steps."""
 
     citation: ClassVar[str] = "this project: anchored replay with preconditioned steps"
     selector: str = "sars_filled"
     penalty: Penalty = field(default_factory=AnchoredReprojection)
     weight: float = 0.5
     strength: float = 0.5
-    """How strongly steps spare the directions that each remembered scene uses; 0 not at all."""
+    """Damping of a step along the inputs of each remembered scene; 0 disables it."""
 
     def begin(self, start: StageStart) -> TrainingHooks:
-        """Replay with preconditioned steps; nothing for the first scene."""
+        """Replay with preconditioned steps, from the second scene on."""
         return _PreconditionedHooks(self, start) if start.memories else TrainingHooks()
 
 
@@ -39,75 +39,77 @@ class _PreconditionedHooks(ReplayHooks):
 
     def __init__(self, method: PreconditionedReplay, start: StageStart):
         super().__init__(method, start)
-        self._held = held_rows(start.head, start.memories)
-        seen = input_moments(start.head, start.memories, start.seed)
+        self._fixed = owned_rows(start.head, start.memories)
+        moments = input_moments(start.head, start.memories, start.seed)
         self._damping = {
             name: torch.linalg.inv(
                 torch.eye(len(moment), dtype=moment.dtype, device=moment.device)
                 + method.strength * moment
             ).float()
-            for name, moment in seen.items()
+            for name, moment in moments.items()
         }
 
     def edit_step(self, proposed: ProposedStep) -> None:
-        """Damps changes of shared matrices, and undoes those of what a remembered scene owns.
+        """Damp changes of shared matrices, and undo changes of rows owned by remembered scenes.
 
-        What belongs to one remembered scene alone (its code, logits and offsets) does not move:
-        trained on a few frames, it would fit those and lose the others. The matrices are shared.
-        Replay holds a scene where its few frames look; a matrix drifts in every other direction
-        that the scene's images use, too. With C_s the second moment of a layer's inputs over
-        replayed rows of scene s and c_s the mean of its diagonal, a change D of the matrix W
-        becomes D (I + strength sum_s C_s / c_s)^-1: what W says about inputs of remembered scenes
-        hardly moves, and directions that they leave free stay free for the new scene. The sum lets
-        every scene count alike however many there are, as precisions add up in sequential Laplace
-        approximations. A soft form of orthogonal weight modification (Zeng et al., Nature Machine
-        Intelligence 2019) and gradient projection memory (Saha et al., ICLR 2021); nothing is
-        stored for it, as C_s comes from the remembered frames.
+        The code, logits and offsets of a remembered scene are fixed, because training them on a few
+        keyframes would overfit. The matrices are shared. Replay constrains a matrix only on the
+        keyframes, and it may drift along other inputs of the scene.
+
+        C_s is the second moment of a layer's inputs over replayed rows of scene s, and c_s the mean
+        of its diagonal. A change D of the matrix becomes D (I + strength sum_s C_s / c_s)^-1.
+        Outputs for inputs of remembered scenes then hardly change, while unused directions stay
+        free for the new scene. Scenes have equal weight in the sum, like precisions in sequential
+        Laplace approximations.
+
+        This is a soft form of orthogonal weight modification (Zeng et al., Nature Machine
+        Intelligence 2019) and gradient projection memory (Saha et al., ICLR 2021). Nothing is
+        stored, because C_s is computed from the remembered frames.
         """
-        for name, where in self._held.items():
+        for name, where in self._fixed.items():
             proposed.changes[name][where] = 0.0
         for name, damping in self._damping.items():
             proposed.changes[name] = proposed.changes[name] @ damping
 
 
-def held_rows(head: Head, memories: Sequence[FeatureBuffer]) -> dict[str, Tensor]:
-    """By parameter name, the rows that remembered scenes own; none where centres are shared."""
+def owned_rows(head: Head, memories: Sequence[FeatureBuffer]) -> dict[str, Tensor]:
+    """Return the rows owned by remembered scenes, by parameter name; empty for shared centres."""
     if head.options.centres != "grow":
         return {}
     scenes = torch.tensor([memory.scene for memory in memories], device=head.centre_scene.device)
-    held = {"code": scenes}
+    owned = {"code": scenes}
     if head.options.offsets == "per_centre":
-        own = torch.nonzero(torch.isin(head.centre_scene, scenes))[:, 0]
-        held |= dict.fromkeys(("logit", "logit_bias", "offset", "offset_bias"), own)
-    return held
+        centres = torch.nonzero(torch.isin(head.centre_scene, scenes))[:, 0]
+        owned |= dict.fromkeys(("logit", "logit_bias", "offset", "offset_bias"), centres)
+    return owned
 
 
 def input_moments(
     head: Head, memories: Sequence[FeatureBuffer], seed: int, rows: int = ROWS
 ) -> dict[str, Tensor]:
-    """By weight name, the second moment of a layer's inputs, its mean diagonal 1 a scene; summed.
+    """Sum the second moments of each layer's inputs over scenes, with mean diagonal 1 per scene.
 
     Args:
-        head: as it is before the stage.
-        memories: rows of remembered scenes, one buffer each.
-        seed: of the rows that are looked at.
-        rows: of each scene.
+        head: Head before the stage.
+        memories: Rows of remembered scenes, one buffer each.
+        seed: Seed of the drawn rows.
+        rows: Number of rows drawn from each scene.
 
     Returns:
-        (inputs, inputs) double for every linear layer of the head.
+        (inputs, inputs) double for every linear layer, by weight name.
     """
     names = {m: f"{name}.weight" for name, m in head.named_modules() if isinstance(m, nn.Linear)}
-    used: dict[str, Tensor] = {}
+    moments: dict[str, Tensor] = {}
 
-    def look(layer: nn.Module, inputs: tuple[Tensor, ...], _: Tensor) -> None:
+    def accumulate(layer: nn.Module, inputs: tuple[Tensor, ...], _: Tensor) -> None:
         assert isinstance(layer, nn.Linear)
         x = inputs[0].double()
         moment = x.T @ x
         scaled = moment / (moment.trace() / len(moment)).clamp(min=1e-12)
         name = names[layer]
-        used[name] = used[name] + scaled if name in used else scaled
+        moments[name] = moments[name] + scaled if name in moments else scaled
 
-    handles = [layer.register_forward_hook(look) for layer in names]
+    handles = [layer.register_forward_hook(accumulate) for layer in names]
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for memory in memories:
@@ -115,4 +117,4 @@ def input_moments(
             head(drawn.features.float(), drawn.scene, drawn.descriptor)
     for handle in handles:
         handle.remove()
-    return used
+    return moments

@@ -1,4 +1,4 @@
-"""Gradient projection memory: steps stay out of the subspaces that earlier scenes use."""
+"""Gradient projection memory: steps are orthogonal to the inputs of earlier scenes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,43 +14,43 @@ from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
 
 OUTPUTS = "outputs"
-"""Names the basis of the last hidden layer, from which logits and offsets are read."""
+"""Name of the basis of the last hidden layer, the input of logits and offsets."""
 
 
 @dataclass(frozen=True)
 class GradientProjectionMemory(Method):
-    """GPM: a change of a matrix is freed of the directions in which earlier inputs vary.
+    """GPM: changes of a matrix are projected off the main input directions of earlier scenes.
 
-    Of a finished scene the main directions of every layer's inputs are kept, so many that they and
-    those kept before hold the given share of the squared inputs. Later changes are projected off
-    them; the original projects the gradient and steps with SGD. Biases, which the original's
-    networks lack, stay as the first scene left them. What an earlier scene owns alone (its code,
-    logits and offsets) does not move; outputs that scenes share are projected like a layer.
+    After each scene, the basis of every layer's inputs grows until it holds the given share of the
+    squared inputs. Later changes are projected off the basis after the optimisers; the original
+    projects the gradient and steps with SGD. Biases, which the original's networks lack, are fixed
+    after the first scene. Code, logits and offsets owned by an earlier scene are fixed, too.
+    Outputs that scenes share are projected like a layer.
     """
 
     citation: ClassVar[str] = "Saha et al., Gradient projection memory, ICLR 2021"
     kept_share: float = 0.9
-    """Share of the squared inputs that the kept directions hold."""
+    """Share of the squared inputs that the basis holds."""
 
     def begin(self, start: StageStart) -> TrainingHooks:
-        """Projected steps; nothing for the first scene."""
+        """Project the steps, from the second scene on."""
         return _ProjectedSteps(start) if start.states else TrainingHooks()
 
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
-        """`basis.NAME` (inputs, k) of every matrix, half precision: orthonormal columns."""
+        """Return `basis.NAME` (inputs, k) of every matrix: orthonormal columns, half precision."""
         before = scene.earlier[-1] if scene.earlier else {}
         buffer = scene.rows()
         moments = input_moments(scene.head, [buffer], scene.number)
         moments[OUTPUTS] = hidden_moment(scene.head, buffer)
-        found = {}
+        bases = {}
         for name, moment in moments.items():
-            none = moment.new_zeros(len(moment), 0)
-            old = before.get(f"basis.{name}", none).to(moment)
-            found[f"basis.{name}"] = grown_basis(old, moment, self.kept_share).half().cpu()
-        return found
+            empty = moment.new_zeros(len(moment), 0)
+            old = before.get(f"basis.{name}", empty).to(moment)
+            bases[f"basis.{name}"] = grown_basis(old, moment, self.kept_share).half().cpu()
+        return bases
 
     def needed(self, states: Sequence[MethodState]) -> Sequence[MethodState]:
-        """The newest bases hold all earlier ones."""
+        """Select the newest state, whose bases contain all earlier ones."""
         return states[-1:]
 
 
@@ -59,34 +59,34 @@ class _ProjectedSteps(TrainingHooks):
 
     def __init__(self, start: StageStart):
         head = start.head
-        found = {k.removeprefix("basis."): b for k, b in start.states[-1].items()}
-        # Stored in half precision, columns are orthonormal to three digits only.
-        bases: dict[str, Tensor] = {}
-        for name, basis in found.items():
-            bases[name] = torch.linalg.qr(basis.to(head.logit)).Q
+        # Columns stored in half precision are orthonormal to three digits only.
+        bases: dict[str, Tensor] = {
+            name.removeprefix("basis."): torch.linalg.qr(basis.to(head.logit)).Q
+            for name, basis in start.states[-1].items()
+        }
         outputs = bases.pop(OUTPUTS)
         shared = _shared_outputs(head)
         self._bases: dict[str, Tensor] = bases | dict.fromkeys(shared, outputs)
         layers = [k.removesuffix("weight") + "bias" for k in bases]
-        self._still = [*layers, *(f"{name}_bias" for name in shared)]
+        self._fixed = [*layers, *(f"{name}_bias" for name in shared)]
         earlier = len(start.states)
         own = torch.nonzero(head.centre_scene < earlier)[:, 0]
-        self._held = {"code": torch.arange(earlier, device=own.device)}
+        self._fixed_rows = {"code": torch.arange(earlier, device=own.device)}
         for name in {"logit", "offset"} - set(shared):
-            self._held |= {name: own, f"{name}_bias": own}
+            self._fixed_rows |= {name: own, f"{name}_bias": own}
 
     def edit_step(self, proposed: ProposedStep) -> None:
         changes = proposed.changes
-        for name, where in self._held.items():
+        for name, where in self._fixed_rows.items():
             changes[name][where] = 0.0
-        for name in self._still:
+        for name in self._fixed:
             changes[name].zero_()
         for name, basis in self._bases.items():
             changes[name] = changes[name] - (changes[name] @ basis) @ basis.T
 
 
 def _shared_outputs(head: Head) -> list[str]:
-    """Which of the outputs every scene uses, by parameter name."""
+    """Return the names of output parameters that all scenes share."""
     if head.options.condition == "descriptor":
         return ["logit", "offset"]
     return ["offset"] if head.options.offsets == "shared" else []
@@ -94,20 +94,22 @@ def _shared_outputs(head: Head) -> list[str]:
 
 @torch.no_grad()
 def hidden_moment(head: Head, buffer: FeatureBuffer) -> Tensor:
-    """(width, width) second moment of the last hidden layer over a scene's rows, double."""
+    """Compute the (width, width) second moment of the last hidden layer over a scene, double."""
     rows = buffer.draw(ROWS, torch.Generator().manual_seed(buffer.scene))
     hidden = head.hidden(rows.features.float(), rows.scene, rows.descriptor).double()
     return hidden.T @ hidden
 
 
 def grown_basis(old: Tensor, moment: Tensor, share: float) -> Tensor:
-    """(n, k) orthonormal columns: the old ones and as many new ones as it takes.
+    """Extend a basis by the fewest directions that reach a share of the squared inputs.
 
     Args:
         old: (n, j) orthonormal columns.
         moment: (n, n) second moment of a layer's inputs.
-        share: of the trace of `moment` that the columns together are to hold (equation 9 of the
-            paper).
+        share: Share of the trace of `moment` that the columns must hold (equation 9 of GPM).
+
+    Returns:
+        (n, k) orthonormal columns whose span contains the old ones.
     """
     total = moment.trace()
     held = torch.trace(old.T @ moment @ old) if old.shape[1] else total.new_zeros(())

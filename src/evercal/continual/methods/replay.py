@@ -1,7 +1,6 @@
-"""Experience replay: rows of remembered keyframes join every step and cost something.
+"""Experience replay: rows of remembered keyframes join every step with a loss of their own.
 
-Most methods here differ in nothing but which frames stay and what replaying them costs; those two
-are fields.
+Most methods differ only in the selected frames and the loss of replayed rows; both are fields.
 """
 
 from collections.abc import Sequence
@@ -24,22 +23,22 @@ from evercal.features.precision import autocast
 
 @dataclass(frozen=True)
 class EpisodicMemory(Method):
-    """Keeps keyframes whose rows join every step; a subclass says what they do there."""
+    """Base of methods that use keyframes during training."""
 
     replays: ClassVar[bool] = True
     selector: str = "reservoir"
-    """Which frames stay: a key of SELECTORS."""
+    """Rule that selects the keyframes: a key of SELECTORS."""
 
     def select(self, frames: FrameStatistics, capacity: int) -> np.ndarray | None:
-        """As the selector says."""
+        """Apply the selector."""
         return SELECTORS[self.selector](frames, capacity)
 
 
 class MemoryHooks(TrainingHooks):
-    """Draws the same number of rows of each remembered scene, at least one.
+    """Draws the same number of rows from each remembered scene, at least one.
 
     Args:
-        start: of the stage; it must have memories.
+        start: Start of the stage, with at least one memory.
     """
 
     def __init__(self, start: StageStart):
@@ -49,7 +48,7 @@ class MemoryHooks(TrainingHooks):
     def replayed(
         self, fresh: Rows, step: int, rate: float, generator: torch.Generator
     ) -> list[Rows]:
-        """As many rows of each remembered scene."""
+        """Draw rows of each remembered scene."""
         return [memory.draw(self.each, generator) for memory in self.memories]
 
 
@@ -59,14 +58,14 @@ class Replay(EpisodicMemory):
 
     citation: ClassVar[str] = "Vitter 1985; Chaudhry et al., On tiny episodic memories, 2019"
     penalty: Penalty = field(default_factory=Reprojection)
-    """What a replayed row costs."""
+    """Loss of replayed rows."""
     weight: float = 1.0
-    """What the penalty of each remembered scene is multiplied by."""
+    """Weight of the penalty of each remembered scene."""
     every_scene: bool = True
-    """Whether each remembered scene costs that much; False: all of them together."""
+    """Apply the weight to each remembered scene; if false, to all of them together."""
 
     def begin(self, start: StageStart) -> TrainingHooks:
-        """Replay from the stage's memories; nothing for the first scene."""
+        """Replay from the stage's memories, from the second scene on."""
         return ReplayHooks(self, start) if start.memories else TrainingHooks()
 
 
@@ -74,8 +73,8 @@ class ReplayHooks(MemoryHooks):
     """Adds the penalty of the replayed rows.
 
     Args:
-        method: what is replayed and at what cost.
-        start: of the stage; it must have memories.
+        method: Penalty and weight.
+        start: Start of the stage, with at least one memory.
     """
 
     def __init__(self, method: Replay, start: StageStart):
@@ -84,7 +83,7 @@ class ReplayHooks(MemoryHooks):
         self._teacher = start.teacher if method.penalty.needs_teacher else None
 
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
-        """The weighted penalty."""
+        """Compute the weighted penalty."""
         teacher = None if self._teacher is None else teacher_output(self._teacher, rows)
         scenes = len(self.memories) if self.method.every_scene else 1
         penalty = self.method.penalty(output, teacher, rows, tau_px)
@@ -92,7 +91,7 @@ class ReplayHooks(MemoryHooks):
 
 
 def teacher_output(teacher: Head, rows: Rows) -> HeadOutput:
-    """What a frozen head says about rows."""
+    """Apply a frozen head to rows."""
     with torch.no_grad(), autocast(rows.features.device):
         return teacher(rows.features.float(), rows.scene, rows.descriptor)
 
@@ -100,7 +99,7 @@ def teacher_output(teacher: Head, rows: Rows) -> HeadOutput:
 def by_scene(
     output: HeadOutput, rows: Rows, memories: Sequence[FeatureBuffer]
 ) -> list[tuple[HeadOutput, Rows]]:
-    """The replayed rows of each remembered scene, which come one scene after the other."""
+    """Split replayed rows by remembered scene; rows are ordered by scene."""
     each = len(rows.scene) // len(memories)
     slices = [slice(i * each, (i + 1) * each) for i in range(len(memories))]
     return [(output.part(where), rows.part(where)) for where in slices]
@@ -108,22 +107,22 @@ def by_scene(
 
 @dataclass(frozen=True)
 class DarkExperienceReplay(Replay):
-    """DER++ for points (Buzzega et al., NeurIPS 2020): keeps what was said about kept frames."""
+    """DER++ for points (Buzzega et al., NeurIPS 2020): stores output points of the keyframes."""
 
     citation: ClassVar[str] = "Buzzega et al., Dark experience (DER++), NeurIPS 2020"
     penalty: Penalty = field(default_factory=StoredOutput)
 
     def begin(self, start: StageStart) -> TrainingHooks:
-        """Replay with the stored points beside the rows of plain views."""
+        """Replay with the stored points of plain views."""
         for memory in start.memories:
             state = start.states[memory.scene]
             memory.stored = state["points"].float() + state["origin"]
         return super().begin(start)
 
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
-        """`points` (m, 3) half and `origin` (3,): what the head says now about plain views.
+        """Return `points` (m, 3) of plain views in half precision, and their mean `origin` (3,).
 
-        Half floats are fine enough near the origin, the mean of the points.
+        Points are stored relative to the origin, where half precision is sufficient.
         """
         buffer = scene.remembered()
         plain = int((buffer.tensors["view"] < scene.keyframes).sum())

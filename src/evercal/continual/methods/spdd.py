@@ -1,36 +1,16 @@
-"""SPDD: what a frozen teacher asks of a student on replayed rows (Algorithm 2 of the paper).
+"""SPDD, structure-preserving dual distillation (Algorithm 2 of the paper).
 
-No reprojection error is computed on replayed rows here: SPDD is the whole replay loss of the
-paper. Every term is summed over active centres and xyz and averaged over rows.
+SPDD is the complete replay loss of the paper; it contains no reprojection error. Every term is
+summed over active centres and coordinates and averaged over rows.
 """
-
-from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
-
-class CentreOutput(Protocol):
-    """What SPDD reads from a head's output for n rows and K cluster centres."""
-
-    @property
-    def logits(self) -> Tensor:
-        """``(n, K)`` scores of the centres; -inf marks a masked centre."""
-        ...
-
-    @property
-    def offsets(self) -> Tensor:
-        """``(n, K, 3)`` per centre or ``(n, 1, 3)`` shared, metres, already divided by scale."""
-        ...
-
-    @property
-    def points(self) -> Tensor:
-        """``(n, 3)`` scene coordinates, metres."""
-        ...
+from evercal.continual.networks.head import HeadOutput
 
 
 @dataclass(frozen=True)
@@ -46,10 +26,10 @@ class SpddOptions:
     temperature: float = 2.0
     """Softmax temperature tau of the prior term (no unit)."""
     active_centres: int = 50
-    """Largest number M_a of active centres per row; all that are alive in it where it has fewer."""
+    """Largest number M_a of active centres per row."""
 
     def __post_init__(self) -> None:
-        """Refuse settings that make no loss."""
+        """Check the values."""
         for name in ("prior_weight", "metric_weight", "output_weight"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
@@ -62,48 +42,42 @@ class SpddOptions:
 
 @dataclass(frozen=True)
 class SpddTerms:
-    """The parts of the loss, each a scalar; `total` is weighted, the others are not."""
+    """The terms of the loss, each a scalar without its weight, and their weighted sum."""
 
     prior: Tensor
+    """Divergence of centre probabilities, nats."""
     metric: Tensor
+    """Distance of offsets, metres."""
     output: Tensor
+    """Distance of points, metres."""
     total: Tensor
+    """Weighted sum."""
 
 
-def spdd_loss(student: CentreOutput, teacher: CentreOutput, options: SpddOptions) -> SpddTerms:
-    """Return the distillation loss of `student` against `teacher` on the same rows.
+def spdd_loss(student: HeadOutput, teacher: HeadOutput, options: SpddOptions) -> SpddTerms:
+    """Compute the distillation loss of a student against a teacher on the same rows.
 
-    The active set A of a row holds the teacher's M_a highest logits among the centres that are
-    alive in it, or all of those where there are fewer. The terms are
+    The active set A of a row contains its M_a highest teacher logits. A centre that either head
+    masks (logit -inf) is never active. The terms are
 
-    - prior: ``tau^2 KL(p_T || p_S)``. Teacher: ``p_T = softmax(z_T / tau)`` over A. Student:
-      softmax over A and, if it has more centres than the teacher, over its new centres N too::
-
-          p_S,i = exp(z_S,i / tau) / sum over j in A and N of exp(z_S,j / tau)
-
-      which equals the paper's term plus ``tau^2 * -log(share of A in A and N)``. Both parts are
-      >= 0: probability that the student moves from A to new centres costs, and pulls their
-      logits down on old rows. Without new centres it is exactly the paper's term. Normalising
-      over *all* of the student's centres is not done: it would charge ``-log p_S(A)`` to a
-      student that equals its teacher and sharpen what the teacher left broad. So, as in the
-      paper, old centres outside A are free here; only the output term sees them.
-    - metric: ``|Delta_S - Delta_T|`` at A, per_centre offsets; of the one offset if shared.
+    - prior: ``tau^2 KL(p_T || p_S)``. The teacher's softmax ``p_T`` is over A. The student's
+      softmax ``p_S`` is over A and over the centres N that the teacher does not have. With s the
+      student's probability of A within A and N, this equals the paper's term plus
+      ``-tau^2 log s``, which lowers the logits of new centres on old rows. Without new centres it
+      is the paper's term. Old centres outside A are free, as in the paper.
+    - metric: ``|Delta_S - Delta_T|`` at A with per-centre offsets, or of the single shared offset.
     - output: ``|x_S - x_T|``.
 
-    New centres are appended: centre k of the teacher is centre k of the student. A centre that
-    either of them masks (logit -inf) is never active; a row in which none is left adds nothing to
-    the prior term nor, for per_centre offsets, to the metric term. NaN in an input stays NaN.
+    Centre k of the teacher is centre k of the student; new centres follow. A row without active
+    centres has no prior term, and no metric term with per-centre offsets. NaN propagates.
 
     Args:
-        student: output with gradients, K_student >= K_teacher centres.
-        teacher: output for the same rows; detached here.
-        options: weights, temperature and size of the active set.
-
-    Returns:
-        The three terms (nats, metres, metres) and their weighted sum; 0 for no rows.
+        student: Output with gradients, K_student >= K_teacher centres.
+        teacher: Output for the same rows; detached here.
+        options: Weights, temperature and size of the active set.
 
     Raises:
-        ValueError: shapes that do not belong together.
+        ValueError: The shapes are inconsistent.
     """
     shared = _check_shapes(student, teacher)
     rows, old = teacher.logits.shape
@@ -135,27 +109,27 @@ def spdd_loss(student: CentreOutput, teacher: CentreOutput, options: SpddOptions
 def _prior(
     student_logits: Tensor, best: torch.return_types.topk, old: int, temperature: float
 ) -> Tensor:
-    """Return ``(n, M_a)`` summands of ``tau^2 KL(p_T || p_S)``; 0 at masked centres."""
+    """Return the ``(n, M_a)`` summands of ``tau^2 KL(p_T || p_S)``; 0 at masked centres."""
     dead = torch.isneginf(best.values)
     target = _log_softmax(best.values / temperature)
-    wanted = torch.cat([student_logits.gather(1, best.indices), student_logits[:, old:]], dim=1)
-    # A dead centre may be alive in one of the two: it must not take part in either softmax.
-    beyond = torch.isneginf(wanted)
-    beyond[:, : dead.shape[1]] |= dead
-    found = _log_softmax(wanted.masked_fill(beyond, -torch.inf) / temperature)
-    gain = target - found[:, : dead.shape[1]]
-    return (temperature**2 * target.exp() * gain).masked_fill(dead, 0.0)
+    logits = torch.cat([student_logits.gather(1, best.indices), student_logits[:, old:]], dim=1)
+    # A centre that only one head masks must not take part in either softmax.
+    excluded = torch.isneginf(logits)
+    excluded[:, : dead.shape[1]] |= dead
+    student = _log_softmax(logits.masked_fill(excluded, -torch.inf) / temperature)
+    gap = target - student[:, : dead.shape[1]]
+    return (temperature**2 * target.exp() * gap).masked_fill(dead, 0.0)
 
 
 def _log_softmax(logits: Tensor) -> Tensor:
-    """Log-softmax over dim 1 that stays finite where logits are -inf (probability still 0)."""
-    # -inf would give 0 * inf in the KL and NaN in its gradient; exp of this is 0 just as well.
+    """Compute a log-softmax over dim 1 that is finite for logits of -inf (probability 0)."""
+    # With -inf, the KL and its gradient would contain 0 * inf.
     floor = torch.finfo(logits.dtype).min / 8
     return logits.masked_fill(torch.isneginf(logits), floor).log_softmax(dim=1)
 
 
-def _check_shapes(student: CentreOutput, teacher: CentreOutput) -> bool:
-    """Return whether offsets are shared; raise ValueError if the outputs do not fit."""
+def _check_shapes(student: HeadOutput, teacher: HeadOutput) -> bool:
+    """Return whether offsets are shared; raise ValueError for inconsistent shapes."""
     rows, old = teacher.logits.shape
     total = student.logits.shape[1]
     if student.logits.shape[0] != rows:

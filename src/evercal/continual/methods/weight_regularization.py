@@ -1,7 +1,7 @@
-"""Weights are tied to where they were, each by how much it mattered: EWC, SI, MAS.
+"""EWC, SI and MAS: weights are tied to earlier values in proportion to their importance.
 
-Importances are scaled to mean 1, so that one strength means the same for all of them. Rows of the
-parameters that later scenes append are free.
+Importances are scaled to mean 1, so a strength has the same meaning for all methods. Parameter rows
+that later scenes append are free.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,44 +18,44 @@ from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
 from evercal.continual.networks.loss import fixed_clamp_loss
 
 IMAGE_ROWS = 256
-"""Of each image whose gradient is taken."""
+"""Rows of each image from which a gradient is computed."""
 MEAN_ROWS = 8192
-"""By which the mean of a scene's points is told."""
+"""Rows from which the mean of a scene's points is estimated."""
 
 
 @dataclass(frozen=True)
 class WeightRegularization(Method):
-    """What the three share: cost = strength / 2 x mean over weights of sum_s I_s (w - w_s)^2."""
+    """Base of the three, with cost strength / 2 x mean over weights of sum_s I_s (w - w_s)^2."""
 
     strength: float = 1e6
-    """What the mean squared change costs, weighted by importances of mean 1."""
+    """Weight of the mean squared change, weighted by importances of mean 1."""
     running: bool = False
-    """Keep one running sum of importances and the newest weights, not one of each per scene."""
+    """Use one running sum of importances and the newest weights instead of a pair per scene."""
     decay: float = 0.9
-    """Of the running sum with every scene."""
+    """Factor of the running sum with every scene."""
     images: int = 200
-    """Drawn from the finished scene for its importances."""
+    """Images of the finished scene from which importances are computed."""
 
     def begin(self, start: StageStart) -> TrainingHooks:
-        """The cost of moving; nothing for the first scene."""
+        """Add the cost of changing weights; it is zero for the first scene."""
         return _TiedWeights(self, start)
 
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
-        """`anchor.NAME` and `importance.NAME` of every parameter, half precision."""
-        found = scaled_to_mean_one(self.importance(scene))
+        """Return `anchor.NAME` and `importance.NAME` of every parameter, half precision."""
+        importances = scaled_to_mean_one(self.importance(scene))
         if self.running and scene.earlier:
-            for name, value in found.items():
+            for name, value in importances.items():
                 old = scene.earlier[-1][f"importance.{name}"].to(value)
                 value[: len(old)] += self.decay * old
         anchors = {f"anchor.{k}": _half(v.detach()) for k, v in scene.head.named_parameters()}
-        return anchors | {f"importance.{k}": _half(v) for k, v in found.items()}
+        return anchors | {f"importance.{k}": _half(v) for k, v in importances.items()}
 
     def needed(self, states: Sequence[MethodState]) -> Sequence[MethodState]:
-        """The newest alone where there is a running sum."""
+        """Select the newest state if there is a running sum, else all."""
         return states[-1:] if self.running else states
 
     def importance(self, scene: FinishedScene) -> dict[str, Tensor]:
-        """How much every weight mattered for a finished scene, by parameter name."""
+        """Compute the importance of every weight for a finished scene, by parameter name."""
         raise NotImplementedError
 
 
@@ -71,11 +71,11 @@ class _TiedWeights(TrainingHooks):
 
 
 def tie_cost(head: Head, ties: Sequence[Mapping[str, tuple[Tensor, Tensor]]]) -> Tensor:
-    """Half the mean over weights of sum_s I_s (w - w_s)^2.
+    """Compute half the mean over weights of sum_s I_s (w - w_s)^2.
 
     Args:
-        head: as it is.
-        ties: for each earlier scene, by parameter name: anchor and importance, for its first rows.
+        head: Current head.
+        ties: For each earlier scene, by parameter name: anchor and importance of the first rows.
     """
     cost = torch.zeros((), device=head.centres.device)
     count = 0
@@ -98,14 +98,14 @@ def _ties(state: MethodState, head: Head) -> dict[str, tuple[Tensor, Tensor]]:
 class ElasticWeightConsolidation(WeightRegularization):
     """EWC: importance is the diagonal of the empirical Fisher information.
 
-    At the clamp of the end (a Laplace-like likelihood): the mean over images of the squared
-    gradient of an image's mean loss. `running` is the online form (Schwarz et al., ICML 2018).
+    It is the mean over images of the squared gradient of an image's mean loss, with a fixed clamp
+    (a Laplace-like likelihood). `running` is the online form (Schwarz et al., ICML 2018).
     """
 
     citation: ClassVar[str] = "Kirkpatrick et al., PNAS 2017; online: Schwarz et al., ICML 2018"
 
     def importance(self, scene: FinishedScene) -> dict[str, Tensor]:
-        """Mean squared gradients."""
+        """Compute mean squared gradients."""
 
         def loss(rows: Rows) -> Tensor:
             points = scene.output(rows).points
@@ -116,10 +116,10 @@ class ElasticWeightConsolidation(WeightRegularization):
 
 @dataclass(frozen=True)
 class MemoryAwareSynapses(WeightRegularization):
-    """MAS: importance is how much the squared length of the output reacts to a weight.
+    """MAS: importance is the sensitivity of the squared output length to a weight.
 
-    The output is the predicted point, from the mean of the points predicted for the scene: its
-    length in the atlas would only tell where the scene lies.
+    The output is the predicted point relative to the mean point of the scene. Its length in the
+    atlas would depend on the position of the scene.
     """
 
     citation: ClassVar[str] = "Aljundi et al., Memory aware synapses, ECCV 2018"
@@ -127,7 +127,7 @@ class MemoryAwareSynapses(WeightRegularization):
     decay: float = 1.0
 
     def importance(self, scene: FinishedScene) -> dict[str, Tensor]:
-        """Mean absolute gradients."""
+        """Compute mean absolute gradients."""
         buffer = scene.rows()
 
         def points(rows: Rows) -> Tensor:
@@ -145,10 +145,10 @@ class MemoryAwareSynapses(WeightRegularization):
 
 @dataclass(frozen=True)
 class SynapticIntelligence(WeightRegularization):
-    """SI: importance is the share of the fall of the loss that a weight's path brought about.
+    """SI: importance is a weight's contribution to the fall of the loss.
 
-    With every step the product of gradient and change is added up; in the end it is divided by the
-    squared way from start to end. What the optimisers really changed is what counts.
+    The product of gradient and applied change is summed over the steps, then divided by the squared
+    distance from start to end.
     """
 
     citation: ClassVar[str] = "Zenke et al., Continual learning through SI, ICML 2017"
@@ -157,14 +157,14 @@ class SynapticIntelligence(WeightRegularization):
     running: bool = True
     decay: float = 1.0
     damping: float = 0.1
-    """Added to the squared way, as a share of its mean."""
+    """Added to the squared distance, as a share of its mean."""
 
     def begin(self, start: StageStart) -> TrainingHooks:
-        """Adds up the path, from the first scene on."""
+        """Accumulate the path, from the first scene on."""
         return _PathIntegral(self, start)
 
     def importance(self, scene: FinishedScene) -> dict[str, Tensor]:
-        """Path integrals over squared ways."""
+        """Divide path integrals by squared distances."""
         assert isinstance(scene.hooks, _PathIntegral)
         return scene.hooks.importance(scene.head)
 
@@ -180,9 +180,9 @@ class _PathIntegral(_TiedWeights):
         self._first = {name: value.detach().clone() for name, value in named.items()}
 
     def edit_step(self, proposed: ProposedStep) -> None:
-        """Adds gradient x change to the path; the step stays as it is.
+        """Add gradient x change to the path, without editing the step.
 
-        The gradient is that of the new rows alone: the part of the ties is taken off again.
+        The gradient is that of the new rows, so the gradient of the ties is subtracted.
         """
         named = dict(self._head.named_parameters())
         count = sum(value.numel() for value in named.values())
@@ -196,11 +196,12 @@ class _PathIntegral(_TiedWeights):
             self._path[name] -= gradient * proposed.changes[name]
 
     def importance(self, head: Head) -> dict[str, Tensor]:
-        """max(path, 0) / (way^2 + damping x mean way^2), by parameter name."""
-        ways = {k: (v.detach() - self._first[k]).square() for k, v in head.named_parameters()}
-        mean = sum(float(w.sum()) for w in ways.values()) / sum(w.numel() for w in ways.values())
+        """Compute max(path, 0) / (distance^2 + damping x mean distance^2), by parameter name."""
+        squared = {k: (v.detach() - self._first[k]).square() for k, v in head.named_parameters()}
+        count = sum(value.numel() for value in squared.values())
+        mean = sum(float(value.sum()) for value in squared.values()) / count
         floor = max(self._damping * mean, 1e-30)
-        return {k: self._path[k].clamp(min=0) / (way + floor) for k, way in ways.items()}
+        return {k: self._path[k].clamp(min=0) / (value + floor) for k, value in squared.items()}
 
     def state(self) -> dict[str, Tensor]:
         return {f"path.{k}": v for k, v in self._path.items()} | {
@@ -221,7 +222,18 @@ def mean_over_images(
     value: Callable[[Rows], Tensor],
     size: Callable[[Tensor], Tensor],
 ) -> dict[str, Tensor]:
-    """By parameter name, the mean over images of the size of the gradient of a value."""
+    """Average a function of gradients over images.
+
+    Args:
+        head: Head with the parameters.
+        buffer: Rows of the images.
+        images: Number of images to draw.
+        value: Scalar of an image's rows that is differentiated.
+        size: Function of the gradient, such as its square.
+
+    Returns:
+        Means by parameter name.
+    """
     generator = torch.Generator().manual_seed(buffer.scene)
     parameters = dict(head.named_parameters())
     total = {name: torch.zeros_like(p) for name, p in parameters.items()}
@@ -230,16 +242,16 @@ def mean_over_images(
     for number in drawn.tolist():
         index = torch.nonzero(view == number)[:, 0]
         some = torch.randint(len(index), (IMAGE_ROWS,), generator=generator, device="cpu")
-        found = torch.autograd.grad(
+        gradients = torch.autograd.grad(
             value(buffer.rows(index[some])), list(parameters.values()), materialize_grads=True
         )
-        for name, gradient in zip(parameters, found, strict=True):
+        for name, gradient in zip(parameters, gradients, strict=True):
             total[name] += size(gradient) / len(drawn)
     return total
 
 
 def scaled_to_mean_one(importance: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The importances, divided by their mean over all weights."""
+    """Divide importances by their mean over all weights."""
     count = sum(value.numel() for value in importance.values())
     mean = sum(float(value.sum()) for value in importance.values()) / count
     return {name: value / max(mean, 1e-30) for name, value in importance.items()}

@@ -1,1 +1,1 @@
-"""Fitting a scene-coordinate head to rows of features; knows no method."""
+"""The scene-coordinate network and its training, independent of any continual-learning method."""

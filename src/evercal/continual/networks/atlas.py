@@ -23,25 +23,25 @@ class Cell:
     centre_m: tuple[float, float, float]
     """Atlas coordinates of the scene's mean camera position."""
     side_m: float
-    """Side of the square around it, in x and y."""
+    """Side of the square in x and y."""
     origin_m: tuple[float, float, float]
     """Mean camera position in the scene's own base frame."""
 
     @property
     def atlas_from_base(self) -> SE3:
-        """A pure shift."""
+        """Translation from the scene's base frame into the atlas."""
         shift = np.subtract(self.centre_m, self.origin_m)
         return SE3(np.array([1.0, 0.0, 0.0, 0.0]), shift)
 
 
 class Atlas:
-    """Cells in order of arrival.
+    """Cells in the order of their scenes.
 
     Args:
-        layout: `open` (default) walks a square spiral and takes the first free place that is large
-            enough, so no scene need be known in advance. `paper` is GLACE's grid: scene i of n goes
-            to 5 m (-row, -column, 0) with ceil(sqrt(n)) columns.
-        expected: n for the layout `paper`.
+        layout: `open` assigns the first free position of a square spiral that is large enough, so
+            scenes need not be known in advance. `paper` is GLACE's grid: with ceil(sqrt(n))
+            columns, the cell of scene i lies at 5 m (-row, -column, 0).
+        expected: Number of scenes n in the layout `paper`.
     """
 
     def __init__(self, layout: Literal["open", "paper"] = "open", expected: int = 0):
@@ -49,24 +49,21 @@ class Atlas:
         self.cells: list[Cell] = []
 
     def place(self, positions_m: np.ndarray) -> Cell:
-        """Gives a new scene its cell.
+        """Assign a cell to a new scene.
 
         Args:
             positions_m: (n, 3) camera positions in the scene's base frame.
 
-        Returns:
-            The cell, already part of the atlas.
-
         Raises:
-            InputError: layout `paper` and more scenes than expected.
+            InputError: Layout `paper` has no cell left.
         """
         origin = positions_m.mean(axis=0)
         side = max(MIN_CELL_M, 2.0 * float(np.ptp(positions_m, axis=0).max()))
         if self.layout == "paper":
             if len(self.cells) >= self.expected:
                 raise InputError(
-                    f"atlas: its paper layout was made for {self.expected} scenes and is full; "
-                    "expect more, or use the open layout"
+                    f"atlas: the paper layout is full with {self.expected} scenes; expect more"
+                    " scenes, or use the open layout"
                 )
             centre, side = paper_grid(self.expected)[len(self.cells)], MIN_CELL_M
         else:
@@ -84,7 +81,7 @@ class Atlas:
         )
 
     def scene_at(self, position_m: np.ndarray) -> int | None:
-        """Index of the scene whose cell holds an atlas position (3,); None outside all cells."""
+        """Return the index of the scene whose cell contains an atlas position (3,), or None."""
         for i, cell in enumerate(self.cells):
             if np.abs(position_m[:2] - cell.centre_m[:2]).max() <= cell.side_m / 2:
                 return i
@@ -92,7 +89,11 @@ class Atlas:
 
 
 def camera_clusters(positions_m: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """(k, 3) means of camera positions (n, 3); k is `count`, or the number of spots if less."""
+    """Cluster camera positions (n, 3) by k-means.
+
+    Returns:
+        (k, 3) means. k is `count`, or the number of distinct positions if that is smaller.
+    """
     from scipy.cluster.vq import kmeans2
 
     if count == 1:
@@ -105,23 +106,23 @@ def camera_clusters(positions_m: np.ndarray, count: int, seed: int) -> np.ndarra
 def combined_centres(
     positions_m: Sequence[np.ndarray], count: int, seed: int
 ) -> tuple[tuple[float, float, float], ...]:
-    """Cluster centres for all scenes in the paper's layout, known before the first is learned.
+    """Compute the cluster centres of all scenes in the paper's layout.
 
-    As in GLACE, k-means of the camera positions of all scenes together.
+    As in GLACE, k-means runs on the camera positions of all scenes together.
 
     Args:
         positions_m: (n, 3) camera positions of each scene in its base frame.
-        count: centres of all scenes together (K of the paper).
-        seed: of the k-means.
+        count: Centres of all scenes together (K of the paper).
+        seed: Seed of the k-means.
     """
     atlas = Atlas("paper", len(positions_m))
-    placed = [atlas.place(positions).atlas_from_base.apply(positions) for positions in positions_m]
-    means = camera_clusters(np.concatenate(placed), count, seed)
+    in_atlas = [atlas.place(scene).atlas_from_base.apply(scene) for scene in positions_m]
+    means = camera_clusters(np.concatenate(in_atlas), count, seed)
     return tuple((float(x), float(y), float(z)) for x, y, z in means)
 
 
 def spiral() -> Iterator[np.ndarray]:
-    """Points of a square spiral around the origin, 5 m apart, for ever."""
+    """Yield the points of an endless square spiral around the origin, 5 m apart."""
     x = y = 0
     dx, dy, leg = 1, 0, 1
     while True:
@@ -134,7 +135,7 @@ def spiral() -> Iterator[np.ndarray]:
 
 
 def paper_grid(count: int) -> np.ndarray:
-    """(count, 3) cell centres of GLACE's combined scenes, metres."""
+    """Return the (count, 3) cell centres of GLACE's combined scenes, metres."""
     columns = math.ceil(math.sqrt(count))
     i = np.arange(count)
     row = -(-(i + 1) // columns) - 1

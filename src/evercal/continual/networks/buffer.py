@@ -1,6 +1,6 @@
-"""The feature buffer: the frozen encoder runs once, its rows are trained on many times."""
+"""The feature buffer: the frozen encoder runs once, then training draws rows many times."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,14 +17,14 @@ from evercal.features.views import View, ViewOptions, augmented_view, frame_view
 from evercal.geometry.se3 import SE3
 from evercal.recordings.frame import Frame
 
-UNBEND_STEPS = 10
-SPARE_SHARE = 0.25
-"""Of a GPU's memory, for all that is no feature row: weights, activations, the encoder."""
+UNDISTORT_STEPS = 10
+RESERVED_SHARE = 0.25
+"""Share of a GPU's memory that rows may not fill: room for weights, activations, the encoder."""
 
 
 @dataclass
 class Rows:
-    """A batch of feature rows with all that a loss needs."""
+    """A batch of feature rows with their observations."""
 
     features: Tensor
     """(n, channels)."""
@@ -33,55 +33,45 @@ class Rows:
     descriptor: Tensor
     """(n, width) descriptor of each row's image."""
     target: Target
-    """Where each row must project to."""
+    """Observation of each row."""
     index: Tensor
-    """(n,) position in the buffer, for what is stored beside it."""
+    """(n,) position in the buffer."""
     stored: Tensor | None = None
-    """(n, 3) points that a head once gave to these rows, NaN where none were kept."""
+    """(n, 3) stored output points of an earlier head; NaN for rows without one."""
+
+    def _mapped(self, change: Callable[[Tensor], Tensor]) -> "Rows":
+        t = self.target
+        return Rows(
+            change(self.features),
+            change(self.scene),
+            change(self.descriptor),
+            Target(change(t.pixels), change(t.intrinsics), change(t.camera_from_atlas)),
+            change(self.index),
+            None if self.stored is None else change(self.stored),
+        )
 
     def part(self, where: slice | Tensor) -> "Rows":
-        """The rows of a slice, or at an index (m,)."""
-        t = self.target
-        target = Target(t.pixels[where], t.intrinsics[where], t.camera_from_atlas[where])
-        return Rows(
-            self.features[where],
-            self.scene[where],
-            self.descriptor[where],
-            target,
-            self.index[where],
-            None if self.stored is None else self.stored[where],
-        )
+        """Return the rows of a slice, or at indices (m,)."""
+        return self._mapped(lambda value: value[where])
 
     def to(self, device: torch.device) -> "Rows":
-        """The same on a device; copies from pinned memory to a GPU run beside other work."""
+        """Copy to a device; copies from pinned memory to a GPU are asynchronous."""
         if self.features.device == device:
             return self
-        beside = device.type == "cuda"
-
-        def moved(value: Tensor) -> Tensor:
-            return value.to(device, non_blocking=beside)
-
-        return Rows(
-            moved(self.features),
-            moved(self.scene),
-            moved(self.descriptor),
-            self.target.to(device, beside),
-            moved(self.index),
-            None if self.stored is None else moved(self.stored),
-        )
+        return self._mapped(lambda v: v.to(device, non_blocking=device.type == "cuda"))
 
 
 class FeatureBuffer:
     """Feature rows of one scene, with poses and cameras in a side table (one entry per view).
 
-    Rows that are added gather on the CPU. When they are asked for they go to `device` as a whole;
-    where a GPU has no room for them they stay, and those that are drawn are copied to it.
+    Added rows accumulate on the CPU. On first use all rows move to `device`. If a GPU has no room
+    for them, they stay on the CPU and drawn rows are copied.
 
     Args:
-        scene: index of the scene in the atlas.
-        atlas_from_base: where the scene's base frame lies in the atlas.
-        correctable: one camera took all frames, and its distortion is not known.
-        device: where rows that are drawn lie.
+        scene: Index of the scene in the head.
+        atlas_from_base: Position of the scene's base frame in the atlas.
+        correctable: One camera took all frames, and its distortion is unknown.
+        device: Device of drawn rows.
     """
 
     def __init__(
@@ -96,26 +86,26 @@ class FeatureBuffer:
         self.views = 0
         self._stored: Tensor | None = None
         self._parts: list[dict[str, Tensor]] = []
-        self._taken = 0
+        self._saved = 0  # leading parts that `take_new` has returned
         self._merged: dict[str, Tensor] | None = None
 
     def add(
         self, views: Sequence[View], features: Tensor, descriptors: Tensor, keep: Tensor
     ) -> None:
-        """Appends encoded views.
+        """Append encoded views.
 
         Args:
             views: b views.
             features: (b, channels, h, w), on any device.
             descriptors: (b, width), on any device.
-            keep: (b, cells) bool: the cells whose rows stay.
+            keep: (b, cells) bool, cells whose rows are added.
         """
-        self._append(self._part(self.views, views, (features, descriptors), keep))
+        self.append(self.part(self.views, views, (features, descriptors), keep))
 
-    def _part(
+    def part(
         self, first: int, views: Sequence[View], encoded: tuple[Tensor, Tensor], keep: Tensor
     ) -> dict[str, Tensor]:
-        """Rows of views whose first is number `first`, by name, on the CPU."""
+        """Return the rows of views by name, on the CPU; `first` is the first view's number."""
         features, descriptors = encoded
         rows = features.flatten(2).transpose(1, 2)
         poses = SE3.stack([self.atlas_from_base @ view.base_from_camera for view in views])
@@ -130,24 +120,25 @@ class FeatureBuffer:
             "descriptors": descriptors.float().cpu(),
         }
 
-    def _append(self, part: dict[str, Tensor]) -> None:
+    def append(self, part: dict[str, Tensor]) -> None:
+        """Append the result of `part`."""
         self._parts.append(part)
         self.views += len(part["intrinsics"])
         self._merged = None
 
     def take_new(self) -> dict[str, Tensor]:
-        """What was added since the last call, on the CPU, for a checkpoint; empty without any."""
-        parts, self._taken = self._parts[self._taken :], len(self._parts)
+        """Return the rows added since the last call for a checkpoint, on the CPU; may be empty."""
+        parts, self._saved = self._parts[self._saved :], len(self._parts)
         return _merge(parts) if parts else {}
 
     def restore(self, rows: Mapping[str, Tensor]) -> None:
-        """Puts back what `take_new` gave."""
-        self._append(dict(rows))
-        self._taken = len(self._parts)
+        """Append rows that `take_new` returned."""
+        self.append(dict(rows))
+        self._saved = len(self._parts)
 
     @property
     def stored(self) -> Tensor | None:
-        """(m, 3) points that a head once gave to the first m rows, on the buffer's device."""
+        """(m, 3) stored output points of the first m rows, on the buffer's device."""
         return self._stored
 
     @stored.setter
@@ -156,51 +147,47 @@ class FeatureBuffer:
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """Everything in the buffer, by name: on its device, or the CPU where that has no room."""
+        """All tensors by name, on the buffer's device, or on the CPU if the device has no room."""
         if self._merged is None:
-            halves = self._parts[: self._taken], self._parts[self._taken :]
-            self._parts, self._taken = (
-                [_merge(half) for half in halves if half],
-                min(self._taken, 1),
-            )
+            halves = self._parts[: self._saved], self._parts[self._saved :]
+            self._parts = [_merge(half) for half in halves if half]
+            self._saved = min(self._saved, 1)
             merged = _merge(self._parts)
             self._merged = _moved(merged, self.device) if _fits(merged, self.device) else merged
             if len(self._parts) == 1:
-                self._parts = [self._merged]  # so that nothing is kept twice
+                self._parts = [self._merged]  # one copy in memory
         return self._merged
 
     def __len__(self) -> int:
         return len(self.tensors["features"])
 
     def correct_lens(self, correction: Tensor) -> None:
-        """Moves rows to where an ideal pinhole would see them, now that the lens is known better.
+        """Undistort the pixels and correct the intrinsics.
 
         Args:
-            correction: (5,) see `reprojection_error`, of the one camera that took all frames.
+            correction: (5,) correction of the camera that took all frames; see
+                `reprojection_error`.
         """
         t, view = self.tensors, self.tensors["view"].long()
         focal, dx, dy, k1, k2 = correction.to(t["pixels"]).unbind()
         scale = t["intrinsics"][:, :2]
-        focals, centres = (
-            scale * (1 + focal),
-            t["intrinsics"][:, 2:] + scale * torch.stack([dx, dy]),
-        )
-        bent = (t["pixels"] - centres[view]) / focals[view]
-        plane = bent
-        for _ in range(UNBEND_STEPS):
+        focals = scale * (1 + focal)
+        centres = t["intrinsics"][:, 2:] + scale * torch.stack([dx, dy])
+        distorted = (t["pixels"] - centres[view]) / focals[view]
+        plane = distorted
+        for _ in range(UNDISTORT_STEPS):
             radius2 = (plane * plane).sum(-1, keepdim=True).clamp(max=MAX_RADIUS2)
-            plane = bent / (1 + k1 * radius2 + k2 * radius2 * radius2)
+            plane = distorted / (1 + k1 * radius2 + k2 * radius2 * radius2)
         pixels, intrinsics = plane * focals[view] + centres[view], torch.cat([focals, centres], -1)
         self._merged = {**t, "pixels": pixels, "intrinsics": intrinsics}
-        self._parts, self._taken = [self._merged], 1
+        self._parts, self._saved = [self._merged], 1
 
     def draw(self, count: int, generator: torch.Generator) -> Rows:
-        """`count` random rows, with replacement."""
-        # The CPU's generator draws, so that the rows are the same on every device.
+        """Draw `count` random rows with replacement, equal on every device."""
         return self.rows(torch.randint(len(self), (count,), generator=generator, device="cpu"))
 
     def rows(self, index: Tensor) -> Rows:
-        """The rows at `index` (n,), which may lie on any device."""
+        """Return the rows at `index` (n,), which may be on any device."""
         t = self.tensors
         held = t["view"].device
         index = index.to(held)
@@ -220,13 +207,13 @@ class FeatureBuffer:
 
 
 def _points_at(stored: Tensor, index: Tensor) -> Tensor:
-    """(n, 3) points at `index` (n,), NaN beyond the last."""
+    """Return the (n, 3) points at `index` (n,), NaN beyond the last."""
     points = stored[index.clamp(max=len(stored) - 1)].float()
     return torch.where((index < len(stored))[:, None], points, torch.nan)
 
 
 def _merge(parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Parts as one, on the CPU."""
+    """Concatenate parts on the CPU."""
     parts = [_moved(part, torch.device("cpu")) for part in parts]
     if len(parts) == 1:
         return parts[0]
@@ -238,57 +225,59 @@ def _moved(part: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor
 
 
 def _fits(part: Mapping[str, Tensor], device: torch.device) -> bool:
-    """Whether a device has room for tensors besides the share that is spared for other things."""
+    """Return whether a device has room for tensors beside its reserved share."""
     if device.type != "cuda":
         return True
     free, total = torch.cuda.mem_get_info(device)
-    # What the allocator holds in reserve is free too.
+    # Memory that the allocator caches is free too.
     free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return sum(value.nbytes for value in part.values()) <= free - SPARE_SHARE * total
+    return sum(value.nbytes for value in part.values()) <= free - RESERVED_SHARE * total
 
 
 def _pinned(values: Tensor, index: Tensor) -> Tensor:
-    """Rows of a tensor of the CPU in memory that a GPU can copy from by itself."""
+    """Select rows of a CPU tensor into pinned memory, from which a GPU copies asynchronously."""
     shape = (len(index), *values.shape[1:])
     out = torch.empty(shape, dtype=values.dtype, device="cpu", pin_memory=True)
     return torch.index_select(values, 0, index, out=out)
 
 
 def join(parts: Sequence[Rows]) -> Rows:
-    """Several batches as one."""
+    """Concatenate batches."""
     if len(parts) == 1:
         return parts[0]
-
-    def cat(name: str) -> Tensor:
-        return torch.cat([getattr(part, name) for part in parts])
-
-    targets = [part.target for part in parts]
-    target = Target(
-        torch.cat([t.pixels for t in targets]),
-        torch.cat([t.intrinsics for t in targets]),
-        torch.cat([t.camera_from_atlas for t in targets]),
-    )
-    stored = None
     if any(part.stored is not None for part in parts):
-        none = torch.nan
-        stored = torch.cat(
-            [
-                torch.full((len(p.scene), 3), none, device=p.scene.device)
-                if p.stored is None
-                else p.stored
-                for p in parts
-            ]
-        )
-    return Rows(cat("features"), cat("scene"), cat("descriptor"), target, cat("index"), stored)
+        parts = [part if part.stored is not None else _without_stored(part) for part in parts]
+
+    def cat(get: Callable[[Rows], Tensor | None]) -> Tensor:
+        return torch.cat([value for value in map(get, parts) if value is not None])
+
+    return Rows(
+        cat(lambda part: part.features),
+        cat(lambda part: part.scene),
+        cat(lambda part: part.descriptor),
+        Target(
+            cat(lambda part: part.target.pixels),
+            cat(lambda part: part.target.intrinsics),
+            cat(lambda part: part.target.camera_from_atlas),
+        ),
+        cat(lambda part: part.index),
+        None if parts[0].stored is None else cat(lambda part: part.stored),
+    )
+
+
+def _without_stored(rows: Rows) -> Rows:
+    nan = torch.full((len(rows.scene), 3), torch.nan, device=rows.scene.device)
+    return replace(rows, stored=nan)
 
 
 def diffused(rows: Rows, deviation: float, generator: torch.Generator) -> Rows:
-    """The rows with noise on their descriptors (GLACE's feature diffusion).
+    """Add noise to the descriptors of rows (GLACE's feature diffusion).
 
     Args:
-        rows: a batch.
-        deviation: of the noise on every channel; descriptors have unit length before and after.
-        generator: of the device where the rows lie.
+        rows: A batch.
+        deviation: Standard deviation of the noise per channel. Descriptors are normalised before
+            and after.
+        generator: Generator of the device of the rows.
     """
     noise = torch.randn(rows.descriptor.shape, generator=generator, device=generator.device)
     descriptor = F.normalize(rows.descriptor + deviation * noise.to(rows.descriptor), dim=-1)
@@ -296,7 +285,7 @@ def diffused(rows: Rows, deviation: float, generator: torch.Generator) -> Rows:
 
 
 def own_share(rows: Rows) -> Rows:
-    """The rows of a batch that this process trains on, as many as every other's."""
+    """Select this process's rows of a batch; every process gets the same number."""
     count = processes()
     if count == 1:
         return rows
@@ -304,43 +293,63 @@ def own_share(rows: Rows) -> Rows:
     return rows.part(slice(rank(), whole, count))
 
 
+@dataclass(frozen=True)
+class EncodePlan:
+    """How a buffer is filled."""
+
+    views_per_frame: int = 4
+    """Views of every frame; the first is not augmented."""
+    cells: int = 600
+    """Rows taken from an augmented view; a plain view gives all rows."""
+    seed: int = 0
+    """Seed of views and cells."""
+    view: ViewOptions = field(default_factory=ViewOptions)
+    """Working size and augmentation."""
+
+
 def encode_frames(
     buffer: FeatureBuffer,
     frames: Sequence[Frame],
-    plan: "EncodePlan",
+    plan: EncodePlan,
     encoder: Encoder,
     descriptor: Descriptor,
 ) -> Iterator[int]:
-    """Encodes every frame `plan.views_per_frame` times into `buffer`; yields the views done so far.
+    """Encode every frame `plan.views_per_frame` times into a buffer.
 
-    Views that are in the buffer already (an interrupted run) are not made again. Where processes
-    work together (`networks.distributed`), each encodes its share of the batches and all get all
-    rows; all must call this alike, and end with what one process alone would have.
+    Views already in the buffer (after an interruption) are skipped. With several processes
+    (`networks.distributed`), each encodes its share of the batches and receives all rows. All must
+    make the same call, and the result equals that of a single process.
 
-    Pass 0 shows the frames as they are, the others show augmented views. What a view looks like and
-    which of its cells stay is a function of (seed, pass, frame) alone.
+    Pass 0 shows the frames unchanged, later passes augmented. A view and its cells depend only on
+    (seed, pass, frame).
+
+    Yields:
+        The number of views in the buffer.
     """
-    todo = encode_batches(frames, plan, buffer.views)
-    for batch in shared_out(todo, rank(), processes()):
+    batches = encode_batches(frames, plan, buffer.views)
+    for batch in shared_out(batches, rank(), processes()):
         part = None
         if batch is not None:
-            made = [_view(frames, number, plan, encoder.stride) for number in batch]
-            views, keep = [view for view, _ in made], torch.stack([mask for _, mask in made])
-            part = buffer._part(batch[0], views, encode(views, encoder, descriptor), keep)
-        for one in gather(part):
-            buffer._append(one)
+            planned = [_view(frames, number, plan, encoder.stride) for number in batch]
+            views, keep = [view for view, _ in planned], torch.stack([mask for _, mask in planned])
+            part = buffer.part(batch[0], views, encode(views, encoder, descriptor), keep)
+        for received in gather(part):
+            buffer.append(received)
         yield buffer.views
 
 
-def encode_batches(frames: Sequence[Frame], plan: "EncodePlan", done: int = 0) -> list[list[int]]:
-    """Numbers of the views that go through the encoder together: neighbours of one size.
+def encode_batches(frames: Sequence[Frame], plan: EncodePlan, done: int = 0) -> list[list[int]]:
+    """Group consecutive views of equal size into batches for the encoder.
 
     View n shows frame n mod len(frames) in pass n // len(frames).
 
     Args:
         frames: n frames.
-        plan: how often each is encoded, and at which size.
-        done: views that are encoded already.
+        plan: Number of passes and working size.
+        done: Number of views that are already encoded.
+
+    Returns:
+        Numbers of the views of each batch.
     """
     batches: list[list[int]] = []
     last = None
@@ -355,9 +364,9 @@ def encode_batches(frames: Sequence[Frame], plan: "EncodePlan", done: int = 0) -
 
 
 def _view(
-    frames: Sequence[Frame], number: int, plan: "EncodePlan", stride: int
+    frames: Sequence[Frame], number: int, plan: EncodePlan, stride: int
 ) -> tuple[View, Tensor]:
-    """A view by its number, and which of its cells stay (cells,)."""
+    """Return a view by its number, and a mask (cells,) of its rows to keep."""
     visit, position = divmod(number, len(frames))
     rng = np.random.default_rng([plan.seed, visit, position])
     if visit == 0:
@@ -368,17 +377,3 @@ def _view(
     mask = np.zeros(len(view.valid), bool)
     mask[keep] = True
     return view, torch.from_numpy(mask)
-
-
-@dataclass(frozen=True)
-class EncodePlan:
-    """How a buffer is filled."""
-
-    views_per_frame: int = 4
-    """Visits of every frame; the first without augmentation."""
-    cells: int = 600
-    """Rows kept from an augmented view; a plain view keeps all."""
-    seed: int = 0
-    """Of views and cells."""
-    view: ViewOptions = field(default_factory=ViewOptions)
-    """Working size and augmentation."""

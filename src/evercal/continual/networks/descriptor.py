@@ -1,4 +1,4 @@
-"""The global descriptor: one vector per image that says which place it shows."""
+"""The global descriptor: one vector per image that identifies the scene."""
 
 import json
 from pathlib import Path
@@ -17,14 +17,14 @@ DESCRIPTOR_FILE = WEIGHTS / "descriptor.safetensors"
 class GlobalDescriptor(nn.Module):
     """Attention-weighted pooling of local features, one vector per image.
 
-    Each cell's feature is lifted by a small MLP, several attention maps pool it (as NetVLAD's soft
-    assignment does, Arandjelovic et al., CVPR 2016), and the result is projected.
+    A small MLP lifts each cell's feature, several attention maps pool the result (like the soft
+    assignment of NetVLAD, Arandjelovic et al., CVPR 2016), and a linear layer projects it.
 
     Args:
-        inputs: channels of the local features.
-        maps: attention maps.
-        hidden: channels that each map pools.
-        width: length of the descriptor.
+        inputs: Channels of the local features.
+        maps: Attention maps.
+        hidden: Channels pooled by each map.
+        width: Length of the descriptor.
     """
 
     def __init__(self, inputs: int, maps: int = 8, hidden: int = 64, width: int = 128):
@@ -37,7 +37,7 @@ class GlobalDescriptor(nn.Module):
         self.project = nn.Linear(maps * hidden, width)
 
     def forward(self, features: Tensor) -> Tensor:
-        """(b, inputs, h, w) local features of any grid size -> (b, width) unit vectors."""
+        """Map (b, inputs, h, w) local features of any grid size to (b, width) unit vectors."""
         lifted = F.relu(self.lift(features))
         weights = self.attention(lifted).flatten(2).softmax(-1)
         pooled = torch.einsum("bmn,bcn->bmc", weights, self.value(lifted).flatten(2))
@@ -46,13 +46,13 @@ class GlobalDescriptor(nn.Module):
 
 
 class PooledDescriptor(nn.Module):
-    """A descriptor without trained weights, for encoders that bring none of their own.
+    """A descriptor without trained weights, for encoders that have no descriptor of their own.
 
-    Mean and deviation of the features over the image, through a fixed random projection.
+    It projects the mean and standard deviation of the features by a fixed random matrix.
 
     Args:
-        inputs: channels of the local features.
-        width: length of the descriptor.
+        inputs: Channels of the local features.
+        width: Length of the descriptor.
     """
 
     projection: Tensor
@@ -62,12 +62,11 @@ class PooledDescriptor(nn.Module):
         self.width = width
         self.settings = {"inputs": inputs, "width": width}
         generator = torch.Generator().manual_seed(0)
-        drawn = torch.randn(2 * inputs, width, generator=generator, device="cpu")
-        projection = drawn / inputs**0.5
-        self.register_buffer("projection", projection)
+        projection = torch.randn(2 * inputs, width, generator=generator, device="cpu")
+        self.register_buffer("projection", projection / inputs**0.5)
 
     def forward(self, features: Tensor) -> Tensor:
-        """(b, inputs, h, w) local features of any grid size -> (b, width) unit vectors."""
+        """Map (b, inputs, h, w) local features of any grid size to (b, width) unit vectors."""
         cells = features.flatten(2)
         pooled = torch.cat([cells.mean(-1), cells.std(-1)], -1)
         return F.normalize(F.normalize(pooled, dim=-1) @ self.projection, dim=-1)
@@ -77,10 +76,10 @@ Descriptor = GlobalDescriptor | PooledDescriptor
 
 
 def load_descriptor(path: Path | None = None) -> Descriptor:
-    """Reads a descriptor, ready for inference; the shipped one when `path` is None.
+    """Load a descriptor for inference, by default the shipped one.
 
     Raises:
-        InputError: no such file, or not a descriptor file.
+        InputError: The file is missing or is not a descriptor.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -100,10 +99,10 @@ def load_descriptor(path: Path | None = None) -> Descriptor:
 
 
 def descriptor_for(encoder_file: Path, inputs: int) -> Descriptor:
-    """The descriptor to go with a user's encoder: its sibling file, or one without training."""
+    """Return the descriptor for a user's encoder: the file beside it, or an untrained one."""
     sibling = encoder_file.with_name(DESCRIPTOR_FILE.name)
     if sibling.is_file() and sibling != encoder_file:
-        found = load_descriptor(sibling)
-        if found.settings["inputs"] == inputs:
-            return found
+        descriptor = load_descriptor(sibling)
+        if descriptor.settings["inputs"] == inputs:
+            return descriptor
     return PooledDescriptor(inputs)

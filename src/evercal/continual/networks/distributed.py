@@ -1,11 +1,11 @@
-"""One training on several processes (torchrun): each takes a share of every batch.
+"""Training on several processes (torchrun), each with a share of every batch.
 
-All start with the weights of the first, draw the same rows from the same seed and keep their own;
-gradients are averaged over processes, so that all hold the same weights at every step. Views are
-shared out too: each is encoded by one process, and all end with all rows.
+All processes start with the weights of the first, draw the same rows from the same seed and train
+on their own share. Gradients are averaged, so all have the same weights at every step. Each view is
+encoded by one process and its rows are sent to all.
 
-On GPUs the processes talk by NCCL, which carries CUDA tensors, else by gloo, which carries tensors
-of the CPU; tensors that lie elsewhere are copied there and back.
+Processes on GPUs communicate by NCCL, which sends CUDA tensors, the others by gloo, which sends CPU
+tensors. Tensors elsewhere are copied.
 """
 
 import os
@@ -22,83 +22,83 @@ Work = TypeVar("Work")
 
 
 def processes() -> int:
-    """How many processes train together; 1 without torch.distributed."""
-    return distributed.get_world_size() if _together() else 1
+    """Return the number of processes that train together."""
+    return distributed.get_world_size() if _initialized() else 1
 
 
 def rank() -> int:
-    """Which of them this is."""
-    return distributed.get_rank() if _together() else 0
+    """Return the number of this process, from 0."""
+    return distributed.get_rank() if _initialized() else 0
 
 
 def join_processes(device: str | torch.device = "auto") -> torch.device:
-    """Joins the processes that torchrun started; nothing to join without torchrun.
+    """Join the process group that torchrun started; without torchrun, only select a device.
 
     Args:
-        device: what the networks shall run on, see `device_of`. On CUDA each process of a machine
-            takes the device of its LOCAL_RANK.
+        device: Device of the networks, see `device_of`. On CUDA each process of a machine uses the
+            device of its LOCAL_RANK.
 
     Returns:
         The device of this process.
 
     Raises:
-        InputError: no such device, or fewer of them on this machine than processes.
+        InputError: The device does not exist, or the machine has fewer devices than processes.
     """
-    found = device_of(device)
+    own = device_of(device)
     if not distributed.is_available() or not distributed.is_torchelastic_launched():
-        return found
-    if found.type == "cuda":
+        return own
+    if own.type == "cuda":
         local, count = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
         if local >= count:
             raise InputError(
-                f"torchrun: process {local + 1} of this machine finds {count} CUDA devices; give"
-                f" --nproc-per-node {count}"
+                f"torchrun: process {local + 1} of this machine has no CUDA device of its own;"
+                f" PyTorch finds {count}, so pass --nproc-per-node {count}"
             )
-        found = torch.device("cuda", local)
-        torch.cuda.set_device(found)
-    if not _together():
-        if found.type == "cuda":
-            distributed.init_process_group("nccl", device_id=found)
+        own = torch.device("cuda", local)
+        torch.cuda.set_device(own)
+    if not _initialized():
+        if own.type == "cuda":
+            distributed.init_process_group("nccl", device_id=own)
         else:
             distributed.init_process_group("gloo")
-    return found
+    return own
 
 
 @torch.no_grad()
 def average(tensors: Iterable[Tensor]) -> None:
-    """Replaces each tensor by its mean over the processes; all travel as one."""
+    """Replace each tensor by its mean over the processes, in one exchange per type."""
     count = processes()
     if count == 1:
         return
-    for some, flat in _flattened(tensors):
+    for group, flat in _flattened(tensors):
         distributed.all_reduce(flat)
         flat /= count
-        _copy_back(flat, some)
+        _copy_back(flat, group)
 
 
 @torch.no_grad()
 def broadcast(tensors: Iterable[Tensor]) -> None:
-    """Replaces each tensor by that of the first process, to its last bit; all travel as one.
+    """Replace each tensor by that of the first process, in one exchange per type.
 
     Args:
-        tensors: parameters and buffers, in the same order and of the same shapes everywhere.
+        tensors: Parameters and buffers, with the same order and shapes in every process.
     """
     if processes() == 1:
         return
-    for some, flat in _flattened(tensors):
+    for group, flat in _flattened(tensors):
         distributed.broadcast(flat, 0)
-        _copy_back(flat, some)
+        _copy_back(flat, group)
 
 
 def _flattened(tensors: Iterable[Tensor]) -> list[tuple[list[Tensor], Tensor]]:
-    """Tensors by type, and all numbers of a type in one row that the processes can exchange."""
+    """Group tensors by type and concatenate each group on the device of the exchange."""
     by_type: dict[torch.dtype, list[Tensor]] = {}
     for tensor in tensors:
         by_type.setdefault(tensor.dtype, []).append(tensor)
-    carrier = _carrier()
+    device = _exchange_device()
     return [
-        (some, torch.cat([tensor.detach().flatten() for tensor in some]).to(carrier))
-        for some in by_type.values()
+        (group, torch.cat([tensor.detach().flatten() for tensor in group]).to(device))
+        for group in by_type.values()
     ]
 
 
@@ -109,63 +109,50 @@ def _copy_back(flat: Tensor, tensors: Sequence[Tensor]) -> None:
 
 
 def shared_out(work: Sequence[Work], number: int, count: int) -> list[Work | None]:
-    """What one of several processes does, round by round; None where nothing is left for it.
+    """Select the work of one process.
 
-    In round r, process k does piece r count + k. All have the same number of rounds, so that they
-    can exchange what they made after each.
+    In round r, process k gets piece r count + k. All processes have the same number of rounds, so
+    they can exchange results after each.
 
     Args:
-        work: all there is to do.
-        number: which process.
-        count: how many there are.
+        work: All pieces.
+        number: Number of the process.
+        count: Number of processes.
+
+    Returns:
+        One piece per round, or None when nothing is left.
     """
     rounds = -(-len(work) // count)
-    places = [turn * count + number for turn in range(rounds)]
-    return [work[place] if place < len(work) else None for place in places]
+    indices = [r * count + number for r in range(rounds)]
+    return [work[index] if index < len(work) else None for index in indices]
 
 
 def gather(part: Mapping[str, Tensor] | None) -> list[dict[str, Tensor]]:
-    """What all processes made, in the order of their numbers, to the last bit.
+    """Collect the tensors of all processes in the order of their numbers, without loss.
 
     Args:
-        part: named tensors of this process, any shapes, on the CPU; None if it made nothing.
+        part: Named CPU tensors of this process, of any shape; None if it has no result.
     """
-    count = processes()
-    if count == 1:
+    if processes() == 1:
         return [] if part is None else [dict(part)]
-    from safetensors.torch import load, save
-
-    carrier = _carrier()
-    own = b"" if part is None else save({k: v.contiguous() for k, v in part.items()})
-    length = torch.tensor([len(own)], device=carrier)
-    lengths = [torch.zeros_like(length) for _ in range(count)]
-    distributed.all_gather(lengths, length)
-    sizes = [int(size) for size in lengths]
-    sent = torch.zeros(max(sizes), dtype=torch.uint8, device=carrier)
-    if own:
-        sent[: len(own)] = torch.frombuffer(bytearray(own), dtype=torch.uint8)
-    received = [torch.empty_like(sent) for _ in range(count)]
-    distributed.all_gather(received, sent)
-    return [
-        load(data[:size].cpu().numpy().tobytes())
-        for data, size in zip(received, sizes, strict=True)
-        if size
-    ]
+    received: list[dict[str, Tensor] | None] = [None] * processes()
+    distributed.all_gather_object(received, part)
+    return [tensors for tensors in received if tensors is not None]
 
 
 def wait_for_all() -> None:
-    """Returns when every process has come here."""
-    if _together():
-        carrier = _carrier()
-        distributed.barrier(device_ids=[carrier.index] if carrier.type == "cuda" else None)
+    """Block until every process has called this."""
+    if _initialized():
+        device = _exchange_device()
+        distributed.barrier(device_ids=[device.index] if device.type == "cuda" else None)
 
 
-def _carrier() -> torch.device:
-    """Where tensors must lie that the processes exchange."""
+def _exchange_device() -> torch.device:
+    """Return the device from which the backend sends tensors."""
     if distributed.get_backend() == "nccl":
         return torch.device("cuda", torch.cuda.current_device())
     return torch.device("cpu")
 
 
-def _together() -> bool:
+def _initialized() -> bool:
     return distributed.is_available() and distributed.is_initialized()

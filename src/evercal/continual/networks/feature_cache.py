@@ -1,4 +1,4 @@
-"""Features of images that were encoded before, for runs that see the same views again and again."""
+"""A cache of encoded images on disk, for runs that encode the same views repeatedly."""
 
 import contextlib
 import hashlib
@@ -13,17 +13,17 @@ from torch import Tensor, nn
 
 
 def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int | None = None) -> None:
-    """Makes a frozen encoder look up what it has encoded before, and note what it has not.
+    """Make a frozen encoder read and write its features in a folder.
 
-    From then on features have half precision, found or not, so that results do not depend on what
-    was encoded first. Files that cannot be read are made again; the folder may be deleted.
+    Features get half precision, cached or not, so results do not depend on the cache. Unreadable
+    files are replaced. The folder may be deleted at any time.
 
     Args:
-        encoder: changed in place; its weights and type stay what they are.
-        folder: where features are kept, one file per image; made when missing.
-        limit_bytes: how much is added to the folder; beyond, features are found but no longer
-            kept. When left out, half of what is free on the disk now stays free, also where others
-            write to it. On a full disk nothing more is kept either.
+        encoder: Changed in place; its weights and class stay the same.
+        folder: One file per image; created if missing.
+        limit_bytes: Largest number of bytes to add. By default half of the disk space that is free
+            now stays free, even if other programs write to the disk. Writing also stops on a full
+            disk.
     """
     weights = hashlib.blake2b(digest_size=8)
     for value in encoder.state_dict().values():
@@ -37,17 +37,18 @@ def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int | None = N
     def forward(grey: Tensor) -> Tensor:
         nonlocal room
         names = [_name(image) for image in grey]
-        found = [_read(folder / name) for name in names]
-        missing = [i for i, value in enumerate(found) if value is None]
+        features = [_read(folder / name) for name in names]
+        missing = [i for i, value in enumerate(features) if value is None]
         if missing:
-            made = compute(grey[missing]).half().cpu()
-            for i, value in zip(missing, made, strict=True):
-                found[i] = value
-                others = shutil.disk_usage(folder).free - spare
-                if min(room, others) > value.nbytes:
+            encoded = compute(grey[missing]).half().cpu()
+            for i, value in zip(missing, encoded, strict=True):
+                features[i] = value
+                free = shutil.disk_usage(folder).free - spare
+                if min(room, free) > value.nbytes:
                     room = room - value.nbytes if _written(folder / names[i], value) else 0
-        whole = torch.stack([value.float() for value in found if value is not None])
-        return whole.to(grey.device)
+        return torch.stack([value.float() for value in features if value is not None]).to(
+            grey.device
+        )
 
     encoder.forward = forward
 
@@ -55,7 +56,7 @@ def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int | None = N
 def _name(image: Tensor) -> str:
     shape = "x".join(map(str, image.shape))
     digest = hashlib.blake2b(image.cpu().numpy().tobytes(), digest_size=16).hexdigest()
-    # Another kind of device rounds otherwise: its features are its own.
+    # Rounding depends on the kind of device, so features of different kinds are kept apart.
     kind = "" if image.device.type == "cpu" else f"-{image.device.type}"
     return f"{shape}-{digest}{kind}.npy"
 
@@ -68,14 +69,14 @@ def _read(path: Path) -> Tensor | None:
 
 
 def _written(path: Path, features: Tensor) -> bool:
-    """Whether features could be kept."""
-    # Whole or not at all, but not synced: what a power cut takes is made again.
+    """Write features to a file; return whether that succeeded."""
+    # Atomic but not synced, because features lost in a power failure are encoded again.
     temporary = path.with_name(f".{uuid.uuid4().hex[:8]}.tmp")
     try:
         with open(temporary, "wb") as file:
             np.save(file, features.contiguous().numpy())
         os.replace(temporary, path)
-    except OSError:  # a full disk, as a rule
+    except OSError:  # usually a full disk
         with contextlib.suppress(OSError):
             temporary.unlink()
         return False

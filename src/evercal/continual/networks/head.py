@@ -1,19 +1,19 @@
-"""The scene-coordinate head: a feature vector in, a point of the scene out.
+"""The scene-coordinate head maps a feature vector to a point of the scene.
 
-After GLACE (Wang et al., CVPR 2024): residual MLP, cluster centres chosen by a softmax, and an
-offset in homogeneous form. Scenes may be told apart in two ways (`HeadOptions.condition`):
+After GLACE (Wang et al., CVPR 2024): a residual MLP, cluster centres weighted by a softmax, and an
+offset in homogeneous form. `HeadOptions.condition` selects how scenes are distinguished:
 
-- `descriptor`: the image's global descriptor is part of the input, as in GLACE. Nothing but the
-  image decides which centres answer.
-- `code`: every layer gets a learned bias of the scene (its code), and only the scene's own centres
-  answer. The caller says for which scene it asks; at test time that is a hypothesis drawn from the
-  image's descriptor, and the hypothesis with most inliers wins.
+- `descriptor`: the image's global descriptor is part of the input, as in GLACE. Every centre can
+  answer for every image.
+- `code`: every layer has a learned bias per scene (its code), and only the scene's own centres
+  answer. The caller names the scene; at test time that is a hypothesis from the image's descriptor,
+  and the hypothesis with most inliers wins.
 """
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -23,41 +23,41 @@ from evercal.errors import InputError
 
 SCALE_MAX = 4.0
 SCALE_MIN = 0.01
-# Share of the way from plain features (0) to wholly decorrelated ones (1).
 WHITENING = 0.5
+"""Strength of the input whitening, from 0 (none) to 1 (fully decorrelated)."""
 
 
 @dataclass(frozen=True)
 class HeadOptions:
-    """Shape of a head."""
+    """Architecture of a head."""
 
     width: int = 256
     """Channels of every hidden layer."""
     blocks: int = 1
     """Residual blocks of three layers after the first one."""
     condition: Literal["code", "descriptor"] = "code"
-    """What tells scenes apart: a code per scene, or the image's global descriptor in the input."""
+    """What distinguishes scenes: a code per scene, or the image's global descriptor."""
     offsets: Literal["shared", "per_centre"] = "per_centre"
     """One offset and scale for all centres (GLACE), or one for each centre (the paper)."""
     centres: Literal["grow", "fixed"] = "grow"
-    """Where centres come from: each scene appends its own, or those of all scenes are there in
-    advance (the paper; needs the future)."""
+    """Each scene appends its own centres, or the centres of all scenes are given in advance
+    (the paper; requires the future scenes)."""
     centres_per_scene: int = 4
-    """Cluster centres that a scene adds; of all scenes together where they are `fixed`."""
+    """Cluster centres added per scene. With `fixed` centres, their total number."""
     whiten: bool = True
-    """Features are centred, scaled and half decorrelated before the first layer. Without it they
-    are scaled alone, and their few strong directions drown the many weak ones, which tell
-    neighbouring points apart."""
+    """Centre, scale and half decorrelate the features before the first layer. If false, they are
+    only scaled, and a few strong directions dominate the many weak ones that distinguish
+    neighbouring points."""
     activation: Literal["gelu", "relu"] = "gelu"
-    """Between layers; ACE and GLACE have `relu`."""
+    """Activation between layers; ACE and GLACE use `relu`."""
 
 
 @dataclass
 class HeadOutput:
-    """What a head says about n rows, K centres (one scene's own where one was asked for)."""
+    """Output for n rows and K centres; with a single scene, K counts its own centres."""
 
     logits: Tensor
-    """(n, K) fp32; -inf for centres that cannot answer."""
+    """(n, K) fp32; -inf for centres of other scenes."""
     offsets: Tensor
     """(n, K, 3) per centre or (n, 1, 3) shared, metres, already divided by the scale."""
     points: Tensor
@@ -66,21 +66,21 @@ class HeadOutput:
     """(n, width) fp32 activations of the last hidden layer."""
 
     def part(self, where: slice) -> "HeadOutput":
-        """The rows of a slice."""
+        """Return the rows of a slice."""
         parts = (self.logits, self.offsets, self.points, self.hidden)
         return HeadOutput(*(part[where] for part in parts))
 
 
 class Head(nn.Module):
-    """Residual MLP with growing outputs.
+    """Residual MLP whose outputs grow with every scene.
 
     Args:
-        features: channels of the local feature.
-        descriptor: channels of the global descriptor (used with condition `descriptor`).
-        options: shape.
+        features: Channels of the local feature.
+        descriptor: Channels of the global descriptor; ignored with condition `code`.
+        options: Architecture.
 
     Raises:
-        InputError: condition `code` with centres that no scene owns.
+        InputError: Condition `code` with fixed centres.
     """
 
     centres: Tensor
@@ -92,17 +92,17 @@ class Head(nn.Module):
         super().__init__()
         if options.condition == "code" and options.centres != "grow":
             raise InputError(
-                f"centres {options.centres!r} belong to no scene, so condition 'code' has none to"
-                " answer with; take condition 'descriptor' or centres 'grow'"
+                f"centres {options.centres!r} belong to no scene, but condition 'code' needs"
+                " centres of each scene; use condition 'descriptor' or centres 'grow'"
             )
-        self.features, self.descriptor, self.options = features, descriptor, options
+        self.options = options
         width = options.width
         inputs = features + (descriptor if options.condition == "descriptor" else 0)
         self.first = nn.ModuleList([nn.Linear(inputs, width), *_linears(width, 2)])
         self.skip = nn.Identity() if inputs == width else nn.Linear(inputs, width)
         self.blocks = nn.ModuleList(_linears(width, 3) for _ in range(options.blocks))
         self.last = _linears(width, 2)
-        # One bias per layer and scene; rows are appended by `grow`.
+        # One bias per layer and scene; `grow` appends rows.
         self.code = nn.Parameter(torch.zeros(0, self.layers, width))
         self.logit = nn.Parameter(torch.zeros(0, width))
         self.logit_bias = nn.Parameter(torch.zeros(0))
@@ -119,22 +119,19 @@ class Head(nn.Module):
     @classmethod
     def from_state(
         cls, features: int, descriptor: int, options: HeadOptions, state: Mapping[str, Tensor]
-    ) -> Self:
-        """A head with the weights of another one's `state_dict()`, half floats or single."""
-        head = cls(features, descriptor, options).to(state["code"].device)
+    ) -> "Head":
+        """Build a head from a `state_dict()` in half or single precision."""
+        head = fresh_head(features, descriptor, options, seed=0).to(state["code"].device)
         state = {name: v.float() if v.dtype == torch.half else v for name, v in state.items()}
-        # These grow with every scene; whatever their shape is in the state, it is theirs.
-        head.code = nn.Parameter(state["code"].clone())
-        head.logit = nn.Parameter(state["logit"].clone())
-        head.logit_bias = nn.Parameter(state["logit_bias"].clone())
-        head.offset = nn.Parameter(state["offset"].clone())
-        head.offset_bias = nn.Parameter(state["offset_bias"].clone())
+        # The shapes of these depend on the number of scenes, so they are taken from the state.
+        for name in ("code", "logit", "logit_bias", "offset", "offset_bias"):
+            setattr(head, name, nn.Parameter(state[name].clone()))
         head.centres, head.centre_scene = state["centres"].clone(), state["centre_scene"].clone()
         head.load_state_dict(state)
         return head
 
     def without_scenes(self) -> "Head":
-        """A copy of what scenes share, which knows none; centres that belong to none stay."""
+        """Copy the weights that scenes share, and centres that belong to no scene."""
         state = dict(self.state_dict())
         state["code"] = state["code"][:0]
         if self.options.centres == "grow":
@@ -144,36 +141,48 @@ class Head(nn.Module):
         return Head.from_state(self.features, self.descriptor, self.options, state)
 
     @property
+    def features(self) -> int:
+        """Channels of the local feature."""
+        return len(self.feature_mean)
+
+    @property
+    def descriptor(self) -> int:
+        """Channels of the global descriptor in the input; 0 with condition `code`."""
+        first = self.first[0]
+        assert isinstance(first, nn.Linear)
+        return first.in_features - self.features
+
+    @property
     def layers(self) -> int:
-        """Hidden layers, each with a row in a scene's code."""
+        """Hidden layers; a scene's code has one row for each."""
         return 3 + 3 * self.options.blocks + 2
 
     @property
     def device(self) -> torch.device:
-        """Where the weights lie."""
+        """Device of the weights."""
         return self.feature_mean.device
 
     @property
     def scenes(self) -> int:
-        """How many scenes this head knows."""
+        """Number of scenes."""
         return self.code.shape[0]
 
     def whiten(self, features: Tensor) -> None:
-        """Fits the input whitening; it stays as it is from then on, also for later scenes.
+        """Fit the input whitening, which later scenes keep.
 
-        With C = V diag(s^2) V' the covariance, an input becomes a (x - mean) V diag(s^-1/2) V',
-        a such that the variance over all rows and channels is 1.
+        With the covariance C = V diag(s^2) V', an input becomes a (x - mean) V diag(s^-1/2) V'. The
+        factor a makes the variance over all rows and channels 1.
 
         Args:
-            features: (n, features) rows of the first scene, n well above the number of channels;
-                on any device.
+            features: (n, features) rows of the first scene on any device. n must be well above the
+                number of channels.
         """
         features = features.double()
         mean = features.mean(0)
         centred = features - mean
         variance, axes = torch.linalg.eigh(centred.T @ centred / len(centred))
         spread = variance.clamp(min=0).sqrt()
-        # Directions in which nothing varies must not be blown up.
+        # The floor keeps constant directions from being amplified.
         gain = (spread + 1e-3 * spread.max() + 1e-12) ** -WHITENING
         mapping = (axes * gain) @ axes.T
         mapping /= (centred @ mapping).std().clamp(min=1e-12)
@@ -181,13 +190,13 @@ class Head(nn.Module):
         self.feature_map.copy_(mapping)
 
     def grow(self, centres: Tensor, seed: int) -> None:
-        """Makes room for one more scene; what the head says about others does not change.
+        """Add a scene; outputs for earlier scenes do not change.
 
-        The new rows are drawn on the CPU, so that they are the same on every device.
+        New rows are drawn on the CPU, so they are equal on every device.
 
         Args:
             centres: (k, 3) atlas coordinates of the new scene's centres, metres; k may be 0.
-            seed: of the new rows.
+            seed: Seed of the new rows.
         """
         generator = torch.Generator().manual_seed(seed)
         width, count = self.options.width, len(centres)
@@ -209,27 +218,27 @@ class Head(nn.Module):
     def forward(
         self, features: Tensor, scene: Tensor | int, descriptor: Tensor | None
     ) -> HeadOutput:
-        """Scene coordinates of feature rows.
+        """Predict the scene coordinates of feature rows.
 
         Args:
             features: (n, features).
-            scene: (n,) index of the scene that each row is taken to show, or one for all.
+            scene: Index of the assumed scene, one for all rows or (n,) one per row.
             descriptor: (n, descriptor), or None with condition `code`.
 
         Returns:
-            What the head says, in fp32, whatever autocast does inside.
+            The output in fp32, also under autocast.
         """
         hidden = self.hidden(features, scene, descriptor)
         with torch.autocast(hidden.device.type, enabled=False):
             return self.decode(hidden.float(), scene)
 
     def hidden(self, features: Tensor, scene: Tensor | int, descriptor: Tensor | None) -> Tensor:
-        """Activations (n, width) of the last hidden layer; arguments as of `forward`."""
+        """Return the (n, width) activations of the last hidden layer; see `forward`."""
         if self.options.whiten:
             features = (features - self.feature_mean) @ self.feature_map
         else:
-            # They have unit length, and layers are initialised for unit variance: left as they
-            # are, biases drown them and the network takes several times as many steps.
+            # Features have unit length, but the initialisation assumes unit variance. Without
+            # this factor biases dominate and training takes several times more steps.
             features = features * math.sqrt(self.features)
         if self.options.condition == "code":
             return self._trunk(features, self._codes(scene))
@@ -238,10 +247,10 @@ class Head(nn.Module):
         return self._trunk(x, None)
 
     def _codes(self, scene: Tensor | int) -> Callable[[int], Tensor]:
-        """The bias of a layer: (width,) for one scene, (n, width) for a scene per row."""
+        """Return the bias of a layer: (width,) for one scene, (n, width) for a scene per row."""
         if isinstance(scene, int):
             return lambda layer: self.code[scene, layer]
-        # A product with one-hot rows instead of indexing: its gradient is a product too.
+        # A product with one-hot rows, because the gradient of indexing is slow.
         one_hot = F.one_hot(scene, self.scenes).to(self.code.dtype)
         return lambda layer: one_hot @ self.code[:, layer]
 
@@ -267,11 +276,11 @@ class Head(nn.Module):
         return hidden
 
     def decode(self, hidden: Tensor, scene: Tensor | int) -> HeadOutput:
-        """What the head says with these activations (n, width) of its last hidden layer, fp32."""
+        """Compute the output from (n, width) activations of the last hidden layer, fp32."""
         coded = self.options.condition == "code"
         rows: slice | Tensor = slice(None)
         if coded and isinstance(scene, int):
-            # Same shapes however many scenes follow, so not a bit of the answer changes with them.
+            # Shapes do not depend on later scenes, so the output stays equal to the last bit.
             rows = torch.nonzero(self.centre_scene == scene)[:, 0]
         logits = F.linear(hidden, self.logit[rows], self.logit_bias[rows])
         if coded and not isinstance(scene, int):
@@ -285,11 +294,21 @@ class Head(nn.Module):
         return HeadOutput(logits, offsets, points, hidden)
 
 
+def fresh_head(features: int, descriptor: int, options: HeadOptions, seed: int) -> Head:
+    """Create a head without scenes on the CPU; its weights depend only on the arguments.
+
+    The state of torch's global generator is left unchanged.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        return Head(features, descriptor, options)
+
+
 def homogeneous_scale(raw: Tensor) -> Tensor:
-    """The clamped softplus h of ACE and GLACE: raw 0 gives 1, the range is (1 / 4, 100].
+    """Compute the clamped softplus h of ACE and GLACE, in (1 / 4, 100], with h(0) = 1.
 
     h = min(softplus_b(raw) + 1 / s_max, 1 / s_min), softplus_b(z) = ln(1 + e^(b z)) / b,
-    b = ln 2 / (1 - 1 / s_max); so an offset is divided by at least 1/4 and at most 100.
+    b = ln 2 / (1 - 1 / s_max).
     """
     beta = math.log(2.0) / (1.0 - 1.0 / SCALE_MAX)
     return (F.softplus(raw, beta=beta) + 1.0 / SCALE_MAX).clamp(max=1.0 / SCALE_MIN)

@@ -1,4 +1,4 @@
-"""What may be added to the training of a head: the trainer calls these hooks and knows no more."""
+"""Hooks through which a continual-learning method takes part in the training of a head."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,69 +12,68 @@ from evercal.continual.networks.head import HeadOutput
 
 @dataclass
 class ProposedStep:
-    """What the optimisers made of one step, before it counts."""
+    """A step of the optimisers before it is applied."""
 
     changes: dict[str, Tensor]
-    """By parameter name, like the parameter: what the step adds to it. Hooks change these in
-    place."""
+    """By parameter name: the change of the parameter. Hooks edit these in place."""
     gradients: Mapping[str, Tensor]
-    """By parameter name: gradient of all that was minimised."""
+    """By parameter name: gradient of the minimised loss."""
     losses: Tensor
-    """(t,) the constraints' losses before the step."""
+    """(t,) losses of `TrainingHooks.constraints` before the step."""
     constraints: Sequence[Mapping[str, Tensor]]
-    """Their t gradients, each by parameter name."""
+    """Gradients of these t losses, each by parameter name."""
     step: int
-    """Steps done before this one."""
+    """Number of earlier steps."""
     schedule: float
-    """Learning rate of this step as a share of the peak, in [0, 1]."""
+    """Learning rate as a share of the peak, in [0, 1]."""
 
 
 class TrainingHooks:
-    """Adds nothing; a method overrides what it needs."""
+    """No-op hooks that a method may override."""
 
     edits_steps = False
-    """Whether `edit_step` has anything to do; looking at steps costs a copy of all weights."""
+    """Whether `edit_step` is called. It costs a copy of all weights per step."""
 
     def replayed(
         self, fresh: Rows, step: int, rate: float, generator: torch.Generator
     ) -> list[Rows]:
-        """Rows that join a step beside those of the scene being learned.
+        """Select remembered rows for a step.
 
         Args:
-            fresh: rows of the scene being learned.
-            step: steps done so far.
-            rate: AdamW's learning rate.
-            generator: of all that is drawn.
+            fresh: Rows of the scene being learned.
+            step: Number of earlier steps.
+            rate: Learning rate of AdamW.
+            generator: Source of all random draws.
 
         Returns:
-            Parts of equal size; the number of parts is the same in every step.
+            Parts of equal size; every step has the same number of parts.
         """
         return []
 
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
-        """What replayed rows cost.
+        """Compute the loss of replayed rows.
 
         Args:
-            output: of the head on them.
-            rows: the parts of `replayed`, one after the other.
-            tau_px: soft clamp of the loss on new rows in this step, pixels.
+            output: Output of the head.
+            rows: The parts of `replayed`, concatenated.
+            tau_px: Soft clamp of the loss on new rows in this step, pixels.
         """
         return None
 
     def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:
-        """Losses on replayed rows that are not minimised but whose gradients `edit_step` needs."""
+        """Return losses whose gradients `edit_step` needs; they are not minimised."""
         return []
 
     def regularizer(self) -> Tensor | None:
-        """What the weights themselves cost."""
+        """Compute a loss of the weights."""
         return None
 
     def edit_step(self, proposed: ProposedStep) -> None:
-        """Changes a step after the optimisers, so that whatever they do is constrained."""
+        """Edit a step after the optimisers, so that constraints hold for the applied step."""
 
     def state(self) -> dict[str, Tensor]:
-        """What `load` needs to go on after an interruption, as named tensors."""
+        """Return named tensors from which `load` resumes."""
         return {}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
-        """Goes back to where `state()` was taken."""
+        """Restore the result of `state()`."""

@@ -1,4 +1,4 @@
-"""Muon, the optimiser of the head's hidden matrices (K. Jordan et al., Muon, 2024)."""
+"""Muon, the optimiser of the head's hidden matrices (Jordan et al., 2024)."""
 
 from collections.abc import Iterable, Mapping
 
@@ -8,16 +8,16 @@ from torch import Tensor
 from evercal.features.precision import fast_bfloat16
 
 MUON_STEPS = 3
-"""Newton-Schulz iterations. Three train as well as the usual five here, and cost less."""
+"""Newton-Schulz iterations. Here three train as well as the usual five."""
 _COEFFICIENTS = (3.4445, -4.775, 2.0315)
 _MOMENTUM = 0.95
 
 
 class Muon(torch.optim.Optimizer):
-    """What `torch.optim.Muon` does, for square matrices of one size.
+    """`torch.optim.Muon` for square matrices of one size, in the fastest precision of the device.
 
-    That one multiplies in bfloat16 on every device, which processors without bfloat16 products do
-    fifty times slower than in float32. This one takes what the device is fast at.
+    `torch.optim.Muon` always multiplies in bfloat16. That is fifty times slower than float32 on
+    processors without bfloat16 products.
     """
 
     def __init__(self, groups: Iterable[Mapping[str, object]], rate: float, weight_decay: float):
@@ -25,7 +25,7 @@ class Muon(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Moves every matrix that has a gradient."""
+        """Update every matrix that has a gradient."""
         for group in self.param_groups:
             matrices = [matrix for matrix in group["params"] if matrix.grad is not None]
             if not matrices:
@@ -36,7 +36,7 @@ class Muon(torch.optim.Optimizer):
                 matrix.add_(change, alpha=-group["lr"])
 
     def _direction(self, matrix: Tensor) -> Tensor:
-        """The gradient with Nesterov's momentum."""
+        """Return the gradient with Nesterov momentum."""
         state, gradient = self.state[matrix], matrix.grad
         assert gradient is not None
         if not state:
@@ -46,13 +46,11 @@ class Muon(torch.optim.Optimizer):
 
 
 def orthogonalised(matrices: Tensor) -> Tensor:
-    """(n, w, w) with singular values near one and the singular vectors of (n, w, w) matrices."""
+    """Replace the singular values of (n, w, w) matrices by values near one."""
     a, b, c = _COEFFICIENTS
-    found = matrices.bfloat16() if fast_bfloat16(matrices.device) else matrices
-    found = found / torch.linalg.matrix_norm(found, keepdim=True).clamp(min=1e-7)
+    x = matrices.bfloat16() if fast_bfloat16(matrices.device) else matrices
+    x = x / torch.linalg.matrix_norm(x, keepdim=True).clamp(min=1e-7)
     for _ in range(MUON_STEPS):
-        gram = found @ found.mT
-        found = torch.baddbmm(
-            found, torch.baddbmm(gram, gram, gram, beta=b, alpha=c), found, beta=a
-        )
-    return found
+        gram = x @ x.mT
+        x = torch.baddbmm(x, torch.baddbmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
+    return x

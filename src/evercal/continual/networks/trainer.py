@@ -1,4 +1,4 @@
-"""The loop that fits a head to rows of scenes; whatever else is wanted comes in as hooks."""
+"""The training loop of a head; a method takes part through hooks."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,8 +17,8 @@ from evercal.features.device import allow_tf32
 from evercal.features.precision import autocast
 
 INLIER_PX = 5.0
-# While points are still far off, their errors say nothing about the lens.
 CORRECTION_FROM_PX = 20.0
+"""Soft clamp below which the camera is corrected. Earlier errors come from the points."""
 
 
 @dataclass(frozen=True)
@@ -30,67 +30,68 @@ class FitOptions:
     batch: int = 2048
     """Rows of the scenes being learned in a step."""
     replay_batch: int = 1024
-    """Replayed rows in a step, drawn evenly from all remembered scenes."""
+    """Replayed rows in a step, the same number from every remembered scene."""
     peak_rate: float = 4e-3
-    """Peak of the one-cycle learning rate (cosine up and down) of AdamW."""
+    """Peak of AdamW's one-cycle learning rate (cosine up and down)."""
     muon_rate: float = 0.02
-    """The same peak for the hidden matrices, which Muon trains (Jordan et al., 2024); 0 leaves them
-    to AdamW."""
+    """Peak learning rate of the hidden matrices, trained by Muon (Jordan et al., 2024). With 0,
+    AdamW trains them too."""
     warm_share: float = 0.05
-    """Share of the steps in which the rate rises."""
+    """Share of the steps during which the rate rises."""
     weight_decay: float = 0.01
-    """Decoupled, relative to the rate; codes and logits have none."""
+    """Decoupled weight decay, relative to the rate; not applied to codes and logits."""
     diffusion: float = 0.1
-    """Standard deviation of the noise on every row's descriptor (GLACE's feature diffusion)."""
+    """Standard deviation of the noise on each row's descriptor (GLACE's feature diffusion)."""
     intrinsics_rate: float = 0.3
-    """Learning rate of the camera correction (focal length, principal point, k1, k2) as a share of
-    the head's; 0 trusts the given intrinsics. Cameras with known distortion stay as they are."""
+    """Learning rate of the camera correction (focal length, principal point, k1, k2), as a share of
+    the head's. With 0, the given intrinsics are used. Cameras with known distortion are never
+    corrected."""
     loss: LossOptions = field(default_factory=LossOptions)
     """Reprojection loss on the scenes being learned."""
 
     def with_known_lens(self) -> "FitOptions":
-        """The same for frames whose lens is known better than training could correct it."""
+        """Return a copy that does not correct the camera."""
         return replace(self, intrinsics_rate=0.0)
 
 
 @dataclass
 class Progress:
-    """Where training stands."""
+    """State of the training after a step."""
 
     step: int
-    """Steps done."""
+    """Completed steps."""
     total: int
     """Steps of the stage."""
     costs: Tensor
-    """(n,) loss of each row being learned at the last step."""
+    """(n,) loss of each new row in the last step."""
     errors_px: Tensor
-    """(n,) reprojection error of each, pixels."""
+    """(n,) reprojection error of each new row in the last step, pixels."""
 
-    # Computed when asked for: a GPU would have to finish the step first.
+    # Properties, because reading a value synchronises with the GPU.
     @property
     def loss(self) -> float:
-        """Mean loss of the rows being learned at the last step."""
+        """Mean loss of the new rows in the last step."""
         return float(self.costs.mean())
 
     @property
     def inlier_share(self) -> float:
-        """Share of the rows being learned within 5 px at the last step."""
+        """Share of the new rows within 5 px in the last step."""
         return float((self.errors_px < INLIER_PX).float().mean())
 
 
 class HeadTrainer:
-    """Trains `head` on `buffers`; can stop after any step and go on from `state()`.
+    """Trains a head on feature rows; can stop after any step and resume from `state()`.
 
-    The rows of step k are a function of (seed, k), so a resumed run sees what an uninterrupted one
-    would have seen.
+    The rows of a step depend only on the seed and the step number, so a resumed run draws the same
+    rows as an uninterrupted one.
 
     Args:
-        head: trained in place, on the device where it lies and the buffers give their rows; all
-            processes begin with the weights of the first.
-        buffers: rows of the scenes being learned.
-        options: how.
-        seed: random seed.
-        hooks: what a continual-learning method adds.
+        head: Trained in place on its device, where the buffers must return their rows. All
+            processes start with the weights of the first.
+        buffers: Rows of the scenes being learned.
+        options: Training options.
+        seed: Random seed.
+        hooks: Hooks of a continual-learning method.
     """
 
     def __init__(
@@ -104,16 +105,15 @@ class HeadTrainer:
         self.head, self.buffers = head, buffers
         self.options, self.seed, self.step = options, seed, 0
         self.hooks = TrainingHooks() if hooks is None else hooks
-        self.device = head.device
-        allow_tf32(self.device)
+        allow_tf32(head.device)
         broadcast([*head.parameters(), *head.buffers()])
-        self.correction = torch.nn.Parameter(torch.zeros(len(buffers), 5, device=self.device))
+        self.correction = torch.nn.Parameter(torch.zeros(len(buffers), 5, device=head.device))
         correctable = [[float(buffer.correctable)] for buffer in buffers]
-        self._correctable = torch.tensor(correctable, device=self.device)
+        self._correctable = torch.tensor(correctable, device=head.device)
         self._optimisers = _optimisers(head, self.correction, options)
 
     def run(self) -> Iterator[Progress]:
-        """Trains to the end, yielding after every step."""
+        """Train to the end, yielding after every step."""
         self.head.train()
         while self.step < self.options.iterations:
             yield self._train_step()
@@ -126,46 +126,46 @@ class HeadTrainer:
             for group in optimiser.param_groups:
                 group["lr"] = rate * group["share"]
             optimiser.zero_grad()
-        # One scene for all rows is a plain bias, a scene per row another product in every layer.
-        alone = len(self.buffers) == 1 and fresh == len(rows.scene)
-        scene = self.buffers[0].scene if alone else rows.scene
-        with autocast(self.device):
+        # A single scene is a plain bias; a scene per row costs a product in every layer.
+        single = len(self.buffers) == 1 and fresh == len(rows.scene)
+        scene = self.buffers[0].scene if single else rows.scene
+        with autocast(self.head.device):
             output = self.head(rows.features.float(), scene, rows.descriptor)
         tau_px = clamp_px(options.loss, self.step / options.iterations)
         costs, errors = self._fresh_costs(output.points[:fresh], rows.part(slice(0, fresh)), tau_px)
         loss = costs.mean()
-        held, remembered = output.part(slice(fresh, None)), rows.part(slice(fresh, None))
+        replayed, remembered = output.part(slice(fresh, None)), rows.part(slice(fresh, None))
         more = [self.hooks.regularizer()]
         if fresh < len(rows.scene):
-            more.append(self.hooks.cost(held, remembered, tau_px))
+            more.append(self.hooks.cost(replayed, remembered, tau_px))
         for cost in more:
             loss = loss if cost is None else loss + cost
-        losses = self.hooks.constraints(held, remembered)
-        constraints = [self._gradients(one) for one in losses]
+        losses = self.hooks.constraints(replayed, remembered)
+        constraints = [self._gradients(constraint) for constraint in losses]
         loss.backward()
-        every = [*self.head.parameters(), self.correction]
-        average([parameter.grad for parameter in every if parameter.grad is not None])
+        parameters = [*self.head.parameters(), self.correction]
+        average([parameter.grad for parameter in parameters if parameter.grad is not None])
         average([gradient for constraint in constraints for gradient in constraint.values()])
         self._take_step(losses, constraints, rate / options.peak_rate)
         self.step += 1
         return Progress(self.step, options.iterations, costs.detach(), errors)
 
     def _rows(self, rate: float) -> tuple[Rows, int]:
-        """The rows of this step that this process trains on, and how many of them are new."""
+        """Draw this process's rows of the step; return them and the number of new rows."""
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
         share = self.options.batch // len(self.buffers)
         parts = [buffer.draw(share, generator) for buffer in self.buffers]
         fresh = len(parts)
         parts += self.hooks.replayed(join(parts), self.step, rate, generator)
         if self.head.options.condition == "descriptor":
-            # Drawn where the rows lie, and for all processes' rows alike.
+            # Drawn on the device of the rows, and before they are shared among processes.
             seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
-            noise = torch.Generator(self.device).manual_seed(seed)
+            noise = torch.Generator(self.head.device).manual_seed(seed)
             parts = [diffused(part, self.options.diffusion, noise) for part in parts]
         return join([own_share(part) for part in parts]), fresh * (share // processes())
 
     def _fresh_costs(self, points: Tensor, rows: Rows, tau_px: float) -> tuple[Tensor, Tensor]:
-        """Loss and error in pixels of the rows being learned."""
+        """Compute loss and error in pixels of the new rows."""
         options = self.options
         correction = None
         if options.intrinsics_rate > 0 and tau_px < CORRECTION_FROM_PX:
@@ -174,17 +174,17 @@ class HeadTrainer:
         return reprojection_loss(points, rows.target, tau_px, options.loss, correction)
 
     def _gradients(self, loss: Tensor) -> dict[str, Tensor]:
-        """Gradient of a loss by every weight of the head; the graph stays."""
+        """Compute the gradient of a loss by parameter name, keeping the graph."""
         named = dict(self.head.named_parameters())
-        found = torch.autograd.grad(
+        gradients = torch.autograd.grad(
             loss, list(named.values()), retain_graph=True, materialize_grads=True
         )
-        return dict(zip(named, found, strict=True))
+        return dict(zip(named, gradients, strict=True))
 
     def _take_step(
         self, losses: Sequence[Tensor], constraints: list[dict[str, Tensor]], schedule: float
     ) -> None:
-        """Lets the optimisers step, and a hook change what they did."""
+        """Step the optimisers and let the hooks edit the change."""
         named = dict(self.head.named_parameters())
         before = {}
         if self.hooks.edits_steps:
@@ -194,58 +194,56 @@ class HeadTrainer:
         if not before:
             return
         with torch.no_grad():
-            found = (
-                torch.stack([loss.detach() for loss in losses])
-                if losses
-                else self.correction[:0, 0]
-            )
-            average([found])
+            values = torch.zeros(0, device=self.head.device)
+            if losses:
+                values = torch.stack([loss.detach() for loss in losses])
+            average([values])
             changes = {name: value - before[name] for name, value in named.items()}
             gradients = {
                 k: torch.zeros_like(v) if v.grad is None else v.grad for k, v in named.items()
             }
             self.hooks.edit_step(
-                ProposedStep(changes, gradients, found, constraints, self.step, schedule)
+                ProposedStep(changes, gradients, values, constraints, self.step, schedule)
             )
             for name, value in named.items():
                 value.copy_(before[name] + changes[name])
 
     def state(self) -> dict[str, Tensor]:
-        """What `load` needs to go on from here, as named tensors."""
+        """Return named tensors from which `load` resumes."""
         state = {f"head.{k}": v for k, v in self.head.state_dict().items()}
         state["correction"] = self.correction.detach()
         state |= {f"hooks.{k}": v for k, v in self.hooks.state().items()}
-        for which, optimiser in enumerate(self._optimisers):
+        for number, optimiser in enumerate(self._optimisers):
             for i, slots in optimiser.state_dict()["state"].items():
-                state |= {f"optimiser.{which}.{i}.{name}": v for name, v in slots.items()}
-        # Copies: training goes on while someone may be writing them.
+                state |= {f"optimiser.{number}.{i}.{name}": v for name, v in slots.items()}
+        # Copies, because training may continue while they are written.
         copies = {k: v.detach().cpu().clone() for k, v in state.items()}
         return copies | {"step": torch.tensor(self.step, device="cpu")}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
-        """Goes back to where `state()` was taken; the head must have the same shape."""
+        """Restore the result of `state()`; the head must have the same shape."""
         self.step = int(state["step"])
-        self.head.load_state_dict(_under("head.", state))
+        self.head.load_state_dict(_without_prefix("head.", state))
         self.correction.data.copy_(state["correction"])
-        self.hooks.load(_under("hooks.", state))
-        for which, optimiser in enumerate(self._optimisers):
+        self.hooks.load(_without_prefix("hooks.", state))
+        for number, optimiser in enumerate(self._optimisers):
             slots: dict[int, dict[str, Tensor]] = {}
-            for key, value in _under(f"optimiser.{which}.", state).items():
+            for key, value in _without_prefix(f"optimiser.{number}.", state).items():
                 i, name = key.split(".")
                 slots.setdefault(int(i), {})[name] = value
             groups = optimiser.state_dict()["param_groups"]
             optimiser.load_state_dict({"state": slots, "param_groups": groups})
 
 
-def _under(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors whose names begin with a prefix, without it."""
+def _without_prefix(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Select the tensors whose names start with a prefix, and remove the prefix."""
     return {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
 
 
 def _optimisers(
     head: Head, correction: torch.nn.Parameter, options: FitOptions
 ) -> list[torch.optim.Optimizer]:
-    """AdamW, and Muon for the hidden matrices where it has a rate."""
+    """Create AdamW, and Muon for the hidden matrices if it has a rate."""
     hidden, decay, plain = [], [], []
     for name, parameter in head.named_parameters():
         if name.startswith(("code", "logit")):
@@ -268,9 +266,9 @@ def _optimisers(
 
 
 def one_cycle(options: FitOptions, step: int) -> float:
-    """Learning rate of a step: cosine from 1/25 of the peak to the peak, then cosine to zero.
+    """Return the learning rate of a step: cosine from 1/25 of the peak up, then down to zero.
 
-    The shape of torch's OneCycleLR, as a function of the step alone so that nothing need be saved.
+    The shape is that of torch's OneCycleLR, but without state to save.
     """
     rise = max(1.0, options.warm_share * options.iterations)
     if step < rise:

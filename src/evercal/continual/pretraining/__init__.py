@@ -1,1 +1,1 @@
-"""How the shipped encoder and descriptor are made: procedural images only."""
+"""Training of the shipped encoder and descriptor on procedural images."""

@@ -1,12 +1,13 @@
-"""Contrastive training of the local encoder on procedural pairs, resumable and seeded."""
+"""Contrastive training of the local encoder on procedural image pairs."""
 
+import io
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import DataLoader, IterableDataset
 
-from evercal.continual.pretraining.furnished import FurnishedViews, kept_furnished_views
+from evercal.continual.pretraining.furnished import FurnishedViews, cached_furnished_views
 from evercal.continual.pretraining.pairs import (
     FIRST_ROOM_SEED,
     HEIGHT,
@@ -37,34 +38,35 @@ from evercal.features.precision import autocast
 from evercal.simulation.furnished.renderer import mitsuba
 from evercal.storage.atomic import write_bytes
 
+CHECKPOINT = "encoder.pt"
 CHECKPOINT_STEPS = 250
 NEAR_PX = 10.0
 
 
 @dataclass(frozen=True)
 class PretrainOptions:
-    """What makes the weights; `pretrain.log` beside the shipped ones tells theirs."""
+    """Options of the pretraining; `pretrain.log` records the options of the shipped weights."""
 
     steps: int = 9_000
     """Optimiser steps of the local encoder."""
     rooms: int = 160
-    """Box rooms, each seen from 20 cameras."""
+    """Box rooms, each with 20 views."""
     furnished: int = 120
-    """Furnished rooms (extra `sim`), each seen from 20 cameras."""
+    """Furnished rooms (extra `sim`), each with 20 views."""
     pictures: int = 300
     """Dead-leaves pictures for homography pairs."""
     room_pairs: int = 1
-    """Pairs of box rooms in a step."""
+    """Pairs from box rooms in a step."""
     furnished_pairs: int = 3
-    """Pairs of furnished rooms in a step."""
+    """Pairs from furnished rooms in a step."""
     leaf_pairs: int = 2
     """Homography pairs in a step."""
     points: int = 192
-    """Corresponding points drawn from a pair."""
+    """Largest number of corresponding points of a pair."""
     rivals: Literal["points", "cells"] = "cells"
-    """What a point is told apart from: the other points, or every cell of its other image, too."""
+    """Negatives of a point: points of other images, or also every cell of its other image."""
     temperature: float = 0.07
-    """Of the softmax over cosine similarities."""
+    """Temperature of the softmax over cosine similarities."""
     peak_rate: float = 2e-3
     """Peak of the one-cycle learning rate."""
     descriptor_steps: int = 2_000
@@ -72,16 +74,27 @@ class PretrainOptions:
     seed: int = 1
     """Random seed."""
     init: str | None = None
-    """Checkpoint `encoder.pt` of an earlier run to start from; random weights when left out."""
+    """Checkpoint `encoder.pt` of an earlier run to start from. Without it, weights are random."""
 
 
 @dataclass(frozen=True)
 class PretrainData:
-    """All rendered input, made once from seeds."""
+    """Rendered training data."""
 
     rooms: list[RoomViews]
     pictures: list[np.ndarray]
     furnished: list[FurnishedViews] = field(default_factory=list)
+
+
+class Batch(NamedTuple):
+    """One training batch of b image pairs."""
+
+    images: Tensor
+    """(2, b, 1, h, w) grey values in [0, 1]."""
+    pixels: Tensor
+    """(2, b, points, 2) corresponding pixels."""
+    valid: Tensor
+    """(b, points) bool; pairs may have fewer points."""
 
 
 def _picture(seed: int) -> np.ndarray:
@@ -89,41 +102,42 @@ def _picture(seed: int) -> np.ndarray:
 
 
 def make_data(options: PretrainOptions, folder: Path) -> PretrainData:
-    """Draws box rooms and pictures with one process per core, and renders furnished rooms.
+    """Render rooms and pictures, box rooms with one process per core.
 
-    The latter take about ten seconds each and are kept in `folder`.
+    Furnished rooms take about ten seconds each and are cached in `folder`.
 
     Raises:
-        InputError: Pairs of furnished rooms without any, more rooms of a kind than there are seeds,
-            or the extra `sim` is missing.
+        InputError: Pairs but no furnished rooms, more rooms than seeds, or no extra `sim`.
     """
     if options.furnished_pairs and not options.furnished:
-        raise InputError("pairs of furnished rooms need --furnished rooms, at least 1")
-    most = VALIDATION_ROOM_SEED - FIRST_ROOM_SEED
-    if max(options.furnished, options.rooms) > most:
         raise InputError(
-            f"rooms {options.rooms}, furnished {options.furnished}: at most {most} of a kind, "
-            "later seeds are held out"
+            f"--furnished-pairs {options.furnished_pairs} needs --furnished of at least 1"
+        )
+    limit = VALIDATION_ROOM_SEED - FIRST_ROOM_SEED
+    if max(options.furnished, options.rooms) > limit:
+        raise InputError(
+            f"--rooms {options.rooms}, --furnished {options.furnished}: at most {limit} of a kind;"
+            " later seeds are held out"
         )
     if options.furnished:
-        mitsuba()  # rather now than after minutes
+        mitsuba()  # fails early without the extra
     with get_context("spawn").Pool() as pool:
         seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + options.rooms)
         rooms = pool.map(room_views, seeds, chunksize=4)
         seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + options.pictures)
         pictures = pool.map(_picture, seeds, chunksize=8)
     seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + options.furnished)
-    return PretrainData(rooms, pictures, [kept_furnished_views(seed, folder) for seed in seeds])
+    return PretrainData(rooms, pictures, [cached_furnished_views(seed, folder) for seed in seeds])
 
 
 class PairStream(IterableDataset):
-    """An endless, seeded stream of training batches that can start at any step."""
+    """Seeded training batches from any first step to the last."""
 
     def __init__(self, data: PretrainData, options: PretrainOptions, first_step: int):
         self.data, self.options, self.first_step = data, options, first_step
 
-    def draw(self, step: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Batch `step`: images (2, b, 1, h, w), pixels (2, b, points, 2), valid (b, points)."""
+    def draw(self, step: int) -> Batch:
+        """Draw the batch of a step."""
         o = self.options
         rng = np.random.default_rng([o.seed, step])
         pairs: list[Pair] = []
@@ -146,10 +160,10 @@ class PairStream(IterableDataset):
             pixels[:, i, : len(chosen)] = pair.pixels[:, chosen]
             valid[i, : len(chosen)] = True
         grey = torch.from_numpy(images[:, :, None]).float() / 255
-        return grey, torch.from_numpy(pixels), torch.from_numpy(valid)
+        return Batch(grey, torch.from_numpy(pixels), torch.from_numpy(valid))
 
     def _parallax(self, rooms: Sequence[Views], rng: np.random.Generator) -> Pair:
-        """Two views of one part of one room."""
+        """Draw two views of one part of a room."""
         views = rooms[int(rng.integers(len(rooms)))]
         anchor = PER_ANCHOR * rng.integers(len(views.images) // PER_ANCHOR)
         first, second = anchor + rng.choice(PER_ANCHOR, 2, replace=False)
@@ -159,7 +173,7 @@ class PairStream(IterableDataset):
         picture = self.data.pictures[rng.integers(len(self.data.pictures))]
         return homography_pair(picture, rng)
 
-    def __iter__(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    def __iter__(self) -> Iterator[Batch]:
         import cv2
 
         cv2.setNumThreads(1)
@@ -168,27 +182,27 @@ class PairStream(IterableDataset):
 
 
 def sample_features(features: Tensor, pixels: Tensor) -> Tensor:
-    """Bilinear features (b, c, h, w) at pixels (b, n, 2) of the image, unit length (b, n, c)."""
+    """Interpolate features (b, c, h, w) at pixels (b, n, 2) as unit vectors (b, n, c)."""
     size = torch.tensor([WIDTH, HEIGHT], dtype=pixels.dtype)
     grid = 2 * (pixels + 0.5) / size - 1
-    found = F.grid_sample(features, grid[:, None], align_corners=False, padding_mode="border")
-    return F.normalize(found[:, :, 0].transpose(1, 2), dim=-1)
+    sampled = F.grid_sample(features, grid[:, None], align_corners=False, padding_mode="border")
+    return F.normalize(sampled[:, :, 0].transpose(1, 2), dim=-1)
 
 
 def contrastive_loss(
     points: Tensor, pixels: Tensor, valid: Tensor, temperature: float, cells: Tensor | None = None
 ) -> Tensor:
-    """Symmetric InfoNCE (van den Oord et al., 2018) over every point of the batch.
+    """Compute the symmetric InfoNCE loss (van den Oord et al., 2018) over all points of a batch.
 
-    A point's rivals are all points of the batch in the other images and, where `cells` are given,
-    all cells of its own other image: what looks alike within one image (books, tiles, handles)
-    must be told apart, too. Rivals nearer than 10 pixels to the truth are not held against it.
+    The negatives of a point are all other points of the batch. With `cells`, all cells of the other
+    image of its pair are added, so similar structures within an image (books, tiles, handles) are
+    separated too. Negatives within 10 pixels of the true match are ignored.
 
     Args:
-        points: (2, p, n, c) unit features of the points in the first and in the second images.
-        pixels: (2, p, n, 2) where they lie there.
+        points: (2, p, n, c) unit features of the points in the first and second images.
+        pixels: (2, p, n, 2) positions of the points.
         valid: (p, n) bool.
-        temperature: of the softmax.
+        temperature: Temperature of the softmax.
         cells: (2, p, m, c) unit features of the images' cells, in the order of `cell_pixels`.
     """
     keep = valid.flatten()
@@ -212,10 +226,8 @@ def contrastive_loss(
 
 
 @torch.inference_mode()
-def matching_accuracy(
-    encoder: torch.nn.Module, batches: list[tuple[Tensor, Tensor, Tensor]]
-) -> float:
-    """Share (%) of points whose best cell in the other image lies within 8 pixels of the truth."""
+def matching_accuracy(encoder: torch.nn.Module, batches: list[Batch]) -> float:
+    """Compute the share (%) of points whose best cell is within 8 pixels of the true match."""
     right = total = 0
     for images, pixels, valid in batches:
         with autocast():
@@ -224,41 +236,37 @@ def matching_accuracy(
         cells = maps[1].flatten(2)
         best = (points @ cells).argmax(-1)
         columns = maps.shape[-1]
-        found = torch.stack([best % columns, best // columns], -1) * 8 + 3.5
-        close = (found - pixels[1]).norm(dim=-1) < 8
+        matches = torch.stack([best % columns, best // columns], -1) * 8 + 3.5
+        close = (matches - pixels[1]).norm(dim=-1) < 8
         right += int((close & valid).sum())
         total += int(valid.sum())
     return 100.0 * right / max(total, 1)
 
 
 def train_encoder(
-    data: PretrainData, options: PretrainOptions, folder: Path, say: Callable[[str], None]
+    data: PretrainData, options: PretrainOptions, folder: Path, log: Callable[[str], None]
 ) -> LocalEncoder:
-    """Trains, checkpointing every 250 steps to `folder`; picks up a checkpoint it finds there.
+    """Train the encoder with a checkpoint every 250 steps; resume from a checkpoint in `folder`.
 
     Returns:
-        The trained encoder with batch norm still separate (`fuse()` gives the inference form).
+        The trained encoder with separate batch norm (`fuse()` gives the inference form).
     """
-    torch.manual_seed(options.seed)
-    encoder = LocalEncoder(fused=False)
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(options.seed)
+        encoder = LocalEncoder(fused=False)
     encoder.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     optimiser = torch.optim.AdamW(encoder.parameters(), lr=1e-4, weight_decay=0.02)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, options.peak_rate, total_steps=options.steps, pct_start=0.05
     )
-    checkpoint, step = folder / "encoder.pt", 0
+    trained = {"encoder": encoder, "optimiser": optimiser, "schedule": schedule}
     if options.init is not None:
         encoder.load_state_dict(_earlier(Path(options.init)))
-    if checkpoint.is_file():
-        saved = torch.load(checkpoint, weights_only=True)
-        if saved["options"] == json.dumps(asdict(options)):
-            encoder.load_state_dict(saved["encoder"])
-            optimiser.load_state_dict(saved["optimiser"])
-            schedule.load_state_dict(saved["schedule"])
-            step = saved["step"]
-            say(f"resumed at step {step}")
+    step = _resume(folder / CHECKPOINT, trained, options)
+    if step:
+        log(f"resumed at step {step}")
     validation = _validation(data, folder)
-    # Spawned, not forked: OpenCV's threads do not survive a fork, and the worker would hang.
+    # Spawned, because OpenCV's threads do not survive a fork and the worker would hang.
     loader = DataLoader(
         PairStream(data, options, step),
         batch_size=None,
@@ -287,58 +295,58 @@ def train_encoder(
             )
             encoder.train()
             seconds = time.perf_counter() - began
-            say(f"step {step} loss {np.mean(losses):.3f} matched {matched} {seconds:.0f} s")
+            log(f"step {step} loss {np.mean(losses):.3f} matched {matched} {seconds:.0f} s")
             losses.clear()
-            _save(checkpoint, encoder, optimiser, schedule, step, options)
+            _save(folder / CHECKPOINT, trained, step, options)
     return encoder
 
 
-def _earlier(checkpoint: Path) -> dict[str, Tensor]:
-    """Weights of an earlier run.
-
-    Raises:
-        InputError: no checkpoint of ours, or of an encoder with another layout.
-    """
-    try:
-        found = torch.load(checkpoint, weights_only=True)["encoder"]
-        LocalEncoder(fused=False).load_state_dict(found)
-    except Exception as error:
-        reason = (str(error).splitlines() or [repr(error)])[0]
-        raise InputError(f"--init {checkpoint}: not the encoder.pt of a run ({reason})") from error
-    return found
+def _resume(path: Path, trained: Mapping[str, Any], options: PretrainOptions) -> int:
+    """Load a checkpoint of a run with the same options; return its step, or 0 without one."""
+    if not path.is_file():
+        return 0
+    saved = torch.load(path, weights_only=True)
+    if saved["options"] != json.dumps(asdict(options)):
+        return 0
+    for name, part in trained.items():
+        part.load_state_dict(saved[name])
+    return saved["step"]
 
 
-def _validation(data: PretrainData, folder: Path) -> dict[str, list[tuple[Tensor, Tensor, Tensor]]]:
-    """Batches of rooms that training never sees, by kind of room."""
-    rooms = [room_views(VALIDATION_ROOM_SEED + i) for i in range(8)]
-    options = PretrainOptions(room_pairs=8, furnished_pairs=0, leaf_pairs=0)
-    judge = PairStream(PretrainData(rooms, []), options, 0)
-    batches = {"box rooms": [judge.draw(i) for i in range(6)]}
-    if data.furnished:
-        cells = [kept_furnished_views(VALIDATION_ROOM_SEED + i, folder) for i in range(8)]
-        options = PretrainOptions(room_pairs=0, furnished_pairs=8, leaf_pairs=0)
-        judge = PairStream(PretrainData([], [], cells), options, 0)
-        batches["furnished rooms"] = [judge.draw(i) for i in range(6)]
-    return batches
-
-
-def _save(
-    path: Path,
-    encoder: LocalEncoder,
-    optimiser: torch.optim.Optimizer,
-    schedule: torch.optim.lr_scheduler.LRScheduler,
-    step: int,
-    options: PretrainOptions,
-) -> None:
-    import io
-
+def _save(path: Path, trained: Mapping[str, Any], step: int, options: PretrainOptions) -> None:
+    state = {name: part.state_dict() for name, part in trained.items()}
+    state |= {"step": step, "options": json.dumps(asdict(options))}
     buffer = io.BytesIO()
-    state = {
-        "encoder": encoder.state_dict(),
-        "optimiser": optimiser.state_dict(),
-        "schedule": schedule.state_dict(),
-        "step": step,
-        "options": json.dumps(asdict(options)),
-    }
     torch.save(state, buffer)
     write_bytes(path, buffer.getvalue())
+
+
+def _earlier(checkpoint: Path) -> dict[str, Tensor]:
+    """Load the encoder's weights from a checkpoint of an earlier run.
+
+    Raises:
+        InputError: Not a checkpoint, or of an encoder with another architecture.
+    """
+    try:
+        weights = torch.load(checkpoint, weights_only=True)["encoder"]
+        LocalEncoder(fused=False).load_state_dict(weights)
+    except Exception as error:
+        reason = (str(error).splitlines() or [repr(error)])[0]
+        raise InputError(
+            f"{checkpoint}: not the {CHECKPOINT} of a run ({reason}); correct --init"
+        ) from error
+    return weights
+
+
+def _validation(data: PretrainData, folder: Path) -> dict[str, list[Batch]]:
+    """Draw batches from held-out rooms, by kind of room."""
+    rooms = [room_views(VALIDATION_ROOM_SEED + i) for i in range(8)]
+    options = PretrainOptions(room_pairs=8, furnished_pairs=0, leaf_pairs=0)
+    stream = PairStream(PretrainData(rooms, []), options, 0)
+    batches = {"box rooms": [stream.draw(i) for i in range(6)]}
+    if data.furnished:
+        furnished = [cached_furnished_views(VALIDATION_ROOM_SEED + i, folder) for i in range(8)]
+        options = PretrainOptions(room_pairs=0, furnished_pairs=8, leaf_pairs=0)
+        stream = PairStream(PretrainData([], [], furnished), options, 0)
+        batches["furnished rooms"] = [stream.draw(i) for i in range(6)]
+    return batches

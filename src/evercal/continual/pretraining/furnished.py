@@ -1,4 +1,4 @@
-"""Views of furnished rooms for pretraining, path-traced with true depth (extra `sim`)."""
+"""Path-traced views of furnished rooms with true depth, for pretraining (extra `sim`)."""
 
 import io
 from collections.abc import Iterator
@@ -18,58 +18,58 @@ from evercal.simulation.furnished.rooms import KINDS, Room, room
 from evercal.storage import lock_settings, write_bytes
 
 SAMPLES = 8
-HIDDEN = 0.02
-"""A point is hidden where the depth map differs by more than this share of its depth."""
+OCCLUSION = 0.02
+"""Relative depth difference beyond which a point is occluded."""
 
 
 @dataclass(eq=False)
 class FurnishedViews:
-    """`Views` of a furnished room; surfaces are known through depth maps."""
+    """`Views` of a furnished room, with surfaces from depth maps."""
 
     images: np.ndarray
     base_from_camera: SE3
     cameras: tuple[Camera, ...]
     depth_m: np.ndarray
-    """(n, HEIGHT, WIDTH) float16 metres along the optical axis, 0 where nothing was hit."""
+    """(n, HEIGHT, WIDTH) float16 metres along the optical axis; 0 without a surface."""
 
     def _depth(self, view: int, pixels: np.ndarray) -> np.ndarray:
         u, v = np.rint(pixels).astype(int).T
         return self.depth_m[view, v, u].astype(float)
 
     def hit(self, view: int, pixels: np.ndarray) -> np.ndarray:
-        """See `Views`."""
+        """Intersect rays with surfaces; see `Views`."""
         depth = self._depth(view, pixels)
         depth[depth == 0] = np.nan
         points = self.cameras[view].unproject(pixels) * depth[:, None]
         return self.base_from_camera[view].apply(points)
 
-    def sees(self, view: int, points_m: np.ndarray) -> np.ndarray:
-        """See `Views`."""
+    def visible(self, view: int, points_m: np.ndarray) -> np.ndarray:
+        """Test for occlusion; see `Views`."""
         within = self.base_from_camera[view].inverse().apply(points_m)
         depth = self._depth(view, self.cameras[view].project(within))
-        return np.abs(depth - within[:, 2]) < HIDDEN * within[:, 2]
+        return np.abs(depth - within[:, 2]) < OCCLUSION * within[:, 2]
 
 
 def furnished_views(seed: int, anchors: int = 5) -> FurnishedViews:
-    """Renders a furnished room from `anchors * PER_ANCHOR` cameras.
+    """Render a furnished room from `anchors * PER_ANCHOR` cameras.
 
-    Cameras stand anywhere in free air and look at furniture from 0.7 to 3 m; those of one anchor
-    differ by parallax, scale and roll.
+    Cameras have random positions in free space, 0.7 to 3 m from a piece of furniture. The views of
+    an anchor differ by parallax, scale and roll.
 
     Args:
-        seed: of room, arm and cameras; FIRST_ROOM_SEED or later.
-        anchors: how many parts of the room are looked at.
+        seed: Seed of room, arm and cameras; FIRST_ROOM_SEED or later.
+        anchors: Number of observed parts of the room.
     """
     import cv2
 
     rng = np.random.default_rng([seed, 78])
-    place, panda = room(sorted(KINDS)[seed % len(KINDS)], seed), Panda()
+    scene, panda = room(sorted(KINDS)[seed % len(KINDS)], seed), Panda()
     joints = np.array(HOME_RAD) + rng.normal(0, 0.3, 7)
-    renderer = Renderer(place.meshes() + panda.meshes(joints), rng.uniform(1.2, 2.8))
+    renderer = Renderer(scene.meshes() + panda.meshes(joints), rng.uniform(1.2, 2.8))
     poses, cameras, images, depths = [], [], [], []
     for _ in range(anchors):
         camera = pinhole(rng.uniform(0.65, 1.15) * WIDTH)
-        for pose in _anchor(place, rng):
+        for pose in _anchor(scene, rng):
             image = renderer.render(camera, pose, RenderOptions(SAMPLES), int(rng.integers(2**31)))
             poses.append(pose)
             cameras.append(camera)
@@ -78,27 +78,27 @@ def furnished_views(seed: int, anchors: int = 5) -> FurnishedViews:
     return FurnishedViews(np.stack(images), SE3.stack(poses), tuple(cameras), np.stack(depths))
 
 
-def _anchor(place: Room, rng: np.random.Generator) -> Iterator[SE3]:
-    """PER_ANCHOR poses that look at the same thing from places near each other."""
+def _anchor(scene: Room, rng: np.random.Generator) -> Iterator[SE3]:
+    """Yield PER_ANCHOR poses that view one item from nearby positions."""
     while True:
-        thing = place.items[rng.integers(len(place.items))].bounds_m()
-        target = rng.uniform(thing[0], thing[1])
-        way = rng.standard_normal(3) * (1, 1, 0.6)
-        eye = target + rng.uniform(0.7, 3.0) * way / np.linalg.norm(way)
+        bounds_m = scene.items[rng.integers(len(scene.items))].bounds_m()
+        target = rng.uniform(bounds_m[0], bounds_m[1])
+        direction = rng.standard_normal(3) * (1, 1, 0.6)
+        eye = target + rng.uniform(0.7, 3.0) * direction / np.linalg.norm(direction)
         spread = 0.25 * float(np.linalg.norm(eye - target))
         eyes = eye + spread * rng.standard_normal((PER_ANCHOR, 3)) * (1, 1, 0.6)
-        if eye[2] > place.low_m[2] + 0.3 and is_clear(place, eyes).all():
+        if eye[2] > scene.low_m[2] + 0.3 and is_clear(scene, eyes).all():
             break
     for eye in eyes:
         aim = target + 0.15 * rng.standard_normal(3)
         yield look_at(eye, aim, rng.normal(0, 0.15))
 
 
-def kept_furnished_views(seed: int, folder: Path) -> FurnishedViews:
-    """The same from `folder`, rendered and put there when it is missing."""
-    # Raise the version when the rooms or the renderer change.
-    made = {"version": 1, "samples": SAMPLES, "size": [WIDTH, HEIGHT], "per_anchor": PER_ANCHOR}
-    lock_settings(folder / "rooms.json", made)
+def cached_furnished_views(seed: int, folder: Path) -> FurnishedViews:
+    """Read the views of a room from `folder`; render and write them if missing."""
+    # Increase the version when the rooms or the renderer change.
+    settings = {"version": 1, "samples": SAMPLES, "size": [WIDTH, HEIGHT], "per_anchor": PER_ANCHOR}
+    lock_settings(folder / "rooms.json", settings)
     path = folder / f"room-{seed}.npz"
     if not path.is_file():
         views, buffer = furnished_views(seed), io.BytesIO()
@@ -113,7 +113,7 @@ def kept_furnished_views(seed: int, folder: Path) -> FurnishedViews:
             translation_m=pose.translation_m,
         )
         write_bytes(path, buffer.getvalue())
-    with np.load(path) as found:
-        cameras = tuple(pinhole(focal) for focal in found["focal"].tolist())
-        poses = SE3(found["rotation_wxyz"], found["translation_m"])
-        return FurnishedViews(found["images"], poses, cameras, found["depth_m"])
+    with np.load(path) as saved:
+        cameras = tuple(pinhole(focal) for focal in saved["focal"].tolist())
+        poses = SE3(saved["rotation_wxyz"], saved["translation_m"])
+        return FurnishedViews(saved["images"], poses, cameras, saved["depth_m"])

@@ -1,4 +1,4 @@
-"""One command from seeds to the weight files that the package ships."""
+"""Pretraining from seeds to the weight files that the package ships."""
 
 import json
 import sys
@@ -16,38 +16,37 @@ from evercal.storage.atomic import write_bytes
 
 
 def pretrain(out: Path, work: Path, options: PretrainOptions) -> None:
-    """Makes `encoder.safetensors`, `descriptor.safetensors` and `pretrain.log` in `out`.
+    """Write `encoder.safetensors`, `descriptor.safetensors` and `pretrain.log`.
 
     Args:
-        out: folder for the three files; files of these names are replaced.
-        work: folder for checkpoints; the same options continue from what lies there.
-        options: what to train.
+        out: Folder of the three files; existing files are replaced.
+        work: Folder of checkpoints. A run with the same options resumes from them.
+        options: Training options.
     """
     out.mkdir(parents=True, exist_ok=True)
     work.mkdir(parents=True, exist_ok=True)
-    log = work / "pretrain.log"
+    path = work / "pretrain.log"
+    began = time.perf_counter()
 
-    def say(line: str) -> None:
-        with log.open("a") as file:
+    def log(line: str) -> None:
+        with path.open("a") as file:
             file.write(line + "\n")
         print(line, file=sys.stderr, flush=True)  # noqa: T201
 
-    say(f"options {json.dumps(asdict(options))}")
-    say(f"torch {torch.__version__} numpy {np.__version__} threads {torch.get_num_threads()}")
-    began = time.perf_counter()
+    def seconds() -> str:
+        return f"{time.perf_counter() - began:.0f} s"
+
+    log(f"options {json.dumps(asdict(options))}")
+    log(f"torch {torch.__version__} numpy {np.__version__} threads {torch.get_num_threads()}")
     data = make_data(options, work)
-    say(
+    log(
         f"rendered {options.rooms} box rooms, {options.furnished} furnished rooms, "
-        f"{options.pictures} pictures {_since(began)}"
+        f"{options.pictures} pictures {seconds()}"
     )
-    trained = train_encoder(data, options, work, say)
+    trained = train_encoder(data, options, work, log)
     encoder = trained.fuse().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     write_bytes(out / "encoder.safetensors", network_bytes(encoder, "encoder"))
-    descriptor = train_descriptor(data, options, encoder, say)
+    descriptor = train_descriptor(data, options, encoder, log)
     write_bytes(out / "descriptor.safetensors", network_bytes(descriptor, "descriptor"))
-    say(f"done {_since(began)}")
-    write_bytes(out / "pretrain.log", log.read_bytes())
-
-
-def _since(began: float) -> str:
-    return f"{time.perf_counter() - began:.0f} s"
+    log(f"done {seconds()}")
+    write_bytes(out / "pretrain.log", path.read_bytes())

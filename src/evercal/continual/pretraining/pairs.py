@@ -1,4 +1,4 @@
-"""Image pairs with known correspondence: dead leaves under homographies, rooms under parallax."""
+"""Image pairs with known correspondences: pictures under homographies, rooms under parallax."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -13,40 +13,40 @@ from evercal.simulation.furnished.textures import dead_leaves
 HEIGHT, WIDTH = 192, 256
 PER_ANCHOR = 4
 FIRST_ROOM_SEED = 1_000
-"""Rooms for pretraining, of boxes or furnished, start here: tests, demos and benchmarks use seeds
-below."""
+"""First seed of pretraining rooms; tests, demos and benchmarks use lower seeds."""
 VALIDATION_ROOM_SEED = FIRST_ROOM_SEED + 7_000
+"""First seed of held-out rooms."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two grey images and where the same surface points lie in both."""
+    """Two grey images with corresponding pixels."""
 
     images: np.ndarray
     """(2, HEIGHT, WIDTH) uint8."""
     pixels: np.ndarray
-    """(2, n, 2) float32: row k is one surface point in both images, (u, v) in pixels."""
+    """(2, n, 2) float32 pixels (u, v); row k is one surface point in both images."""
 
 
 def pinhole(focal: float) -> Camera:
-    """The camera of an image here, its principal point in the middle; `focal` in pixels."""
+    """Create a camera with a focal length in pixels and a central principal point."""
     return Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 
 
 def cell_pixels() -> np.ndarray:
-    """((HEIGHT / 8) (WIDTH / 8), 2) centres of the stride-8 cells, (u, v) in pixels."""
+    """Return the centres (u, v) of the stride-8 cells, ((HEIGHT / 8) (WIDTH / 8), 2)."""
     v, u = np.mgrid[0 : HEIGHT // 8, 0 : WIDTH // 8]
     return np.stack([u, v], -1).reshape(-1, 2) * 8.0 + 3.5
 
 
 def inside(pixels: np.ndarray, margin: float = 3.5) -> np.ndarray:
-    """(n,) bool: at least `margin` pixels from the border."""
+    """Return a mask (n,) of pixels at least `margin` from the border."""
     u, v = pixels[:, 0], pixels[:, 1]
     return (u >= margin) & (u <= WIDTH - 1 - margin) & (v >= margin) & (v <= HEIGHT - 1 - margin)
 
 
 def random_homography(side: int, rng: np.random.Generator) -> np.ndarray:
-    """(3, 3) map from image pixels to pixels of a square picture with the given side."""
+    """Draw a (3, 3) homography from image pixels to pixels of a square picture."""
     import cv2
 
     scale = np.exp(rng.uniform(np.log(0.6), np.log(1.7)))
@@ -61,7 +61,7 @@ def random_homography(side: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def homography_pair(picture: np.ndarray, rng: np.random.Generator) -> Pair:
-    """Two random perspective views of one grey (s, s) uint8 picture."""
+    """Warp one grey (s, s) uint8 picture to two random perspective views."""
     import cv2
 
     maps = [random_homography(picture.shape[0], rng) for _ in range(2)]
@@ -79,21 +79,21 @@ def homography_pair(picture: np.ndarray, rng: np.random.Generator) -> Pair:
 
 
 class Views(Protocol):
-    """Views of one room: every `PER_ANCHOR` in a row look at roughly the same part."""
+    """Views of one room; each group of `PER_ANCHOR` consecutive views shows the same part."""
 
     images: np.ndarray
     """(n, HEIGHT, WIDTH) uint8 grey."""
     base_from_camera: SE3
     """(n,) poses."""
     cameras: tuple[Camera, ...]
-    """n pinholes; the focal length differs between anchors."""
+    """n pinhole cameras; the focal length differs between anchors."""
 
     def hit(self, view: int, pixels: np.ndarray) -> np.ndarray:
-        """(n, 3) surface points that (n, 2) pixels of a view show; not finite where none is."""
+        """Return the (n, 3) surface points at (n, 2) pixels of a view; NaN without a surface."""
         ...
 
-    def sees(self, view: int, points_m: np.ndarray) -> np.ndarray:
-        """(n,) bool: no surface hides the (n, 3) points, which project into the view."""
+    def visible(self, view: int, points_m: np.ndarray) -> np.ndarray:
+        """Return a mask (n,) of points (n, 3) within the image that no surface occludes."""
         ...
 
 
@@ -105,23 +105,23 @@ class RoomViews:
     base_from_camera: SE3
     cameras: tuple[Camera, ...]
     geometry: BoxRoom
-    """The room; its textures are dropped to save memory, its rectangles stay."""
+    """The room without its textures, which would use much memory."""
 
     def hit(self, view: int, pixels: np.ndarray) -> np.ndarray:
-        """See `Views`."""
+        """Intersect rays with surfaces; see `Views`."""
         pose = self.base_from_camera[view]
         rays = self.cameras[view].unproject(pixels) @ pose.rotation_matrix().T
         return self.geometry.intersect(pose.translation_m, rays)[0]
 
-    def sees(self, view: int, points_m: np.ndarray) -> np.ndarray:
-        """See `Views`."""
+    def visible(self, view: int, points_m: np.ndarray) -> np.ndarray:
+        """Test for occlusion; see `Views`."""
         eye = self.base_from_camera[view].translation_m
         _, depth = self.geometry.intersect(eye, points_m - eye)
-        return np.abs(depth - 1.0) < 0.01  # 1: the first thing hit is the point itself
+        return np.abs(depth - 1.0) < 0.01  # 1: the first hit is the point itself
 
 
 def room_views(seed: int, anchors: int = 5, per_anchor: int = PER_ANCHOR) -> RoomViews:
-    """Draws a room from `anchors * per_anchor` cameras that differ by parallax, scale and roll."""
+    """Render a room from `anchors * per_anchor` cameras with different parallax, scale, roll."""
     import cv2
 
     rng = np.random.default_rng([seed, 77])
@@ -150,21 +150,21 @@ def room_views(seed: int, anchors: int = 5, per_anchor: int = PER_ANCHOR) -> Roo
 
 
 def view_pair(views: Views, first: int, second: int, rng: np.random.Generator) -> Pair:
-    """Corresponding pixels of two views of a room, with what is hidden in either left out."""
+    """Compute corresponding pixels of two views of a room, without occluded points."""
     pixels = cell_pixels() + rng.uniform(-3.5, 3.5, (HEIGHT * WIDTH // 64, 2))
     points = views.hit(first, pixels)
     in_b = views.base_from_camera[second].inverse().apply(points)
     front = np.isfinite(in_b[:, 2]) & (in_b[:, 2] > 0.05)
     in_b[~front] = [0, 0, 1]
-    seen = views.cameras[second].project(in_b)
-    keep = np.flatnonzero(front & inside(pixels) & inside(seen))
-    keep = keep[views.sees(second, points[keep])]
+    projected = views.cameras[second].project(in_b)
+    keep = np.flatnonzero(front & inside(pixels) & inside(projected))
+    keep = keep[views.visible(second, points[keep])]
     images = views.images[[first, second]]
-    return Pair(images, np.stack([pixels[keep], seen[keep]]).astype(np.float32))
+    return Pair(images, np.stack([pixels[keep], projected[keep]]).astype(np.float32))
 
 
 def photometric(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Exposure, contrast, gamma, shading, blur and noise, as cameras disagree; uint8 in and out."""
+    """Change exposure, contrast, gamma, shading, blur and noise at random; uint8."""
     import cv2
 
     x = image.astype(np.float32) / 255.0
@@ -173,7 +173,7 @@ def photometric(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         x = cv2.GaussianBlur(x, (0, 0), sigma)
     if rng.random() < 0.25:  # motion blur
         length = int(rng.integers(3, 8))
-        middle = length // 2  # of an odd kernel: an even one would move the picture
+        middle = length // 2  # an even kernel would shift the picture
         kernel = np.zeros((2 * middle + 1, 2 * middle + 1), np.float32)
         angle = rng.uniform(0, np.pi)
         half = (length - 1) / 2
@@ -191,7 +191,7 @@ def photometric(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def leaf_picture(rng: np.random.Generator, side: int = 448) -> np.ndarray:
-    """One grey (side, side) uint8 dead-leaves picture."""
+    """Draw a grey (side, side) uint8 dead-leaves picture."""
     import cv2
 
     return cv2.cvtColor(dead_leaves(side, side, rng), cv2.COLOR_RGB2GRAY)

@@ -1,4 +1,4 @@
-"""Training of the global descriptor: views of one place together, other rooms apart."""
+"""Training of the global descriptor: views of one place attract, views of other rooms repel."""
 
 from collections.abc import Callable, Sequence
 
@@ -25,7 +25,11 @@ TEMPERATURE = 0.07
 
 @torch.inference_mode()
 def _encode(encoder: Encoder, rooms: Sequence[Views], rng: np.random.Generator) -> Tensor:
-    """(rooms, anchors, views, width, h, w) features in bfloat16, each image under its own light."""
+    """Encode all views with random photometric changes.
+
+    Returns:
+        (rooms, anchors, views, width, h, w) features in bfloat16.
+    """
     maps = []
     for room in rooms:
         images = np.stack([photometric(image, rng) for image in room.images])
@@ -34,8 +38,8 @@ def _encode(encoder: Encoder, rooms: Sequence[Views], rng: np.random.Generator) 
     return torch.stack(maps).unflatten(1, (-1, PER_ANCHOR))
 
 
-def _crop(maps: Tensor, rng: np.random.Generator) -> Tensor:
-    """A random window of the feature grid: other fields of view than the pretraining's."""
+def random_crop(maps: Tensor, rng: np.random.Generator) -> Tensor:
+    """Crop a random window of the feature grid, to vary the field of view."""
     height, width = maps.shape[-2:]
     h, w = rng.integers(int(0.7 * height), height + 1), rng.integers(int(0.7 * width), width + 1)
     top, left = rng.integers(height - h + 1), rng.integers(width - w + 1)
@@ -43,12 +47,12 @@ def _crop(maps: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def place_loss(a: Tensor, b: Tensor, rooms: Tensor) -> Tensor:
-    """Symmetric InfoNCE; other places of the same room are neither friend nor foe.
+    """Compute the symmetric InfoNCE loss, ignoring other places of the same room.
 
     Args:
         a: (n, width) descriptors of n places.
-        b: (n, width) the same places from elsewhere.
-        rooms: (n,) which room each place lies in.
+        b: (n, width) descriptors of other views of the same places.
+        rooms: (n,) room of each place.
     """
     same_room = rooms[:, None] == rooms[None]
     same_room.fill_diagonal_(False)
@@ -59,7 +63,7 @@ def place_loss(a: Tensor, b: Tensor, rooms: Tensor) -> Tensor:
 
 @torch.inference_mode()
 def place_accuracy(descriptor: GlobalDescriptor, maps: Tensor) -> float:
-    """Share (%) of first views whose nearest other view, among all rooms, is of the same room."""
+    """Compute the share (%) of first views whose nearest other view shows the same room."""
     flat = descriptor(maps.flatten(0, 2).float()).unflatten(0, maps.shape[:3])
     queries = flat[:, :, 0].flatten(0, 1)
     gallery = flat[:, :, 1:].flatten(0, 2)
@@ -71,15 +75,16 @@ def place_accuracy(descriptor: GlobalDescriptor, maps: Tensor) -> float:
 
 
 def train_descriptor(
-    data: PretrainData, options: PretrainOptions, encoder: Encoder, say: Callable[[str], None]
+    data: PretrainData, options: PretrainOptions, encoder: Encoder, log: Callable[[str], None]
 ) -> GlobalDescriptor:
-    """Trains the descriptor on features of the finished, frozen encoder."""
+    """Train the descriptor on features of the frozen encoder."""
     rng = np.random.default_rng([options.seed, 9])
-    torch.manual_seed(options.seed)
     maps = _encode(encoder, [*data.rooms, *data.furnished], rng)
     held_out = [room_views(VALIDATION_ROOM_SEED + i) for i in range(24)]
     validation = _encode(encoder, held_out, rng)
-    descriptor = GlobalDescriptor(encoder.width)
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(options.seed)
+        descriptor = GlobalDescriptor(encoder.width)
     optimiser = torch.optim.AdamW(descriptor.parameters(), lr=1e-3, weight_decay=0.05)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, 3e-3, total_steps=options.descriptor_steps
@@ -87,11 +92,11 @@ def train_descriptor(
     rooms, anchors = maps.shape[:2]
     losses = []
     for step in range(1, options.descriptor_steps + 1):
-        place = rng.permutation(rooms * anchors)[:PLACES_PER_BATCH]
-        room, anchor = place // anchors, place % anchors
-        views = np.argsort(rng.random((len(place), PER_ANCHOR)), axis=1)[:, :2]
-        a = descriptor(_crop(maps[room, anchor, views[:, 0]].float(), rng))
-        b = descriptor(_crop(maps[room, anchor, views[:, 1]].float(), rng))
+        places = rng.permutation(rooms * anchors)[:PLACES_PER_BATCH]
+        room, anchor = places // anchors, places % anchors
+        views = np.argsort(rng.random((len(places), PER_ANCHOR)), axis=1)[:, :2]
+        a = descriptor(random_crop(maps[room, anchor, views[:, 0]].float(), rng))
+        b = descriptor(random_crop(maps[room, anchor, views[:, 1]].float(), rng))
         loss = place_loss(a, b, torch.from_numpy(room))
         optimiser.zero_grad()
         loss.backward()
@@ -100,6 +105,6 @@ def train_descriptor(
         losses.append(float(loss.detach()))
         if step % 250 == 0:
             accuracy = place_accuracy(descriptor, validation)
-            say(f"descriptor step {step} loss {np.mean(losses):.3f} right room {accuracy:.1f} %")
+            log(f"descriptor step {step} loss {np.mean(losses):.3f} right room {accuracy:.1f} %")
             losses.clear()
     return descriptor

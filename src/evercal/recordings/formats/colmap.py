@@ -1,12 +1,12 @@
-"""A COLMAP model (Schönberger and Frahm, CVPR 2016), read by pycolmap (extra `colmap`).
+"""COLMAP models (Schönberger and Frahm, CVPR 2016), read by pycolmap (extra `colmap`).
 
     ROOT/sparse/0/cameras.bin, images.bin, points3D.bin    or .txt, or ROOT itself, or ROOT/0
     ROOT/images/...
 
-COLMAP states camera_from_world and counts pixels from the image's corner, so that the centre of the
-top-left pixel is (0.5, 0.5); here it is (0, 0). The base frame and the unit of length are the
-model's own. Images without a pose, and those beside them that the model does not name, count as
-untracked. Of several models in one place the one with the most images is taken.
+COLMAP states camera_from_world, and its pixel (0.5, 0.5) is the centre of the top-left pixel, which
+is (0, 0) here. The base frame and the unit of length are the model's own. Images without a pose
+count as untracked, including files beside the images of the model. Of several models in one folder,
+the one with the most images is read.
 """
 
 import os
@@ -23,7 +23,7 @@ from evercal.recordings.images import IMAGE_ENDINGS
 from evercal.recordings.poses.row_files import natural_key
 
 _MODEL_FOLDERS = (".", "sparse", "colmap/sparse", "distorted/sparse")
-# Where COLMAP's parameters stand: focal lengths, principal point, OpenCV's distortion.
+# Indices of fx, fy, cx, cy and OpenCV's distortion in COLMAP's parameters; None for 0.
 _PARAMETERS: dict[str, tuple[int, int, int, int, tuple[int | None, ...]]] = {
     "SIMPLE_PINHOLE": (0, 0, 1, 2, ()),
     "PINHOLE": (0, 1, 2, 3, ()),
@@ -40,19 +40,22 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str]) -> Recording:
-    """Reads the model and looks for its images; opens none of them.
+    """Read the largest model and check that its images exist; no image is opened.
 
     Raises:
-        InputError: The extra `colmap` is not installed, the model is broken or of a camera that is
-            not supported, or its images are missing.
+        InputError: The extra `colmap` is not installed, the model is broken, its camera is not
+            supported, or its images are missing.
     """
     root = Path(root)
-    folder, model, notes = _largest(root)
+    models = _read_models(root)
+    folder, model = max(models, key=lambda pair: pair[1].num_reg_images())
+    notes = [NOTE.format(file="COLMAP")]
+    if len(models) > 1:
+        sizes = ", ".join(f"{f.name}: {m.num_reg_images()}" for f, m in models)
+        notes.append(f"took model {folder.name}, the one with the most images ({sizes})")
     cameras = {key: _camera(folder, camera) for key, camera in model.cameras.items()}
-    posed = sorted(
-        (image for image in model.images.values() if image.has_pose),
-        key=lambda image: natural_key(image.name),
-    )
+    posed = [image for image in model.images.values() if image.has_pose]
+    posed.sort(key=lambda image: natural_key(image.name))
     if not posed:
         raise InputError(f"{folder}: no image has a pose; reconstruct with more overlap")
     images = _image_folder(root, folder, [image.name for image in posed])
@@ -60,29 +63,24 @@ def load(root: str | os.PathLike[str]) -> Recording:
         Frame(image.name, images / image.name, cameras[image.camera_id], _base_from_camera(image))
         for image in posed
     )
-    beside = (
-        sum(p.suffix.lower() in IMAGE_ENDINGS for p in images.rglob("*")) if images != root else 0
-    )
-    lost = max(len(model.images), beside) - len(frames)
-    return Recording(
-        root.resolve().name, frames, (), lost, notes=(NOTE.format(file="COLMAP"), *notes)
-    )
+    files = [p for p in images.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS]
+    total = max(len(model.images), len(files) if images != root else 0)
+    return Recording(root.resolve().name, frames, (), total - len(frames), notes=tuple(notes))
 
 
 def _models(root: Path) -> list[Path]:
-    """Folders with a model in them, all in the first place that has one.
+    """Model folders in the first of the usual places that has one.
 
-    Models elsewhere are not of the same images: those of distorted/sparse are from before the lens
-    was taken out.
+    Models in other places have other images: distorted/sparse is from before undistortion.
     """
     for name in _MODEL_FOLDERS:
-        place = root / name
-        inner = sorted(place.iterdir()) if place.is_dir() else []
+        parent = root / name
+        inner = sorted(parent.iterdir()) if parent.is_dir() else []
         if name == ".":  # may be a folder of models, which COLMAP numbers
             inner = [folder for folder in inner if folder.name.isdigit()]
-        found = [f for f in (place, *inner) if f.is_dir() and _is_model(f)]
-        if found:
-            return found
+        models = [f for f in (parent, *inner) if f.is_dir() and _is_model(f)]
+        if models:
+            return models
     return []
 
 
@@ -93,8 +91,7 @@ def _is_model(folder: Path) -> bool:
     )
 
 
-def _largest(root: Path) -> tuple[Path, Any, list[str]]:
-    """The model with the most posed images, and a note if there are others."""
+def _read_models(root: Path) -> list[tuple[Path, Any]]:
     try:
         import pycolmap  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -106,18 +103,14 @@ def _largest(root: Path) -> tuple[Path, Any, list[str]]:
         raise InputError(
             f"{root}: no COLMAP model; expected cameras, images and points3D (.bin, .txt)"
         )
-    read = []
+    models = []
     for folder in folders:
         try:
-            read.append((folder, pycolmap.Reconstruction(str(folder))))
+            models.append((folder, pycolmap.Reconstruction(str(folder))))
         except Exception as error:  # pycolmap passes C++ exceptions on as several types
             text = " ".join(str(error).split())[:200]
             raise InputError(f"{folder}: pycolmap cannot read the model: {text}") from None
-    folder, model = max(read, key=lambda pair: pair[1].num_reg_images())
-    if len(read) == 1:
-        return folder, model, []
-    sizes = ", ".join(f"{f.name}: {m.num_reg_images()}" for f, m in read)
-    return folder, model, [f"took model {folder.name}, the one with the most images ({sizes})"]
+    return models
 
 
 def _camera(folder: Path, camera: Any) -> Camera:
@@ -127,40 +120,36 @@ def _camera(folder: Path, camera: Any) -> Camera:
             f"{folder}: camera model {name} is not supported, only {', '.join(_PARAMETERS)};"
             f" undistort the images with 'colmap image_undistorter' and read its result"
         )
-    fx, fy, cx, cy, lens = _PARAMETERS[name]
+    fx, fy, cx, cy, distortion = _PARAMETERS[name]
     p = np.asarray(camera.params, dtype=np.float64)
-    distortion = tuple(0.0 if i is None else float(p[i]) for i in lens)
     try:
-        # Half a pixel: COLMAP counts from the image's corner.
         return Camera(
             int(camera.width),
             int(camera.height),
-            p[fx],
-            p[fy],
-            p[cx] - 0.5,
-            p[cy] - 0.5,
-            distortion if any(distortion) else (),
+            fx=p[fx],
+            fy=p[fy],
+            # Half a pixel: COLMAP counts from the image's corner.
+            cx=p[cx] - 0.5,
+            cy=p[cy] - 0.5,
+            distortion=tuple(0.0 if i is None else float(p[i]) for i in distortion),
         )
     except ValueError as error:
         raise InputError(f"{folder}: {error}") from None
 
 
 def _base_from_camera(image: Any) -> SE3:
-    stated: Any = image.cam_from_world
-    stated = stated() if callable(stated) else stated  # a method since pycolmap 3.12
-    return SE3.from_matrix(np.asarray(stated.matrix())).inverse()
+    camera_from_world: Any = image.cam_from_world
+    if callable(camera_from_world):  # a method since pycolmap 3.12
+        camera_from_world = camera_from_world()
+    return SE3.from_matrix(np.asarray(camera_from_world.matrix())).inverse()
 
 
 def _image_folder(root: Path, folder: Path, names: list[str]) -> Path:
-    """The folder that all images are in."""
-    places = [
-        root / "images",
-        root,
-        *(parent / "images" for parent in folder.resolve().parents[:3]),
-    ]
-    for place in places:
-        if all((place / name).is_file() for name in names):
-            return place
+    """The folder that holds all images."""
+    beside = (parent / "images" for parent in folder.resolve().parents[:3])
+    for candidate in (root / "images", root, *beside):
+        if all((candidate / name).is_file() for name in names):
+            return candidate
     missing = next((n for n in names if not (root / "images" / n).is_file()), names[0])
     raise InputError(
         f"{root / 'images' / missing}: missing; put the model's images in {root}/images"

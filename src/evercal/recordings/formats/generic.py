@@ -1,27 +1,15 @@
 """evercal's own folder format: one `scene.json` beside the images it names.
 
-    {"format": "evercal-scene", "version": 1, "name": "kitchen",
-     "cameras": {"0": {"width", "height", "fx", "fy", "cx", "cy", "distortion": []}},
-     "frames": [{"name": "000000", "image": "images/000000.png", "camera": "0", "split": "train",
-                 "base_from_camera": {"translation_m": [3], "quaternion_wxyz": [4]},
-                 "base_from_gripper": null, "depth": "depth/000000.png",
-                 "joints_rad": [7]}, ...],
-     "untracked": 0, "notes": [], "render": {}}
-
-Metres, quaternions in the order w, x, y, z, OpenCV camera axes, pixel (0, 0) at the centre of the
-top-left pixel, distortion k1 k2 p1 p2 k3 k4 k5 k6 as in OpenCV. Image paths are relative to the
-folder, with forward slashes. Both poses may be null or missing, as may `name` and `untracked`.
-Depth is a 16-bit PNG in millimetres along the optical axis, 0 where unknown; it and the arm's joint
-angles are there only if known. `notes` are sentences about how the recording was read. `render`
-tells how a simulated scene was made.
-Frames stand in the order they were recorded. Keys not listed here are passed over.
+docs/formats.md lists the keys. `render` describes how a simulated scene was made. Unknown keys are
+ignored.
 """
 
 import json
 import os
 import shutil
+from collections import Counter
 from collections.abc import Callable, Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PureWindowsPath
 from types import TracebackType
 from typing import Any, Literal, Self
 
@@ -34,8 +22,8 @@ from evercal.storage import write_json
 FILE = "scene.json"
 _FORMAT = "evercal-scene"
 _VERSION = 1
-_BEGUN = ".unfinished"
-"""Lies in a folder while it is written, and stays when the writer is cut off."""
+_UNFINISHED = ".unfinished"
+"""Marker file in a folder that is being written; it stays if the writer is interrupted."""
 
 
 def detect(root: Path) -> bool:
@@ -44,11 +32,10 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str]) -> Recording:
-    """Reads scene.json and checks that every image it names is there; opens none of them.
+    """Read scene.json and check that its images exist; no image is opened.
 
     Raises:
-        InputError: scene.json or an image is missing, or scene.json breaks the format; the message
-            names the file and the entry.
+        InputError: scene.json or an image is missing, or scene.json breaks the format.
     """
     root = Path(root)
     file = root / FILE
@@ -65,60 +52,71 @@ def load(root: str | os.PathLike[str]) -> Recording:
         untracked = data.get("untracked", 0)
         if not isinstance(untracked, int):
             raise ValueError(f"'untracked' is a count, got {untracked!r}")
-        _refuse_repeated_names(frames["train"] + frames["test"])
+        notes = data.get("notes", [])
+        if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
+            raise ValueError(f"'notes' is a list of sentences, got {notes!r}")
+        if not entries:
+            raise ValueError("no frames; a scene has at least one")
+        every = frames["train"] + frames["test"]
+        name, times = Counter(frame.name for frame in every).most_common(1)[0]
+        if times > 1:
+            raise ValueError(f"frame name {name!r} comes twice; names are unique")
     except (ValueError, OverflowError) as error:  # JSON numbers have no largest
         raise InputError(f"{file}: {error}") from None
-    if not entries:
-        raise InputError(f"{file}: no frames; a scene has at least one")
-    _refuse_missing_images(root, frames["train"] + frames["test"])
+    missing = [frame.image for frame in every if not Path(frame.image).is_file()]  # pyright: ignore[reportArgumentType]
+    if missing:
+        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+        raise InputError(
+            f"{missing[0]}{more}: named in {file} but missing; restore or take the frame out"
+        )
     name = data.get("name")
     return Recording(
         name if isinstance(name, str) and name else root.resolve().name,
         tuple(frames["train"]),
         tuple(frames["test"]),
         untracked,
-        notes=_notes(file, data.get("notes", [])),
+        notes=tuple(notes),
     )
 
 
 def write(
     root: str | os.PathLike[str],
-    scene: Recording,
+    recording: Recording,
     *,
     link: bool = False,
     on_frame: Callable[[], object] | None = None,
 ) -> None:
-    """Writes a scene with its images; images that are files are copied byte for byte.
+    """Write a recording with its images; image files are copied byte for byte.
 
     Args:
-        root: Folder to write to; made when missing.
-        scene: What to write.
-        link: Whether image files are hard links where the disk allows them, which take no room.
+        root: Folder to write to; created if missing.
+        recording: Frames to write.
+        link: Create hard links to image files where the file system allows it.
         on_frame: Called after every frame, for progress bars.
 
     Raises:
         InputError: `root` already holds a scene, or an image cannot be read.
     """
-    with SceneWriter(root, scene.name, link) as writer:
-        writer.untracked, writer.notes = scene.untracked, scene.notes
-        for i, frame in enumerate((*scene.train, *scene.test)):
-            writer.add(frame, "train" if i < len(scene.train) else "test")
+    with SceneWriter(root, recording.name, link) as writer:
+        writer.untracked, writer.notes = recording.untracked, recording.notes
+        for i, frame in enumerate((*recording.train, *recording.test)):
+            writer.add(frame, "train" if i < len(recording.train) else "test")
             if on_frame is not None:
                 on_frame()
 
 
 class SceneWriter:
-    """Writes frames one by one; scene.json comes last, when the `with` block ends without error.
+    """Write frames one by one; scene.json is written last, if the `with` block ends without error.
 
-    A folder without scene.json is therefore a recording that was cut off, not a short scene.
+    A folder without scene.json is therefore an interrupted recording, not a short scene.
 
     Args:
-        root: Folder to write to; made when missing.
-        name: What the scene is called.
-        link: Whether image files are hard links where the disk allows them.
+        root: Folder to write to; created if missing.
+        name: Name of the scene.
+        link: Create hard links to image files where the file system allows it.
 
     Raises:
-        InputError: `root` already holds a scene; and from `add`, an image that is none of ours.
+        InputError: `root` already holds a scene.
     """
 
     def __init__(self, root: str | os.PathLike[str], name: str, link: bool = False) -> None:
@@ -129,18 +127,16 @@ class SceneWriter:
         self._name = name
         self._link = link
         self._cameras: dict[Camera, str] = {}
-        self._frames: list[dict[str, object]] = []
-        self._names: set[str] = set()
+        self._entries: dict[str, dict[str, object]] = {}
         if (self._root / FILE).exists():
             raise InputError(
                 f"{self._root / FILE}: already there; give a new folder, or remove the whole folder"
             )
         (self._root / "images").mkdir(parents=True, exist_ok=True)
-        self._begun = self._root / _BEGUN
-        self._goes_on = self._begun.exists()
+        self._resumed = (self._root / _UNFINISHED).exists()
 
     def __enter__(self) -> Self:
-        """Nothing to open: the folder was made with the writer."""
+        """Return the writer; its folder exists already."""
         return self
 
     def __exit__(
@@ -149,25 +145,23 @@ class SceneWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Writes scene.json unless something went wrong."""
+        """Write scene.json unless an error was raised."""
         if kind is None:
             self.close()
 
     def add(self, frame: Frame, split: Literal["train", "test"]) -> None:
-        """Writes the frame's image and remembers the rest.
+        """Write the frame's image and collect its entry of scene.json.
 
         Raises:
-            InputError: The frame's image cannot be read, or its name was used before.
+            InputError: The image cannot be read or written, or the frame name is not unique.
         """
-        if frame.name in self._names:
+        if frame.name in self._entries:
             raise InputError(f"frame {frame.name!r}: already written; frame names are unique")
         # The counter keeps names like 'a/b' and 'a_b' apart and the folder in recorded order.
-        stem = f"{len(self._frames):06d}"
-        relative = self._write_image(frame, f"images/{stem}")
-        self._names.add(frame.name)
+        stem = f"{len(self._entries):06d}"
         entry: dict[str, object] = {
             "name": frame.name,
-            "image": relative,
+            "image": self._write_image(frame, f"images/{stem}"),
             "camera": self._cameras.setdefault(frame.camera, str(len(self._cameras))),
             "split": split,
             "base_from_camera": pose_to_dict(frame.base_from_camera),
@@ -179,10 +173,10 @@ class SceneWriter:
             self._copy(frame.depth, f"depth/{stem}.png")
         if frame.joints_rad is not None:
             entry["joints_rad"] = list(frame.joints_rad)
-        self._frames.append(entry)
+        self._entries[frame.name] = entry
 
     def _write_image(self, frame: Frame, stem: str) -> str:
-        """Writes an image as it is stored, else as a PNG, and gives its path in the folder."""
+        """Write an image file as it is stored, else a PNG; return its path in the folder."""
         if isinstance(frame.image, Path):
             relative = stem + frame.image.suffix.lower()
             self._copy(frame.image, relative)
@@ -197,67 +191,78 @@ class SceneWriter:
         return f"{stem}{ending}"
 
     def _copy(self, source: Path, relative: str) -> None:
-        """Copies or links a file to its place; one that already lies there stays as it is."""
+        """Copy or link a file into the folder, unless it is that file already."""
         target = self._root / relative
         if target.exists() and target.samefile(source):
             return
+
+        def write(path: Path) -> None:
+            # A link through a link would be broken once the folder moves.
+            if not (self._link and _linked(source.resolve(), path)):
+                shutil.copyfile(source, path)
+
         try:
-            # A link through a link would point to nothing once the folder moves.
-            self._put(
-                relative,
-                lambda path: (
-                    (self._link and self._linked(source.resolve(), path))
-                    or shutil.copyfile(source, path)
-                ),
-            )
+            source.stat()
         except OSError as error:
             raise InputError(f"{source}: cannot be copied ({error.strerror})") from None
+        self._put(relative, write)
 
     def _put(self, relative: str, write: Callable[[Path], object]) -> None:
-        """Writes a file beside its place and moves it there, so no hard link is written through.
+        """Write a file under a temporary name and move it, so no hard link is written through.
 
         Raises:
-            InputError: A file lies there that is not left from a recording that was cut off.
+            InputError: The file exists and is not from an interrupted recording, or it cannot be
+                written.
         """
-        target = self._root / relative
-        if target.exists() and not self._goes_on:
-            self._begun.unlink(missing_ok=True)
+        target, marker = self._root / relative, self._root / _UNFINISHED
+        if target.exists() and not self._resumed:
+            marker.unlink(missing_ok=True)
             raise InputError(f"{target}: already there; give a new folder")
-        self._begun.touch()
-        beside = target.with_name(f".{target.name}")
-        beside.unlink(missing_ok=True)
-        write(beside)
-        beside.replace(target)
-
-    @staticmethod
-    def _linked(source: Path, target: Path) -> bool:
-        """Whether a hard link could be made; not from one disk to another."""
+        temporary = target.with_name(f".{target.name}")
         try:
-            target.hardlink_to(source)
-        except OSError:
-            return False
-        return True
+            marker.touch()
+            temporary.unlink(missing_ok=True)
+            write(temporary)
+            temporary.replace(target)
+        except OSError as error:
+            raise InputError(f"{target}: cannot be written ({error.strerror})") from None
 
     def close(self) -> None:
-        """Writes scene.json."""
+        """Write scene.json.
+
+        Raises:
+            InputError: The file cannot be written.
+        """
         data: dict[str, object] = {
             "format": _FORMAT,
             "version": _VERSION,
             "name": self._name,
             "cameras": {number: camera.to_dict() for camera, number in self._cameras.items()},
-            "frames": self._frames,
+            "frames": list(self._entries.values()),
             "untracked": self.untracked,
         }
         if self.notes:
             data["notes"] = list(self.notes)
         if self.render is not None:
             data["render"] = self.render
-        write_json(self._root / FILE, data)
-        self._begun.unlink(missing_ok=True)
+        try:
+            write_json(self._root / FILE, data)
+            (self._root / _UNFINISHED).unlink(missing_ok=True)
+        except OSError as error:
+            raise InputError(f"{self._root / FILE}: cannot be written ({error.strerror})") from None
+
+
+def _linked(source: Path, target: Path) -> bool:
+    """Create a hard link; False if the file system does not allow it."""
+    try:
+        target.hardlink_to(source)
+    except OSError:
+        return False
+    return True
 
 
 def pose_to_dict(pose: SE3 | None) -> dict[str, object] | None:
-    """A single transform as plain numbers, metres and wxyz; None stays None."""
+    """Single transform as plain numbers, metres and wxyz; None stays None."""
     if pose is None:
         return None
     return {
@@ -266,12 +271,7 @@ def pose_to_dict(pose: SE3 | None) -> dict[str, object] | None:
     }
 
 
-def pose_from_dict(data: object) -> SE3 | None:
-    """The inverse of `pose_to_dict`.
-
-    Raises:
-        ValueError: Not three and four finite numbers, or a quaternion that is not of length one.
-    """
+def _pose_from_dict(data: object) -> SE3 | None:
     if data is None:
         return None
     if not isinstance(data, Mapping):
@@ -290,7 +290,7 @@ def _read(file: Path) -> dict[str, object]:
     except OSError:
         raise InputError(f"{file}: missing; a scene folder of this format holds one") from None
     except ValueError as error:
-        raise InputError(f"{file}: not valid JSON ({error}); write it anew") from None
+        raise InputError(f"{file}: not valid JSON ({error}); convert the recording again") from None
     if not isinstance(data, dict) or data.get("format") != _FORMAT:
         raise InputError(f"{file}: 'format' is not '{_FORMAT}'; this is another program's file")
     if data.get("version") != _VERSION:
@@ -321,37 +321,41 @@ def _frame(
     if not isinstance(entry, dict):
         raise ValueError(f"frame {i} is an object, got {entry!r}")
     camera, split = entry.get("camera"), entry.get("split")
-    image = _inside(entry.get("image"), f"frame {i}: 'image'")
-    depth = entry.get("depth")
-    poses: dict[str, Any] = {}
-    if depth is not None:
-        poses["depth"] = root / _inside(depth, f"frame {i}: 'depth'")
+    image = path_inside(entry.get("image"), f"frame {i}: 'image'")
+    optional: dict[str, Any] = {}
+    if (depth := entry.get("depth")) is not None:
+        optional["depth"] = root / path_inside(depth, f"frame {i}: 'depth'")
     if (joints := entry.get("joints_rad")) is not None:
         count = len(joints) if isinstance(joints, list) else 7
-        poses["joints_rad"] = tuple(_numbers(joints, count, f"frame {i}: joints_rad"))
+        optional["joints_rad"] = tuple(_numbers(joints, count, f"frame {i}: joints_rad"))
     if not isinstance(camera, str) or camera not in cameras:
         raise ValueError(f"frame {i}: 'camera' is one of {sorted(cameras)}, got {camera!r}")
     if split not in ("train", "test"):
         raise ValueError(f"frame {i}: 'split' is 'train' or 'test', got {split!r}")
     for key in ("base_from_camera", "base_from_gripper"):
         try:
-            poses[key] = pose_from_dict(entry.get(key))
+            optional[key] = _pose_from_dict(entry.get(key))
         except ValueError as error:
             raise ValueError(f"frame {i}: '{key}': {error}") from None
-    name = entry.get("name", image)
-    return split, Frame(str(name), root / image, cameras[camera], **poses)
+    return split, Frame(str(entry.get("name", image)), root / image, cameras[camera], **optional)
 
 
-def _notes(file: Path, notes: object) -> tuple[str, ...]:
-    if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
-        raise InputError(f"{file}: 'notes' is a list of sentences, got {notes!r}")
-    return tuple(notes)
+def path_inside(path: object, what: str) -> str:
+    """Check that a path with forward slashes stays inside the folder of its file.
 
+    Symbolic links are followed: download caches keep files elsewhere.
 
-def _inside(path: object, what: str) -> str:
-    if not isinstance(path, str) or not path or PurePosixPath(path).is_absolute():
+    Args:
+        path: Value from a file.
+        what: Name of the entry, for the message.
+
+    Raises:
+        ValueError: The path is empty, absolute or contains "..".
+    """
+    # Windows paths split at both kinds of slashes and have an anchor for drives as well.
+    if not isinstance(path, str) or not path or PureWindowsPath(path).anchor:
         raise ValueError(f"{what} is a path relative to the folder, got {path!r}")
-    if ".." in PurePosixPath(path).parts:
+    if ".." in PureWindowsPath(path).parts:
         raise ValueError(f"{what} stays inside the folder, got {path!r}")
     return path
 
@@ -363,20 +367,3 @@ def _numbers(value: object, count: int, name: str) -> list[float]:
     if not isinstance(value, list) or not plain or len(value) != count:
         raise ValueError(f"'{name}' is {count} numbers, got {value!r}")
     return [float(v) for v in value]
-
-
-def _refuse_repeated_names(frames: list[Frame]) -> None:
-    seen: set[str] = set()
-    for frame in frames:
-        if frame.name in seen:
-            raise ValueError(f"frame name {frame.name!r} comes twice; names are unique")
-        seen.add(frame.name)
-
-
-def _refuse_missing_images(root: Path, frames: list[Frame]) -> None:
-    missing = [frame.image for frame in frames if not Path(frame.image).is_file()]  # pyright: ignore[reportArgumentType]
-    if missing:
-        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise InputError(
-            f"{missing[0]}{more}: named in {root / FILE} but missing; restore or take the frame out"
-        )

@@ -1,13 +1,14 @@
 """LeRobot datasets, versions 2 and 3, with images as videos or in the tables (extra `lerobot`).
 
     ROOT/meta/info.json                                       features, frame rate, paths
-    ROOT/data/chunk-000/episode_000000.parquet                version 2: one file an episode
+    ROOT/data/chunk-000/episode_000000.parquet                version 2: one file per episode
     ROOT/videos/chunk-000/KEY/episode_000000.mp4
-    ROOT/data/chunk-000/file-000.parquet                      version 3: several in a file
+    ROOT/data/chunk-000/file-000.parquet                      version 3: several episodes per file
     ROOT/meta/episodes/chunk-000/file-000.parquet, ROOT/videos/KEY/chunk-000/file-000.mp4
 
-Poses come from the features, see `lerobot_poses`. The format has no place for intrinsics: a camera
-file has to be given. Frames of all episodes are training frames with base_from_gripper.
+Poses are read from the features, see `lerobot_poses`. The format has no intrinsics, so a camera
+file is required. Frames of all episodes are training frames with base_from_gripper. Paths in the
+dataset must stay inside its folder.
 """
 
 import json
@@ -20,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
+from evercal.recordings.formats.generic import path_inside
 from evercal.recordings.formats.lerobot_poses import feature_poses, pose_feature
 from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, decode_image, image_file
-from evercal.recordings.poses.camera_file import read_camera
+from evercal.recordings.poses.camera_file import read_camera_of_size
 from evercal.recordings.read_options import ReadOptions
 
 USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")
@@ -40,11 +42,11 @@ def detect(root: Path) -> bool:
 
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
-    """Reads the tables and decodes one image; the others stay in their files until needed.
+    """Read the tables and decode one image; the others stay in their files until needed.
 
     Raises:
-        InputError: The extra `lerobot` is not installed, a file is missing or broken, the dataset
-            is of another version, or nothing in it says where the gripper was.
+        InputError: The extra `lerobot` is not installed, a file is missing or broken, the version
+            is not supported, or the dataset has no gripper poses.
     """
     root, options = Path(root), options or ReadOptions()
     info = _info(root)
@@ -53,17 +55,11 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
         raise InputError(
             f"{root}: LeRobot datasets hold no intrinsics; give them with --camera FILE"
         )
-    height, width = (int(n) for n in info["features"][key]["shape"][:2])
-    if height == 3:  # some datasets state channels first
-        height, width = (int(n) for n in info["features"][key]["shape"][1:3])
-    camera = read_camera(options.camera, (width, height))
-    if (camera.width, camera.height) != (width, height):
-        raise InputError(
-            f"{options.camera}: is for images of {camera.width}x{camera.height}, {key} is"
-            f" {width}x{height}; give the intrinsics of this image size"
-        )
+    shape = [int(n) for n in info["features"][key]["shape"]]
+    height, width = shape[1:3] if shape[0] == 3 else shape[:2]  # some state channels first
+    camera = read_camera_of_size(options.camera, (width, height), key)
     column = pose_feature(root, info, options)
-    table = _table(root, info, column)
+    table = _table(root, column)
     poses, notes = feature_poses(root, info, column, table.values, options)
     images = _images(root, info, key, table)
     frames = tuple(
@@ -88,6 +84,9 @@ def _info(root: Path) -> dict[str, Any]:
             raise InputError(f"{file}: version {version}; this evercal reads v2 and v3")
         if not isinstance(info["features"], dict) or not float(info["fps"]) > 0:
             raise ValueError("'features' is an object and 'fps' a number > 0")
+        for name in ("data_path", "video_path"):
+            if info.get(name) is not None:
+                path_inside(info[name], repr(name))
         return info
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror})") from None
@@ -111,15 +110,19 @@ class _Table:
 
     files: list[Path]
     file: NDArray[np.int64]
+    """(n,) index of the row's file in `files`."""
     row: NDArray[np.int64]
+    """(n,) index of the row in its file."""
     episode: NDArray[np.int64]
     number: NDArray[np.int64]
+    """(n,) index of the frame in its episode."""
     seconds: NDArray[np.float64]
+    """(n,) time since the start of the episode."""
     values: NDArray[np.float64]
+    """(n, k) numbers of the pose feature."""
 
 
-def _table(root: Path, info: Mapping[str, Any], column: str) -> _Table:
-    parquet = _parquet(root)
+def _table(root: Path, column: str) -> _Table:
     files = sorted((root / "data").glob("*/*.parquet"))
     if not files:
         raise InputError(
@@ -127,97 +130,100 @@ def _table(root: Path, info: Mapping[str, Any], column: str) -> _Table:
         )
     parts: list[list[NDArray[Any]]] = []
     for i, file in enumerate(files):
-        columns = ["episode_index", "frame_index", "timestamp", column]
+        rows = _read_table(file, ["episode_index", "frame_index", "timestamp", column])
+        episode, number, seconds = (rows[name].to_numpy() for name in rows.column_names[:3])
         try:
-            read = parquet.read_table(file, columns=columns)
-            episode, number, seconds = (read[name].to_numpy() for name in columns[:3])
-            values = np.array(read[column].to_pylist(), dtype=np.float64)
-        except Exception as error:  # pyarrow raises many kinds for damaged files
-            text = " ".join(str(error).split())[:200]
-            raise InputError(f"{file}: cannot be read: {text}") from None
+            values = np.array(rows[column].to_pylist(), dtype=np.float64)
+        except (TypeError, ValueError):
+            values = np.empty(0)
         if values.ndim != 2 or not np.isfinite(values).all():
             raise InputError(f"{file}: {column} holds no rows of finite numbers")
         where = np.full(len(values), i)
         parts.append([where, np.arange(len(values)), episode, number, seconds, values])
-    where, row, episode, number, seconds, values = (
-        np.concatenate(part) for part in zip(*parts, strict=True)
-    )
+    where, row, episode, number, seconds, values = map(np.concatenate, zip(*parts, strict=True))
     if not len(values):
         raise InputError(f"{root}: the dataset has no frames")
     return _Table(files, where, row, episode, number, seconds.astype(np.float64), values)
 
 
-def _parquet(root: Path) -> Any:
+def _parquet(path: Path) -> Any:
     try:
         import pyarrow.parquet as parquet  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise InputError(
-            f"{root}: LeRobot datasets need pyarrow and PyAV; run: pip install 'evercal[lerobot]'"
+            f"{path}: LeRobot datasets need pyarrow and PyAV; run: pip install 'evercal[lerobot]'"
         ) from None
     return parquet
 
 
-def _images(
-    root: Path, info: Mapping[str, Any], key: str, table: _Table
-) -> list[StoredImage]:  # fmt: skip
+def _read_table(file: Path, columns: list[str]) -> Any:
+    parquet = _parquet(file)
+    try:
+        return parquet.read_table(file, columns=columns).select(columns)
+    except Exception as error:  # pyarrow raises many types for damaged files
+        text = " ".join(str(error).split())[:200]
+        raise InputError(f"{file}: cannot be read: {text}") from None
+
+
+def _images(root: Path, info: Mapping[str, Any], key: str, table: _Table) -> list[StoredImage]:
     rows = range(len(table.row))
     if info["features"][key]["dtype"] == "image":
         tables = _Tables(root, key)
         return [_Embedded(tables, table.files[table.file[i]], int(table.row[i])) for i in rows]
     videos = Videos(float(info["fps"]))
-    begins = _begins(root, info, key) if str(info["codebase_version"]).startswith("v3") else None
-    found: list[StoredImage] = []
-    for i in rows:
-        episode = int(table.episode[i])
-        if begins is None:
-            path = str(info["video_path"]).format(
-                episode_chunk=episode // int(info["chunks_size"]),
-                video_key=key,
-                episode_index=episode,
-            )
-            begin = 0.0
-        elif episode in begins:
-            path, begin = begins[episode]
-        else:
+    starts = _video_starts(root, info, key, set(table.episode.tolist()))
+    images: list[StoredImage] = []
+    for episode, seconds in zip(table.episode.tolist(), table.seconds.tolist(), strict=True):
+        if episode not in starts:
             raise InputError(f"{root / 'meta' / 'episodes'}: episode {episode} is not listed")
-        found.append(VideoFrame(videos, root / path, begin + float(table.seconds[i])))
-    return found
+        path, start = starts[episode]
+        images.append(VideoFrame(videos, path, start + seconds))
+    return images
 
 
-def _begins(root: Path, info: Mapping[str, Any], key: str) -> dict[int, tuple[str, float]]:
-    """By episode of version 3: its video and the time in it at which the episode begins."""
-    found = {}
+def _video_starts(
+    root: Path, info: Mapping[str, Any], key: str, episodes: set[int]
+) -> dict[int, tuple[Path, float]]:
+    """By episode: its video, and the time in the video at which it starts."""
+    starts = {}
+    if str(info["codebase_version"]).startswith("v2"):
+        for episode in episodes:
+            chunk = episode // int(info.get("chunks_size", 1000))
+            numbers = {"episode_chunk": chunk, "episode_index": episode}
+            starts[episode] = _video_path(root, info, key, numbers), 0.0
+        return starts
     parts = ("chunk_index", "file_index", "from_timestamp")
     names = ["episode_index", *(f"videos/{key}/{part}" for part in parts)]
     for file in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
-        try:
-            rows = _parquet(root).read_table(file, columns=names).to_pylist()
-        except Exception as error:  # pyarrow raises many kinds for damaged files
-            text = " ".join(str(error).split())[:200]
-            raise InputError(f"{file}: cannot be read: {text}") from None
-        for row in rows:
-            episode, chunk, number, begin = (row[name] for name in names)
-            path = str(info["video_path"]).format(
-                video_key=key, chunk_index=chunk, file_index=number
-            )
-            found[int(episode)] = path, float(begin)
-    return found
+        for row in _read_table(file, names).to_pylist():
+            episode, chunk, number, start = (row[name] for name in names)
+            numbers = {"chunk_index": chunk, "file_index": number}
+            starts[int(episode)] = _video_path(root, info, key, numbers), float(start)
+    return starts
+
+
+def _video_path(root: Path, info: Mapping[str, Any], key: str, numbers: dict[str, int]) -> Path:
+    try:
+        path = str(info["video_path"]).format(video_key=key, **numbers)
+        return root / path_inside(path, "'video_path'")
+    except (KeyError, IndexError, AttributeError, ValueError) as error:
+        raise InputError(f"{root / INFO}: unusable 'video_path': {error}") from None
 
 
 class _Tables:
-    """The images in parquet files, the last row group of which is kept."""
+    """Images in parquet files; the last row group is cached."""
 
     def __init__(self, root: Path, key: str) -> None:
         self._parquet, self._key, self._root = _parquet(root), key, root
         self._last: tuple[Path, int, list[Any]] | None = None
 
     def bytes(self, path: Path, row: int) -> bytes:
-        """The image file in a row."""
+        """Content of the image file in a row."""
         file = self._parquet.ParquetFile(path)
         try:
-            group = 0
-            while row >= file.metadata.row_group(group).num_rows:
-                row -= file.metadata.row_group(group).num_rows
+            group, index = 0, row
+            while index >= file.metadata.row_group(group).num_rows:
+                index -= file.metadata.row_group(group).num_rows
                 group += 1
             last = self._last
             if last is None or last[:2] != (path, group):
@@ -225,13 +231,15 @@ class _Tables:
                 last = self._last = path, group, rows
         finally:
             file.close()
-        cell = last[2][row]
+        cell = last[2][index]
         if cell["bytes"]:
             return bytes(cell["bytes"])
+        where = f"{path}: row {row}: image {cell['path']!r}"
         try:
-            return (self._root / cell["path"]).read_bytes()
+            return (self._root / path_inside(cell["path"], "the path")).read_bytes()
+        except ValueError as error:
+            raise InputError(f"{where}: {error}") from None
         except OSError as error:
-            where = f"{path}: row {row}: image {cell['path']!r}"
             raise InputError(f"{where} cannot be read ({error.strerror})") from None
 
 
@@ -251,5 +259,5 @@ class _Embedded(StoredImage):
         return image
 
     def file(self) -> tuple[str, bytes] | None:
-        """The PNG or JPEG as it is stored."""
+        """The PNG or JPEG file as it is stored."""
         return image_file(self.tables.bytes(self.path, self.row))

@@ -1,10 +1,15 @@
-"""Where the gripper was at the frames of a LeRobot dataset, from the features of its tables.
+"""Gripper poses of a LeRobot dataset, from the features of its tables.
 
-Poses come from a feature whose names hold x, y, z and qx, qy, qz, qw, or wx, wy, wz for a rotation
-vector (`ee.x` and `x` alike), in metres and radians; or from the first numbers of observation.state
-in a convention that is given; or with a URDF from the joints of observation.state (`elbow.pos` is
-the joint elbow), in radians unless the convention deg is given. `--gripper-frame` names the feature
-where several hold poses, or the arm, left_ee, where one feature holds left_ee.x and right_ee.x.
+A pose is one of the following:
+
+- a feature with the names x, y, z and qx, qy, qz, qw, or wx, wy, wz for a rotation vector (`ee.x`
+  and `x` alike), in metres and radians;
+- the first numbers of observation.state or another feature, in a convention that the user gives;
+- with a URDF, the joints of observation.state (`elbow.pos` is the joint elbow), in radians, or in
+  degrees with the convention deg.
+
+`--gripper-frame` selects the feature if several hold poses, or the arm, such as left_ee, if one
+feature holds left_ee.x and right_ee.x.
 """
 
 from collections.abc import Mapping
@@ -17,8 +22,9 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.conventions import (
+    ConventionError,
     PoseConvention,
-    doubt,
+    check_units,
     pose_convention,
     poses_from_numbers,
 )
@@ -27,39 +33,43 @@ from evercal.recordings.poses.kinematics import RobotModel
 from evercal.recordings.read_options import ReadOptions
 
 _STATE = "observation.state"
-# By convention: how the numbers of a pose are called.
-_CALLED = {"xyzw": ("x", "y", "z", "qx", "qy", "qz", "qw"), "ur": ("x", "y", "z", "wx", "wy", "wz")}
+# Names of the numbers of a pose, by convention.
+_PARTS = {"xyzw": ("x", "y", "z", "qx", "qy", "qz", "qw"), "ur": ("x", "y", "z", "wx", "wy", "wz")}
 
 
 def pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> str:
-    """The feature that says where the arm was."""
+    """Name of the feature with the gripper poses or joint angles.
+
+    Raises:
+        InputError: No feature holds poses, or several do.
+    """
+    features = info["features"]
     if options.urdf is not None:
         return _STATE
     if options.pose_convention is not None:
         column = options.gripper_frame or _STATE
-        if column not in info["features"]:
-            has = ", ".join(info["features"])
-            raise InputError(f"{root}: no feature {column!r}; --gripper-frame names one of {has}")
+        if column not in features:
+            names = ", ".join(features)
+            raise InputError(f"{root}: no feature {column!r}; --gripper-frame is one of {names}")
         return column
-    keys = [key for key in info["features"] if key.startswith("observation")]
-    found = [key for key in keys if _called(_names(info, key))]
+    observed = {key: _names(info, key) for key in features if key.startswith("observation")}
+    keys = [key for key, names in observed.items() if _convention_of(names)]
     if options.gripper_frame is not None:
-        wanted = options.gripper_frame
-        found = [k for k in found if wanted in (k, *_arms(_names(info, k)))]
-    if _STATE in found or len(found) == 1:
-        return _STATE if _STATE in found else found[0]
-    if found:
+        keys = [key for key in keys if options.gripper_frame in (key, *_arms(observed[key]))]
+    if _STATE in keys or len(keys) == 1:
+        return _STATE if _STATE in keys else keys[0]
+    if keys:
         raise InputError(
-            f"{root}: gripper poses are in {' and '.join(found)}; name one with --gripper-frame"
+            f"{root}: gripper poses are in {' and '.join(keys)}; name one with --gripper-frame"
         )
-    has = "; ".join(
-        f"{key}: {', '.join(_names(info, key))}"
-        for key in info["features"]
-        if key.startswith("observation") and _names(info, key) and "image" not in key
+    listed = "; ".join(
+        f"{key}: {', '.join(names)}"
+        for key, names in observed.items()
+        if names and "image" not in key
     )
     raise InputError(
         f"{root}: no feature holds a pose (x, y, z and qx, qy, qz, qw or wx, wy, wz), there are"
-        f" {has or 'no named numbers'}; for joint angles give --urdf, for a pose in another form"
+        f" {listed or 'no named numbers'}; for joint angles give --urdf, for a pose in another form"
         f" --pose-convention and --gripper-frame FEATURE"
     )
 
@@ -71,7 +81,21 @@ def feature_poses(
     values: NDArray[np.float64],
     options: ReadOptions,
 ) -> tuple[SE3, list[str]]:
-    """(n,) base_from_gripper and what was taken."""
+    """Convert the numbers of a feature to poses.
+
+    Args:
+        root: The dataset, for messages.
+        info: Content of info.json.
+        column: Name of the feature.
+        values: (n, k) numbers of the feature.
+        options: Convention, arm, frames and URDF.
+
+    Returns:
+        (n,) base_from_gripper, and notes.
+
+    Raises:
+        InputError: The numbers are no poses, or several poses are possible.
+    """
     names = _names(info, column)
     if options.urdf is not None:
         return _joint_poses(root, names, values, options)
@@ -83,18 +107,19 @@ def feature_poses(
             convention = pose_convention(options.pose_convention)
             numbers = values[:, : convention.count]
             if convention.count < count:
-                taken = f" ({', '.join(names[: convention.count])})" if names else ""
-                notes = [f"the first {convention.count} of its {count} numbers were taken{taken}"]
+                used = f" ({', '.join(names[: convention.count])})" if names else ""
+                notes = [f"the first {convention.count} of its {count} numbers were taken{used}"]
         elif len(names) != count:
             raise ValueError(f"has {count} numbers and {len(names)} names")
         else:
             convention, columns = _pose_columns(names, options.gripper_frame)
             numbers = values[:, columns]
-        poses, why = poses_from_numbers(numbers, convention), doubt(numbers, convention)
+        poses = poses_from_numbers(numbers, convention)
+        check_units(numbers, convention)
+    except ConventionError as error:
+        raise InputError(f"{root}: {column}: {error.naming('--pose-convention')}") from None
     except ValueError as error:
         raise InputError(f"{root}: {column}: {error}") from None
-    if why is not None:
-        raise InputError(f"{root}: {column}: {why}")
     return poses, [f"gripper poses are {column}: {convention.meaning}", *notes]
 
 
@@ -106,53 +131,53 @@ def _joint_poses(
     if len(names) != stated.shape[1]:
         count = stated.shape[1]
         raise InputError(f"{root}: {_STATE} has {count} numbers and {len(names)} names")
-    twice = [name for i, name in enumerate(names) if name in names[:i]]
-    if twice:
-        raise InputError(f"{root}: {_STATE}: {twice[0]!r} names several numbers; name each apart")
+    repeated = [name for i, name in enumerate(names) if name in names[:i]]
+    if repeated:
+        raise InputError(f"{root}: {_STATE}: {repeated[0]!r} names several numbers; rename them")
     model = RobotModel(options.urdf)
-    base = options.base_frame or model.base_link
-    gripper = options.gripper_frame or model.end_link()
+    base, gripper = model.chosen_links(options.base_frame, options.gripper_frame)
     values = in_radians(model, names, stated, [options.pose_convention] * len(names))
     try:
         poses = model.base_from_gripper(names, values, base, gripper)
     except InputError as error:
-        raise InputError(f"{root}: {_STATE}: {error} (or say --pose-convention deg)") from None
-    notes = [f"gripper poses are those of {gripper} in {base}, from {options.urdf.name}"]
-    return poses, notes + model.beyond_limits(names, values)
+        raise InputError(f"{root}: {_STATE}: {error} (or give --pose-convention deg)") from None
+    return poses, [model.note(base, gripper), *model.beyond_limits(names, values)]
 
 
 def _pose_columns(names: list[str], arm: str | None) -> tuple[PoseConvention, list[int]]:
-    """How a feature's pose is meant, and where its numbers stand.
+    """Convention of a feature's pose, and the columns of its numbers.
 
     Raises:
-        ValueError: The names are those of several poses and `arm` is none of them.
+        ValueError: The names are those of several poses, and `arm` selects none of them.
     """
     arms = _arms(names)
     chosen = [n if arm not in arms or n.rpartition(".")[0] == arm else "" for n in names]
-    called = _called(chosen)
-    assert called is not None
+    convention = _convention_of(chosen)
+    assert convention is not None
     last = [name.rpartition(".")[2] for name in chosen]
-    if any(last.count(part) > 1 for part in _CALLED[called]):
+    if any(last.count(part) > 1 for part in _PARTS[convention]):
         which = " or ".join(filter(None, arms))
-        todo = f"--gripper-frame {which}" if which else "names that tell them apart in info.json"
-        raise ValueError(f"holds several poses ({', '.join(names)}); give {todo}")
-    return pose_convention(called), [last.index(part) for part in _CALLED[called]]
+        remedy = f"--gripper-frame {which}" if which else "names that tell them apart in info.json"
+        raise ValueError(f"holds several poses ({', '.join(names)}); give {remedy}")
+    return pose_convention(convention), [last.index(part) for part in _PARTS[convention]]
 
 
-def _called(names: list[str]) -> str | None:
-    """The convention that a feature's names speak of, if it is a pose."""
+def _convention_of(names: list[str]) -> str | None:
+    """The convention of a feature with these names, if it is a pose."""
     last = [name.rpartition(".")[2] for name in names]
-    return next((c for c, parts in _CALLED.items() if all(p in last for p in parts)), None)
+    return next((c for c, parts in _PARTS.items() if all(p in last for p in parts)), None)
 
 
 def _arms(names: list[str]) -> list[str]:
-    """What stands before the names of whole poses, such as left_ee and right_ee."""
-    before = dict.fromkeys(name.rpartition(".")[0] for name in names)
-    return [arm for arm in before if _called([n for n in names if n.rpartition(".")[0] == arm])]
+    """Prefixes of the names of whole poses, such as left_ee and right_ee."""
+    prefixes = dict.fromkeys(name.rpartition(".")[0] for name in names)
+    return [
+        arm for arm in prefixes if _convention_of([n for n in names if n.rpartition(".")[0] == arm])
+    ]
 
 
 def _names(info: Mapping[str, Any], column: str) -> list[str]:
-    """What the numbers of a feature are called, without prefixes and `.pos`."""
+    """Names of the numbers of a feature, without `.pos`."""
     names = info["features"].get(column, {}).get("names") or []
     if isinstance(names, dict):  # {"motors": [...]}, or several arms with the same names
         groups = {key: group for key, group in names.items() if isinstance(group, list)}

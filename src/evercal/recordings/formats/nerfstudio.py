@@ -1,16 +1,10 @@
-"""nerfstudio's `transforms.json`, as phone apps and `ns-process-data` write it.
-
-    {"camera_model": "OPENCV", "fl_x": 1450, "fl_y": 1450, "cx": 960, "cy": 540, "w": 1920,
-     "h": 1080, "k1": 0, "k2": 0, "p1": 0, "p2": 0, "applied_transform": [3][4],
-     "frames": [{"file_path": "images/frame_00001.png", "transform_matrix": [4][4]}, ...],
-     "test_filenames": [...]}
+"""nerfstudio's `transforms.json`, as written by phone apps and `ns-process-data`.
 
 `transform_matrix` is the camera in the world with OpenGL's axes (y up, looking along -z).
-Intrinsics stand at the top or in each frame; pixels count from the image's corner, as in COLMAP, so
-that the centre of the top-left pixel is (0.5, 0.5). `applied_transform` and `applied_scale` are
-undone: the base frame is that of the program that made the poses, and its scale is that program's.
-Files that `val_filenames` and `test_filenames` name are test frames. (Tancik et al., Nerfstudio,
-SIGGRAPH 2023; its documentation, Data conventions.)
+Intrinsics stand at the top or in each frame. The centre of the top-left pixel is (0.5, 0.5), as in
+COLMAP. `applied_transform` and `applied_scale` are undone, so the base frame and the unit of length
+are set by the program that estimated the poses. Files in `val_filenames` and `test_filenames` are
+test frames. (Tancik et al., Nerfstudio, SIGGRAPH 2023; its documentation, Data conventions.)
 """
 
 import json
@@ -18,6 +12,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Container, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,12 +25,12 @@ from evercal.recordings.images import IMAGE_ENDINGS, image_size
 
 FILE = "transforms.json"
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
-# A camera's OpenGL axes (right, up, backward) from OpenCV's (right, down, forward).
+# OpenGL axes (right, up, backward) from OpenCV axes (right, down, forward).
 _GL_FROM_CV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
 _TOLERANCE = 1e-2
 NOTE = (
-    "the base frame and the unit of length are those of {file}; poses are in metres of a robot only"
-    " if that was so, see 'evercal align'"
+    "the base frame and the unit of length are those of {file}; if they are not metres in the"
+    " robot's base frame, run 'evercal align' after learning"
 )
 
 
@@ -45,13 +40,12 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str]) -> Recording:
-    """Reads the poses and the size of one image of every camera; no other image is opened.
+    """Read the poses and the size of one image of every camera; no other image is opened.
 
-    Where the file states no size, it is that of the first image.
+    If the file states no image size, that of the first image is taken.
 
     Raises:
-        InputError: The file or an image is missing, or the file breaks the format; the message
-            names the entry.
+        InputError: The file or an image is missing, or the file breaks the format.
     """
     root = Path(root)
     file = root if root.is_file() else root / FILE
@@ -64,10 +58,10 @@ def load(root: str | os.PathLike[str]) -> Recording:
             raise ValueError("'frames' is a list with at least one frame")
         data = {**_first_size(root, data, entries), **data}
         frames = [_frame(root, data, i, entry, undo, scale) for i, entry in enumerate(entries)]
-        test = _tested(root, data, {str(frame.image) for frame in frames})
+        test = _test_images(root, data, {str(frame.image) for frame in frames})
     except (ValueError, OverflowError) as error:
         raise InputError(f"{file}: {error}") from None
-    frames = _sized(file, frames)
+    frames = _resized(file, frames)
     (name, times), *_ = Counter(frame.name for frame in frames).most_common(1)
     if times > 1:
         raise InputError(f"{file}: {name!r} comes {times} times; keep one entry for each image")
@@ -85,14 +79,14 @@ def _read(file: Path) -> dict[str, object]:
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror})") from None
     except ValueError as error:
-        raise InputError(f"{file}: not valid JSON ({error}); write it anew") from None
+        raise InputError(f"{file}: not valid JSON ({error}); export it again") from None
     if not isinstance(data, dict):
-        raise InputError(f"{file}: no JSON object; it has 'frames' in it")
+        raise InputError(f"{file}: no JSON object; expected an object with 'frames'")
     return data
 
 
 def _first_size(root: Path, data: Mapping[str, object], entries: list[object]) -> dict[str, object]:
-    """The first image's w and h, where neither the file nor its first frame states one of them."""
+    """Size of the first image as w and h, if neither the file nor its first frame states it."""
     first = entries[0]
     if not isinstance(first, dict) or {"w", "h"} & {*data, *first}:
         return {}
@@ -104,7 +98,7 @@ def _first_size(root: Path, data: Mapping[str, object], entries: list[object]) -
 
 
 def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
-    """What brings the file's world back to the one before it, and the scale to divide by first."""
+    """Inverse of the rigid part of `applied_transform`, and the scale to divide by first."""
     scale = _number(data, "applied_scale", 1.0)
     if not scale > 0:
         raise ValueError(f"'applied_scale' is > 0, got {scale}")
@@ -114,18 +108,12 @@ def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
     size = abs(np.linalg.det(matrix[:3, :3])) ** (1 / 3)
     if not size > 0:
         raise ValueError("'applied_transform' cannot be undone: its determinant is 0")
+    rigid = np.eye(4)
+    rigid[:3] = matrix[:3] / size
     try:
-        applied = SE3.from_matrix(_scaled(matrix, size), _TOLERANCE)
+        return SE3.from_matrix(rigid, _TOLERANCE).inverse(), scale * size
     except ValueError as error:
         raise ValueError(f"'applied_transform': {error}") from None
-    return applied.inverse(), scale * size
-
-
-def _scaled(matrix: NDArray[np.float64], size: float) -> NDArray[np.float64]:
-    """A similarity's matrix divided by its scale."""
-    found = np.eye(4)
-    found[:3] = matrix[:3] / size
-    return found
 
 
 def _frame(
@@ -135,9 +123,8 @@ def _frame(
         raise ValueError(f"frame {i}: an object with 'file_path' and 'transform_matrix'")
     name = entry["file_path"]
     try:
-        stated = SE3.from_matrix(
-            _matrix(entry.get("transform_matrix"), "transform_matrix"), _TOLERANCE
-        )
+        matrix = _matrix(entry.get("transform_matrix"), "transform_matrix")
+        stated = SE3.from_matrix(matrix, _TOLERANCE)
         camera = _camera({**data, **entry})
     except ValueError as error:
         raise ValueError(f"frame {i} ({name}): {error}") from None
@@ -146,7 +133,7 @@ def _frame(
 
 
 def _image(root: Path, name: str) -> Path:
-    """The image of a frame; old files leave its ending out."""
+    """Image file of a frame; old files omit its ending."""
     image = root / name
     if image.suffix:
         return image
@@ -167,23 +154,22 @@ def _camera(data: Mapping[str, object]) -> Camera:
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None:
         raise ValueError("'fl_x' is missing, and so are 'fl_y' and 'camera_angle_x'")
-    lens = [_number(data, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
     if _number(data, "k4", 0.0):
         raise ValueError("k4 is not 0; only k1, k2, k3, p1 and p2 are supported")
-    # Half a pixel: the file counts from the image's corner.
     return Camera(
         width,  # pyright: ignore[reportArgumentType]  # checked when constructed
         height,  # pyright: ignore[reportArgumentType]
         fx,
         fy,
-        _number(data, "cx", width / 2) - 0.5,
-        _number(data, "cy", height / 2) - 0.5,
-        tuple(lens) if any(lens) else (),
+        # Half a pixel: the file counts from the image's corner.
+        cx=_number(data, "cx", width / 2) - 0.5,
+        cy=_number(data, "cy", height / 2) - 0.5,
+        distortion=tuple(_number(data, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")),
     )
 
 
 def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:
-    """A focal length in pixels, of itself or from the angle of view; None if neither is there."""
+    """Focal length in pixels, stated or from the angle of view; None if neither is stated."""
     if data.get(f"fl_{axis}") is not None:
         return _number(data, f"fl_{axis}")
     if data.get(f"camera_angle_{axis}") is None:
@@ -194,38 +180,34 @@ def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:
     return size / 2 / math.tan(angle / 2)
 
 
-def _sized(file: Path, frames: list[Frame]) -> list[Frame]:
-    """The frames with cameras of their images' size, judged by one image of every camera size.
+def _resized(file: Path, frames: list[Frame]) -> list[Frame]:
+    """Frames with cameras of their images' size, judged by one image of every camera size.
 
-    Downscaled copies of the images have smaller cameras. Images that were turned have none.
+    Downscaled copies of the images get scaled cameras. Rotated and cropped images are refused.
     """
     sizes: dict[tuple[int, int], tuple[int, int]] = {}
+    resized = []
     for frame in frames:
-        camera, image = frame.camera, frame.image
+        image, stated = frame.image, (frame.camera.width, frame.camera.height)
         if not isinstance(image, Path) or not image.is_file():
             raise InputError(f"{image}: named in {file} but missing; restore or take the frame out")
-        stated = camera.width, camera.height
-        if stated in sizes:
-            continue
-        sizes[stated] = found = image_size(image)
-        if abs(found[0] / found[1] / (stated[0] / stated[1]) - 1) > 0.01:
-            turned = found == stated[::-1]
-            why = "the image was turned after the intrinsics were written" if turned else "cropped?"
-            raise InputError(
-                f"{image}: is {found[0]}x{found[1]}, {file.name} says {stated[0]}x{stated[1]}"
-                f" ({why}); give images of that shape"
-            )
-    return [_resized(frame, sizes[frame.camera.width, frame.camera.height]) for frame in frames]
+        if stated not in sizes:
+            size = sizes[stated] = image_size(image)
+            if abs(size[0] / size[1] / (stated[0] / stated[1]) - 1) > 0.01:
+                rotated = "the image was rotated after the intrinsics were written"
+                raise InputError(
+                    f"{image}: is {size[0]}x{size[1]}, {file.name} says {stated[0]}x{stated[1]}"
+                    f" ({rotated if size == stated[::-1] else 'cropped?'}); give images of that"
+                    f" shape"
+                )
+        if sizes[stated] != stated:
+            frame = replace(frame, camera=frame.camera.resized(*sizes[stated]))
+        resized.append(frame)
+    return resized
 
 
-def _resized(frame: Frame, size: tuple[int, int]) -> Frame:
-    if (frame.camera.width, frame.camera.height) == size:
-        return frame
-    return Frame(frame.name, frame.image, frame.camera.resized(*size), frame.base_from_camera)
-
-
-def _tested(root: Path, data: Mapping[str, object], images: Container[str]) -> set[Path]:
-    found: set[Path] = set()
+def _test_images(root: Path, data: Mapping[str, object], images: Container[str]) -> set[Path]:
+    test: set[Path] = set()
     for key in ("val_filenames", "test_filenames"):
         names = data.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -233,9 +215,9 @@ def _tested(root: Path, data: Mapping[str, object], images: Container[str]) -> s
         # A test frame under another name would be learned from.
         other = [name for name in names if str(_image(root, name)) not in images]
         if other:
-            raise ValueError(f"{key!r} names {other[0]!r}, which no frame does; mend the name")
-        found |= {_image(root, name) for name in names}
-    return found
+            raise ValueError(f"{key!r} names {other[0]!r}, which is no frame; correct the name")
+        test |= {_image(root, name) for name in names}
+    return test
 
 
 def _matrix(value: object, name: str) -> NDArray[np.float64]:

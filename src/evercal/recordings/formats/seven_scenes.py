@@ -1,47 +1,48 @@
-"""The folder layout of Microsoft's 7-Scenes, read as it is.
+"""The folder layout of Microsoft's 7-Scenes.
 
     ROOT/TrainSplit.txt, TestSplit.txt     one sequence per line: `sequence3` means seq-03
     ROOT/camera-intrinsics.txt             optional 3x3 matrix in pixels (as in 3DMatch)
     ROOT/seq-03/frame-000000.color.png     or .jpg
     ROOT/seq-03/frame-000000.pose.txt      4x4 base_from_camera, metres
 
-Camera axes are OpenCV's. Without the intrinsics file the colour camera has the focal length that
-the field uses, 525 pixels at 640x480 and scaled with the size, and its principal point in the
-middle of the image: nobody calibrated it. Code that writes (width / 2, height / 2) for the middle
-counts pixels from the image's corner; here pixel (0, 0) is a centre, so the middle is at ((width -
-1) / 2, (height - 1) / 2). An intrinsics file is taken at its word, with (0, 0) a centre. A pose
-with inf or nan marks a frame that was not tracked: it is left out and counted. Every sequence is
-taken to come from one camera. Depth files are not read.
+Camera axes are OpenCV's. Without an intrinsics file the focal length is 525 pixels at 640x480, as
+is usual, scaled with the image size, and the principal point is the middle of the image. In the
+intrinsics file, pixel (0, 0) is the centre of the top-left pixel. Poses with inf or nan mark
+untracked frames, which are left out and counted. All sequences come from one camera. Depth files
+are not read.
 """
 
-import itertools
 import os
 import re
 from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
+from evercal.recordings.formats.frame_files import (
+    colour_images,
+    frame_name,
+    read_numbers,
+    tracked_frames,
+)
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import image_size
-from evercal.recordings.poses.pose_files import read_numbers, tracked_frames
 
 _SPLITS = ("TrainSplit.txt", "TestSplit.txt")
 _FOCAL_AT_640 = 525.0
 
 
 def detect(root: Path) -> bool:
-    """Whether `root` looks like this format, be it a damaged one."""
+    """Whether `root` looks like this format, even if it is damaged."""
     if not root.is_dir():
         return False
     return any((root / split).is_file() for split in _SPLITS) or any(root.glob("seq-*/"))
 
 
 def load(root: str | os.PathLike[str]) -> Recording:
-    """Reads split files and poses, and the size of one image; no other image is opened.
+    """Read split files and poses, and the size of one image; no other image is opened.
 
     Raises:
-        InputError: The folder, a split, a sequence, a pose or an image is missing or broken; the
-            message names the file.
+        InputError: The folder, a split, a sequence, a pose or an image is missing or broken.
     """
     root = Path(root)
     if not root.is_dir():
@@ -50,7 +51,9 @@ def load(root: str | os.PathLike[str]) -> Recording:
     shared = sorted({folder.name for folder in splits[0]} & {folder.name for folder in splits[1]})
     if shared:
         raise InputError(f"{root}: {shared[0]} is in both {_SPLITS[0]} and {_SPLITS[1]}; keep one")
-    images = [[image for folder in folders for image in _images(folder)] for folders in splits]
+    images = [
+        [image for folder in folders for image in colour_images(folder)] for folders in splits
+    ]
     if not (images[0] or images[1]):
         raise InputError(f"{root}: {_SPLITS[0]} and {_SPLITS[1]} are empty; name a sequence in one")
     camera = _camera(root, (images[0] + images[1])[0])
@@ -60,7 +63,7 @@ def load(root: str | os.PathLike[str]) -> Recording:
 
 
 def _sequences(root: Path, split: str) -> list[Path]:
-    """The folders that a split file names, in its order."""
+    """Folders named by a split file, in its order."""
     file = root / split
     try:
         lines = file.read_text().split("\n")
@@ -83,22 +86,9 @@ def _sequences(root: Path, split: str) -> list[Path]:
     return folders
 
 
-def _images(folder: Path) -> list[Path]:
-    # os.listdir and one sort: globbing a thousand files twice is the slow part of loading.
-    names = sorted(name for name in os.listdir(folder) if re.search(r"\.color\.(png|jpe?g)$", name))
-    if not names:
-        raise InputError(f"{folder}: no images; expected frame-XXXXXX.color.png or .jpg")
-    stems = [_stem(name) for name in names]
-    for first, second in itertools.pairwise(stems):
-        if first == second:
-            raise InputError(f"{folder}: {first}.color is there as .png and as .jpg; keep one")
-    return [folder / name for name in names]
-
-
 def _frames(images: list[Path], camera: Camera) -> tuple[Frame, ...]:
-    names = [f"{image.parent.name}/{_stem(image.name)}" for image in images]
-    poses = [image.with_name(_stem(image.name) + ".pose.txt") for image in images]
-    return tracked_frames(names, images, poses, camera)
+    names = [f"{image.parent.name}/{frame_name(image.name)}" for image in images]
+    return tracked_frames(names, images, camera)
 
 
 def _camera(root: Path, image: Path) -> Camera:
@@ -112,7 +102,3 @@ def _camera(root: Path, image: Path) -> Camera:
         return Camera.from_matrix(matrix, width, height)
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
-
-
-def _stem(name: str) -> str:
-    return name[: name.rindex(".color.")]

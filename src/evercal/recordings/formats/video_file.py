@@ -1,4 +1,4 @@
-"""Single frames of video files, decoded by PyAV (extra `lerobot`) when they are asked for."""
+"""Single frames of video files, decoded on demand by PyAV (extra `lerobot`)."""
 
 import threading
 import weakref
@@ -14,8 +14,8 @@ from evercal.errors import InputError
 from evercal.recordings.images import StoredImage
 
 _MOST_OPEN = 4
-# Decoding on is cheaper than seeking when the wanted frame is so near.
-_READ_ON_S = 1.0
+# Within this time ahead, decoding frame by frame is cheaper than seeking.
+_READ_AHEAD_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,19 +25,15 @@ class VideoFrame(StoredImage):
     videos: "Videos"
     path: Path
     seconds: float
-    """From the video's first frame."""
+    """Time since the video's first frame."""
 
     def read(self) -> NDArray[np.uint8]:
-        """(H, W, 3) uint8 RGB.
-
-        Raises:
-            InputError: The video is missing, cannot be decoded, or has no frame at this time.
-        """
+        """Decode the frame, see `Videos.frame`."""
         return self.videos.frame(self.path, self.seconds)
 
 
 class _Open:
-    """A video that is being decoded, and the last frame of it."""
+    """A video that is being decoded, with its last frame."""
 
     def __init__(self, path: Path, container: Any) -> None:
         self.path, self.container = path, container
@@ -47,9 +43,9 @@ class _Open:
         self.last: tuple[float, Any] | None = None
 
     def at(self, seconds: float, half: float) -> NDArray[np.uint8] | None:
-        """The frame within `half` seconds of a time, decoding on or from the key frame before."""
+        """Frame within `half` seconds of a time, or None if there is none."""
         last = None if self.last is None else self.last[0]
-        if last is None or not last - half < seconds < last + _READ_ON_S:
+        if last is None or not last - half < seconds < last + _READ_AHEAD_S:
             self.container.seek(
                 max(0, round(seconds / self.stream.time_base)), stream=self.stream, backward=True
             )
@@ -66,10 +62,10 @@ class _Open:
 
 
 class Videos:
-    """Some open videos of one frame rate; threads may share it.
+    """Cache of open videos of one frame rate; threads may share it.
 
     Args:
-        fps: Frames a second of all videos.
+        fps: Frames per second of all videos.
 
     Raises:
         InputError: The extra `lerobot` is not installed.
@@ -89,7 +85,11 @@ class Videos:
         weakref.finalize(self, _close, self._open)
 
     def frame(self, path: Path, seconds: float) -> NDArray[np.uint8]:
-        """The frame shown at a time.
+        """Decode the frame at a time.
+
+        Args:
+            path: Video file.
+            seconds: Time since the first frame.
 
         Returns:
             (H, W, 3) uint8 RGB.

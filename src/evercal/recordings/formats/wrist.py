@@ -1,13 +1,8 @@
-"""A plain folder: images, and where the gripper was when each was taken.
+"""A plain folder: images, and the gripper pose at each, see docs/formats.md.
 
-    ROOT/image-1.png, ...               or in ROOT/images, ROOT/rgb
-    ROOT/base_from_gripper.csv          or .json, .npy, .tum, .txt: as `read_robot_poses` takes them
-    ROOT/joints.csv, ROOT/arm.urdf      or joint angles and a URDF in its place
-    ROOT/camera.json                    or .yaml, .yml, .xml, .txt: as `read_camera` takes it
-    ROOT/stamps.csv                     optional: columns image, stamp_s
-
-Rows go to images by name, by time or in order. Every image that gets a pose is a training frame
-with base_from_gripper; where the camera is on the gripper is not known here. One camera took all.
+Poses are in base_from_gripper.csv, .json, .npy, .tum or .txt, or in joints.csv or joints.json with
+a URDF. Rows are paired with images by name, by time or in order. Images with a pose become training
+frames with base_from_gripper; gripper_from_camera is unknown. All images come from one camera.
 """
 
 import os
@@ -17,7 +12,7 @@ from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, image_size
-from evercal.recordings.poses.camera_file import read_camera
+from evercal.recordings.poses.camera_file import read_camera_of_size
 from evercal.recordings.poses.joint_states import read_joint_poses
 from evercal.recordings.poses.kinematics import RobotModel
 from evercal.recordings.poses.pairing import pair_images
@@ -42,92 +37,85 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Recording:
-    """Reads poses and intrinsics, and the size of one image; no other image is opened.
+    """Read poses, intrinsics and the size of one image; no other image is opened.
 
     Raises:
-        InputError: Poses, images or intrinsics are missing or broken, or do not go together.
+        InputError: Poses, images or intrinsics are missing, broken or inconsistent.
     """
     root = Path(root)
     options = options or ReadOptions()
-    file = _only(root, _POSES + _JOINTS, "gripper poses")
+    file = _pose_file(root)
     rows, notes = _rows(root, file, options)
     images = _images(root)
-    camera = _camera(root, options, images[0])
-    stamps = _stamps(root)
-    poses, paired = pair_images(images, rows, stamps, file)
+    camera = _camera(root, options.camera, images[0])
+    poses, pairing_notes = pair_images(images, rows, _stamps(root), file)
     frames = tuple(
         Frame(image.name, image, camera, None, pose)
         for image, pose in zip(images, poses, strict=True)
         if pose is not None
     )
     lost = len(images) - len(frames)
-    return Recording(root.resolve().name, frames, (), lost, notes=(*notes, *paired))
+    return Recording(root.resolve().name, frames, (), lost, notes=(*notes, *pairing_notes))
+
+
+def _pose_file(root: Path) -> Path:
+    names = [name for name in _POSES + _JOINTS if (root / name).is_file()]
+    if len(names) > 1:
+        raise InputError(f"{root}: holds {' and '.join(names)}; keep the one with gripper poses")
+    if not names:
+        raise InputError(f"{root}: no gripper poses; expected {', '.join(_POSES + _JOINTS)}")
+    return root / names[0]
 
 
 def _rows(root: Path, file: Path, options: ReadOptions) -> tuple[RobotPoses, list[str]]:
     if file.name in _JOINTS:
         model = RobotModel(options.urdf or _urdf(root, file))
-        frames = options.base_frame, options.gripper_frame
-        return read_joint_poses(file, model, *frames, options.pose_convention)
+        links = options.base_frame, options.gripper_frame
+        return read_joint_poses(file, model, *links, options.pose_convention)
     for name in ("urdf", "base_frame", "gripper_frame"):
         if getattr(options, name) is not None:
             raise InputError(
                 f"{flag(name)}: {file} holds gripper poses already; leave the option"
                 f" out, or give joint angles in joints.csv instead"
             )
-    return read_robot_poses(file, options.pose_convention), []
-
-
-def _only(root: Path, names: tuple[str, ...], what: str) -> Path:
-    found = [name for name in names if (root / name).is_file()]
-    if len(found) > 1:
-        raise InputError(f"{root}: holds {' and '.join(found)}; keep the one with the {what}")
-    if not found:
-        raise InputError(f"{root}: no {what}; expected {', '.join(names)}")
-    return root / found[0]
+    return read_robot_poses(file, options.pose_convention, option="--pose-convention"), []
 
 
 def _urdf(root: Path, joints: Path) -> Path:
-    found = sorted(root.glob("*.urdf"))
-    if len(found) != 1:
-        has = f"{len(found)} URDF files" if found else "no URDF"
-        raise InputError(f"{root}: {joints.name} needs a URDF, and {has} is beside it; give --urdf")
-    return found[0]
+    files = sorted(root.glob("*.urdf"))
+    if len(files) != 1:
+        number = f"{len(files)} URDF files" if files else "no URDF"
+        raise InputError(
+            f"{root}: {joints.name} needs a URDF, and {number} is beside it; give --urdf"
+        )
+    return files[0]
 
 
 def _images(root: Path) -> list[Path]:
     for folder in _FOLDERS:
-        place = root / folder
-        names = os.listdir(place) if place.is_dir() else []
+        names = os.listdir(root / folder) if (root / folder).is_dir() else []
         images = [name for name in names if Path(name).suffix.lower() in IMAGE_ENDINGS]
         if images:
-            return [place / name for name in sorted(images, key=natural_key)]
+            return [root / folder / name for name in sorted(images, key=natural_key)]
     raise InputError(f"{root}: no images ({', '.join(IMAGE_ENDINGS)}) in it, in images or in rgb")
 
 
-def _camera(root: Path, options: ReadOptions, image: Path) -> Camera:
-    size = image_size(image)
-    file = options.camera
+def _camera(root: Path, file: Path | None, image: Path) -> Camera:
     if file is None:
-        found = [name for name in _CAMERAS if (root / name).is_file()]
-        if len(found) != 1:
-            has = f"{' and '.join(found)} in it" if found else "no camera file in it"
+        names = [name for name in _CAMERAS if (root / name).is_file()]
+        if len(names) != 1:
+            files = f"{' and '.join(names)} in it" if names else "no camera file in it"
             raise InputError(
-                f"{root}: {has}; name the file of the intrinsics with --camera (3x3 matrix, JSON,"
+                f"{root}: {files}; name the file of the intrinsics with --camera (3x3 matrix, JSON,"
                 f" camera_info YAML or OpenCV's storage), or put it there as camera.json,"
                 f" .yaml, .xml or .txt"
             )
-        file = root / found[0]
-    camera = read_camera(file, size)
-    if (camera.width, camera.height) != size:
-        raise InputError(
-            f"{file}: is for images of {camera.width}x{camera.height}, {image.name} is"
-            f" {size[0]}x{size[1]}; give the intrinsics of this image size"
-        )
-    return camera
+        file = root / names[0]
+    return read_camera_of_size(file, image_size(image), image.name)
 
 
 def _stamps(root: Path) -> dict[str, float] | None:
+    """Seconds by image name, if there is a stamps file."""
     file = root / "stamps.csv"
     if not file.is_file():
         return None
@@ -135,7 +123,7 @@ def _stamps(root: Path) -> dict[str, float] | None:
     if rows.names is None or rows.stamps_s is None:
         raise InputError(f"{file}: needs the columns image and stamp_s")
     names = [PurePath(name).name for name in rows.names]
-    twice = [name for i, name in enumerate(names) if name in names[:i]]
-    if twice:
-        raise InputError(f"{file}: {twice[0]!r} comes twice; give every image one time")
+    repeated = [name for i, name in enumerate(names) if name in names[:i]]
+    if repeated:
+        raise InputError(f"{file}: {repeated[0]!r} comes twice; give every image one time")
     return dict(zip(names, rows.stamps_s.tolist(), strict=True))

@@ -1,15 +1,8 @@
-"""Intrinsics from a file: 3x3 matrix as text, evercal's JSON, ROS's camera_info, OpenCV's storage.
+"""Camera files: 3x3 matrix as text, evercal's JSON, ROS camera_info, OpenCV's FileStorage.
 
-    525 0 319.5                  {"width": 640, "height": 480,       image_width: 640
-    0 525 239.5                   "fx": 525, "fy": 525,              image_height: 480
-    0 0 1                         "cx": 319.5, "cy": 239.5,          camera_matrix: {data: [...]}
-                                  "distortion": []}                  distortion_coefficients: ...
-
-The file's content decides which of them it is, not its ending. Of ROS both the calibration file and
-a printed message (`ros2 topic echo --once .../camera_info`) are read, the matrix K and D of the raw
-image; the projection P of the rectified image is not used. What OpenCV's FileStorage writes (YAML
-that starts with %YAML:1.0, or XML) holds camera_matrix and distortion_coefficients too. All count
-pixels from the centre of the top-left pixel.
+The content decides the kind, not the file ending. Both ROS calibration files and printed messages
+(`ros2 topic echo --once .../camera_info`) are read, with the matrix K and D of the raw image. In
+all kinds, pixel (0, 0) is the centre of the top-left pixel, and images are upright.
 """
 
 import json
@@ -22,8 +15,8 @@ from evercal.geometry import Camera
 
 _MODELS = ("plumb_bob", "rational_polynomial", "none", "")
 _LENGTHS = (0, 4, 5, 8)
-# What programs that write OpenCV's storage call the fields, in lower case without underscores.
-_CALLED = {
+# Names of the fields in OpenCV's storage, in lower case without underscores.
+_ALIASES = {
     "camera_matrix": ("cameramatrix", "intrinsicmatrix", "k"),
     "distortion_coefficients": ("distortioncoefficients", "distcoeffs", "distcoeff", "d"),
     "image_width": ("imagewidth", "width"),
@@ -32,15 +25,15 @@ _CALLED = {
 
 
 def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> Camera:
-    """Reads the intrinsics of one camera.
+    """Read the intrinsics of one camera.
 
     Args:
         path: The file.
-        size: (width, height) in pixels of the images that a bare 3x3 matrix belongs to, or
-            OpenCV's storage without a size; the other kinds say it themselves.
+        size: (width, height) in pixels of the images. Required for a 3x3 matrix and for OpenCV's
+            storage without a size; otherwise the size in the file is used.
 
     Raises:
-        InputError: The file is missing, is none of these kinds, or holds no usable camera.
+        InputError: The file is missing, of an unknown kind, or holds no usable camera.
     """
     path = Path(path)
     try:
@@ -64,6 +57,31 @@ def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = Non
         raise InputError(f"{path}: {error}") from None
 
 
+def read_camera_of_size(path: Path, size: tuple[int, int], images: str) -> Camera:
+    """Read the intrinsics of images of one size.
+
+    Args:
+        path: The file.
+        size: (width, height) in pixels of the images.
+        images: Name of the images, for messages.
+
+    Raises:
+        InputError: As `read_camera`, or the camera has another size.
+    """
+    camera = read_camera(path, size)
+    check_size(str(path), camera, size, images)
+    return camera
+
+
+def check_size(source: str, camera: Camera, size: tuple[int, int], images: str) -> None:
+    """Raise `InputError` if a camera from `source` has another size than its images."""
+    if (camera.width, camera.height) != size:
+        raise InputError(
+            f"{source}: is for images of {camera.width}x{camera.height}, {images} is"
+            f" {size[0]}x{size[1]}; give the intrinsics of this image size with --camera"
+        )
+
+
 _EXPECTED = (
     "give a 3x3 matrix as text, evercal's camera JSON, a ROS camera_info YAML or OpenCV's storage"
 )
@@ -71,14 +89,13 @@ _EXPECTED = (
 
 def _json_object(text: str) -> Mapping[str, object]:
     try:
-        data = json.loads(text)
+        return json.loads(text)
     except ValueError as error:
         raise ValueError(f"not valid JSON ({error}); {_EXPECTED}") from None
-    return data
 
 
 def _plain_numbers(text: str) -> list[float] | None:
-    """All words as numbers, without commas and comments; None if a word is none."""
+    """All words as numbers, without commas and comments; None if a word is not a number."""
     lines = (line.split("#")[0].replace(",", " ") for line in text.splitlines())
     try:
         return [float(word) for line in lines for word in line.split()]
@@ -90,7 +107,7 @@ def _from_matrix(numbers: list[float], size: tuple[int, int] | None) -> Camera:
     if len(numbers) != 9:
         raise ValueError(f"{len(numbers)} numbers, a 3x3 matrix has 9; {_EXPECTED}")
     if size is None:
-        raise ValueError("a 3x3 matrix does not tell the image size it is for; give it as well")
+        raise ValueError("a 3x3 matrix has no image size; give another kind of camera file")
     return Camera.from_matrix([numbers[:3], numbers[3:6], numbers[6:]], *size)
 
 
@@ -108,7 +125,7 @@ def _yaml_mapping(text: str) -> Mapping[str, object]:
 
 
 def _stored_by_opencv(text: str, size: tuple[int, int] | None) -> dict[str, object]:
-    """The fields of a cv2.FileStorage, by ROS's names."""
+    """Fields of a cv2.FileStorage under their names in ROS."""
     import cv2
 
     try:
@@ -124,42 +141,41 @@ def _stored_by_opencv(text: str, size: tuple[int, int] | None) -> dict[str, obje
         raise ValueError(f"OpenCV cannot read its storage ({text}); {_EXPECTED}") from None
     if values.get("fisheye_model"):
         raise ValueError("fisheye_model is set; rectify the images or calibrate without it")
-    found: dict[str, object] = {}
-    for name, called in _CALLED.items():
-        keys = [key for key in values if key.lower().replace("_", "") in called]
+    fields: dict[str, object] = {}
+    for name, aliases in _ALIASES.items():
+        keys = [key for key in values if key.lower().replace("_", "") in aliases]
         if len(keys) > 1:
             raise ValueError(f"{' and '.join(keys)} are the same; keep one of them")
         if keys:
-            found[name] = values[keys[0]]
-    if "camera_matrix" not in found:
+            fields[name] = values[keys[0]]
+    if "camera_matrix" not in fields:
         raise ValueError(f"'camera_matrix' is missing, there is {', '.join(nodes) or 'nothing'}")
-    if size is not None and not {"image_width", "image_height"} & found.keys():
-        found |= {"image_width": size[0], "image_height": size[1]}
-    return found
+    if size is not None and not {"image_width", "image_height"} & fields.keys():
+        fields |= {"image_width": size[0], "image_height": size[1]}
+    return fields
 
 
 def camera_from_ros(data: Mapping[str, object]) -> Camera:
-    """The raw image's camera of a camera_info message, by the names of its fields.
+    """Build the camera of the raw image from the fields of a camera_info.
 
     Args:
-        data: `width`, `height`, `k`, `d`, `distortion_model` and `roi` of a message, or the names
+        data: `width`, `height`, `k`, `d`, `distortion_model` and `roi` of a message, or the fields
             of a calibration file.
 
     Raises:
-        ValueError: A field is missing or unusable; a lens that is not supported; a cut-out image.
+        ValueError: A field is missing or unusable, the distortion model is not supported, or the
+            image is a region of interest.
     """
     width = _first(data, "image_width", "width")
     height = _first(data, "image_height", "height")
     matrix = _list(_first(data, "camera_matrix", "K", "k"), "camera_matrix")
-    lens = next(
-        (data[name] for name in ("distortion_coefficients", "D", "d") if name in data), None
-    )
-    if lens is None:  # it may stand under another name
+    names = [name for name in ("distortion_coefficients", "D", "d") if name in data]
+    if not names:  # it may stand under another name
         raise ValueError(
             f"'distortion_coefficients' is missing, there is {', '.join(map(str, data))}; write"
             f" four zeros if images have no lens distortion"
         )
-    distortion = _list(lens, "distortion_coefficients")
+    distortion = _list(data[names[0]], "distortion_coefficients")
     model = data.get("distortion_model", "")
     if model not in _MODELS:
         raise ValueError(
@@ -168,8 +184,10 @@ def camera_from_ros(data: Mapping[str, object]) -> Camera:
         )
     if len(matrix) != 9:
         raise ValueError(f"camera_matrix has 9 numbers, got {len(matrix)}")
-    _refuse_cropped(data.get("roi"))
-    # Longer models add terms that are mostly zero; only then nothing is lost without them.
+    roi = data.get("roi")
+    if isinstance(roi, dict) and any(roi.get(key) for key in ("x_offset", "y_offset")):
+        raise ValueError(f"the image is a cut-out (roi {roi}); give the whole image's camera_info")
+    # Longer models add terms that are mostly zero and can then be dropped.
     while len(distortion) not in _LENGTHS and distortion[-1] == 0:
         distortion.pop()
     sides = _list([width, height], "image size")
@@ -194,12 +212,7 @@ def _list(value: object, name: str) -> list[float]:
     try:
         if not isinstance(value, list) or any(isinstance(v, bool) for v in value):
             raise TypeError
-        # YAML 1.1 reads 1e-05, as ROS writes it, as a word.
+        # YAML 1.1 reads 1e-05, as written by ROS, as a word.
         return [float(v) for v in value]
     except (TypeError, ValueError):
         raise ValueError(f"'{name}' is a list of numbers, got {value!r}") from None
-
-
-def _refuse_cropped(roi: object) -> None:
-    if isinstance(roi, dict) and any(roi.get(key) for key in ("x_offset", "y_offset")):
-        raise ValueError(f"the image is a cut-out (roi {roi}); give the whole image's camera_info")

@@ -1,30 +1,16 @@
-"""Named pose conventions: how robots and programs write a pose as numbers.
+"""Named conventions for poses as numbers, as robots and programs write them.
 
-A convention says which numbers stand in which order, in which unit, and how the rotation is meant.
-Its name may be followed by modifiers: `kuka:m` (KUKA's angles, but metres), `matrix:inverse` (the
-file holds gripper_from_base), `matrix:opengl` (camera axes x right, y up, z back). A unit that is
-given in this way is taken as it is; one that a convention merely implies is doubted where the
-numbers look like another (`doubt`).
+A convention defines order, units and rotation of the numbers; the table is in docs/formats.md. Its
+name may be followed by modifiers: `kuka:m` (KUKA's angles, but metres), `matrix:inverse` (the file
+holds gripper_from_base), `matrix:opengl` (camera axes x right, y up, z back). Units in the name are
+final. Units that a convention only implies are checked against the numbers by `check_units`.
 
-    name      numbers                             unit       rotation
-    wxyz      x y z qw qx qy qz                   m          unit quaternion
-    xyzw      x y z qx qy qz qw                   m          unit quaternion, as ROS and TUM
-    abb       X Y Z q1 q2 q3 q4                   mm         unit quaternion, q1 = w
-    ur        x y z rx ry rz                      m, rad     rotation vector
-    rpy       x y z roll pitch yaw                m, rad     Rz(yaw) Ry(pitch) Rx(roll), as URDF
-    kuka      X Y Z A B C                         mm, deg    Rz(A) Ry(B) Rx(C)
-    fanuc     X Y Z W P R                         mm, deg    Rz(R) Ry(P) Rx(W)
-    yaskawa   X Y Z Rx Ry Rz                      mm, deg    Rz(Rz) Ry(Ry) Rx(Rx)
-    staubli   X Y Z RX RY RZ                      mm, deg    Rx(RX) Ry(RY) Rz(RZ)
-    matrix    16 numbers, row after row           m          homogeneous matrix
-    franka    16 numbers, column after column     m          homogeneous matrix, libfranka's O_T_EE
-
-The robots' rows were checked against Roboception's documentation of pose formats (ABB, FANUC, KUKA,
+The conventions were checked against Roboception's documentation of pose formats (ABB, FANUC, KUKA,
 Yaskawa), Universal Robots' script manual, RoboDK's converters (Staubli) and libfranka's reference.
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,144 +21,148 @@ from evercal.geometry.se3 import SE3
 Array = NDArray[np.float64]
 Layout = Literal["wxyz", "xyzw", "rotation_vector", "euler", "rows", "columns"]
 
-_NUMBERS: dict[Layout, int] = {
-    "wxyz": 7,
-    "xyzw": 7,
-    "rotation_vector": 6,
-    "euler": 6,
-    "rows": 16,
-    "columns": 16,
-}
 _FAR_M = 10.0
-"""No gripper is farther than this from its base."""
+"""Largest distance of a gripper from its base, metres."""
 _NEAR_M = 0.01
-"""No recording has every gripper closer than this to its base."""
+"""Smallest distance of a gripper from its base, metres, for at least one pose."""
 _UNIT_TOLERANCE = 1e-2
-"""A quaternion printed with three digits is no farther than this from length one."""
+"""Largest error of the length of a quaternion printed with three digits."""
 _RIGID_TOLERANCE = 1e-2
-"""A matrix printed with three digits is no farther than this from a rotation."""
+"""Largest error of R^T R of a rotation matrix printed with three digits."""
 
 
 @dataclass(frozen=True)
 class PoseConvention:
-    """How a pose is written as numbers."""
+    """How numbers represent a pose."""
 
     name: str
-    """With its modifiers, as the user gives it."""
+    """Name with its modifiers, as the user gives it."""
     layout: Layout
-    """What the numbers are: translation then rotation, or a matrix."""
+    """Translation then this kind of rotation, or a matrix."""
     meaning: str
-    """One line for people."""
+    """Description in one line."""
     euler: str = ""
-    """scipy's axes of the angles: lower case about fixed axes, upper case about moved ones."""
+    """scipy's Euler axes: lower case about fixed axes, upper case about moving axes."""
     degrees: bool = False
     """Whether angles are in degrees, else radians."""
     metres_per_unit: float = 1.0
     """0.001 for millimetres."""
     inverse: bool = False
-    """Whether the numbers are the inverse of the pose that is wanted."""
+    """Whether the numbers are the inverse of the pose."""
     opengl: bool = False
     """Whether the camera's axes are x right, y up, z back, else OpenCV's."""
     length_stated: bool = False
-    """Whether the user named the unit of length."""
+    """Whether the name has the unit of length."""
     angle_stated: bool = False
-    """Whether the user named the unit of angles."""
+    """Whether the name has the unit of angles."""
 
     @property
     def count(self) -> int:
-        """How many numbers a pose has."""
-        return _NUMBERS[self.layout]
+        """Number of numbers of a pose."""
+        if self.layout in ("rows", "columns"):
+            return 16
+        return 6 if self.has_angles else 7
 
     @property
     def has_angles(self) -> bool:
-        """Whether it holds numbers in radians or degrees."""
+        """Whether some numbers are in radians or degrees."""
         return self.layout in ("rotation_vector", "euler")
 
 
-def _table() -> dict[str, PoseConvention]:
-    rows = [
+class ConventionError(ValueError):
+    """A convention is missing, or does not fit the numbers.
+
+    Args:
+        problem: What is wrong.
+        remedy: Conventions to give instead.
+    """
+
+    def __init__(self, problem: str, remedy: str) -> None:
+        super().__init__(f"{problem}; give the convention {remedy}")
+        self.problem, self.remedy = problem, remedy
+
+    def naming(self, option: str | None) -> str:
+        """Message that names the command line option of the convention, if there is one."""
+        return f"{self.problem}; give {option or 'the convention'} {self.remedy}"
+
+
+_MM: dict[str, Any] = {"metres_per_unit": 0.001}
+_MM_DEG: dict[str, Any] = {"metres_per_unit": 0.001, "degrees": True}
+CONVENTIONS = {
+    convention.name: convention
+    for convention in (
         PoseConvention("wxyz", "wxyz", "x y z qw qx qy qz, metres"),
         PoseConvention("xyzw", "xyzw", "x y z qx qy qz qw, metres, as ROS and TUM"),
-        PoseConvention("abb", "wxyz", "X Y Z q1 q2 q3 q4, millimetres, q1 is w"),
+        PoseConvention("abb", "wxyz", "X Y Z q1 q2 q3 q4, millimetres, q1 is w", **_MM),
         PoseConvention("ur", "rotation_vector", "x y z rx ry rz, metres, rotation vector"),
         PoseConvention("rpy", "euler", "x y z roll pitch yaw, metres, radians, as URDF", "xyz"),
-        PoseConvention("kuka", "euler", "X Y Z A B C, mm, degrees, A about z", "ZYX"),
-        PoseConvention("fanuc", "euler", "X Y Z W P R, mm, degrees, W about x", "xyz"),
-        PoseConvention("yaskawa", "euler", "X Y Z Rx Ry Rz, mm, degrees, fixed axes", "xyz"),
-        PoseConvention("staubli", "euler", "X Y Z RX RY RZ, mm, degrees, moved axes", "XYZ"),
+        PoseConvention("kuka", "euler", "X Y Z A B C, mm, degrees, A about z", "ZYX", **_MM_DEG),
+        PoseConvention("fanuc", "euler", "X Y Z W P R, mm, degrees, W about x", "xyz", **_MM_DEG),
+        PoseConvention(
+            "yaskawa", "euler", "X Y Z Rx Ry Rz, mm, degrees, fixed axes", "xyz", **_MM_DEG
+        ),
+        PoseConvention(
+            "staubli", "euler", "X Y Z RX RY RZ, mm, degrees, moving axes", "XYZ", **_MM_DEG
+        ),
         PoseConvention("matrix", "rows", "4x4 matrix row after row, metres"),
         PoseConvention("franka", "columns", "4x4 matrix column after column, metres (O_T_EE)"),
-    ]
-    millimetres = ("abb", "kuka", "fanuc", "yaskawa", "staubli")
-    return {
-        row.name: replace(row, metres_per_unit=0.001, degrees=row.has_angles)
-        if row.name in millimetres
-        else row
-        for row in rows
-    }
-
-
-CONVENTIONS = _table()
+    )
+}
 """All conventions by name, without modifiers."""
-MODIFIERS = ("m", "mm", "rad", "deg", "inverse", "opengl")
+MODIFIERS: dict[str, dict[str, Any]] = {
+    "m": {"metres_per_unit": 1.0, "length_stated": True},
+    "mm": {"metres_per_unit": 0.001, "length_stated": True},
+    "rad": {"degrees": False, "angle_stated": True},
+    "deg": {"degrees": True, "angle_stated": True},
+    "inverse": {"inverse": True},
+    "opengl": {"opengl": True},
+}
+"""Fields that each modifier sets."""
+KNOWN_CONVENTIONS = (
+    f"{', '.join(CONVENTIONS)}, followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"
+)
+"""All names and modifiers, for messages."""
 
 
 def pose_convention(name: str) -> PoseConvention:
-    """Finds a convention by its name with modifiers, such as `kuka:m:inverse`.
+    """Parse the name of a convention with modifiers, such as `kuka:m:inverse`.
 
     Raises:
-        ValueError: No such name, or a modifier that does not belong to it.
+        ValueError: The name is not known, or a modifier does not belong to it.
     """
     base, *modifiers = name.strip().lower().split(":")
     if base not in CONVENTIONS:
-        raise ValueError(f"pose convention {name!r} is not known; use one of {known_conventions()}")
-    found = replace(CONVENTIONS[base], name=":".join([base, *modifiers]))
+        raise ValueError(f"pose convention {name!r} is not known; use one of {KNOWN_CONVENTIONS}")
+    convention = replace(CONVENTIONS[base], name=":".join([base, *modifiers]))
     for modifier in modifiers:
-        found = _modified(found, modifier)
-    if len(set(modifiers)) < len(modifiers) or {"m", "mm"} <= {*modifiers}:
-        raise ValueError(f"pose convention {name!r} says a thing twice; give each modifier once")
-    if {"rad", "deg"} <= {*modifiers}:
-        raise ValueError(f"pose convention {name!r} says a thing twice; give each modifier once")
-    return found
-
-
-def known_conventions() -> str:
-    """The names for a message, with the modifiers."""
-    names = ", ".join(CONVENTIONS)
-    return f"{names}, with :m or :mm, :rad or :deg, :inverse, :opengl behind it where it is so"
-
-
-def _modified(convention: PoseConvention, modifier: str) -> PoseConvention:
-    if modifier in ("m", "mm"):
-        scale = 0.001 if modifier == "mm" else 1.0
-        return replace(convention, metres_per_unit=scale, length_stated=True)
-    if modifier in ("rad", "deg"):
-        if not convention.has_angles:
+        if modifier not in MODIFIERS:
             raise ValueError(
-                f"pose convention {convention.name!r}: it has no angles; leave :{modifier} out"
+                f"pose convention {name!r}: modifier {modifier!r} is not known;"
+                f" use one of {', '.join(MODIFIERS)}"
             )
-        return replace(convention, degrees=modifier == "deg", angle_stated=True)
-    if modifier in ("inverse", "opengl"):
-        return replace(convention, **{modifier: True})
-    raise ValueError(
-        f"pose convention {convention.name!r}: modifier {modifier!r} is not known;"
-        f" use one of {', '.join(MODIFIERS)}"
-    )
+        if modifier in ("rad", "deg") and not convention.has_angles:
+            raise ValueError(f"pose convention {name!r}: it has no angles; leave :{modifier} out")
+        convention = replace(convention, **MODIFIERS[modifier])
+    kinds = [modifier.replace("mm", "m").replace("deg", "rad") for modifier in modifiers]
+    if len(set(kinds)) < len(kinds):
+        raise ValueError(f"pose convention {name!r} repeats a modifier; give each kind once")
+    return convention
 
 
 def poses_from_numbers(numbers: ArrayLike, convention: PoseConvention) -> SE3:
-    """Reads poses.
+    """Convert numbers to poses.
 
     Args:
         numbers: (..., `convention.count`).
-        convention: how they are meant.
+        convention: Convention of the numbers.
 
     Returns:
-        (...) transforms in metres, camera axes as OpenCV's, not inverted.
+        (...) transforms in metres with OpenCV's camera axes, not inverted.
 
     Raises:
-        ValueError: A wrong count, numbers that are not finite, a quaternion that is not of length
-            one, a matrix that is no rigid transform; the message names the first such pose.
+        ValueError: The count is wrong, a number is not finite, a quaternion is not of length one,
+            or a matrix is no rigid transform; the message names the first such pose.
+        ConventionError: The matrices are transposed.
     """
     numbers = np.asarray(numbers, dtype=np.float64)
     if numbers.shape[-1:] != (convention.count,):
@@ -182,24 +172,24 @@ def poses_from_numbers(numbers: ArrayLike, convention: PoseConvention) -> SE3:
         )
     _refuse(~np.isfinite(numbers).all(-1), "a number is inf or nan; leave untracked poses out")
     if convention.layout in ("rows", "columns"):
-        read = _from_matrices(numbers.reshape(*numbers.shape[:-1], 4, 4), convention)
+        poses = _from_matrices(numbers.reshape(*numbers.shape[:-1], 4, 4), convention)
     else:
         rotation = _rotations(numbers[..., 3:], convention)
         quaternion = rotation.as_quat(canonical=True, scalar_first=True)
-        read = SE3(quaternion, numbers[..., :3] * convention.metres_per_unit)
-    read = read.inverse() if convention.inverse else read
-    return read @ _OPENGL_FROM_OPENCV if convention.opengl else read
+        poses = SE3(quaternion, numbers[..., :3] * convention.metres_per_unit)
+    poses = poses.inverse() if convention.inverse else poses
+    return poses @ _OPENGL_FROM_OPENCV if convention.opengl else poses
 
 
 def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
-    """The reverse of `poses_from_numbers`.
+    """Convert poses to numbers, the inverse of `poses_from_numbers`.
 
-    Quaternions get w >= 0. Where the middle angle of an Euler convention is within 1e-7 rad of
-    gimbal lock, the third angle is 0 and the rotation is right to 2e-7 rad (scipy).
+    Quaternions get w >= 0. If the middle angle of an Euler convention is within 1e-7 rad of gimbal
+    lock, the third angle is 0 and the rotation is exact to 2e-7 rad (scipy).
 
     Args:
-        poses: (...).
-        convention: how to write them.
+        poses: (...) transforms.
+        convention: Convention of the numbers.
 
     Returns:
         (..., `convention.count`).
@@ -225,72 +215,64 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
     return np.concatenate([translation, numbers], axis=-1)
 
 
-def doubt(numbers: ArrayLike, convention: PoseConvention) -> str | None:
-    """Why numbers do not look like the units of a convention, None if they do.
+def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
+    """Compare numbers with the units that a convention implies; units in its name are final.
 
     Args:
         numbers: (n, `convention.count`) of one recording.
-        convention: how they are meant; units that it states are believed.
+        convention: Convention of the numbers.
 
-    Returns:
-        A sentence that says what they look like and what to give instead.
+    Raises:
+        ConventionError: The numbers look like another unit.
+        ValueError: The numbers mix two units of length.
     """
     numbers = np.asarray(numbers, dtype=np.float64)
     if not convention.length_stated:
         distance = np.linalg.norm(_translations(numbers, convention), axis=-1)
-        found = _doubt_lengths(distance * convention.metres_per_unit, convention)
-        if found is not None:
-            return found
+        _check_lengths(distance * convention.metres_per_unit, convention)
     if convention.has_angles and not convention.angle_stated:
-        return _doubt_angles(numbers[..., 3:], convention)
-    return None
+        _check_angles(numbers[..., 3:], convention)
 
 
-def _doubt_lengths(metres: Array, convention: PoseConvention) -> str | None:
+def _check_lengths(metres: Array, convention: PoseConvention) -> None:
     far = metres > _FAR_M
     near = (metres > 0) & (metres < _NEAR_M) & (convention.metres_per_unit < 1.0)
     odd = far if far.any() else near
     usual = metres[~odd]
     if odd.any() and len(usual) and 0.03 < np.median(usual) < 3.0:
         poses = ", ".join(str(i + 1) for i in np.flatnonzero(odd)[:5])
-        return (
+        raise ValueError(
             f"positions are {np.median(usual):.3g} m from the base, but those of poses {poses} are"
-            f" {metres[odd][0]:.3g} m; the file seems to mix millimetres and metres: write all of"
-            f" them in one unit"
+            f" {metres[odd][0]:.3g} m; millimetres and metres may be mixed: write all of them in"
+            f" one unit"
         )
     if far.any():
-        seen = f"positions up to {metres.max():.4g} m from the base look like millimetres"
-        return f"{seen}; {_instead(convention, 'mm', 'm')}"
+        problem = f"positions up to {metres.max():.4g} m from the base look like millimetres"
+        raise _other_unit(convention, problem, "mm", "m")
     if near.any() and near.all():
-        seen = f"all positions are within {1000 * metres.max():.2g} mm of the base"
-        return f"{seen}, which looks like metres; {_instead(convention, 'm', 'mm')}"
-    return None
+        problem = f"all positions are within {1000 * metres.max():.2g} mm of the base"
+        raise _other_unit(convention, f"{problem}, which looks like metres", "m", "mm")
 
 
-def _doubt_angles(angles: Array, convention: PoseConvention) -> str | None:
+def _check_angles(angles: Array, convention: PoseConvention) -> None:
     if convention.layout == "rotation_vector":
         angles = np.linalg.norm(angles, axis=-1)
-    largest, turn = float(np.abs(angles).max(initial=0.0)), 2.0 * np.pi
-    if not convention.degrees and largest > turn + 1e-6:
-        seen = f"an angle of {largest:.4g} is more than a full turn in radians"
-        return f"{seen}, so it looks like degrees; {_instead(convention, 'deg', 'rad')}"
-    if convention.degrees and 0 < largest <= turn:
-        seen = f"no angle is larger than {largest:.3g}"
-        return f"{seen}, which looks like radians; {_instead(convention, 'rad', 'deg')}"
-    return None
+    largest, full = float(np.abs(angles).max(initial=0.0)), 2.0 * np.pi
+    if not convention.degrees and largest > full + 1e-6:
+        problem = f"an angle of {largest:.4g} is more than a full rotation in radians"
+        raise _other_unit(convention, f"{problem}, so it looks like degrees", "deg", "rad")
+    if convention.degrees and 0 < largest <= full:
+        problem = f"no angle is larger than {largest:.3g}"
+        raise _other_unit(convention, f"{problem}, which looks like radians", "rad", "deg")
 
 
-def _instead(convention: PoseConvention, likely: str, other: str) -> str:
-    return (
-        f"give --convention {_said(convention, likely)}"
-        f" (or {_said(convention, other)} if the unit is right as it is)"
-    )
-
-
-def _said(convention: PoseConvention, unit: str) -> str:
-    """The name of a convention with another unit."""
-    kind = ("m", "mm") if unit in ("m", "mm") else ("rad", "deg")
-    return ":".join([*(w for w in convention.name.split(":") if w not in kind), unit])
+def _other_unit(
+    convention: PoseConvention, problem: str, likely: str, other: str
+) -> ConventionError:
+    units = ("m", "mm") if likely in ("m", "mm") else ("rad", "deg")
+    words = [word for word in convention.name.split(":") if word not in units]
+    likely, other = (":".join([*words, unit]) for unit in (likely, other))
+    return ConventionError(problem, f"{likely} (or {other} if the unit is right as it is)")
 
 
 def _translations(numbers: Array, convention: PoseConvention) -> Array:
@@ -319,14 +301,15 @@ def _from_matrices(matrices: Array, convention: PoseConvention) -> SE3:
     last = np.array([0.0, 0.0, 0.0, 1.0])
     rows_fit = np.abs(matrices[..., 3, :] - last).max(-1) < 1e-6
     columns_fit = np.abs(matrices[..., :, 3] - last).max(-1) < 1e-6
-    order = ("row after row", "matrix"), ("column after column", "franka")
-    modifiers = convention.name.split(":")[1:]
-    said, other = order if convention.layout == "rows" else order[::-1]
-    _refuse(
-        ~rows_fit & columns_fit,
-        f"read {said[0]}, the last column is 0 0 0 1 and the last row holds the translation, so"
-        f" it was written {other[0]}; give --convention {':'.join([other[1], *modifiers])}",
-    )
+    if (~rows_fit & columns_fit).any():
+        orders = ("row after row", "matrix"), ("column after column", "franka")
+        stated, other = orders if convention.layout == "rows" else orders[::-1]
+        pose = _first(~rows_fit & columns_fit)
+        raise ConventionError(
+            f"{pose}: read {stated[0]}, the last column is 0 0 0 1 and the last row holds the"
+            f" translation, so it was written {other[0]}",
+            ":".join([other[1], *convention.name.split(":")[1:]]),
+        )
     _refuse(~rows_fit, "the last row of the matrix is not 0 0 0 1, so it is no rigid transform")
     block = matrices[..., :3, :3]
     drift = np.abs(np.swapaxes(block, -1, -2) @ block - np.eye(3)).max((-1, -2), initial=0.0)
@@ -340,13 +323,18 @@ def _from_matrices(matrices: Array, convention: PoseConvention) -> SE3:
     return SE3.from_matrix(scaled, _RIGID_TOLERANCE)
 
 
-def _refuse(broken: ArrayLike, why: str) -> None:
-    """Raises for the first pose that is broken, by its number from 1."""
-    found = np.flatnonzero(np.atleast_1d(broken))
-    if len(found):
-        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-        raise ValueError(f"pose {found[0] + 1}{more}: {why}")
+def _refuse(broken: ArrayLike, reason: str) -> None:
+    """Raise for the first broken pose."""
+    if np.any(broken):
+        raise ValueError(f"{_first(broken)}: {reason}")
+
+
+def _first(broken: ArrayLike) -> str:
+    """Number of the first broken pose from 1, and how many more there are."""
+    indices = np.flatnonzero(np.atleast_1d(broken))
+    more = f" (and {len(indices) - 1} more)" if len(indices) > 1 else ""
+    return f"pose {indices[0] + 1}{more}"
 
 
 _OPENGL_FROM_OPENCV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
-"""Half a turn about x; its own inverse."""
+"""Half a rotation about x; its own inverse."""

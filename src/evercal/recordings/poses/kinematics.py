@@ -12,15 +12,15 @@ from evercal.errors import InputError
 from evercal.geometry import SE3
 
 _MOVING = ("revolute", "continuous", "prismatic")
-# Two whole turns: no arm's joint goes further, and 12.6 as degrees is next to nothing.
+# Two full rotations: no joint of an arm exceeds them, and 12.6 in degrees is a small angle.
 _LARGEST_RAD = 4 * np.pi
 
 
 class RobotModel:
-    """The links and joints of a URDF.
+    """Links and joints of a URDF.
 
     Args:
-        path: The URDF. Meshes that it names are not read.
+        path: The URDF. Its meshes are not read.
 
     Raises:
         InputError: The extra `urdf` is not installed, or the file is missing or no URDF.
@@ -46,7 +46,7 @@ class RobotModel:
                 build_collision_scene_graph=False,
             )
             self.base_link = str(self._urdf.base_link)
-        except Exception as error:  # whatever lxml, yourdfpy and numpy raise for broken files
+        except Exception as error:  # lxml, yourdfpy and numpy raise many types for broken files
             text = " ".join(str(error).split())[:200]
             raise InputError(f"{path}: no usable URDF ({type(error).__name__}: {text})") from None
         self.links = tuple(self._urdf.link_map)
@@ -56,11 +56,19 @@ class RobotModel:
         """Whether the URDF has a joint of this name."""
         return name in self._urdf.joint_map
 
-    def end_link(self) -> str:
-        """The last link of an arm that has one end only.
+    def chosen_links(self, base: str | None, gripper: str | None) -> tuple[str, str]:
+        """Base and gripper link; if omitted, the root and the only end of the arm.
 
         Raises:
-            InputError: The links end in several places, as those of a gripper with fingers do.
+            InputError: The gripper is omitted and the links have several ends.
+        """
+        return base or self.base_link, gripper or self.end_link()
+
+    def end_link(self) -> str:
+        """The last link of an arm with a single end.
+
+        Raises:
+            InputError: The links have several ends, such as the fingers of a gripper.
         """
         parents = {joint.parent for joint in self._joint_above.values()}
         ends = [link for link in self.links if link not in parents]
@@ -71,11 +79,15 @@ class RobotModel:
             )
         return ends[0]
 
+    def note(self, base: str, gripper: str) -> str:
+        """Sentence about the source of gripper poses."""
+        return f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
+
     def joints_between(self, base: str, gripper: str) -> tuple[str, ...]:
-        """The moving joints whose values `base_from_gripper` depends on, from the base outwards.
+        """Moving joints between two links, from the base outwards.
 
         Raises:
-            InputError: A link that the URDF has not, or a joint of a kind with several values.
+            InputError: A link does not exist, or a joint has several values.
         """
         up, down = self._ancestors(base), self._ancestors(gripper)
         joints = [j for j in down if j not in up] + [j for j in up if j not in down]
@@ -90,19 +102,19 @@ class RobotModel:
     def base_from_gripper(
         self, names: Sequence[str], values: NDArray[np.float64], base: str, gripper: str
     ) -> SE3:
-        """Poses of one link in another.
+        """Compute poses of one link in another.
 
         Args:
-            names: of the joints, at least those of `joints_between`.
-            values: (n, joints) radians, metres for joints that slide.
-            base: link.
-            gripper: link.
+            names: (k,) joints, at least those of `joints_between`.
+            values: (n, k) radians, or metres for prismatic joints.
+            base: Link.
+            gripper: Link.
 
         Returns:
-            (n,).
+            (n,) base_from_gripper.
 
         Raises:
-            InputError: A joint without values, or values that are no radians.
+            InputError: A joint has no values, or values are not in radians.
         """
         needed = self.joints_between(base, gripper)
         missing = [name for name in needed if name not in names]
@@ -111,45 +123,48 @@ class RobotModel:
                 f"no values for joint {', '.join(missing)}, which {gripper} depends on; given are"
                 f" {', '.join(names) or 'none'}"
             )
-        columns = [list(names).index(name) for name in needed]
-        self._refuse_degrees(needed, values[:, columns])
-        found = np.empty((len(values), 4, 4))
-        for row, matrix in zip(values[:, columns], found, strict=True):
+        values = values[:, [list(names).index(name) for name in needed]]
+        self._refuse_degrees(needed, values)
+        matrices = np.empty((len(values), 4, 4))
+        for row, matrix in zip(values, matrices, strict=True):
             self._urdf.update_cfg(dict(zip(needed, row.tolist(), strict=True)))
             matrix[...] = self._urdf.get_transform(gripper, base)
-        return SE3.from_matrix(found)
+        return SE3.from_matrix(matrices)
 
-    def turning(self, names: Sequence[str]) -> list[bool]:
-        """Whether each joint turns, so that its values are angles."""
-        kinds = {name: joint.type for name, joint in self._urdf.joint_map.items()}
-        return [kinds.get(name) in ("revolute", "continuous") for name in names]
+    def rotates(self, name: str) -> bool:
+        """Whether a joint exists and its values are angles."""
+        joint = self._urdf.joint_map.get(name)
+        return joint is not None and joint.type in ("revolute", "continuous")
 
     def beyond_limits(self, names: Sequence[str], values: NDArray[np.float64]) -> list[str]:
-        """One sentence for each joint whose values leave what the URDF allows by over 0.1.
+        """One sentence for each joint that exceeds its limits by more than 0.1.
 
-        A joint without limits may wind up, but degrees look the same.
+        Joints without limits are reported beyond two full rotations, which degrees exceed, too.
         """
-        found = []
+        notes = []
         for name, column in zip(names, values.T, strict=True):
             joint = self._urdf.joint_map.get(name)
-            if joint is not None and joint.type == "continuous" and np.ptp(column) > _LARGEST_RAD:
-                found.append(
-                    f"joint {name} goes from {column.min():.2f} to {column.max():.2f}, more than"
-                    f" two turns in radians; are these degrees?"
-                )
-            limit = None if joint is None or joint.type == "continuous" else joint.limit
+            if joint is None:
+                continue
+            covered = f"joint {name} goes from {column.min():.2f} to {column.max():.2f}"
+            if joint.type == "continuous":
+                if np.ptp(column) > _LARGEST_RAD:
+                    notes.append(
+                        f"{covered}, more than two rotations in radians; are these degrees?"
+                    )
+                continue
+            limit = joint.limit
             if limit is None or limit.lower is None or limit.upper is None:
                 continue
             if column.min() < limit.lower - 0.1 or column.max() > limit.upper + 0.1:
-                found.append(
-                    f"joint {name} goes from {column.min():.2f} to {column.max():.2f}, the URDF"
-                    f" allows {limit.lower:.2f} to {limit.upper:.2f}; are the joints in the right"
-                    f" order and in radians?"
+                notes.append(
+                    f"{covered}, the URDF allows {limit.lower:.2f} to {limit.upper:.2f}; are the"
+                    f" joints in the right order and in radians?"
                 )
-        return found
+        return notes
 
     def _ancestors(self, link: str) -> list[Any]:
-        """The joints from a link up to the root."""
+        """Joints from a link up to the root."""
         if link not in self.links:
             raise InputError(
                 f"{self.path}: has no link {link!r}; its links are {', '.join(self.links)}"
@@ -162,9 +177,9 @@ class RobotModel:
 
     def _refuse_degrees(self, names: Sequence[str], values: NDArray[np.float64]) -> None:
         for name, column in zip(names, values.T, strict=True):
-            turns = self._urdf.joint_map[name].type == "revolute"
-            if turns and column.size and np.abs(column).max() > _LARGEST_RAD:
+            revolute = self._urdf.joint_map[name].type == "revolute"
+            if revolute and column.size and np.abs(column).max() > _LARGEST_RAD:
                 raise InputError(
-                    f"joint {name} is at {column[np.abs(column).argmax()]:.1f}, no joint turns so"
-                    f" far in radians; if these are degrees, write the column as {name}_deg"
+                    f"joint {name} is at {column[np.abs(column).argmax()]:.1f}, too far for"
+                    f" radians; if these are degrees, write the column as {name}_deg"
                 )

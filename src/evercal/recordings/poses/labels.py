@@ -1,8 +1,8 @@
-"""Which columns of a table, or keys of JSON, say what image or what time a row belongs to.
+"""Columns of a table, or keys of JSON, that hold image names and times.
 
-In any case, times with or without a unit behind them (`stamp_ns`, `time [ms]`); where there are
-several, the first of the list counts. A column that holds nothing but names of image files may be
-called anything. In JSON lists beside the poses stand in the plural: `images`, `stamps_s`.
+Names are case-insensitive, and times may have a unit (`stamp_ns`, `time [ms]`). If there are
+several candidates, the first of the list is used. A column with nothing but names of image files
+may have any name. In JSON lists beside the poses, names are in the plural: `images`, `stamps_s`.
 """
 
 import re
@@ -24,88 +24,87 @@ _UNIT = re.compile(r"[\s_]*[\s_\[(](mm|m|degrees|deg|radians|rad|ns|us|ms|s)[\])
 _SHORT = {"degrees": "deg", "radians": "rad"}
 _PER_SECOND = {"ms": 1e3, "us": 1e6, "ns": 1e9}
 _LATEST_S = 1e11
-"""The year 5138: a stamp beyond it is not in seconds."""
+"""The year 5138: a larger stamp is not in seconds."""
 
 
 @dataclass(frozen=True)
 class Labels:
-    """Where the labels of rows stand."""
+    """Positions of the labels in a list of columns or keys."""
 
     name: int | None
-    """Of the image's name."""
+    """Image names, if any."""
     stamp: int | None
-    """Of the time."""
+    """Times, if any."""
     unit: str | None
-    """`s`, `ms`, `us` or `ns` of the time, if it is said."""
+    """`s`, `ms`, `us` or `ns` of the times, if stated."""
     all: frozenset[int]
-    """Of everything that is called like a label."""
+    """All columns or keys with the name of a label."""
 
 
 def find_labels(words: Sequence[str], plural: bool = False) -> Labels:
-    """Looks for labels among the names of columns, or the keys of lists, which are in plural."""
-    called: dict[str, int] = {}
+    """Find labels among names of columns, or among plural keys of JSON lists."""
+    positions: dict[str, int] = {}
     for i, word in enumerate(words):
         name, _ = name_and_unit(word)
         if not plural or name.endswith("s"):
-            called.setdefault(name[:-1] if plural else name, i)
-    name = next((called[n] for n in _NAMES if n in called), None)
-    stamp = next((called[n] for n in _STAMPS if n in called), None)
+            positions.setdefault(name[:-1] if plural else name, i)
+    name = next((positions[n] for n in _NAMES if n in positions), None)
+    stamp = next((positions[n] for n in _STAMPS if n in positions), None)
     unit = None if stamp is None else name_and_unit(words[stamp])[1]
-    known = frozenset(i for n, i in called.items() if n in _NAMES + _STAMPS)
-    return Labels(name, stamp, unit, known)
+    return Labels(
+        name, stamp, unit, frozenset(i for n, i in positions.items() if n in _NAMES + _STAMPS)
+    )
 
 
 def name_and_unit(cell: str) -> tuple[str, str | None]:
-    """A column's plain name, and the unit behind it."""
+    """Split a column's name into its plain name and its unit."""
     name = re.sub(r"^(pose|transform)[._/]", "", cell.strip().lower())
-    found = _UNIT.search(name)
-    unit = found.group(1) if found else None
-    name = name[: found.start()] if found else name
+    match = _UNIT.search(name)
+    unit = match.group(1) if match else None
+    name = name[: match.start()] if match else name
     return re.sub(r"[\s.]+", "_", name), _SHORT.get(unit or "", unit)
 
 
-def image_column(columns: Mapping[str, Sequence[object]]) -> str | None:
-    """The one column that holds nothing but names of image files, whatever it is called.
-
-    Raises:
-        ValueError: There are several.
-    """
-    found = [name for name, cells in columns.items() if all(map(_is_image, cells))]
-    if len(found) > 1:
-        raise ValueError(f"{' and '.join(found)} name image files; call the right one 'image'")
-    return found[0] if found else None
+def _image_column(columns: Mapping[str, Sequence[object]]) -> str | None:
+    """Name of the only column with nothing but names of image files, if there is one."""
+    names = [name for name, cells in columns.items() if cells and all(map(_is_image, cells))]
+    if len(names) > 1:
+        raise ValueError(f"{' and '.join(names)} name image files; call the right one 'image'")
+    return names[0] if names else None
 
 
 def _is_image(cell: object) -> bool:
     return isinstance(cell, str) and PurePath(cell).suffix.lower() in IMAGE_ENDINGS
 
 
-def labels_of_lists(
-    data: Mapping[str, object], count: int
+def row_labels(
+    columns: Mapping[str, Sequence[object]], count: int, plural: bool = False
 ) -> tuple[tuple[str, ...] | None, NDArray[np.float64] | None]:
-    """Names and seconds that stand in lists of their own beside `count` poses; None without.
+    """Image names and seconds of `count` rows, each None if there is no such column.
 
     Raises:
-        ValueError: A list is longer or shorter, or a time is no number.
+        ValueError: A column is incomplete, a time is no number, or the columns are ambiguous.
     """
-    lists = {key: value for key, value in data.items() if isinstance(value, list)}
-    found = find_labels([*lists], plural=True)
-    names, stamps = (None if i is None else [*lists][i] for i in (found.name, found.stamp))
-    names = names or image_column({key: value for key, value in lists.items() if value})
-    for key in filter(None, (names, stamps)):
-        if len(lists[key]) != count:
-            raise ValueError(f"{key!r} holds {len(lists[key])} entries for {count} poses")
-    return (
-        None if names is None else tuple(map(str, lists[names])),
-        None if stamps is None else seconds(number_array(lists[stamps], f"{stamps!r}"), found.unit),
-    )
+    keys = [*columns]
+    labels = find_labels(keys, plural)
+    name, stamp = (None if i is None else keys[i] for i in (labels.name, labels.stamp))
+    name = name or _image_column(columns)
+    for key in filter(None, (name, stamp)):
+        if len(columns[key]) != count:
+            raise ValueError(f"{key!r} holds {len(columns[key])} entries for {count} poses")
+        if None in columns[key]:
+            raise ValueError(f"some poses have {key!r}, others lack it; give it to all poses")
+    seconds = None
+    if stamp is not None:
+        seconds = in_unit(number_array(columns[stamp], f"{stamp!r}"), labels.unit)
+    return None if name is None else tuple(map(str, columns[name])), seconds
 
 
 def number_array(values: object, what: str) -> NDArray[np.float64]:
-    """An array.
+    """Convert nested lists to an array.
 
     Raises:
-        ValueError: Not numbers, or ragged.
+        ValueError: The lists are ragged or hold something other than numbers.
     """
     try:
         return np.array(values, dtype=np.float64)
@@ -113,11 +112,11 @@ def number_array(values: object, what: str) -> NDArray[np.float64]:
         raise ValueError(f"{what} is made of numbers and has the same shape everywhere") from None
 
 
-def seconds(stamps: NDArray[np.float64], unit: str | None) -> NDArray[np.float64]:
-    """Stamps (n,) in seconds.
+def in_unit(stamps: NDArray[np.float64], unit: str | None) -> NDArray[np.float64]:
+    """Convert stamps (n,) to seconds from `s`, `ms`, `us` or `ns`; seconds if omitted.
 
     Raises:
-        ValueError: Numbers that cannot be seconds, and no unit that says what they are.
+        ValueError: The unit is omitted, and the numbers are too large for seconds.
     """
     if unit in _PER_SECOND:
         return stamps / _PER_SECOND[unit]

@@ -1,4 +1,4 @@
-"""Which gripper pose belongs to which image: by name, by time, or in order."""
+"""Pairing of gripper poses with images by name, by time, or in order."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -13,65 +13,67 @@ from evercal.recordings.poses.pose_track import MAX_GAP_S, PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, times_in_names
 
+Pairing = tuple[list[SE3 | None], list[str]]
+"""The pose of each image, if it has one, and notes."""
+
 
 def pair_images(
     images: Sequence[Path], rows: RobotPoses, stamps_s: Mapping[str, float] | None, file: Path
-) -> tuple[list[SE3 | None], list[str]]:
-    """Gives every image its gripper pose.
+) -> Pairing:
+    """Find the gripper pose of every image.
 
-    Rows with names go to the images of these names. Rows with times are interpolated at the times
-    of the images, which a file states or the images' names are. Else rows and images are as many
-    and go together in their order.
+    Rows with names are paired with the images of these names. Rows with times are interpolated at
+    the image times, from a file or from the image names. Otherwise rows and images are paired in
+    order, and their numbers must be equal.
 
     Args:
-        images: in natural order.
-        rows: as read.
-        stamps_s: time of each image by its name; None if no file states them.
-        file: that the rows came from, for the messages.
-
-    Returns:
-        One pose for each image, None where it has none, and notes on what was done.
+        images: Image files in natural order.
+        rows: Content of the pose file.
+        stamps_s: Time of each image by its name, if a file states them.
+        file: The pose file, for messages.
 
     Raises:
-        InputError: they cannot be paired.
+        InputError: The images cannot be paired.
     """
     if rows.names is not None:
         return _by_name(images, rows.names, rows.poses, file)
-    times = None
-    if rows.stamps_s is not None:
-        times = _image_times(images, stamps_s)
+    times = None if rows.stamps_s is None else _image_times(images, stamps_s)
     if times is not None and rows.stamps_s is not None:
         return _by_time(times, PoseTrack(rows.stamps_s, rows.poses), file)
     if len(rows.poses) != len(images):
         how = "an image column" if rows.stamps_s is None else "a stamps.csv (image, stamp_s)"
         raise InputError(
             f"{file}: {len(rows.poses)} poses for {len(images)} images in {images[0].parent}; give"
-            f" each image a row, or add {how} that says which belong together"
+            f" each image a row, or add {how} to pair them"
         )
-    # A shell's *.png puts image-10 before image-2, the rows do not.
+    # A shell's *.png puts image-10 before image-2, unlike the rows.
     for before, after in itertools.pairwise(images):
-        same = before.parent == after.parent
-        if same and natural_key(before.name) > natural_key(after.name):
+        same_folder = before.parent == after.parent
+        if same_folder and natural_key(before.name) > natural_key(after.name):
             raise InputError(
-                f"{file}: {after.name} is given after {before.name}, so which row is whose is open;"
-                f" give the folder, or name the images in a column image"
+                f"{file}: {after.name} is given after {before.name}, so the order of the rows is"
+                f" ambiguous; give the folder, or name the images in a column image"
             )
     first, last = images[0].name, images[-1].name
     return list(rows.poses), [f"images and poses were paired in order, {first} to {last}"]
 
 
 def poses_of_images(file: Path, images: Sequence[Path], convention: str | None = None) -> SE3:
-    """(n,) base_from_gripper of images, paired with the rows of a file as `pair_images` does.
+    """Read the pose of every image from a pose file, for the commands with `--convention`.
 
     Args:
-        file: as `read_robot_poses` takes it.
-        images: in the order of the rows, where neither names nor times pair them.
-        convention: how the file is written, where it does not say it.
+        file: As `read_robot_poses` takes it.
+        images: (n,) image files, in the order of the rows if neither names nor times pair them.
+        convention: Convention of the file. Required if the file does not define it.
+
+    Returns:
+        (n,) base_from_gripper.
 
     Raises:
-        InputError: they cannot be paired, or an image has no pose.
+        InputError: The images cannot be paired, or an image has no pose.
     """
-    poses, _ = pair_images(images, read_robot_poses(file, convention), None, file)
+    rows = read_robot_poses(file, convention, option="--convention")
+    poses, _ = pair_images(images, rows, None, file)
     missing = [image.name for image, pose in zip(images, poses, strict=True) if pose is None]
     if missing:
         raise InputError(
@@ -80,37 +82,33 @@ def poses_of_images(file: Path, images: Sequence[Path], convention: str | None =
     return SE3.stack([pose for pose in poses if pose is not None])
 
 
-def _by_name(
-    images: Sequence[Path], names: Sequence[str], poses: SE3, file: Path
-) -> tuple[list[SE3 | None], list[str]]:
+def _by_name(images: Sequence[Path], names: Sequence[str], poses: SE3, file: Path) -> Pairing:
     by_name: dict[str, SE3] = {}
     for name, pose in zip(names, poses, strict=True):
         key = PurePath(name).name
         if key in by_name:
             raise InputError(f"{file}: {name!r} comes twice; give every image one row")
         by_name[key] = pose
-    # A table may leave the ending out.
-    found = [by_name.pop(i.name, None) or by_name.pop(i.stem, None) for i in images]
-    if not any(pose is not None for pose in found):
+    # A table may omit the ending.
+    paired = [by_name.pop(i.name, None) or by_name.pop(i.stem, None) for i in images]
+    if not any(pose is not None for pose in paired):
         raise InputError(
             f"{file}: names no image of {images[0].parent}; its first is {names[0]!r}, the first"
-            f" image is {images[0].name!r}; mend the names, or leave them out to pair in order"
+            f" image is {images[0].name!r}; correct the names, or leave them out to pair in order"
         )
     notes = []
-    if None in found:
-        alone = [i.name for i, pose in zip(images, found, strict=True) if pose is None]
+    if None in paired:
+        alone = [i.name for i, pose in zip(images, paired, strict=True) if pose is None]
         notes.append(f"{_count(len(alone), 'image')} without a row in {file.name}: {_few(alone)}")
     if by_name:
-        notes.append(f"{_count(len(by_name), 'row')} of {file.name} without an image:"
-                     f" {_few(list(by_name))}")  # fmt: skip
-    return found, notes
+        rows = _count(len(by_name), "row")
+        notes.append(f"{rows} of {file.name} without an image: {_few(list(by_name))}")
+    return paired, notes
 
 
-def _by_time(
-    times: NDArray[np.float64], track: PoseTrack, file: Path
-) -> tuple[list[SE3 | None], list[str]]:
-    poses, known = track.at(times)
-    if not known.any():
+def _by_time(times: NDArray[np.float64], track: PoseTrack, file: Path) -> Pairing:
+    poses, valid = track.at(times)
+    if not valid.any():
         first, last = track.stamps_s[0], track.stamps_s[-1]
         raise InputError(
             f"{file}: no image was taken while poses were recorded: images at {times.min():.3f} to"
@@ -118,25 +116,25 @@ def _by_time(
             f" If not, name the image of each row in a column image"
         )
     notes = [f"gripper poses were interpolated at the times of {_count(len(times), 'image')}"]
-    if not known.all():
+    if not valid.all():
         notes.append(
-            f"{_count(int((~known).sum()), 'image')} lie outside the recorded poses or in a gap of"
-            f" more than {MAX_GAP_S:g} s in which the gripper moved"
+            f"{_count(int((~valid).sum()), 'image')} taken outside the recorded poses or in a gap"
+            f" of more than {MAX_GAP_S:g} s in which the gripper moved"
         )
-    return [pose if ok else None for pose, ok in zip(poses, known, strict=True)], notes
+    return [pose if ok else None for pose, ok in zip(poses, valid, strict=True)], notes
 
 
 def _image_times(
     images: Sequence[Path], stamps_s: Mapping[str, float] | None
 ) -> NDArray[np.float64] | None:
-    """(n,) seconds; from the stamps file, else from names that are times."""
-    if stamps_s is not None:
-        times = [stamps_s.get(i.name, stamps_s.get(i.stem)) for i in images]
-        if None in times:
-            missing = images[times.index(None)]
-            raise InputError(f"{missing}: stamps.csv has no row for it; add one for every image")
-        return np.array(times, dtype=np.float64)
-    return times_in_names([image.name for image in images])
+    """(n,) seconds from the stamps file, else from image names that are times."""
+    if stamps_s is None:
+        return times_in_names([image.name for image in images])
+    times = [stamps_s.get(i.name, stamps_s.get(i.stem)) for i in images]
+    if None in times:
+        missing = images[times.index(None)]
+        raise InputError(f"{missing}: stamps.csv has no row for it; add one for every image")
+    return np.array(times, dtype=np.float64)
 
 
 def _count(number: int, what: str) -> str:

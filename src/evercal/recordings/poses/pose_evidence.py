@@ -1,9 +1,9 @@
-"""What the images say about the stated rotations: inverted poses, other axes, mixed-up angles.
+"""Comparison of stated rotations with the images: inverted poses, other axes, mixed-up angles.
 
-The turn between two images of one scene shows in the images alone (the essential matrix; Nister, An
-Efficient Solution to the Five-Point Relative Pose Problem, PAMI 2004). Of poses that are what they
-are said to be, a camera's turns equal these, and a gripper's equal them but for one fixed rotation
-between gripper and camera. Inverted poses turn about other axes.
+The rotation between two images of one scene follows from the images alone (the essential matrix;
+Nister, An Efficient Solution to the Five-Point Relative Pose Problem, PAMI 2004). Correct camera
+poses rotate equally. Correct gripper poses do so up to one fixed rotation between gripper and
+camera. Inverted poses rotate about other axes.
 """
 
 from collections.abc import Sequence
@@ -19,105 +19,109 @@ from evercal.recordings.frame import Frame
 Array = NDArray[np.float64]
 
 PAIRS = 16
-"""Pairs of images that are looked at."""
+"""Number of image pairs that are compared."""
 LEAST_PAIRS = 6
-"""Fewer pairs with enough matches say nothing."""
-TURN_DEG, WANTED_DEG = 5.0, 12.0
-"""How far the images of a pair are turned as stated, at least and at best."""
-APART = 30
-"""The images of a pair are at most so many frames apart."""
+"""Matched pairs below which there is no verdict."""
+LEAST_DEG, BEST_DEG = 5.0, 12.0
+"""Smallest and best stated rotation between the images of a pair."""
+MOST_FRAMES_APART = 30
+"""Largest distance between the images of a pair, frames."""
 LEAST_MATCHES = 40
+"""Feature matches, and inliers of them, below which a pair is dropped."""
 LONG_SIDE = 640
+"""Longer side of the images that are matched, pixels."""
 AGREE_DEG = 2.0
-"""Turns that differ by no more agree."""
+"""Difference up to which rotations agree."""
 STILL_DEG = 1.0
+"""Median measured rotation below which the images stand still."""
 BETTER, CLOSE_DEG = 3.0, 0.5
-"""Another reading of the poses has to fit so many times better to be named; with it those that fit
-as well within so much."""
+"""Factor by which another reading of the poses must fit better to be named, and the margin within
+which further readings are named with it."""
 GRIPPER_AGREE_DEG, GRIPPER_BETTER = 1.0, 2.0
-"""The same of a gripper, which has a free rotation to fit with: only far turns tell readings
-apart."""
-# A camera's axes (right, down, forward) in OpenGL's (right, up, backward).
+"""Stricter limits for grippers: the free fixed rotation lets wrong readings fit better."""
+# OpenGL's camera axes (right, up, backward) from OpenCV's (right, down, forward).
 _GL = Rotation.from_euler("x", 180, degrees=True)
 
 
 @dataclass(frozen=True, eq=False)
-class Turns:
-    """How far the second image of each pair is turned against the first, as rotation vectors."""
+class PairRotations:
+    """Rotation of the second image of each pair in the frame of the first, as rotation vectors."""
 
-    seen: Array
-    """(n, 3) radians, by the images, in the first camera."""
+    measured: Array
+    """(n, 3) radians, from the images."""
     stated: Array
-    """(n, 3) by the poses, in the first frame."""
+    """(n, 3) radians, from the poses."""
     inverse: Array
-    """(n, 3) by the inverses of the poses."""
+    """(n, 3) radians, from the inverses of the poses."""
     swapped: Array
-    """(n, 3) by the poses whose quaternions are read in the other order."""
+    """(n, 3) radians, from the poses with quaternions in the other order."""
 
 
-def doubts(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> list[str]:
-    """Sentences about how stated poses contradict the images; none where they agree.
+def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> list[str]:
+    """Compare stated rotations with the images.
 
     Args:
-        frames: in recorded order.
-        poses: (n,) base_from_camera or base_from_gripper of them.
-        of_camera: which of the two.
+        frames: (n,) frames in recorded order.
+        poses: (n,) base_from_camera or base_from_gripper.
+        of_camera: Whether the poses are base_from_camera.
+
+    Returns:
+        Sentences about contradictions.
 
     Raises:
-        InputError: an image that cannot be read.
+        InputError: An image cannot be read.
     """
-    turns = measure(frames, poses)
-    if turns is None:
+    rotations = pair_rotations(frames, poses)
+    if rotations is None:
         return []
-    return _camera_doubts(turns) if of_camera else _gripper_doubts(turns)
+    return _camera_warnings(rotations) if of_camera else _gripper_warnings(rotations)
 
 
-def measure(frames: Sequence[Frame], poses: SE3) -> Turns | None:
-    """The turns between some pairs of images; None where too few could be matched."""
-    pairs, seen = [], []
+def pair_rotations(frames: Sequence[Frame], poses: SE3) -> PairRotations | None:
+    """Measure the rotation of some image pairs; None if too few pairs can be matched."""
+    pairs, measured = [], []
     for first, second in _pairs(poses):
-        turn = seen_turn(frames[first], frames[second])
-        if turn is not None:
+        rotation = measured_rotation(frames[first], frames[second])
+        if rotation is not None:
             pairs.append((first, second))
-            seen.append(turn)
+            measured.append(rotation)
     if len(pairs) < LEAST_PAIRS:
         return None
     first, second = np.array(pairs).T
     stated = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
-    swapped = Rotation.from_quat(poses.rotation_wxyz)  # as if w stood last
-    return Turns(
-        np.array(seen),
-        (stated[first].inv() * stated[second]).as_rotvec(),
-        (stated[first] * stated[second].inv()).as_rotvec(),
-        (swapped[first].inv() * swapped[second]).as_rotvec(),
+    swapped = Rotation.from_quat(poses.rotation_wxyz)
+    return PairRotations(
+        measured=np.array(measured),
+        stated=(stated[first].inv() * stated[second]).as_rotvec(),
+        inverse=(stated[first] * stated[second].inv()).as_rotvec(),
+        swapped=(swapped[first].inv() * swapped[second]).as_rotvec(),
     )
 
 
-def seen_turn(first: Frame, second: Frame) -> Array | None:
-    """(3,) rotation vector first_from_second of two images, radians; None with too few matches."""
+def measured_rotation(first: Frame, second: Frame) -> Array | None:
+    """(3,) rotation vector first_from_second in radians; None if there are too few matches."""
     import cv2
 
-    found = [_features(frame) for frame in (first, second)]
-    if min(len(rays) for rays, _ in found) < LEAST_MATCHES:
+    features = [_features(frame) for frame in (first, second)]
+    if min(len(rays) for rays, _ in features) < LEAST_MATCHES:
         return None
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    near = matcher.knnMatch(found[0][1], found[1][1], k=2)
-    kept = [m[0] for m in near if len(m) == 2 and m[0].distance < 0.75 * m[1].distance]
-    if len(kept) < LEAST_MATCHES:
+    neighbours = cv2.BFMatcher(cv2.NORM_L2).knnMatch(features[0][1], features[1][1], k=2)
+    matches = [m[0] for m in neighbours if len(m) == 2 and m[0].distance < 0.75 * m[1].distance]
+    if len(matches) < LEAST_MATCHES:
         return None
-    a = found[0][0][[m.queryIdx for m in kept]]
-    b = found[1][0][[m.trainIdx for m in kept]]
-    pixel = 1.5 / (first.camera.fx * min(1.0, LONG_SIDE / max(first.camera.width, 1)))
+    a = features[0][0][[m.queryIdx for m in matches]]
+    b = features[1][0][[m.trainIdx for m in matches]]
+    threshold = 1.5 / (first.camera.fx * min(1.0, LONG_SIDE / max(first.camera.width, 1)))
     cv2.setRNGSeed(0)
-    matrix, inside = cv2.findEssentialMat(a, b, np.eye(3), cv2.RANSAC, 0.999, pixel)
-    if matrix is None or matrix.shape != (3, 3) or int(inside.sum()) < LEAST_MATCHES:
+    matrix, inliers = cv2.findEssentialMat(a, b, np.eye(3), cv2.RANSAC, 0.999, threshold)
+    if matrix is None or matrix.shape != (3, 3) or int(inliers.sum()) < LEAST_MATCHES:
         return None
-    _, second_from_first, _, _ = cv2.recoverPose(matrix, a, b, np.eye(3), mask=inside)
+    _, second_from_first, _, _ = cv2.recoverPose(matrix, a, b, np.eye(3), mask=inliers)
     return Rotation.from_matrix(second_from_first).inv().as_rotvec()
 
 
 def _features(frame: Frame) -> tuple[Array, NDArray[np.float32]]:
-    """(n, 2) points of the plane at distance one, and their SIFT descriptors."""
+    """(n, 2) points of the plane z = 1, and their SIFT descriptors."""
     import cv2
 
     image = cv2.cvtColor(frame.read_image(), cv2.COLOR_RGB2GRAY)
@@ -131,96 +135,91 @@ def _features(frame: Frame) -> tuple[Array, NDArray[np.float32]]:
     if descriptors is None:
         return np.empty((0, 2)), np.empty((0, 128), np.float32)
     rays = camera.unproject([point.pt for point in points])[:, :2]
-    known = np.isfinite(rays).all(1)
-    return rays[known], descriptors[known]
+    valid = np.isfinite(rays).all(1)
+    return rays[valid], descriptors[valid]
 
 
 def _pairs(poses: SE3) -> list[tuple[int, int]]:
-    """Frames spread over the recording, each with a later one that is turned enough.
+    """Frames spread over the recording, each with a later one that is rotated enough.
 
-    Far turns tell most, but where stated angles are nonsense only near frames are sure to match:
-    every second pair is the nearest one.
+    Large rotations separate the readings best, but with nonsensical angles only near frames are
+    certain to match. Every second pair is therefore the nearest one.
     """
     rotation = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
-    found = []
+    pairs = []
     firsts = np.unique(np.linspace(0, len(poses) - 2, PAIRS).round().astype(int))
     for i, first in enumerate(firsts):
-        later = np.arange(first + 1, min(first + 1 + APART, len(poses)))
-        turned = np.rad2deg((rotation[first].inv() * rotation[later]).magnitude())
-        best = np.argmin(np.abs(turned - WANTED_DEG)) if i % 2 else np.argmax(turned > TURN_DEG)
-        if turned[best] > TURN_DEG:
-            found.append((int(first), int(later[best])))
-    return found
+        later = np.arange(first + 1, min(first + 1 + MOST_FRAMES_APART, len(poses)))
+        degrees = np.rad2deg((rotation[first].inv() * rotation[later]).magnitude())
+        best = np.argmin(np.abs(degrees - BEST_DEG)) if i % 2 else np.argmax(degrees > LEAST_DEG)
+        if degrees[best] > LEAST_DEG:
+            pairs.append((int(first), int(later[best])))
+    return pairs
 
 
-def _camera_doubts(turns: Turns) -> list[str]:
-    as_said = _apart(turns.seen, turns.stated)
-    if as_said < AGREE_DEG:
+def _camera_warnings(rotations: PairRotations) -> list[str]:
+    measured, stated, inverse = rotations.measured, rotations.stated, rotations.inverse
+    error = _error_deg(measured, stated)
+    if error < AGREE_DEG:
         return []
-    fits = {
-        "camera_from_base, the inverse": _apart(turns.seen, turns.inverse),
-        "with OpenGL's camera axes (right, up, backward)": _apart(
-            turns.seen, _GL.apply(turns.stated)
-        ),
-        "the inverse with OpenGL's camera axes": _apart(turns.seen, _GL.apply(turns.inverse)),
-        "with quaternions in another order": _apart(turns.seen, turns.swapped),
+    errors = {
+        "camera_from_base, the inverse": _error_deg(measured, inverse),
+        "with OpenGL's camera axes (right, up, backward)": _error_deg(measured, _GL.apply(stated)),
+        "the inverse with OpenGL's camera axes": _error_deg(measured, _GL.apply(inverse)),
+        "with quaternions in another order": _error_deg(measured, rotations.swapped),
     }
-    if min(fits.values()) > as_said / BETTER:
-        fits["those of another frame, at a fixed angle to the camera"] = _fitted(
-            turns.seen, turns.stated
-        )
-    return [_told("camera", as_said, fits, len(turns.seen), BETTER)]
+    if min(errors.values()) > error / BETTER:
+        fitted = _fitted_error_deg(measured, stated)
+        errors["those of another frame, at a fixed angle to the camera"] = fitted
+    return [_sentence("camera", error, errors, len(measured), BETTER)]
 
 
-def _gripper_doubts(turns: Turns) -> list[str]:
-    if _still(turns):
+def _gripper_warnings(rotations: PairRotations) -> list[str]:
+    measured = rotations.measured
+    if np.rad2deg(np.median(np.linalg.norm(measured, axis=1))) < STILL_DEG:
         return [
-            "the gripper turns and the images hardly do; does the camera stand still, or are the"
-            " angles in another unit than was said?"
+            "the gripper rotates and the images hardly do; does the camera stand still, or are the"
+            " angles in another unit than stated?"
         ]
-    as_said = _fitted(turns.seen, turns.stated)
-    fits = {
-        "gripper_from_base, the inverse": _fitted(turns.seen, turns.inverse),
-        "with quaternions in another order": _fitted(turns.seen, turns.swapped),
+    error = _fitted_error_deg(measured, rotations.stated)
+    errors = {
+        "gripper_from_base, the inverse": _fitted_error_deg(measured, rotations.inverse),
+        "with quaternions in another order": _fitted_error_deg(measured, rotations.swapped),
     }
-    better = min(fits.values()) < as_said / GRIPPER_BETTER
-    if as_said < (GRIPPER_AGREE_DEG if better else AGREE_DEG):
+    better = min(errors.values()) < error / GRIPPER_BETTER
+    if error < (GRIPPER_AGREE_DEG if better else AGREE_DEG):
         return []
-    return [_told("gripper", as_said, fits, len(turns.seen), GRIPPER_BETTER)]
+    return [_sentence("gripper", error, errors, len(measured), GRIPPER_BETTER)]
 
 
-def _still(turns: Turns) -> bool:
-    """Whether the images hardly turn although the gripper does."""
-    return float(np.rad2deg(np.median(np.linalg.norm(turns.seen, axis=1)))) < STILL_DEG
-
-
-def _told(what: str, as_said: float, fits: dict[str, float], pairs: int, better: float) -> str:
-    least = min(fits.values())
-    said = (
-        f"the {what} turns otherwise than the images do, by {as_said:.1f} deg in the median of"
+def _sentence(frame: str, error: float, errors: dict[str, float], pairs: int, better: float) -> str:
+    """Warning that names the readings with the smallest error, if it is small enough."""
+    least = min(errors.values())
+    problem = (
+        f"the {frame} rotates differently from the images, by {error:.1f} deg in the median of"
         f" {pairs} pairs"
     )
-    if least < min(AGREE_DEG, as_said / better):
-        alike = [guess for guess, fit in fits.items() if fit < least + CLOSE_DEG]
-        return f"{said}; the poses fit ({least:.1f} deg) if they are {', or '.join(alike)}"
+    if least < min(AGREE_DEG, error / better):
+        readings = [reading for reading, e in errors.items() if e < least + CLOSE_DEG]
+        return f"{problem}; the poses fit ({least:.1f} deg) if they are {', or '.join(readings)}"
     return (
-        f"{said}; do poses and images go together, are angles in the unit and Euler order that was"
-        f" said, and are the intrinsics right?"
+        f"{problem}; do poses and images belong together, are angles in the stated unit and Euler"
+        f" order, and are the intrinsics right?"
     )
 
 
-def _apart(seen: Array, stated: Array) -> float:
-    """Median angle between turns, degrees."""
-    off = Rotation.from_rotvec(seen).inv() * Rotation.from_rotvec(stated)
-    return float(np.rad2deg(np.median(off.magnitude())))
+def _error_deg(measured: Array, stated: Array) -> float:
+    """Median angle between rotations, degrees."""
+    difference = Rotation.from_rotvec(measured).inv() * Rotation.from_rotvec(stated)
+    return float(np.rad2deg(np.median(difference.magnitude())))
 
 
-def _fitted(seen: Array, stated: Array) -> float:
-    """The same after the fixed rotation between the two frames that fits best."""
-    weights = np.ones(len(seen))
-    turn = Rotation.identity()
-    for _ in range(5):  # turns that fit badly count less
-        turn = Rotation.align_vectors(seen, stated, weights)[0]
-        off = np.linalg.norm(turn.apply(stated) - seen, axis=1)
-        weights = 1 / (1 + (off / max(float(np.median(off)), 1e-6)) ** 2)
-    return _apart(seen, turn.apply(stated))
+def _fitted_error_deg(measured: Array, stated: Array) -> float:
+    """Median angle after the best fixed rotation between the two frames, degrees."""
+    weights = np.ones(len(measured))
+    rotation = Rotation.identity()
+    for _ in range(5):  # iterative reweighting against outliers
+        rotation = Rotation.align_vectors(measured, stated, weights)[0]
+        distance = np.linalg.norm(rotation.apply(stated) - measured, axis=1)
+        weights = 1 / (1 + (distance / max(float(np.median(distance)), 1e-6)) ** 2)
+    return _error_deg(measured, rotation.apply(stated))

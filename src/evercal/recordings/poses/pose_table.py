@@ -1,9 +1,9 @@
-"""Tables of poses: lines of numbers behind a header that says which column is what.
+"""Tables of poses: a header that names the columns, and rows of numbers.
 
-Columns are parted by semicolons, commas, tabs or blanks. Lines that start with # are passed over,
-but the last of them before the numbers may be the header, as numpy and TUM write it. The names of
-columns that are known stand in `pose_header`. A table without a header has the numbers of its
-convention, behind a stamp, and with a name before or after them, where there are more columns.
+Columns are separated by semicolons, commas, tabs or blanks. Lines that start with # are ignored,
+except that the last of them before the numbers may be the header, as in files of numpy and TUM.
+`pose_header` lists the known column names. A table without a header has the numbers of its
+convention, optionally preceded by a stamp, and a name before or after them.
 """
 
 import csv
@@ -13,36 +13,36 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.recordings.poses.conventions import PoseConvention, known_conventions
-from evercal.recordings.poses.labels import image_column, seconds
-from evercal.recordings.poses.pose_header import PoseHeader, is_number, meant, pose_header
+from evercal.recordings.poses.conventions import KNOWN_CONVENTIONS, ConventionError, PoseConvention
+from evercal.recordings.poses.labels import in_unit, row_labels
+from evercal.recordings.poses.pose_header import PoseHeader, is_number, pose_columns, pose_header
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class PoseTable:
-    """Poses as they stand in a file."""
+    """Poses as numbers in a convention."""
 
     numbers: Array
     """(n, convention.count)."""
     convention: PoseConvention
-    """How they are meant."""
-    names: tuple[str, ...] | None
-    """(n,) of the rows."""
-    stamps_s: Array | None
-    """(n,) seconds."""
+    """Convention of the numbers."""
+    names: tuple[str, ...] | None = None
+    """(n,) image names, if there are any."""
+    stamps_s: Array | None = None
+    """(n,) seconds, if there are any."""
 
 
 def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
-    """Reads a table.
+    """Read a table.
 
     Args:
-        text: of the file.
-        given: how the numbers are meant; None if the header says it.
+        text: Content of the file.
+        given: Convention of the numbers. If omitted, the header defines it.
 
     Raises:
-        ValueError: No table of numbers, or one that does not say how its poses are meant.
+        ValueError: The text is no table of numbers, or its convention is not defined.
     """
     header, rows = _split(text)
     if not rows:
@@ -52,22 +52,15 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
     for i, row in enumerate(rows):
         if len(row) != header.width:
             raise ValueError(f"row {i + 1} has {len(row)} columns, the header {header.width}")
-    convention, columns = meant(header, given)
-    names = None if header.name is None else tuple(row[header.name] for row in rows)
-    if names is None:
-        cells = dict(zip(header.cells, zip(*rows, strict=True), strict=True))
-        named = image_column(cells)
-        names = None if named is None else cells[named]
-    stamps = None
-    if header.stamp is not None:
-        column = np.array([_number(row[header.stamp], i) for i, row in enumerate(rows)])
-        stamps = seconds(column, header.stamp_unit)
+    convention, columns = pose_columns(header, given)
+    cells = dict(zip(header.cells, zip(*rows, strict=True), strict=True))
+    names, stamps = row_labels(cells, len(rows))
     numbers = np.array([[_number(row[c], i) for c in columns] for i, row in enumerate(rows)])
     return PoseTable(numbers, convention, names, stamps)
 
 
 def _split(text: str) -> tuple[PoseHeader | None, list[list[str]]]:
-    """The header, if there is one, and the cells of the lines of numbers."""
+    """The header, if there is one, and the cells of the rows."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     plain = [line for line in lines if not line.startswith("#")]
     if not plain:
@@ -97,32 +90,32 @@ def _cells(line: str) -> list[str]:
 def _without_header(rows: list[list[str]], given: PoseConvention | None) -> PoseTable:
     width = len(rows[0])
     if given is None:
-        raise ValueError(
-            f"{width} columns without a header do not say how they are meant; write a header such"
-            f" as x,y,z,qw,qx,qy,qz or give --convention, one of {known_conventions()}, or tum"
+        raise ConventionError(
+            f"{width} columns without a header do not define a pose; write a header such as"
+            f" x,y,z,qw,qx,qy,qz",
+            f"NAME, one of {KNOWN_CONVENTIONS}, or tum",
         )
-    names, numbers = None, []
     words = [i for i, cell in enumerate(rows[0]) if not is_number(cell)]
     extra = width - given.count
     if len(words) > 1 or not len(words) <= extra <= len(words) + 1:
         raise ValueError(
             f"row 1 has {width} columns; {given.name} takes {given.count} ({given.meaning}),"
-            f" and a name and a stamp before them where they are known"
+            f" optionally after a name and a stamp"
         )
+    numbers = []
     for i, row in enumerate(rows):
         if len(row) != width:
             raise ValueError(f"row {i + 1} has {len(row)} columns, row 1 has {width}")
         numbers.append([_number(cell, i) for c, cell in enumerate(row) if c not in words])
-    if words:
-        names = tuple(row[words[0]] for row in rows)
+    names = tuple(row[words[0]] for row in rows) if words else None
     table = np.array(numbers)
-    stamps = seconds(table[:, 0], None) if extra > len(words) else None
+    stamps = in_unit(table[:, 0], None) if extra > len(words) else None
     back = np.flatnonzero(np.diff(table[:, 0]) < 0)
-    # A number behind the pose instead shows in quaternions and matrices, but not in angles.
+    # A misplaced number shows in quaternions and matrices, but not in angles.
     if stamps is not None and given.has_angles and back.size:
         raise ValueError(
             f"the first number of row {back[0] + 2} is smaller than the one before, so it is no"
-            f" stamp; write a header that says what the {width} columns are"
+            f" stamp; write a header that names the {width} columns"
         )
     return PoseTable(table[:, table.shape[1] - given.count :], given, names, stamps)
 

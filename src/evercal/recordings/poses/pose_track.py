@@ -1,4 +1,4 @@
-"""Poses at times, and between them."""
+"""Poses over time, with interpolation."""
 
 from dataclasses import dataclass
 
@@ -13,55 +13,55 @@ Array = NDArray[np.float64]
 MAX_GAP_S = 0.2
 """Longest time between two poses over which a moving frame is interpolated, seconds."""
 STILL_M, STILL_DEG = 0.001, 0.1
-"""A frame that is no farther from where it was has stood still over a gap, however long."""
+"""Motion below which a frame counts as standing still over a gap of any length."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseTrack:
-    """A pose as it changes over time; what comes twice at one time counts once, the last of them.
+    """A pose over time; of several poses at one time, the last is kept.
 
     Raises:
-        ValueError: No pose, or times that are not one for each pose.
+        ValueError: There is no pose, or the numbers of times and poses differ.
     """
 
     stamps_s: Array
     """(n,) seconds, in any order."""
     poses: SE3
-    """(n,)."""
+    """(n,) poses at these times."""
 
     def __post_init__(self) -> None:
         stamps = np.asarray(self.stamps_s, dtype=np.float64)
         if stamps.ndim != 1 or not stamps.size or stamps.shape != self.poses.shape:
             raise ValueError(f"a track takes n >= 1 times and poses, got {stamps.shape}")
-        # The last of equal times: unique keeps the first, so it looks from the end.
+        # np.unique keeps the first of equal times, so the order is reversed.
         _, last = np.unique(stamps[::-1], return_index=True)
         order = len(stamps) - 1 - last
         object.__setattr__(self, "stamps_s", stamps[order])
         object.__setattr__(self, "poses", self.poses[order])
 
     def at(self, stamps_s: Array, max_gap_s: float = MAX_GAP_S) -> tuple[SE3, NDArray[np.bool_]]:
-        """Poses between the known ones: positions on a line, rotations on a great circle.
+        """Interpolate positions linearly and rotations along great circles.
 
         Args:
             stamps_s: (m,) seconds.
-            max_gap_s: longest gap in the track that a moving frame is interpolated over.
+            max_gap_s: Longest gap over which a moving frame is interpolated, seconds.
 
         Returns:
-            (m,) poses and (m,) whether each is known. Beyond the ends none is, the nearest one
-            stands there; nor is any in a long gap over which the frame moved.
+            (m,) poses and (m,) whether each is valid. Poses beyond the ends, which are those of
+            the ends, and in a longer gap over which the frame moved are not valid.
         """
         stamps = np.asarray(stamps_s, dtype=np.float64)
-        held = np.clip(stamps, self.stamps_s[0], self.stamps_s[-1])
-        known = held == stamps
+        inside = np.clip(stamps, self.stamps_s[0], self.stamps_s[-1])
+        valid = inside == stamps
         if len(self.stamps_s) == 1:
-            return self.poses[np.zeros(len(stamps), dtype=int)], known
-        after = np.searchsorted(self.stamps_s, held).clip(1, len(self.stamps_s) - 1)
+            return self.poses[np.zeros(len(stamps), dtype=int)], valid
+        after = np.searchsorted(self.stamps_s, inside).clip(1, len(self.stamps_s) - 1)
         before = after - 1
         metres, radians = pose_distance(self.poses[before], self.poses[after])
         still = (metres < STILL_M) & (np.rad2deg(radians) < STILL_DEG)
         short = self.stamps_s[after] - self.stamps_s[before] <= max_gap_s
-        exact = (held == self.stamps_s[before]) | (held == self.stamps_s[after])
+        exact = (inside == self.stamps_s[before]) | (inside == self.stamps_s[after])
         rotations = Rotation.from_quat(self.poses.rotation_wxyz, scalar_first=True)
-        moved = [np.interp(held, self.stamps_s, axis) for axis in self.poses.translation_m.T]
-        quaternion = Slerp(self.stamps_s, rotations)(held).as_quat(scalar_first=True)
-        return SE3(quaternion, np.stack(moved, axis=-1)), known & (short | still | exact)
+        position = [np.interp(inside, self.stamps_s, axis) for axis in self.poses.translation_m.T]
+        quaternion = Slerp(self.stamps_s, rotations)(inside).as_quat(scalar_first=True)
+        return SE3(quaternion, np.stack(position, axis=-1)), valid & (short | still | exact)

@@ -1,4 +1,4 @@
-"""Small things that stand on tables, shelves and the floor; each with its foot's middle at 0."""
+"""Small objects for tables, shelves and the floor. Each stands on z = 0, centred at x = y = 0."""
 
 import numpy as np
 
@@ -18,9 +18,13 @@ from evercal.simulation.furnished.shapes import (
     tube,
 )
 
+FRUIT = {"orange": (0.85, 0.45, 0.1), "apple": (0.68, 0.12, 0.1), "lime": (0.45, 0.62, 0.15)}
+GLASS = ((0.08, 0.2, 0.1), (0.2, 0.1, 0.05), (0.3, 0.42, 0.5))
+LEAVES = ((0.25, 0.42, 0.18), (0.33, 0.48, 0.22), (0.2, 0.34, 0.2))
+
 
 class SmallObjects:
-    """Makes small things from the materials of a workshop and new ones."""
+    """Makes small objects from new materials and those of the room's furniture."""
 
     def __init__(self, shop: FurnitureBuilder):
         self.shop = shop
@@ -28,110 +32,57 @@ class SmallObjects:
         self.glazes = [
             m.lacquer(f"glaze{i}", pick(self.rng, (*CLOTHS, *PAINTS)), self.rng) for i in range(3)
         ]
+        self._spines: m.Material | None = None
 
     def glaze(self) -> m.Material:
         """One of three colours of ceramics."""
         return self.glazes[self.rng.integers(len(self.glazes))]
 
     def mug(self) -> Item:
-        """With a handle."""
+        """A mug with a handle."""
         r, h = 0.04, float(self.rng.uniform(0.085, 0.11))
         body = lathe(
-            [
-                (0, 0),
-                (0.8 * r, 0),
-                (r, 0.012),
-                (r, h),
-                (r - 0.004, h),
-                (r - 0.005, 0.01),
-                (0, 0.008),
-            ],
-            24,
-            2,
-        )
+            [(0, 0), (0.8 * r, 0), (r, 0.012), (r, h), (r - 0.004, h), (r - 0.005, 0.01),
+             (0, 0.008)], 24, 2,
+        )  # fmt: skip
         t = np.linspace(-np.pi / 2, np.pi / 2, 9)
         ear = np.stack([r - 0.002 + 0.028 * np.cos(t), np.zeros(9), h / 2 + 0.03 * np.sin(t)], -1)
         return Item("mug", [(body, self.glaze()), (tube(ear, 0.006), self.glazes[0])])
 
     def bowl(self) -> Item:
-        """With fruit in it, or empty."""
+        """A bowl with up to five fruits."""
         r = float(self.rng.uniform(0.09, 0.14))
         body = lathe(
-            [
-                (0, 0),
-                (0.4 * r, 0),
-                (0.45 * r, 0.008),
-                (0.85 * r, 0.05),
-                (r, 0.085),
-                (r - 0.005, 0.086),
-                (0.8 * r, 0.052),
-                (0, 0.014),
-            ],
-            32,
-            3,
-        )
+            [(0, 0), (0.4 * r, 0), (0.45 * r, 0.008), (0.85 * r, 0.05), (r, 0.085),
+             (r - 0.005, 0.086), (0.8 * r, 0.052), (0, 0.014)], 32, 3,
+        )  # fmt: skip
         parts = [(body, self.glaze())]
-        colour = self.rng.choice(("orange", "apple", "lime"))
-        rgb = {"orange": (0.85, 0.45, 0.1), "apple": (0.68, 0.12, 0.1), "lime": (0.45, 0.62, 0.15)}[
-            str(colour)
-        ]
-        fruit = m.stone(self.shop.name("fruit"), rgb, self.rng)
+        colour = FRUIT[str(self.rng.choice(tuple(FRUIT)))]
+        fruit = m.stone(self.shop.name("fruit"), colour, self.rng)
         for i in range(int(self.rng.integers(0, 6))):
-            angle = 2.2 * i
-            way = 0.045 if i else 0.0
-            parts.append(
-                (
-                    ball(0.037, 0.95, 16).shifted(
-                        way * np.cos(angle), way * np.sin(angle), 0.03 + 0.012 * i
-                    ),
-                    fruit,
-                )
-            )
+            angle, radius = 2.2 * i, 0.045 if i else 0.0
+            x, y, z = radius * np.cos(angle), radius * np.sin(angle), 0.03 + 0.012 * i
+            parts.append((ball(0.037, 0.95, 16).shifted(x, y, z), fruit))
         return Item("bowl", parts)
 
     def plate(self) -> Item:
         """A pile of plates."""
         plate = lathe(
-            [
-                (0, 0),
-                (0.07, 0),
-                (0.08, 0.006),
-                (0.12, 0.018),
-                (0.12, 0.02),
-                (0.08, 0.01),
-                (0, 0.006),
-            ],
-            32,
-            2,
-        )
+            [(0, 0), (0.07, 0), (0.08, 0.006), (0.12, 0.018), (0.12, 0.02), (0.08, 0.01),
+             (0, 0.006)], 32, 2,
+        )  # fmt: skip
         count = int(self.rng.integers(1, 6))
         pile = Mesh.merged([plate.shifted(0, 0, 0.009 * i) for i in range(count)])
         return Item("plates", [(pile, self.glaze())])
 
     def bottle(self) -> Item:
-        """Glass, with a printed label."""
+        """A glass bottle with a printed label."""
         r, h = float(self.rng.uniform(0.032, 0.042)), float(self.rng.uniform(0.24, 0.32))
         body = lathe(
-            [
-                (0, 0),
-                (0.9 * r, 0),
-                (r, 0.01),
-                (r, 0.55 * h),
-                (0.85 * r, 0.65 * h),
-                (0.36 * r, 0.78 * h),
-                (0.34 * r, h),
-                (0.4 * r, h),
-                (0, h),
-            ],
-            24,
-            2,
-        )
-        glass = m.plain(
-            self.shop.name("glass"),
-            pick(self.rng, ((0.08, 0.2, 0.1), (0.2, 0.1, 0.05), (0.3, 0.42, 0.5))),
-            "coated",
-            0.05,
-        )
+            [(0, 0), (0.9 * r, 0), (r, 0.01), (r, 0.55 * h), (0.85 * r, 0.65 * h),
+             (0.36 * r, 0.78 * h), (0.34 * r, h), (0.4 * r, h), (0, h)], 24, 2,
+        )  # fmt: skip
+        glass = m.plain(self.shop.name("glass"), pick(self.rng, GLASS), "coated", 0.05)
         band = self._labelled(cylinder(r + 0.0006, 0.3 * h, 0.001).shifted(0, 0, 0.16 * h))
         return Item("bottle", [(body, glass), band])
 
@@ -142,47 +93,33 @@ class SmallObjects:
         return Item("jar", [self._labelled(cylinder(r, h)), (lid, self.shop.steel)])
 
     def vase(self) -> Item:
-        """Turned to a random profile, with stalks."""
+        """A vase of random profile with up to five flowers."""
         h, r = float(self.rng.uniform(0.18, 0.34)), self.rng.uniform(0.4, 1.0, 4) * 0.085
         body = lathe(
-            [
-                (0, 0),
-                (r[0], 0),
-                (r[1] + 0.02, 0.3 * h),
-                (r[2], 0.6 * h),
-                (0.025, 0.85 * h),
-                (0.03 + 0.2 * r[3], h),
-                (0.02 + 0.2 * r[3], h),
-                (0.018, 0.8 * h),
-                (0, 0.7 * h),
-            ],
-            30,
-            4,
-        )
+            [(0, 0), (r[0], 0), (r[1] + 0.02, 0.3 * h), (r[2], 0.6 * h), (0.025, 0.85 * h),
+             (0.03 + 0.2 * r[3], h), (0.02 + 0.2 * r[3], h), (0.018, 0.8 * h), (0, 0.7 * h)], 30, 4,
+        )  # fmt: skip
         parts = [(body, self.glaze())]
         green = m.plain("stalk", (0.25, 0.38, 0.16))
         petal = m.plain(self.shop.name("petal"), pick(self.rng, CLOTHS))
         for _ in range(int(self.rng.integers(0, 6))):
             lean = self.rng.uniform(-0.09, 0.09, 2)
             tip = np.array([*lean, h + self.rng.uniform(0.08, 0.2)])
-            parts.append(
-                (tube(np.array([[0, 0, 0.7 * h], [*(0.3 * lean), h], tip]), 0.002, 5), green)
-            )
+            stalk = np.array([[0, 0, 0.7 * h], [*(0.3 * lean), h], tip])
+            parts.append((tube(stalk, 0.002, 5), green))
             parts.append((ball(0.02, 0.8, 10).shifted(tip[0], tip[1], tip[2] - 0.01), petal))
         return Item("vase", parts)
 
     def books(self) -> Item:
-        """A pile of lying books, or a row."""
-        if not hasattr(self, "_spines"):
+        """A pile of books."""
+        if self._spines is None:
             self._spines = m.spines(self.shop.name("spines"), self.rng)
         z, pile = 0.0, []
         for _ in range(int(self.rng.integers(2, 6))):
             thick = float(self.rng.uniform(0.018, 0.045))
-            lying = self.shop.book(thick, 0.16, float(self.rng.uniform(0.19, 0.25))).turned(
-                about_y(np.pi / 2), (0, 0, thick / 2)
-            )
-            lying = lying.shifted(-0.11, 0, z).placed((0, 0, 0), float(self.rng.normal(0, 0.15)))
-            pile.append(lying)
+            upright = self.shop.book(thick, 0.16, float(self.rng.uniform(0.19, 0.25)))
+            lying = upright.rotated(about_y(np.pi / 2), (0, 0, thick / 2)).shifted(-0.11, 0, z)
+            pile.append(lying.placed((0, 0, 0), float(self.rng.normal(0, 0.15))))
             z += thick
         return Item("books", [(Mesh.merged(pile), self._spines)])
 
@@ -195,49 +132,26 @@ class SmallObjects:
         """Leaves in a pot."""
         scale = float(self.rng.uniform(0.7, 1.3))
         pot = lathe(
-            [
-                (0, 0),
-                (0.06, 0),
-                (0.085, 0.12),
-                (0.09, 0.14),
-                (0.08, 0.14),
-                (0.075, 0.12),
-                (0, 0.12),
-            ],
-            28,
-            2,
-        )
-        rgb = pick(self.rng, ((0.25, 0.42, 0.18), (0.33, 0.48, 0.22), (0.2, 0.34, 0.2)))
-        green = m.stone(self.shop.name("leaf"), rgb, self.rng)
+            [(0, 0), (0.06, 0), (0.085, 0.12), (0.09, 0.14), (0.08, 0.14), (0.075, 0.12),
+             (0, 0.12)], 28, 2,
+        )  # fmt: skip
+        green = m.stone(self.shop.name("leaf"), pick(self.rng, LEAVES), self.rng)
         leaves = []
         for i in range(int(self.rng.integers(9, 20))):
-            blade = leaf(
-                float(self.rng.uniform(0.16, 0.34)),
-                float(self.rng.uniform(0.04, 0.08)),
-                float(self.rng.uniform(0.8, 2.2)),
-            )
-            blade = blade.turned(about_y(float(self.rng.uniform(-0.7, 0.2))))
+            low, high = (0.16, 0.04, 0.8), (0.34, 0.08, 2.2)
+            length, width, droop = self.rng.uniform(low, high).tolist()
+            blade = leaf(length, width, droop)
+            blade = blade.rotated(about_y(float(self.rng.uniform(-0.7, 0.2))))
             leaves.append(blade.placed((0, 0, 0.12), 2.4 * i + float(self.rng.normal(0, 0.2))))
         parts = [(pot, self.glaze()), (Mesh.merged(leaves), green)]
-        return Item("plant", [(_scaled(mesh, scale), material) for mesh, material in parts])
+        return Item("plant", [(mesh.scaled(scale), material) for mesh, material in parts])
 
     def lamp(self) -> Item:
         """A table lamp that is on."""
         foot = lathe(
-            [
-                (0, 0),
-                (0.07, 0),
-                (0.07, 0.012),
-                (0.02, 0.03),
-                (0.045, 0.1),
-                (0.03, 0.17),
-                (0.01, 0.2),
-                (0.01, 0.26),
-                (0, 0.26),
-            ],
-            28,
-            3,
-        )
+            [(0, 0), (0.07, 0), (0.07, 0.012), (0.02, 0.03), (0.045, 0.1), (0.03, 0.17),
+             (0.01, 0.2), (0.01, 0.26), (0, 0.26)], 28, 3,
+        )  # fmt: skip
         shade = lathe(lampshade((0.12, 0.23), (0.105, 0.32), (0.075, 0.41)), 28, 1)
         glow = m.plain("glow", (1.0, 0.82, 0.58), emission=2.2)
         return Item("lamp", [(foot, self.glaze()), (shade, glow)])
@@ -246,58 +160,36 @@ class SmallObjects:
         """A cooking pot with a lid and two handles."""
         r, h = float(self.rng.uniform(0.09, 0.12)), float(self.rng.uniform(0.1, 0.16))
         body = lathe(
-            [
-                (0, 0),
-                (r - 0.01, 0),
-                (r, 0.012),
-                (r, h),
-                (r + 0.004, h + 0.004),
-                (r * 0.6, h + 0.02),
-                (0, h + 0.026),
-            ],
-            32,
-            2,
-        )
+            [(0, 0), (r - 0.01, 0), (r, 0.012), (r, h), (r + 0.004, h + 0.004),
+             (r * 0.6, h + 0.02), (0, h + 0.026)], 32, 2,
+        )  # fmt: skip
         parts = [(body, self.shop.steel), (ball(0.016).shifted(0, 0, h + 0.024), self.shop.dark)]
         t = np.linspace(-np.pi / 2, np.pi / 2, 7)
         for sign in (1, -1):
-            ear = np.stack(
-                [sign * (r + 0.03 * np.cos(t)), 0.035 * np.sin(t), np.full(7, 0.8 * h)], -1
-            )
+            x, y = sign * (r + 0.03 * np.cos(t)), 0.035 * np.sin(t)
+            ear = np.stack([x, y, np.full(7, 0.8 * h)], -1)
             parts.append((tube(ear, 0.006), self.shop.dark))
         return Item("pot", parts)
 
     def kettle(self) -> Item:
-        """Round, with a spout and an arched handle."""
+        """A round kettle with a spout and an arched handle."""
         body = lathe(
-            [
-                (0, 0),
-                (0.085, 0),
-                (0.095, 0.02),
-                (0.09, 0.09),
-                (0.06, 0.14),
-                (0.035, 0.155),
-                (0.012, 0.165),
-                (0.015, 0.18),
-                (0, 0.185),
-            ],
-            32,
-            3,
-        )
+            [(0, 0), (0.085, 0), (0.095, 0.02), (0.09, 0.09), (0.06, 0.14), (0.035, 0.155),
+             (0.012, 0.165), (0.015, 0.18), (0, 0.185)], 32, 3,
+        )  # fmt: skip
         spout = tube(np.array([[0.07, 0, 0.07], [0.11, 0, 0.1], [0.14, 0, 0.15]]), 0.014)
         t = np.linspace(0.25, np.pi - 0.25, 10)
         arch = tube(np.stack([0.085 * np.cos(t), np.zeros(10), 0.12 + 0.11 * np.sin(t)], -1), 0.009)
-        return Item(
-            "kettle", [(body, self.glaze()), (spout, self.shop.steel), (arch, self.shop.dark)]
-        )
+        shop = self.shop
+        return Item("kettle", [(body, self.glaze()), (spout, shop.steel), (arch, shop.dark)])
 
     def toy_ball(self) -> Item:
-        """A ball with a pattern."""
+        """A patterned ball."""
         cloth = m.fabric(self.shop.name("ball"), pick(self.rng, CLOTHS), self.rng)
         return Item("ball", [(ball(float(self.rng.uniform(0.05, 0.11)), segments=32), cloth)])
 
     def blocks(self) -> Item:
-        """Three toy blocks on each other."""
+        """A tower of three toy blocks."""
         parts, z = [], 0.0
         for side in (0.05, 0.045, 0.04):
             block = box(side, side, side, 0.006).placed((0, 0, z), float(self.rng.uniform(0, 1.5)))
@@ -308,19 +200,9 @@ class SmallObjects:
     def basket(self) -> Item:
         """A woven basket with cloth in it."""
         body = lathe(
-            [
-                (0, 0),
-                (0.13, 0),
-                (0.17, 0.1),
-                (0.18, 0.22),
-                (0.185, 0.23),
-                (0.17, 0.22),
-                (0.15, 0.1),
-                (0, 0.08),
-            ],
-            32,
-            2,
-        )
+            [(0, 0), (0.13, 0), (0.17, 0.1), (0.18, 0.22), (0.185, 0.23), (0.17, 0.22),
+             (0.15, 0.1), (0, 0.08)], 32, 2,
+        )  # fmt: skip
         cane = m.fabric(self.shop.name("cane"), (0.66, 0.5, 0.31), self.rng)
         cloth = cushion(0.26, 0.26, 0.16).shifted(0, 0, 0.12)
         return Item("basket", [(body, cane), (cloth, self.shop.cloths[1])])
@@ -331,17 +213,13 @@ class SmallObjects:
         grille = m.fabric(self.shop.name("grille"), (0.3, 0.28, 0.25), self.rng)
         parts.append((box(0.13, 0.012, 0.1, 0.004).shifted(-0.035, -0.05, 0.02), grille))
         for z in (0.045, 0.095):
-            knob = cylinder(0.018, 0.02).turned(about_x(np.pi / 2), (0.08, -0.046, z))
+            knob = cylinder(0.018, 0.02).rotated(about_x(np.pi / 2), (0.08, -0.046, z))
             parts.append((knob, self.shop.steel))
         return Item("radio", parts)
 
     def _labelled(self, mesh: Mesh) -> tuple[Mesh, m.Material]:
-        """A printed label once over the height, repeated around."""
+        """The mesh with a printed label that covers its height and repeats around it."""
         height = float(np.ptp(mesh.vertices_m[:, 2]))
         material = m.label(self.shop.name("label"), pick(self.rng, (*CLOTHS, *PAINTS)), self.rng)
         uv = (mesh.uv - (mesh.uv[:, 0].min(), mesh.uv[:, 1].min())) / height
         return Mesh(mesh.vertices_m, mesh.faces, mesh.normals, uv), material
-
-
-def _scaled(mesh: Mesh, factor: float) -> Mesh:
-    return Mesh(mesh.vertices_m * factor, mesh.faces, mesh.normals, mesh.uv * factor)

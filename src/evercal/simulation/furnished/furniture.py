@@ -1,8 +1,4 @@
-"""Large things. Each stands with its back at y = 0 and its front towards -y, its middle at x = 0.
-
-A builder takes a generator and gives an `Item`: meshes with materials and the flat places on which
-small things may be put.
-"""
+"""Furniture. Each item is centred at x = 0, with its back at y = 0 and its front towards -y."""
 
 from dataclasses import dataclass, field
 
@@ -36,28 +32,30 @@ CLOTHS: tuple[Colour, ...] = (
     (0.62, 0.22, 0.20), (0.24, 0.34, 0.50), (0.78, 0.72, 0.60), (0.36, 0.46, 0.34),
     (0.55, 0.52, 0.50), (0.80, 0.58, 0.24), (0.46, 0.34, 0.48),
 )  # fmt: skip
+HOB_RINGS = ((0.09, -0.13, 0.1), (0.075, 0.13, 0.1), (0.075, -0.13, -0.11), (0.1, 0.13, -0.11))
+"""Radius, x and y of the rings of a hob, metres."""
 
 
 @dataclass(eq=False)
 class Item:
-    """One thing in a room."""
+    """An object in a room."""
 
     kind: str
-    """What it is called."""
+    """Name of the kind of object."""
     parts: list[tuple[Mesh, m.Material]]
-    """Meshes in the item's own frame, metres."""
+    """Meshes in the frame of the item, metres."""
     tops: list[tuple[float, float, float, float, float]] = field(default_factory=list)
-    """Places for small things: x from, x to, y from, y to, z; metres, item's frame."""
+    """Surfaces for small objects: x_min, x_max, y_min, y_max, z; metres, frame of the item."""
     curved: bool = True
-    """Whether it is round or has bevelled edges that one sees."""
+    """Whether it is round or has visible bevelled edges."""
 
     def bounds_m(self) -> np.ndarray:
-        """(2, 3) lowest and highest corner."""
+        """Lowest and highest corner, shape (2, 3)."""
         points = np.concatenate([mesh.vertices_m for mesh, _ in self.parts])
         return np.stack([points.min(0), points.max(0)])
 
     def placed(self, x: float, y: float, z: float, yaw_rad: float = 0.0) -> "Item":
-        """Turned about z and shifted; tops turn with it in quarter turns only."""
+        """The item rotated about z, then shifted. Tops are exact for multiples of 90 deg only."""
         parts = [(mesh.placed((x, y, z), yaw_rad), material) for mesh, material in self.parts]
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         tops = []
@@ -69,13 +67,13 @@ class Item:
 
 
 def pick(rng: np.random.Generator, colours: tuple[Colour, ...]) -> Colour:
-    """One of them, a little varied."""
+    """One of the colours with a small random variation."""
     colour = np.array(colours[rng.integers(len(colours))]) * rng.uniform(0.9, 1.1)
     return tuple(np.clip(colour + rng.uniform(-0.03, 0.03, 3), 0.02, 0.95).tolist())
 
 
 class FurnitureBuilder:
-    """Makes furniture; materials are made once per room and shared, as in a real one."""
+    """Makes furniture from materials that all items of a room share."""
 
     def __init__(self, rng: np.random.Generator):
         self.rng = rng
@@ -90,7 +88,7 @@ class FurnitureBuilder:
         self.white = m.plain("white", (0.86, 0.86, 0.84), "coated", 0.12)
 
     def name(self, what: str) -> str:
-        """A name that no other material has."""
+        """A unique material name."""
         self._count += 1
         return f"{what}{self._count}"
 
@@ -103,27 +101,24 @@ class FurnitureBuilder:
         return self.cloths[self.rng.integers(len(self.cloths))]
 
     def bed(self) -> Item:
-        """Frame, head board, mattress, quilt, two pillows."""
+        """A bed with a head board, mattress, quilt and pillows."""
         w, d, wood = 1.5, 2.05, self.wood()
+        mattress = box(w - 0.06, d - 0.12, 0.22, 0.07, steps=4).shifted(0, -d / 2 - 0.02, 0.3)
         parts = [
             (box(w, d, 0.22, 0.02).shifted(0, -d / 2, 0.1), wood),
             (box(w + 0.1, 0.07, 1.0, 0.03, steps=3).shifted(0, -0.04, 0), wood),
-            (
-                box(w - 0.06, d - 0.12, 0.22, 0.07, steps=4).shifted(0, -d / 2 - 0.02, 0.3),
-                self.linen,
-            ),
+            (mattress, self.linen),
             (box(w + 0.04, 1.3, 0.14, 0.06, steps=4).shifted(0, -1.42, 0.42), self.cloths[0]),
         ]
         for x in (-0.36, 0.36):
-            pillow = cushion(0.62, 0.42, 0.17).turned(about_x(0.35), (x, -0.36, 0.52))
+            pillow = cushion(0.62, 0.42, 0.17).rotated(about_x(0.35), (x, -0.36, 0.52))
             parts.append((pillow, self.cloths[1]))
-        parts.append(
-            (cushion(0.4, 0.4, 0.16).turned(about_x(0.9), (0.05, -0.55, 0.62)), self.cloths[2])
-        )
+        small = cushion(0.4, 0.4, 0.16).rotated(about_x(0.9), (0.05, -0.55, 0.62))
+        parts.append((small, self.cloths[2]))
         return Item("bed", parts)
 
     def wardrobe(self) -> Item:
-        """Doors with handles."""
+        """A wardrobe with three doors and handles."""
         w, d, h, paint = 1.5, 0.6, 2.05, self.wood()
         parts = [(box(w, d - 0.02, h, 0.012).shifted(0, -d / 2 + 0.01, 0), paint)]
         for i in range(3):
@@ -135,7 +130,7 @@ class FurnitureBuilder:
         return Item("wardrobe", parts, [(-0.65, 0.65, -0.5, -0.1, h)])
 
     def drawers(self) -> Item:
-        """A chest with round knobs."""
+        """A chest of drawers with round knobs."""
         w, d, h = 0.5 + 0.5 * float(self.rng.random()), 0.45, float(self.rng.uniform(0.5, 0.9))
         body, front = (self.wood(), self.paint) if self.rng.random() < 0.5 else (self.paint,) * 2
         parts = [(box(w, d, h, 0.012).shifted(0, -d / 2, 0), body)]
@@ -144,12 +139,12 @@ class FurnitureBuilder:
             z = 0.05 + i * (h - 0.08) / rows
             parts.append((box(w - 0.05, 0.024, (h - 0.12) / rows, 0.008).shifted(0, -d, z), front))
             for x in (-w / 4, w / 4):
-                knob = ball(0.016).turned(about_x(np.pi / 2), (x, -d - 0.005, z + 0.5 * h / rows))
+                knob = ball(0.016).rotated(about_x(np.pi / 2), (x, -d - 0.005, z + 0.5 * h / rows))
                 parts.append((knob, self.steel))
         return Item("drawers", parts, [(-w / 2 + 0.05, w / 2 - 0.05, -d + 0.06, -0.06, h)])
 
     def sofa(self) -> Item:
-        """Arms, seat cushions, back cushions, loose pillows."""
+        """A sofa with cushions and pillows."""
         w, d, cloth = 1.9, 0.88, self.cloths[0]
         parts = [(box(w, d, 0.3, 0.03).shifted(0, -d / 2, 0.08), cloth)]
         for x in (-w / 2 + 0.1, w / 2 - 0.1):
@@ -157,15 +152,15 @@ class FurnitureBuilder:
         parts.append((box(w, 0.22, 0.82, 0.09, steps=5).shifted(0, -0.11, 0.06), cloth))
         for x in (-0.38, 0.38):
             seat = box(0.74, 0.64, 0.17, 0.06, steps=4).shifted(x, -0.53, 0.36)
-            back = box(0.72, 0.17, 0.42, 0.07, steps=4).turned(about_x(0.2), (x, -0.24, 0.48))
+            back = box(0.72, 0.17, 0.42, 0.07, steps=4).rotated(about_x(0.2), (x, -0.24, 0.48))
             parts += [(seat, cloth), (back, cloth)]
         for i, x in enumerate((-0.6, 0.2, 0.62)):
-            pillow = cushion(0.42, 0.42, 0.17).turned(about_x(1.15), (x, -0.42, 0.74))
+            pillow = cushion(0.42, 0.42, 0.17).rotated(about_x(1.15), (x, -0.42, 0.74))
             parts.append((pillow, self.cloths[1 + i % 2]))
         return Item("sofa", parts)
 
     def armchair(self) -> Item:
-        """A bucket chair: a turned shell would be stiff, so rounded boxes."""
+        """An armchair of rounded boxes."""
         cloth = self.cloths[2]
         parts = [
             (box(0.74, 0.7, 0.3, 0.1, steps=5).shifted(0, -0.37, 0.14), cloth),
@@ -178,7 +173,7 @@ class FurnitureBuilder:
         return Item("armchair", parts)
 
     def chair(self) -> Item:
-        """Four turned legs, a seat, a bent back."""
+        """A chair with four round legs and a curved back."""
         wood = self.wood()
         parts = [(box(0.43, 0.42, 0.035, 0.014, steps=3).shifted(0, -0.25, 0.44), wood)]
         for x in (-0.17, 0.17):
@@ -207,7 +202,7 @@ class FurnitureBuilder:
         return Item("table", parts, [(-w / 2 + 0.06, w / 2 - 0.06, -d + 0.06, -0.06, h)])
 
     def round_table(self) -> Item:
-        """A turned side table on one foot."""
+        """A round side table on one foot."""
         r, h = float(self.rng.uniform(0.28, 0.42)), float(self.rng.uniform(0.42, 0.58))
         top = cylinder(r, 0.03, 0.012, 40).shifted(0, -r, h - 0.03)
         foot = lathe(
@@ -218,7 +213,7 @@ class FurnitureBuilder:
         return Item("side table", [(top, wood), (foot, wood)], [(-k, k, -r - k, -r + k, h)])
 
     def bookcase(self) -> Item:
-        """Shelves full of books with titles."""
+        """A bookcase full of books with titles."""
         w, d, h, wood = float(self.rng.uniform(0.8, 1.2)), 0.3, 1.9, self.wood()
         parts = [(box(w, 0.012, h, 0.002).shifted(0, -0.006, 0), wood)]
         for x in (-w / 2 + 0.0125, w / 2 - 0.0125):
@@ -232,13 +227,9 @@ class FurnitureBuilder:
             end = x1 - float(self.rng.uniform(0.0, 0.45)) * (x1 - x0)
             books, x = [], x0
             while x < end:
-                thick, tall = (
-                    float(self.rng.uniform(0.018, 0.05)),
-                    float(self.rng.uniform(0.18, 0.3)),
-                )
-                books.append(
-                    self.book(thick, 0.19, tall).shifted(x + thick / 2, -0.15, i * gap + 0.022)
-                )
+                thick = float(self.rng.uniform(0.018, 0.05))
+                book = self.book(thick, 0.19, float(self.rng.uniform(0.18, 0.3)))
+                books.append(book.shifted(x + thick / 2, -0.15, i * gap + 0.022))
                 x += thick + 0.001
             if books:
                 parts.append((Mesh.merged(books), spines))
@@ -247,83 +238,65 @@ class FurnitureBuilder:
         return Item("bookcase", parts, tops)
 
     def book(self, thick: float, deep: float, tall: float) -> Mesh:
-        """A book upright, its spine towards -y with one random cell of the `spines` texture."""
+        """An upright book with its spine towards -y and a random cell of the `spines` texture."""
         mesh, cell = box(thick, deep, tall, 0.003, steps=1), self.rng.integers(m.BOOKS)
         spine = mesh.normals[:, 1] < -0.5
-        # Covers take the colour of their own spine from its untitled edge.
+        # Covers have the colour of the untitled edge of their spine.
         u = (cell + np.where(spine, 0.5 + 0.9 * mesh.vertices_m[:, 0] / thick, 0.06)) / m.BOOKS
         v = np.where(spine, 0.02 + 0.96 * mesh.vertices_m[:, 2] / tall, 0.97)
         return Mesh(mesh.vertices_m, mesh.faces, mesh.normals, np.stack([u, v], -1))
 
     def counter(self, w: float = 2.4) -> Item:
-        """Kitchen base units with a worktop, a sink with a bent tap, a hob, an oven."""
+        """Kitchen base units with a worktop, a sink with a tap, a hob and an oven."""
         d, h = 0.62, 0.9
+        worktop = box(w, d + 0.02, 0.04, 0.012, steps=3).shifted(0, -d / 2 - 0.01, h - 0.04)
         parts = [
             (box(w, d - 0.08, 0.1, 0.003).shifted(0, -d / 2 + 0.04, 0), self.woods[1]),
             (box(w, d - 0.04, h - 0.14, 0.004).shifted(0, -d / 2 + 0.02, 0.1), self.paint),
-            (
-                box(w, d + 0.02, 0.04, 0.012, steps=3).shifted(0, -d / 2 - 0.01, h - 0.04),
-                self.stone,
-            ),
+            (worktop, self.stone),
         ]
         units = round(w / 0.6)
         for i in range(units):
             x = -w / 2 + (i + 0.5) * w / units
             if i == units - 1:  # the oven
                 parts.append((box(0.56, 0.03, 0.6, 0.01).shifted(x, -d + 0.02, 0.14), self.dark))
-                bar = np.array(
-                    [[x - 0.22, -d - 0.03, 0.66], [x, -d - 0.04, 0.66], [x + 0.22, -d - 0.03, 0.66]]
-                )
-                parts.append((tube(bar, 0.01), self.steel))
+                parts.append((_handle(x, 0.22, -d - 0.03, 0.66, 0.01), self.steel))
                 knobs = [
-                    cylinder(0.018, 0.025).turned(about_x(np.pi / 2), (x + k, -d + 0.01, 0.8))
+                    cylinder(0.018, 0.025).rotated(about_x(np.pi / 2), (x + k, -d + 0.01, 0.8))
                     for k in (-0.2, -0.1, 0.1, 0.2)
                 ]
                 parts.append((Mesh.merged(knobs), self.steel))
             else:
                 door = box(w / units - 0.012, 0.022, h - 0.17, 0.007).shifted(x, -d + 0.03, 0.11)
-                bar = np.array(
-                    [[x - 0.1, -d - 0.01, 0.75], [x, -d - 0.02, 0.75], [x + 0.1, -d - 0.01, 0.75]]
-                )
-                parts += [(door, self.paint), (tube(bar, 0.007), self.steel)]
+                handle = _handle(x, 0.1, -d - 0.01, 0.75, 0.007)
+                parts += [(door, self.paint), (handle, self.steel)]
         sink, hob = -w / 2 + 0.7, w / 2 - 0.32
         parts.append((box(0.56, 0.42, 0.012, 0.005).shifted(sink, -d / 2, h), self.steel))
         parts.append((box(0.46, 0.32, 0.01, 0.004).shifted(sink, -d / 2, h + 0.005), self.dark))
         t = np.linspace(0, np.pi, 12)
-        arc = np.stack(
-            [np.full(12, sink), -0.17 - 0.08 * (1 - np.cos(t)), h + 0.24 + 0.09 * np.sin(t)], -1
-        )
+        y, z = -0.17 - 0.08 * (1 - np.cos(t)), h + 0.24 + 0.09 * np.sin(t)
+        arc = np.stack([np.full(12, sink), y, z], -1)
         pipe = np.concatenate([[[sink, -0.17, h]], [[sink, -0.17, h + 0.12]], arc])
         parts.append((tube(pipe, 0.013), self.steel))
         parts.append((box(0.56, 0.48, 0.008, 0.003).shifted(hob, -d / 2, h), self.dark))
         rings = [
             cylinder(r, 0.006, 0.002, 32).shifted(hob + x, -d / 2 + y, h + 0.005)
-            for r, x, y in (
-                (0.09, -0.13, 0.1),
-                (0.075, 0.13, 0.1),
-                (0.075, -0.13, -0.11),
-                (0.1, 0.13, -0.11),
-            )
+            for r, x, y in HOB_RINGS
         ]
         parts.append((Mesh.merged(rings), self.steel))
-        return Item(
-            "counter",
-            parts,
-            [
-                (sink + 0.32, hob - 0.32, -d + 0.08, -0.06, h),
-                (hob - 0.2, hob + 0.2, -0.3, -0.15, h + 0.012),
-            ],
-        )
+        worktop_space = (sink + 0.32, hob - 0.32, -d + 0.08, -0.06, h)
+        hob_space = (hob - 0.2, hob + 0.2, -0.3, -0.15, h + 0.012)
+        return Item("counter", parts, [worktop_space, hob_space])
 
     def fridge(self) -> Item:
-        """Two rounded doors, notes held by magnets."""
+        """A fridge with two rounded doors and notes on them."""
         paint = m.lacquer(self.name("fridge"), pick(self.rng, PAINTS), self.rng)
         parts = [(box(0.62, 0.6, 1.8, 0.02).shifted(0, -0.3, 0), paint)]
         for z, h in ((0.05, 1.1), (1.17, 0.6)):
             parts.append((box(0.61, 0.06, h, 0.028, steps=4).shifted(0, -0.62, z), paint))
-            bar = np.array(
-                [[-0.25, -0.67, z + 0.1], [-0.25, -0.69, z + h / 2], [-0.25, -0.67, z + h - 0.1]]
-            )
+            ends = np.array([[-0.25, -0.67, z + 0.1], [-0.25, -0.67, z + h - 0.1]])
+            middle = np.array([[-0.25, -0.69, z + h / 2]])
+            bar = np.concatenate([ends[:1], middle, ends[1:]])
             parts.append((tube(bar, 0.012), self.steel))
         for _ in range(4):
             x, z = self.rng.uniform(-0.15, 0.2), self.rng.uniform(0.7, 1.55)
@@ -332,14 +305,19 @@ class FurnitureBuilder:
         return Item("fridge", parts, [(-0.25, 0.25, -0.5, -0.1, 1.8)])
 
     def floor_lamp(self) -> Item:
-        """Foot, pole, a glowing shade."""
+        """A floor lamp that is on."""
         foot = lathe(
-            [(0, 0), (0.15, 0), (0.15, 0.015), (0.02, 0.035), (0.012, 0.1), (0.012, 1.4), (0, 1.4)],
-            24,
-            2,
-        )
+            [(0, 0), (0.15, 0), (0.15, 0.015), (0.02, 0.035), (0.012, 0.1), (0.012, 1.4),
+             (0, 1.4)], 24, 2,
+        )  # fmt: skip
         glow = m.plain("glow", (1.0, 0.82, 0.58), emission=2.2)
         parts = [(foot.shifted(0, -0.2, 0), self.dark)]
         shade = lathe(lampshade((0.19, 1.3), (0.17, 1.45), (0.13, 1.62)), 28, 1)
         parts.append((shade.shifted(0, -0.2, 0), glow))
         return Item("floor lamp", parts)
+
+
+def _handle(x: float, half_width: float, y: float, z: float, radius: float) -> Mesh:
+    """A horizontal bar that bends 1 cm outwards in the middle."""
+    bar = np.array([[x - half_width, y, z], [x, y - 0.01, z], [x + half_width, y, z]])
+    return tube(bar, radius)

@@ -1,7 +1,6 @@
-"""Surfaces: procedural bitmap textures and how light leaves them.
+"""Materials: procedural sRGB textures that tile, and one of three kinds of reflection.
 
-Textures are sRGB bytes that tile. Three kinds of surface do: matt (diffuse), coated (plastic,
-varnished wood, glazed ceramics) and metal.
+Matt surfaces are diffuse; coated ones are plastic, varnished wood or glaze; the third is metal.
 """
 
 from dataclasses import dataclass
@@ -25,23 +24,23 @@ _WORDS = (
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """What a surface looks like."""
+    """Texture, reflection and emission of a surface."""
 
     name: str
-    """Surfaces of one name are drawn as one mesh."""
+    """Surfaces with the same name are rendered as one mesh."""
     texture: np.ndarray
-    """(h, w, 3) uint8 sRGB; a plain colour is (1, 1, 3)."""
+    """sRGB bytes, shape (h, w, 3); a plain colour has shape (1, 1, 3)."""
     tile_m: float = 1.0
-    """How many metres one repeat covers."""
+    """Size of one repetition, metres."""
     kind: Literal["matt", "coated", "metal"] = "matt"
-    """How it reflects."""
+    """Kind of reflection."""
     roughness: float = 0.2
     """Microfacet roughness of coated and metal surfaces."""
     emission: float = 0.0
-    """Radiance of a lamp, times the texture; 0 for everything else."""
+    """Factor from texture to radiance; 0 except for lamps."""
 
     def bsdf(self, mi: Any) -> dict[str, Any]:
-        """Mitsuba's description of the surface, as seen from outside; the inside is black."""
+        """Mitsuba dictionary of the reflection. Back sides are black."""
         if self.texture.shape[:2] == (1, 1):
             colour: dict[str, Any] = {"type": "rgb", "value": linear(self.texture[0, 0]).tolist()}
         else:
@@ -63,11 +62,11 @@ class Material:
         return {"type": "diffuse", "reflectance": colour}
 
     def emitter(self, mi: Any) -> dict[str, Any] | None:
-        """Mitsuba's description of the light it gives, if any."""
+        """Mitsuba dictionary of the emission; None for surfaces that emit no light."""
         if self.emission <= 0:
             return None
         value = (linear(self.texture.reshape(-1, 3).mean(0)) * self.emission).tolist()
-        # Little lamps are sampled rarely, or they would take the samples from the windows.
+        # Small lamps get few samples, so that windows keep most of them.
         weight = 0.12 if self.name == "glow" else 1.0
         radiance = {"type": "rgb", "value": value}
         return {"type": "area", "radiance": radiance, "sampling_weight": weight}
@@ -83,7 +82,7 @@ class Material:
 
 
 def linear(srgb: np.ndarray) -> np.ndarray:
-    """SRGB bytes to linear values in [0, 1]."""
+    """Convert sRGB bytes to linear values in [0, 1]."""
     value = np.asarray(srgb, float) / 255
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
@@ -92,13 +91,13 @@ def plain(
     name: str, rgb: tuple[float, float, float], kind: Literal["matt", "coated", "metal"] = "matt",
     roughness: float = 0.2, emission: float = 0.0,
 ) -> Material:  # fmt: skip
-    """One colour, (r, g, b) in [0, 1] sRGB; for small things, walls and lamps."""
+    """A plain colour, sRGB in [0, 1]."""
     texel = np.round(np.clip(np.array(rgb), 0, 1) * 255).astype(np.uint8).reshape(1, 1, 3)
     return Material(name, texel, kind=kind, roughness=roughness, emission=emission)
 
 
 def wood(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
-    """Varnished boards: grain along u, fine fibres, now and then a knot."""
+    """Varnished wood: grain along u, fine fibres, sometimes a knot."""
     v, u = np.mgrid[0:SIZE, 0:SIZE].astype(np.float32) / SIZE
     warp = 0.05 * _stretched(rng, 1, 6) + 0.02 * _noise(1.8, rng)
     rings = np.sin(2 * np.pi * (rng.integers(5, 11) * v + 2.2 * warp * 8))
@@ -132,20 +131,20 @@ def boards(name: str, rgb: tuple[float, float, float], rng: np.random.Generator)
 def tiles(
     name: str, rgb: tuple[float, float, float], rng: np.random.Generator, count: int, tile_m: float
 ) -> Material:
-    """Glazed tiles with grout, `count` along `tile_m`; every one a little different."""
+    """Glazed tiles with grout, `count` along `tile_m`, each in a slightly different shade."""
     side = SIZE // count
     marble = 0.05 * _noise(1.6, rng)
     shade = np.kron(rng.normal(1, 0.05, (count, count)), np.ones((side, side)))
     shade = np.pad(shade, ((0, SIZE - side * count),) * 2, mode="wrap")
     picture = np.array(rgb) * (shade + marble)[..., None]
-    if rng.random() < 0.5:  # an ornament on some of them
+    if rng.random() < 0.5:  # an ornament on some tiles
         v, u = np.mgrid[0:side, 0:side] / side - 0.5
         radius = np.hypot(u, v)
         mark = (np.abs(radius - 0.28) < 0.05) | ((np.abs(u) < 0.04) ^ (np.abs(v) < 0.04))
         colour = rng.uniform(0.15, 0.7, 3)
         for row, column in np.argwhere(rng.random((count, count)) < 0.4):
-            where = picture[row * side : (row + 1) * side, column * side : (column + 1) * side]
-            where[mark] = colour
+            tile = picture[row * side : (row + 1) * side, column * side : (column + 1) * side]
+            tile[mark] = colour
     line = max(2, side // 28)
     grout = (np.arange(SIZE) % side) < line
     picture[grout[:, None] | grout[None, :]] = 0.55
@@ -153,7 +152,7 @@ def tiles(
 
 
 def fabric(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
-    """Woven cloth: threads, a slow change of shade, stripes or checks on some."""
+    """Woven cloth with threads, shading and sometimes stripes, checks or dots."""
     v, u = np.mgrid[0:SIZE, 0:SIZE].astype(np.float32)
     weave = np.where(((u // 3) + (v // 3)) % 2, 1.06, 0.94)
     value = weave + 0.05 * _noise(0.8, rng) + 0.04 * _noise(1.8, rng)
@@ -174,7 +173,7 @@ def fabric(name: str, rgb: tuple[float, float, float], rng: np.random.Generator)
 
 
 def carpet(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
-    """A woven rug: border, medallions and rows of figures, mirrored like the real ones."""
+    """A woven rug with a border and figures that are mirrored at both axes."""
     half = dead_leaves(SIZE // 2, SIZE // 2, rng, 70).astype(np.float32) / 255
     half = 0.35 * half + 0.2 * half.mean(-1, keepdims=True) + 0.45 * np.array(rgb)
     picture = np.concatenate([half, half[:, ::-1]], 1)
@@ -191,13 +190,13 @@ def carpet(name: str, rgb: tuple[float, float, float], rng: np.random.Generator)
 
 
 def plaster(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
-    """A painted wall: nearly plain, with roller marks that one sees from near."""
+    """A painted wall: nearly plain, with faint roller marks."""
     value = 1 + 0.018 * _noise(1.0, rng) + 0.012 * _noise(2.0, rng)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 1.5)
 
 
 def wallpaper(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
-    """A repeated figure, as real walls have: the same patch looks alike in many places."""
+    """Wallpaper with a repeated figure, so the same patch appears many times."""
     import cv2
 
     period = SIZE // 4
@@ -212,14 +211,14 @@ def wallpaper(name: str, rgb: tuple[float, float, float], rng: np.random.Generat
 
 
 def stone(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
-    """A polished worktop: speckles over a slow change of shade."""
+    """A polished worktop: speckles and shading."""
     speck = (rng.random((SIZE, SIZE)) < 0.16) * rng.normal(0, 0.18, (SIZE, SIZE))
     value = 1 + speck + 0.06 * _noise(1.4, rng)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 0.7, "coated", 0.12)
 
 
 def lacquer(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
-    """Painted wood: brush strokes that the gloss breaks on."""
+    """Painted wood with brush strokes."""
     value = 1 + 0.035 * _stretched(rng, 1, 16) + 0.02 * _noise(1.6, rng)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 0.8, "coated", 0.18)
 
@@ -231,7 +230,7 @@ def brushed(name: str, rgb: tuple[float, float, float], rng: np.random.Generator
 
 
 def painting(name: str, rng: np.random.Generator, height: int = 256, width: int = 320) -> Material:
-    """A picture to hang up."""
+    """A painting."""
     picture = dead_leaves(height, width, rng, int(rng.integers(25, 120))).astype(np.float32)
     if rng.random() < 0.5:  # a landscape behind: sky above, ground below
         v = np.linspace(0, 1, height)[:, None, None]
@@ -260,11 +259,11 @@ def label(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) 
 
 
 BOOKS = 16
-"""Spines in one `spines` texture."""
+"""Number of spines in one `spines` texture."""
 
 
 def spines(name: str, rng: np.random.Generator) -> Material:
-    """Sixteen book spines side by side, titles running upwards; the lowest tenth is page edges."""
+    """Sixteen book spines side by side, with titles that run upwards."""
     import cv2
 
     height, width = 512, 64
@@ -291,10 +290,10 @@ def clock_face(name: str) -> Material:
     face = np.full((256, 256, 3), 238, np.uint8)
     for hour in range(12):
         angle = 2 * np.pi * hour / 12
-        way = np.array([np.sin(angle), -np.cos(angle)])
-        a, b = (128 + 108 * way).astype(int), (128 + 120 * way).astype(int)
+        direction = np.array([np.sin(angle), -np.cos(angle)])
+        a, b = ((128 + radius * direction).astype(int) for radius in (108, 120))
         cv2.line(face, tuple(map(int, a)), tuple(map(int, b)), (20, 20, 20), 5)
-        at = (128 + 88 * way - (12, -8)).astype(int)
+        at = (128 + 88 * direction - (12, -8)).astype(int)
         cv2.putText(face, str(hour or 12), tuple(map(int, at)), 0, 0.7, (20, 20, 20), 2)
     cv2.line(face, (128, 128), (176, 96), (15, 15, 15), 6)
     cv2.line(face, (128, 128), (104, 40), (15, 15, 15), 4)
@@ -308,14 +307,14 @@ def _noise_bank(exponent: float) -> np.ndarray:
 
 
 def _noise(exponent: float, rng: np.random.Generator) -> np.ndarray:
-    """(SIZE, SIZE) noise that tiles: one of a few, shifted and flipped, as drawing it is slow."""
+    """Tiling noise (SIZE, SIZE): one of three stored ones, shifted and flipped for speed."""
     noise = _noise_bank(exponent)[rng.integers(3)]
     noise = np.roll(noise, rng.integers(0, SIZE, 2), (0, 1))
     return noise[:: 1 - 2 * int(rng.integers(2))]
 
 
 def _stretched(rng: np.random.Generator, exponent: float, factor: int) -> np.ndarray:
-    """Noise drawn out along u by `factor`."""
+    """Noise stretched along u by `factor`."""
     import cv2
 
     noise = _noise(exponent, rng)

@@ -1,7 +1,7 @@
-"""The Franka Panda: where its links are for given joint angles, and what they look like.
+"""The Franka Panda: forward kinematics and meshes.
 
-URDF and meshes (Apache-2.0, from franka_ros) come with the package `example-robot-data`; forward
-kinematics is yourdfpy's.
+URDF and meshes (Apache-2.0, from franka_ros) come with the package `example-robot-data`; yourdfpy
+computes the forward kinematics.
 """
 
 import sys
@@ -16,7 +16,7 @@ from evercal.simulation.furnished.materials import Material, plain
 from evercal.simulation.furnished.shapes import Mesh
 
 FLANGE = "panda_link8"
-"""The frame that is called gripper: the flange the hand is screwed to."""
+"""The gripper frame: the flange that carries the hand."""
 
 HOME_RAD = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
 """Franka's ready position."""
@@ -25,7 +25,7 @@ _FOLDER = "share/example-robot-data/robots/panda_description"
 
 
 class Panda:
-    """One arm with its hand.
+    """An arm with its hand.
 
     Raises:
         InputError: The extra `sim` is not installed.
@@ -49,17 +49,17 @@ class Panda:
         self._parts = self._read_meshes() if meshes else []
 
     def base_from_flange(self, joints_rad: np.ndarray) -> SE3:
-        """Pose of the flange for (7,) joint angles in radians."""
+        """Pose of the flange for joint angles of shape (7,)."""
         return self._link(joints_rad, FLANGE)
 
     def meshes(self, joints_rad: np.ndarray) -> list[tuple[Mesh, Material]]:
-        """The arm for (7,) joint angles in radians; one named mesh per colour."""
+        """Meshes of the arm for joint angles of shape (7,), one named mesh per colour."""
         self._configure(joints_rad)
         groups: dict[str, tuple[Material, list[Mesh]]] = {}
         for node, mesh, material in self._parts:
             matrix = np.asarray(self._urdf.scene.graph.get(node)[0], float)
-            turned = mesh.turned(matrix[:3, :3], matrix[:3, 3].tolist())
-            groups.setdefault(material.name, (material, []))[1].append(turned)
+            rotated = mesh.rotated(matrix[:3, :3], matrix[:3, 3].tolist())
+            groups.setdefault(material.name, (material, []))[1].append(rotated)
         return [(Mesh.merged(group), material) for material, group in groups.values()]
 
     def _link(self, joints_rad: np.ndarray, link: str) -> SE3:
@@ -70,7 +70,7 @@ class Panda:
         joints = np.asarray(joints_rad, float)
         if joints.shape != (7,):
             raise ValueError(f"a Panda takes 7 joint angles, got {joints.shape}")
-        self._urdf.update_cfg(np.append(joints, 0.03))  # the fingers stand a little open
+        self._urdf.update_cfg(np.append(joints, 0.03))  # finger opening, metres
 
     def _read_meshes(self) -> list[tuple[str, Mesh, Material]]:
         scene, parts = self._urdf.scene, []
@@ -98,9 +98,9 @@ _MATERIALS = {
 
 
 def _description() -> Path:
-    for place in sys.path:
+    for entry in sys.path:
         for prefix in ("cmeel.prefix", "."):
-            folder = Path(place) / prefix / _FOLDER
+            folder = Path(entry) / prefix / _FOLDER
             if (folder / "urdf" / "panda.urdf").is_file():
                 return folder
     raise InputError(

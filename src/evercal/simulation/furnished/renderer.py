@@ -1,7 +1,7 @@
-"""Path-traced pictures with Mitsuba 3: colour, and depth along the optical axis.
+"""Path tracing with Mitsuba 3: colour, and depth along the optical axis.
 
-Mitsuba's camera looks along +z with x to the LEFT and y up; ours is OpenCV's (x right, y down).
-Depth does not come from the noisy colour pass: one ray per pixel goes through the pixel's centre.
+Mitsuba's camera looks along +z with x to the left and y up; ours has OpenCV axes (x right, y down).
+Depth is exact: one ray passes through the centre of each pixel.
 """
 
 import glob
@@ -35,25 +35,25 @@ assert float(mi.TensorXf(mi.render(scene, spp=1)).array[0]) > 0
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How a picture is taken."""
+    """Settings of one rendering."""
 
     samples: int = 16
-    """Paths per pixel."""
+    """Light paths per pixel."""
     denoise: bool = True
-    """Whether Open Image Denoise removes the grain."""
+    """Apply Open Image Denoise."""
     exposure_ev: float = 0.0
-    """Brighter (> 0) or darker than the room's own exposure, in stops."""
+    """Exposure in stops relative to the default; positive is brighter."""
     noise: float = 0.0
-    """Standard deviation of sensor noise at mid grey, in parts of full scale."""
+    """Standard deviation of sensor noise at mid grey, as a fraction of full scale."""
     blur_steps: int = 1
-    """Poses that the samples are spread over while the shutter is open; 1 is no motion blur."""
+    """Poses per exposure that share the samples; 1 disables motion blur."""
 
 
 @lru_cache(maxsize=1)
 def mitsuba() -> Any:
-    """The mitsuba module with the fastest variant that works here, see `choose_variant`.
+    """Import mitsuba with the fastest working variant, see `choose_variant`.
 
-    EVERCAL_MITSUBA_VARIANT names a variant instead; EVERCAL_RENDER_THREADS limits the threads.
+    EVERCAL_MITSUBA_VARIANT overrides the variant; EVERCAL_RENDER_THREADS limits the threads.
 
     Raises:
         InputError: The extra `sim` is not installed.
@@ -76,32 +76,36 @@ def mitsuba() -> Any:
 
 @lru_cache(maxsize=1)
 def choose_variant() -> tuple[str, str]:
-    """(variant, reason). Candidates are tried in a process of their own: a bad LLVM aborts."""
-    asked = os.environ.get("EVERCAL_MITSUBA_VARIANT")
-    if asked:
-        return asked, "as EVERCAL_MITSUBA_VARIANT says"
+    """Mitsuba variant and the reason for it. A subprocess tests each one: a bad LLVM aborts."""
+    override = os.environ.get("EVERCAL_MITSUBA_VARIANT")
+    if override:
+        return override, "set by EVERCAL_MITSUBA_VARIANT"
     for library in _llvm_libraries():
         if _works("llvm_ad_rgb", library):
             os.environ["DRJIT_LIBLLVM_PATH"] = library
             return "llvm_ad_rgb", library
     if _works("cuda_ad_rgb", None):
-        return "cuda_ad_rgb", "no working LLVM, but a GPU"
+        return "cuda_ad_rgb", "GPU; no working LLVM"
     return "scalar_rgb", "slow; neither a working LLVM >= 16 nor a GPU: apt-get install libllvm19"
 
 
 def _llvm_libraries() -> list[str]:
-    """Shared libraries to try, the one the user named or the newest first."""
-    named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    if named:
-        return [named]
-    places = ("/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/lib64/libLLVM*")
-    found = {os.path.realpath(path) for place in places for path in glob.glob(place)}
+    """LLVM libraries to try: the one set by the user, else all installed, newest first."""
+    override = os.environ.get("DRJIT_LIBLLVM_PATH")
+    if override:
+        return [override]
+    patterns = (
+        "/usr/lib/*/libLLVM*.so*",
+        "/usr/lib/llvm-*/lib/libLLVM*.so*",
+        "/usr/lib64/libLLVM*",
+    )
+    paths = {os.path.realpath(path) for pattern in patterns for path in glob.glob(pattern)}
     versions = {}
-    for path in found:
+    for path in paths:
         digits = "".join(c if c.isdigit() else " " for c in os.path.basename(path)).split()
         if digits:
             versions.setdefault(int(digits[0]), path)
-    # Older ones lack opaque pointers or abort on processors with AVX-512.
+    # Older versions lack opaque pointers or abort on processors with AVX-512.
     return [versions[version] for version in sorted(versions, reverse=True) if version >= 16]
 
 
@@ -122,13 +126,13 @@ def _works(variant: str, library: str | None) -> bool:
 
 
 class Renderer:
-    """A set of meshes that can be looked at from anywhere.
+    """Renders a set of meshes from any pose.
 
     Args:
-        meshes: in the base frame; one Mitsuba mesh is made per material, as many small ones are
-            slow. A mesh with a `name` stays on its own and can be moved.
-        exposure: factor on radiance before it is encoded.
-        max_depth: longest path in segments; 4 is light, up to two surfaces on the way, eye.
+        meshes: Meshes in the base frame. Meshes of one material are merged for speed; a mesh with
+            a `name` stays separate and can be moved.
+        exposure: Factor on radiance before encoding.
+        max_depth: Longest light path in segments; 4 allows two bounces.
     """
 
     def __init__(
@@ -140,7 +144,7 @@ class Renderer:
         self._sensors: dict[Camera, tuple[Any, Any]] = {}
         scene: dict[str, Any] = {
             "type": "scene",
-            # Roulette from the first bounce on costs some noise and saves half of the time.
+            # Russian roulette from the first bounce halves the time for little noise.
             "integrator": {"type": "path", "max_depth": max_depth, "rr_depth": 1},
         }
         groups: dict[tuple[str, str], tuple[Material, list[Mesh]]] = {}
@@ -154,7 +158,7 @@ class Renderer:
         self._parameters = mi.traverse(self._scene)
 
     def move(self, moved: dict[str, Mesh]) -> None:
-        """New vertices and normals for named meshes, in the base frame."""
+        """Replace vertices and normals of named meshes, in the base frame."""
         for name, mesh in moved.items():
             for key, value in (("positions", mesh.vertices_m), ("normals", mesh.normals)):
                 old = self._parameters[f"{name}.vertex_{key}"]
@@ -170,20 +174,19 @@ class Renderer:
         options: RenderOptions | None = None,
         seed: int = 0,
     ) -> np.ndarray:
-        """Takes one picture.
+        """Render one image.
 
         Args:
-            camera: pinhole with square pixels and no distortion.
-            base_from_camera: pose (), or (n,) poses that the camera passes while the shutter is
-                open.
-            options: samples and the like.
-            seed: of the noise; same seed, same pixels on the same variant.
+            camera: Pinhole with square pixels and no distortion.
+            base_from_camera: Camera pose, shape (), or poses during the exposure, shape (n,).
+            options: Samples, exposure and noise.
+            seed: Seed of the noise. One variant gives the same pixels for the same seed.
 
         Returns:
-            (H, W, 3) uint8 RGB, sRGB-encoded.
+            sRGB image, uint8, shape (H, W, 3).
 
         Raises:
-            ValueError: A camera with distortion or with fx and fy that differ.
+            ValueError: The camera has distortion, or fx and fy differ.
         """
         options = options or RenderOptions()
         poses = list(base_from_camera) if base_from_camera.shape else [base_from_camera]
@@ -199,8 +202,8 @@ class Renderer:
             light += np.asarray(self._mi.render(self._scene, spp=share, **how))[..., :3]
             if options.denoise:
                 few = min(share, 4)
-                seen = self._mi.render(self._scene, integrator=self._features, spp=few, **how)
-                features += np.asarray(seen)[..., -6:]
+                aov = self._mi.render(self._scene, integrator=self._features, spp=few, **how)
+                features += np.asarray(aov)[..., -6:]
         if options.denoise:
             light = _denoised(light / len(poses), features / len(poses))
         else:
@@ -209,7 +212,7 @@ class Renderer:
         return _encode(radiance, options.noise, np.random.default_rng([seed, 1]))
 
     def depth(self, camera: Camera, base_from_camera: SE3) -> np.ndarray:
-        """(H, W) float32 metres along the optical axis; 0 where nothing is hit."""
+        """Depth along the optical axis, float32 metres, shape (H, W); 0 for a miss."""
         mi = self._mi
         v, u = np.mgrid[0 : camera.height, 0 : camera.width]
         rays = camera.unproject(np.stack([u, v], -1).reshape(-1, 2))
@@ -219,12 +222,12 @@ class Renderer:
         if mi.variant().startswith("scalar"):
             start = mi.Point3f(*origin.tolist())
             hits = [
-                self._scene.ray_intersect_preliminary(mi.Ray3f(start, mi.Vector3f(*way.tolist()))).t
-                for way in directions
+                self._scene.ray_intersect_preliminary(mi.Ray3f(start, mi.Vector3f(*ray.tolist()))).t
+                for ray in directions
             ]
             distance = np.array(hits, np.float64)
         else:
-            # Arrays, not constants: a constant would have the kernel compiled for every frame.
+            # Arrays: a constant would compile a new kernel for every frame.
             starts = np.broadcast_to(origin[:, None], (3, len(rays))).astype(np.float32)
             ray = mi.Ray3f(mi.Point3f(starts), mi.Vector3f(directions.T.astype(np.float32)))
             hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
@@ -233,10 +236,10 @@ class Renderer:
         return depth.reshape(camera.height, camera.width).astype(np.float32)
 
     def _sensor(self, camera: Camera) -> tuple[Any, Any]:
-        """The sensor of a camera; only its pose changes, so that kernels are compiled once."""
+        """Sensor of a camera and its parameters, cached so that kernels are compiled once."""
         if camera not in self._sensors:
             if any(camera.distortion) or abs(camera.fx - camera.fy) > 1e-6 * camera.fx:
-                raise ValueError(f"rendering takes a pinhole with fx = fy, got {camera}")
+                raise ValueError(f"rendering needs a pinhole with fx = fy, got {camera}")
             width, height = camera.width, camera.height
             sensor = self._mi.load_dict(
                 {
@@ -262,11 +265,14 @@ class Renderer:
 
 
 def _denoised(light: np.ndarray, features: np.ndarray) -> np.ndarray:
-    """(H, W, 3) radiance without the grain of few samples; textures and edges stay.
+    """Remove sampling noise; textures and edges stay.
 
     Args:
-        light: (H, W, 3) radiance.
-        features: (H, W, 6) albedo and normal of the first surface.
+        light: Radiance, shape (H, W, 3).
+        features: Albedo and normal of the first surface, shape (H, W, 6).
+
+    Returns:
+        Radiance, shape (H, W, 3).
     """
     import mitsuba_oidn as oidn  # pyright: ignore[reportMissingImports]
 
@@ -276,11 +282,11 @@ def _denoised(light: np.ndarray, features: np.ndarray) -> np.ndarray:
 
 
 def _encode(radiance: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarray:
-    """Radiance to sRGB bytes; highlights roll off instead of clipping hard."""
+    """Radiance to sRGB bytes with a soft shoulder for highlights."""
     knee = 0.7
     over = np.maximum(radiance - knee, 0.0)
     linear = np.minimum(radiance, knee) + (1 - knee) * (1 - np.exp(-over / (1 - knee)))
-    if noise > 0:  # shot noise grows with the root of the light
+    if noise > 0:  # shot noise grows with the square root of the light
         sigma = noise * np.sqrt(np.clip(linear, 0.01, 1.0) / 0.2)
         linear = linear + sigma * rng.standard_normal(linear.shape)
     linear = np.clip(linear, 0.0, 1.0)
@@ -294,7 +300,7 @@ def _mesh(mi: Any, mesh: Mesh, material: Material) -> Any:
     light = material.emitter(mi)
     if light is not None:
         properties["emitter"] = mi.load_dict(light)
-    made = mi.Mesh(
+    result = mi.Mesh(
         mesh.name or material.name,
         len(mesh.vertices_m),
         len(mesh.faces),
@@ -302,7 +308,7 @@ def _mesh(mi: Any, mesh: Mesh, material: Material) -> Any:
         has_vertex_texcoords=True,
         props=properties,
     )
-    parameters = mi.traverse(made)
+    parameters = mi.traverse(result)
     for key, value, kind in (
         ("vertex_positions", mesh.vertices_m, np.float32),
         ("vertex_normals", mesh.normals, np.float32),
@@ -312,4 +318,4 @@ def _mesh(mi: Any, mesh: Mesh, material: Material) -> Any:
         flat = np.ascontiguousarray(value, kind).ravel()
         parameters[key] = type(parameters[key])(flat)
     parameters.update()
-    return made
+    return result

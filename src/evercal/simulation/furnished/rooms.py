@@ -1,11 +1,11 @@
-"""Rooms composed from a seed: bedroom, kitchen, living room, each with a robot's table in it.
+"""Rooms composed from a seed: bedroom, kitchen or living room, each with a table for the robot.
 
-The base frame is the robot's: origin in the middle of its foot on the table top, x to the front,
-z up. A room is built with its corner at the origin and shifted at the end.
+Base frame: origin at the centre of the robot's foot on the table top, x to the front, z up. A room
+is composed with one corner at the origin and shifted at the end.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from evercal.simulation.furnished.shapes import Mesh, box, cylinder, lathe, shee
 from evercal.simulation.furnished.wall_objects import WallObjects
 
 RESERVED = 9000
-"""Seeds from here on belong to nobody's training and tuning."""
+"""Seeds from this one on are reserved for final evaluation."""
 
 FLOOR: tuple[tuple[float, float, float], ...] = (
     (0.56, 0.40, 0.26), (0.68, 0.53, 0.36), (0.42, 0.29, 0.2), (0.74, 0.62, 0.46),
@@ -27,37 +27,36 @@ WALLS: tuple[tuple[float, float, float], ...] = (
 )  # fmt: skip
 
 WALL_YAW_RAD = (0.0, np.pi / 2, np.pi, -np.pi / 2)
-"""How a thing with its back to wall 0 (y high), 1 (x low), 2 (y low) or 3 (x high) is turned, so
-that its front faces the room."""
+"""Yaw with which an item at wall 0 (high y), 1 (low x), 2 (low y) or 3 (high x) faces the room."""
 
 
 @dataclass(eq=False)
 class Room:
-    """Everything but the robot, in the base frame."""
+    """A furnished room without the robot, in the base frame."""
 
     kind: str
-    """Bedroom, kitchen or living."""
+    """One of `KINDS`."""
     seed: int
-    """What it was composed from."""
+    """Seed of the composition."""
     shell: list[tuple[Mesh, m.Material]]
     """Walls, floor, ceiling, windows and lamps."""
     items: list[Item]
-    """Furniture and small things."""
+    """Furniture and small objects."""
     low_m: np.ndarray
-    """(3,) lowest corner of the room."""
+    """Lowest corner, shape (3,)."""
     high_m: np.ndarray
-    """(3,) highest corner."""
+    """Highest corner, shape (3,)."""
 
     def boxes_m(self) -> np.ndarray:
-        """(n, 2, 3) bounding boxes of all things."""
+        """Bounding boxes of all items, shape (n, 2, 3)."""
         return np.stack([item.bounds_m() for item in self.items])
 
     def meshes(self) -> list[tuple[Mesh, m.Material]]:
-        """All surfaces."""
+        """All meshes with their materials."""
         return self.shell + [part for item in self.items for part in item.parts]
 
     def is_free(self, points_m: np.ndarray, margin_m: float = 0.12) -> np.ndarray:
-        """Whether (n, 3) points lie inside the room and outside all things, with a margin."""
+        """Whether points (n, 3) are inside the room and outside all items, with a margin."""
         inside = (points_m > self.low_m + margin_m) & (points_m < self.high_m - margin_m)
         boxes = self.boxes_m()
         low, high = boxes[:, 0] - margin_m, boxes[:, 1] + margin_m
@@ -66,7 +65,7 @@ class Room:
 
 
 class _Builder:
-    """Puts things into a room so that no two overlap."""
+    """Adds items to a room without overlap."""
 
     def __init__(self, kind: str, seed: int):
         self.rng = np.random.default_rng([seed, sum(map(ord, kind))])
@@ -78,7 +77,7 @@ class _Builder:
         self.blocked: list[tuple[Item | None, np.ndarray]] = []
 
     def add(self, item: Item, gap_m: float = 0.03, host: Item | None = None) -> bool:
-        """Keeps the item unless it would stand in another (but its host) or outside."""
+        """Add an item unless it overlaps another one (except its host) or leaves the room."""
         bounds = item.bounds_m()
         if (bounds[0, :2] < -0.01).any() or (bounds[1, :2] > self.size[:2] + 0.01).any():
             return False
@@ -92,18 +91,18 @@ class _Builder:
         return True
 
     def along_wall(self, item: Item, wall: int, at: float, z: float = 0.0) -> bool:
-        """Back to wall 0 (y high), 1 (x low), 2 (y low) or 3 (x high), `at` in 0..1 along it."""
+        """Add an item at a wall (see `WALL_YAW_RAD`), `at` in 0..1 along it."""
         x, y, _ = self.size
         bounds = item.bounds_m()
         half = (bounds[1, 0] - bounds[0, 0]) / 2 + 0.01
         length = x if wall % 2 == 0 else y
         along = half + at * (length - 2 * half)
         gap = 0.015 if z == 0.0 else 0.003
-        place = ((along, y - gap), (gap, along), (along, gap), (x - gap, along))[wall]
-        return self.add(item.placed(*place, z, WALL_YAW_RAD[wall]))
+        position = ((along, y - gap), (gap, along), (along, gap), (x - gap, along))[wall]
+        return self.add(item.placed(*position, z, WALL_YAW_RAD[wall]))
 
     def try_wall(self, make: Callable[[], Item], walls: tuple[int, ...], z: float = 0.0) -> bool:
-        """Some free place along one of the walls."""
+        """Add an item at a random free position along one of the walls."""
         item = make()
         for _ in range(30):
             wall = int(self.rng.choice(walls))
@@ -112,33 +111,33 @@ class _Builder:
         return False
 
     def scatter(self, item: Item, makes: list[Callable[[], Item]], count: int) -> None:
-        """Small things on the tops of an item."""
+        """Scatter small objects on the tops of an item."""
         for x0, x1, y0, y1, z in item.tops:
             for _ in range(count):
                 thing = makes[self.rng.integers(len(makes))]()
                 for _ in range(6):
-                    x, y = self.rng.uniform(x0, x1), self.rng.uniform(y0, y1)
-                    yaw = self.rng.uniform(0, 2 * np.pi)
-                    if self.add(
-                        thing.placed(float(x), float(y), z + 0.001, float(yaw)), 0.004, item
-                    ):
+                    x, y = float(self.rng.uniform(x0, x1)), float(self.rng.uniform(y0, y1))
+                    yaw = float(self.rng.uniform(0, 2 * np.pi))
+                    if self.add(thing.placed(x, y, z + 0.001, yaw), 0.004, item):
                         break
 
 
 def room(kind: str, seed: int) -> Room:
-    """Composes a room; the same kind and seed give the same room.
+    """Compose a room. The same kind and seed give the same room.
 
     Args:
-        kind: one of `KINDS`.
-        seed: below 9000.
+        kind: One of `KINDS`.
+        seed: A seed below 9000.
 
     Raises:
-        ValueError: An unknown kind or a reserved seed.
+        ValueError: The kind is unknown or the seed is reserved.
     """
     if kind not in KINDS:
         raise ValueError(f"room kind is one of {', '.join(KINDS)}, got {kind!r}")
     if not 0 <= seed < RESERVED:
-        raise ValueError(f"room seeds are 0 to {RESERVED - 1}; later ones are reserved, got {seed}")
+        raise ValueError(
+            f"room seeds are 0 to {RESERVED - 1}; higher ones are reserved, got {seed}"
+        )
     build = _Builder(kind, seed)
     shell = _shell(build, kind)
     base = np.array([0.46 * build.size[0], build.size[1] / 2, 0.0])
@@ -162,11 +161,11 @@ def _small_things(t: SmallObjects, kind: str) -> list[Callable[[], Item]]:
 
 
 def _robot_table(build: _Builder, base: np.ndarray) -> float:
-    """The table that the robot stands on, with tools and parts in a ring; gives its height."""
+    """Add the robot's table with small objects around the work area, and return its height."""
     height = 0.74
     table = build.shop.table(1.5, 0.95, height).placed(base[0] + 0.3, base[1] + 0.475, 0.0)
     build.add(table)
-    # The foot of the arm and the middle of the work area stay free.
+    # The foot of the arm and the centre of the work area stay free.
     foot = np.array([[base[0] - 0.2, base[1] - 0.2, height], [base[0] + 0.2, base[1] + 0.2, 2.0]])
     build.blocked.append((None, foot))
     t = build.trinkets
@@ -178,10 +177,9 @@ def _robot_table(build: _Builder, base: np.ndarray) -> float:
             x = base[0] + build.rng.uniform(-0.35, 0.98)
             y = base[1] + build.rng.uniform(-0.42, 0.42)
             near = np.hypot(x - base[0] - 0.45, y - base[1]) < 0.16
-            turned = thing.placed(
-                float(x), float(y), height + 0.001, float(build.rng.uniform(0, 6))
-            )
-            if not near and build.add(turned, 0.01, table):
+            yaw = float(build.rng.uniform(0, 6))
+            placed = thing.placed(float(x), float(y), height + 0.001, yaw)
+            if not near and build.add(placed, 0.01, table):
                 break
     return height
 
@@ -225,17 +223,11 @@ KINDS: dict[str, Callable[[_Builder], None]] = {
 
 
 def _fill_up(build: _Builder) -> None:
-    """What every room has: a door, chairs, chests, shelves, pictures, plants on the floor."""
+    """Add what every room has: a door, furniture, wall objects and plants."""
     shop, t, rng = build.shop, build.trinkets, build.rng
     build.try_wall(build.hangings.door, (3, 2))
-    for make in (
-        shop.drawers,
-        shop.chair,
-        shop.floor_lamp,
-        shop.round_table,
-        shop.chair,
-        shop.drawers,
-    ):
+    chair, drawers = shop.chair, shop.drawers
+    for make in (drawers, chair, shop.floor_lamp, shop.round_table, chair, drawers):
         build.try_wall(make, (0, 2, 3))
     build.try_wall(build.hangings.clock, (0, 1, 2), float(rng.uniform(1.75, 1.95)))
     for _ in range(3):
@@ -245,24 +237,22 @@ def _fill_up(build: _Builder) -> None:
     for make in (t.plant, t.basket, t.toy_ball, t.basket, t.plant):
         thing = _on_floor(make())
         for _ in range(20):
-            place = rng.uniform((0.25, 0.25), build.size[:2] - 0.25)
-            rim = np.minimum(place, build.size[:2] - place).min()
-            if rim < 0.9 and build.add(thing.placed(float(place[0]), float(place[1]), 0.0)):
+            spot = rng.uniform((0.25, 0.25), build.size[:2] - 0.25)
+            wall_distance = np.minimum(spot, build.size[:2] - spot).min()
+            free = wall_distance < 0.9
+            if free and build.add(thing.placed(float(spot[0]), float(spot[1]), 0.0)):
                 break
 
 
 def _on_floor(item: Item) -> Item:
-    """Twice as large for things that also stand on tables."""
+    """The item in its size for the floor: plants are larger than on tables."""
     if item.kind != "plant":
         return item
-    parts = [
-        (Mesh(2.6 * p.vertices_m, p.faces, p.normals, 2.6 * p.uv), mat) for p, mat in item.parts
-    ]
-    return Item(item.kind, parts)
+    return Item(item.kind, [(mesh.scaled(2.6), material) for mesh, material in item.parts])
 
 
 def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
-    """Walls, floor, ceiling, skirting, two windows with curtains, a ceiling lamp, a carpet."""
+    """Make walls, floor, ceiling, skirting, windows with curtains, a ceiling lamp and a carpet."""
     x, y, z = (float(side) for side in build.size)
     rng, shop = build.rng, build.shop
     tone = WALLS[rng.integers(len(WALLS))]
@@ -282,23 +272,18 @@ def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
         (_panel((x, 0, 0), (-x, 0, 0), (0, 0, z)), paint),
         (_panel((x, y, 0), (0, -y, 0), (0, 0, z)), paint),
     ]
-    for px, py, w, d in (
-        (x / 2, 0.008, x, 0.016),
-        (x / 2, y - 0.008, x, 0.016),
-        (0.008, y / 2, 0.016, y),
-        (x - 0.008, y / 2, 0.016, y),
-    ):
-        slabs.append((box(w, d, 0.08, 0.006).shifted(px, py, 0), shop.white))
+    for py in (0.008, y - 0.008):
+        slabs.append((box(x, 0.016, 0.08, 0.006).shifted(x / 2, py, 0), shop.white))
+    for px in (0.008, x - 0.008):
+        slabs.append((box(0.016, y, 0.08, 0.006).shifted(px, y / 2, 0), shop.white))
     slabs += _window(build, 0, float(rng.uniform(0.45, 0.75)))
     slabs += _window(build, 2, float(rng.uniform(0.2, 0.5)))
     slabs += _window(build, 3, float(rng.uniform(0.3, 0.7)))
     # A broad ceiling lamp keeps shadows soft and noise low.
     lamp = m.plain("lamp", (1.0, 0.95, 0.87), emission=5.0)
     slabs.append((cylinder(0.38, 0.05, 0.01, 48).shifted(0.55 * x, y / 2, z - 0.07), lamp))
-    rim = lathe([(0.38, 0), (0.4, 0), (0.4, 0.06), (0.38, 0.06)], 48, 1).shifted(
-        0.55 * x, y / 2, z - 0.06
-    )
-    slabs.append((rim, shop.steel))
+    rim = lathe([(0.38, 0), (0.4, 0), (0.4, 0.06), (0.38, 0.06)], 48, 1)
+    slabs.append((rim.shifted(0.55 * x, y / 2, z - 0.06), shop.steel))
     rug = m.carpet("carpet", tuple(rng.uniform(0.2, 0.6, 3).tolist()), rng)
     w, d = 0.62 * x, 0.55 * y
     mat = box(w, d, 0.012, 0.005, bottom=False).shifted(0.5 * x, y / 2, 0.0)
@@ -308,37 +293,32 @@ def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
 
 
 def _panel(corner: tuple, u: tuple, v: tuple) -> Mesh:
-    """A wall seen from inside whose texture coordinates are metres."""
+    """A wall that faces inwards, with texture coordinates in metres."""
     flat = sheet(corner, u, v)
-    return Mesh(
-        flat.vertices_m, flat.faces, flat.normals, flat.uv * (np.linalg.norm(u), np.linalg.norm(v))
-    )
+    return replace(flat, uv=flat.uv * (np.linalg.norm(u), np.linalg.norm(v)))
 
 
 def _window(build: _Builder, wall: int, at: float) -> list[tuple[Mesh, m.Material]]:
-    """Daylight behind bars and a sill; curtains on both sides."""
+    """Make a window with bars and a sill, and add curtains on both sides."""
     shop, rng = build.shop, build.rng
     w, h, low = float(rng.uniform(1.1, 1.5)), 1.25, 0.9
     sky = m.plain("sky", (0.86, 0.93, 1.0), emission=4.2)
     x, y, _ = build.size
     length = x if wall % 2 == 0 else y
     along = w / 2 + 0.6 + at * (length - w - 1.2)
-    place = ((along, y, 0.0), (0.0, along, 0.0), (along, 0.0, 0.0), (x, along, 0.0))[wall]
+    position = ((along, y, 0.0), (0.0, along, 0.0), (along, 0.0, 0.0), (x, along, 0.0))[wall]
     yaw = WALL_YAW_RAD[wall]
     parts = [(sheet((-w / 2, -0.012, low), (w, 0, 0), (0, 0, h)), sky)]
     for px in (-w / 2, 0.0, w / 2):
         parts.append((box(0.06, 0.07, h + 0.06, 0.012).shifted(px, -0.03, low - 0.03), shop.white))
     for pz in (low - 0.03, low + 0.62 * h, low + h):
         parts.append((box(w, 0.06, 0.05, 0.012).shifted(0, -0.03, pz), shop.white))
-    parts.append(
-        (box(w + 0.2, 0.2, 0.035, 0.014, steps=3).shifted(0, -0.1, low - 0.06), shop.white)
-    )
-    frame = Item("window", parts).placed(*place, yaw)
+    sill = box(w + 0.2, 0.2, 0.035, 0.014, steps=3).shifted(0, -0.1, low - 0.06)
+    parts.append((sill, shop.white))
+    frame = Item("window", parts).placed(*position, yaw)
     build.blocked.append((None, frame.bounds_m()))
     for side in (-1, 1):
         offset = np.array([np.cos(yaw), np.sin(yaw), 0.0]) * side * (w / 2 + 0.22)
-        spot = np.array(place) + offset
-        build.add(
-            build.hangings.curtains(0.42).placed(float(spot[0]), float(spot[1]), 0.0, yaw), -0.25
-        )
+        cx, cy, _ = (np.array(position) + offset).tolist()
+        build.add(build.hangings.curtains(0.42).placed(cx, cy, 0.0, yaw), -0.25)
     return frame.parts

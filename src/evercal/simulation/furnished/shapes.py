@@ -1,7 +1,7 @@
-"""Triangle meshes from numpy: bevelled boxes, turned profiles, bent tubes, cushions, sheets.
+"""Triangle meshes: bevelled boxes, bodies of revolution, tubes, cushions, sheets.
 
-Everything is in metres. Texture coordinates are metres along the surface too, so that a material's
-`tile_m` alone decides how large its pattern is; `sheet` runs from 0 to 1 for pictures.
+Positions and texture coordinates are in metres, so the `tile_m` of a material sets the size of its
+pattern. Only the texture coordinates of `sheet` run from 0 to 1, for pictures.
 """
 
 from collections.abc import Sequence
@@ -15,19 +15,19 @@ class Mesh:
     """Triangles with smooth normals."""
 
     vertices_m: np.ndarray
-    """(n, 3) metres."""
+    """Positions, shape (n, 3)."""
     faces: np.ndarray
-    """(m, 3) vertex numbers, counter-clockwise seen from outside."""
+    """Vertex indices, counter-clockwise from outside, shape (m, 3)."""
     normals: np.ndarray
-    """(n, 3) unit normals that point outside."""
+    """Outward unit normals, shape (n, 3)."""
     uv: np.ndarray
-    """(n, 2) texture coordinates, metres along the surface."""
+    """Texture coordinates, metres along the surface, shape (n, 2)."""
     name: str = ""
-    """Set for meshes that move on their own."""
+    """Name of a mesh that can be moved; empty for static meshes."""
 
     @classmethod
     def merged(cls, meshes: Sequence["Mesh"]) -> "Mesh":
-        """All of them as one; it bears the first one's name."""
+        """Merge meshes into one with the name of the first."""
         starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
         return cls(
             np.concatenate([mesh.vertices_m for mesh in meshes]),
@@ -38,13 +38,13 @@ class Mesh:
         )
 
     def placed(self, position_m: Sequence[float], yaw_rad: float = 0.0) -> "Mesh":
-        """Turned about z, then shifted."""
+        """The mesh rotated about z, then shifted."""
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        return self.turned(turn, position_m)
+        rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return self.rotated(rotation, position_m)
 
-    def turned(self, rotation: np.ndarray, position_m: Sequence[float] = (0, 0, 0)) -> "Mesh":
-        """Turned by a (3, 3) rotation, then shifted."""
+    def rotated(self, rotation: np.ndarray, position_m: Sequence[float] = (0, 0, 0)) -> "Mesh":
+        """The mesh rotated by a (3, 3) matrix, then shifted."""
         return replace(
             self,
             vertices_m=self.vertices_m @ rotation.T + np.asarray(position_m, float),
@@ -52,24 +52,28 @@ class Mesh:
         )
 
     def shifted(self, x: float, y: float, z: float) -> "Mesh":
-        """Moved along."""
+        """The mesh shifted by (x, y, z) metres."""
         return replace(self, vertices_m=self.vertices_m + np.array([x, y, z]))
+
+    def scaled(self, factor: float) -> "Mesh":
+        """The mesh scaled about the origin; its pattern keeps its size in metres."""
+        return replace(self, vertices_m=self.vertices_m * factor, uv=self.uv * factor)
 
 
 def about_x(angle_rad: float) -> np.ndarray:
-    """(3, 3) rotation about x."""
+    """Rotation matrix about x."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])
 
 
 def about_y(angle_rad: float) -> np.ndarray:
-    """(3, 3) rotation about y."""
+    """Rotation matrix about y."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, 0, s], [0, 1.0, 0], [-s, 0, c]])
 
 
 def _grid(points: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> Mesh:
-    """A surface from (rows, columns, 3) points; normals decide which way the triangles turn."""
+    """A surface through points (rows, columns, 3); normals define the outside."""
     rows, columns = points.shape[:2]
     number = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
@@ -86,15 +90,15 @@ def _grid(points: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> Mesh:
 def box(
     x: float, y: float, z: float, bevel_m: float = 0.006, bottom: bool = True, steps: int = 2
 ) -> Mesh:
-    """A bevelled box with its footprint's middle at the origin, standing on z = 0.
+    """A bevelled box on z = 0, centred at x = y = 0.
 
     Args:
-        x: length in metres.
-        y: depth in metres.
-        z: height in metres.
-        bevel_m: radius of the edges.
-        bottom: whether there is an underside.
-        steps: segments per bevel.
+        x: Length in metres.
+        y: Depth in metres.
+        z: Height in metres.
+        bevel_m: Radius of the edges.
+        bottom: Include the underside.
+        steps: Segments per bevel.
     """
     half = np.array([x, y, z]) / 2
     radius = min(bevel_m, 0.499 * min(x, y, z))
@@ -108,7 +112,7 @@ def box(
             lines = []
             for side in (a, b):
                 inner = half[side] - radius
-                # One step from one side's bevel to the other's: long flat faces stay two triangles.
+                # A flat face between its bevels is two triangles.
                 lines.append(np.concatenate([-inner - ring[::-1], inner + ring]))
             p = np.zeros((len(lines[0]), len(lines[1]), 3))
             p[..., axis] = sign * half[axis]
@@ -119,7 +123,7 @@ def box(
             points = core + radius * normal
             # Upright faces carry their texture upright, with v along z.
             u_axis, v_axis = (0, 1) if axis == 2 else (1 - axis, 2)
-            # u runs to the right for who looks from outside, or writing would be mirrored.
+            # Seen from outside, u runs to the right; otherwise writing would be mirrored.
             right = -sign if axis == 1 else sign
             uv = np.stack([right * points[..., u_axis], points[..., v_axis]], -1)
             meshes.append(_grid(points, normal, uv))
@@ -127,13 +131,13 @@ def box(
 
 
 def lathe(profile: Sequence[tuple[float, float]], segments: int = 28, smooth: int = 3) -> Mesh:
-    """A turned body.
+    """A body of revolution about z.
 
     Args:
-        profile: (radius, height) pairs in metres from the bottom of the outside over the rim to
-            the bottom of the inside; the outside is on the right of the way.
-        segments: around.
-        smooth: pieces each profile step is cut into by a spline; 1 keeps straight steps.
+        profile: (radius, height) pairs in metres, from the bottom of the outside over the rim to
+            the bottom of the inside. The outside is to the right of this direction.
+        segments: Number of segments around z.
+        smooth: Spline pieces per profile step; 1 keeps straight steps.
     """
     points = np.asarray(profile, float)
     if smooth > 1:
@@ -157,12 +161,12 @@ def lathe(profile: Sequence[tuple[float, float]], segments: int = 28, smooth: in
 
 
 def lampshade(*outside: tuple[float, float]) -> list[tuple[float, float]]:
-    """The profile of a thin wall, open below and above, from its outside's."""
+    """Profile of a thin wall, open below and above, from the profile of its outside."""
     return [*outside, *((radius - 0.002, height) for radius, height in reversed(outside))]
 
 
 def _spline(points: np.ndarray, pieces: int) -> np.ndarray:
-    """Catmull-Rom through (k, 2) points."""
+    """A Catmull-Rom spline through points (k, 2)."""
     padded = np.concatenate([points[:1], points, points[-1:]])
     t = np.arange(pieces)[:, None] / pieces
     parts = []
@@ -181,10 +185,10 @@ def _spline(points: np.ndarray, pieces: int) -> np.ndarray:
 
 
 def cylinder(radius: float, height: float, bevel_m: float = 0.004, segments: int = 28) -> Mesh:
-    """A turned bar with bevelled ends, standing on z = 0."""
+    """A cylinder with bevelled ends on z = 0."""
     r, b = radius, min(bevel_m, 0.45 * height, 0.45 * radius)
     k = b * (1 - np.sqrt(0.5))
-    # Doubled points keep the flat ends flat where normals are smoothed.
+    # Doubled points keep the ends flat although normals are smoothed.
     profile = [
         (0, 0), (r - b - 1e-4, 0), (r - b, 0), (r - k, k), (r, b), (r, b + 1e-4),
         (r, height - b - 1e-4), (r, height - b), (r - k, height - k), (r - b, height),
@@ -194,14 +198,14 @@ def cylinder(radius: float, height: float, bevel_m: float = 0.004, segments: int
 
 
 def ball(radius: float, squash: float = 1.0, segments: int = 24) -> Mesh:
-    """A sphere (or an ellipsoid of height `squash`) lying on z = 0."""
+    """A sphere on z = 0, scaled along z by `squash`."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 1)
     z = squash * radius * (1 + np.sin(angle))
     return lathe(list(zip(radius * np.cos(angle), z, strict=True)), segments, smooth=1)
 
 
 def tube(path: np.ndarray, radius: float, segments: int = 10) -> Mesh:
-    """A round bar along a (k, 3) path in metres."""
+    """A round bar along a path (k, 3) in metres."""
     path = np.asarray(path, float)
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
@@ -219,7 +223,7 @@ def tube(path: np.ndarray, radius: float, segments: int = 10) -> Mesh:
 
 
 def cushion(x: float, y: float, z: float, cells: int = 12) -> Mesh:
-    """A pillow lying on z = 0, thick in the middle and thin at the seam."""
+    """A pillow on z = 0, thick in the middle and thin at the seam."""
     s = np.sin(np.linspace(-np.pi / 2, np.pi / 2, cells + 1))
     u, v = np.meshgrid(s, s, indexing="ij")
     bulge = np.sqrt(np.clip((1 - u**4) * (1 - v**4), 0, 1))
@@ -234,7 +238,7 @@ def cushion(x: float, y: float, z: float, cells: int = 12) -> Mesh:
 
 
 def _normals(points: np.ndarray) -> np.ndarray:
-    """Upward unit normals of a (rows, columns, 3) height field."""
+    """Upward unit normals of a height field (rows, columns, 3)."""
     du, dv = np.gradient(points, axis=0), np.gradient(points, axis=1)
     normal = np.cross(du, dv)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -243,7 +247,7 @@ def _normals(points: np.ndarray) -> np.ndarray:
 
 
 def sheet(corner_m: Sequence[float], u_m: Sequence[float], v_m: Sequence[float]) -> Mesh:
-    """A flat rectangle with texture coordinates from 0 to 1, seen from the side of u x v."""
+    """A flat rectangle with normal u x v and texture coordinates from 0 to 1."""
     corner, u, v = (np.asarray(value, float) for value in (corner_m, u_m, v_m))
     normal = np.cross(u, v)
     normal /= np.linalg.norm(normal)
@@ -253,13 +257,13 @@ def sheet(corner_m: Sequence[float], u_m: Sequence[float], v_m: Sequence[float])
 
 
 def _both_sides(points: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> Mesh:
-    """A thin surface as two, a millimetre apart: surfaces are drawn from outside only."""
+    """A thin surface as two, 1 mm apart, because back sides are not rendered."""
     step = 5e-4 * normals
     return Mesh.merged([_grid(points + step, normals, uv), _grid(points - step, -normals, uv)])
 
 
 def drape(width: float, height: float, fold_m: float, folds: int, seed: int = 0) -> Mesh:
-    """A curtain in the plane y = 0 whose folds run in y, hanging from z = height to 0."""
+    """A curtain around the plane y = 0 with folds along y, from z = height to 0."""
     rng = np.random.default_rng(seed)
     x = np.linspace(-width / 2, width / 2, folds * 8 + 1)
     z = np.linspace(0, height, 9)
@@ -274,7 +278,7 @@ def drape(width: float, height: float, fold_m: float, folds: int, seed: int = 0)
 
 
 def leaf(length: float, width: float, droop: float, cells: int = 6) -> Mesh:
-    """A leaf that starts at the origin, grows along +x and bends down by `droop` radians."""
+    """A leaf from the origin along +x that bends down by `droop` radians."""
     t = np.linspace(0, 1, cells + 1)
     angle = 0.9 - droop * t
     step = np.stack([np.cos(angle), np.zeros_like(t), np.sin(angle)], -1) * length / cells

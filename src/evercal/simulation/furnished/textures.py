@@ -1,9 +1,8 @@
-"""Procedural pictures: the only image source that the shipped weights are made from.
+"""Procedural pictures: the only image source of the shipped weights.
 
 A picture is a "dead leaves" collage (Lee, Mumford, Huang: Occlusion models for natural images,
 IJCV 2001): shapes of power-law size painted over each other, each filled with 1/f noise, stripes,
-checks, a plain tone or text. It has what features need to learn from: edges, corners, blobs and
-flat parts at every scale.
+checks, a plain tone or text. It has edges, corners, blobs and flat parts at every scale.
 """
 
 from collections.abc import Callable
@@ -18,12 +17,12 @@ def one_over_f(size: int, exponent: float, rng: np.random.Generator) -> np.ndarr
     """Noise whose amplitude falls with frequency as 1/f^exponent.
 
     Args:
-        size: side in pixels.
-        exponent: 1 looks like natural images, 0 is white noise.
-        rng: source of randomness.
+        size: Side in pixels.
+        exponent: 1 resembles natural images, 0 is white noise.
+        rng: Random generator.
 
     Returns:
-        (size, size) float32 with mean 0 and standard deviation 1; it tiles.
+        Tiling noise of mean 0 and standard deviation 1, float32, shape (size, size).
     """
     frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :])
     frequency[0, 0] = 1.0
@@ -35,7 +34,7 @@ def one_over_f(size: int, exponent: float, rng: np.random.Generator) -> np.ndarr
 
 @lru_cache(maxsize=1)
 def _noise_bank() -> list[np.ndarray]:
-    # Drawing a fresh FFT noise for each of 200 leaves would cost more than the rest of the picture.
+    # New FFT noise for each of 200 leaves would cost more than the rest of the picture.
     rng = np.random.default_rng(20_01)
     return [one_over_f(256, exponent, rng) for exponent in np.linspace(0.9, 2.0, 16)]
 
@@ -103,22 +102,22 @@ def _leaf_mask(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
 def dead_leaves(
     height: int, width: int, rng: np.random.Generator, leaves: int | None = None
 ) -> np.ndarray:
-    """One dead-leaves picture.
+    """Draw a dead-leaves picture.
 
     Args:
-        height: rows in pixels.
-        width: columns in pixels.
-        rng: source of randomness; the same generator state gives the same pixels.
-        leaves: how many shapes; drawn when None. Few shapes give a calm picture.
+        height: Rows in pixels.
+        width: Columns in pixels.
+        rng: Random generator; the same state gives the same pixels.
+        leaves: Number of shapes, random if omitted. Few shapes give a calm picture.
 
     Returns:
-        (height, width, 3) uint8 RGB.
+        RGB picture, uint8, shape (height, width, 3).
     """
     tint = rng.uniform(0.2, 0.8, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(0.2, 0.8))
     picture = np.empty((height, width, 3), np.float32)
     picture[:] = tint + _noise_fill(height, width, rng)[..., None]
     count = int(rng.integers(20, 220)) if leaves is None else leaves
-    # Power-law sizes, the largest first, so that small leaves are not buried.
+    # Power-law sizes. The largest are painted first, so small leaves stay visible.
     low, high = 10.0, 0.6 * min(height, width)
     u = rng.random(count)
     sizes = np.sort(1.0 / (u / low + (1 - u) / high))[::-1]

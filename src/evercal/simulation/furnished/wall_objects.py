@@ -1,4 +1,4 @@
-"""Things on walls: cupboards, shelves, pictures, clocks, curtains, doors; back at y = 0."""
+"""Wall objects: cupboards, shelves, pictures, clocks, curtains, doors; back at y = 0."""
 
 import numpy as np
 
@@ -8,23 +8,25 @@ from evercal.simulation.furnished.shapes import Mesh, about_x, ball, box, drape,
 
 
 class WallObjects:
-    """Makes what hangs on walls from the materials of a workshop."""
+    """Makes wall objects from the materials of the room's furniture."""
 
     def __init__(self, shop: FurnitureBuilder):
         self.shop = shop
         self.rng = shop.rng
 
     def cupboard(self, w: float = 1.2) -> Item:
-        """A wall cupboard with two doors and knobs; hangs."""
+        """A wall cupboard with two doors and knobs."""
         shop = self.shop
         parts = [(box(w, 0.32, 0.65, 0.006).shifted(0, -0.16, 0), shop.paint)]
         for x, knob in ((-w / 4, -0.06), (w / 4, 0.06)):
             parts.append((box(w / 2 - 0.01, 0.02, 0.63, 0.008).shifted(x, -0.33, 0.01), shop.paint))
-            parts.append((ball(0.014).turned(about_x(np.pi / 2), (knob, -0.335, 0.08)), shop.steel))
+            parts.append(
+                (ball(0.014).rotated(about_x(np.pi / 2), (knob, -0.335, 0.08)), shop.steel)
+            )
         return Item("cupboard", parts)
 
     def wall_shelf(self) -> Item:
-        """A board on two bent brackets; hangs."""
+        """A board on two curved brackets."""
         shop = self.shop
         w = float(self.rng.uniform(0.7, 1.2))
         parts = [(box(w, 0.24, 0.028, 0.01, steps=3).shifted(0, -0.12, 0), shop.wood())]
@@ -37,7 +39,7 @@ class WallObjects:
         return Item("wall shelf", parts, [(-w / 2 + 0.04, w / 2 - 0.04, -0.21, -0.03, 0.028)])
 
     def picture(self) -> Item:
-        """A framed picture; hangs."""
+        """A framed picture."""
         shop = self.shop
         w, h = self.rng.uniform(0.35, 0.85), self.rng.uniform(0.3, 0.65)
         frame = shop.dark if self.rng.random() < 0.4 else shop.wood()
@@ -49,7 +51,7 @@ class WallObjects:
         return Item("picture", parts)
 
     def clock(self) -> Item:
-        """A round wall clock; hangs."""
+        """A round wall clock."""
         shop = self.shop
         r = float(self.rng.uniform(0.13, 0.18))
         rim = lathe(
@@ -64,13 +66,13 @@ class WallObjects:
         points = np.concatenate([points, [[0, 0, 0]]])
         face = Mesh(points, fan, np.tile([0.0, 0, 1], (37, 1)), uv)
         parts = [
-            (rim.turned(up, (0, 0, r)), shop.dark),
-            (face.turned(up, (0, -0.012, r)), m.clock_face("clock")),
+            (rim.rotated(up, (0, 0, r)), shop.dark),
+            (face.rotated(up, (0, -0.012, r)), m.clock_face("clock")),
         ]
         return Item("clock", parts)
 
     def curtains(self, w: float = 0.5) -> Item:
-        """One length of cloth on a rod; hangs from 2.2 m."""
+        """A curtain on a rod at a height of 2.2 m."""
         shop = self.shop
         cloth = shop.cloths[1]
         parts = [

@@ -18,7 +18,7 @@ from ..bags_of_messages import (
     Bag,
     arm,
     picture,
-    recording,
+    recorded_bag,
     refusal,
     refusal_of,
     shoulder_from_tool,
@@ -31,39 +31,42 @@ TURNING = (
 )
 
 
-def test_frames_may_be_chosen_and_the_camera_be_one(tmp_path: Path) -> None:
-    path = recording("mcap").write(tmp_path)
+def test_frames_can_be_chosen(tmp_path: Path) -> None:
+    path = recorded_bag("mcap").write(tmp_path)
     options = ReadOptions(base_frame="/shoulder", gripper_frame="camera_optical")
-    scene = load_recording(path, options=options)
-    for frame, at in zip(scene.train, SHOTS, strict=False):
+    recording = load_recording(path, options=options)
+    for frame, at in zip(recording.train, SHOTS, strict=False):
         assert frame.base_from_gripper is None
         assert frame.base_from_camera is not None
         expected = shoulder_from_tool(at) @ TOOL_FROM_OPTICAL
         assert max(pose_distance(frame.base_from_camera, expected)) < 1e-7
     # The other way round, through the shared ancestor of two side branches.
     options = ReadOptions(base_frame="camera_optical", gripper_frame="world")
-    turned = load_recording(path, options=options).train[0].base_from_gripper
+    optical_from_world = load_recording(path, options=options).train[0].base_from_gripper
     world_from_base = SE3.exp([9.0, 9.0, 9.0, 1.0, 0.0, 0.0])
     base_from_optical = BASE_FROM_SHOULDER @ shoulder_from_tool(0) @ TOOL_FROM_OPTICAL
-    assert turned is not None
-    assert max(pose_distance(turned, (world_from_base @ base_from_optical).inverse())) < 1e-7
+    assert optical_from_world is not None
+    assert (
+        max(pose_distance(optical_from_world, (world_from_base @ base_from_optical).inverse()))
+        < 1e-7
+    )
 
 
-def test_stop_and_go_needs_no_dense_tf(tmp_path: Path) -> None:
+def test_poses_of_a_still_arm_cover_long_gaps(tmp_path: Path) -> None:
     bag = Bag("sqlite3")
     bag.tf(0.0, "base_link", "shoulder", BASE_FROM_SHOULDER, static=True)
     # Stands for 3 s at two places; on the way nothing is recorded.
-    for at, place in ((0.0, 0.1), (3.0, 0.1), (6.0, 0.9), (9.0, 0.9)):
-        bag.tf(at, "shoulder", "tool0", shoulder_from_tool(place))
+    for at, progress in ((0.0, 0.1), (3.0, 0.1), (6.0, 0.9), (9.0, 0.9)):
+        bag.tf(at, "shoulder", "tool0", shoulder_from_tool(progress))
     for at in (1.0, 4.5, 7.0):
         bag.image(at, "/cam/image_raw", picture(0))
     bag.info("/cam/camera_info")
-    scene = load_recording(bag.write(tmp_path))
-    assert [frame.name for frame in scene.train] == ["000000", "000002"]
-    assert scene.untracked == 1
+    recording = load_recording(bag.write(tmp_path))
+    assert [frame.name for frame in recording.train] == ["000000", "000002"]
+    assert recording.untracked == 1
 
 
-def test_joint_states_and_a_urdf_do_without_tf(tmp_path: Path) -> None:
+def test_joint_states_with_a_urdf_replace_tf(tmp_path: Path) -> None:
     pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(TURNING)
@@ -74,9 +77,9 @@ def test_joint_states_and_a_urdf_do_without_tf(tmp_path: Path) -> None:
         bag.image(at, "/cam/image_raw", picture(0))
     bag.info("/cam/camera_info")
     path = bag.write(tmp_path)
-    scene = load_recording(path, options=ReadOptions(urdf=urdf))
-    assert scene.untracked == 1
-    for frame, at in zip(scene.train, (0.25, 1.99), strict=True):
+    recording = load_recording(path, options=ReadOptions(urdf=urdf))
+    assert recording.untracked == 1
+    for frame, at in zip(recording.train, (0.25, 1.99), strict=True):
         assert frame.base_from_gripper is not None
         expected = SE3.exp([1, 0, 0, 0, 0, 0]) @ SE3.exp([0, 0, 0, 0, 0, at])
         assert max(pose_distance(frame.base_from_gripper, expected)) < 1e-7
@@ -87,7 +90,7 @@ def test_joint_states_and_a_urdf_do_without_tf(tmp_path: Path) -> None:
         load_recording(path, options=ReadOptions(urdf=urdf))
 
 
-def test_a_joint_on_several_topics_is_asked_for(tmp_path: Path) -> None:
+def test_joint_on_several_topics_needs_a_pose_topic(tmp_path: Path) -> None:
     pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(TURNING)
@@ -99,43 +102,43 @@ def test_a_joint_on_several_topics_is_asked_for(tmp_path: Path) -> None:
     bag.image(1.0, "/cam/image_raw", picture(0))
     bag.info("/cam/camera_info")
     assert (
-        "joint turn is on several topics, /joint_states, /joint_states_desired; name the one that"
-        " holds with --pose-topic"
+        "joint turn is on several topics, /joint_states, /joint_states_desired; choose one with"
+        " --pose-topic"
     ) in refusal(bag, tmp_path, urdf=urdf)
     path = tmp_path / "wave"
-    scene = load_recording(path, options=ReadOptions(urdf=urdf, pose_topic="/joint_states"))
-    pose = scene.train[0].base_from_gripper
+    recording = load_recording(path, options=ReadOptions(urdf=urdf, pose_topic="/joint_states"))
+    pose = recording.train[0].base_from_gripper
     assert pose is not None
     assert max(pose_distance(pose, SE3.exp([1, 0, 0, 0, 0, 0]) @ SE3.exp([0] * 5 + [1.0]))) < 1e-7
     with pytest.raises(InputError, match="no joint states on --pose-topic /tf; it is on /hand/"):
         load_recording(path, options=ReadOptions(urdf=urdf, pose_topic="/tf"))
 
 
-def test_a_frame_that_several_topics_place_is_asked_for(tmp_path: Path) -> None:
-    bag = recording("mcap")
+def test_frame_on_several_topics_needs_a_pose_topic(tmp_path: Path) -> None:
+    bag = recorded_bag("mcap")
     bag.tf(0.0, "base_link", "shoulder", BASE_FROM_SHOULDER, static=True, robot="/left")  # agrees
     bag.tf(0.0, "tool0", "finger", SE3.identity(), static=True)
     bag.tf(0.0, "tool0", "finger", SE3.exp([1, 0, 0, 0, 0, 0]), static=True, robot="/left")
     (tmp_path / "static").mkdir()
     assert len(load_recording(bag.write(tmp_path / "static")).train) == 6
-    said = "tf tool0 -> finger is on several topics, /left/tf, /tf; name the one"
-    assert said in refusal_of(tmp_path / "static/wave", gripper_frame="finger")
+    expected_message = "tf tool0 -> finger is on several topics, /left/tf, /tf; choose one"
+    assert expected_message in refusal_of(tmp_path / "static/wave", gripper_frame="finger")
     for i in range(51):
         bag.tf(i / 25, "shoulder", "tool0", shoulder_from_tool(i / 25 + 0.3), robot="/left")
     (tmp_path / "moving").mkdir()
-    said = "tf shoulder -> tool0 is on several topics, /left/tf, /tf; name the one"
-    assert said in refusal(bag, tmp_path / "moving")
+    expected_message = "tf shoulder -> tool0 is on several topics, /left/tf, /tf; choose one"
+    assert expected_message in refusal(bag, tmp_path / "moving")
     for topic, late in (("/tf", 0.0), ("/left/tf", 0.3)):
-        scene = load_recording(tmp_path / "moving/wave", options=ReadOptions(pose_topic=topic))
-        pose = scene.train[0].base_from_gripper
+        recording = load_recording(tmp_path / "moving/wave", options=ReadOptions(pose_topic=topic))
+        pose = recording.train[0].base_from_gripper
         assert pose is not None
         assert max(pose_distance(pose, BASE_FROM_SHOULDER @ shoulder_from_tool(late))) < 1e-7
-    said = "no tf on --pose-topic /right/tf; it is on /left/tf, /tf"
-    assert said in refusal_of(tmp_path / "moving/wave", pose_topic="/right/tf")
+    expected_message = "no tf on --pose-topic /right/tf; it is on /left/tf, /tf"
+    assert expected_message in refusal_of(tmp_path / "moving/wave", pose_topic="/right/tf")
 
 
-def test_frames_that_cannot_be_guessed_are_asked_for(tmp_path: Path) -> None:
-    bag = recording("mcap")
+def test_ambiguous_frames_are_refused(tmp_path: Path) -> None:
+    bag = recorded_bag("mcap")
     path = bag.write(tmp_path)
     for options, message in (
         (
@@ -154,32 +157,32 @@ def test_frames_that_cannot_be_guessed_are_asked_for(tmp_path: Path) -> None:
     odd.tf(0.0, "map", "phone", SE3.identity())
     odd.image(0.0, "/cam/image_raw", picture(0))
     odd.info("/cam/camera_info")
-    assert "--base-frame (none has a usual name); tf has map, phone" in refusal(
+    assert "--base-frame (no frame has a usual name); tf has map, phone" in refusal(
         odd, tmp_path / "odd"
     )
 
 
-def test_broken_trees_of_frames_are_named(tmp_path: Path) -> None:
+def test_broken_trees_of_frames_are_refused(tmp_path: Path) -> None:
     for name, parent, child, message in (
         ("apart", "elsewhere", "flange", "tf has no chain between 'base_link' and 'flange'"),
-        ("circle", "camera_optical", "world", "tf goes in a circle"),
+        ("circle", "camera_optical", "world", "tf has a cycle"),
         ("two", "world", "tool0", "tf frame 'tool0' has several parents, shoulder, world"),
     ):
-        bag = recording("mcap")
+        bag = recorded_bag("mcap")
         bag.tf(0.1, parent, child, SE3.identity())
         (tmp_path / name).mkdir()
         gripper = "flange" if name == "apart" else "tool0"
         assert message in refusal(bag, tmp_path / name, gripper_frame=gripper)
-    bag = recording("mcap")
+    bag = recorded_bag("mcap")
     nothing = bag.messages[0][3].transforms[0]
     zero = bag.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=0.0)
     transform = dataclasses.replace(nothing.transform, rotation=zero)
     bag.messages[0][3].transforms[0] = dataclasses.replace(nothing, transform=transform)
     (tmp_path / "zero").mkdir()
-    assert "no rigid transform; mend what publishes it" in refusal(bag, tmp_path / "zero")
+    assert "no rigid transform; repair the program" in refusal(bag, tmp_path / "zero")
 
 
-def test_clocks_that_differ_are_named(tmp_path: Path) -> None:
+def test_images_of_another_clock_are_refused(tmp_path: Path) -> None:
     bag = arm(Bag("mcap"))
     bag.image(3600.0, "/cam/image_raw", picture(0))
     bag.info("/cam/camera_info")

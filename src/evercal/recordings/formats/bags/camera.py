@@ -1,4 +1,4 @@
-"""The intrinsics that belong to an image topic of a bag."""
+"""The intrinsics of an image topic of a bag."""
 
 from typing import Any
 
@@ -11,18 +11,19 @@ from evercal.recordings.poses.camera_file import camera_from_ros
 
 
 def bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
-    """The first camera_info beside an image topic; that of another topic is another camera's.
+    """Read the first camera_info beside an image topic.
 
     Args:
-        bag: open.
+        bag: Open bag.
         image_topic: `/camera/image_raw` or `/camera/image_raw/compressed`, whose camera_info is
             `/camera/camera_info`.
 
     Returns:
-        Its topic and the camera: K and D, or P without a lens where the image is rectified.
+        Topic of the camera_info, and the camera: P without distortion for rectified images, else
+        K and D.
 
     Raises:
-        InputError: None, uncalibrated, or a lens that is not supported.
+        InputError: There is no camera_info, it is uncalibrated, or its model is not supported.
     """
     topics = bag.topics(CAMERA_INFO)
     image = image_topic.removesuffix("/compressed")
@@ -47,20 +48,11 @@ def _camera(message: Any, rectified: bool) -> Camera:
     )
     if not any(k):
         raise ValueError("K is all zeros: the camera is not calibrated; give --camera")
+    data = {"k": k, "d": d, "distortion_model": message.distortion_model}
     if rectified:
         if len(p) != 12 or not any(p):
             raise ValueError("P is missing, which rectified images need; give --camera")
-        matrix, d, model = [*p[:3], *p[4:7], *p[8:11]], [], ""
-    else:
-        matrix, model = k, message.distortion_model
-    roi = message.roi
-    return camera_from_ros(
-        {
-            "width": int(message.width),
-            "height": int(message.height),
-            "k": matrix,
-            "d": d,
-            "distortion_model": model,
-            "roi": {"x_offset": int(roi.x_offset), "y_offset": int(roi.y_offset)},
-        }
-    )
+        data = {"k": [*p[:3], *p[4:7], *p[8:11]], "d": [], "distortion_model": ""}
+    offsets = {name: int(getattr(message.roi, name)) for name in ("x_offset", "y_offset")}
+    size = {"width": int(message.width), "height": int(message.height)}
+    return camera_from_ros({**data, **size, "roi": offsets})

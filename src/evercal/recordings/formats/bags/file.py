@@ -1,4 +1,4 @@
-"""An open ROS 1 or ROS 2 bag or MCAP file, read by rosbags (extra `bags`); no ROS is needed."""
+"""ROS 1 and ROS 2 bags and MCAP files, opened by rosbags (extra `bags`) without ROS."""
 
 import threading
 import weakref
@@ -17,22 +17,24 @@ TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 @dataclass(frozen=True)
 class Message:
-    """One message and where it stands."""
+    """One message of a bag."""
 
     topic: str
-    """Where it was sent."""
+    """Topic name."""
     kind: str
-    """Its type, such as sensor_msgs/msg/Image."""
+    """Type, such as sensor_msgs/msg/Image."""
     logged_ns: int
-    """When it was recorded."""
+    """Time of recording, nanoseconds."""
     repeat: int
-    """How many messages of the topic with the same time came before it."""
+    """Number of earlier messages of the topic with the same time of recording."""
     content: Any
-    """As rosbags decodes it."""
+    """Fields as rosbags decodes them."""
 
 
 class BagFile:
-    """A bag that is open until nothing refers to it; threads may share it.
+    """A bag that stays open until nothing refers to it.
+
+    Threads may share it, and messages may be read while others are iterated.
 
     Args:
         path: A `.bag`, `.mcap` or `.db3` file, or a folder of a ROS 2 bag or of parts of a bag.
@@ -50,15 +52,15 @@ class BagFile:
             raise InputError(
                 f"{path}: reading bags needs rosbags; run: pip install 'evercal[bags]'"
             ) from None
-        # Bags of ROS 2 before Iron hold no definitions; those of the types read here never changed.
+        # Bags of ROS 2 before Iron lack type definitions; the types read here never changed.
         types = get_typestore(Stores.ROS2_HUMBLE)
         try:
             self._reader = AnyReader(_parts(path), default_typestore=types)
             self._reader.open()
         except InputError:
             raise
-        except Exception as error:  # damaged bags make rosbags raise many kinds
-            raise InputError(f"{path}: rosbags cannot read it: {_hint(error)}") from None
+        except Exception as error:  # damaged bags make rosbags raise many types
+            raise InputError(f"{path}: rosbags cannot read it: {_reason(error)}") from None
         weakref.finalize(self, self._reader.close)
         self._lock = threading.Lock()
         self.kinds: dict[str, str] = {}
@@ -72,46 +74,62 @@ class BagFile:
         return sorted(t for t, kind in self.kinds.items() if kind in kinds and self.counts[t])
 
     def contents(self) -> str:
-        """What is in it, for messages."""
+        """List of the topics, for messages."""
         words = [f"{t} ({kind.replace('/msg', '')})" for t, kind in sorted(self.kinds.items())]
         more = f" and {len(words) - 30} more" if len(words) > 30 else ""
         return (", ".join(words[:30]) or "nothing") + more
 
-    def messages(
-        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
-    ) -> Iterator[Message]:
-        """Messages in recorded order, from `start_ns` to before `stop_ns`.
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """Iterate over the messages of some topics in recorded order.
 
         Raises:
-            InputError: Broken data.
+            InputError: The bag is damaged.
         """
+        messages = self._messages(topics)
+        while True:
+            # The lock is free between two messages, so that the caller may read others.
+            with self._lock:
+                message = next(messages, None)
+            if message is None:
+                return
+            yield message
+
+    def message(self, topic: str, logged_ns: int, repeat: int) -> Message:
+        """Read one message.
+
+        Raises:
+            InputError: The bag is damaged or has changed.
+        """
+        with self._lock:
+            for message in self._messages([topic], logged_ns, logged_ns + 1):
+                if message.repeat == repeat:
+                    return message
+        raise InputError(
+            f"{self.path}: message of {topic} at {logged_ns} ns is gone; load the bag again"
+        )
+
+    def _messages(
+        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[Message]:
+        """Messages from `start_ns` to before `stop_ns`; the caller holds the lock."""
         links = [link for link in self._reader.connections if link.topic in topics]
         if not links:
             return
         last: dict[str, tuple[int, int]] = {}
-        with self._lock:
-            try:
-                for link, stamp, data in self._reader.messages(links, start_ns, stop_ns):
-                    before, repeat = last.get(link.topic, (None, -1))
-                    repeat = repeat + 1 if before == stamp else 0
-                    last[link.topic] = (stamp, repeat)
-                    content = self._reader.deserialize(data, link.msgtype)
-                    yield Message(link.topic, link.msgtype, stamp, repeat, content)
-            except InputError:
-                raise
-            except Exception as error:  # whatever a damaged bag makes of its decoders
-                raise InputError(f"{self.path}: damaged: {_hint(error)}") from None
+        try:
+            for link, stamp, data in self._reader.messages(links, start_ns, stop_ns):
+                before, repeat = last.get(link.topic, (None, -1))
+                repeat = repeat + 1 if before == stamp else 0
+                last[link.topic] = (stamp, repeat)
+                content = self._reader.deserialize(data, link.msgtype)
+                yield Message(link.topic, link.msgtype, stamp, repeat, content)
+        except Exception as error:  # damaged bags make rosbags raise many types
+            raise InputError(f"{self.path}: damaged: {_reason(error)}") from None
 
-    def message(self, topic: str, logged_ns: int, repeat: int) -> Message:
-        """One message again.
 
-        Raises:
-            InputError: It is not there any more.
-        """
-        for found in self.messages([topic], logged_ns, logged_ns + 1):
-            if found.repeat == repeat:
-                return found
-        raise InputError(f"{self.path}: message of {topic} at {logged_ns} ns is gone; read it anew")
+def stamp_ns(stamp: Any) -> int:
+    """Nanoseconds of a ROS time; 0 if it is not set."""
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
 def is_bag(path: Path) -> bool:
@@ -136,7 +154,7 @@ def _bags_in(folder: Path) -> list[Path]:
 
 
 def _parts(path: Path) -> list[Path]:
-    """The files to open: a ROS 2 folder as it is, else its bags, all of one kind."""
+    """Paths to open: a ROS 2 folder as a whole, else its bag files, all of one kind."""
     if path.is_file() or _is_ros2_folder(path):
         return [path]
     parts = _bags_in(path)
@@ -146,10 +164,10 @@ def _parts(path: Path) -> list[Path]:
     return parts
 
 
-def _hint(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     text = " ".join(str(error).split())[:200] or type(error).__name__
     if "not indexed" in text:
-        return f"{text}; mend it with 'rosbag reindex'"
+        return f"{text}; repair it with 'rosbag reindex'"
     if "Profile is not ros2" in text:
         return "its messages are not ROS 2's; convert it, or record with ros2 bag"
     return text

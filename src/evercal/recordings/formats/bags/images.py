@@ -1,7 +1,8 @@
-"""Pixels of ROS's Image and CompressedImage messages.
+"""Pixels of ROS Image and CompressedImage messages.
 
-Bayer patterns are named by their first two pixels in ROS and by the second row in OpenCV, so that
-`bayer_rggb8` is OpenCV's BayerBG.
+ROS names a Bayer pattern by its first two pixels and OpenCV by its second row, so `bayer_rggb8` is
+OpenCV's BayerBG. The package rosbags-image is not used: it ignores the padding of rows (`step`) and
+truncates 16-bit values.
 """
 
 from typing import Any
@@ -9,21 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.recordings.images import decode_image
+from evercal.recordings.images import as_rgb, decode_image
 
-# Encoding: bytes of a channel, channels, OpenCV's constant COLOR_... that makes it RGB.
+# Encoding: bytes of a channel, channels, and OpenCV's COLOR_... constant if `as_rgb` needs it.
 _ENCODINGS: dict[str, tuple[int, int, str | None]] = {
     "rgb8": (1, 3, None),
     "bgr8": (1, 3, "BGR2RGB"),
     "8UC3": (1, 3, "BGR2RGB"),
-    "rgba8": (1, 4, "RGBA2RGB"),
+    "rgba8": (1, 4, None),
     "bgra8": (1, 4, "BGRA2RGB"),
     "8UC4": (1, 4, "BGRA2RGB"),
-    "mono8": (1, 1, "GRAY2RGB"),
-    "8UC1": (1, 1, "GRAY2RGB"),
+    "mono8": (1, 1, None),
+    "8UC1": (1, 1, None),
     "rgb16": (2, 3, None),
     "bgr16": (2, 3, "BGR2RGB"),
-    "mono16": (2, 1, "GRAY2RGB"),
+    "mono16": (2, 1, None),
     "bayer_rggb8": (1, 1, "BayerBG2RGB"),
     "bayer_bggr8": (1, 1, "BayerRG2RGB"),
     "bayer_gbrg8": (1, 1, "BayerGR2RGB"),
@@ -35,8 +36,8 @@ _ENCODINGS: dict[str, tuple[int, int, str | None]] = {
 }
 
 
-def refused(encoding: str) -> str | None:
-    """Why an encoding of Image messages cannot be read; None if it can."""
+def unsupported(encoding: str) -> str | None:
+    """Reason why images of an encoding cannot be read, or None if they can."""
     if encoding in _ENCODINGS:
         return None
     if encoding.startswith(("16UC", "32FC", "64FC", "16SC", "32SC")):
@@ -45,53 +46,49 @@ def refused(encoding: str) -> str | None:
 
 
 def image_of(message: Any) -> NDArray[np.uint8]:
-    """The picture in a sensor_msgs/Image.
-
-    Sixteen bits become eight by division, as cv_bridge does it.
+    """Decode a sensor_msgs/Image.
 
     Returns:
-        (H, W, 3) uint8 RGB.
+        (H, W, 3) uint8 RGB, 16-bit values converted as by `as_rgb`.
 
     Raises:
-        ValueError: An encoding that cannot be read, or less data than its size needs.
+        ValueError: The encoding is not supported, or there is less data than the size needs.
     """
     import cv2
 
-    reason = refused(message.encoding)
+    reason = unsupported(message.encoding)
     if reason is not None:
         raise ValueError(reason)
-    size, channels, colour = _ENCODINGS[message.encoding]
+    size, channels, conversion = _ENCODINGS[message.encoding]
     height, width, step = int(message.height), int(message.width), int(message.step)
     line = width * channels * size
     data = np.asarray(message.data, dtype=np.uint8).reshape(-1)
-    if step < line or data.size < height * step or not line:
+    if step < line or data.size < height * step or not line * height:
         raise ValueError(
             f"{width}x{height} {message.encoding} with rows of {step} bytes, but {data.size} bytes"
         )
     # Rows may be padded.
-    rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :line])
+    pixels = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :line])
     if size == 2:
-        rows = rows.view(">u2" if message.is_bigendian else "<u2")
-        rows = (rows.astype(np.float64) / 257).round().astype(np.uint8)
-    pixels = rows.reshape(height, width, channels) if channels > 1 else rows
-    if colour is not None:
-        pixels = cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{colour}"))
-    return np.ascontiguousarray(pixels, dtype=np.uint8)
+        pixels = pixels.view(">u2" if message.is_bigendian else "<u2").astype(np.uint16)
+    pixels = pixels.reshape(height, width, channels)
+    if conversion is not None:
+        pixels = cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}"))
+    return as_rgb(pixels)
 
 
 def compressed_image_of(message: Any) -> NDArray[np.uint8]:
-    """The picture in a sensor_msgs/CompressedImage with a PNG or JPEG in it.
+    """Decode a sensor_msgs/CompressedImage with a PNG or JPEG.
 
     Returns:
         (H, W, 3) uint8 RGB.
 
     Raises:
-        ValueError: Another format, a depth image, or broken data.
+        ValueError: The image has another format, holds depth, or is broken.
     """
-    data = np.asarray(message.data, dtype=np.uint8)
     if "compressedDepth" in message.format:
         raise ValueError(f"format {message.format!r} holds depth, no picture")
-    image = decode_image(data)
+    image = decode_image(np.asarray(message.data, dtype=np.uint8))
     if image is None:
         raise ValueError(f"format {message.format!r} is not supported or broken; use jpeg or png")
     return image

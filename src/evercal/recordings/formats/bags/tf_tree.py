@@ -1,4 +1,4 @@
-"""The transforms of ROS's /tf and /tf_static, and the chain of them between two frames."""
+"""The tree of transforms of ROS's /tf and /tf_static."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from evercal.recordings.poses.pose_track import PoseTrack
 
 @dataclass
 class _Edge:
-    """One child frame in its parent."""
+    """Transforms of one child frame in its parent, from one topic."""
 
     parent: str
     static: bool
@@ -21,171 +21,170 @@ class _Edge:
     quaternions: list[tuple[float, ...]] = field(default_factory=list)
     translations: list[tuple[float, ...]] = field(default_factory=list)
 
-    def same(self, other: "_Edge") -> bool:
-        """Whether two static ones place the frame alike."""
+    def equals(self, other: "_Edge") -> bool:
+        """Whether two static transforms are equal."""
         return np.allclose(
             self.translations[-1], other.translations[-1], atol=1e-6
         ) and np.allclose(self.quaternions[-1], other.quaternions[-1], atol=1e-6)
 
 
 class TfTree:
-    """What was said about frames, in any order.
+    """Transforms of a recording, added in any order.
 
     Args:
-        where: The recording, for the messages.
-        topic: That holds where several topics place one frame; None to refuse that.
+        source: The recording, for messages.
+        topic: Topic to use if several topics move one frame. If omitted, this is refused.
     """
 
-    def __init__(self, where: str, topic: str | None = None) -> None:
-        self._where, self._topic = where, topic
+    def __init__(self, source: str, topic: str | None = None) -> None:
+        self._source, self._topic = source, topic
         self._edges: dict[str, dict[str, _Edge]] = {}
         """By child and topic."""
-        self._two_parents: dict[str, set[str]] = {}
+        self._parents: dict[str, set[str]] = {}
+        """Parents of every child that has several on one topic."""
 
     def add(
         self,
         parent: str,
         child: str,
         stamp_s: float | None,
-        translation_m: tuple[float, ...],
-        rotation_wxyz: tuple[float, ...],
+        parent_from_child: tuple[tuple[float, ...], tuple[float, ...]],
         topic: str,
     ) -> None:
-        """Takes one TransformStamped.
+        """Add one TransformStamped.
 
         Args:
             parent: header.frame_id.
             child: child_frame_id.
-            stamp_s: when, seconds; None where it holds at all times (/tf_static).
-            translation_m: x, y, z.
-            rotation_wxyz: unit quaternion.
-            topic: That it came on; /tf_static goes with /tf.
+            stamp_s: Time in seconds, or None for a static transform.
+            parent_from_child: Unit quaternion wxyz, and translation in metres.
+            topic: Topic of the message; /tf_static belongs to /tf.
 
         Raises:
-            InputError: A quaternion that is none, or numbers that are not finite.
+            InputError: The numbers are no rigid transform.
         """
-        parent, child = plain(parent), plain(child)
-        length = float(np.linalg.norm(rotation_wxyz))
-        if not (abs(length - 1) < 1e-2 and np.isfinite(translation_m).all()):
+        parent, child = plain_name(parent), plain_name(child)
+        quaternion, translation = parent_from_child
+        length = float(np.linalg.norm(quaternion))
+        if not (abs(length - 1) < 1e-2 and np.isfinite(translation).all()):
             raise InputError(
-                f"{self._where}: tf {parent} -> {child}: quaternion (w x y z)"
-                f" {tuple(rotation_wxyz)}, translation {tuple(translation_m)}: no rigid transform;"
-                f" mend what publishes it"
+                f"{self._source}: tf {parent} -> {child}: quaternion (w x y z) {quaternion},"
+                f" translation {translation}: no rigid transform; repair the program that"
+                f" publishes it"
             )
         topics = self._edges.setdefault(child, {})
         edge = topics.get(topic)
         if edge is not None and edge.parent != parent:
-            self._two_parents.setdefault(child, {edge.parent}).add(parent)
+            self._parents.setdefault(child, {edge.parent}).add(parent)
             return
-        if edge is None or edge.static:  # the last static one holds, and one that moves wins
+        # The last static transform is valid, and a moving transform takes precedence.
+        if edge is None or edge.static:
             edge = topics[topic] = _Edge(parent, stamp_s is None)
         elif stamp_s is None:
             return
         edge.stamps_s.append(0.0 if stamp_s is None else stamp_s)
-        edge.quaternions.append(rotation_wxyz)
-        edge.translations.append(translation_m)
+        edge.quaternions.append(quaternion)
+        edge.translations.append(translation)
 
     def frames(self) -> tuple[str, ...]:
         """All frames, parents before children."""
-        found = dict.fromkeys(e.parent for topics in self._edges.values() for e in topics.values())
-        return tuple(sorted({**found, **self._edges}, key=lambda f: (len(self._chain(f)), f)))
+        parents = {e.parent for topics in self._edges.values() for e in topics.values()}
+        return tuple(sorted({*parents, *self._edges}, key=lambda f: (len(self._chain(f)), f)))
 
     def __contains__(self, frame: str) -> bool:
-        """Whether anything was said about a frame."""
+        """Whether a transform has this frame."""
         return frame in self.frames()
 
     def connected(self, a: str, b: str) -> bool:
-        """Whether a chain of transforms leads from one frame to the other."""
+        """Whether a chain of transforms joins two frames."""
         return self._chain(a)[-1] == self._chain(b)[-1]
 
     def a_from_b(
         self, a: str, b: str, stamps_s: NDArray[np.float64]
     ) -> tuple[SE3, NDArray[np.bool_]]:
-        """Poses of one frame in another, interpolated.
+        """Interpolate poses of frame b in frame a.
 
         Args:
-            a: frame.
-            b: frame.
+            a: Frame.
+            b: Frame.
             stamps_s: (n,) seconds.
 
         Returns:
-            (n,) a_from_b and (n,) whether each is known, see `PoseTrack.at`.
+            (n,) a_from_b and (n,) whether each is valid, see `PoseTrack.at`.
 
         Raises:
-            InputError: A frame that is not there, no chain between them, or one with two parents.
+            InputError: The frames are not connected, or the transforms between them are ambiguous.
         """
-        for frame in (a, b):
-            if frame not in self:
-                raise InputError(
-                    f"{self._where}: no frame {frame!r} in tf; it has {', '.join(self.frames())}"
-                )
         up, down = self._chain(a), self._chain(b)
-        self._refuse_doubt(frame for frame in (*up, *down) if frame in self._edges)
+        self._refuse_ambiguous(frame for frame in (*up, *down) if frame in self._edges)
         if up[-1] != down[-1]:
             raise InputError(
-                f"{self._where}: tf has no chain between {a!r} and {b!r}: one hangs on"
-                f" {up[-1]!r}, the other on {down[-1]!r}; record the transform that joins them"
+                f"{self._source}: tf has no chain between {a!r} and {b!r}: their roots are"
+                f" {up[-1]!r} and {down[-1]!r}; record the transform that joins them"
             )
         shared = set(up) & set(down)
-        known = np.ones(len(stamps_s), dtype=bool)
+        valid = np.ones(len(stamps_s), dtype=bool)
         sides = []
         for chain in (up, down):
             ancestor_from_frame = SE3.identity((len(stamps_s),))
             for child in (frame for frame in chain if frame not in shared):
-                parent_from_child, seen = self._at(child, stamps_s)
+                parent_from_child, valid_here = self._at(child, stamps_s)
                 ancestor_from_frame = parent_from_child @ ancestor_from_frame
-                known &= seen
+                valid &= valid_here
             sides.append(ancestor_from_frame)
-        return sides[0].inverse() @ sides[1], known
+        return sides[0].inverse() @ sides[1], valid
 
-    def _refuse_doubt(self, frames: Iterable[str]) -> None:
-        """Raises for a frame that is placed by several topics or in several parents."""
+    def _refuse_ambiguous(self, frames: Iterable[str]) -> None:
+        """Raise for a frame with conflicting topics or several parents."""
         for child in frames:
-            edge, topics = self._edge(child)
-            if topics:
+            if self._conflicting(child):
                 raise InputError(
-                    f"{self._where}: tf {edge.parent} -> {child} is on several topics,"
-                    f" {', '.join(topics)}; name the one that holds with --pose-topic"
+                    f"{self._source}: tf {self._edge(child).parent} -> {child} is on several"
+                    f" topics, {', '.join(sorted(self._edges[child]))}; choose one with"
+                    f" --pose-topic"
                 )
-            if child in self._two_parents:
-                parents = ", ".join(sorted(self._two_parents[child]))
+            if child in self._parents:
+                parents = ", ".join(sorted(self._parents[child]))
                 raise InputError(
-                    f"{self._where}: tf frame {child!r} has several parents, {parents}: two"
+                    f"{self._source}: tf frame {child!r} has several parents, {parents}: two"
                     f" programs publish it; record with one of them"
                 )
 
-    def _edge(self, child: str) -> tuple[_Edge, list[str]]:
-        """What places a frame, and the topics that contradict one another about it."""
+    def _edge(self, child: str) -> _Edge:
+        """The transforms to use for a frame: the chosen topic, else a moving one."""
         topics = self._edges[child]
-        if self._topic in topics:
-            return topics[self._topic], []
         moving = [topic for topic, edge in topics.items() if not edge.static]
-        first = topics[(moving or [*topics])[0]]
-        # The same place on several topics is no contradiction, nor is a moving one on one of them.
-        sure = all(edge.parent == first.parent for edge in topics.values()) and (
-            len(moving) == 1 or (not moving and all(first.same(edge) for edge in topics.values()))
-        )
-        return first, [] if sure else sorted(topics)
+        return topics[self._topic if self._topic in topics else (moving or [*topics])[0]]
+
+    def _conflicting(self, child: str) -> bool:
+        """Whether topics contradict each other about a frame and no topic was chosen."""
+        edges, edge = list(self._edges[child].values()), self._edge(child)
+        if self._topic in self._edges[child]:
+            return False
+        moving = sum(not other.static for other in edges)
+        # Equal static transforms agree, and one moving topic takes precedence over static ones.
+        agree = moving == 1 or (not moving and all(edge.equals(other) for other in edges))
+        return not agree or any(other.parent != edge.parent for other in edges)
 
     def _at(self, child: str, stamps_s: NDArray[np.float64]) -> tuple[SE3, NDArray[np.bool_]]:
-        edge, _ = self._edge(child)
+        edge = self._edge(child)
         poses = SE3(np.array(edge.quaternions), np.array(edge.translations))
         if edge.static:
             return poses[np.zeros(len(stamps_s), int)], np.ones(len(stamps_s), dtype=bool)
         return PoseTrack(np.array(edge.stamps_s), poses).at(stamps_s)
 
     def _chain(self, frame: str) -> list[str]:
-        """A frame and those it hangs on, up to the root."""
+        """A frame and its ancestors up to the root."""
         chain = [frame]
         while chain[-1] in self._edges:
-            parent = self._edge(chain[-1])[0].parent
+            parent = self._edge(chain[-1]).parent
             if parent in chain:
-                circle = " -> ".join([*chain, parent])
-                raise InputError(f"{self._where}: tf goes in a circle: {circle}")
+                cycle = " -> ".join([*chain, parent])
+                raise InputError(f"{self._source}: tf has a cycle: {cycle}")
             chain.append(parent)
         return chain
 
 
-def plain(frame: str) -> str:
-    """A frame's name without the leading slash of old ROS 1 programs."""
+def plain_name(frame: str) -> str:
+    """Name of a frame without the leading slash of old ROS 1 programs."""
     return frame.lstrip("/")

@@ -1,0 +1,153 @@
+"""Formats that hold a pose for every image: TUM, COLMAP, nerfstudio, MoveIt's pose pairs.
+
+A fixed camera has one pose, repeated for every image of the calibration. A camera on the arm has
+one pose for every robot pose. COLMAP and nerfstudio measure pixels from the corner of the first
+pixel, so their principal point is half a pixel larger. Checked against pycolmap, and against
+nerfstudio's data conventions, parser and `Cameras`.
+"""
+
+import json
+from typing import NamedTuple
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from evercal.calibration.export.request import Export
+from evercal.errors import InputError
+from evercal.geometry import SE3
+from evercal.recordings.poses.conventions import numbers_from_poses, pose_convention
+
+
+class _ImagePoses(NamedTuple):
+    """Camera poses of n images."""
+
+    names: tuple[str, ...]
+    stamps_s: NDArray[np.float64]
+    """(n,) seconds; 0, 1, 2, ... without time stamps."""
+    base_from_camera: SE3
+
+    def numbers(self, convention: str) -> list[list[float]]:
+        """Return the poses as numbers of a convention, without negative zeros."""
+        numbers = numbers_from_poses(self.base_from_camera, pose_convention(convention))
+        return (numbers + 0.0).tolist()
+
+
+def _image_poses(export: Export) -> _ImagePoses:
+    robot = export.robot_poses
+    if export.calibration.mount == "eye_to_hand":
+        used = tuple(image.name for image in export.calibration.images if image.used)
+        names = used or (f"{export.child.replace('/', '_')}.png",)
+        poses = SE3.stack([export.pose] * len(names))
+        return _ImagePoses(names, np.arange(len(names), dtype=np.float64), poses)
+    if robot is None:
+        raise InputError(
+            "the pose of a camera on the arm changes with each image;"
+            " give the gripper's poses with --robot-poses"
+        )
+    names = robot.names or tuple(f"{i:06d}.png" for i in range(len(robot)))
+    stamps = np.arange(len(robot), dtype=np.float64) if robot.stamps_s is None else robot.stamps_s
+    return _ImagePoses(names, stamps, robot.poses @ export.pose)
+
+
+def tum(export: Export) -> str:
+    """Write lines of stamp, translation in metres, quaternion x y z w: base_from_camera."""
+    images = _image_poses(export)
+    lines = [
+        " ".join(map(repr, [stamp, *row]))
+        for stamp, row in zip(images.stamps_s.tolist(), images.numbers("xyzw"), strict=True)
+    ]
+    if export.calibration.mount == "eye_to_hand":
+        lines = lines[:1]
+    return "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines, ""])
+
+
+def colmap(export: Export) -> dict[str, str]:
+    """Write a sparse model without points: camera_from_base, quaternion w x y z.
+
+    Raises:
+        InputError: An image name contains white space, which COLMAP's text format cannot hold.
+    """
+    camera, images = export.camera, _image_poses(export)
+    lines = []
+    for i, (name, row) in enumerate(zip(images.names, images.numbers("wxyz:inverse"), strict=True)):
+        if len(name.split()) != 1:
+            raise InputError(f"image name {name!r} contains a blank; rename the image")
+        pose = " ".join(map(repr, [*row[3:], *row[:3]]))
+        lines += [f"{i + 1} {pose} 1 {name}", ""]
+    model, parameters = "PINHOLE", [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5]
+    if any(camera.distortion):
+        four = len(camera.distortion) == 4
+        model = "OPENCV" if four else "FULL_OPENCV"
+        parameters += camera.distortion if four else camera.coefficients
+    return {
+        "cameras.txt": "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+        f"1 {model} {camera.width} {camera.height} {' '.join(map(repr, parameters))}\n",
+        "images.txt": "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
+        "# POINTS2D[] as (X, Y, POINT3D_ID)\n" + "\n".join([*lines, ""]),
+        "points3D.txt": "# no points\n",
+    }
+
+
+def nerfstudio(export: Export) -> str:
+    """Write transforms.json: base_from_camera with camera axes x right, y up, z back.
+
+    Raises:
+        InputError: The distortion has terms that nerfstudio does not support.
+    """
+    camera, images = export.camera, _image_poses(export)
+    k1, k2, p1, p2, k3, *rational = camera.coefficients
+    if any(rational):
+        # nerfstudio's k4 is the fourth coefficient of a polynomial, not OpenCV's k4.
+        raise InputError(
+            "there are no terms for k4 k5 k6 of this camera; calibrate it with k1 k2 p1 p2 k3,"
+            " or undistort the images"
+        )
+    record = {
+        "camera_model": "OPENCV",
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx + 0.5,
+        "cy": camera.cy + 0.5,
+        **{"k1": k1, "k2": k2, "k3": k3, "k4": 0.0, "p1": p1, "p2": p2},
+        "frames": [
+            {"file_path": name, "transform_matrix": np.reshape(row, (4, 4)).tolist()}
+            for name, row in zip(images.names, images.numbers("matrix:opengl"), strict=True)
+        ],
+    }
+    return json.dumps(record, indent=1, allow_nan=False) + "\n"
+
+
+def moveit_samples(export: Export) -> str:
+    """Write the pose pairs that MoveIt Calibration solves: 4x4 matrices by row, metres.
+
+    Raises:
+        InputError: A pose has no partner.
+    """
+    robot, target = export.robot_poses, export.target_poses
+    if robot is None or target is None:
+        raise InputError(
+            "a calibration holds no pose pairs; give the gripper's poses with --robot-poses"
+            " and the board's poses in the camera with --target-poses"
+        )
+    camera_from_target = target.poses
+    if robot.names and target.names and robot.names != target.names:
+        single = sorted({*robot.names} ^ {*target.names})
+        if single:
+            raise InputError(f"{single[0]!r} has only one of its two poses")
+        camera_from_target = target.poses[[target.names.index(name) for name in robot.names]]
+    if len(robot) != len(target):
+        raise InputError(
+            f"{len(robot)} robot poses and {len(target)} target poses; give one of"
+            f" each for every image"
+        )
+    samples = [
+        {
+            "effector_wrt_world": (gripper.matrix() + 0.0).ravel().tolist(),
+            "object_wrt_sensor": (board.matrix() + 0.0).ravel().tolist(),
+        }
+        for gripper, board in zip(robot.poses, camera_from_target, strict=True)
+    ]
+    return yaml.safe_dump(samples, sort_keys=False, default_flow_style=None, width=1000)

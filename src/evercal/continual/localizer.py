@@ -1,0 +1,282 @@
+"""Localization by networks: predicted scene coordinates and PnP, alone or beside a map."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from evercal.continual.scenes import LearnedScenes, SceneRecord
+from evercal.continual.store import NetworkStore
+from evercal.errors import InputError
+from evercal.features.device import device_of
+from evercal.features.precision import autocast
+from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.localization.estimate import PoseEstimate
+from evercal.localization.localizer import (
+    Localizer,
+    SceneLocalizer,
+    camera_in_scenes,
+    encode_image,
+    own_or_stated,
+)
+from evercal.localization.matching import strided_patches
+from evercal.localization.parallel import in_parallel
+from evercal.localization.pnp import PnpOptions, PnpResult, solve_pnp
+from evercal.localization.query import Candidate, Hypothesis, LocalizeOptions, Matches, Query
+from evercal.recordings.images import as_rgb
+
+
+@dataclass(frozen=True)
+class NetworkLocalizeOptions:
+    """How networks locate an image."""
+
+    candidates: int = 3
+    """Scenes that are tried per image, at most."""
+    margin: float = 0.15
+    """Scenes whose best prototype is less similar than the best scene's by more are not tried."""
+    pnp: PnpOptions = field(default_factory=PnpOptions)
+    """RANSAC settings."""
+    patches_short_side: int = 480
+    """Short side of the image kept with a query, pixels."""
+
+
+def open_networks(path: Path, device: str = "auto") -> SceneLocalizer:
+    """A localizer for a store of networks.
+
+    Args:
+        path: folder of the store.
+        device: `auto` (a CUDA device if there is one), `cpu` or `cuda`.
+
+    Raises:
+        InputError: Not a store, an empty one, or a damaged file; no such device.
+    """
+    where = device_of(device)
+    scenes = NetworkStore.open(path).contents
+    if not scenes.scenes:
+        raise InputError(f"store {path}: no scene learned yet; run 'evercal learn' first")
+    return localizer_of(scenes.to(where))
+
+
+def localizer_of(scenes: LearnedScenes) -> SceneLocalizer:
+    """The localizer for what a strategy learns: a map, networks, or both."""
+    if not scenes.heads:
+        return Localizer(scenes.map_contents())
+    if scenes.scenes[-1].map is not None:
+        return HybridLocalizer(scenes)
+    return NetworkLocalizer(scenes)
+
+
+class NetworkLocalizer:
+    """Locates images by scene-coordinate networks.
+
+    Args:
+        scenes: networks and scenes, at least one.
+        options: RANSAC settings and retrieval.
+    """
+
+    def __init__(self, scenes: LearnedScenes, options: NetworkLocalizeOptions | None = None):
+        self.contents, self.options = scenes, options or NetworkLocalizeOptions()
+        self._prototypes = [r.prototypes.float().to(scenes.device) for r in scenes.scenes]
+        for head in scenes.heads:
+            head.eval()
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Names of the scenes, in order of learning."""
+        return tuple(record.name for record in self.contents.scenes)
+
+    def camera_for(self, stated: Camera) -> Camera | None:
+        """The `camera` argument for an image with these stated intrinsics."""
+        return own_or_stated(stated, [record.camera for record in self.contents.scenes])
+
+    def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
+        """Estimate the camera pose of one image; see `Localizer.localize`."""
+        began = time.perf_counter()
+        image, scenes = as_rgb(image), self.contents
+        cameras = camera_in_scenes(camera, image, scenes.scenes)
+        features = encode_image(image, scenes.encoder, scenes.short_side)
+        query = Query(image, features, self.options.patches_short_side)
+        best: Hypothesis | None = None
+        for scene in self._candidates(query, cameras):
+            trial = self._hypothesis(query, scene, cameras)
+            if best is None or _support(trial) > _support(best):
+                best = trial
+        assert best is not None, "at least one scene is tried"
+        return self._answer(best, 1000 * (time.perf_counter() - began))
+
+    def localize_batch(
+        self, images: Sequence[np.ndarray], cameras: Sequence[Camera | None]
+    ) -> list[PoseEstimate]:
+        """`localize` for many images in parallel; the answers are the same to the last bit."""
+        pairs = list(zip(images, cameras, strict=True))
+        return list(in_parallel(lambda pair: self.localize(*pair), pairs))
+
+    @property
+    def _decides_scene(self) -> bool:
+        """Whether the network itself decides the scene (condition `descriptor`)."""
+        heads = self.contents.heads
+        return len(heads) == 1 and heads[0].options.condition == "descriptor"
+
+    @torch.inference_mode()
+    def _candidates(self, query: Query, cameras: list[Camera | None]) -> list[int]:
+        """Scenes to try, most similar prototype first."""
+        usable = [i for i, camera in enumerate(cameras) if camera is not None]
+        if self._decides_scene:
+            return usable[:1]
+        descriptor = self.contents.descriptor(query.features[None])[0]
+        similarity = {i: float((self._prototypes[i] @ descriptor).max()) for i in usable}
+        usable.sort(key=lambda i: -similarity[i])
+        floor = similarity[usable[0]] - self.options.margin
+        return [i for i in usable if similarity[i] >= floor][: self.options.candidates]
+
+    def _hypothesis(
+        self, query: Query, scene: int, cameras: list[Camera | None], moved: bool = False
+    ) -> Hypothesis:
+        """A pose in one scene: predict, PnP."""
+        camera = cameras[scene]
+        assert camera is not None, "only scenes whose camera fits are tried"
+        small = camera.short_side_resized(self.contents.short_side)
+        matches, patches = predicted_matches(self.contents, query, scene, small, 1)
+        rough = solve_pnp(matches.pixels, matches.points_m, small, self.options.pnp)
+        if rough is None:
+            return Hypothesis(scene)
+        if self._decides_scene and not moved:
+            other = self._scene_of(rough, scene)
+            if other != scene:
+                other_camera = cameras[other]
+                if other_camera is not None and other_camera != camera:
+                    # The pose lies in the cell of a scene with another camera: solve once more.
+                    return self._hypothesis(query, other, cameras, moved=True)
+                return _moved(rough, matches, patches, self.contents.scenes, scene, other)
+        return _from_pnp(rough, matches, patches, scene)
+
+    def _scene_of(self, rough: PnpResult, scene: int) -> int:
+        """The scene in whose cell of the atlas a pose lies."""
+        atlas_from_base = self.contents.scenes[scene].cell.atlas_from_base
+        position = atlas_from_base.apply(rough.pose.pose.translation_m)
+        inside = self.contents.atlas().scene_at(position)
+        return scene if inside is None else inside
+
+    def _answer(self, best: Hypothesis, milliseconds: float) -> PoseEstimate:
+        record = self.contents.scenes[best.scene]
+        status, reason = self._status(best, record)
+        rejected = PoseEstimate(
+            status=status,
+            reason=reason,
+            scene=None,
+            base_from_camera=None,
+            covariance=None,
+            inliers=best.inliers,
+            inlier_ratio=best.inlier_ratio,
+            milliseconds=milliseconds,
+            support=_support(best),
+        )
+        if status != "ok" or best.pose is None:
+            return rejected
+        return replace(
+            rejected,
+            scene=record.name,
+            base_from_camera=best.pose.pose,
+            covariance=record.covariance_scale * best.pose.covariance,
+            pixels=best.pixels,
+            points_m=best.points_m,
+        )
+
+    def _status(self, best: Hypothesis, record: SceneRecord):
+        if best.pose is None:
+            return "failed", "fewer than 6 inliers"
+        position = record.cell.atlas_from_base.apply(best.pose.pose.translation_m)
+        if self.contents.atlas().scene_at(position) != best.scene:
+            return "failed", "the pose lies outside the cell of its scene"
+        if best.inlier_ratio < record.inlier_threshold:
+            need = f"{100 * record.inlier_threshold:.0f} %"
+            share = f"{100 * best.inlier_ratio:.0f} %"
+            return (
+                "unknown_scene",
+                f"{share} of the patches are inliers, {record.name} needs {need}",
+            )
+        return "ok", ""
+
+
+class HybridLocalizer(Localizer):
+    """A map's localizer whose first pose also uses the points that a network predicts.
+
+    Args:
+        scenes: networks and scenes with maps.
+        options: effort and thresholds.
+    """
+
+    def __init__(self, scenes: LearnedScenes, options: LocalizeOptions | None = None):
+        super().__init__(scenes.map_contents(), options)
+        self.networks = scenes
+        for head in scenes.heads:
+            head.eval()
+
+    def _matches(
+        self, query: Query, candidate: Candidate, camera: Camera, near: SE3 | None
+    ) -> Matches:
+        """Matches to keyframes and predicted points, at the encoder's working size."""
+        matched = super()._matches(query, candidate, camera, near)
+        stride = candidate.match_stride if self.options.align else 1
+        predicted, _ = predicted_matches(self.networks, query, candidate.scene, camera, stride)
+        return Matches(
+            np.concatenate([matched.pixels, predicted.pixels]),
+            np.concatenate([matched.points_m, predicted.points_m]),
+        )
+
+
+@torch.inference_mode()
+def predicted_matches(
+    scenes: LearnedScenes, query: Query, scene: int, camera: Camera, stride: int
+) -> tuple[Matches, int]:
+    """Scene coordinates that the network predicts for patches of an image.
+
+    Args:
+        scenes: with the networks.
+        query: the image.
+        scene: index of the scene.
+        camera: intrinsics of the image at the encoder's working size.
+        stride: every n-th row and column of patches.
+
+    Returns:
+        Matches in the scene's base frame, and the number of patches.
+    """
+    patches, pixels = strided_patches(query, camera, scenes.encoder.stride, stride)
+    head, local = scenes.head_for(scene)
+    features = query.features.flatten(1).T.to(head.device)
+    descriptor = scenes.descriptor(query.features[None])[0].to(head.device)
+    with autocast(head.device):
+        output = head(features, local, descriptor.expand(len(features), -1))
+    points = output.points.cpu().double().numpy()
+    points = scenes.scenes[scene].cell.atlas_from_base.inverse().apply(points)[patches]
+    valid = np.isfinite(points).all(1)
+    return Matches(pixels[valid], points[valid]), len(patches)
+
+
+def _support(hypothesis: Hypothesis) -> float:
+    return hypothesis.inlier_ratio * hypothesis.inliers**0.5
+
+
+def _from_pnp(rough: PnpResult, matches: Matches, patches: int, scene: int) -> Hypothesis:
+    inliers = rough.inliers
+    return Hypothesis(
+        scene, rough.pose, matches.pixels[inliers], matches.points_m[inliers], expected=patches
+    )
+
+
+def _moved(
+    rough: PnpResult,
+    matches: Matches,
+    patches: int,
+    records: Sequence[SceneRecord],
+    asked: int,
+    scene: int,
+) -> Hypothesis:
+    """A pose in the base frame of the scene that it lies in, not of the scene that was asked."""
+    across = records[scene].cell.atlas_from_base.inverse() @ records[asked].cell.atlas_from_base
+    pose: UncertainPose = across @ rough.pose
+    moved = Matches(matches.pixels, across.apply(matches.points_m))
+    return _from_pnp(PnpResult(pose, rough.inliers), moved, patches, scene)

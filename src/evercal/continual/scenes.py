@@ -1,0 +1,159 @@
+"""What a robot with networks has learned: heads, remembered keyframes and a record per scene."""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from evercal.continual.networks.atlas import Atlas, Cell
+from evercal.continual.networks.descriptor import Descriptor
+from evercal.continual.networks.head import Head
+from evercal.features.device import device_of_network
+from evercal.features.encoder import Encoder
+from evercal.geometry import Camera
+from evercal.mapping.keyframes import Keyframes
+from evercal.mapping.scene_map import MapContents, SceneMap
+
+MAX_PROTOTYPES = 256
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """A learned scene, without the weights of the head."""
+
+    name: str
+    """Unique in a store."""
+    camera: Camera
+    """Intrinsics of its first training frame."""
+    cell: Cell
+    """Its cell of the atlas."""
+    prototypes: Tensor
+    """(p, width) descriptors of training frames spread over the recording, half precision."""
+    train_frames: int
+    """Frames it was learned from."""
+    refined_camera: Camera | None = None
+    """`camera` as training corrected it; None where the stated one is kept."""
+    inlier_threshold: float = 0.0
+    """Poses with a smaller inlier ratio are rejected; fitted to held-out training frames."""
+    covariance_scale: float = 1.0
+    """Factor on covariances, fitted to held-out training frames."""
+    map: SceneMap | None = None
+    """The map of the scene, for strategies that build one."""
+
+    @property
+    def adjusted_camera(self) -> Camera:
+        """Intrinsics for images of the camera that recorded the scene."""
+        if self.map is not None:
+            return self.map.adjusted_camera
+        return self.refined_camera or self.camera
+
+
+@dataclass
+class LearnedScenes:
+    """Everything that localization and the next stage need."""
+
+    encoder: Encoder
+    """Frozen local encoder."""
+    descriptor: Descriptor
+    """Frozen global descriptor."""
+    strategy: str
+    """Key of STRATEGIES."""
+    short_side: int
+    """Working size of images, pixels."""
+    heads: list[Head] = field(default_factory=list)
+    """One head, or one per scene; empty for strategies without a network."""
+    scenes: list[SceneRecord] = field(default_factory=list)
+    """In order of arrival; the index is the scene index of head and atlas."""
+    keyframes: list[Keyframes | None] = field(default_factory=list)
+    """Remembered keyframes of each scene; None where nothing is kept."""
+    method_states: list[Mapping[str, Tensor]] = field(default_factory=list)
+    """Named tensors that the method keeps of each scene."""
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the encoder's weights, on which images are encoded."""
+        return device_of_network(self.encoder)
+
+    def to(self, device: torch.device) -> Self:
+        """Move encoder, descriptor and heads to a device, in place.
+
+        Keyframes, prototypes and method states stay on the CPU.
+        """
+        for network in (self.encoder, self.descriptor, *self.heads):
+            if isinstance(network, nn.Module):
+                network.to(device)
+        return self
+
+    @property
+    def memory_bytes(self) -> int:
+        """Size of everything kept for later stages: keyframes and method states."""
+        frames = sum(keyframes.bytes for keyframes in self.keyframes if keyframes is not None)
+        return frames + sum(
+            value.nbytes for state in self.method_states for value in state.values()
+        )
+
+    def map_contents(self) -> MapContents:
+        """The maps of all scenes, for strategies that build them."""
+        maps = [record.map for record in self.scenes if record.map is not None]
+        return MapContents(self.encoder, self.short_side, maps)
+
+    def atlas(self, grid_scenes: int = 0) -> Atlas:
+        """Cells of the scenes learned so far.
+
+        Args:
+            grid_scenes: of the paper's layout; 0 for the open one.
+        """
+        atlas = Atlas("paper", grid_scenes) if grid_scenes else Atlas()
+        atlas.cells = [record.cell for record in self.scenes]
+        return atlas
+
+    def head_for(self, scene: int) -> tuple[Head, int]:
+        """The head of a scene and the scene's index in that head."""
+        if len(self.heads) == 1 and self.heads[0].scenes > scene:
+            return self.heads[0], scene
+        return self.heads[scene], 0
+
+    def copy_for_training(self) -> "LearnedScenes":
+        """A copy whose heads can be trained without changing these."""
+        return LearnedScenes(
+            self.encoder,
+            self.descriptor,
+            self.strategy,
+            self.short_side,
+            copy.deepcopy(self.heads),
+            list(self.scenes),
+            list(self.keyframes),
+            list(self.method_states),
+        )
+
+
+def corrected_camera(camera: Camera, correction: Tensor) -> Camera:
+    """A nominal pinhole with the correction (5,) of training (see `reprojection_error`)."""
+    focal, dx, dy, k1, k2 = (float(value) for value in correction)
+    return Camera(
+        camera.width,
+        camera.height,
+        camera.fx * (1 + focal),
+        camera.fy * (1 + focal),
+        camera.cx + dx * camera.fx,
+        camera.cy + dy * camera.fy,
+        (k1, k2, 0.0, 0.0),
+    )
+
+
+def correction_between(nominal: Camera, refined: Camera) -> Tensor:
+    """(5,) the correction from a nominal to a refined camera: inverse of `corrected_camera`."""
+    k1, k2 = refined.distortion[:2] or (0.0, 0.0)
+    shift = (refined.cx - nominal.cx) / nominal.fx, (refined.cy - nominal.cy) / nominal.fy
+    return torch.tensor([refined.fx / nominal.fx - 1, *shift, k1, k2])
+
+
+def prototypes(descriptors: Tensor) -> Tensor:
+    """At most 256 of (n, width) descriptors, spread over a recording; half precision, CPU."""
+    count = min(MAX_PROTOTYPES, len(descriptors))
+    index = np.linspace(0, len(descriptors) - 1, count).round().astype(int)
+    return descriptors[index].half().cpu()

@@ -1,0 +1,73 @@
+"""Acceptance of network poses: a threshold on the share of patches that are inliers."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from evercal.continual.localizer import NetworkLocalizer
+from evercal.continual.scenes import LearnedScenes, SceneRecord
+from evercal.geometry import pose_distance
+from evercal.recordings.frame import Frame
+from evercal.simulation.box_room import BoxRoom, default_camera
+
+NEGATIVE_ROOM_SEED = 8_990
+CHI2_6_MEDIAN = 5.348
+ACCEPTANCE_FRACTION = 1 / 6
+"""Position of the threshold between the inlier ratios of negative and positive images."""
+
+
+def fit_threshold(scenes: LearnedScenes, held_out: Sequence[Frame], index: int = -1) -> SceneRecord:
+    """Fit the inlier threshold and covariance scale of a scene.
+
+    Positives are held-out training frames; negatives are views of box rooms that were never
+    learned. The threshold lies a sixth of the way from the 95 % quantile of the negatives to the
+    5 % quantile of the positives: positives lie on the path of the recording, and views beside it
+    have fewer inliers. The scale gives well-located frames the median squared Mahalanobis error of
+    six Gaussian dimensions.
+
+    Args:
+        scenes: with the scene.
+        held_out: training frames that were held out.
+        index: of the scene; the newest by default.
+
+    Returns:
+        The record with its threshold and scale.
+    """
+    # A threshold that was fitted before must not count twice.
+    records = list(scenes.scenes)
+    records[index] = replace(records[index], inlier_threshold=0.0, covariance_scale=1.0)
+    localizer = NetworkLocalizer(replace(scenes, scenes=records))
+    squared, ratios = [], []
+    for frame in held_out:
+        camera = localizer.camera_for(frame.camera)
+        estimate = localizer.localize(frame.read_image(), camera)
+        ratios.append(estimate.inlier_ratio)
+        pose = estimate.uncertain_pose
+        if pose is None or frame.base_from_camera is None:
+            continue
+        metres, radians = pose_distance(pose.pose, frame.base_from_camera)
+        if metres < 0.25 and radians < np.deg2rad(15):
+            squared.append(pose.squared_mahalanobis(frame.base_from_camera))
+    small = records[index].camera.short_side_resized(scenes.short_side)
+    negatives = [
+        localizer.localize(image).inlier_ratio
+        for image in _negative_views(small.width, small.height)
+    ]
+    top = float(np.quantile(negatives, 0.95))
+    low = float(np.quantile(ratios, 0.05)) if ratios else 1.0
+    threshold = top + ACCEPTANCE_FRACTION * max(0.0, low - top)
+    scale = float(np.median(squared)) / CHI2_6_MEDIAN if squared else 1.0
+    return replace(records[index], inlier_threshold=threshold, covariance_scale=max(scale, 1.0))
+
+
+@lru_cache(maxsize=4)
+def _negative_views(width: int, height: int) -> list[np.ndarray]:
+    """Views of rooms that are in no scene."""
+    plain, images = default_camera(width, height), []
+    for seed in range(NEGATIVE_ROOM_SEED, NEGATIVE_ROOM_SEED + 4):
+        room = BoxRoom(seed, texture_px=192)
+        rng = np.random.default_rng(seed)
+        images += [room.render(plain, room.random_view(rng)) for _ in range(4)]
+    return images

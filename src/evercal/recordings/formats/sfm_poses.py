@@ -1,0 +1,85 @@
+"""Structure-from-motion poses that replace the original poses of 7-Scenes and 12-Scenes.
+
+The files are from Brachmann et al., On the Limits of Pseudo Ground Truth in Visual Camera
+Re-Localization (ICCV 2021), one for each split of a scene:
+
+    FOLDER/chess_train.txt, chess_test.txt          or apt1_kitchen_train.txt, ...
+        seq-01/frame-000768.color.png qw qx qy qz tx ty tz f
+
+The pose is camera_from_world in metres, and f is the focal length in pixels of the published image.
+The files state no principal point. COLMAP keeps it at the middle of the image, and these focal
+lengths were estimated with it, so it replaces that of the original calibration. Frames outside the
+reconstruction count as untracked. It is unknown which poses are more accurate: report results under
+both.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from evercal.errors import InputError
+from evercal.geometry import SE3, Camera
+from evercal.recordings.frame import Frame, Recording
+
+
+def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:
+    """Replace poses and focal lengths of a recording.
+
+    Args:
+        recording: Images with original poses; its split is kept.
+        folder: Folder of the pose files.
+        name: First part of the file names, such as chess or apt1_kitchen.
+
+    Raises:
+        InputError: A file is missing or broken, or holds no frame of the recording.
+    """
+    splits, lost = [], 0
+    for split, frames in (("train", recording.train), ("test", recording.test)):
+        file = folder / f"{name}_{split}.txt"
+        poses = _read(file)
+        posed = tuple(_posed(f, *poses[_key(f.name)]) for f in frames if _key(f.name) in poses)
+        if frames and not posed:
+            first = _key(frames[0].name)
+            raise InputError(f"{file}: no frame of {recording.name} is in it, such as {first}")
+        splits.append(posed)
+        lost += len(frames) - len(posed)
+    return replace(recording, train=splits[0], test=splits[1], untracked=recording.untracked + lost)
+
+
+def _posed(frame: Frame, base_from_camera: SE3, focal: float) -> Frame:
+    c = frame.camera
+    # The middle of the image, counted from the centre of the first pixel.
+    middle = (c.width - 1) / 2, (c.height - 1) / 2
+    camera = Camera(c.width, c.height, focal, focal, *middle, c.distortion)
+    return replace(frame, camera=camera, base_from_camera=base_from_camera)
+
+
+def _key(name: str) -> str:
+    """Sequence and number of a frame without its ending; 12-Scenes has no sequence."""
+    return name.split(".color.")[0].removeprefix("data/")
+
+
+def _read(file: Path) -> dict[str, tuple[SE3, float]]:
+    """base_from_camera and focal length in pixels by frame."""
+    try:
+        lines = file.read_text().splitlines()
+    except (OSError, UnicodeDecodeError):
+        raise InputError(
+            f"{file}: missing; get the folder pgt/sfm of "
+            "https://github.com/tsattler/visloc_pseudo_gt_limitations"
+        ) from None
+    poses = {}
+    for number, line in enumerate(filter(str.strip, lines), start=1):
+        name, *words = line.split()
+        try:
+            numbers = np.array([float(word) for word in words])
+            if len(numbers) != 8 or not np.isfinite(numbers).all() or numbers[7] <= 0:
+                raise ValueError
+            camera_from_base = SE3(numbers[:4] / np.linalg.norm(numbers[:4]), numbers[4:7])
+        except ValueError:
+            raise InputError(
+                f"{file}: line {number} is not 'image qw qx qy qz tx ty tz focal': {line[:60]!r}"
+            ) from None
+        poses[_key(name)] = camera_from_base.inverse(), float(numbers[7])
+    return poses

@@ -1,0 +1,35 @@
+"""Without an optional package, the error names the command that installs it."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from evercal.errors import InputError
+from evercal.recordings.formats import colmap, lerobot
+from evercal.recordings.formats.bags.file import BagFile
+from evercal.recordings.formats.video_file import Videos
+from evercal.recordings.poses.kinematics import RobotModel
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "read"),
+    [
+        ("pycolmap", "colmap", colmap.load),
+        ("rosbags.highlevel", "bags", BagFile),
+        ("yourdfpy", "urdf", RobotModel),
+        ("pyarrow.parquet", "lerobot", lerobot._parquet),
+        ("av", "lerobot", lambda _: Videos(30.0)),
+    ],
+)
+def test_missing_extra_names_the_install_command(
+    module: str,
+    extra: str,
+    read: Callable[[Path], object],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=rf"pip install 'evercal\[{extra}\]'"):
+        read(tmp_path)

@@ -1,0 +1,168 @@
+"""Selection of the images of a calibration, and the axes and landmarks drawn into them."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from evercal.mapping.scene_maps import SceneRecord
+from numpy.typing import ArrayLike
+
+from evercal.calibration.calibration import Calibration, ImageUse
+from evercal.continual.networks.atlas import Cell
+from evercal.geometry import SE3, Camera
+from evercal.localization.estimate import PoseEstimate
+from evercal.recordings.images import write_image
+from evercal.reports.calibration_images import annotate_images, select_images
+
+
+def pose(quaternion: ArrayLike, translation: ArrayLike) -> SE3:
+    return SE3(np.array(quaternion, np.float64), np.array(translation, np.float64))
+
+
+CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
+BASE_FROM_CAMERA = pose([0.0, 1.0, 0.0, 0.0], [0.1, 0.05, 1.0])
+
+
+def calibration(names: dict[str, bool], **more: Any) -> Calibration:
+    uses = tuple(ImageUse(name, used, "" if used else "blurred") for name, used in names.items())
+    result = Calibration(
+        "eye_to_hand", BASE_FROM_CAMERA, 1e-6 * np.eye(6), camera=CAMERA, images=uses
+    )
+    return replace(result, **more)
+
+
+def write_images(folder: Path, *names: str, size: tuple[int, int] = (120, 160)) -> list[Path]:
+    for name in names:
+        write_image(folder / name, np.full((*size, 3), 90, np.uint8))
+    return [folder / name for name in names]
+
+
+class FixedLocalizer:
+    """Detects two landmarks in every image: one at its projection, one three pixels off."""
+
+    scenes = ("room",)
+
+    def __init__(self, pose: SE3 | None) -> None:
+        prototypes: Any = None
+        cell = Cell((0.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0))
+        record = SceneRecord("room", CAMERA, cell, prototypes, 10)
+        self.maps = SimpleNamespace(scenes=[record], short_side=60, keyframes=[None])
+        self.pose = pose
+
+    def localize(self, image: np.ndarray, camera: Camera) -> PoseEstimate:
+        if self.pose is None:
+            return PoseEstimate("failed", "too dark", None, None, None, 0, 0.0, 1.0)
+        points = BASE_FROM_CAMERA.apply([[0.1, 0.1, 1.0], [-0.2, 0.1, 1.0]])
+        pixels = camera.resized(80, 60).project([[0.1, 0.1, 1.0], [-0.2, 0.1, 1.0]])
+        pixels[1, 0] += 3
+        return PoseEstimate("ok", "", "room", self.pose, None, 2, 1.0, 1.0, pixels, points)
+
+
+def test_selection_is_spread_and_includes_a_rejected_image(tmp_path: Path) -> None:
+    names = {f"{i}.png": i not in (4, 7) for i in range(10)}
+    write_images(tmp_path, *names)
+    files, reason = select_images(calibration(names), tmp_path)
+    assert reason == ""
+    assert [file.path.name for file in files] == ["0.png", "5.png", "9.png", "4.png"]
+    assert [file.use is not None and file.use.used for file in files] == [True, True, True, False]
+
+
+def test_given_images_replace_those_of_the_calibration(tmp_path: Path) -> None:
+    own = write_images(tmp_path, "a.png")
+    others = write_images(tmp_path, *(f"{i}.png" for i in range(6)))
+    files, _ = select_images(calibration({str(own[0]): True}), tmp_path, [*others[:3], *own])
+    assert [file.path for file in files] == [*others[:3], *own]
+    assert [file.use is None for file in files] == [True, True, True, False]
+    assert len(select_images(calibration({}), tmp_path, others)[0]) == 4
+
+
+def test_reason_for_no_images_is_given(tmp_path: Path) -> None:
+    assert "names no images" in select_images(calibration({}), tmp_path)[1]
+    files, reason = select_images(calibration({"gone.png": True, "b.png": True}), tmp_path)
+    assert files == []
+    assert "none of the 2 images" in reason
+    assert "gone.png" in reason
+    without_camera = annotate_images(calibration({}, camera=None), [])
+    assert not without_camera.images
+    assert "no intrinsics" in without_camera.missing[0]
+
+
+def test_unusable_images_are_reported(tmp_path: Path) -> None:
+    write_images(tmp_path, "a.png")
+    write_images(tmp_path, "wide.png", size=(90, 160))
+    (tmp_path / "broken.png").write_bytes(b"no image")
+    own = calibration({"a.png": True, "wide.png": True, "broken.png": True})
+    result = annotate_images(own, select_images(own, tmp_path)[0])
+    assert [Path(image.name).name for image in result.images] == ["a.png"]
+    assert result.images[0].summary == "used"
+    assert not result.landmarks
+    text = " ".join(result.missing)
+    assert "wide.png is 160x90, which does not fit the camera, 160x120" in text
+    assert "broken.png: not a readable image" in text
+    assert "No landmarks: pass --store" in text
+
+
+def test_axes_are_drawn_at_the_projected_base(tmp_path: Path) -> None:
+    write_images(tmp_path, "a.png")
+    own = calibration({"a.png": True})
+    result = annotate_images(own, select_images(own, tmp_path)[0])
+    assert result.axes is not None
+    # K [R | t] by hand: the camera looks straight down from a metre above.
+    assert result.axes.origin_px == pytest.approx((79.5 - 15, 59.5 + 7.5))
+    image = result.images[0].image.astype(int)
+    scale = image.shape[1] / 160
+    x, y = np.round((result.axes.origin_px + 0.5) * scale - 0.5).astype(int)
+    coloured = np.argwhere(np.ptp(image, axis=2) > 60)
+    assert np.abs(coloured - [y, x]).max(axis=1).min() <= 3
+    # 10 cm are 15 pixels of the camera: x to the right, y up.
+    assert coloured[:, 1].max() == pytest.approx(x + 15 * scale, abs=40)
+    assert coloured[:, 0].min() == pytest.approx(y - 15 * scale, abs=40)
+
+
+def test_axes_of_an_older_calibration_are_added(tmp_path: Path) -> None:
+    write_images(tmp_path, "a.png")
+    own = calibration({"a.png": True})
+    older = replace(own, parent_from_child=pose([0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
+    files, _ = select_images(own, tmp_path)
+    alone, both = annotate_images(own, files), annotate_images(own, files, older)
+    assert both.older_axes is not None
+    assert both.older_axes.origin_px == pytest.approx((79.5, 59.5))
+    differ = np.argwhere((alone.images[0].image != both.images[0].image).any(axis=2))
+    scale = both.images[0].image.shape[1] / 160
+    assert np.abs(differ - [60 * scale, 80 * scale]).max(axis=1).min() < 12
+
+
+@pytest.mark.parametrize(
+    ("mount", "median_px"),
+    [
+        ("eye_to_hand", 0.5 * (0 + 6)),  # 0 and 3 pixels of an image of half the size
+        ("eye_in_hand", 3.75 + 6.75),  # relative to the image's own pose, 50 mm off: 3.75 pixels
+    ],
+)
+def test_residuals_refer_to_the_calibration_of_a_fixed_camera(
+    tmp_path: Path, mount: str, median_px: float
+) -> None:
+    write_images(tmp_path, "a.png")
+    own = calibration({"a.png": True}, mount=mount, parent_frame="parent")
+    localizer: Any = FixedLocalizer(BASE_FROM_CAMERA @ SE3.exp([0.05, 0, 0, 0, 0, 0]))
+    [image] = annotate_images(own, select_images(own, tmp_path)[0], None, localizer).images
+    assert image.landmarks == 2
+    assert image.summary == f"used; 2 landmarks, median residual {median_px:.2f} px"
+
+
+def test_reason_for_missing_landmarks_is_given(tmp_path: Path) -> None:
+    write_images(tmp_path, "a.png")
+    own = calibration({"a.png": True}, source={"scene": "room", "map": "another"})
+    files, _ = select_images(own, tmp_path)
+    without_pose: Any = FixedLocalizer(None)
+    result = annotate_images(own, files, None, without_pose)
+    assert result.images[0].summary == "used; too dark"
+    assert result.other_map
+    assert not annotate_images(calibration({}), [], None, without_pose).other_map
+    localizer: Any = FixedLocalizer(BASE_FROM_CAMERA)
+    elsewhere = replace(own, source={"scene": "attic"})
+    [image] = annotate_images(elsewhere, files, None, localizer).images
+    assert image.summary == "used; shows room, not attic"
