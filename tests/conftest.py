@@ -1,10 +1,9 @@
-"""Small rooms and small networks, made once.
+"""Recordings of small rooms and a map, each made once.
 
-Three sizes. `rooms` are 64x48 pixels with random networks, for all that does not depend on what was
-learned. `arcs` are short camera arcs at 160x120 with the shipped networks: a few hundred steps of
-training locate their images to some centimetres. `hall` is an arc at 320x240 with fine textures:
-its map locates images to a millimetre. torch is imported inside the fixtures only, after its number
-of threads is set: tests run side by side, and small products are slower with more threads.
+`rooms` are 64x48 pixels, for tests that need no pose. `arcs` are short camera arcs at 160x120.
+`hall` is an arc at 320x240 with fine textures: its map locates images to a millimetre. torch is
+imported inside the fixtures, after its number of threads is set: tests run side by side, and small
+matrix products are slower with more threads.
 """
 
 from __future__ import annotations
@@ -23,9 +22,8 @@ os.environ["OMP_NUM_THREADS"] = "1"
 if TYPE_CHECKING:
     import torch
 
-    from evercal.continual.stage import Stage, StageOptions
-    from evercal.mapping.scene_maps import SceneMaps
-    from evercal.mapping.store import Store
+    from evercal.mapping.build import BuiltMap
+    from evercal.mapping.scene_map import MapContents
     from evercal.recordings.frame import Recording
     from evercal.simulation.box_room import BoxRoom
 
@@ -33,9 +31,15 @@ if TYPE_CHECKING:
 def _room(
     seed: int, name: str, size: tuple[int, int], span: int, every: int = 1, texture_px: int = 96
 ) -> Recording:
-    """A walk of half a metre, turning by 50 degrees; every `every`-th view of `span` is learned.
+    """A walk of half a metre that turns by 50 degrees.
 
-    The other views are there to test.
+    Args:
+        seed: of the room and the heading.
+        name: of the recording.
+        size: width and height of its images, pixels.
+        span: number of views.
+        every: step between training views; the others are test views.
+        texture_px: side of the textures.
     """
     import numpy as np
 
@@ -56,14 +60,25 @@ def _room(
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request: pytest.FixtureRequest) -> torch.device:
-    """The CPU, and with `-m gpu` a CUDA device; without one the test is skipped."""
+    """The CPU, and with `-m gpu` a CUDA device; the test is skipped if there is none."""
     import torch
 
     from evercal.features.device import device_of
 
     if request.param == "cuda" and not torch.cuda.is_available():
-        pytest.skip("PyTorch finds no CUDA device on this machine")
+        pytest.skip("this machine has no CUDA device")
     return device_of(request.param)
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """torch with two threads, whatever the machine has."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")
@@ -77,174 +92,10 @@ def rooms() -> tuple[Recording, Recording, Recording]:
 
 
 @pytest.fixture(scope="session")
-def quick() -> StageOptions:
-    """A stage of eight steps for `rooms`."""
-    from evercal.continual.networks.buffer import EncodePlan
-    from evercal.continual.networks.head import HeadOptions
-    from evercal.continual.networks.trainer import FitOptions
-    from evercal.continual.stage import StageOptions
-    from evercal.features.views import ViewOptions
-
-    return StageOptions(
-        head=HeadOptions(width=16, centres_per_scene=3),
-        fit=FitOptions(iterations=8, batch=64, replay_batch=32),
-        encode=EncodePlan(views_per_frame=2, cells=24, view=ViewOptions(short_side=48)),
-        replay_views_per_frame=2,
-    )
-
-
-@pytest.fixture(scope="session")
-def quick_vlad() -> Iterator[None]:
-    """Tiny encoders get random centroids at once; rooms for better ones take seconds to draw."""
-    import torch
-
-    from evercal.features import vlad
-    from evercal.features.encoder import Encoder
-
-    whole = vlad.fit_centroids
-
-    def quick(encoder: Encoder) -> torch.Tensor:
-        if encoder.width > 8:
-            return whole(encoder)
-        drawn = torch.randn(4, encoder.width, generator=torch.Generator().manual_seed(0))
-        return torch.nn.functional.normalize(drawn, dim=1)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(vlad, "fit_centroids", quick)
-        yield
-
-
-@pytest.fixture(scope="session")
-def blank(quick_vlad: None) -> Callable[[str], SceneMaps]:
-    """Makes a robot that knows nothing, with tiny random networks, given its strategy."""
-    import torch
-
-    from evercal.continual.networks.descriptor import GlobalDescriptor
-    from evercal.features.encoder import LocalEncoder
-    from evercal.mapping.scene_maps import SceneMaps
-
-    torch.manual_seed(0)
-    encoder = LocalEncoder(stem=(4, 4), inner=8, blocks=1, width=8).eval()
-    descriptor = GlobalDescriptor(8, maps=2, hidden=4, width=8).eval()
-    for parameter in (*encoder.parameters(), *descriptor.parameters()):
-        parameter.data = parameter.data.half().float()  # as they are stored
-    return lambda strategy: SceneMaps(encoder, descriptor, strategy, 48)
-
-
-@pytest.fixture(scope="session")
-def taught(
-    blank: Callable[[str], SceneMaps],
-    rooms: tuple[Recording, Recording, Recording],
-    quick: StageOptions,
-) -> dict[str, list[SceneMaps]]:
-    """By strategy: what is known after one, two and three rooms."""
-    from evercal.continual.learn import learn
-    from evercal.continual.stage import Stage
-    from evercal.continual.strategies import STRATEGIES
-    from evercal.mapping.scene_maps import with_fit
-
-    found: dict[str, list[SceneMaps]] = {}
-    for strategy in ("evercal", "evercal_network", "isolation"):
-        maps, after = blank(strategy), []
-        for scene in rooms:
-            *_, stage = learn(maps, STRATEGIES[strategy], scene, quick)
-            assert isinstance(stage, Stage)
-            maps = stage.maps
-            maps.scenes[-1] = with_fit(maps.scenes[-1], 0.01 * len(maps.scenes), 1.5)
-            after.append(maps)
-        found[strategy] = after
-    return found
-
-
-@pytest.fixture(scope="session")
-def make() -> Callable[[Path, list[SceneMaps]], Store]:
-    """Makes a store with given stages, the way `teach` does."""
-    import torch
-
-    from evercal.mapping.store import Checkpoint, Store
-
-    def store(root: Path, stages: list[SceneMaps]) -> Store:
-        first = stages[0]
-        store = Store(root, replace(first, heads=[], scenes=[], keyframes=[]), [], None)
-        for maps in stages:
-            store.begin({"scene": maps.scenes[-1].name})
-            store.checkpoint(Checkpoint({"a": torch.zeros(3)}, {"b": torch.ones(2)}))
-            store.commit(maps, {"scene": maps.scenes[-1].name, "seconds": 1.5})
-        return store
-
-    return store
-
-
-@pytest.fixture(scope="session")
-def answers(rooms: tuple[Recording, Recording, Recording]) -> Callable[..., list[bytes]]:
-    """Tells what a robot says to an image of each room and keeps of it, to the last bit."""
-    from evercal.localization.localizer import LocalizeOptions, Localizer
-    from evercal.localization.pnp import PnpOptions
-
-    # Networks this small are wide of the mark: only generous bounds give poses to compare.
-    wide = PnpOptions(threshold_px=20.0)
-
-    def ask(maps: SceneMaps, sure: bool | None = None) -> list[bytes]:
-        # The encoder is too small for maps to answer, so what they hold is compared.
-        sure = bool(maps.heads) if sure is None else sure
-        localizer, said = Localizer(maps, LocalizeOptions(pnp=wide)), []
-        for scene in rooms:
-            frame = scene.train[0]
-            found = localizer.localize(frame.read_image(), frame.camera)
-            pose = found.base_from_camera
-            numbers = b"" if pose is None else pose.matrix().tobytes()
-            assert found.inliers > 0 or not sure, "an answer without a pose would be like any other"
-            said.append(repr((found.status, found.scene, found.inliers)).encode() + numbers)
-        for kept in maps.keyframes if not maps.heads else []:
-            assert kept is not None
-            assert kept.landmarks
-            said += [value.numpy().tobytes() for value in kept.to_tensors().values()]
-        return said
-
-    return ask
-
-
-@pytest.fixture(scope="session")
 def arcs() -> tuple[Recording, Recording]:
     """Two scenes of 24 training and 24 test frames in between, 160x120 pixels."""
     one, two = (_room(seed, name, (160, 120), 48, 2) for seed, name in ((34, "one"), (31, "two")))
     return one, two
-
-
-@pytest.fixture(scope="session")
-def arc_stage() -> StageOptions:
-    """Enough training for `arcs`."""
-    from evercal.continual.networks.buffer import EncodePlan
-    from evercal.continual.networks.head import HeadOptions
-    from evercal.continual.networks.trainer import FitOptions
-    from evercal.continual.stage import StageOptions
-    from evercal.features.views import ViewOptions
-
-    return StageOptions(
-        head=HeadOptions(width=64),
-        fit=FitOptions(iterations=600, batch=384, replay_batch=256, peak_rate=7e-3),
-        encode=EncodePlan(views_per_frame=2, view=ViewOptions(short_side=120)),
-    )
-
-
-@pytest.fixture(scope="session")
-def arc_maps(
-    arcs: tuple[Recording, Recording], arc_stage: StageOptions
-) -> tuple[SceneMaps, SceneMaps]:
-    """What is known after the first arc, and after both."""
-    from evercal.continual.learn import learn
-    from evercal.continual.networks.descriptor import load_descriptor
-    from evercal.continual.stage import Stage
-    from evercal.continual.strategies import STRATEGIES
-    from evercal.features.encoder import load_encoder
-    from evercal.mapping.scene_maps import SceneMaps
-
-    maps = [SceneMaps(load_encoder(), load_descriptor(), "evercal_network", 120)]
-    for arc in arcs:
-        *_, stage = learn(maps[-1], STRATEGIES["evercal_network"], arc, arc_stage)
-        assert isinstance(stage, Stage)
-        maps.append(stage.maps)
-    return maps[1], maps[2]
 
 
 HALL_SEED = 34
@@ -265,33 +116,32 @@ def hall_room() -> BoxRoom:
 
 
 @pytest.fixture(scope="session")
-def hall_stage(hall: Recording) -> Stage:
-    """The map of `hall` with 7 keyframes; the thresholds of its record are fitted."""
-    from evercal.continual.learn import learn
-    from evercal.continual.networks.descriptor import load_descriptor
-    from evercal.continual.stage import Stage, StageOptions
-    from evercal.continual.strategies import STRATEGIES
+def hall_built(hall: Recording) -> BuiltMap:
+    """The map of `hall` with 7 keyframes; its acceptance is fitted to three test frames."""
     from evercal.features.encoder import load_encoder
-    from evercal.localization.acceptance import fitted_record
-    from evercal.mapping.scene_maps import SceneMaps
+    from evercal.localization.acceptance import fit_acceptance
+    from evercal.mapping.build import MapOptions, build_map
+    from evercal.mapping.memory_budget import MemoryBudget
+    from evercal.mapping.scene_map import MapContents
 
-    nothing = SceneMaps(load_encoder(), load_descriptor(), "evercal", 240)
-    options = StageOptions(memory_share=0.25)
-    *_, stage = learn(nothing, STRATEGIES["evercal"], hall, options)
-    assert isinstance(stage, Stage)
-    stage.maps.scenes[0] = fitted_record(stage.maps, hall.test[::10])
-    return stage
+    encoder, options = load_encoder(), MapOptions(memory=MemoryBudget(share=0.25))
+    built = build_map("hall", hall.train, encoder, options)
+    contents = MapContents(encoder, options.size.cells, [built.scene])
+    return replace(built, scene=fit_acceptance(contents, hall.test[::10]))
 
 
 @pytest.fixture(scope="session")
-def hall_maps(hall_stage: Stage) -> SceneMaps:
-    """What is known after `hall`."""
-    return hall_stage.maps
+def hall_map(hall_built: BuiltMap) -> MapContents:
+    """A map with `hall` as its only scene."""
+    from evercal.features.encoder import load_encoder
+    from evercal.mapping.scene_map import MapContents
+
+    return MapContents(load_encoder(), 240, [hall_built.scene])
 
 
 @pytest.fixture(scope="session")
 def tree() -> Callable[[Path], dict[str, str]]:
-    """Lists a folder: checksum of every file in it, by relative path."""
+    """Checksums of the files in a folder, by relative path."""
 
     def checksums(root: Path) -> dict[str, str]:
         return {

@@ -1,8 +1,7 @@
-"""Finds tensors on the wrong device on a machine that has only one.
+"""Detect tensors on the wrong device on a machine without a GPU.
 
-torch's `meta` device stands in for a GPU: its tensors have shapes and no numbers. Many of torch's
-own kernels take a `meta` tensor beside one of the CPU without a word, so every operation is checked
-here.
+torch's `meta` device replaces the GPU: its tensors have shapes and no numbers. Many kernels of torch
+accept a `meta` tensor beside one of the CPU, so every operation is checked here.
 """
 
 from collections.abc import Iterable, Iterator
@@ -19,9 +18,9 @@ _COPIES = (torch.ops.aten._to_copy, torch.ops.aten.to, torch.ops.aten.copy_)
 
 
 class OneDevice(TorchDispatchMode):
-    """Raises where an operation takes tensors of two devices, as CUDA would.
+    """Raise if an operation takes tensors of two devices, as CUDA does.
 
-    Copies may, and single numbers of the CPU may go anywhere.
+    Copies and scalars of the CPU are allowed.
     """
 
     def __torch_dispatch__(
@@ -35,10 +34,10 @@ class OneDevice(TorchDispatchMode):
 
 
 @contextmanager
-def made_where_inputs_lie() -> Iterator[None]:
-    """Whatever is made without naming a device lies on `meta`; with inputs on the CPU it is found.
+def tensors_stay_on_their_device() -> Iterator[None]:
+    """Create tensors without a named device on `meta`, while all inputs are on the CPU.
 
-    It makes an operation raise, or has no numbers to give.
+    Any operation on such a tensor and an input raises, and its values cannot be read.
     """
     with META, OneDevice():
         yield

@@ -1,4 +1,4 @@
-"""Maps are brought into the base frame by touched points, with an uncertainty that holds."""
+"""A map is aligned to the base frame by touched points."""
 
 import numpy as np
 import pytest
@@ -7,17 +7,17 @@ from scipy.spatial.transform import Rotation
 from evercal.calibration.align_points import Picks, align_by_points
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.mapping.scene_maps import Alignment
+from evercal.mapping.map_frame import Similarity
 
 CAMERA = Camera(640, 480, 600, 600, 320, 240)
 MIDDLE = np.array([0.5, 0.0, 0.2])
 
 
 def views(
-    truth: Alignment, points: np.ndarray, sigma_px: float, rng: np.random.Generator
+    truth: Similarity, points: np.ndarray, sigma_px: float, rng: np.random.Generator
 ) -> list[Picks]:
-    """Four cameras around the points, located in the map, with noisy picks."""
-    found = []
+    """Noisy picks in four located images around the points."""
+    images = []
     for _ in range(4):
         eye = MIDDLE + 1.2 * Rotation.random(rng=rng).apply([0, 0, -1])
         z = (MIDDLE - eye) / 1.2
@@ -28,43 +28,42 @@ def views(
         base_from_camera = SE3.from_matrix(matrix)
         pixels = CAMERA.project(base_from_camera.inverse().apply(points))
         pixels = pixels + rng.normal(0, sigma_px, pixels.shape)
-        inside = truth.base_from_map.inverse() @ base_from_camera
-        inside = SE3(inside.rotation_wxyz, inside.translation_m / truth.scale)
+        map_from_camera = truth.inverse_pose(base_from_camera)
         names = tuple(f"p{i}" for i in range(len(points)))
-        found.append(Picks(inside, CAMERA, points, names, pixels))
-    return found
+        images.append(Picks(map_from_camera, CAMERA, points, names, pixels))
+    return images
 
 
-def drawn(seed: int) -> tuple[Alignment, np.ndarray, np.random.Generator]:
+def drawn(seed: int) -> tuple[Similarity, np.ndarray, np.random.Generator]:
     rng = np.random.default_rng(seed)
-    truth = Alignment(SE3.exp(rng.normal(0, 1, 6)), float(np.exp(rng.normal(0, 0.5))))
+    truth = Similarity(SE3.exp(rng.normal(0, 1, 6)), float(np.exp(rng.normal(0, 0.5))))
     return truth, rng.uniform(-0.3, 0.3, (6, 3)) + MIDDLE, rng
 
 
-def test_exact_picks_give_the_exact_place_and_scale() -> None:
+def test_exact_picks_give_the_exact_similarity() -> None:
     truth, points, rng = drawn(0)
-    found = align_by_points(views(truth, points, 0.0, rng), scale_known=False)
-    assert found.alignment.scale == pytest.approx(truth.scale, rel=1e-6)
+    fit = align_by_points(views(truth, points, 0.0, rng), scale_known=False)
+    assert fit.similarity.scale == pytest.approx(truth.scale, rel=1e-6)
     in_map = truth.base_from_map.inverse().apply(points) / truth.scale
-    assert found.alignment.points(in_map) == pytest.approx(points, abs=1e-6)
+    assert fit.similarity.points(in_map) == pytest.approx(points, abs=1e-6)
 
 
-def test_the_covariance_is_no_smaller_than_the_errors() -> None:
+def test_covariance_covers_the_errors() -> None:
     squared = []
     for seed in range(40):
         truth, points, rng = drawn(seed)
-        found = align_by_points(views(truth, points, 1.0, rng), scale_known=False)
+        fit = align_by_points(views(truth, points, 1.0, rng), scale_known=False)
         in_map = truth.base_from_map.inverse().apply(points) / truth.scale
-        placed = found.alignment.points(in_map)
-        # The seven numbers that would bring the points home, by linear least squares.
+        estimate = fit.similarity.points(in_map)
+        # The seven parameters that map the estimates to the points, by linear least squares.
         rows = []
-        for x, y, z in placed:
-            turn = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+        for x, y, z in estimate:
+            rotation = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
             away = np.array([x, y, z]) - points.mean(0)
-            rows.append(np.column_stack([np.eye(3), turn, away]))
-        error = np.linalg.lstsq(np.concatenate(rows), (points - placed).ravel(), rcond=None)[0]
-        squared.append(error @ np.linalg.solve(found.covariance, error))
-    assert 2.5 < np.mean(squared) < 9.0  # seven for an exact one
+            rows.append(np.column_stack([np.eye(3), rotation, away]))
+        error = np.linalg.lstsq(np.concatenate(rows), (points - estimate).ravel(), rcond=None)[0]
+        squared.append(error @ np.linalg.solve(fit.covariance, error))
+    assert 2.5 < np.mean(squared) < 9.0  # 7 for an exact covariance
 
 
 def test_points_on_a_line_are_refused() -> None:

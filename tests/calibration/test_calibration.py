@@ -1,4 +1,4 @@
-"""The calibration file says what it said, and nothing that contradicts itself."""
+"""Calibration files: a round trip, and refusal of files that contradict themselves."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 
 
-def made() -> Calibration:
+def example() -> Calibration:
     return Calibration(
         "eye_in_hand",
         SE3.exp([0.1, -0.2, 0.3, 0.4, -0.5, 0.6]),
@@ -28,23 +28,23 @@ def made() -> Calibration:
     )
 
 
-def test_a_file_comes_back_as_it_was(tmp_path: Path) -> None:
-    calibration = made()
+def test_round_trip(tmp_path: Path) -> None:
+    calibration = example()
     calibration.write(tmp_path / "c.json")
-    back = read_calibration(tmp_path / "c.json")
-    assert max(pose_distance(back.parent_from_child, calibration.parent_from_child)) < 1e-12
-    assert back.to_dict() == calibration.to_dict()
-    assert back.images == calibration.images
-    assert back.meaning.startswith("pose of camera_color_optical_frame in panda_hand")
+    read = read_calibration(tmp_path / "c.json")
+    assert max(pose_distance(read.parent_from_child, calibration.parent_from_child)) < 1e-12
+    assert read.to_dict() == calibration.to_dict()
+    assert read.images == calibration.images
+    assert read.meaning.startswith("pose of camera_color_optical_frame in panda_hand")
 
 
-def test_sigmas_are_root_mean_squares_of_the_axes() -> None:
-    assert made().sigma_mm == pytest.approx(1000 * np.sqrt(2e-6))
-    assert made().sigma_deg == pytest.approx(np.rad2deg(np.sqrt(2e-8)))
+def test_sigmas_are_root_mean_squares_over_the_axes() -> None:
+    assert example().sigma_mm == pytest.approx(1000 * np.sqrt(2e-6))
+    assert example().sigma_deg == pytest.approx(np.rad2deg(np.sqrt(2e-8)))
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"format": "x"}, "no calibration"),
         ({"version": 2}, "version 2"),
@@ -57,20 +57,20 @@ def test_sigmas_are_root_mean_squares_of_the_axes() -> None:
         ({"child_frame": "panda_hand"}, "both called"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, change: dict, said: str) -> None:
+def test_contradictions_are_refused(tmp_path: Path, change: dict, message: str) -> None:
     file = tmp_path / "c.json"
-    file.write_text(json.dumps({**made().to_dict(), **change}))
-    with pytest.raises(InputError, match=said):
+    file.write_text(json.dumps({**example().to_dict(), **change}))
+    with pytest.raises(InputError, match=message):
         read_calibration(file)
 
 
-def test_files_that_are_none(tmp_path: Path) -> None:
+def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="missing"):
         read_calibration(tmp_path / "none.json")
     (tmp_path / "text").write_text("hello")
     with pytest.raises(InputError, match="give the JSON"):
         read_calibration(tmp_path / "text")
-    data = made().to_dict()
+    data = example().to_dict()
     del data["covariance"]
     (tmp_path / "half").write_text(json.dumps(data))
     with pytest.raises(InputError, match="'covariance' is missing"):

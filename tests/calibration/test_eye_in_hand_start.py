@@ -1,4 +1,6 @@
-"""The start of `gripper_from_camera`: exact from exact motions, robust, refused with a reason."""
+"""A first `gripper_from_camera` from the motions of pairs of images."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,23 +26,25 @@ def grippers(count: int, seed: int, size: tuple[float, float] = (0.3, 0.4)) -> S
 
 
 def motions(poses: SE3, truth: SE3, noise_rad: float = 0.0, wrong: int = 0) -> list[PairMotion]:
-    """Camera motions as two images give them: no length; some of them nonsense."""
-    rng, found = np.random.default_rng(1), []
+    """Camera motions from pairs of images, without length; some of them random."""
+    rng, pairs = np.random.default_rng(1), []
     cameras = poses @ truth
     for i in range(len(poses)):
         for j in range(i + 1, min(i + 4, len(poses))):
             moved = cameras[j].inverse() @ cameras[i]
-            turn = Rotation.from_quat(moved.rotation_wxyz, scalar_first=True)
-            turn = turn * Rotation.from_rotvec(rng.normal(0, noise_rad, 3))
+            rotation = Rotation.from_quat(moved.rotation_wxyz, scalar_first=True)
+            rotation = rotation * Rotation.from_rotvec(rng.normal(0, noise_rad, 3))
             direction = moved.translation_m + rng.normal(0, noise_rad, 3) * np.linalg.norm(
                 moved.translation_m
             )
-            found.append(PairMotion(i, j, turn, direction / np.linalg.norm(direction)))
-    for k in rng.choice(len(found), wrong, replace=False).tolist():
-        away = rng.normal(size=3)
-        turn = Rotation.random(rng=rng)
-        found[k] = PairMotion(found[k].first, found[k].second, turn, away / np.linalg.norm(away))
-    return found
+            pairs.append(PairMotion(i, j, rotation, direction / np.linalg.norm(direction)))
+    for k in rng.choice(len(pairs), wrong, replace=False).tolist():
+        random = rng.normal(size=3)
+        rotation = Rotation.random(rng=rng)
+        pairs[k] = PairMotion(
+            pairs[k].first, pairs[k].second, rotation, random / np.linalg.norm(random)
+        )
+    return pairs
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -54,7 +58,7 @@ def test_exact_motions_give_the_exact_transform(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_wrong_pairs_are_left_out(seed: int) -> None:
+def test_wrong_pairs_are_rejected(seed: int) -> None:
     poses = grippers(30, seed)
     start = solve_motions(poses, motions(poses, TRUTH, 0.005, wrong=20), OPTIONS)
     metres, radians = pose_distance(start.gripper_from_camera, TRUTH)
@@ -63,19 +67,19 @@ def test_wrong_pairs_are_left_out(seed: int) -> None:
     assert start.pairs <= start.of_pairs - 15
 
 
-def test_the_inverse_of_the_poses_is_noticed() -> None:
+def test_inverted_poses_are_refused() -> None:
     poses = grippers(20, 0)
     with pytest.raises(InputError, match=r"agree in only .*not the inverse"):
         solve_motions(poses.inverse(), motions(poses, TRUTH), OPTIONS)
 
 
-def test_too_few_pairs_are_said() -> None:
+def test_too_few_pairs_are_refused() -> None:
     poses = grippers(4, 0)
     with pytest.raises(InputError, match="only 6 pairs"):
         solve_motions(poses, motions(poses, TRUTH), OPTIONS)
 
 
-def test_the_spread_of_rotations_is_that_of_their_axes() -> None:
+def test_rotation_spread_by_axis() -> None:
     angles = np.deg2rad([-20, -10, 0, 10, 20])
     six = np.zeros((5, 6))
     six[:, 4] = angles
@@ -84,16 +88,16 @@ def test_the_spread_of_rotations_is_that_of_their_axes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("axes", "said"),
+    ("axes", "message"),
     [((0, 0, 0), "without rotation"), ((0, 20, 0), "about one axis only"), ((20, 20, 0), None)],
 )
-def test_what_a_recording_lacks_is_said(axes: tuple[float, ...], said: str | None) -> None:
+def test_poor_motion_is_refused(axes: tuple[float, ...], message: str | None) -> None:
     rng = np.random.default_rng(0)
     six = np.concatenate(
         [rng.normal(0, 0.2, (30, 3)), rng.normal(0, 1, (30, 3)) * np.deg2rad(axes)], 1
     )
-    if said is None:
+    if message is None:
         refuse_poor_motion(SE3.exp(six), OPTIONS)
         return
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         refuse_poor_motion(SE3.exp(six), OPTIONS)

@@ -1,8 +1,8 @@
-"""Cameras calibrated in a map: fixed, on the gripper, in rigs; outliers, drift and audits."""
+"""Cameras calibrated in a map: fixed, on the gripper, in rigs; drift and audits."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,100 +10,28 @@ import numpy as np
 import pytest
 
 from evercal.calibration.audit import audit
-from evercal.calibration.drift import check, shift_between
+from evercal.calibration.drift import check
 from evercal.calibration.from_images import Images, calibrate
-from evercal.calibration.located import Located, fuse, halves_apart
 from evercal.calibration.rig import rig_of
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
-from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
-from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.scene_map import MapContents
 from evercal.recordings import write_image
+from evercal.recordings.formats import generic
 from evercal.recordings.frame import Frame, Recording
 
 Draw = Callable[[Frame, int, int], list[tuple[str, np.ndarray]]]
 
 
-def estimate(scene: str | None, reason: str = "") -> PoseEstimate:
-    pose = None if scene is None else SE3.identity()
-    status = "unknown_scene" if scene is None else "ok"
-    return PoseEstimate(status, reason, scene, pose, np.eye(6) * 1e-6, 100, 0.5, 1.0)
-
-
-def located(poses: SE3, scenes: Sequence[str | None] | None = None) -> list[Located]:
-    names = scenes or ["room"] * len(poses)
-    return [
-        Located(f"{i}.png", estimate(names[i], "too dark"), pose, np.eye(6) * 1e-6)
-        for i, pose in enumerate(poses)
-    ]
-
-
-def scattered(count: int, seed: int = 0, sigma: float = 5e-4) -> tuple[SE3, SE3]:
-    rng = np.random.default_rng(seed)
-    truth = SE3.exp(rng.normal(0, 1, 6))
-    return truth, truth @ SE3.exp(rng.normal(0, sigma, (count, 6)))
-
-
-def test_poses_are_put_together_without_the_outliers() -> None:
-    truth, poses = scattered(20)
-    far = truth @ SE3.exp([0.03, 0, 0, 0, 0, 0])
-    turned = truth @ SE3.exp([0, 0, 0, 0, 0.05, 0])
-    fused = fuse(located(SE3.stack([*poses, far, turned])))
-    assert fused.used.tolist() == [True] * 20 + [False] * 2
-    assert "30.0 mm" in fused.uses[20].reason
-    assert "2.8" in fused.uses[21].reason
-    metres, radians = pose_distance(fused.pose, truth)
-    assert metres < 5e-4
-    assert radians < 5e-4
-
-
-def test_the_order_of_images_does_not_matter() -> None:
-    _, poses = scattered(15)
-    order = np.random.default_rng(1).permutation(15)
-    one, other = fuse(located(poses)), fuse(located(poses[order]))
-    assert max(pose_distance(one.pose, other.pose)) < 1e-9
-    assert one.scatter == pytest.approx(other.scatter)
-
-
-def test_the_scatter_is_that_of_one_image() -> None:
-    _, poses = scattered(400, sigma=1e-3)
-    scatter = fuse(located(poses)).scatter
-    assert np.sqrt(np.diag(scatter)) == pytest.approx([1e-3] * 6, rel=0.15)
-
-
-def test_images_of_other_places_are_named() -> None:
-    _, poses = scattered(5)
-    fused = fuse(located(poses, ["room", "hall", None, "room", "room"]))
-    assert fused.scene == "room"
-    assert fused.used.tolist() == [True, False, False, True, True]
-    assert fused.uses[1].reason == "shows scene hall, most images show room"
-    assert fused.uses[2].reason == "unknown scene: too dark"
-
-
-def test_no_image_of_a_known_place_is_an_error() -> None:
-    _, poses = scattered(2)
-    with pytest.raises(InputError, match="none of 2 images was located"):
-        fuse(located(poses, [None, None]))
-
-
-def test_halves_need_four_images() -> None:
-    _, poses = scattered(40, sigma=1e-3)
-    assert halves_apart(poses[:3]) is None
-    halves = halves_apart(poses)
-    assert halves is not None
-    # Two means of 20 with 1 mm an axis lie some tenths of a millimetre apart.
-    assert 0.05 < halves[0] < 2.0
-
-
 @pytest.fixture(scope="module")
-def localizer(hall_maps: SceneMaps) -> Localizer:
-    return Localizer(hall_maps)
+def localizer(hall_map: MapContents) -> Localizer:
+    return Localizer(hall_map)
 
 
 @pytest.fixture(scope="module")
 def noisy() -> Draw:
-    """Images of a frame as a camera takes them again and again."""
+    """Repeated images of a frame with sensor noise."""
 
     def draw(frame: Frame, count: int, seed: int) -> list[tuple[str, np.ndarray]]:
         rng, image = np.random.default_rng(seed), frame.read_image().astype(float)
@@ -120,21 +48,22 @@ def truth_of(frame: Frame) -> SE3:
     return frame.base_from_camera
 
 
-def test_a_fixed_camera_is_found_within_its_uncertainty(
+def test_fixed_camera_within_its_uncertainty(
     localizer: Localizer, hall: Recording, noisy: Draw
 ) -> None:
     frame = hall.test[3]
-    found = calibrate(localizer, Images(noisy(frame, 6, 0), frame.camera))
-    metres, radians = pose_distance(found.parent_from_child, truth_of(frame))
-    assert found.mount == "eye_to_hand"
+    calibration = calibrate(localizer, Images(noisy(frame, 6, 0), frame.camera))
+    metres, radians = pose_distance(calibration.parent_from_child, truth_of(frame))
+    assert calibration.mount == "eye_to_hand"
+    assert calibration.parent_frame == "base"
     assert metres < 0.004
-    assert metres < 4 * found.sigma_mm / 1000
-    assert radians < 4 * np.deg2rad(found.sigma_deg)
-    assert "will not help" in found.verdict
-    assert [image.used for image in found.images] == [True] * 6
+    assert metres < 4 * calibration.sigma_mm / 1000
+    assert radians < 4 * np.deg2rad(calibration.sigma_deg)
+    assert "will not help" in calibration.verdict
+    assert [image.used for image in calibration.images] == [True] * 6
 
 
-def test_many_images_from_one_spot_are_hardly_better_than_few(
+def test_more_images_from_one_spot_hardly_reduce_the_uncertainty(
     localizer: Localizer, hall: Recording, noisy: Draw
 ) -> None:
     frame = hall.test[3]
@@ -143,19 +72,60 @@ def test_many_images_from_one_spot_are_hardly_better_than_few(
     assert many.sigma_mm > 0.7 * few.sigma_mm
 
 
-def test_a_camera_on_the_gripper_is_told_from_its_motion(
-    localizer: Localizer, hall: Recording
+@pytest.fixture(scope="module")
+def adjusted(hall_map: MapContents) -> Localizer:
+    """A map whose bundle adjustment changed the focal length by 3 %."""
+    scene = hall_map.scenes[0]
+    camera = replace(scene.camera, fx=1.03 * scene.camera.fx, fy=1.03 * scene.camera.fy)
+    scene = replace(scene, adjusted_camera=camera)
+    return Localizer(MapContents(hall_map.encoder, hall_map.short_side, [scene]))
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.0005])
+def test_given_camera_is_used_and_saved(
+    factor: float, adjusted: Localizer, hall: Recording, noisy: Draw
 ) -> None:
+    frame, stated = hall.test[3], adjusted.contents.scenes[0].camera
+    camera = replace(stated, fx=factor * stated.fx, fy=factor * stated.fy)
+    calibration = calibrate(adjusted, Images(noisy(frame, 2, 0), camera))
+    assert pose_distance(calibration.parent_from_child, truth_of(frame))[0] < 0.006
+    assert calibration.camera == camera
+    assert calibration.source["intrinsics"] == "given"
+    assert "--camera" not in calibration.verdict
+
+
+def test_without_a_camera_the_adjusted_one_of_the_map_is_used_and_saved(
+    adjusted: Localizer, hall: Recording, noisy: Draw
+) -> None:
+    images = noisy(hall.test[3], 2, 0)
+    calibration = calibrate(adjusted, Images(images))
+    camera = adjusted.contents.scenes[0].adjusted_camera
+    same = calibrate(adjusted, Images(images, camera))
+    assert calibration.camera == same.camera == camera
+    assert max(pose_distance(calibration.parent_from_child, same.parent_from_child)) < 1e-12
+    assert calibration.source["intrinsics"] == "map"
+    assert "The intrinsics are those of the camera that recorded hall" in calibration.verdict
+    assert "--camera" in calibration.verdict
+
+
+def test_camera_is_saved_at_the_size_of_the_images(localizer: Localizer, hall: Recording) -> None:
+    image = np.repeat(np.repeat(hall.test[3].read_image(), 2, 0), 2, 1)
+    calibration = calibrate(localizer, Images([("a", image)], hall.test[3].camera))
+    assert calibration.camera == hall.test[3].camera.resized(640, 480)
+    assert "It rests on one image" in calibration.verdict
+
+
+def test_camera_on_the_gripper(localizer: Localizer, hall: Recording) -> None:
     gripper_from_camera = SE3.exp([0.05, -0.02, 0.1, 0.3, 0.2, -1.0])
     frames = hall.test[::3]
     grippers = SE3.stack([truth_of(f) @ gripper_from_camera.inverse() for f in frames])
     images = [(f.name, f.read_image()) for f in frames]
-    found = calibrate(localizer, Images(images, frames[0].camera, grippers))
-    assert found.mount == "eye_in_hand"
-    assert found.parent_frame == "gripper"
-    metres, _ = pose_distance(found.parent_from_child, gripper_from_camera)
+    calibration = calibrate(localizer, Images(images, frames[0].camera, grippers))
+    assert calibration.mount == "eye_in_hand"
+    assert calibration.parent_frame == "gripper"
+    metres, _ = pose_distance(calibration.parent_from_child, gripper_from_camera)
     assert metres < 0.004
-    assert metres < 4 * found.sigma_mm / 1000
+    assert metres < 4 * calibration.sigma_mm / 1000
 
 
 def test_eye_in_hand_needs_a_pose_for_every_image(localizer: Localizer, hall: Recording) -> None:
@@ -166,56 +136,78 @@ def test_eye_in_hand_needs_a_pose_for_every_image(localizer: Localizer, hall: Re
         calibrate(localizer, Images(images, base_from_gripper=SE3.identity((2,))))
 
 
-def test_drift_is_seen_and_rest_is_not(localizer: Localizer, hall: Recording, noisy: Draw) -> None:
+def test_images_from_files_and_arrays(hall: Recording, tmp_path: Path) -> None:
+    frames = hall.test[:3]
+    for number, frame in zip((2, 10, 1), frames, strict=True):
+        write_image(tmp_path / f"{number}.png", frame.read_image())
+    in_order = [f.read_image() for f in (frames[2], frames[0], frames[1])]
+    folder = Images.of(tmp_path)
+    assert [Path(name).name for name, _ in folder.images] == ["1.png", "2.png", "10.png"]
+    for source in (in_order, np.stack(in_order), [tmp_path / f"{i}.png" for i in (1, 2, 10)]):
+        for (_, image), expected in zip(Images.of(source).images, in_order, strict=True):
+            np.testing.assert_array_equal(image, expected)
+    [(_, image)] = Images.of(in_order[0]).images
+    np.testing.assert_array_equal(image, in_order[0])
+    with pytest.raises(InputError, match=r"poses\.csv: .*give poses \(n,\)"):
+        Images.of(in_order, robot_poses=tmp_path / "poses.csv")
+    with pytest.raises(InputError, match="no image given"):
+        Images.of([])
+
+
+def test_motion_is_detected_and_rest_is_not(
+    localizer: Localizer, hall: Recording, noisy: Draw
+) -> None:
     frame = hall.test[3]
     reference = calibrate(localizer, Images(noisy(frame, 10, 0), frame.camera))
     now = noisy(frame, 5, 1)
-    shift, _ = check(localizer, now, reference)
+    shift = check(localizer, now, reference)
     assert shift.same_map
     assert not shift.moved
-    for six in ([0.002, 0, 0, 0, 0, 0], [0, 0, 0, 0, np.deg2rad(0.1), 0]):
-        # The camera is where it was, and the reference says elsewhere.
-        elsewhere = replace(reference, parent_from_child=reference.parent_from_child @ SE3.exp(six))
-        shift, _ = check(localizer, now, elsewhere)
+    for tangent in ([0.002, 0, 0, 0, 0, 0], [0, 0, 0, 0, np.deg2rad(0.1), 0]):
+        # The camera has not moved; the reference states another pose.
+        pose = reference.parent_from_child @ SE3.exp(tangent)
+        shift = check(localizer, now, replace(reference, parent_from_child=pose))
         assert shift.moved
-        assert shift.translation_mm == pytest.approx(1000 * np.linalg.norm(six[:3]), abs=0.5)
+        assert shift.translation_mm == pytest.approx(1000 * np.linalg.norm(tangent[:3]), abs=0.5)
 
 
-def test_a_reference_of_another_map_counts_with_its_whole_uncertainty(
+def test_check_uses_the_camera_of_the_calibration(
+    adjusted: Localizer, hall: Recording, noisy: Draw
+) -> None:
+    frame, camera = hall.test[3], adjusted.contents.scenes[0].camera
+    reference = calibrate(adjusted, Images(noisy(frame, 5, 0), camera))
+    now = noisy(frame, 3, 1)
+    assert not check(adjusted, now, reference).moved
+    assert check(adjusted, now, replace(reference, camera=None)).moved
+
+
+def test_reference_of_another_map_adds_its_uncertainty(
     localizer: Localizer, hall: Recording, noisy: Draw
 ) -> None:
     frame = hall.test[3]
     reference = calibrate(localizer, Images(noisy(frame, 5, 0), frame.camera))
-    foreign = replace(reference, source={"command": "solve"})
-    items = [
-        Located(name, found, found.base_from_camera or SE3.identity(), found.covariance)
-        for name, image in noisy(frame, 5, 1)
-        if (found := localizer.localize(image, frame.camera)).covariance is not None
-    ]
-    own = shift_between(reference, fuse(items), items, localizer)
-    other = shift_between(foreign, fuse(items), items, localizer)
+    now = noisy(frame, 5, 1)
+    own = check(localizer, now, reference)
+    other = check(localizer, now, replace(reference, source={"command": "solve"}))
     assert not other.same_map
     assert other.sigma_mm > 1.1 * own.sigma_mm
     with pytest.raises(InputError, match="on the gripper"):
-        shift_between(replace(reference, mount="eye_in_hand"), fuse(items), items, localizer)
+        check(localizer, now, replace(reference, mount="eye_in_hand"))
 
 
-def test_a_rig_knows_its_cameras_relative_to_each_other(
-    localizer: Localizer, hall: Recording, noisy: Draw
-) -> None:
+def test_rig_contains_relative_poses(localizer: Localizer, hall: Recording, noisy: Draw) -> None:
     frames = {"left": hall.test[2], "right": hall.test[5]}
-    rig = rig_of({name: calibrate(localizer, Images(noisy(f, 2, 0))) for name, f in frames.items()})
-    [pair] = rig.relative
+    cameras = {name: calibrate(localizer, Images(noisy(f, 2, 0))) for name, f in frames.items()}
+    [pair] = rig_of(cameras).relative
     truth = truth_of(frames["left"]).inverse() @ truth_of(frames["right"])
-    metres, _ = pose_distance(pair.first_from_second, truth)
     assert (pair.first, pair.second) == ("left", "right")
-    assert metres < 0.006
-    assert pair.sigma_mm > max(found.sigma_mm for found in rig.cameras.values()) * 0.7
+    assert pose_distance(pair.first_from_second, truth)[0] < 0.006
+    assert pair.sigma_mm > max(each.sigma_mm for each in cameras.values()) * 0.7
     with pytest.raises(InputError, match="at least two"):
-        rig_of({"left": rig.cameras["left"]})
+        rig_of({"left": cameras["left"]})
 
 
-def test_episodes_with_wrong_poses_are_listed(
+def test_episodes_with_wrong_poses_are_reported(
     localizer: Localizer, hall: Recording, tmp_path: Path
 ) -> None:
     frame = hall.test[3]
@@ -227,26 +219,16 @@ def test_episodes_with_wrong_poses_are_listed(
     (tmp_path / "dark").mkdir()
     write_image(tmp_path / "dark" / "0.png", np.zeros((240, 320, 3), np.uint8))
     np.savetxt(tmp_path / "dark" / "base_from_camera.txt", np.eye(4))
-    found = {episode.name: episode for episode in audit(localizer, tmp_path)}
-    assert {name: e.verdict for name, e in found.items()} == {
+    generic.write(tmp_path / "recording", Recording("recording", (hall.test[1],), ()))
+    episodes = {episode.name: episode for episode in audit(localizer, tmp_path)}
+    assert {name: episode.verdict for name, episode in episodes.items()} == {
         "good": "right",
         "moved": "wrong",
         "dark": "unknown",
+        "recording": "right",
     }
-    assert found["moved"].translation_mm == pytest.approx(30, abs=4)
+    assert episodes["moved"].translation_mm == pytest.approx(30, abs=4)
     (tmp_path / "bare").mkdir()
     write_image(tmp_path / "bare" / "0.png", frame.read_image())
     with pytest.raises(InputError, match=r"bare: states no camera pose.*--calibration"):
         audit(localizer, tmp_path)
-
-
-def test_an_episode_inside_a_bag_is_audited_too(
-    localizer: Localizer, hall: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "bag").mkdir()
-    frames = tuple(replace(frame, image=frame.read_image()) for frame in hall.test[3:4])
-    monkeypatch.setattr(
-        "evercal.calibration.audit.load_recording", lambda _: Recording("bag", frames, ())
-    )
-    [episode] = audit(localizer, tmp_path)
-    assert episode.verdict == "right"

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Iterable, Iterator
 
 import torch
+from evercal.mapping.scene_maps import SceneMaps
 from torch import Tensor
 
 from evercal.continual.learn import learn
 from evercal.continual.networks.head import Head
 from evercal.continual.stage import Event, Stage, StageOptions
 from evercal.continual.strategies import STRATEGIES
-from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Resume
 from evercal.recordings.frame import Recording
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from evercal.mapping.scene_maps import SceneMaps
 from torch import Tensor
 
 from evercal.continual.finish_scene import memory_bytes
@@ -19,7 +20,6 @@ from evercal.continual.methods.method import FinishedScene, Method, StageStart
 from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.stage import Stage, StageOptions
 from evercal.continual.strategies import STRATEGIES, Strategy
-from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Store
 
 from .stages import Blank, Rooms, assert_same, continued, outcome, weights

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from evercal.mapping.scene_maps import SceneMaps
 from torch import Tensor
 
 from evercal.continual.learn import learn
@@ -25,7 +26,6 @@ from evercal.features.precision import autocast
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.acceptance import fitted_record
 from evercal.localization.localizer import Localizer
-from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Checkpoint
 from evercal.recordings.frame import Frame, Recording
 

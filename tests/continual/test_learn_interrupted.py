@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator, Sequence
 
 import pytest
 import torch
+from evercal.mapping.scene_maps import SceneMaps
 from safetensors.torch import load, save
 
 from evercal.continual import stage_rows
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.stage import Encoding, Event, StageOptions
 from evercal.continual.strategies import STRATEGIES
-from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Checkpoint, Resume
 
 from .stages import Rooms, assert_same, continued, outcome, weights

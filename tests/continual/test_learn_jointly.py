@@ -8,6 +8,7 @@ from itertools import groupby
 import numpy as np
 import pytest
 import torch
+from evercal.mapping.scene_maps import SceneMaps
 
 from evercal.continual.learn_jointly import learn_jointly
 from evercal.continual.networks.head import Head
@@ -15,7 +16,6 @@ from evercal.continual.networks.trainer import Progress
 from evercal.continual.stage import Encoding, Stage, StageOptions
 from evercal.continual.strategies import STRATEGIES
 from evercal.mapping.build import Mapping
-from evercal.mapping.scene_maps import SceneMaps
 
 from .stages import Blank, Rooms, outcome, weights
 

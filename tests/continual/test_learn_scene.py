@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from evercal.mapping.scene_maps import Alignment
+from evercal.mapping.stage_files import head_bytes
 
 from evercal.continual import stage_rows
 from evercal.continual.learn_scene import LearnOptions, LearnReport, learn_scene, validation_split
@@ -26,8 +28,6 @@ from evercal.localization import acceptance
 from evercal.localization.acceptance import MAX_SUPPORT, MIN_SUPPORT
 from evercal.localization.localizer import Localizer
 from evercal.mapping.build import Mapping
-from evercal.mapping.scene_maps import Alignment
-from evercal.mapping.stage_files import head_bytes
 from evercal.mapping.store import Checkpoint, Store
 from evercal.recordings import generic
 from evercal.recordings.frame import Recording

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from evercal.mapping.scene_maps import SceneMaps
 
 from evercal.continual.learn import learn
 from evercal.continual.networks.buffer import FeatureBuffer
@@ -13,7 +14,6 @@ from evercal.continual.stage import Stage, StageOptions
 from evercal.continual.stage_map import fitting
 from evercal.continual.strategies import STRATEGIES
 from evercal.geometry.se3 import SE3, pose_distance
-from evercal.mapping.scene_maps import SceneMaps
 from evercal.recordings.frame import Frame, Recording
 
 from .stages import Blank, Rooms

@@ -1,5 +1,5 @@
-"""A box room and networks that need no training."""
+"""A box room and an encoder that needs no training."""
 
-from ..box_world import block_mean, box, describe, shoot
+from ..box_world import block_mean, box, shoot
 
-__all__ = ["block_mean", "box", "describe", "shoot"]
+__all__ = ["block_mean", "box", "shoot"]

@@ -1,158 +1,105 @@
-"""Which poses are accepted: the threshold and the scale, from answers that are known."""
+"""Support of a pose, the fit of its threshold, and the covariance of accepted poses."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
-from evercal.continual.networks.atlas import Atlas
-from evercal.geometry.se3 import SE3
-from evercal.localization import acceptance
-from evercal.localization.acceptance import MAX_SUPPORT, MIN_SUPPORT
-from evercal.localization.estimate import PoseEstimate
-from evercal.localization.localizer import Localizer
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord, with_fit
-from evercal.recordings.frame import Frame, Recording
-from evercal.simulation.box_room import BoxRoom, default_camera
-
-
-@dataclass
-class Answer:
-    """What the fake localizer says of an image."""
-
-    ratio: float
-    truth: SE3 | None = None
-    estimate: SE3 | None = None
-    covariance: np.ndarray | None = None
-
-
-def fit(
-    monkeypatch: pytest.MonkeyPatch,
-    blank: Callable[[str], SceneMaps],
-    positives: Sequence[Answer],
-    negatives: Sequence[float],
-) -> tuple[float, float]:
-    """`fit_threshold` with given answers to the held-out frames and to the negative images."""
-    said = [*positives, *(Answer(ratio) for ratio in negatives)]
-
-    class Fake:
-        def __init__(self, maps: SceneMaps, *_: object) -> None:
-            # What an earlier fit had found must not count twice.
-            assert maps.scenes[0].covariance_scale == 1.0
-            assert maps.scenes[0].inlier_threshold == 0.0
-
-        def localize(self, image: np.ndarray, camera: object = None) -> PoseEstimate:
-            number = int(image.ravel()[0]) + 256 * int(image.ravel()[1])
-            a = said[number]
-            status = "failed" if a.estimate is None else "ok"
-            return PoseEstimate(status, "", "x", a.estimate, a.covariance, 9, a.ratio, 1.0)
-
-    def image(number: int) -> np.ndarray:
-        return np.array([[[number % 256, number // 256, 0]]], np.uint8)
-
-    camera = default_camera(1, 1)
-    frames = [Frame(str(i), image(i), camera, a.truth) for i, a in enumerate(positives)]
-    unknown = [image(i) for i in range(len(positives), len(said))]
-    with monkeypatch.context() as patch:
-        patch.setattr(acceptance, "Localizer", Fake)
-        patch.setattr(acceptance, "_negative_images", lambda *_: unknown)
-        maps = blank("evercal_network")
-        place = Atlas().place(np.zeros((1, 3)))
-        record = SceneRecord("x", camera, place, torch.zeros(0, maps.descriptor.width), 30)
-        maps.scenes.append(with_fit(record, 0.4, 5.0))
-        return acceptance.fit_threshold(maps, frames)
-
-
-def test_the_threshold_lies_a_sixth_of_the_way_up(
-    monkeypatch: pytest.MonkeyPatch, blank: Callable[[str], SceneMaps]
-) -> None:
-    # 41 values in equal steps: the 5 % and 95 % quantiles are the 3rd and the 39th.
-    positives = [Answer(0.5 + 0.01 * i) for i in range(41)]
-    negatives = [0.001 * i for i in range(41)]
-    threshold, _ = fit(monkeypatch, blank, positives[::-1], negatives)
-    top, low = 0.038, 0.52
-    assert threshold == pytest.approx(top + (low - top) / 6)
-    assert max(negatives) < threshold < min(a.ratio for a in positives)
-
-
-def test_negative_images_are_not_accepted_even_if_known_views_are_no_better(
-    monkeypatch: pytest.MonkeyPatch, blank: Callable[[str], SceneMaps]
-) -> None:
-    threshold, _ = fit(monkeypatch, blank, [Answer(0.05)] * 8, [0.1] * 16)
-    assert threshold == pytest.approx(0.1)
-
-
-@pytest.mark.parametrize(("factor", "expected"), [(1.0, 1.0), (3.0, 9.0), (0.2, 1.0)])
-def test_the_scale_turns_claimed_covariance_into_found_errors(
-    factor: float,
-    expected: float,
-    monkeypatch: pytest.MonkeyPatch,
-    blank: Callable[[str], SceneMaps],
-) -> None:
-    rng = np.random.default_rng(0)
-    positives = []
-    for _ in range(600):
-        truth = SE3.exp(rng.normal(0, 1, 6))
-        root = rng.normal(0, 1, (6, 6)) * np.array([[0.002] * 3 + [0.001] * 3]).T
-        error = factor * root @ rng.normal(0, 1, 6)
-        # As documented: translation in the base frame, rotation about the camera's axes.
-        turned = truth @ SE3.exp(np.array([0, 0, 0, *error[3:]]))
-        estimate = SE3(turned.rotation_wxyz, truth.translation_m + error[:3])
-        positives.append(Answer(0.5, truth, estimate, root @ root.T))
-    for i in range(0, 600, 4):  # poses that are plainly wrong say nothing about precision
-        truth = positives[i].truth
-        assert truth is not None
-        positives[i].estimate = SE3.exp(np.array([2.0, 0, 0, 1, 0, 0])) @ truth
-    _, scale = fit(monkeypatch, blank, positives, [0.0])
-    assert scale == pytest.approx(expected, rel=0.15)
-
-
-def test_unknown_places_are_told_from_known_ones(
-    arc_maps: tuple[SceneMaps, SceneMaps],
-    arcs: tuple[Recording, Recording],
-) -> None:
-    maps = replace(arc_maps[0], scenes=list(arc_maps[0].scenes))
-    fitted = acceptance.fit_threshold(maps, arcs[0].test[:8])
-    maps.scenes[0] = with_fit(maps.scenes[0], *fitted)
-    localizer, camera = Localizer(maps), default_camera(160, 120)
-    right = [localizer.localize(frame.read_image()).status for frame in arcs[0].test[8:]]
-    assert right.count("ok") >= 0.9 * len(right)
-    room = BoxRoom(77, texture_px=96)
-    views = [room.render(camera, room.random_view(np.random.default_rng(i))) for i in range(10)]
-    views.append(np.random.default_rng(0).integers(0, 256, (120, 160, 3)).astype(np.uint8))
-    wrong = [localizer.localize(view).status for view in views]
-    assert wrong.count("ok") <= 1
-
-
-@pytest.mark.parametrize(
-    ("wrong", "bound"),
-    [(0, MAX_SUPPORT), (3, 0.4), (4, MAX_SUPPORT)],  # without a right one nothing is known
+from evercal.geometry import SE3, UncertainPose
+from evercal.localization.acceptance import (
+    COVARIANCE_SCALE,
+    MAX_SUPPORT,
+    MIN_SUPPORT,
+    accepted,
+    fit_acceptance,
+    support,
+    widened,
 )
-def test_frames_that_are_found_elsewhere_do_not_lower_the_bound(
-    wrong: int, bound: float, hall: Recording, hall_maps: SceneMaps, monkeypatch: pytest.MonkeyPatch
+from evercal.localization.query import Hypothesis
+from evercal.mapping.scene_map import MapContents
+from evercal.recordings.frame import Frame, Recording
+
+Change = Callable[[Frame], Frame]
+
+
+def hypothesis(inliers: int, matched: int, expected: int) -> Hypothesis:
+    points = np.zeros((inliers, 3))
+    pose, planned = UncertainPose(SE3.identity(), np.eye(6)), min(expected, 900)
+    return Hypothesis(0, pose, points[:, :2], points, expected, matched, planned)
+
+
+def test_support_formula() -> None:
+    # Half of 800 landmarks match and 4 of 5 matches are inliers: 0.4 * 0.8^2 * sqrt(0.4 * 800).
+    assert support(hypothesis(320, 400, 800)) == pytest.approx(0.4 * 0.64 * np.sqrt(320))
+    assert support(hypothesis(45, 60, 900)) > support(hypothesis(45, 90, 900))
+    assert support(hypothesis(45, 90, 600)) > support(hypothesis(45, 90, 900))
+
+
+def test_searching_more_landmarks_does_not_raise_the_support() -> None:
+    once, three_times = hypothesis(45, 90, 900), hypothesis(135, 270, 2700)
+    assert support(three_times) == pytest.approx(support(once))
+
+
+@pytest.mark.parametrize("threshold", [0.0, 1.5])
+def test_pose_without_inliers_is_never_accepted(threshold: float, hall_map: MapContents) -> None:
+    scene = replace(hall_map.scenes[0], min_support=threshold)
+    assert not accepted(hypothesis(0, 0, 0), scene)
+    assert not accepted(Hypothesis(0), scene)
+
+
+def test_little_support_widens_the_covariance(hall_map: MapContents) -> None:
+    scene = replace(hall_map.scenes[0], covariance_scale=1.5)
+    # All of n landmarks are inliers, so the support is the square root of n.
+    for landmarks, factor in ((1, 6.0), (4, 3.0), (16, 1.5), (400, 1.5)):
+        wide = widened(hypothesis(landmarks, landmarks, landmarks), scene)
+        np.testing.assert_allclose(wide.covariance, factor * np.eye(6))
+
+
+def moved(frame: Frame) -> Frame:
+    """The frame with a stated pose one metre away."""
+    assert frame.base_from_camera is not None
+    return replace(frame, base_from_camera=SE3.exp([1.0, 0, 0, 0, 0, 0]) @ frame.base_from_camera)
+
+
+def occluded(frame: Frame) -> Frame:
+    """The frame with noise over most of its image."""
+    image = frame.read_image().copy()
+    rng = np.random.default_rng(0)
+    image[:, 60:] = rng.integers(0, 256, image[:, 60:].shape)
+    return replace(frame, image=image)
+
+
+def test_threshold_is_the_largest_where_held_out_frames_have_much_support(
+    hall: Recording, hall_map: MapContents
 ) -> None:
-    """Of four frames the first are found a metre off, with little support."""
-    frames = hall.test[:4]
-    said = dict(zip((f.name for f in frames), (0.2, 0.2, 0.2, 0.8), strict=True))
+    scene = fit_acceptance(hall_map, hall.test[::10])
+    assert scene.min_support == MAX_SUPPORT
+    assert scene.covariance_scale == COVARIANCE_SCALE
+    assert scene.keyframes is hall_map.scenes[0].keyframes
 
-    class Fake:
-        def __init__(self, maps: SceneMaps) -> None:
-            assert maps.scenes[0].min_support == MIN_SUPPORT
 
-        def localize(self, image: Frame, camera: object) -> PoseEstimate:
-            pose, support = image.base_from_camera, said[image.name]
-            assert pose is not None
-            if image in frames[:wrong]:
-                pose = SE3.exp([1.0, 0, 0, 0, 0, 0]) @ pose
-            elif not wrong:
-                support = 2.0
-            return PoseEstimate("ok", "", "hall", pose, np.eye(6), 9, 0.5, 1.0, support=support)
+def test_held_out_frames_with_little_support_lower_the_threshold(
+    hall: Recording, hall_map: MapContents
+) -> None:
+    scene = fit_acceptance(hall_map, [occluded(frame) for frame in hall.test[1:12:2]])
+    assert MIN_SUPPORT <= scene.min_support < MAX_SUPPORT
 
-    monkeypatch.setattr(acceptance, "Localizer", Fake)
-    monkeypatch.setattr(Frame, "read_image", lambda frame: frame)
-    record = acceptance.fitted_record(hall_maps, frames)
-    assert record.min_support == pytest.approx(bound)
+
+@pytest.mark.parametrize("frames", [1, 0])
+def test_frames_far_from_their_stated_pose_do_not_count(
+    frames: int, hall: Recording, hall_map: MapContents
+) -> None:
+    # The occluded frames would lower the threshold.
+    held_out = [*hall.test[3 : 3 + frames], *(moved(occluded(f)) for f in hall.test[1:12:2])]
+    assert fit_acceptance(hall_map, held_out).min_support == MAX_SUPPORT
+
+
+def test_only_the_given_scene_is_fitted(hall: Recording, hall_map: MapContents) -> None:
+    first = replace(hall_map.scenes[0], min_support=0.3)
+    both = hall_map.with_scene(replace(first, name="second"))
+    scene = fit_acceptance(both, hall.test[::20], index=0)
+    assert scene.name == "hall"
+    assert [other.min_support for other in both.scenes] == [hall_map.scenes[0].min_support, 0.3]

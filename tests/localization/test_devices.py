@@ -1,113 +1,79 @@
-"""A localizer on any device answers as on the CPU, and makes no tensor on another."""
+"""A localizer on any device gives the same poses and creates no tensor on another device."""
 
 from __future__ import annotations
 
 import copy
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
+from torch import nn
 
-from evercal.errors import InputError
 from evercal.features.vlad import Vlad
-from evercal.geometry.se3 import pose_distance
-from evercal.localization.estimate import PoseEstimate
+from evercal.geometry import pose_distance
 from evercal.localization.localizer import Localizer
-from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.scene_map import MapContents
+from evercal.mapping.store import MapStore
 from evercal.recordings.frame import Recording
 
-from ..one_device import META, OneDevice, made_where_inputs_lie
+from ..one_device import META, OneDevice, tensors_stay_on_their_device
 
 
-def moved(maps: SceneMaps, device: torch.device) -> SceneMaps:
-    """A copy whose networks lie on a device; what others use stays where it is."""
-    networks = copy.deepcopy((maps.encoder, maps.descriptor, maps.heads))
-    encoder, descriptor, heads = networks
-    twin = replace(maps, encoder=encoder, descriptor=descriptor, heads=heads)
-    assert twin.to(device) is twin
-    assert twin.device == device
-    return twin
+def on_device(contents: MapContents, device: torch.device) -> MapContents:
+    """A copy whose encoder is on a device."""
+    copied = replace(contents, encoder=copy.deepcopy(contents.encoder))
+    assert copied.to(device) is copied
+    assert copied.device == device
+    return copied
 
 
-def numbers(found: PoseEstimate) -> list[object]:
-    """All of an answer but the time it took."""
-    arrays = [found.covariance, found.pixels, found.points_m]
-    pose = found.base_from_camera
-    arrays.append(None if pose is None else pose.matrix())
-    plain = [found.status, found.reason, found.scene, found.inliers, found.inlier_ratio]
-    return [*plain, *(None if array is None else array.tobytes() for array in arrays)]
-
-
-@pytest.fixture(params=["map", "network"])
-def known(request: pytest.FixtureRequest) -> tuple[SceneMaps, Recording]:
-    """A map, and networks of two scenes, with a scene that they know."""
-    if request.param == "map":
-        return request.getfixturevalue("hall_maps"), request.getfixturevalue("hall")
-    return request.getfixturevalue("arc_maps")[1], request.getfixturevalue("arcs")[0]
-
-
-def test_poses_are_those_of_the_cpu(
-    known: tuple[SceneMaps, Recording], device: torch.device
+def test_poses_equal_those_of_the_cpu(
+    hall: Recording, hall_map: MapContents, device: torch.device
 ) -> None:
-    """Features are rounded otherwise on another device, so poses differ by less than they err."""
-    maps, scene = known
-    frames = scene.test[2:20:4]
-    here, there = Localizer(maps), Localizer(moved(maps, device))
-    alone = [there.localize(f.read_image(), f.camera) for f in frames]
+    """Features are rounded differently on another device; poses differ less than they err."""
+    frames = hall.test[2:20:4]
+    here, there = Localizer(hall_map), Localizer(on_device(hall_map, device))
+    single = [there.localize(f.read_image(), f.camera) for f in frames]
     batch = there.localize_batch([f.read_image() for f in frames], [f.camera for f in frames])
-    tolerance = 0.005 if maps.heads == [] else 0.05
-    for frame, one, same in zip(frames, alone, batch, strict=True):
+    for frame, one, other in zip(frames, single, batch, strict=True):
         expected = here.localize(frame.read_image(), frame.camera)
-        assert one.status == same.status == expected.status == "ok"
         assert expected.base_from_camera is not None
-        for found in (one, same):
-            assert found.base_from_camera is not None
-            metres, _ = pose_distance(found.base_from_camera, expected.base_from_camera)
-            assert metres < tolerance
+        for estimate in (one, other):
+            assert estimate.status == "ok"
+            assert estimate.base_from_camera is not None
+            assert pose_distance(estimate.base_from_camera, expected.base_from_camera)[0] < 0.005
 
 
-def test_nothing_is_made_on_the_default_device(known: tuple[SceneMaps, Recording]) -> None:
-    maps, scene = known
-    frame = scene.test[7]
-    expected = numbers(Localizer(maps).localize(frame.read_image(), frame.camera))
-    with made_where_inputs_lie():
-        found = Localizer(moved(maps, torch.device("cpu")))
-        assert numbers(found.localize(frame.read_image(), frame.camera)) == expected
+def test_no_tensor_is_created_on_the_default_device(hall: Recording, hall_map: MapContents) -> None:
+    frame = hall.test[7]
+    expected = Localizer(hall_map).localize(frame.read_image(), frame.camera)
+    with tensors_stay_on_their_device():
+        localizer = Localizer(on_device(hall_map, torch.device("cpu")))
+        estimate = localizer.localize(frame.read_image(), frame.camera)
+    assert estimate.base_from_camera is not None
+    assert expected.base_from_camera is not None
+    matrices = [each.base_from_camera.matrix() for each in (estimate, expected)]
+    assert matrices[0].tobytes() == matrices[1].tobytes()
 
 
-def test_a_vlad_is_made_where_the_features_lie(device: torch.device) -> None:
+def test_vlad_is_computed_on_the_device_of_the_features(device: torch.device) -> None:
     generator = torch.Generator().manual_seed(0)
     centroids, features = (
-        torch.nn.functional.normalize(torch.randn(n, 6, generator=generator), dim=1)
-        for n in (5, 200)
+        nn.functional.normalize(torch.randn(n, 6, generator=generator), dim=1) for n in (5, 200)
     )
     vlad = Vlad(centroids, torch.randn(30, 16, generator=generator))
-    found = vlad(features.to(device))
-    assert found.device == device
-    torch.testing.assert_close(found.cpu(), vlad(features), atol=1e-5, rtol=0)
-    # Off the CPU the sums are made as a product, so that their order is always the same.
+    result = vlad(features.to(device))
+    assert result.device == device
+    torch.testing.assert_close(result.cpu(), vlad(features), atol=1e-5, rtol=0)
+    # Off the CPU the sums are matrix products, so that their order is always the same.
     with OneDevice():
         assert vlad(features.to(META)).device == META
 
 
-def test_a_store_opens_on_the_device_that_is_asked_for(
-    hall_maps: SceneMaps, tmp_path: Path, make: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    make(tmp_path / "store", [hall_maps])
-    assert Localizer.open(tmp_path / "store", device="cpu").maps.device == torch.device("cpu")
-    asked: list[torch.device] = []
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
-    monkeypatch.setattr(SceneMaps, "to", lambda maps, where: asked.append(where) or maps)
-    Localizer.open(tmp_path / "store")
-    Localizer.open(tmp_path / "store", device="cuda")
-    Localizer.open(tmp_path / "store", device="cpu")
-    assert asked == [torch.device("cuda", 0), torch.device("cuda", 0), torch.device("cpu")]
-
-
-def test_a_device_that_is_not_there_is_refused_before_the_store_is_read(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="device 'gpu'"):
-        Localizer.open(tmp_path / "none", device="gpu")
+@pytest.mark.gpu
+def test_map_opens_on_the_given_device(hall_map: MapContents, tmp_path: Path) -> None:
+    contents = MapContents(hall_map.encoder, hall_map.short_side)
+    MapStore(tmp_path / "map", contents).commit(hall_map.scenes[0], {})
+    for name, kind in (("auto", "cuda"), ("cuda", "cuda"), ("cpu", "cpu")):
+        assert Localizer.open(tmp_path / "map", device=name).contents.device.type == kind

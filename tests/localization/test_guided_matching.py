@@ -1,101 +1,123 @@
-"""Guided matching: a pose of little support is looked for again near where it was found."""
+"""Guided matching: an image is matched again near a pose with little support."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 
-from evercal.geometry import SE3, pose_distance
-from evercal.localization.localizer import LocalizeOptions, Localizer
-from evercal.localization.query import Candidate, Hypothesis, Query
-from evercal.mapping.scene_maps import SceneMaps
-from evercal.recordings import Recording
+from evercal.features.encode import encode_features
+from evercal.features.views import ViewOptions, plain_view
+from evercal.geometry import SE3, UncertainPose, pose_distance
+from evercal.localization.acceptance import support
+from evercal.localization.localizer import Localizer
+from evercal.localization.query import Candidate, Hypothesis, LocalizeOptions, Query
+from evercal.mapping.scene_map import MapContents
+from evercal.recordings import Frame, Recording
 
 KEYFRAMES = Candidate(0, np.arange(3), 2)
 
 
-def with_support(support: float, metres: float = 0.0) -> Hypothesis:
-    """Nine landmarks of nine are found: the support is the share to the power 1.5, times 3."""
-    share = (support / 3) ** (2 / 3)
-    place = SE3.exp([metres, 0, 0, 0, 0, 0])
-    return Hypothesis(0, place, np.eye(6), 9, share, aligned=True, matched=9, planned=9)
+def with_support(value: float, x_m: float = 0.0) -> Hypothesis:
+    """A pose with a given support: all of n landmarks are inliers, so it is sqrt(planned)."""
+    points = np.zeros((9, 3))
+    inliers = points if value else points[:0]
+    pose = UncertainPose(SE3.exp([x_m, 0, 0, 0, 0, 0]), np.eye(6))
+    # 9 of 9 matches are inliers, a share r of the landmarks: r^1.5 * sqrt(900) = value.
+    expected = 9 / (value / 30) ** (2 / 3) if value else 0
+    return Hypothesis(0, pose, inliers[:, :2], inliers, expected, 9, 900)  # type: ignore[arg-type]
+
+
+@dataclass
+class Scripted(Localizer):
+    """A localizer whose hypotheses have a given support, one after another."""
+
+    supports: list[float]
+    near: list[float] = field(default_factory=list)
+    strides: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.options = LocalizeOptions()
+
+    def _hypothesis(
+        self, query: object, candidate: Candidate, camera: object, near: SE3 | None = None
+    ) -> Hypothesis:
+        if near is not None:
+            self.near.append(float(near.translation_m[0]))
+            self.strides.append(candidate.match_stride)
+        number = len(self.near)
+        return with_support(self.supports[min(number, len(self.supports) - 1)], float(number))
 
 
 @pytest.mark.parametrize(
-    ("first", "later", "end", "looks"),
+    ("supports", "best", "rounds"),
     [
-        (0.5, [1.0, 1.05], 1.0, 2),  # until the gain is small
-        (0.5, [0.4], 0.5, 1),
-        (0.5, [1.0, 1.6, 9.0], 1.6, 2),  # until it is clear
-        (1.5, [], 1.5, 0),
-        (0.0, [], 0.0, 0),
+        ([0.5, 1.0, 1.05], 1.0, 2),
+        ([0.5, 0.4], 0.5, 1),
+        ([0.5, 1.0, 1.6, 9.0], 1.6, 2),
+        ([1.5], 1.5, 0),
+        ([0.0], 0.0, 0),
+        ([0.5, 0.5, 0.5], 0.5, 1),
     ],
 )
-def test_it_is_looked_at_as_long_as_that_helps(
-    first: float, later: list[float], end: float, looks: int
+def test_rounds_repeat_while_the_support_rises(
+    supports: list[float], best: float, rounds: int
 ) -> None:
-    localizer: Any = Localizer.__new__(Localizer)
-    localizer.options = LocalizeOptions()
-    asked: list[tuple[int, SE3]] = []
-
-    def hypothesis(query: Query, candidate: Candidate, cameras: object, near: SE3) -> Hypothesis:
-        asked.append((candidate.match_stride, near))
-        return with_support(later[len(asked) - 1], float(len(asked)))
-
-    localizer._hypothesis = hypothesis
-    start = with_support(first) if first else replace(with_support(1.0), inliers=0)
-    found = localizer._guided(None, start, KEYFRAMES, [])
-    assert found.support == pytest.approx(end)
-    assert [stride for stride, _ in asked] == [1] * looks
-    places = [near.translation_m[0] for _, near in asked]
-    assert np.allclose(places, range(looks))
+    localizer = Scripted(supports)
+    hypothesis = localizer._guided(None, KEYFRAMES, None)  # type: ignore[arg-type]
+    assert support(hypothesis) == pytest.approx(best)
+    assert localizer.near == list(range(rounds))
+    assert localizer.strides == [1] * rounds
 
 
 @pytest.fixture(scope="module")
-def asked(hall: Recording, hall_maps: SceneMaps) -> tuple[Localizer, Query, Any, SE3]:
-    """A localizer, an image on its way, its camera and its pose."""
-    frame, localizer = hall.test[7], Localizer(hall_maps)
-    image, truth = frame.read_image(), frame.base_from_camera
-    assert truth is not None
-    features = localizer._encode([localizer._prepare(image, frame.camera)])[0]
-    return localizer, Query(image, features, 480), frame.camera, truth
+def localizer(hall_map: MapContents) -> Localizer:
+    return Localizer(hall_map)
 
 
-def test_patches_are_matched_to_what_they_would_show_nearby(
-    asked: tuple[Localizer, Query, Any, SE3],
+@pytest.fixture(scope="module")
+def frame(hall: Recording) -> Frame:
+    return hall.test[7]
+
+
+@pytest.fixture(scope="module")
+def query(hall_map: MapContents, frame: Frame) -> Query:
+    image, encoder = frame.read_image(), hall_map.encoder
+    view = plain_view(image, frame.camera, encoder.stride, ViewOptions(short_side=240))
+    return Query(image, encode_features([view], encoder)[0], 480)
+
+
+def truth_of(frame: Frame) -> SE3:
+    assert frame.base_from_camera is not None
+    return frame.base_from_camera
+
+
+def test_matches_project_near_their_pixels(
+    localizer: Localizer, query: Query, frame: Frame
 ) -> None:
-    localizer, query, camera, truth = asked
+    camera, truth = frame.camera, truth_of(frame)
 
-    def away(near: SE3 | None) -> np.ndarray:
-        pixels, points, cells = localizer._matcher.correspondences(query, KEYFRAMES, camera, near)
-        assert len(pixels) == len(points) <= cells
-        assert np.isfinite(points).all()
-        return np.linalg.norm(camera.project(truth.inverse().apply(points)) - pixels, axis=1)
+    def distances(near: SE3 | None) -> np.ndarray:
+        matches = localizer._matches(query, KEYFRAMES, camera, near)
+        assert np.isfinite(matches.points_m).all()
+        projected = camera.project(truth.inverse().apply(matches.points_m))
+        return np.linalg.norm(projected - matches.pixels, axis=1)
 
-    near, anywhere = away(truth), away(None)
-    assert near.max() < LocalizeOptions().guided_px < anywhere.max()
+    near, anywhere = distances(truth), distances(None)
+    assert near.max() < LocalizeOptions().guided_px < np.nanmax(anywhere)
     assert (near < 4).sum() >= (anywhere < 4).sum()
     behind = truth @ SE3.exp([0, 0, 0, 0, np.pi, 0])
-    pixels, points, _ = localizer._matcher.correspondences(query, KEYFRAMES, camera, behind)
-    assert len(pixels) == len(points) < 0.5 * len(near)
+    assert len(localizer._matches(query, KEYFRAMES, camera, behind).pixels) < 0.5 * len(near)
 
 
-def test_a_pose_beside_the_true_one_leads_to_it(
-    asked: tuple[Localizer, Query, Any, SE3],
+def test_a_pose_beside_the_true_one_converges(
+    localizer: Localizer, query: Query, frame: Frame
 ) -> None:
-    localizer, query, camera, truth = asked
+    truth = truth_of(frame)
     beside = truth @ SE3.exp([0.1, 0.05, 0, 0, 0.03, 0])
-    wrong = replace(with_support(0.3), pose=beside)
-    found = localizer._guided(query, wrong, KEYFRAMES, [camera])
-    assert found.pose is not None
-    assert pose_distance(found.pose, truth)[0] < 0.01 < pose_distance(beside, truth)[0]
-
-
-def test_little_support_widens_the_covariance() -> None:
-    assert with_support(1.0).doubt == pytest.approx(4.0)
-    assert with_support(2.0).doubt == pytest.approx(2.0)
-    assert replace(with_support(4.0), planned=900).doubt == 1.0
-    assert Hypothesis(0, SE3.identity(), np.eye(6), 9, 0.1).doubt == 1.0
+    dense = replace(KEYFRAMES, match_stride=1)
+    hypothesis = localizer._hypothesis(query, dense, frame.camera, beside)
+    assert hypothesis.pose is not None
+    estimate = localizer.contents.scenes[0].frame.to_base(hypothesis.pose)
+    assert pose_distance(estimate.pose, truth)[0] < 0.01 < pose_distance(beside, truth)[0]

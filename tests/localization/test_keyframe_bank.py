@@ -1,87 +1,74 @@
-"""The keyframes of a map: who is found, who stays in memory, where the landmarks are."""
+"""The keyframes of a map: retrieval, the limit on decoded keyframes, and their landmarks."""
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from threading import Barrier
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor, nn
 
 from evercal.features.vlad import vlad_for
-from evercal.localization import keyframe_bank as module
 from evercal.localization.keyframe_bank import KeyframeBank
-from evercal.mapping.scene_maps import SceneMaps
+from evercal.mapping.scene_map import MapContents
 
 
 @pytest.fixture(scope="module")
-def several(hall_maps: SceneMaps) -> SceneMaps:
-    """Four scenes: two with keyframes of the hall, two without a map."""
-    keyframes = hall_maps.keyframes[0]
-    assert keyframes is not None
-    plain = replace(keyframes, descriptors=None, landmarks=(), inverse_depth=())
-    mixed = [None, keyframes, plain, keyframes]
-    return replace(hall_maps, scenes=hall_maps.scenes * 4, keyframes=mixed)
+def several(hall_map: MapContents) -> MapContents:
+    """Three scenes with the same seven keyframes."""
+    scene = hall_map.scenes[0]
+    scenes = [replace(scene, name=name) for name in ("a", "b", "c")]
+    return MapContents(hall_map.encoder, hall_map.short_side, scenes)
 
 
-def features(seed: int, maps: SceneMaps) -> torch.Tensor:
-    drawn = torch.randn(300, maps.encoder.width, generator=torch.Generator().manual_seed(seed))
-    return torch.nn.functional.normalize(drawn, dim=1)
+def features(seed: int, contents: MapContents) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.randn(300, contents.encoder.width, generator=generator)
+    return nn.functional.normalize(drawn, dim=1)
 
 
-def test_only_scenes_with_a_map_are_in_the_bank(several: SceneMaps) -> None:
-    bank = KeyframeBank(several, 9)
-    assert len(bank) == 14
-    assert bank.scene.tolist() == [1] * 7 + [3] * 7
-    none = KeyframeBank(replace(several, keyframes=[None] * 4), 9)
-    assert len(none) == 0
-    assert len(none.retrieve(features(0, several), [0, 1])) == 0
-
-
-@pytest.mark.parametrize("scenes", [[1, 3], [3], [0, 2], []])
-def test_retrieval_is_a_search_of_all(scenes: list[int], several: SceneMaps) -> None:
-    bank, keyframes = KeyframeBank(several, 9), several.keyframes[1]
-    assert keyframes is not None
-    assert keyframes.descriptors is not None
+@pytest.mark.parametrize("scenes", [[0, 2], [2], [0, 1, 2], []])
+def test_retrieval_ranks_the_keyframes_of_given_scenes(
+    scenes: list[int], several: MapContents
+) -> None:
+    bank, descriptors = KeyframeBank(several, 9), several.scenes[1].keyframes.descriptors
+    assert len(bank) == 21
+    assert descriptors is not None
     for seed in range(5):
         query = features(seed, several)
-        whole = vlad_for(several.encoder)(query)
-        likeness = [float(row.float() @ whole) for row in keyframes.descriptors] * 2
-        mine = [i for i in range(14) if bank.scene[i] in scenes]
-        found = bank.retrieve(query, scenes).tolist()
-        assert sorted(found) == mine
-        # Both scenes hold the same keyframes, so two are always equally alike.
-        values = [likeness[i] for i in found]
+        vlad = vlad_for(several.encoder)(query)
+        similarity = [float(row.float() @ vlad) for row in descriptors] * 3
+        ranked = bank.retrieve(query, scenes).tolist()
+        assert sorted(ranked) == [i for i in range(21) if bank.scene[i] in scenes]
+        values = [similarity[i] for i in ranked]
         np.testing.assert_allclose(values, sorted(values, reverse=True), atol=1e-6)
 
 
-def test_a_keyframe_finds_itself(hall_maps: SceneMaps) -> None:
-    bank = KeyframeBank(hall_maps, 9)
+def test_a_keyframe_is_most_similar_to_itself(hall_map: MapContents) -> None:
+    bank = KeyframeBank(hall_map, 9)
     for i in range(len(bank)):
         assert bank.retrieve(bank.load(i).cells.features.float(), [0])[0] == i
 
 
 @pytest.mark.parametrize("most", [1, 3, 7])
-def test_no_more_keyframes_stay_in_memory_than_allowed(most: int, hall_maps: SceneMaps) -> None:
-    bank, rng = KeyframeBank(hall_maps, most), np.random.default_rng(0)
-    recent: list[int] = []
-    reads: list[int] = []
-    read = bank._read
-    bank._read = lambda scene, number: reads.append(number) or read(scene, number)  # type: ignore[method-assign]
+def test_least_recently_used_keyframes_are_dropped(most: int, hall_map: MapContents) -> None:
+    bank, rng = KeyframeBank(hall_map, most), np.random.default_rng(0)
+    recent: dict[int, object] = {}
+    dropped: list[object] = []
     for index in rng.integers(0, 7, 25).tolist():
-        known, before = index in recent, len(reads)
-        bank.load(index)
-        # The last ones used are those that stay.
-        recent = [*(i for i in recent if i != index), index][-most:]
-        assert len(reads) == before + (not known)
-        assert list(bank._loaded) == recent
+        loaded, expected = bank.load(index), recent.pop(index, None)
+        assert expected is None or loaded is expected
+        assert expected is not None or loaded not in dropped
+        recent[index] = loaded
+        if len(recent) > most:
+            dropped.append(recent.pop(next(iter(recent))))
 
 
-def test_what_was_dropped_comes_back_the_same(hall_maps: SceneMaps) -> None:
-    bank = KeyframeBank(hall_maps, 1)
+def test_a_keyframe_that_was_dropped_is_loaded_again(hall_map: MapContents) -> None:
+    bank = KeyframeBank(hall_map, 1)
     one, _, again = bank.load(2), bank.load(3), bank.load(2)
     assert one is not again
     assert torch.equal(one.cells.features, again.cells.features)
@@ -91,46 +78,51 @@ def test_what_was_dropped_comes_back_the_same(hall_maps: SceneMaps) -> None:
         np.testing.assert_array_equal(before, after)
 
 
-def test_landmarks_stand_where_their_keyframe_sees_them(hall_maps: SceneMaps) -> None:
-    bank, keyframes = KeyframeBank(hall_maps, 9), hall_maps.keyframes[0]
-    assert keyframes is not None
-    for i, marks in enumerate(keyframes.landmarks):
+def test_landmarks_project_to_their_pixels(hall_map: MapContents) -> None:
+    bank, keyframes = KeyframeBank(hall_map, 9), hall_map.scenes[0].keyframes
+    for i, landmarks in enumerate(keyframes.landmarks):
         loaded, pose = bank.load(i).landmarks, keyframes.base_from_camera[i]
-        seen = keyframes.cameras[i].project(pose.inverse().apply(loaded.surface_m[0]))
-        np.testing.assert_allclose(seen, marks.pixels, atol=1e-6)
+        pixels = keyframes.cameras[i].project(pose.inverse().apply(loaded.surface_m[0]))
+        np.testing.assert_allclose(pixels, landmarks.pixels, atol=1e-6)
         np.testing.assert_array_equal(loaded.position_m, pose.translation_m)
         cells = bank.load(i).cells
         assert len(cells.points_m) == len(cells.features) == 30 * 40
-        assert len(loaded.depth_noise) == len(marks) == len(loaded.patches[0].intensity)
+        assert len(loaded.depth_noise) == len(landmarks) == len(loaded.patches[0].intensity)
 
 
-def test_only_what_is_asked_for_is_made(
-    hall_maps: SceneMaps, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: list[str] = []
-    for name in ("encode_features", "cut_patches"):
-        whole = getattr(module, name)
-        monkeypatch.setattr(
-            module, name, lambda *a, name=name, whole=whole: made.append(name) or whole(*a)
-        )
-    keyframe = KeyframeBank(hall_maps, 9).load(0)
-    assert made == []
-    assert keyframe.cells is keyframe.cells
-    assert made == ["encode_features"]
+class Counted(nn.Module):
+    """An encoder that counts its calls and can wait for another thread in them."""
+
+    def __init__(self, encoder: nn.Module, barrier: Barrier | None = None) -> None:
+        super().__init__()
+        self.encoder, self.barrier, self.calls = encoder, barrier, 0
+        self.stride, self.width = encoder.stride, encoder.width
+
+    def forward(self, grey: Tensor) -> Tensor:
+        self.calls += 1
+        if self.barrier is not None:
+            self.barrier.wait()
+        return self.encoder(grey)
+
+
+def counted(hall_map: MapContents, barrier: Barrier | None = None) -> tuple[KeyframeBank, Counted]:
+    assert isinstance(hall_map.encoder, nn.Module)
+    encoder = Counted(hall_map.encoder, barrier)
+    return KeyframeBank(replace(hall_map, encoder=encoder), 9), encoder
+
+
+def test_keyframes_are_encoded_once_and_on_demand(hall_map: MapContents) -> None:
+    bank, encoder = counted(hall_map)
+    keyframe = bank.load(0)
     assert keyframe.landmarks is keyframe.landmarks
-    assert made == ["encode_features", "cut_patches", "cut_patches"]
+    assert encoder.calls == 0
+    assert keyframe.cells is bank.load(0).cells
+    assert encoder.calls == 1
 
 
-def test_threads_read_other_keyframes_meanwhile(
-    hall_maps: SceneMaps, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bank, whole, both = KeyframeBank(hall_maps, 9), module.encode_features, Barrier(2, timeout=20)
-
-    def together(*words: Any) -> torch.Tensor:
-        both.wait()  # raises where the second thread is kept waiting until the first is done
-        return whole(*words)
-
-    monkeypatch.setattr(module, "encode_features", together)
+def test_threads_load_different_keyframes_at_once(hall_map: MapContents) -> None:
+    # The barrier breaks if the second thread waits until the first one has finished.
+    bank, _ = counted(hall_map, Barrier(2, timeout=20))
     with ThreadPoolExecutor(2) as pool:
         cells = list(pool.map(lambda i: bank.load(i).cells, (0, 1)))
     assert not torch.equal(cells[0].features, cells[1].features)

@@ -51,7 +51,7 @@ def fewest_keyframes(
         options: shares and tolerances.
 
     Returns:
-        Indices of the keyframes, sorted.
+        Indices of the keyframes, sorted; all of them if they locate no other frame.
     """
     options = options or AutoMemoryOptions()
     others = [frame for frame in frames if frame.name not in set(built.keyframe_names)]
@@ -70,7 +70,7 @@ def fewest_keyframes(
             _close(pose, truth, options)
             for pose, truth in zip(poses_of_few, reference, strict=True)
         ]
-        if sum(good) >= options.least_located * len(probes):
+        if good and sum(good) >= options.least_located * len(probes):
             everything = selected
             break
     on_progress("selecting keyframes", len(sizes), len(sizes))

@@ -6,8 +6,13 @@
       stages/0001-NAME/     files of one stage
 
 A file that the manifest does not list is not part of the store. One process writes at a time, under
+<<<<<<< HEAD
+a lock beside the folder. Readers need no lock: they start over if a writer replaced files meanwhile.
+A map and networks are two kinds of store with different files.
+=======
 a lock beside the folder. Readers need no lock: they read again if a writer replaced files.
 What the files mean is up to the kind of store: a map or networks.
+>>>>>>> main
 """
 
 import json
@@ -68,12 +73,19 @@ def _check(root: Path, manifest: Manifest) -> None:
     problems = manifest.problems(root)
     if problems:
         raise InputError(f"store {root}: {problems[0]}; restore it from a copy")
-    for name in manifest.payload.get("networks", []):
+    for name in _listed(root, manifest, "networks"):
         if name not in manifest.files:
             raise InputError(f"store {root}: network {name!r} is not in the manifest; restore it")
-    for name in manifest.payload.get("stages", []):
+    for name in _listed(root, manifest, "stages"):
         if not isinstance(name, str) or not _STAGE.fullmatch(name):
             raise InputError(f"store {root}: stage {name!r} is not a stage's name; restore it")
+
+
+def _listed(root: Path, manifest: Manifest, key: str) -> list[object]:
+    names = manifest.payload.get(key, [])
+    if not isinstance(names, list):
+        raise InputError(f"store {root}: {key!r} in the manifest is not a list; restore it")
+    return names
 
 
 class StageStore:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 
 from evercal.continual.benchmark import bench, strategy_run
 from evercal.continual.benchmark.bench import BenchOptions, begin_bench, in_order, run_bench
@@ -29,7 +30,6 @@ from evercal.continual.presets import PRESETS, on_paper_backbone
 from evercal.continual.strategies import Strategy, strategy_named
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 from evercal.mapping.store import Store
 from evercal.recordings import Frame, Recording
 

@@ -1,5 +1,6 @@
 """A box room and networks that need no training."""
 
-from ...box_world import box, learnable
+from ...box_world import box
+from ..box_features import learnable
 
 __all__ = ["box", "learnable"]

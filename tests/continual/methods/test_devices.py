@@ -18,7 +18,7 @@ from evercal.continual.strategies import STRATEGIES
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame
 
-from ...one_device import made_where_inputs_lie
+from ...one_device import tensors_stay_on_their_device
 from .by_hand import stage_start, wave_buffer, wave_head
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def learned(
 def test_no_tensor_is_created_on_the_default_device(name: str, backbone: str) -> None:
     # With `meta` as the default device and inputs on the CPU, results are the same.
     expected, frames = learned(METHODS[name], BACKBONES[backbone], nullcontext())
-    actual, again = learned(METHODS[name], BACKBONES[backbone], made_where_inputs_lie())
+    actual, again = learned(METHODS[name], BACKBONES[backbone], tensors_stay_on_their_device())
     assert actual.keys() == expected.keys()
     for key, value in actual.items():
         assert value.device.type == "cpu", key

@@ -18,7 +18,7 @@ from evercal.features.views import ViewOptions
 from evercal.geometry import SE3
 from evercal.simulation.box_room import box_room_scene
 
-from ...one_device import META, OneDevice, made_where_inputs_lie
+from ...one_device import META, OneDevice, tensors_stay_on_their_device
 
 SHAPES = [
     HeadOptions(width=12, condition="code", offsets="per_centre"),
@@ -157,7 +157,7 @@ def test_no_tensor_is_created_on_the_default_device(options: HeadOptions, one_sc
 
     context = nullcontext()
     expected = whole()
-    context = made_where_inputs_lie()
+    context = tensors_stay_on_their_device()
     actual = whole()
     assert actual.keys() == expected.keys()
     for name, value in actual.items():
@@ -181,7 +181,7 @@ def test_no_tensor_stays_on_the_cpu(options: HeadOptions, monkeypatch: pytest.Mo
 
 def test_device_guard_detects_mixed_devices() -> None:
     ones = torch.ones(3)
-    with pytest.raises(AssertionError, match="meta"), made_where_inputs_lie():
+    with pytest.raises(AssertionError, match="meta"), tensors_stay_on_their_device():
         torch.nn.functional.linear(ones[None], torch.zeros(2, 3))
     with pytest.raises(AssertionError, match="meta"), OneDevice():
         torch.mm(torch.zeros(3, 3, device=META), ones[:, None])
@@ -221,7 +221,7 @@ def test_views_are_encoded_on_the_device_of_the_networks(
 def test_encoding_creates_no_tensor_on_the_default_device() -> None:
     expected = encoded(CPU, CPU).tensors
     both, buffer = networks(CPU), FeatureBuffer(0, SE3.identity())
-    with made_where_inputs_lie():
+    with tensors_stay_on_their_device():
         for _ in encode_frames(buffer, FRAMES, PLAN, *both):
             pass
     for name, value in buffer.tensors.items():

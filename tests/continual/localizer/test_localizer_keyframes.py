@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from evercal.mapping.scene_maps import SceneMaps
 
 from evercal.continual.learn import learn
 from evercal.continual.networks.descriptor import load_descriptor
@@ -15,7 +16,6 @@ from evercal.continual.strategies import STRATEGIES
 from evercal.features.encoder import load_encoder
 from evercal.localization.localizer import LocalizeOptions, Localizer
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.scene_maps import SceneMaps
 
 if TYPE_CHECKING:
     from evercal.continual.stage import StageOptions

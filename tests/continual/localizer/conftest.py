@@ -6,7 +6,7 @@ oracle looks up what that view sees at that cell and says the true point, in clo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import cast
@@ -14,6 +14,7 @@ from typing import cast
 import numpy as np
 import pytest
 import torch
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -23,20 +24,10 @@ from evercal.continual.networks.head import Head, HeadOptions, HeadOutput
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.estimate import PoseEstimate
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 from evercal.simulation.box_room import BoxRoom, default_camera
 
 SHORT = 120
 CAMERA = default_camera(160, 120)
-
-
-@pytest.fixture
-def two_threads() -> Iterator[None]:
-    """torch with two threads, whatever the machine has."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
 
 
 @cache

@@ -1,0 +1,55 @@
+"""Networks and features of a box room that need no training."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.continual.networks.descriptor import GlobalDescriptor
+from evercal.features.views import View, cell_centres
+from evercal.geometry import SE3, Camera
+from evercal.simulation.box_room import BoxRoom
+
+Learnable = Callable[..., tuple[FeatureBuffer, Tensor]]
+
+CAMERA = Camera(160, 120, 131.0, 128.0, 79.5, 59.5)
+CHANNELS = 48
+ATLAS_FROM_BASE = SE3.exp([5.0, -5.0, 0.0, 0.0, 0.0, 0.7])
+
+
+@pytest.fixture(scope="session")
+def describe() -> GlobalDescriptor:
+    torch.manual_seed(1)
+    return GlobalDescriptor(1, maps=2, hidden=4, width=6).eval()
+
+
+@pytest.fixture(scope="session")
+def learnable(box: BoxRoom) -> Learnable:
+    """A buffer of a box room whose features are waves of the true point; and those points."""
+    waves = np.random.default_rng(0).normal(0, 0.6, (CHANNELS // 2, 3))
+
+    def make(
+        scene: int = 0, views: int = 6, lens: Camera | None = None, correctable: bool = False
+    ) -> tuple[FeatureBuffer, Tensor]:
+        rng = np.random.default_rng(scene)
+        buffer = FeatureBuffer(scene, ATLAS_FROM_BASE, correctable)
+        everything = []
+        for _ in range(views):
+            pose, pixels = box.random_view(rng), cell_centres(120, 160, 8)
+            rays = (lens or CAMERA).unproject(pixels) @ pose.rotation_matrix().T
+            points, _ = box.intersect(pose.translation_m, rays)
+            phase = points @ waves.T
+            features = np.concatenate([np.sin(phase), np.cos(phase)], 1)
+            grid = torch.from_numpy(features.T.reshape(1, CHANNELS, 15, 20)).float()
+            intrinsics = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy], np.float32)
+            grey, valid = np.zeros((120, 160), np.uint8), np.ones(300, bool)
+            view = View(grey, pixels.astype(np.float32), valid, intrinsics, pose)
+            descriptor = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(1, 6))))
+            buffer.add([view], grid, descriptor, torch.ones(1, 300, dtype=torch.bool))
+            everything.append(torch.from_numpy(ATLAS_FROM_BASE.apply(points)).float())
+        return buffer, torch.cat(everything)
+
+    return make

@@ -1,0 +1,379 @@
+"""A folder of stages: whole or not at all, one writer at a time, damage is reported."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from evercal.errors import InputError
+from evercal.storage import MANIFEST, Manifest, verify, write_manifest
+from evercal.storage.stages import SCHEMA, StageStore, is_store, read_store
+
+Tree = Callable[[Path], dict[str, str]]
+PAYLOAD = {"kind": "test"}
+
+
+def opened(root: Path) -> StageStore:
+    """The store at a path, or a new one."""
+    if not is_store(root):
+        return StageStore(root, [], ())
+    payload = read_store(root, lambda manifest: manifest.payload)
+    return StageStore(root, payload["stages"], payload["networks"])
+
+
+def add(store: StageStore, name: str, text: str = "") -> None:
+    def write(folder: Path) -> None:
+        if not store.networks:
+            (store.root / "encoder-1.bin").write_text("weights")
+            store.networks = ("encoder-1.bin",)
+        (folder / "scene.json").write_text(json.dumps(name + text))
+        (folder / "head.bin").write_bytes(bytes(100))
+
+    store.add(name, write, PAYLOAD)
+
+
+def texts(root: Path) -> list[str]:
+    """`scene.json` of every stage."""
+
+    def read(manifest: Manifest) -> list[str]:
+        folders = [root / "stages" / stage for stage in manifest.payload["stages"]]
+        return [json.loads((folder / "scene.json").read_text()) for folder in folders]
+
+    return read_store(root, read)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A store of two stages."""
+    add(opened(tmp_path / "store"), "kitchen")
+    add(opened(tmp_path / "store"), "hall")
+    return tmp_path / "store"
+
+
+def test_stages_are_read_back_in_order(root: Path) -> None:
+    assert texts(root) == ["kitchen", "hall"]
+    store = opened(root)
+    assert store.stages == ["0001-kitchen", "0002-hall"]
+    assert store.size_bytes().keys() == {
+        "encoder-1.bin",
+        *(
+            f"stages/{stage}/{name}"
+            for stage in store.stages
+            for name in ("scene.json", "head.bin")
+        ),
+    }
+    assert verify(root) == []
+    add(store, "a b/c:d")
+    assert store.stages[-1] == "0003-a_b_c_d"
+
+
+def test_a_stage_is_replaced_and_its_other_files_stay(root: Path) -> None:
+    store = opened(root)
+
+    def write(folder: Path) -> None:
+        (folder / "scene.json").write_text('"kitchen, aligned"')
+
+    store.replace(0, write, PAYLOAD)
+    store.replace(0, write, PAYLOAD)
+    assert texts(root) == ["kitchen, aligned", "hall"]
+    assert store.stages == ["0001-kitchen~3", "0002-hall"]
+    assert sorted(os.listdir(root / "stages")) == sorted(store.stages)
+    assert (root / "stages" / store.stages[0] / "head.bin").read_bytes() == bytes(100)
+
+
+def test_superseded_files_of_earlier_stages_are_dropped(root: Path) -> None:
+    store = opened(root)
+    store.add("attic", lambda folder: None, PAYLOAD, lambda name: name == "head.bin")
+    assert not list(root.rglob("head.bin"))
+    assert verify(root) == []
+
+
+def test_an_error_while_writing_leaves_the_store_unchanged(root: Path, tree: Tree) -> None:
+    store, before = opened(root), tree(root)
+
+    def fail(folder: Path) -> None:
+        (folder / "scene.json").write_text("half")
+        raise OSError(28, "No space left on device")
+
+    for change in (
+        lambda: store.add("attic", fail, PAYLOAD),
+        lambda: store.replace(0, fail, PAYLOAD),
+    ):
+        with pytest.raises(OSError, match="No space"):
+            change()
+        assert texts(root) == ["kitchen", "hall"]
+        assert store.stages == ["0001-kitchen", "0002-hall"]
+    add(store, "attic")
+    assert tree(root).keys() - before.keys() == {
+        "stages/0003-attic/scene.json",
+        "stages/0003-attic/head.bin",
+    }
+
+
+@pytest.fixture
+def every_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[Path, Callable[[], object]], list[Path]]:
+    """Run an action on a folder; return what a killed process leaves at each of its steps.
+
+    A step is a call that changes names on disk or syncs them. Snapshots link files instead of
+    copying them: a store never writes into a file that is in place.
+    """
+
+    def record(root: Path, action: Callable[[], object]) -> list[Path]:
+        snapshots: list[Path] = []
+        busy = [False]
+
+        def take() -> None:
+            busy[0] = True
+            snapshots.append(tmp_path / "steps" / f"{len(snapshots):04d}" / "store")
+            if root.exists():
+                shutil.copytree(root, snapshots[-1], copy_function=os.link)
+            busy[0] = False
+
+        def watched(function: Callable[..., object]) -> Callable[..., object]:
+            def call(*args: object, **kwargs: object) -> object:
+                if not busy[0]:
+                    take()
+                return function(*args, **kwargs)
+
+            return call
+
+        with monkeypatch.context() as patch:
+            for name in ("replace", "fsync", "unlink", "rmdir", "mkdir"):
+                patch.setattr(os, name, watched(getattr(os, name)))
+            action()
+        take()
+        return snapshots
+
+    return record
+
+
+@pytest.mark.parametrize("action", ["first", "add", "replace"])
+def test_writer_killed_at_any_step(
+    action: str,
+    root: Path,
+    tmp_path: Path,
+    every_step: Callable[[Path, Callable[[], object]], list[Path]],
+    tree: Tree,
+) -> None:
+    def change(where: Path) -> None:
+        if action == "replace":
+            store = opened(where)
+            store.replace(0, lambda f: write_text(f / "scene.json", '"new"'), PAYLOAD)
+        else:
+            add(opened(where), "attic")
+
+    def write_text(path: Path, text: str) -> None:
+        path.unlink()  # snapshots link the file
+        path.write_text(text)
+
+    where = tmp_path / "new" if action == "first" else root
+    before = [] if action == "first" else ["kitchen", "hall"]
+    snapshots = every_step(where, lambda: change(where))
+    after, final = texts(where), tree(where)
+    outcomes = []
+    for i, snapshot in enumerate(snapshots):
+        outcomes.append(texts(snapshot) if is_store(snapshot) else [])
+        assert outcomes[-1] in (before, after)
+        if outcomes[-1] == before:
+            again = tmp_path / "again" / str(i)
+            if snapshot.exists():
+                shutil.copytree(snapshot, again)
+            change(again)
+            assert tree(again) == final
+    # The change is complete at one step, and something remains to be tidied or synced after it.
+    assert outcomes == sorted(outcomes, key=lambda outcome: outcome == after)
+    assert len(snapshots) > 6
+    assert outcomes[0] == before
+    assert outcomes[-2] == after
+
+
+def test_one_process_writes_at_a_time(root: Path, tree: Tree) -> None:
+    first, second = opened(root), opened(root)
+    with first.writing():
+        before = tree(root)
+        with pytest.raises(InputError, match="another process is writing into it; wait"):
+            add(second, "attic")
+        with pytest.raises(InputError, match="another process is writing into it; wait"):
+            second.replace(0, lambda folder: None, PAYLOAD)
+        assert tree(root) == before
+        add(first, "cellar")
+    # The second one was opened before the cellar was added.
+    with pytest.raises(InputError, match="another process has changed it; run it again"):
+        add(second, "attic")
+    assert texts(root) == ["kitchen", "hall", "cellar"]
+
+
+def test_two_processes_that_create_a_store(tmp_path: Path) -> None:
+    first, second = (opened(tmp_path / "store") for _ in range(2))
+    add(first, "kitchen")
+    with pytest.raises(InputError, match="another process has changed it"):
+        add(second, "hall")
+    assert texts(tmp_path / "store") == ["kitchen"]
+
+
+def test_one_lock_under_every_name(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    link = root.parent / "elsewhere" / "link"
+    link.parent.mkdir()
+    link.symlink_to(root)
+    monkeypatch.chdir(root)
+    stores = [opened(path) for path in (root, link, Path())]
+    for store in stores:
+        with store.writing():
+            for other in stores:
+                if other is not store:
+                    with pytest.raises(InputError, match="another process"):
+                        add(other, "attic")
+
+
+LOCKED = """
+import sys, time
+from pathlib import Path
+from evercal.storage.stages import StageStore
+store = StageStore(Path(sys.argv[1]), ["0001-kitchen", "0002-hall"], ())
+with store.writing():
+    print("locked", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def other_writer(root: Path) -> Iterator[subprocess.Popen[str]]:
+    """Another process that is writing into the store."""
+    command = [sys.executable, "-c", LOCKED, str(root)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "locked\n"
+        yield process
+        process.kill()
+
+
+def test_a_killed_process_leaves_no_lock(root: Path, other_writer: subprocess.Popen[str]) -> None:
+    with pytest.raises(InputError, match="another process is writing"):
+        add(opened(root), "attic")
+    other_writer.kill()
+    other_writer.wait()
+    add(opened(root), "attic")
+    assert texts(root) == ["kitchen", "hall", "attic"]
+
+
+def test_lock_file_survives_so_that_a_waiting_process_locks_the_same_file(root: Path) -> None:
+    lock = root.parent / f".{root.name}.lock"
+    with opened(root).writing():
+        inode = lock.stat().st_ino
+        waiting = opened(root)
+        descriptor = os.open(lock, os.O_RDWR)  # a process that has opened it and waits
+    assert lock.stat().st_ino == inode == os.fstat(descriptor).st_ino
+    with waiting.writing():
+        assert lock.stat().st_ino == inode
+    os.close(descriptor)
+    assert not any(".lock" in name for name in os.listdir(root))
+
+
+def race(root: str, name: str) -> None:
+    while True:
+        try:
+            return add(opened(Path(root)), name)
+        except InputError as error:
+            assert "another process" in str(error)  # noqa: PT017 - it tries again
+
+
+def test_racing_processes_lose_no_stage(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("fork")
+    names = [f"scene-{i}" for i in range(4)]
+    processes = [context.Process(target=race, args=(str(tmp_path / "s"), n)) for n in names]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(60)
+        assert process.exitcode == 0
+    assert sorted(texts(tmp_path / "s")) == names
+
+
+def test_a_reader_starts_over_if_a_writer_replaces_files(root: Path) -> None:
+    writer, attempts = opened(root), []
+
+    def read(manifest: Manifest) -> str:
+        attempts.append(manifest.payload["stages"])
+        if len(attempts) == 1:
+            writer.replace(0, lambda f: (f / "scene.json").write_text('"new"'), PAYLOAD)  # type: ignore[arg-type, return-value]
+        stage = manifest.payload["stages"][0]
+        return (root / "stages" / stage / "scene.json").read_text()
+
+    assert read_store(root, read) == '"new"'
+    assert len(attempts) == 2
+
+
+@pytest.mark.parametrize("file", ["encoder-1.bin", "stages/0001-kitchen/head.bin"])
+def test_damaged_files_are_named(root: Path, file: str) -> None:
+    path = root / file
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    with pytest.raises(InputError, match=rf"{file}: checksum does not match.*; restore it"):
+        texts(root)
+    # The damage is still reported after another stage is added.
+    add(StageStore(root, ["0001-kitchen", "0002-hall"], ("encoder-1.bin",)), "attic")
+    assert verify(root) == [f"{path}: checksum does not match, its content was changed"]
+    with pytest.raises(InputError, match="checksum"):
+        StageStore(root, ["0001-kitchen", "0002-hall", "0003-attic"], ()).replace(
+            0, lambda folder: None, PAYLOAD
+        )
+    path.unlink()
+    with pytest.raises(InputError, match=f"{file}: missing"):
+        texts(root)
+
+
+def test_a_store_whose_file_is_missing_is_not_written(root: Path) -> None:
+    store = opened(root)
+    (root / "stages/0001-kitchen/head.bin").unlink()
+    before = (root / MANIFEST).read_bytes()
+    with pytest.raises((InputError, FileNotFoundError), match=r"head\.bin"):
+        add(store, "attic")
+    assert (root / MANIFEST).read_bytes() == before
+
+
+OUTSIDE = ["../secret.bin", "/etc/hostname", "stages/../../secret.bin", "", 7, None]
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+@pytest.mark.parametrize("key", ["networks", "stages"])
+def test_names_that_leave_the_folder_are_refused(root: Path, key: str, name: object) -> None:
+    (root.parent / "secret.bin").write_text("secret")
+    manifest = Manifest.read(root)
+    payload = {**manifest.payload, key: [name]}
+    write_manifest(root, payload, list(manifest.files))
+    with pytest.raises(InputError, match=rf"{key[:-1]} .* is not .*; restore it"):
+        texts(root)
+
+
+@pytest.mark.parametrize("value", ["encoder-1.bin", None, {"a": 1}, 3])
+@pytest.mark.parametrize("key", ["networks", "stages"])
+def test_payload_of_another_shape_is_refused(root: Path, key: str, value: object) -> None:
+    manifest = Manifest.read(root)
+    write_manifest(root, {**manifest.payload, key: value}, list(manifest.files))
+    with pytest.raises(InputError, match=f"store {root}"):
+        texts(root)
+
+
+@pytest.mark.parametrize(
+    ("schema", "message"), [(SCHEMA - 1, "learn the scenes again"), (SCHEMA + 1, "update evercal")]
+)
+def test_other_schemas_are_refused(root: Path, schema: int, message: str) -> None:
+    manifest = Manifest.read(root)
+    write_manifest(root, {**manifest.payload, "schema": schema}, list(manifest.files))
+    with pytest.raises(InputError, match=message):
+        texts(root)
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        add(StageStore(tmp_path / "file" / "store", [], ()), "kitchen")
