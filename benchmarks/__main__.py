@@ -10,7 +10,7 @@ VERBS = {
     "real": "accuracy of each real scene alone",
     "calibration": "cameras calibrated from images, compared with the simulator's truth",
     "handeye": "pose pairs: errors, ellipsoids, outliers, scale, time",
-    "crowd": "localization among thousands of keyframes of other rooms",
+    "many-keyframes": "localization among thousands of keyframes of other rooms",
     "peers": "SIFT and XFeat on the same frames",
     "tune": "the setting of every continual method, on held-out training frames",
     "paper": "the first steps of preset paper",
@@ -22,7 +22,7 @@ VERBS = {
     "tables": "generate the tables of the docs from results/",
     "gate": "check accuracy, speed and size against the committed baseline",
 }
-MODULES = {"handeye": "hand_eye", "tune": "tuning"}
+MODULES = {"handeye": "hand_eye", "many-keyframes": "many_keyframes", "tune": "tuning"}
 """Modules whose names differ from their verbs."""
 
 
@@ -34,7 +34,7 @@ def main(args: list[str]) -> int:
     verb = "gate" if verb == "--gate" else verb
     if verb not in VERBS:
         print("usage: python -m benchmarks VERB [--help]\n")
-        print("\n".join(f"  {name:12} {summary}" for name, summary in VERBS.items()))
+        print("\n".join(f"  {name:15} {summary}" for name, summary in VERBS.items()))
         return 0 if verb in ("-h", "--help") else 2
     module = importlib.import_module(f"benchmarks.{MODULES.get(verb, verb)}")
     try:
