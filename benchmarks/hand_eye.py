@@ -127,7 +127,9 @@ def trials(setting: Setting, count: int, first_seed: int = 0) -> dict[str, float
         mm.append(1000 * np.linalg.norm(off[:3]))
         deg.append(np.rad2deg(np.linalg.norm(off[3:])))
         squared.append(
-            squared_mahalanobis(result.parent_from_child, result.covariance, drawn.parent_from_camera)
+            squared_mahalanobis(
+                result.parent_from_child, result.covariance, drawn.parent_from_camera
+            )
         )
         left_out = tuple(i for i, image in enumerate(result.images) if not image.used)
         named.append(left_out == drawn.spoiled)

@@ -116,6 +116,16 @@ def _bench(rows_of: Callable[[Sequence[Run]], TableRows]) -> Callable[..., str]:
     return generated
 
 
+SUMMARY = ("strategy", "runs", "final %", "1 cm 1 deg %", "last scene %", "TFR", "memory MB", "s")
+"""Columns of the kind `summary`."""
+
+
+def _summary_rows(runs: Sequence[Run]) -> TableRows:
+    """Tabulate the main columns of `method_rows`."""
+    rows = method_rows(runs)
+    return [[row[rows[0].index(column)] for column in SUMMARY] for row in rows]
+
+
 def _differences(sources: Sequence[Published], reference: str) -> str:
     """Tabulate differences; strategies with one common seed form a second table."""
     runs = _runs(sources)
@@ -323,6 +333,7 @@ def _range(values: pd.Series, digits: int) -> str:
 
 KINDS: dict[str, Callable[[Sequence[Published], str], str]] = {
     "methods": _bench(method_rows),
+    "summary": _bench(_summary_rows),
     "thresholds": _bench(threshold_rows),
     "scenes": _bench(scene_rows),
     "selectors": _bench(selector_rows),
