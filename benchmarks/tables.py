@@ -236,23 +236,23 @@ POSE_ERRORS = {
 def _bad_poses(sources: Sequence[Published], _: str) -> str:
     """Tabulate `maps badposes`: the cost of wrong training poses, and what was estimated."""
     rows = _frame(sources[0])
-    groups = rows.groupby(rows["scene"].str.split().str[0])
+    groups = _groups(rows.assign(kind=rows["scene"].str.split().str[0]), "kind")
     table = [["bedroom, wrong training poses", "1 cm/1 deg", "median", "estimated"]]
     for kind, title in POSE_ERRORS.items():
-        group = groups.get_group(kind)
+        group = groups[kind]
         first = group.iloc[0]
         common = f"{first['common_error_mm']:.3f} mm, {first['common_error_deg']:.3f} deg"
         estimated = {
             "none": f"nothing moved ({common})",
-            "noise": f"stated poses good to {_range(group['pose_sigma_mm'], 1)} mm",
+            "noise": f"stated poses good to {_range(group, 'pose_sigma_mm', 1)} mm",
             "offset": f"the offset, to {common}",
             "focal": f"{first['focal_percent']:+.3f} % (true: -0.990 %)",
             "gross": f"{group['named'].sum():.0f} of {group['planted'].sum():.0f} named,"
             f" {group['named_wrongly'].sum():.0f} wrongly",
         }[kind]
         seeds = f" ({len(group)} seeds)" if len(group) > 1 else ""
-        share = _share(group["1 cm/1 deg"].mean())
-        table.append([title + seeds, share, f"{_range(group['median_mm'], 2)} mm", estimated])
+        share = _share(_column(group, "1 cm/1 deg").mean())
+        table.append([title + seeds, share, f"{_range(group, 'median_mm', 2)} mm", estimated])
     return markdown(table)
 
 
@@ -262,12 +262,12 @@ def _trials(sources: Sequence[Published], _: str) -> str:
     for source in sources:
         rows = _frame(source)
         if "images" in rows:
-            rows = rows[rows["images"] == 25]
+            rows = rows.query("images == 25")
         for prefix, title in (("", source.note), ("fixed_", "then a fixed camera in that map")):
             if f"{prefix}mm" not in rows:
                 continue
             mm, deg, squared = (
-                rows[f"{prefix}{name}"] for name in ("mm", "deg", "squared_mahalanobis")
+                _column(rows, f"{prefix}{name}") for name in ("mm", "deg", "squared_mahalanobis")
             )
             median, worst = (f"{at(mm):.2f} mm, {at(deg):.3f} deg" for at in (np.median, np.max))
             inside = f"{int((squared < CHI2_6).sum())} of {len(rows)}"
@@ -277,10 +277,10 @@ def _trials(sources: Sequence[Published], _: str) -> str:
 
 def _bump(sources: Sequence[Published], _: str) -> str:
     """Tabulate `calibration bump`: how often a camera is reported as moved."""
-    moved = _frame(sources[0]).groupby("kind", sort=False)["moved"]
-    trials = " and ".join(str(count) for count in sorted(set(moved.size())))
+    groups = _groups(_frame(sources[0]), "kind")
+    trials = " and ".join(str(count) for count in sorted({len(of) for of in groups.values()}))
     title = f"bumped by (5 images, {trials} trials each)"
-    shares = {str(kind): f"{100 * share:.1f} %" for kind, share in moved.mean().items()}
+    shares = {kind: f"{100 * _column(of, 'moved').mean():.1f} %" for kind, of in groups.items()}
     return markdown([[title, *shares], ["reported as moved", *shares.values()]])
 
 
@@ -290,17 +290,18 @@ def _tuning(sources: Sequence[Published], _: str) -> str:
     A trial is its area under the recall curve for the earlier scenes + that for the newest.
     """
     table = [["method", "setting", "trials", *(str(s.settings["suite"]) for s in sources)]]
-    grouped = [_frame(source).groupby("method", sort=False) for source in sources]
-    for method, rows in grouped[0]:
+    grouped = [_groups(_frame(source), "method") for source in sources]
+    for method, rows in grouped[0].items():
         cells = []
         for groups in grouped:
-            trials = groups.get_group(method)
-            cell = [f"{a:.0f}+{b:.0f}" for a, b in trials[["auc_earlier", "auc_newest"]].to_numpy()]
-            best = int(trials["auc_20cm"].to_numpy().argmax())
+            trials = groups[method]
+            parts = zip(_column(trials, "auc_earlier"), _column(trials, "auc_newest"), strict=True)
+            cell = [f"{earlier:.0f}+{newest:.0f}" for earlier, newest in parts]
+            best = int(_column(trials, "auc_20cm").argmax())
             cell[best] = f"**{cell[best]}**"
             cells.append(", ".join(cell))
         values = ", ".join(f"{value:g}" for value in rows["value"])
-        table.append([str(method), str(rows["setting"].iloc[0]), values, *cells])
+        table.append([method, str(rows["setting"].iloc[0]), values, *cells])
     return markdown(table)
 
 
@@ -308,12 +309,20 @@ def _frame(source: Published) -> pd.DataFrame:
     return pd.DataFrame(list(source.rows))
 
 
+def _groups(rows: pd.DataFrame, key: str) -> dict[str, pd.DataFrame]:
+    return {str(value): group for value, group in rows.groupby(key, sort=False)}
+
+
+def _column(rows: pd.DataFrame, key: str) -> np.ndarray:
+    return rows[key].to_numpy(float)
+
+
 def _inside(rows: pd.DataFrame) -> str:
     """Return the per cent of poses in the right scene that lie in their ellipsoid."""
-    poses = rows["frames"] - rows["wrong_scene"] - rows["refused"]
+    poses = _column(rows, "frames") - _column(rows, "wrong_scene") - _column(rows, "refused")
     if not (poses > 0).any():
         return "-"
-    inside = rows["inside_95"].astype(float)[poses > 0]
+    inside = _column(rows, "inside_95")[poses > 0]
     return f"{np.average(inside, weights=poses[poses > 0]):.0f} %"
 
 
@@ -322,11 +331,12 @@ def _share(percent: float) -> str:
 
 
 def _median(rows: pd.DataFrame) -> str:
-    mm, deg = rows["median_mm"].mean(skipna=False), rows["median_deg"].mean(skipna=False)
+    mm, deg = (_column(rows, key).mean() for key in ("median_mm", "median_deg"))
     return f"{mm:.{2 if mm < 10 else 1}f} mm, {deg:.3f} deg"
 
 
-def _range(values: pd.Series, digits: int) -> str:
+def _range(rows: pd.DataFrame, key: str, digits: int) -> str:
+    values = _column(rows, key)
     ends = [f"{end:.{digits}f}" for end in (values.min(), values.max())]
     return ends[0] if ends[0] == ends[1] else " to ".join(ends)
 

@@ -107,9 +107,8 @@ class Scores:
 
     def to_dict(self) -> dict[str, object]:
         """Convert to plain values for JSON; infinity and NaN become None."""
-        return dataclasses.asdict(self) | {
-            "scenes": {name: _plain(row) for name, row in self.scenes.items()}
-        }
+        scenes = {name: _plain(row) for name, row in self.scenes.items()}
+        return {**dataclasses.asdict(self), "scenes": scenes}
 
 
 @dataclass(frozen=True)

@@ -278,10 +278,11 @@ def scene_rows(runs: Sequence[Run]) -> TableRows:
         for run in runs
         for i, scene in enumerate(run.scenes)
     ]
-    frame = pandas.DataFrame(accuracies, columns=columns).groupby(columns[:2], sort=False)
+    frame = pandas.DataFrame(accuracies, columns=columns)
+    means = frame.pivot_table(index=columns[:2], aggfunc="mean", sort=False)
     cells = {
         key: f"{number(learned)} -> {number(end)}"
-        for key, learned, end in frame.mean(skipna=False).itertuples()
+        for key, learned, end in zip(means.index, means["learned"], means["end"], strict=True)
     }
     names = sorted(runs[0].scenes)
     rows = [

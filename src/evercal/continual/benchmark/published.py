@@ -235,11 +235,14 @@ def read_published(path: Path) -> Published:
             raise ValueError("other fields")
         for key in ("groups", "frames"):
             header[key] = {k: tuple(v) for k, v in header.get(key, {}).items()}
-        is_bench, records = header["kind"] == "bench", []
+        scenes: list[PublishedScene] = []
+        rows: list[Row] = []
         for number, line in enumerate(lines[1:], start=2):  # noqa: B007  # for the message
-            record = json.loads(line)
-            records.append(_from_line(record) if is_bench else dict(record))
-        published = Published(**header, **{"scenes" if is_bench else "rows": tuple(records)})
+            if header["kind"] == "bench":
+                scenes.append(_from_line(json.loads(line)))
+            else:
+                rows.append(dict(json.loads(line)))
+        published = Published(**header, scenes=tuple(scenes), rows=tuple(rows))
     except (ValueError, TypeError, KeyError, IndexError) as error:
         raise InputError(f"{path}: line {number} is not a published result ({error!r})") from error
     if published.settings_sha256 != stated:
