@@ -44,7 +44,7 @@ def run(
         rooms: Folders of rendered rooms. Defaults to the packaged rooms.
         out: Folder for stores and results; complete wrist draws are not repeated.
         draws: Trials of each room.
-        store: Store that knows the rooms. Without it, they are learned.
+        store: Store with the rooms. Without it, they are learned.
     """
     out.mkdir(parents=True, exist_ok=True)
     folders = rooms or tuple(FOLDER / name for name in ("bedroom", "kitchen", "living"))

@@ -44,7 +44,7 @@ def run(
     """Localize test frames of a store's scenes among thousands of keyframes of other rooms.
 
     Args:
-        store: Store that knows the scenes.
+        store: Store with the scenes.
         scenes: Folders of the scenes, NAME=FOLDER if the store has another name.
         keyframes: Keyframes to add.
         rooms: Rooms to divide them over.

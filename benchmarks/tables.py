@@ -98,19 +98,13 @@ def _runs(sources: Sequence[Published]) -> list[Run]:
 
 
 def _bench(rows_of: Callable[[Sequence[Run]], TableRows]) -> Callable[..., str]:
-    """Return a table of strategies; strategies with one run form a second table.
+    """Return a table of strategies; strategies with one run form a second table."""
 
-    The argument `map` selects strategies with a map, `network` the others.
-    """
-
-    def generated(sources: Sequence[Published], part: str) -> str:
-        runs = _runs(sources)
-        if part:
-            runs = [run for run in runs if run.description["map"] == (part == "map")]
-        counts = {name: len(group) for name, group in by_strategy(runs).items()}
-        several = [run for run in runs if counts[run.strategy] > 1]
-        single = [run for run in runs if counts[run.strategy] == 1]
-        parts = [markdown(rows_of(group)) for group in (several, single) if group]
+    def generated(sources: Sequence[Published], _: str) -> str:
+        groups = by_strategy(_runs(sources)).values()
+        several = [run for group in groups if len(group) > 1 for run in group]
+        single = [run for group in groups if len(group) == 1 for run in group]
+        parts = [markdown(rows_of(runs)) for runs in (several, single) if runs]
         return f"\n\n{ONE_RUN}\n\n".join(parts) if len(parts) > 1 else parts[0]
 
     return generated
@@ -147,23 +141,11 @@ def _ablation(sources: Sequence[Published], suite: str) -> str:
 
 
 def _memory(sources: Sequence[Published], _: str) -> str:
-    """Tabulate the same scenes with several shares of keyframes."""
-    shares = [float(str(source.settings["memory_share"])) for source in sources]
-    return _along(sources, "keyframes", [f"{100 * share:.0f} %" for share in shares])
-
-
-def _steps(sources: Sequence[Published], _: str) -> str:
-    """Tabulate the same scenes with several numbers of training steps."""
-    fits = [source.settings["fit"] for source in sources]
-    steps = [fit["iterations"] for fit in fits if isinstance(fit, dict)]
-    return _along(sources, "steps a scene", [f"{count:,.0f}" for count in steps])
-
-
-def _along(sources: Sequence[Published], title: str, labels: Sequence[str]) -> str:
-    """Tabulate one row per strategy and file, means over its runs."""
+    """Tabulate the same scenes with several shares of keyframes, means over runs."""
     bounds = {"5 cm/5 deg": COARSE, "1 cm/1 deg": FINE, "5 mm/0.5 deg": FINEST}
-    rows = [[title, "strategy", *bounds, "median mm", "wrong scene", "MB"]]
-    for source, label in zip(sources, labels, strict=True):
+    rows = [["keyframes", "strategy", *bounds, "median mm", "wrong scene", "MB"]]
+    for source in sources:
+        label = f"{100 * float(str(source.settings['memory_share'])):.0f} %"
         for name, runs in by_strategy(_runs([source])).items():
             ends = [result for run in runs for result in run.last]
             shares = [np.mean([r.scores(b).final_accuracy for r in runs]) for b in bounds.values()]
@@ -350,7 +332,6 @@ KINDS: dict[str, Callable[[Sequence[Published], str], str]] = {
     "differences": _differences,
     "ablation": _ablation,
     "memory": _memory,
-    "steps": _steps,
     "accuracy": _accuracy,
     "spoiled": _degraded,
     "fixed": _fixed,

@@ -146,23 +146,6 @@ def test_best_trial_is_bold(tmp_path: Path) -> None:
     ]
 
 
-def test_strategies_with_a_map_are_selected(tmp_path: Path) -> None:
-    (folder := tmp_path / "run").mkdir()
-    write_json(folder / results.SETTINGS, {})
-    write_json(folder / results.STRATEGIES, {"er_map": {"method": {"kind": "Replay"}, "map": True}})
-    for name in ("er_map", "er_map:network"):
-        results.append(folder, lines(name, 0, [[16], [14, 12]]))
-    publish(folder, "beside", {}, out=tmp_path)
-
-    def rows(part: str) -> list[str]:
-        page = tables.regenerated(f"<!-- table: beside methods{part} -->\n<!-- end -->\n", tmp_path)
-        return re.findall(r"^\| (er\S+)", page, re.MULTILINE)
-
-    assert rows("") == ["er_map", "er_map:network"]
-    assert rows(" map") == ["er_map"]
-    assert rows(" network") == ["er_map:network"]
-
-
 def test_ablation_has_its_steps_and_published_numbers(tmp_path: Path) -> None:
     (folder := tmp_path / "run").mkdir()
     write_json(folder / results.SETTINGS, {})
@@ -178,19 +161,6 @@ def test_ablation_has_its_steps_and_published_numbers(tmp_path: Path) -> None:
         ["61.2", "+10.0", "90.9 |"],
         ["91.2", "+30.0", "91.8 |"],
     ]
-
-
-def test_learning_curve_has_a_row_per_number_of_steps(tmp_path: Path) -> None:
-    for steps, right in ((600, 4), (9600, 16)):
-        (folder := tmp_path / f"run-{steps}").mkdir()
-        write_json(folder / results.SETTINGS, {"fit": {"iterations": steps}})
-        for seed in (0, 1):
-            results.append(folder, lines("er", seed, [[16], [right - seed, right]]))
-        publish(folder, f"at-{steps}", {}, out=tmp_path)
-    page = tables.regenerated("<!-- table: at-600+at-9600 steps -->\n<!-- end -->\n", tmp_path)
-    # 3.5 and 4 of 20 frames are correct with 600 steps, 15.5 and 16 with 9,600.
-    assert "| 600 | er | 18.8 |" in page
-    assert "| 9,600 | er | 78.8 |" in page
 
 
 def test_ellipsoids_weigh_by_poses(tmp_path: Path) -> None:
