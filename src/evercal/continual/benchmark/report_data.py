@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +106,16 @@ class Report:
         )
 
 
+def require_pandas() -> None:
+    """Check that tables can be computed.
+
+    Raises:
+        InputError: pandas is not installed.
+    """
+    if find_spec("pandas") is None:
+        raise InputError("tables of a benchmark need pandas: pip install 'evercal[bench]'")
+
+
 def read_report(folder: Path, reference: str, compare_with: Sequence[Path] = ()) -> Report:
     """Read results.
 
@@ -114,8 +125,9 @@ def read_report(folder: Path, reference: str, compare_with: Sequence[Path] = ())
         compare_with: Other folders with results of the same scenes.
 
     Raises:
-        InputError: A folder has no results, or results of other scenes.
+        InputError: A folder has no results, or results of other scenes, or pandas is missing.
     """
+    require_pandas()
     runs, settings = _results(folder)
     others = []
     for other in compare_with:
