@@ -47,7 +47,7 @@ class Features:
     """Undistorted pixels, shape (n, 2)."""
     descriptors: np.ndarray
     """uint8 or float16, shape (n, d)."""
-    intrinsics: np.ndarray
+    camera: Camera
     """fx, fy, cx, cy of the undistorted image, pixels, shape (4,)."""
 
 
