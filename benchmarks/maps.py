@@ -63,10 +63,8 @@ def run(
         rows = ablation(out, recordings, memory)
     else:
         rows = {"mini": mini, "fixed": fixed, "badposes": wrong_poses}[what](out, memory)
-    settings = {
-        "map": asdict(MapOptions(MemoryBudget(memory))),
-        "localize": asdict(LocalizeOptions()),
-    }
+    options = MapOptions(MemoryBudget(memory))
+    settings = {"map": asdict(options), "localize": asdict(LocalizeOptions())}
     (out / f"{what}.json").write_text(json.dumps({"rows": rows, "settings": settings}, indent=1))
     print(tabulate([list(row.values()) for row in rows], list(rows[0]), "github", floatfmt=".3g"))
 

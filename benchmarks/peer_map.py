@@ -20,6 +20,7 @@ from evercal.features.encoder import load_encoder
 from evercal.features.views import ViewOptions, plain_view
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
+from evercal.localization.estimate import PoseEstimate
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.recordings.frame import Frame, Recording, stated_poses
 
@@ -172,7 +173,7 @@ def _tracks(
     for view, (partner, (here, there)) in enumerate(zip(partners, matches, strict=True), start=1):
         pixels[view, here] = described.features[partner].pixels[there]
     views = [frame, *partners]
-    intrinsics = np.stack([_four(described.features[view].camera) for view in views])
+    intrinsics = np.stack([_intrinsics(described.features[view].camera) for view in views])
     return Tracks(pixels, intrinsics, described.poses[np.array(views)])
 
 
@@ -232,3 +233,7 @@ class PeerLocalizer:
         similarity = self._map.descriptors.astype(np.float32) @ self._describer(image, camera)
         order = np.argsort(-similarity, kind="stable")[: self._options.retrieved]
         return [self._map.frames[i] for i in order]
+
+
+def _intrinsics(camera: Camera) -> np.ndarray:
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
