@@ -1,1 +1,1 @@
-"""Long measurements, apart from the test suite."""
+"""Measurements of evercal that the docs report."""

@@ -1,16 +1,19 @@
-"""How well cameras are calibrated from images: on the arm from nothing, fixed, and after bumps."""
+"""Accuracy of cameras calibrated from images: on the arm, fixed, and after bumps."""
 
 import json
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from tabulate import tabulate
 from tqdm import tqdm
+from tyro.conf import Positional
 
+from benchmarks.accuracy import Row
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.drift import check
 from evercal.calibration.from_images import Images, calibrate
@@ -26,133 +29,132 @@ from evercal.recordings.samples import FOLDER
 ROBOT_NOISE_M, ROBOT_NOISE_DEG = 2e-4, 0.02
 
 
-def run(what: str, rooms: Sequence[Path], out: Path, draws: int, store: Path | None) -> None:
-    """Runs one measurement, prints its table, and writes it as JSON lines.
+def run(
+    what: Positional[Literal["wrist", "fixed", "bump"]],
+    rooms: tuple[Path, ...] = (),
+    out: Path = Path("runs/calibration"),
+    draws: int = 10,
+    store: Path | None = None,
+) -> None:
+    """Calibrate cameras from images and compare with the simulator's truth.
 
     Args:
-        what: wrist, fixed or bump.
-        rooms: folders of recorded rooms; the packaged ones when empty.
-        out: folder for stores and results; a wrist draw that is there already is not repeated.
-        draws: random `gripper_from_camera`, images or bumps of each room.
-        store: a store that knows the rooms; one is learned when left out.
+        what: wrist: gripper_from_camera of a camera on the arm, without an initial value. fixed: a
+            fixed camera. bump: the alarm after bumps.
+        rooms: Folders of rendered rooms. Defaults to the packaged rooms.
+        out: Folder for stores and results; complete wrist draws are not repeated.
+        draws: Trials of each room.
+        store: Store with the rooms. Without it, they are learned.
     """
     out.mkdir(parents=True, exist_ok=True)
-    rooms = rooms or [FOLDER / name for name in ("bedroom", "kitchen", "living")]
+    folders = rooms or tuple(FOLDER / name for name in ("bedroom", "kitchen", "living"))
     if what == "wrist":
-        rows = wrist(rooms, out, draws)
+        rows = wrist(folders, out, draws)
     else:
-        path = store or _learned(rooms, out / "rooms.evercal")
-        rows = (fixed if what == "fixed" else bumps)(rooms, path, draws)
+        localizer = Localizer.open(store or _learned(folders, out / "rooms.evercal"))
+        rows = (fixed if what == "fixed" else bumps)(folders, localizer, draws)
     (out / f"{what}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    print(tabulate([_short(row) for row in rows], headers="keys", floatfmt=".3f"))
-    _summary(rows)
+    print(tabulate(rows, headers="keys", floatfmt=".3f"))
+    print(summary(rows))
 
 
-def wrist(rooms: Sequence[Path], out: Path, draws: int) -> list[dict[str, object]]:
-    """Training frames of a room seen as a wrist recording through a random hand-eye transform."""
+def wrist(rooms: Sequence[Path], out: Path, draws: int) -> list[Row]:
+    """Calibrate a wrist camera from training frames and gripper poses."""
     rows = []
     for room in rooms:
         scene = load_recording(room)
         for draw in tqdm(range(draws), room.name, unit="draw"):
-            done = out / f"wrist-{room.name}-{draw}.json"
-            if not done.exists():
-                store = out / f"wrist-{room.name}-{draw}.evercal"
-                done.write_text(json.dumps(_wrist_draw(scene, room, store, draw)))
-            rows.append(json.loads(done.read_text()))
+            path = out / f"wrist-{room.name}-{draw}.json"
+            if not path.exists():
+                store = path.with_suffix(".evercal")
+                path.write_text(json.dumps(_wrist_draw(scene, room, store, draw)))
+            rows.append(json.loads(path.read_text()))
     return rows
 
 
 def as_wrist_recording(scene: Recording, draw: int) -> tuple[Recording, SE3]:
-    """A recording that states gripper poses only, and the true `gripper_from_camera`."""
+    """Return a recording of gripper poses, and the true `gripper_from_camera`."""
     rng = np.random.default_rng(draw)
-    turn = Rotation.random(rng=rng).as_quat(canonical=True, scalar_first=True)
-    truth = SE3(turn, rng.uniform(-0.1, 0.1, 3))
-    size = np.repeat([ROBOT_NOISE_M, np.deg2rad(ROBOT_NOISE_DEG)], 3)
+    rotation = Rotation.random(rng=rng).as_quat(canonical=True, scalar_first=True)
+    truth = SE3(rotation, rng.uniform(-0.1, 0.1, 3))
+    sigma = np.repeat([ROBOT_NOISE_M, np.deg2rad(ROBOT_NOISE_DEG)], 3)
     train = []
     for frame in scene.train:
         assert frame.base_from_camera is not None
-        noise = SE3.exp(rng.normal(0, size))
+        noise = SE3.exp(rng.normal(0, sigma))
         gripper = frame.base_from_camera @ truth.inverse() @ noise
         train.append(replace(frame, base_from_camera=None, base_from_gripper=gripper))
     return replace(scene, train=tuple(train), test=()), truth
 
 
-def _wrist_draw(scene: Recording, room: Path, store: Path, draw: int) -> dict[str, object]:
+def _wrist_draw(scene: Recording, room: Path, store: Path, draw: int) -> Row:
     recording, truth = as_wrist_recording(scene, draw)
     began = time.perf_counter()
     report = learn_scene(store, recording, LearnOptions(preset("fast")))
-    seconds, found = time.perf_counter() - began, report.hand_eye
-    assert found is not None
-    row = _error(found.gripper_from_camera, np.array(found.covariance), truth)
-    row |= {"start_mm": found.start_mm, "seconds": seconds}
+    seconds, result = time.perf_counter() - began, report.hand_eye
+    assert result is not None
+    row = _error(result.gripper_from_camera, np.array(result.covariance), truth)
+    row |= {"start_mm": result.start_mm, "seconds": seconds}
     folder = room / "calibration" / "fixed"
     if folder.is_dir():
         images, true_camera = _images(folder)
-        answer = calibrate(Localizer.open(store), images)
-        error = _error(answer.parent_from_child, answer.covariance, true_camera)
+        calibration = calibrate(Localizer.open(store), images)
+        error = _error(calibration.parent_from_child, calibration.covariance, true_camera)
         row |= {f"fixed_{key}": value for key, value in error.items()}
     return {"room": room.name, "draw": draw, **row}
 
 
-def fixed(rooms: Sequence[Path], store: Path, draws: int) -> list[dict[str, object]]:
-    """A fixed camera of each room: all images, and random five of them."""
-    localizer, rows = Localizer.open(store), []
+def fixed(rooms: Sequence[Path], localizer: Localizer, draws: int) -> list[Row]:
+    """Calibrate the fixed cameras of each room from all images, and from random sets of five."""
+    rows = []
     for room in tqdm(rooms, "rooms"):
         for recording in ("fixed", "bumped"):
             images, truth = _images(room / "calibration" / recording)
-            rng = np.random.default_rng(0)
-            for draw in range(draws + 1):
-                given = images if draw == 0 else _some(images, 5, rng)
-                answer = calibrate(localizer, given)
-                error = _error(answer.parent_from_child, answer.covariance, truth)
-                count = len(given.images)
-                rows.append({"room": room.name, "camera": recording, "images": count, **error})
+            rng, count = np.random.default_rng(0), len(images.images)
+            five = [rng.choice(count, 5, replace=False).tolist() for _ in range(draws)]
+            for some in (images, *(_take(images, chosen) for chosen in five)):
+                calibration = calibrate(localizer, some)
+                error = _error(calibration.parent_from_child, calibration.covariance, truth)
+                camera: Row = {"room": room.name, "camera": recording, "images": len(some.images)}
+                rows.append(camera | error)
     return rows
 
 
-def bumps(rooms: Sequence[Path], store: Path, draws: int) -> list[dict[str, object]]:
-    """Five images of a camera against its reference from all others that it took.
+def bumps(rooms: Sequence[Path], localizer: Localizer, draws: int) -> list[Row]:
+    """Check five images of a camera against a reference from its other images.
 
-    Bumps come from moving the reference instead of the camera: a reference that states a pose 2 mm
-    or 0.1 deg off is what a camera looks like that was moved by as much. False alarms come from
-    five images of the unmoved camera that the reference never saw.
+    Instead of the camera, the reference is moved. False alarms are counted with the reference as it
+    is.
     """
-    localizer, rows = Localizer.open(store), []
+    rows = []
     for room in tqdm(rooms, "rooms"):
         for recording in ("fixed", "bumped"):
             images, _ = _images(room / "calibration" / recording)
             rng = np.random.default_rng(1)
             for _ in range(draws):
                 order = rng.permutation(len(images.images)).tolist()
-                five, rest = order[:5], order[5:]
-                reference = calibrate(localizer, _take(images, rest))
-                for kind, moved in _moves(reference, rng).items():
-                    shift, _ = check(localizer, [images.images[i] for i in five], moved)
-                    rows.append(
-                        {
-                            "room": room.name,
-                            "camera": recording,
-                            "kind": kind,
-                            "moved": shift.moved,
-                            "mm": shift.translation_mm,
-                            "deg": shift.rotation_deg,
-                            "confidence": shift.confidence,
-                        }
-                    )
+                reference = calibrate(localizer, _take(images, order[5:]))
+                five = _take(images, order[:5]).images
+                for kind, moved in _moved(reference, rng).items():
+                    shift, _ = check(localizer, five, moved)
+                    row: Row = {"room": room.name, "camera": recording, "kind": kind}
+                    row |= {"moved": shift.moved, "mm": shift.translation_mm}
+                    row |= {"deg": shift.rotation_deg, "confidence": shift.confidence}
+                    rows.append(row)
     return rows
 
 
-def _moves(reference: Calibration, rng: np.random.Generator) -> dict[str, Calibration]:
-    """The reference as it is, and moved by 2 mm, by 0.1 deg and by both, in random directions."""
-    kinds = {"none": (0.0, 0.0), "2 mm": (2e-3, 0.0), "0.1 deg": (0.0, 0.1), "both": (2e-3, 0.1)}
-    found = {}
-    for kind, (metres, degrees) in kinds.items():
-        shift, turn = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
-        small = SE3.exp(np.r_[np.zeros(3), np.deg2rad(degrees) * turn])
-        pose = reference.parent_from_child @ small
-        pose = SE3(pose.rotation_wxyz, pose.translation_m + metres * shift)
-        found[kind] = replace(reference, parent_from_child=pose)
-    return found
+def _moved(reference: Calibration, rng: np.random.Generator) -> dict[str, Calibration]:
+    """Move a reference in random directions, by 2 mm, by 0.1 deg, and by both."""
+    sizes = {"none": (0.0, 0.0), "2 mm": (2e-3, 0.0), "0.1 deg": (0.0, 0.1), "both": (2e-3, 0.1)}
+    moved = {}
+    for kind, (metres, degrees) in sizes.items():
+        direction, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+        rotation = SE3.exp(np.r_[np.zeros(3), np.deg2rad(degrees) * axis])
+        pose = reference.parent_from_child @ rotation
+        pose = SE3(pose.rotation_wxyz, pose.translation_m + metres * direction)
+        moved[kind] = replace(reference, parent_from_child=pose)
+    return moved
 
 
 def _learned(rooms: Sequence[Path], store: Path) -> Path:
@@ -163,60 +165,53 @@ def _learned(rooms: Sequence[Path], store: Path) -> Path:
 
 
 def _images(folder: Path) -> tuple[Images, SE3]:
+    """Load the images of a fixed camera, and its true pose."""
     scene = load_recording(folder)
     truth = scene.test[0].base_from_camera
     if truth is None:
-        raise InputError(f"{folder}: states no camera pose to compare with")
+        raise InputError(f"{folder}: no true camera pose")
     images = [(frame.name, frame.read_image()) for frame in scene.test]
     return Images(images, scene.test[0].camera), truth
 
 
-def _take(images: Images, which: Sequence[int]) -> Images:
-    return replace(images, images=[images.images[i] for i in which])
+def _take(images: Images, chosen: Sequence[int]) -> Images:
+    return replace(images, images=[images.images[i] for i in chosen])
 
 
-def _some(images: Images, count: int, rng: np.random.Generator) -> Images:
-    return _take(images, rng.choice(len(images.images), count, replace=False).tolist())
-
-
-def _error(found: SE3, covariance: np.ndarray, truth: SE3) -> dict[str, object]:
-    metres, radians = pose_distance(found, truth)
+def _error(estimate: SE3, covariance: np.ndarray, truth: SE3) -> Row:
+    metres, radians = pose_distance(estimate, truth)
     return {
         "mm": 1000 * float(metres),
         "deg": float(np.rad2deg(radians)),
         "sigma_mm": 1000 * float(np.sqrt(np.trace(covariance[:3, :3]) / 3)),
         "sigma_deg": float(np.rad2deg(np.sqrt(np.trace(covariance[3:, 3:]) / 3))),
-        "squared_mahalanobis": squared_mahalanobis(found, covariance, truth),
+        "squared_mahalanobis": squared_mahalanobis(estimate, covariance, truth),
     }
 
 
-def _short(row: dict[str, object]) -> dict[str, object]:
-    return {key.replace("squared_mahalanobis", "m2"): value for key, value in row.items()}
+def summary(rows: Sequence[Row]) -> str:
+    """Summarize trials, a line per kind of bump or per number of images."""
+    import pandas
+
+    frame, lines = pandas.DataFrame(list(rows)), []
+    if "kind" in frame:
+        for kind, moved in frame.groupby("kind", sort=False)["moved"]:
+            lines.append(f"{kind}: moved in {100 * moved.mean():.1f} % of {len(moved)} trials")
+        return "\n".join(lines)
+    if "images" in frame:
+        counts = frame.groupby("images", sort=False)
+        lines += [_errors(f"camera, {count} images", group, "") for count, group in counts]
+    else:
+        lines.append(_errors("camera", frame, ""))
+    if "fixed_mm" in frame:
+        lines.append(_errors("fixed camera in that map", frame, "fixed_"))
+    return "\n".join(lines)
 
 
-def _summary(rows: Sequence[dict[str, object]]) -> None:
-    """Medians, worst cases and ellipsoids by the number of images; of bumps the rates."""
-    if "kind" in rows[0]:
-        for kind in dict.fromkeys(row["kind"] for row in rows):
-            of_kind = [row for row in rows if row["kind"] == kind]
-            rate = 100 * np.mean([bool(row["moved"]) for row in of_kind])
-            print(f"{kind}: moved in {rate:.1f} % of {len(of_kind)} trials")
-        return
-    for count in dict.fromkeys(row.get("images") for row in rows):
-        some = [row for row in rows if row.get("images") == count]
-        title = "camera" if count is None else f"camera, {count} images"
-        _print_errors(title, "", some)
-        if "fixed_mm" in some[0]:
-            _print_errors("fixed camera in that map", "fixed_", some)
-
-
-def _print_errors(title: str, prefix: str, rows: Sequence[dict[str, object]]) -> None:
-    mm, deg, m2 = (
-        np.array([float(str(row[f"{prefix}{key}"])) for row in rows])
-        for key in ("mm", "deg", "squared_mahalanobis")
-    )
-    print(
-        f"{title}: {len(mm)} trials, median {np.median(mm):.2f} mm and {np.median(deg):.3f} deg,"
-        f" worst {mm.max():.2f} mm and {deg.max():.3f} deg, {share_inside(m2):.1f} % inside the"
-        f" 95 % ellipsoid"
+def _errors(title: str, frame, prefix: str) -> str:
+    mm, deg = frame[f"{prefix}mm"], frame[f"{prefix}deg"]
+    inside = share_inside(frame[f"{prefix}squared_mahalanobis"])
+    return (
+        f"{title}: {len(mm)} trials, median {mm.median():.2f} mm and {deg.median():.3f} deg, worst"
+        f" {mm.max():.2f} mm and {deg.max():.3f} deg, {inside:.1f} % inside the 95 % ellipsoid"
     )

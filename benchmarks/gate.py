@@ -1,8 +1,7 @@
-"""The contract: what a change may not make worse, against a committed baseline.
+"""The gate: accuracy, speed and size against a committed baseline.
 
-Times are ratios to a reference kernel timed in the same run, so that they carry over between
-machines of one kind. Accuracy is that of one rendered room of the package, learned with the preset
-`bench`: its test frames, which nothing is tuned on.
+Times are ratios to a reference kernel timed in the same run, so that they compare between machines
+of one kind. Accuracy is on the test frames of one packaged room, learned with the preset `bench`.
 """
 
 import json
@@ -36,14 +35,14 @@ class Metric:
     """One line of the contract."""
 
     unit: str
-    """What the number counts."""
+    """Unit of the number."""
     better: Literal["higher", "lower"]
-    """Its direction."""
+    """Direction of improvement."""
     tolerance: float
-    """How much worse than the baseline it may be: points for `%`, a share of it otherwise."""
+    """Allowed loss: points if the unit is `%`, otherwise a share of the baseline."""
 
     def holds(self, baseline: float, now: float) -> bool:
-        """Whether `now` is not worse than allowed."""
+        """Check that `now` is within the tolerance."""
         slack = self.tolerance if self.unit == "%" else self.tolerance * baseline
         return now >= baseline - slack if self.better == "higher" else now <= baseline + slack
 
@@ -63,7 +62,7 @@ CONTRACT: dict[str, Metric] = {
 
 
 def measure() -> dict[str, float]:
-    """All numbers of the contract; about a minute on two cores."""
+    """Measure all numbers of the contract, in about a minute on two cores."""
     room = sample_rooms()[0].scene
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
@@ -76,20 +75,20 @@ def measure() -> dict[str, float]:
         training = time.perf_counter() - began
         network = scores(evaluate(Localizer.open(Path(folder) / "network"), {room.name: room}))
     kernel = _seconds(_reference)
-    right = evaluate(localizer, {room.name: room})
-    found = scores(right)
-    (near,) = correct(right, FINEST).values()
+    results = evaluate(localizer, {room.name: room})
+    (finest,) = correct(results, FINEST).values()
     maps = localizer.maps
     view = frame_view(room.test[0], maps.encoder.stride, ViewOptions())
     image = room.test[0].read_image()
     encoding = _seconds(lambda: encode([view], maps.encoder, maps.descriptor))
     localizing = _seconds(lambda: localizer.localize(image))
     rng = np.random.default_rng(0)
-    places, turns = rng.normal(size=(4000, 3)), rng.normal(size=(4000, 4))
-    selecting = _seconds(lambda: select_sars(places, turns, 400, SarsOptions(radius=0.0)), 3)
+    positions, rotations = rng.normal(size=(4000, 3)), rng.normal(size=(4000, 4))
+    options_sars = SarsOptions(radius=0.0)
+    selecting = _seconds(lambda: select_sars(positions, rotations, 400, options_sars), 3)
     return {
-        "accuracy, 1 cm 1 deg": found.mean_accuracy_1cm_1deg,
-        "accuracy, 5 mm 0.5 deg": 100 * float(np.mean(near)),
+        "accuracy, 1 cm 1 deg": scores(results).mean_accuracy_1cm_1deg,
+        "accuracy, 5 mm 0.5 deg": 100 * float(np.mean(finest)),
         "accuracy of the network alone, 5 cm 5 deg": network.mean_accuracy_5cm_5deg,
         "memory of a frame": report.memory_bytes / report.frames_kept / 1e3,
         "head": trained.head_bytes / 1e3,
@@ -101,8 +100,12 @@ def measure() -> dict[str, float]:
     }
 
 
-def run(update: bool) -> int:
-    """Measures and prints the table; writes the baseline or says whether the contract holds."""
+def run(update: bool = False) -> int:
+    """Check accuracy, speed and size against the committed baseline.
+
+    Args:
+        update: Write the measured numbers as the new baseline.
+    """
     now = measure()
     if update or not BASELINE.exists():
         rounded = {name: round(value, 3) for name, value in now.items()}
@@ -116,21 +119,20 @@ def run(update: bool) -> int:
 
 
 def judge(baseline: dict[str, float], now: dict[str, float]) -> tuple[list[list[str]], list[str]]:
-    """Rows of the table, and the names of what is worse than allowed or not in the baseline."""
+    """Return rows of the table, and the names of metrics beyond their tolerance or not in it."""
     rows, broken = [], []
     for name, metric in CONTRACT.items():
-        maps = baseline.get(name)
-        holds = maps is not None and metric.holds(maps, now[name])
+        before = baseline.get(name)
+        holds = before is not None and metric.holds(before, now[name])
         if not holds:
             broken.append(name)
-        was = "-" if maps is None else f"{maps:.1f}"
-        said = "yes" if holds else "NO"
-        rows.append([name, metric.unit, metric.better, was, f"{now[name]:.1f}", said])
+        was, verdict = "-" if before is None else f"{before:.1f}", "yes" if holds else "NO"
+        rows.append([name, metric.unit, metric.better, was, f"{now[name]:.1f}", verdict])
     return rows, broken
 
 
 def _reference() -> None:
-    """The kernel that times are told in: twenty fp32 products of 512 x 512."""
+    """Run the unit of time: twenty float32 products of 512 x 512."""
     a = torch.ones(512, 512)
     for _ in range(20):
         a = (a @ a).clamp(max=1.0)

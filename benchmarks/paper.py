@@ -1,4 +1,4 @@
-"""The first steps of preset `paper`: its shapes, memory, loss and seconds on this machine."""
+"""The first steps of preset `paper`: memory, loss and seconds on this machine."""
 
 import json
 import time
@@ -20,37 +20,52 @@ from evercal.features.encoder import load_encoder
 from evercal.mapping.scene_maps import SceneMaps
 from evercal.recordings import stated_poses
 
-TOLD_EVERY = 10
+REPORT_EVERY = 10
 
 
-def run(suite: str, data: Path | None, steps: int, device: str, out: Path) -> None:
-    """Prints a line every ten steps and appends it to `out`, JSON lines."""
-    scenes = load_suite(suite, data, (), None)
-    train = validation_split(scenes[0].train)[0]
+def run(
+    suite: str = "sim-mini",
+    data: Path | None = None,
+    steps: int = 200,
+    device: str = "auto",
+    out: Path = Path("runs/paper.jsonl"),
+) -> None:
+    """Run and time the first steps of preset `paper` on the first scene of a suite.
+
+    Args:
+        suite: Suite; all of its scenes give the centres.
+        data: Folder of its recordings.
+        steps: Steps to run, of 5,000.
+        device: auto, cpu or cuda.
+        out: File for loss, seconds and memory every ten steps, JSON lines.
+    """
+    scenes = load_suite(suite, data)
+    trains = [validation_split(scene.train)[0] for scene in scenes]
     stage = on_paper_backbone(preset("paper"))
-    places = [stated_poses(validation_split(scene.train)[0]).translation_m for scene in scenes]
-    centres = combined_centres(places, stage.head.centres_per_scene, 0)
+    positions = [stated_poses(train).translation_m for train in trains]
+    centres = combined_centres(positions, stage.head.centres_per_scene, 0)
     fit = replace(stage.fit, iterations=PAPER_SIM_STEPS)
     stage = replace(stage, fit=fit, grid_scenes=len(scenes), fixed_centres_m=centres)
     maps = SceneMaps(load_encoder(), load_descriptor(), "sars_spdd", short_side("paper"))
     maps.to(device_of(device))
     out.parent.mkdir(parents=True, exist_ok=True)
-    began, spent = time.perf_counter(), time.process_time()
-    for event in learn(maps, strategy_named("sars_spdd"), replace(scenes[0], train=train), stage):
+    began, cpu = time.perf_counter(), time.process_time()
+    first = replace(scenes[0], train=trains[0])
+    for event in learn(maps, strategy_named("sars_spdd"), first, stage):
         if isinstance(event, Encoding):
-            began, spent = time.perf_counter(), time.process_time()
-        if not isinstance(event, Progress) or event.step % TOLD_EVERY:
+            began, cpu = time.perf_counter(), time.process_time()
+        if not isinstance(event, Progress) or event.step % REPORT_EVERY:
             continue
-        told = {
+        row = {
             "step": event.step,
             "loss_px": round(event.loss, 3),
             "within_5_px": round(100 * event.inlier_share, 2),
             "seconds_a_step": round((time.perf_counter() - began) / event.step, 2),
-            "processor_seconds_a_step": round((time.process_time() - spent) / event.step, 2),
+            "processor_seconds_a_step": round((time.process_time() - cpu) / event.step, 2),
             "peak_gb": round(peak_gb(maps.device), 2),
         }
-        print(json.dumps(told), flush=True)
+        print(json.dumps(row), flush=True)
         with open(out, "a", encoding="utf-8") as file:
-            file.write(json.dumps(told) + "\n")
+            file.write(json.dumps(row) + "\n")
         if event.step >= steps:
             return

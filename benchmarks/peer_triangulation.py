@@ -1,4 +1,4 @@
-"""Points of a frame's features from where other frames see them, with the stated poses."""
+"""Triangulation of a frame's features from matches in other frames, with the stated poses."""
 
 from dataclasses import dataclass, replace
 
@@ -11,67 +11,67 @@ GAUSS_NEWTON_STEPS = 5
 
 @dataclass(frozen=True)
 class TriangulationOptions:
-    """What a point has to stand up to."""
+    """Options of triangulation."""
 
     partners: int = 12
-    """Other training frames that a frame is matched to."""
+    """Training frames that a frame is matched to."""
     baseline_m: float = 0.05
-    """They stand at least so far from it and from one another, metres."""
+    """Least distance of these frames from it and from each other, metres."""
     reprojection_px: float = 4.0
-    """A partner agrees up to this error, pixels at working size."""
+    """Reprojection error below which a partner agrees, pixels at working size."""
     agreeing: int = 2
-    """Partners that have to agree."""
+    """Least number of agreeing partners."""
     angle_deg: float = 1.5
-    """The widest angle between the frame's ray and one of theirs, at least."""
+    """Least angle between the ray of the frame and that of some agreeing partner."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """The features of one frame in it and in its partners; the frame itself is view 0."""
+    """Features of a frame in itself (view 0) and in its partners."""
 
     pixels: np.ndarray
-    """(v, n, 2) in ideal pinholes; NaN where a partner has no match."""
+    """Undistorted pixels, NaN without a match, shape (v, n, 2)."""
     intrinsics: np.ndarray
-    """(v, 4) fx, fy, cx, cy, pixels."""
+    """fx, fy, cx, cy in pixels, shape (v, 4)."""
     world_from_camera: SE3
-    """(v,) stated poses."""
+    """Stated poses, shape (v,)."""
 
     def rays(self) -> np.ndarray:
-        """(v, n, 3) unit viewing rays in the world frame."""
+        """Return unit viewing rays in the world frame, shape (v, n, 3)."""
         plane = (self.pixels - self.intrinsics[:, None, 2:]) / self.intrinsics[:, None, :2]
         rays = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], -1)
         rays = rays @ np.swapaxes(self.world_from_camera.rotation_matrix(), -1, -2)
         return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
     def in_cameras(self, points_m: np.ndarray) -> np.ndarray:
-        """(v, n, 3) camera coordinates of (n, 3) points, metres."""
+        """Return camera coordinates (v, n, 3) of points (n, 3), metres."""
         inverse = self.world_from_camera.inverse()
-        turned = points_m @ np.swapaxes(inverse.rotation_matrix(), -1, -2)
-        return turned + inverse.translation_m[:, None]
+        rotated = points_m @ np.swapaxes(inverse.rotation_matrix(), -1, -2)
+        return rotated + inverse.translation_m[:, None]
 
     def residuals(self, local: np.ndarray) -> np.ndarray:
-        """(v, n, 2) pixels from (v, n, 3) camera coordinates; NaN behind a camera."""
+        """Return residuals (v, n, 2) in pixels of camera coordinates (v, n, 3); NaN behind."""
         depth = np.where(local[..., 2:] > 1e-3, local[..., 2:], np.nan)
         plane = local[..., :2] / depth
         return plane * self.intrinsics[:, None, :2] + self.intrinsics[:, None, 2:] - self.pixels
 
     def errors(self, points_m: np.ndarray) -> np.ndarray:
-        """(v, n) reprojection errors in pixels, infinite where there is nothing to compare."""
+        """Return reprojection errors in pixels, infinite without a match, shape (v, n)."""
         error = np.linalg.norm(self.residuals(self.in_cameras(points_m)), axis=-1)
         return np.where(np.isfinite(error), error, np.inf)
 
 
 def triangulate(tracks: Tracks, options: TriangulationOptions) -> np.ndarray:
-    """Points of the features of view 0.
+    """Triangulate the features of view 0.
 
-    Every partner proposes the point of the frame's ray that is closest to its own ray; the
-    proposal with the smallest truncated squared error over all partners wins (MSAC, Torr and
-    Zisserman, CVIU 2000) and is refined by Gauss-Newton over the views that agree.
+    Every partner proposes the point on the frame's ray that is closest to its own ray. The proposal
+    with the smallest truncated squared error over all partners (MSAC, Torr and Zisserman, CVIU
+    2000) is refined by Gauss-Newton over the agreeing views.
 
     Returns:
-        (n, 3) metres, NaN where too few partners agree or their rays are too close to parallel.
+        Points in metres, shape (n, 3). NaN if too few partners agree or rays are nearly parallel.
     """
-    everywhere = np.full((tracks.pixels.shape[1], 3), np.nan)
+    triangulated = np.full((tracks.pixels.shape[1], 3), np.nan)
     enough = np.isfinite(tracks.pixels[1:, :, 0]).sum(0) >= options.agreeing
     tracks = replace(tracks, pixels=tracks.pixels[:, enough])
     rays, bound = tracks.rays(), options.reprojection_px
@@ -82,20 +82,20 @@ def triangulate(tracks: Tracks, options: TriangulationOptions) -> np.ndarray:
     cosine = np.where(agrees[1:], (rays[1:] * rays[0]).sum(-1), 1.0).min(0, initial=1.0)
     good = agrees[0] & (agrees[1:].sum(0) >= options.agreeing)
     good &= cosine <= np.cos(np.deg2rad(options.angle_deg))
-    everywhere[enough] = np.where(good[:, None], points, np.nan)
-    return everywhere
+    triangulated[enough] = np.where(good[:, None], points, np.nan)
+    return triangulated
 
 
 def _best_proposal(tracks: Tracks, rays: np.ndarray, bound: float) -> np.ndarray:
-    """(n, 3) points on the rays of view 0; NaN where no partner has a match."""
+    """Return points on the rays of view 0, NaN without a match, shape (n, 3)."""
     origins = tracks.world_from_camera.translation_m
     best = np.full(rays.shape[1:], np.nan)
     cost = np.full(len(best), np.inf)
     for partner in range(1, len(rays)):
-        way = origins[partner] - origins[0]
+        baseline = origins[partner] - origins[0]
         cosine = (rays[0] * rays[partner]).sum(-1)
         sine_squared = np.maximum(1.0 - cosine**2, 1e-12)
-        distance = (rays[0] @ way - cosine * (rays[partner] @ way)) / sine_squared
+        distance = (rays[0] @ baseline - cosine * (rays[partner] @ baseline)) / sine_squared
         proposal = origins[0] + np.where(distance > 0, distance, np.nan)[:, None] * rays[0]
         error = np.minimum(tracks.errors(proposal), bound)
         total = np.where(np.isfinite(distance) & (distance > 0), (error**2).sum(0), np.inf)
@@ -105,7 +105,7 @@ def _best_proposal(tracks: Tracks, rays: np.ndarray, bound: float) -> np.ndarray
 
 
 def _step(tracks: Tracks, points_m: np.ndarray, use: np.ndarray) -> np.ndarray:
-    """(n, 3) Gauss-Newton step in metres over the views of (v, n) `use`; 0 where it is open."""
+    """Return the Gauss-Newton step (n, 3) over the views of (v, n) `use`; 0 for fewer than two."""
     local = tracks.in_cameras(points_m)
     residual = np.where(use[..., None], tracks.residuals(local), 0.0)
     x, y, z = np.moveaxis(local, -1, 0)

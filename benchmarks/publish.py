@@ -1,13 +1,30 @@
-"""Puts the numbers of a measurement into `results/`, from where tables are made."""
+"""Publishes the numbers of a measurement in `results/`, from which tables are generated."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+from tyro.conf import Positional
 
 from evercal.continual.benchmark.published import Published, Row, from_bench, write_published
 from evercal.errors import InputError
 
 FOLDER = Path(__file__).resolve().parent.parent / "results"
+
+
+def run(
+    source: Positional[Path], name: Positional[str], groups: tuple[str, ...] = (), note: str = ""
+) -> None:
+    """Write the numbers of a measurement to results/NAME.jsonl.
+
+    Args:
+        source: Folder of `evercal bench`, or rows in JSON from another measurement.
+        name: Name of the file.
+        groups: Rows that a table averages, each TITLE=ROW,ROW.
+        note: A remark for the reader.
+    """
+    print(publish(source, name, groups_of(groups), note))
 
 
 def publish(
@@ -17,43 +34,43 @@ def publish(
     note: str = "",
     out: Path = FOLDER,
 ) -> Path:
-    """Writes `OUT/NAME.jsonl`.
+    """Write `OUT/NAME.jsonl`.
 
     Args:
-        source: folder of `evercal bench`, or a file of rows: JSON or JSON lines.
-        name: of the table.
-        groups: rows that tables take together, by title; for a file of rows.
-        note: what a reader must know besides.
-        out: the folder.
+        source: Folder of `evercal bench`, or a file of rows: JSON or JSON lines.
+        name: Name of the file.
+        groups: Rows that tables average, by title; for a file of rows.
+        note: A remark for the reader.
+        out: Folder to write to.
 
     Raises:
-        InputError: nothing that can be published, or groups of rows that are not there.
+        InputError: Nothing to publish, or groups of missing rows.
     """
     if source.is_dir():
         return write_published(out, from_bench(source, name, note))
     settings, rows = _read(source)
-    known = {str(next(iter(row.values()))) for row in rows}
-    missing = [one for of in groups.values() for one in of if one not in known]
-    if missing:
-        raise InputError(f"{source}: no row is called {missing[0]!r}; there are {sorted(known)}")
+    names = {str(next(iter(row.values()))) for row in rows}
+    for member in (member for members in groups.values() for member in members):
+        if member not in names:
+            raise InputError(f"{source}: no row is called {member!r}; rows are {sorted(names)}")
     return write_published(
         out, Published(name, "rows", settings, note, groups=dict(groups), rows=tuple(rows))
     )
 
 
 def groups_of(words: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """`TITLE=ROW,ROW` to rows by title."""
-    found = {}
+    """Parse words `TITLE=ROW,ROW` to rows by title."""
+    groups = {}
     for word in words:
         title, equals, names = word.partition("=")
         if not equals:
             raise InputError(f"--groups {word!r}: give TITLE=ROW,ROW")
-        found[title] = tuple(names.split(","))
-    return found
+        groups[title] = tuple(names.split(","))
+    return groups
 
 
 def _read(source: Path) -> tuple[dict[str, object], list[Row]]:
-    """Settings and rows of a file, as `maps`, `calibration` and `peers` write them."""
+    """Read settings and rows of a file that a measurement wrote."""
     try:
         text = source.read_text()
         if source.suffix == ".jsonl":
@@ -67,24 +84,25 @@ def _read(source: Path) -> tuple[dict[str, object], list[Row]]:
         settings = {key: value for key, value in data.items() if key not in ("rows", "scenes")}
         settings = settings.get("settings", settings)  # pyright: ignore[reportAssignmentType]
         data = data.get("rows") or [
-            {"scene": scene, **row} for scene, of in data.get("scenes", {}).items() for row in of
+            {"scene": scene, **row}
+            for scene, rows in data.get("scenes", {}).items()
+            for row in rows
         ]
     if not isinstance(data, list) or not data or not all(isinstance(row, dict) for row in data):
-        raise InputError(f"{source}: holds no list of rows")
+        raise InputError(f"{source}: no list of rows")
     return settings, [_flat(row) for row in data]
 
 
 def _flat(row: Mapping[str, object]) -> Row:
-    """Six digits are more than any of it is good for."""
-    found: dict[str, str | float | int | bool | None] = {}
+    """Flatten a row, with six digits per number; NaN and infinity become None."""
+    flat: dict[str, str | float | int | bool | None] = {}
     for key, value in row.items():
         if isinstance(value, Mapping):
-            found |= _flat(value)
+            flat |= _flat(value)
         elif isinstance(value, float):
-            number = float(f"{value:.6g}")
-            found[key] = number if abs(number) < float("inf") else None  # NaN fails this too
+            flat[key] = float(f"{value:.6g}") if math.isfinite(value) else None
         elif value is None or isinstance(value, str | int):
-            found[key] = value
+            flat[key] = value
         else:
             raise InputError(f"{key}: {value!r} is not a number or a word")
-    return found
+    return flat

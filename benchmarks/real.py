@@ -1,6 +1,7 @@
-"""Accuracy and time of one real scene alone with preset `fast`; resumable."""
+"""Accuracy and time of each real scene alone."""
 
 import json
+import os
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +16,8 @@ from evercal.evaluation.protocol import evaluate
 from evercal.localization.localizer import Localizer
 from evercal.recordings import load_recording
 
-REAL = ("redkitchen", "fr1_rpy")
+DATA_VARIABLE = "EVERCAL_REAL_DATA"
+SCENES = ("redkitchen", "fr1_rpy")
 COLUMNS = (
     "frames",
     "accuracy_5cm_5deg",
@@ -28,23 +30,40 @@ COLUMNS = (
 )
 
 
-def run(data: Path, out: Path, seed: int) -> None:
-    """Learns each scene alone, a cold store each, and prints the table."""
+def run(data: Path | None = None, out: Path = Path("runs/real"), seed: int = 0) -> None:
+    """Learn each real scene alone, preset `fast`. Complete runs are not repeated.
+
+    Args:
+        data: Folder with `redkitchen` and `fr1_rpy` (7-Scenes layout). Defaults to
+            EVERCAL_REAL_DATA.
+        out: Folder for stores and results.
+        seed: Seed of the runs.
+    """
+    if data is None and DATA_VARIABLE not in os.environ:
+        print(f"skipped: no real data; give --data DIR or set {DATA_VARIABLE}")
+        return
+    folder = data or Path(os.environ[DATA_VARIABLE])
     out.mkdir(parents=True, exist_ok=True)
     rows = []
-    for name in REAL:
-        scene = load_recording(data / name)
-        store, record = out / f"fast-{name}-{seed}", out / f"fast-{name}-{seed}.json"
-        if not record.exists():
-            began = time.perf_counter()
-            report = learn_scene(store, scene, LearnOptions(stage=preset("fast", seed)))
-            seconds = time.perf_counter() - began
-            results = evaluate(Localizer.open(store), {name: scene})
-            table = asdict(scores(results).scenes[name])
-            ms = float(np.mean([r.milliseconds for r in results]))
-            kept = report.memory_bytes + report.head_bytes
-            record.write_text(json.dumps(table | {"seconds": seconds, "ms": ms, "bytes": kept}))
-        found = json.loads(record.read_text())
-        rows.append([name, *[found[key] for key in COLUMNS]])
+    for name in SCENES:
+        store = out / f"fast-{name}-{seed}"
+        path = store.with_suffix(".json")
+        if not path.exists():
+            path.write_text(json.dumps(_measured(folder / name, name, store, seed)))
+        record = json.loads(path.read_text())
+        rows.append([name, *[record[key] for key in COLUMNS]])
     print("\nOne scene, preset fast\n")
     print(tabulate(rows, ["scene", *COLUMNS], "github", floatfmt=".1f"))
+
+
+def _measured(folder: Path, name: str, store: Path, seed: int) -> dict[str, float]:
+    scene = load_recording(folder)
+    began = time.perf_counter()
+    report = learn_scene(store, scene, LearnOptions(stage=preset("fast", seed)))
+    seconds = time.perf_counter() - began
+    results = evaluate(Localizer.open(store), {name: scene})
+    return asdict(scores(results).scenes[name]) | {
+        "seconds": seconds,
+        "ms": float(np.mean([result.milliseconds for result in results])),
+        "bytes": report.memory_bytes + report.head_bytes,
+    }

@@ -1,8 +1,8 @@
-"""What the simulator's rooms look like, and how fast they are rendered."""
+"""Views of the simulator's rooms, and rendering time."""
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from tabulate import tabulate
@@ -19,17 +19,28 @@ from evercal.storage import write_bytes
 TIMED, COLUMNS = 6, 4
 
 
-def run(out: Path, suites: Sequence[str], samples: int, views: int) -> None:
-    """Renders some views of every room of the suites, writes them as one sheet, prints times."""
+def run(
+    out: Path = Path("runs/rooms.jpg"),
+    suites: tuple[Literal["sim", "sim-7", "sim-12"], ...] = ("sim",),
+    samples: int = 16,
+    views: int = 2,
+) -> None:
+    """Render views of every room as one contact sheet and time them; needs evercal[sim].
+
+    Args:
+        out: The sheet, a JPEG.
+        suites: Suites whose rooms are rendered.
+        samples: Paths per pixel.
+        views: Views of each room on the sheet.
+    """
     camera, panda, options = default_camera(320, 240), Panda(), RenderOptions(samples=samples)
     images, rows = [], []
     for suite in suites:
         for name, kind, seed in SUITES[suite].rooms:
-            place = room(kind, seed)
-            train = sweep_shots(place, 40, 0)[:28]
-            count = max(views, TIMED)
-            shots = [train[int(i)] for i in np.linspace(0, 27, count)]
-            renderer = Renderer(place.meshes() + panda.meshes(shots[0].joints_rad))
+            furnished = room(kind, seed)
+            train = sweep_shots(furnished, 40, 0)[:28]
+            shots = [train[int(i)] for i in np.linspace(0, 27, max(views, TIMED))]
+            renderer = Renderer(furnished.meshes() + panda.meshes(shots[0].joints_rad))
             seconds = []
             for i, shot in enumerate(shots):
                 start = time.perf_counter()
@@ -39,7 +50,7 @@ def run(out: Path, suites: Sequence[str], samples: int, views: int) -> None:
                     images.append(labelled(image, f"{suite}: {name}"))
             # The first frame compiles the kernels.
             rate = 1 / float(np.median(seconds[1:]))
-            rows.append([suite, name, len(place.items), rate])
+            rows.append([suite, name, len(furnished.items), rate])
             print(f"{suite} {name}: {rate:.2f} frames/s", flush=True)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(out, encode_image(sheet(images), "jpg"))

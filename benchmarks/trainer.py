@@ -1,4 +1,4 @@
-"""What a training step costs beside its matrix products, measured in the same run."""
+"""Time of a training step and of its bare matrix products, measured in the same run."""
 
 import time
 from collections.abc import Callable
@@ -18,8 +18,14 @@ from evercal.geometry import SE3
 ROWS, VIEWS = 60_000, 100
 
 
-def run(widths: tuple[int, ...], batch: int, repeat: int) -> None:
-    """Prints a row for each width: milliseconds of processor time, and the share of the peak."""
+def run(widths: tuple[int, ...] = (256, 384), batch: int = 2048, repeat: int = 30) -> None:
+    """Time a training step and its bare matrix products, in processor time.
+
+    Args:
+        widths: Widths of the head.
+        batch: Rows of a step.
+        repeat: Steps to time.
+    """
     rows = []
     for width in widths:
         trainer = _trainer(width, batch)
@@ -56,7 +62,7 @@ def _trainer(width: int, batch: int) -> HeadTrainer:
 
 
 def _products(head: Head, batch: int, repeat: int) -> tuple[float, float]:
-    """Milliseconds of the bare products of one step: forward and backward, and Muon's."""
+    """Return milliseconds of the products of one step: forward and backward, and Muon's."""
     kind = torch.bfloat16 if fast_bfloat16() else torch.float32
     width, hidden = head.options.width, head.layers - 1
     x, w = torch.randn(batch, width, dtype=kind), torch.randn(width, width, dtype=kind)

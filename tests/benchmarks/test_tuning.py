@@ -1,7 +1,8 @@
-"""Which trial of a method is taken."""
+"""The best trial of every method is selected on held-out frames."""
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,36 +12,39 @@ from evercal.continual.benchmark import results
 from evercal.continual.benchmark.bench import BenchOptions
 from evercal.continual.benchmark.results import SceneResult
 from evercal.continual.benchmark.rows import load_rows, strategy_from_row
+from evercal.continual.stage import StageOptions
 from evercal.errors import InputError
-from evercal.storage import write_json
+from evercal.recordings import Recording
 
 
 def result(strategy: str, stage: int, scene: str, errors_m: tuple[float, ...]) -> SceneResult:
     n = len(errors_m)
     return SceneResult(
-        strategy,
-        0,
-        stage,
-        scene,
-        tuple(map(str, range(n))),
-        errors_m,
-        (0.0,) * n,
-        (False,) * n,
-        (False,) * n,
-        1.0,
-        0,
-        0,
-        0,
+        strategy=strategy,
+        seed=0,
+        stage=stage,
+        scene=scene,
+        frames=tuple(map(str, range(n))),
+        translation_m=errors_m,
+        rotation_rad=(0.0,) * n,
+        wrong_scene=(False,) * n,
+        near_training_frame=(False,) * n,
+        seconds=1.0,
+        memory_bytes=0,
+        head_bytes=0,
+        frames_kept=0,
     )
 
 
-def test_area_counts_every_centimetre_and_only_the_last_stage(tmp_path: Path) -> None:
-    found = [
-        result("er_0.1", 0, "a", (0.0, 0.0)),  # forgotten later
-        result("er_0.1", 1, "a", (0.1, math.inf)),
-        result("er_0.1", 1, "b", (0.04, 0.0)),
-    ]
-    results.append(tmp_path, found)
+def test_final_scores_use_the_last_stage(tmp_path: Path) -> None:
+    results.append(
+        tmp_path,
+        [
+            result("er_0.1", 0, "a", (0.0, 0.0)),
+            result("er_0.1", 1, "a", (0.1, math.inf)),
+            result("er_0.1", 1, "b", (0.04, 0.0)),
+        ],
+    )
     row = {"name": "er_0.1", "of": "er", "with": {"weight": 0.1}}
     assert tuning.final_scores(tmp_path, [strategy_from_row("t", row)], 2) == {
         "er_0.1": {
@@ -52,72 +56,36 @@ def test_area_counts_every_centimetre_and_only_the_last_stage(tmp_path: Path) ->
     }
 
 
-def test_the_best_trial_of_every_method_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def options(arc_stage: StageOptions) -> BenchOptions:
+    def stage(seed: int) -> StageOptions:
+        fit = replace(arc_stage.fit, iterations=4, batch=64, replay_batch=32)
+        encode = replace(arc_stage.encode, views_per_frame=1, seed=seed)
+        return replace(arc_stage, fit=fit, encode=encode, replay_views_per_frame=1, seed=seed)
+
+    return BenchOptions(stage, (), (0,), short_side=120, settings={"suite": "arcs"})
+
+
+def test_best_trial_and_rows_derived_from_it_are_written(
+    arcs: tuple[Recording, Recording], options: BenchOptions, tmp_path: Path
 ) -> None:
-    errors = {"er_0.1": 0.15, "er_0.3": 0.02, "er_1": 0.06, "er_3": 0.3}
-
-    def bench(scenes: list[object], options: BenchOptions, out: Path) -> list[object]:
-        out.mkdir()
-        write_json(out / results.SETTINGS, {"suite": "sim-mini"})
-        for scene in "ab":
-            results.append(out, [result(k, 1, scene, (v,)) for k, v in errors.items()])
-        assert options.settings["judged"] == "held-out training frames"
-        return []
-
-    monkeypatch.setattr(tuning, "TRIALS", {"er": tuning.WEIGHTS})
-    monkeypatch.setattr(tuning, "load_suite", lambda *_: ["a", "b"])
-    monkeypatch.setattr(tuning, "tuning_split", lambda scene: scene)
-    monkeypatch.setattr(tuning, "run_bench", bench)
-    file = tmp_path / "tuned.json"
-    tuning.run("sim-mini", None, 2, tmp_path / "out", file)
-    found, others = {"weight": 0.3}, {"weight": 0.3, "selector": "sars"}
+    scenes = [replace(arc, train=arc.train[:18], test=arc.test[:3]) for arc in arcs]
+    file = tmp_path / "tuned" / "arcs.json"
+    tuning.tune(scenes, options, ("er",), file, tmp_path / "out")
+    outcomes = json.loads(file.with_suffix(".outcomes.json").read_text())
+    assert outcomes["settings"]["suite"] == "arcs"
+    trials = [(row["method"], row["setting"], row["value"]) for row in outcomes["rows"]]
+    assert trials == [("er", "weight", value) for value in (0.1, 0.3, 1.0, 3.0)]
+    best = max(outcomes["rows"], key=lambda row: row["auc_20cm"])["value"]
     assert json.loads(file.read_text()) == [
-        {"name": "er", "of": "er", "with": found},
-        {"name": "sars_reprojection", "of": "er", "with": others},
+        {"name": "er", "of": "er", "with": {"weight": best}},
+        {"name": "sars_reprojection", "of": "er", "with": {"weight": best, "selector": "sars"}},
     ]
     assert [strategy.name for strategy in load_rows(str(file))] == ["er", "sars_reprojection"]
-    outcomes = json.loads(file.with_suffix(".outcomes.json").read_text())
-    told = outcomes["rows"]
-    assert outcomes["settings"] == {"suite": "sim-mini"}
-    assert [(one["method"], one["setting"], one["value"]) for one in told] == [
-        ("er", "weight", 0.1),
-        ("er", "weight", 0.3),
-        ("er", "weight", 1.0),
-        ("er", "weight", 3.0),
-    ]
-    assert [one["auc_20cm"] for one in told] == [25.0, 90.0, 70.0, 0.0]
-    assert [one["accuracy_5cm_5deg"] for one in told] == [0.0, 100.0, 0.0, 0.0]
 
 
-def test_what_is_trained_can_be_the_papers_network_and_a_few_methods(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[BenchOptions] = []
-
-    def bench(scenes: list[object], options: BenchOptions, out: Path) -> list[object]:
-        asked.append(options)
-        out.mkdir()
-        write_json(out / results.SETTINGS, {"suite": "sim-mini"})
-        results.append(
-            out, [result(s.name, 1, at, (0.1,)) for s in options.strategies for at in "ab"]
-        )
-        return []
-
-    monkeypatch.setattr(tuning, "load_suite", lambda *_: ["a", "b"])
-    monkeypatch.setattr(tuning, "tuning_split", lambda scene: scene)
-    monkeypatch.setattr(tuning, "run_bench", bench)
-    where = ("sim-mini", None, 2, tmp_path / "out", tmp_path / "tuned.json")
-    tuning.run(*where, methods=("er", "sars_spdd"), paper_backbone=True, steps=7)
-    (options,) = asked
-    assert {s.name.rpartition("_")[0] for s in options.strategies} == {"er", "sars_spdd"}
-    stage = options.stage(0)
-    assert stage.fit.iterations == 7
-    assert stage.head.condition == "descriptor"
-    assert stage.fit.loss.schedule == "circle"
-    names = [row["name"] for row in json.loads((tmp_path / "tuned.json").read_text())]
-    assert names == ["er", "sars_spdd", "sars_spdd_filled", "sars_reprojection", "reservoir_spdd"]
+def test_unusable_arguments_are_refused(options: BenchOptions, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--methods joint: choose of er, "):
-        tuning.run(*where, methods=("joint",))
+        tuning.tune([], options, ("joint",), tmp_path / "f.json", tmp_path)
     with pytest.raises(InputError, match="--scenes 1: give 2 or more"):
-        tuning.run("sim-mini", None, 1, tmp_path / "out", tmp_path / "tuned.json")
+        tuning.run("sim-mini", tmp_path / "tuned.json", scenes=1)

@@ -1,4 +1,4 @@
-"""`evercal bench` and `bench-report`: tables, one JSON object, and complaints before any work."""
+"""`evercal bench` and `bench-report`: tables, one JSON object, and refused input."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from evercal.cli import bench as verb
+from evercal.continual.benchmark import report_data
 from evercal.continual.benchmark.results import RESULTS, STRATEGIES
 from evercal.recordings import generic
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, quick: StageOptions) -> None:
-    """Stages that take no time."""
+    """Tiny stages."""
     monkeypatch.setattr(verb.Bench, "_stage", lambda self, seed: replace(quick, seed=seed))
 
 
@@ -35,18 +36,23 @@ def test_bench_and_its_report(
     first = run("bench", *words, "--out", tmp_path / "out")
     assert first.code == 0, first.err
     assert "[4/4] finetune seed 0: one " in first.out
+    # A map is also evaluated without alignment, under its own name.
+    line = next(line for line in first.out.splitlines() if line.startswith("[2/4] evercal"))
+    assert "evercal:unaligned seed 0: one " in line
     assert "evercal - finetune" in first.out
+    assert "BWT (backward transfer): mean change" in first.out
     again = run("bench", *words, "--out", tmp_path / "out", "--json")
     assert again.code == 0
-    (found,) = json.loads(again.out)["strategies"]["evercal"]
-    assert found["scenes"] == ["one", "two"]
-    assert found["accuracy_5cm_5deg"][0][1] is None
+    (summary,) = json.loads(again.out)["strategies"]["evercal"]
+    assert summary["scenes"] == ["one", "two"]
+    assert summary["accuracy_5cm_5deg"][0][1] is None
     report = run("bench-report", tmp_path / "out")
     assert report.code == 0
     assert "| evercal " in (tmp_path / "out" / "tables.md").read_text()
     page = (tmp_path / "out" / "report.html").read_text()
-    assert page.count("<img ") == 8
-    assert "seen from the estimated pose" in page
+    assert page.count("<img ") == 12
+    assert "Scenes at the estimated poses" in page
+    assert "<dt>TFR</dt>" in page
     assert "evercal - finetune" in page
     assert r"\multicolumn{3}{c}{finetune}" in (tmp_path / "out" / "table.tex").read_text()
 
@@ -55,11 +61,11 @@ def test_bench_and_its_report(
     ("words", "message"),
     [
         (["attic"], "suite 'attic': unknown; choose one of sim-mini"),
-        (["custom"], "suite custom: scene folders are for the suites custom and regions"),
-        (["sim-mini", "somewhere"], "suite sim-mini: scene folders are for the suites custom"),
+        (["custom"], "suite custom: give scene folders for the suites custom and regions only"),
+        (["sim-mini", "somewhere"], "suite sim-mini: give scene folders for the suites custom"),
         (["sim-mini", "--strategies", "evercal,magic"], "strategy 'magic': unknown; choose one of"),
-        (["sim-mini", "--seeds", "0,one"], "--seeds 0,one: give numbers"),
-        (["sim-mini", "--seeds", ","], "--seeds ,: give numbers"),
+        (["sim-mini", "--seeds", "0,one"], "--seeds 0,one: give comma-separated numbers"),
+        (["sim-mini", "--seeds", ","], "--seeds ,: give comma-separated numbers"),
         (["sim-mini", "--strategies", "er@3"], "strategy 'er@3': unknown; choose one of"),
         (["sim-mini", "--rows", "table5"], "rows table5: give spdd-sweep, table4, with-map"),
         (["sim-mini", "--rows", "nowhere.json"], "rows nowhere.json: no such file"),
@@ -70,20 +76,32 @@ def test_bench_and_its_report(
         (["real2"], "--data"),
     ],
 )
-def test_bad_input(run: Any, words: list[str], message: str, tmp_path: Path) -> None:
-    found = run("bench", *words, "--out", tmp_path / "out")
-    assert found.code == 2
-    assert message in " ".join(" ".join(found.err).split())
+def test_unusable_input_is_refused(
+    run: Any, words: list[str], message: str, tmp_path: Path
+) -> None:
+    ran = run("bench", *words, "--out", tmp_path / "out")
+    assert ran.code == 2
+    assert message in " ".join(" ".join(ran.err).split())
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_without_results(run: Any, tmp_path: Path) -> None:
-    found = run("bench-report", tmp_path)
-    assert found.code == 2
-    assert "no results here" in found.err[0]
+def test_folder_without_results_is_refused(run: Any, tmp_path: Path) -> None:
+    ran = run("bench-report", tmp_path)
+    assert ran.code == 2
+    assert "no results here" in ran.err[0]
 
 
-def test_settings_are_chosen_on_training_frames(
+def test_missing_pandas_is_refused_before_any_work(
+    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(report_data, "find_spec", lambda name: None)
+    ran = run("bench", "sim-mini", "--out", tmp_path / "out")
+    assert ran.code == 2
+    assert "pip install 'evercal[bench]'" in ran.err[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_held_out_frames_are_training_frames(
     run: Any, small: None, arcs: tuple[Recording, Recording], tmp_path: Path
 ) -> None:
     folders = []
@@ -91,28 +109,28 @@ def test_settings_are_chosen_on_training_frames(
         folders.append(tmp_path / scene.name)
         generic.write(folders[-1], replace(scene, train=scene.train[:30], test=scene.test[:2]))
     rows = tmp_path / "rows.json"
-    # What is named twice and means the same is run once.
+    # Equal strategies run once.
     rows.write_text(
         '[{"name": "er", "of": "er"}, {"name": "er_3", "of": "er", "with": {"weight": 0.9}}]'
     )
     words = ["custom", *folders, "--strategies", "er", "--rows", rows, "--seeds", "0", "--held-out"]
     assert run("bench", *words, "--out", tmp_path / "out").code == 0
     lines = [json.loads(line) for line in (tmp_path / "out" / RESULTS).read_text().splitlines()]
-    learned = {frame.name for scene in arcs for frame in scene.train}
-    done = [(line["strategy"], line["stage"], line["scene"]) for line in lines]
+    train = {frame.name for scene in arcs for frame in scene.train}
+    ran = [(line["strategy"], line["stage"], line["scene"]) for line in lines]
     stages = [(0, "one"), (1, "one"), (1, "two")]
-    assert done == [(name, *stage) for name in ("er", "er_3") for stage in stages]
-    told = json.loads((tmp_path / "out" / STRATEGIES).read_text())
-    assert [told[name]["method"]["weight"] for name in ("er", "er_3")] == [0.3, 0.9]
+    assert ran == [(name, *stage) for name in ("er", "er_3") for stage in stages]
+    described = json.loads((tmp_path / "out" / STRATEGIES).read_text())
+    assert [described[name]["method"]["weight"] for name in ("er", "er_3")] == [0.3, 0.9]
     assert {len(line["frames"]) for line in lines} == {6}
-    assert {name for line in lines for name in line["frames"]} <= learned
-    # Results on test frames do not mix with these.
-    found = run("bench", *words[:-1], "--out", tmp_path / "out")
-    assert found.code == 2
-    assert "now it is 'test frames'" in " ".join(found.err)
+    assert {name for line in lines for name in line["frames"]} <= train
+    # Results on test frames are not mixed with these.
+    refused = run("bench", *words[:-1], "--out", tmp_path / "out")
+    assert refused.code == 2
+    assert "now it is 'test frames'" in " ".join(refused.err)
 
 
-def test_rows_stand_alone_unless_strategies_are_named() -> None:
+def test_rows_replace_the_default_strategies() -> None:
     def names(rows: str | None = None, strategies: str | None = None) -> list[str]:
         bench = verb.Bench("sim-mini", rows=rows, strategies=strategies)
         return [one.name for one in bench._strategies()]
@@ -124,7 +142,7 @@ def test_rows_stand_alone_unless_strategies_are_named() -> None:
     assert names() == ["evercal", "joint", "finetune", "er", "sars_spdd"]
 
 
-def test_the_backbone_of_the_paper() -> None:
+def test_options_of_the_backbone_of_the_paper() -> None:
     ours, paper = (verb.Bench("sim-mini", backbone=b, steps=7) for b in ("evercal", "paper"))
     stage = paper._stage(3)
     assert (stage.seed, stage.fit.iterations) == (3, 7)

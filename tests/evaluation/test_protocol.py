@@ -1,4 +1,4 @@
-"""The examination with a fake localizer that answers from the pixels alone."""
+"""The protocol with a fake localizer that uses pixels only."""
 
 import math
 import time
@@ -17,7 +17,7 @@ CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 
 
 @dataclass(frozen=True)
-class Answer:
+class Estimate:
     status: Status
     scene: str | None
     base_from_camera: SE3 | None
@@ -28,22 +28,22 @@ class Answer:
 
 @dataclass
 class Fake:
-    """Knows each image by its first pixel, and keeps the order in which it was asked."""
+    """Returns estimates by the first pixel of the image, and records their order."""
 
-    answers: dict[int, Answer]
+    estimates: dict[int, Estimate]
     scenes: tuple[str, ...] = ("a", "b")
-    asked: list[int] = field(default_factory=list)
+    calls: list[int] = field(default_factory=list)
 
-    def localize(self, image: np.ndarray, camera: Camera) -> Answer:
+    def localize(self, image: np.ndarray, camera: Camera) -> Estimate:
         assert image.shape == (3, 4, 3)
         assert camera == CAMERA
-        self.asked.append(int(image[0, 0, 0]))
-        return self.answers[self.asked[-1]]
+        self.calls.append(int(image[0, 0, 0]))
+        return self.estimates[self.calls[-1]]
 
 
 def pose(x: float, degrees: float = 0.0) -> SE3:
-    turn = math.radians(degrees) / 2
-    return SE3(np.array([math.cos(turn), 0.0, 0.0, math.sin(turn)]), np.array([x, 0.0, 0.0]))
+    half = math.radians(degrees) / 2
+    return SE3(np.array([math.cos(half), 0.0, 0.0, math.sin(half)]), np.array([x, 0.0, 0.0]))
 
 
 def frame(number: int, base_from_camera: SE3 | None) -> Frame:
@@ -55,32 +55,32 @@ def scene(name: str, *test: Frame, train: tuple[Frame, ...] = ()) -> Recording:
     return Recording(name, train, test)
 
 
-def test_a_pose_in_a_scene_of_the_same_base_frame_is_measured_too() -> None:
-    answers = {0: Answer("ok", "b", pose(1.25)), 1: Answer("ok", "a", pose(9.0))}
+def test_pose_in_a_scene_of_the_same_base_frame_is_measured() -> None:
+    estimates = {0: Estimate("ok", "b", pose(1.25)), 1: Estimate("ok", "a", pose(9.0))}
     for base in ("kitchen", None):
         scenes = {
             "a": replace(scene("a", frame(0, pose(1.0))), base=base),
             "b": replace(scene("b", frame(1, pose(9.0))), base=base),
         }
-        first, second = evaluate(Fake(answers), scenes)
+        first, second = evaluate(Fake(estimates), scenes)
         expected = (0.25, 0.0) if base else (math.inf, math.inf)
         assert (first.translation_error_m, second.translation_error_m) == pytest.approx(expected)
-        assert first.wrong_scene == (base is None)  # another region of one place is no wrong place
+        assert first.wrong_scene == (base is None)
 
 
-def test_only_a_pose_in_the_right_scene_is_measured() -> None:
+def test_pose_in_another_scene_has_infinite_error() -> None:
     scenes = {
         "a": scene("x", frame(0, pose(1.0)), frame(1, pose(2.0)), frame(2, pose(3.0))),
         "b": scene("y", frame(3, pose(1.0)), frame(4, pose(1.0))),
     }
-    answers = {
-        0: Answer("ok", "a", pose(1.03, 2.0)),
-        1: Answer("ok", "b", pose(2.0)),  # the right numbers in the wrong scene
-        2: Answer("unknown_scene", None, None),
-        3: Answer("failed", "b", pose(1.0)),  # a pose that the localizer itself does not trust
-        4: Answer("ok", "b", pose(1.0)),
+    estimates = {
+        0: Estimate("ok", "a", pose(1.03, 2.0)),
+        1: Estimate("ok", "b", pose(2.0)),
+        2: Estimate("unknown_scene", None, None),
+        3: Estimate("failed", "b", pose(1.0)),
+        4: Estimate("ok", "b", pose(1.0)),
     }
-    results = evaluate(Fake(answers), scenes)
+    results = evaluate(Fake(estimates), scenes)
     assert [r.frame for r in results] == ["f0", "f1", "f2", "f3", "f4"]
     assert [r.scene for r in results] == ["a", "a", "a", "b", "b"]
     assert results[0].translation_error_m == pytest.approx(0.03)
@@ -93,32 +93,32 @@ def test_only_a_pose_in_the_right_scene_is_measured() -> None:
     assert (results[4].inliers, results[4].inlier_ratio) == (7, 0.25)
 
 
-def test_images_of_all_scenes_come_mixed_and_the_seed_decides_how() -> None:
+def test_images_of_all_scenes_are_shuffled_by_seed() -> None:
     count = 40
-    answers = {i: Answer("failed", None, None) for i in range(2 * count)}
+    estimates = {i: Estimate("failed", None, None) for i in range(2 * count)}
     scenes = {
         "a": scene("a", *(frame(i, pose(0.0)) for i in range(count))),
         "b": scene("b", *(frame(i + count, pose(0.0)) for i in range(count))),
     }
-    first, again, other = Fake(answers), Fake(answers), Fake(answers)
-    told: list[tuple[int, int]] = []
-    results = evaluate(first, scenes, on_frame=lambda done, total: told.append((done, total)))
+    first, again, other = Fake(estimates), Fake(estimates), Fake(estimates)
+    progress: list[tuple[int, int]] = []
+    results = evaluate(first, scenes, on_frame=lambda done, total: progress.append((done, total)))
     evaluate(again, scenes)
     evaluate(other, scenes, seed=1)
-    assert sorted(first.asked) == list(range(2 * count))
-    assert first.asked == again.asked != other.asked
-    early = sum(number < count for number in first.asked[:count])
+    assert sorted(first.calls) == list(range(2 * count))
+    assert first.calls == again.calls != other.calls
+    early = sum(number < count for number in first.calls[:count])
     assert 8 < early < 32  # in recorded order it would be 40
     assert [r.frame for r in results] == [f"f{i}" for i in range(2 * count)]
-    assert told == [(i + 1, 2 * count) for i in range(2 * count)]
+    assert progress == [(i + 1, 2 * count) for i in range(2 * count)]
 
 
-def test_the_localizer_gets_an_image_and_a_camera_and_nothing_else() -> None:
+def test_localizer_gets_image_and_camera_only() -> None:
     class Strict(Fake):
-        def localize(self, *given: object, **named: object) -> Answer:
+        def localize(self, *given: object, **named: object) -> Estimate:
             assert [type(value) for value in given] == [np.ndarray, Camera]
             assert not named
-            return Answer("failed", None, None)
+            return Estimate("failed", None, None)
 
     assert len(evaluate(Strict({}), {"a": scene("a", frame(0, pose(0.0)))})) == 1
 
@@ -131,23 +131,23 @@ def test_time_includes_reading_the_image() -> None:
 
     plain = frame(0, pose(0.0))
     slow = Slow(plain.name, plain.image, plain.camera, plain.base_from_camera)
-    (r,) = evaluate(Fake({0: Answer("failed", None, None)}), {"a": scene("a", slow)})
+    (r,) = evaluate(Fake({0: Estimate("failed", None, None)}), {"a": scene("a", slow)})
     assert r.milliseconds >= 20.0
 
 
-def test_near_training_frames_are_those_of_the_same_scene() -> None:
-    answers = {i: Answer("failed", None, None) for i in range(3)}
+def test_near_training_frames_are_of_the_same_scene() -> None:
+    estimates = {i: Estimate("failed", None, None) for i in range(3)}
     scenes = {
         "a": scene("a", frame(0, pose(0.0)), frame(1, pose(0.5)), train=(frame(9, pose(0.52)),)),
         "b": scene("b", frame(2, pose(0.5)), train=(frame(8, pose(9.0)), frame(7, None))),
     }
-    results = evaluate(Fake(answers), scenes)
+    results = evaluate(Fake(estimates), scenes)
     assert [r.near_training_frame for r in results] == [False, True, False]
 
 
-def test_frames_without_a_known_pose_are_left_out() -> None:
-    answers = {1: Answer("failed", None, None)}
-    results = evaluate(Fake(answers), {"a": scene("a", frame(0, None), frame(1, pose(0.0)))})
+def test_frames_without_pose_are_skipped() -> None:
+    estimates = {1: Estimate("failed", None, None)}
+    results = evaluate(Fake(estimates), {"a": scene("a", frame(0, None), frame(1, pose(0.0)))})
     assert [r.frame for r in results] == ["f1"]
 
 
@@ -155,29 +155,29 @@ def test_frames_without_a_known_pose_are_left_out() -> None:
     ("scenes", "message"),
     [
         ({}, r"no scene to evaluate; give one or more of a, b"),
-        ({"c": scene("c", frame(0, pose(0.0)))}, r"'c' is not in the store, which knows a, b;"),
+        ({"c": scene("c", frame(0, pose(0.0)))}, r"'c' is not in the store; its scenes are a, b;"),
         ({"a": scene("a")}, r"'a' has 0 test frames"),
-        ({"b": scene("b", frame(0, None))}, r"'b' has 1 test frames, none with a known pose"),
+        ({"b": scene("b", frame(0, None))}, r"'b' has 1 test frames, none with a pose"),
     ],
 )
-def test_misuse_is_named_before_any_work(scenes: dict[str, Recording], message: str) -> None:
+def test_unusable_scenes_are_refused(scenes: dict[str, Recording], message: str) -> None:
     fake = Fake({})
     with pytest.raises(InputError, match=message):
         evaluate(fake, scenes)
-    assert fake.asked == []
+    assert fake.calls == []
 
 
-def test_an_error_is_told_in_units_of_its_covariance() -> None:
-    """3 cm where 1 cm is stated and 2 deg where 1 deg is: 9 + 4. Only for a pose that counts."""
+def test_squared_error_is_in_units_of_the_covariance() -> None:
+    """3 cm with a sigma of 1 cm and 2 deg with a sigma of 1 deg: 9 + 4."""
     covariance = np.diag([0.01**2] * 3 + [math.radians(1) ** 2] * 3)
-    there = pose(1.03, 2.0)
-    answers = {
-        0: Answer("ok", "a", there, covariance=covariance),
-        1: Answer("ok", "a", there),
-        2: Answer("ok", "b", there, covariance=covariance),
-        3: Answer("failed", "a", there, covariance=covariance),
+    estimate = pose(1.03, 2.0)
+    estimates = {
+        0: Estimate("ok", "a", estimate, covariance=covariance),
+        1: Estimate("ok", "a", estimate),
+        2: Estimate("ok", "b", estimate, covariance=covariance),
+        3: Estimate("failed", "a", estimate, covariance=covariance),
     }
     scenes = {"a": scene("a", *(frame(i, pose(1.0)) for i in range(4)))}
-    first, *others = evaluate(Fake(answers), scenes)
+    first, *others = evaluate(Fake(estimates), scenes)
     assert first.squared_mahalanobis == pytest.approx(13.0)
     assert all(math.isnan(result.squared_mahalanobis) for result in others)

@@ -1,4 +1,4 @@
-"""`evercal.evaluate` takes scenes however they come."""
+"""`evercal.evaluate` accepts recordings, folders and mappings."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ from evercal.simulation.box_room import box_room_scene
 
 
 class Shifted:
-    """Knows one scene under two names, and is 3 mm off in it."""
+    """A localizer of one scene under two names, with errors of 3 mm."""
 
     scenes = ("box-room-7", "other")
 
@@ -26,11 +26,11 @@ class Shifted:
         frame = next(f for f in self.scene.test if (f.read_image() == image).all())
         assert frame.base_from_camera is not None
         pose = frame.base_from_camera @ SE3.exp([0.003, 0, 0, 0, 0, 0])
-        found = {"status": "ok", "scene": self.name, "inliers": 9, "inlier_ratio": 0.5}
-        return SimpleNamespace(base_from_camera=pose, **found)
+        fields = {"status": "ok", "scene": self.name, "inliers": 9, "inlier_ratio": 0.5}
+        return SimpleNamespace(base_from_camera=pose, **fields)
 
 
-def test_scenes_folders_and_names(tmp_path: Path) -> None:
+def test_recordings_folders_and_mappings(tmp_path: Path) -> None:
     localizer = Shifted()
     generic.write(tmp_path / "room", localizer.scene)
     folder = tmp_path / "room"
@@ -44,7 +44,7 @@ def test_scenes_folders_and_names(tmp_path: Path) -> None:
     assert evercal.evaluate is evaluate
 
 
-def test_one_name_twice_is_refused() -> None:
+def test_repeated_name_is_refused() -> None:
     localizer = Shifted()
     with pytest.raises(InputError, match="given twice"):
         evaluate(localizer, [localizer.scene, localizer.scene])

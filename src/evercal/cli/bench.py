@@ -22,74 +22,76 @@ if TYPE_CHECKING:
 
 
 LEAST_BATCH = 64
-"""Rows of a step below which nothing is learned."""
+"""Smallest number of rows in a step that learns anything."""
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Compare strategies on a sequence of scenes; what is done is kept, what is missing is run.
+    """Compare strategies on a sequence of scenes. The same command resumes.
 
     Under torchrun, several processes share every training.
     """
 
     suite: Annotated[Positional[str], arg(metavar="SUITE")]
-    """One of sim-mini (in the package), sim, sim-7, sim-12, real2, i7s, i12s, custom, regions."""
+    """One of sim-mini (packaged), sim, sim-7, sim-12, real2, i7s, i12s, custom, regions."""
     recordings: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="")
     ] = ()
-    """Recording folders of the suite custom, in order of learning; a single one for regions."""
+    """Recordings of the suite custom, in order of learning; one recording for regions."""
     strategies: Annotated[str | None, arg(metavar="A,B", help_behavior_hint="")] = None
-    """Strategies with commas between; the others are compared with the first. When left out, those
-    of --rows alone, or evercal,joint,finetune,er,sars_spdd."""
+    """Comma-separated strategies; the others are compared with the first. Defaults to those of
+    --rows, or to evercal,joint,finetune,er,sars_spdd."""
     rows: Annotated[str | None, arg(metavar="NAME|FILE.json", help_behavior_hint="")] = None
-    """More strategies, made from others: table4, spdd-sweep, with-map, or a file of one's own (see
+    """Strategies derived from others: table4, spdd-sweep, with-map, or your own file (see
     `evercal.continual.benchmark.rows`)."""
     seeds: Annotated[str, arg(metavar="0,1")] = "0,1,2"
-    """Seeds with commas between; every strategy is run once with each."""
+    """Comma-separated seeds; every strategy runs once with each."""
     order: Literal["given", "reversed", "shuffled"] = "given"
     """Order in which the scenes are learned."""
     scenes: Annotated[str, arg(metavar="A,B", help_behavior_hint="")] = ""
-    """Scenes of the suite to use, with commas between; all when left out."""
+    """Comma-separated scenes of the suite. Defaults to all."""
     data: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Folder of the suite's recordings, with a folder for each scene."""
+    """Folder of the suite's recordings, with one folder per scene."""
     poses: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Structure-from-motion poses for i7s and i12s (Brachmann et al., ICCV 2021); the original ones
-    when left out."""
+    """Structure-from-motion poses for i7s and i12s (Brachmann et al., ICCV 2021). Defaults to the
+    original poses."""
     parts: int = 4
-    """How many stages the suite regions makes of one scene."""
+    """Stages that the suite regions splits a scene into."""
     preset: Literal["fast", "demo", "bench", "paper"] = "bench"
-    """How much a network is trained in a stage."""
+    """Training effort per stage."""
     backbone: Literal["evercal", "paper"] = "evercal"
-    """The network: ours, or the paper's with all centres known in advance and trained its way."""
+    """Network: ours, or the paper's, with all centres given in advance and its training."""
     offsets: Literal["per_centre", "shared"] = "per_centre"
-    """An offset and scale for each centre (the paper), or one for all (GLACE)."""
+    """One offset and scale per centre (the paper), or one for all centres (GLACE)."""
     steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Optimiser steps of a stage; the preset's number when left out."""
+    """Optimiser steps of a stage. Defaults to that of the preset."""
     batch: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Rows of a new scene in a step, and replayed ones in the preset's proportion; the preset's
-    number when left out."""
+    """Rows of the new scene in a step; replayed rows keep the preset's proportion. Defaults to that
+    of the preset."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
-    """How many keyframes are kept of a scene: a share of its frames (10%) or bytes (5MB)."""
+    """Keyframes to keep of a scene: a share of its frames (10%) or bytes (5MB)."""
     held_out: bool = False
-    """Judge on a fifth of the training frames instead of the test frames, to choose settings."""
+    """Evaluate on a fifth of the training frames instead of the test frames, to choose settings."""
     device: Device = "auto"
     plugin: Annotated[Path | None, arg(metavar="FILE.py", help_behavior_hint="")] = None
-    """File with strategies of one's own (see examples/my_strategy.py)."""
+    """Python file of your own strategies (see examples/my_strategy.py)."""
     ray: Annotated[str | None, arg(metavar="ADDRESS", help_behavior_hint="")] = None
-    """Ray cluster to run on, `local` for this machine; one run after the other when left out."""
+    """Ray cluster to run on, or `local` for this machine. Without it, runs are sequential."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-bench")
-    """Folder of results; the same command continues there."""
+    """Folder of results. The same command resumes there."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Runs what is missing and prints the tables."""
+        """Run what is missing and print the tables."""
         seeds = _numbers(self.seeds)
         from evercal.continual.benchmark.bench import BenchOptions
+        from evercal.continual.benchmark.report_data import require_pandas
         from evercal.continual.networks.distributed import join_processes, rank, wait_for_all
         from evercal.continual.plugin import load_plugin
         from evercal.continual.presets import short_side
 
+        require_pandas()  # before hours of learning
         if self.plugin is not None:
             load_plugin(self.plugin)
         # Workers of a cluster have GPUs of their own.
@@ -110,14 +112,9 @@ class Bench:
             device=device,
             features=self.out.absolute() / "features",
         )
-        said = sys.stderr if self.json else sys.stdout
         for step in self._steps(options, out):
-            if rank():
-                continue
-            found = ", ".join(f"{o.scene} {100 * o.correct().mean():.1f}" for o in step.results)
-            seconds = f" ({step.results[0].seconds:.0f} s)" if step.results else ""
-            line = f"[{step.done}/{step.total}] {step.strategy} seed {step.seed}: "
-            print(line + (found or "noted") + seconds, file=said, flush=True)
+            if rank() == 0:
+                print(_progress(step), file=sys.stderr if self.json else sys.stdout, flush=True)
         return 0 if rank() else show_report(self.out, options.strategies[0].name, self.json)
 
     def _strategies(self) -> "tuple[Strategy, ...]":
@@ -128,7 +125,7 @@ class Bench:
         if names is None:
             names = "" if self.rows else "evercal,joint,finetune,er,sars_spdd"
         named = [strategy_named(name) for name in _words(names)]
-        # Rows may repeat what is named: it is run once. Two of one name are refused later.
+        # Equal strategies run once. Different strategies of one name are refused later.
         return tuple(dict.fromkeys((*named, *(load_rows(self.rows) if self.rows else ()))))
 
     def _steps(self, options: "BenchOptions", out: Path) -> "Iterator[Step]":
@@ -151,13 +148,12 @@ class Bench:
 
         if (self.suite in ("custom", "regions")) != bool(self.recordings):
             raise InputError(
-                f"suite {self.suite}: scene folders are for the suites custom and regions, and "
-                "these need them"
+                f"suite {self.suite}: give scene folders for the suites custom and regions only"
             )
         if self.suite == "regions":
             scenes = [load_recording(path) for path in self.recordings]
             if len(scenes) > 1:
-                raise InputError(f"suite regions: one scene, got {len(scenes)}")
+                raise InputError(f"suite regions: got {len(scenes)} scenes; give one")
             return regions(scenes[0], self.parts)
         if self.suite == "custom":
             return [load_recording(path) for path in self.recordings]
@@ -188,10 +184,22 @@ class Bench:
         return dataclasses.replace(stage, head=head, fit=fit)
 
 
-def _mirror(out: Path) -> Path:
-    """A folder for a process that trains along with the first, and whose results nobody reads.
+def _progress(step: "Step") -> str:
+    """Describe a stage: accuracy of each scene, under every name that the strategy is judged by."""
+    shares: dict[str, list[str]] = {}
+    for result in step.results:
+        part = f"{result.scene} {100 * result.accuracy():.1f}"
+        shares.setdefault(result.strategy, []).append(part)
+    names = [f"{name} seed {step.seed}: {', '.join(parts)}" for name, parts in shares.items()]
+    text = "; ".join(names) or f"{step.strategy} seed {step.seed}: no results before the last stage"
+    seconds = f" ({step.results[0].seconds:.0f} s)" if step.results else ""
+    return f"[{step.done}/{step.total}] {text} % within 5 cm, 5 deg{seconds}"
 
-    It begins with what is done already, so that all run the same.
+
+def _mirror(out: Path) -> Path:
+    """Create the folder of a process that trains along with the first; its results are not used.
+
+    It starts with a copy of what is complete, so that all processes run the same.
     """
     import atexit
     import shutil
@@ -216,5 +224,5 @@ def _words(text: str) -> tuple[str, ...]:
 def _numbers(text: str) -> tuple[int, ...]:
     words = _words(text)
     if not words or not all(word.isdecimal() for word in words):
-        raise InputError(f"--seeds {text}: give numbers >= 0 with commas between, such as 0,1,2")
+        raise InputError(f"--seeds {text}: give comma-separated numbers >= 0, such as 0,1,2")
     return tuple(int(word) for word in words)

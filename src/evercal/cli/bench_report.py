@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
@@ -13,37 +13,40 @@ TABLES, PAGE, LATEX = "tables.md", "report.html", "table.tex"
 
 @dataclass(frozen=True)
 class BenchReport:
-    """Make tables and report of a benchmark anew from its results."""
+    """Generate tables and report of a benchmark from its results."""
 
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder of results."""
     reference: Annotated[str, arg(metavar="NAME")] = "evercal"
-    """Name of the strategy that the others are compared with."""
+    """Strategy that the others are compared with."""
     compare_with: Annotated[tuple[Path, ...], arg(metavar="DIR...", help_behavior_hint="")] = ()
-    """Other folders of results to show beside it, of the same scenes under other settings, such as
-    another --memory."""
+    """Other folders of results to show, of the same scenes under other settings, such as another
+    --memory."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Prints and writes the tables."""
+        """Print and write the tables."""
         return show_report(self.folder, self.reference, self.json, self.compare_with)
 
 
 def show_report(
     folder: Path, reference: str, as_json: bool, compare_with: tuple[Path, ...] = ()
 ) -> int:
-    """Writes tables and page of a folder of results, prints the tables, and gives the exit code.
+    """Write tables and page of a folder of results, and print the tables.
 
     Args:
-        folder: results.
-        reference: the strategy that the others are compared with.
-        as_json: print one JSON object instead.
-        compare_with: other folders of results to show in the page.
+        folder: Folder of results.
+        reference: Strategy that the others are compared with.
+        as_json: Print one JSON object instead of the tables.
+        compare_with: Other folders of results to show on the page.
+
+    Returns:
+        The exit code.
     """
     from evercal.continual.benchmark.bench_page import bench_page
     from evercal.continual.benchmark.bench_views import view_pictures
-    from evercal.continual.benchmark.comparison import as_text, summary
+    from evercal.continual.benchmark.comparison import summary
     from evercal.continual.benchmark.latex import paper_tables
     from evercal.continual.benchmark.report_data import read_report
     from evercal.simulation.cell import SUITES
@@ -51,11 +54,7 @@ def show_report(
 
     report = read_report(folder, reference, compare_with)
     tables = report.tables()
-
-    def text(style: Literal["terminal", "markdown"]) -> str:
-        return "\n\n".join(as_text(rows, style) for rows in tables.non_empty())
-
-    write_bytes(folder / TABLES, (text("markdown") + "\n").encode())
+    write_bytes(folder / TABLES, (tables.as_text("markdown") + "\n").encode())
     suite = SUITES.get(report.suite)
     rooms = {name: (kind, seed) for name, kind, seed in suite.rooms} if suite else {}
     views = view_pictures(folder, report.plotted, rooms)
@@ -65,7 +64,7 @@ def show_report(
     if as_json:
         print_json({"strategies": summary([*report.runs, *report.compare_with])})
         return 0
-    print(text("terminal"))
+    print(tables.as_text("terminal"))
     print(f"wrote {folder / PAGE}, {TABLES} and {LATEX}")
     print_next("evercal", "bench-report", folder)
     return 0

@@ -1,9 +1,5 @@
-"""The questions a paper asks: how accurate, how much was forgotten, and how sure is that."""
+"""Evaluation of localization: errors per frame, scores per scene, forgetting over scenes."""
 
-from evercal.continual.benchmark.statistics import Interval as Interval
-from evercal.continual.benchmark.statistics import frame_pieces as frame_pieces
-from evercal.continual.benchmark.statistics import mean_interval as mean_interval
-from evercal.continual.benchmark.statistics import paired_difference as paired_difference
 from evercal.evaluation.metrics import ContinualScores as ContinualScores
 from evercal.evaluation.metrics import FrameResult as FrameResult
 from evercal.evaluation.metrics import SceneScores as SceneScores

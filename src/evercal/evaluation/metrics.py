@@ -1,8 +1,8 @@
-"""From results per frame to scores per scene, and from accuracies per stage to forgetting.
+"""Scores of scenes from results of frames, and forgetting from accuracies of stages.
 
-Units: results are in metres and radians, scores in per cent, centimetres and degrees. A frame is
-correct if both errors are strictly below the thresholds; a frame without a pose, or placed in
-another scene, has infinite errors.
+Results are in metres and radians, scores in per cent, centimetres and degrees. A frame is correct
+if both errors are strictly below the thresholds. Frames without a pose, or with a pose in another
+scene, have infinite errors.
 """
 
 import dataclasses
@@ -33,46 +33,46 @@ CHI2_6 = 12.5916
 
 @dataclass(frozen=True)
 class FrameResult:
-    """What became of one test image."""
+    """Result of one test image."""
 
     scene: str
-    """The scene that the image is from."""
+    """Scene of the image."""
     frame: str
-    """The frame's name within its scene."""
+    """Name of the frame in its scene."""
     translation_error_m: float
     """Metres; infinite without a pose in the right scene."""
     rotation_error_rad: float
     """Radians; infinite without a pose in the right scene."""
     status: Status
-    """What the localizer said."""
+    """Status of the estimate."""
     found_scene: str | None
-    """The scene that the localizer named, if any."""
+    """Scene of the estimate, if any."""
     near_training_frame: bool
-    """Whether a training frame of its scene lies within 5 cm and 5 deg."""
+    """Whether a training frame of the scene is within 5 cm and 5 deg."""
     milliseconds: float
-    """Time from the encoded image to the answer."""
+    """Time per image, decoding included."""
     inliers: int
-    """How many scene points agree with the pose."""
+    """Scene points that agree with the pose."""
     inlier_ratio: float
-    """The same as a share of all scene points, 0 to 1."""
+    """Share of scene points that agree with the pose, 0 to 1."""
     squared_mahalanobis: float = math.nan
-    """Squared error of the pose in units of its own covariance; NaN without a pose in the right
-    scene or without a covariance."""
+    """Squared error of the pose in units of its covariance; NaN without a pose in the right scene
+    or without a covariance."""
     estimated: SE3 | None = field(default=None, compare=False)
     """Estimated camera pose in the base frame of `found_scene`."""
 
     @property
     def wrong_scene(self) -> bool:
-        """Whether a pose was given, but in a scene of another base frame."""
+        """Whether the pose is in a scene with another base frame."""
         return self.status == "ok" and math.isinf(self.translation_error_m)
 
 
 @dataclass(frozen=True)
 class SceneScores:
-    """One scene's row."""
+    """Scores of one scene."""
 
     frames: int
-    """How many test frames were scored."""
+    """Number of test frames."""
     accuracy_5cm_5deg: float
     """Per cent."""
     accuracy_2cm_2deg: float
@@ -82,23 +82,23 @@ class SceneScores:
     accuracy_5mm_05deg: float
     """Per cent, within 5 mm and 0.5 deg."""
     median_translation_cm: float
-    """Over all frames, those without a pose as infinite."""
+    """Median over all frames; frames without a pose count as infinite."""
     median_rotation_deg: float
-    """Over all frames, those without a pose as infinite."""
+    """Median over all frames; frames without a pose count as infinite."""
     wrong_scene: float
-    """Per cent of frames that got a pose in another scene."""
+    """Per cent of frames with a pose in another scene."""
     unknown: float
-    """Per cent of frames that the localizer said it does not know."""
+    """Per cent of frames with status `unknown_scene`."""
     near_training_frame: float
-    """Per cent of frames with a training frame within 5 cm and 5 deg: what a lookup could reach."""
+    """Per cent of frames with a training frame within 5 cm and 5 deg."""
     inside_95: float = math.nan
-    """Per cent of the frames with a pose in the right scene whose true pose lies inside the 95 %
-    ellipsoid that was stated for it; NaN where none was."""
+    """Per cent of poses in the right scene whose 95 % ellipsoid contains the true pose; NaN without
+    covariances."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """All scenes and what sums them up."""
+    """Scores of all scenes and their means."""
 
     scenes: dict[str, SceneScores]
     """By name, in the order of the results."""
@@ -107,48 +107,48 @@ class Scores:
     mean_accuracy_1cm_1deg: float
     """Per cent, unweighted mean over scenes."""
     ms_per_image: float
-    """Mean milliseconds of one image at a time, decoding included."""
+    """Mean milliseconds per image, one at a time, decoding included."""
 
     def to_dict(self) -> dict[str, object]:
-        """Plain values for JSON; None stands for infinite."""
-        return {
-            "scenes": {name: _plain(row) for name, row in self.scenes.items()},
-            "mean_accuracy_5cm_5deg": self.mean_accuracy_5cm_5deg,
-            "mean_accuracy_1cm_1deg": self.mean_accuracy_1cm_1deg,
-            "ms_per_image": self.ms_per_image,
-        }
+        """Convert to plain values for JSON; infinity and NaN become None."""
+        scenes = {name: _plain(row) for name, row in self.scenes.items()}
+        return {**dataclasses.asdict(self), "scenes": scenes}
 
 
 @dataclass(frozen=True)
 class ContinualScores:
-    """What a sequence of scenes did to accuracy; all in the unit of the accuracies given."""
+    """Accuracy and forgetting over a sequence of scenes, in the unit of the accuracies."""
 
     final_accuracy: float
     """Mean over scenes after the last stage."""
     total_forgetting: float
-    """TFR: mean drop from a scene's best, the last stage included, to its last; never negative."""
+    """TFR: mean drop from a scene's best accuracy, the last stage included, to its final one."""
     forgetting: float
-    """The same with the best before the last stage (Chaudhry et al. 2018); negative is a gain."""
+    """Mean drop from the best accuracy before the last stage (Chaudhry et al. 2018); a negative
+    value is a gain."""
     backward_transfer: float
-    """Mean change from just after learning a scene to the end (Lopez-Paz and Ranzato 2017)."""
+    """BWT: mean change from just after learning a scene to the end (Lopez-Paz and Ranzato 2017)."""
     last_scene_accuracy: float
-    """Accuracy on the scene learned last: can it still learn?"""
+    """Accuracy on the scene learned last."""
     accuracy_along: float
-    """ACC: mean over all stages and the scenes known at each (Diaz-Rodriguez et al. 2018)."""
+    """ACC: mean over all stages and the scenes learned by then (Diaz-Rodriguez et al. 2018)."""
 
     def to_dict(self) -> dict[str, object]:
-        """Plain values for JSON; None where one scene alone leaves nothing to forget."""
+        """Convert to plain values for JSON; NaN becomes None."""
         return _plain(self)
 
 
 def correct(
     results: Iterable[FrameResult], thresholds: tuple[float, float] = COARSE
 ) -> dict[str, NDArray[np.bool_]]:
-    """Which frames are right, per scene, in the order of the results.
+    """Check which frames are correct.
 
     Args:
-        results: In recorded order within each scene, if blocks of frames are to be resampled.
-        thresholds: Metres and radians; an error equal to either is not below it.
+        results: Results of frames.
+        thresholds: Metres and radians. An error equal to its threshold is not correct.
+
+    Returns:
+        Flags (frames,) of each scene, in the order of the results.
     """
     metres, radians = thresholds
     return {
@@ -160,13 +160,16 @@ def correct(
 
 
 def scores(results: Sequence[FrameResult]) -> Scores:
-    """Sums up the results of one run.
+    """Compute scores of scenes.
+
+    Args:
+        results: Results of all frames, at least one.
 
     Raises:
         ValueError: There are no results.
     """
     if not results:
-        raise ValueError("scores takes at least one frame's result, got none")
+        raise ValueError("scores needs at least one result, got none")
     scenes = {scene: _scene_scores(rows) for scene, rows in _by_scene(results).items()}
     return Scores(
         scenes,
@@ -177,48 +180,54 @@ def scores(results: Sequence[FrameResult]) -> Scores:
 
 
 def share_inside(squared: ArrayLike) -> float:
-    """Per cent inside the 95 % ellipsoid among squared errors that are not NaN; NaN for none."""
+    """Compute the per cent of squared Mahalanobis errors inside the 95 % ellipsoid.
+
+    Args:
+        squared: Squared errors, shape (n,). NaN entries are ignored.
+
+    Returns:
+        Per cent, NaN without any number.
+    """
     values = np.asarray(squared, dtype=np.float64)
-    known = values[~np.isnan(values)]
-    return _percent(known < CHI2_6) if len(known) else math.nan
+    values = values[~np.isnan(values)]
+    return _percent(values < CHI2_6) if len(values) else math.nan
 
 
 def recall_area(translation_m: ArrayLike, within_m: float = 0.2) -> float:
-    """Area under the curve of recall over position error, per cent of what it could be.
+    """Compute the area under the curve of recall over position error, in per cent.
 
-    It tells methods apart where few frames pass one bound, and jumps less from run to run.
+    It separates methods that have few frames below any single threshold.
 
     Args:
-        translation_m: (frames,) errors, infinite without a pose in the right scene.
-        within_m: where the curve ends.
+        translation_m: Errors, infinite without a pose in the right scene, shape (frames,).
+        within_m: End of the curve, metres.
     """
     errors = np.asarray(translation_m, dtype=np.float64)
     return 100 * float(np.clip(1 - errors / within_m, 0, 1).mean())
 
 
 def continual_scores(accuracies: ArrayLike) -> ContinualScores:
-    """Sums up one run through a sequence of scenes.
+    """Compute final accuracy and forgetting of one run over a sequence of scenes.
 
     Args:
-        accuracies: (N, N); row i holds the accuracies after stage i, column j those of the scene
-            learned in stage j. What stands above the diagonal, scenes not yet learned, is not
-            read and may be NaN.
+        accuracies: Shape (N, N). Row i holds the accuracies after stage i, column j those of the
+            scene learned in stage j. Entries above the diagonal are ignored and may be NaN.
 
     Returns:
-        Scores in the unit of `accuracies`; the three about forgetting are NaN for N = 1.
+        Scores in the unit of `accuracies`. The three scores of forgetting are NaN for N = 1.
 
     Raises:
-        ValueError: Not square, or no finite number on or below the diagonal.
+        ValueError: Not square, or not finite on and below the diagonal.
     """
     matrix = np.asarray(accuracies, dtype=np.float64)
     count = len(matrix) if matrix.ndim == 2 else 0
     if count == 0 or matrix.shape != (count, count):
-        raise ValueError(f"accuracies are (stages, scenes) and square, got {matrix.shape}")
-    if not np.isfinite(matrix[np.tril_indices(count)]).all():
-        raise ValueError("accuracies on and below the diagonal are finite, got inf or nan")
-    last = matrix[-1]
+        raise ValueError(f"accuracies must be square (stages, scenes), got {matrix.shape}")
+    learned = matrix[np.tril_indices(count)]
+    if not np.isfinite(learned).all():
+        raise ValueError("accuracies must be finite on and below the diagonal, got inf or nan")
+    last, along = matrix[-1], float(learned.mean())
     final, newest = float(last.mean()), float(last[-1])
-    along = float(matrix[np.tril_indices(count)].mean())
     if count == 1:
         return ContinualScores(final, math.nan, math.nan, math.nan, newest, along)
     old = range(count - 1)
@@ -242,6 +251,7 @@ def _by_scene(results: Iterable[FrameResult]) -> dict[str, list[FrameResult]]:
 
 
 def _scene_scores(rows: list[FrameResult]) -> SceneScores:
+    # The upper median: a mean of the two middle errors may include infinity.
     middle = len(rows) // 2
     within = [_percent(*correct(rows, t).values()) for t in (COARSE, MIDDLE, FINE, FINEST)]
     return SceneScores(

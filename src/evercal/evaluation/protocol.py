@@ -1,4 +1,4 @@
-"""How a store is examined: the test images of all scenes in one list, no scene given away."""
+"""The evaluation protocol: test images of all scenes in random order, without their scene names."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,44 +14,47 @@ from evercal.recordings import Frame, Recording, posed_frames, stated_poses
 
 
 class Estimate(Protocol):
-    """What is read from a localizer's answer."""
+    """The fields of an estimate that are evaluated.
+
+    An optional `covariance` (6, 6), of translation and rotation, is evaluated too.
+    """
 
     @property
     def status(self) -> Status:
-        """Whether there is a pose, and if not, why."""
+        """`ok`, or why there is no pose."""
         ...
 
     @property
     def scene(self) -> str | None:
-        """The scene that the image was found in."""
+        """Scene of the pose."""
         ...
 
     @property
     def base_from_camera(self) -> SE3 | None:
-        """The pose in the base frame of `scene`; not None if the status is ok."""
+        """Pose in the base frame of `scene`; not None if the status is `ok`."""
         ...
 
     @property
     def inliers(self) -> int:
-        """How many scene points agree with the pose."""
+        """Scene points that agree with the pose."""
         ...
 
     @property
     def inlier_ratio(self) -> float:
-        """The same as a share of all scene points."""
+        """Share of scene points that agree with the pose."""
         ...
 
 
 class SceneLocalizer(Protocol):
-    """What is examined: anything that takes an image and a camera and knows some scenes."""
+    """A localizer to evaluate."""
 
     @property
     def scenes(self) -> Sequence[str]:
-        """The names of the scenes it was taught."""
+        """Names of the scenes it learned."""
         ...
 
     def localize(self, image: NDArray[np.uint8], camera: Camera, /) -> Estimate:
-        """Localizes one image (H, W, 3) uint8 RGB."""
+        """Localize one RGB image, uint8, shape (H, W, 3)."""
         ...
 
 
@@ -61,25 +64,24 @@ def evaluate(
     seed: int = 0,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> list[FrameResult]:
-    """Localizes every test image of all scenes, one at a time and in random order, and scores it.
+    """Localize every test image of all scenes, one at a time in random order.
 
-    The localizer sees an image and its camera only. Names are used afterwards: errors count if
-    the scene that was found is the frame's, or has the same base frame (`Recording.base`), and are
-    infinite otherwise. Test frames whose pose is
-    not known cannot be scored and are left out.
+    The localizer gets image and camera only. Errors are measured if the estimated scene is that of
+    the frame or has the same base frame (`Recording.base`), and are infinite otherwise. Test frames
+    without a pose are skipped.
 
     Args:
-        localizer: What is examined.
-        scenes: By the name under which the localizer was taught each; no need to give them all.
-        seed: Of the random order.
-        on_frame: Told the number of images done and of all images, after each.
+        localizer: Localizer to evaluate.
+        scenes: Recordings by the names under which they were learned; some or all of them.
+        seed: Seed of the random order.
+        on_frame: Called after each image with the numbers of images done and in total.
 
     Returns:
         Results scene by scene in the order of `scenes`, frames in recorded order.
 
     Raises:
-        InputError: No scenes, a scene that the localizer was not taught, one without test frames
-            that have a pose, or an image that cannot be read.
+        InputError: No scenes, a scene that was not learned or has no posed test frames, or an
+            unreadable image.
     """
     tests = {name: _test_frames(localizer, name, scene) for name, scene in scenes.items()}
     if not tests:
@@ -89,7 +91,8 @@ def evaluate(
     results: dict[int, FrameResult] = {}
     for done, index in enumerate(np.random.default_rng(seed).permutation(len(jobs)), start=1):
         name, frame = jobs[index]
-        results[int(index)] = _result(localizer, name, frame, near[index], _alike(name, scenes))
+        accepted = _same_base(name, scenes)
+        results[int(index)] = _result(localizer, name, frame, near[index], accepted)
         if on_frame is not None:
             on_frame(done, len(jobs))
     return [results[index] for index in range(len(jobs))]
@@ -98,41 +101,40 @@ def evaluate(
 def _test_frames(localizer: SceneLocalizer, name: str, scene: Recording) -> tuple[Frame, ...]:
     if name not in localizer.scenes:
         raise InputError(
-            f"scene {name!r} is not in the store, which knows {_listed(localizer.scenes)};"
-            f" give it as NAME=SCENE with the name under which it was learned"
+            f"scene {name!r} is not in the store; its scenes are {_listed(localizer.scenes)};"
+            " give NAME=SCENE with the name under which it was learned"
         )
     frames = posed_frames(scene.test)
     if not frames:
         raise InputError(
-            f"scene {name!r} has {len(scene.test)} test frames, none with a known pose;"
-            f" give a scene with posed test frames"
+            f"scene {name!r} has {len(scene.test)} test frames, none with a pose; give a scene with"
+            " posed test frames"
         )
     return frames
 
 
-def _alike(name: str, scenes: Mapping[str, Recording]) -> set[str]:
-    """The scenes in whose base frame a scene's poses are told."""
+def _same_base(name: str, scenes: Mapping[str, Recording]) -> set[str]:
+    """Return the names of the scenes with the same base frame."""
     base = scenes[name].base
     return {name} | {n for n, scene in scenes.items() if base is not None and scene.base == base}
 
 
 def _result(
-    localizer: SceneLocalizer, name: str, frame: Frame, near: bool, alike: set[str]
+    localizer: SceneLocalizer, name: str, frame: Frame, near: bool, accepted: set[str]
 ) -> FrameResult:
     start = time.perf_counter()
     estimate = localizer.localize(frame.read_image(), frame.camera)
     milliseconds = 1e3 * (time.perf_counter() - start)
     metres = radians = np.inf
     squared = np.nan
-    # Not in `Estimate`: a localizer need not say how sure it is.
     covariance = getattr(estimate, "covariance", None)
-    truth, found = frame.base_from_camera, estimate.base_from_camera
-    if estimate.status == "ok" and estimate.scene in alike:
+    truth, pose = frame.base_from_camera, estimate.base_from_camera
+    if estimate.status == "ok" and estimate.scene in accepted:
         assert truth is not None
-        assert found is not None, "an estimate whose status is ok has a pose"
-        metres, radians = pose_distance(truth, found)
+        assert pose is not None, "an estimate whose status is ok has a pose"
+        metres, radians = pose_distance(truth, pose)
         if covariance is not None:
-            squared = squared_mahalanobis(found, covariance, truth)
+            squared = squared_mahalanobis(pose, covariance, truth)
     return FrameResult(
         scene=name,
         frame=frame.name,
@@ -154,4 +156,4 @@ def _near(scene: Recording, frames: Sequence[Frame]) -> list[bool]:
 
 
 def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names) or "no scene yet"
+    return ", ".join(names) or "none"

@@ -10,24 +10,24 @@ from evercal.evaluation.protocol import evaluate as frame_results
 from evercal.recordings import Recording, load_recording
 
 Recorded = str | os.PathLike[str] | Recording
-"""The folder of a recorded scene, or the scene itself."""
+"""A recording, or its folder."""
 
 
 def evaluate(
     localizer: SceneLocalizer, scenes: Recorded | Sequence[Recorded] | Mapping[str, Recorded]
 ) -> Scores:
-    """Accuracy on the test frames of scenes, mixed, without telling which is from where.
+    """Evaluate a localizer on the test frames of scenes, in random order.
 
     Args:
-        localizer: that was taught these scenes, and maybe others.
-        scenes: one or more, as folders or as scenes; by name where the localizer knows them by
-            another name than their own.
+        localizer: A localizer that learned these scenes, and possibly others.
+        scenes: One or more recordings or their folders. Give a mapping if the localizer has other
+            names for them.
 
     Returns:
         Scores of each scene and their means.
 
     Raises:
-        InputError: no scene, one name twice, or as `evaluation.protocol.evaluate`.
+        InputError: No scene, a repeated name, or as `evaluation.protocol.evaluate`.
     """
     return scores(frame_results(localizer, _named(scenes)))
 
@@ -37,12 +37,11 @@ def _named(scenes: Recorded | Sequence[Recorded] | Mapping[str, Recorded]) -> di
         return {name: _loaded(scene) for name, scene in scenes.items()}
     given = [scenes] if isinstance(scenes, str | os.PathLike | Recording) else scenes
     named: dict[str, Recording] = {}
-    for recorded in given:
-        scene = _loaded(recorded)
+    for scene in map(_loaded, given):
         if scene.name in named:
             raise InputError(
-                f"scene {scene.name!r}: given twice; tell them apart by name, as in"
-                f" {{'name under which it was learned': scene}}"
+                f"scene {scene.name!r}: given twice; give a mapping of the names under which they"
+                " were learned"
             )
         named[scene.name] = scene
     return named

@@ -1,9 +1,10 @@
-"""The benchmark runs what is missing, once, and a stop in between does not show."""
+"""The benchmark runs what is missing, once, and an interruption does not change results."""
 
 from __future__ import annotations
 
+import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,21 +13,20 @@ import numpy as np
 import pytest
 from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 
-from evercal.continual.benchmark import bench, strategy_run
-from evercal.continual.benchmark.bench import BenchOptions, begin_bench, in_order, run_bench
+from evercal.continual.benchmark.bench import BenchOptions, Step, begin_bench, in_order, run_bench
 from evercal.continual.benchmark.comparison import runs_of
 from evercal.continual.benchmark.results import (
     NETWORK,
     RESULTS,
+    SETTINGS,
     STRATEGIES,
     SceneResult,
     read,
     read_strategies,
 )
-from evercal.continual.benchmark.strategy_run import RunOptions
 from evercal.continual.benchmark.suites import SUITES, load_suite, regions, tuning_split
 from evercal.continual.methods.replay import Replay
-from evercal.continual.presets import PRESETS, on_paper_backbone
+from evercal.continual.presets import on_paper_backbone
 from evercal.continual.strategies import Strategy, strategy_named
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
@@ -54,106 +54,121 @@ def options(arc_stage: StageOptions) -> BenchOptions:
     return BenchOptions(stage, named("er", "finetune", "joint"), seeds=(0,), short_side=120)
 
 
-def told(results: list[SceneResult]) -> list[SceneResult]:
-    """What must be the same in every run."""
-    return [replace(result, seconds=0.0) for result in results]
+def comparable(results: list[SceneResult]) -> list[SceneResult]:
+    """Results without times, sorted."""
+    plain = [replace(result, seconds=0.0) for result in results]
+    return sorted(plain, key=lambda r: (r.strategy, r.stage, r.scene))
 
 
 @pytest.fixture(scope="module")
-def done(
+def complete(
     arcs: Arcs, options: BenchOptions, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, list[bench.Step]]:
-    """A whole benchmark and its steps."""
+) -> tuple[Path, list[Step]]:
+    """The folder of a complete benchmark, and its steps."""
     out = tmp_path_factory.mktemp("bench")
     return out, list(run_bench(arcs, options, out))
 
 
-def test_every_strategy_is_judged_after_every_stage(done: tuple[Path, list[bench.Step]]) -> None:
-    out, steps = done
+def test_all_learned_scenes_are_evaluated_after_every_stage(
+    complete: tuple[Path, list[Step]],
+) -> None:
+    out, steps = complete
+    names = ["er", "er", "finetune", "finetune", "joint", "joint"]
     assert [(s.strategy, s.done, s.total) for s in steps] == [
-        ("er", 1, 6),
-        ("er", 2, 6),
-        ("finetune", 3, 6),
-        ("finetune", 4, 6),
-        ("joint", 5, 6),
-        ("joint", 6, 6),
+        (name, i, 6) for i, name in enumerate(names, start=1)
     ]
-    found = [(o.strategy, o.stage, o.scene) for o in read(out)]
-    rows = [(0, "one"), (1, "one"), (1, "two")]
-    expected = [(s, stage, scene) for s in ("er", "finetune") for stage, scene in rows]
-    assert found == [*expected, ("joint", 1, "one"), ("joint", 1, "two")]
-    assert {len(o.frames) for o in read(out)} == {24}
+    stages = [(0, "one"), (1, "one"), (1, "two")]
+    expected = [(name, stage, scene) for name in ("er", "finetune") for stage, scene in stages]
+    lines = [(r.strategy, r.stage, r.scene) for r in read(out)]
+    assert lines == [*expected, ("joint", 1, "one"), ("joint", 1, "two")]
+    assert {len(r.frames) for r in read(out)} == {24}
+    runs = runs_of(read(out))
+    assert [run.strategy for run in runs] == ["er", "finetune", "joint"]
+    assert {run.scenes for run in runs} == {("one", "two")}
 
 
-def test_strategies_start_from_the_same_first_stage(done: tuple[Path, list[bench.Step]]) -> None:
-    out, _ = done
-    ours, control = (
-        next(o for o in read(out) if o.strategy == name and o.stage == 0)
+def test_strategies_share_the_first_stage(complete: tuple[Path, list[Step]]) -> None:
+    out, _ = complete
+    replay, control = (
+        next(r for r in read(out) if r.strategy == name and r.stage == 0)
         for name in ("er", "finetune")
     )
-    assert ours.translation_m == control.translation_m
-    assert ours.memory_bytes > control.memory_bytes == 0
-    assert ours.frames_kept == len(ours.keyframe_positions_m) == 2
-    assert 0 < ours.min_spacing <= 2 * ours.covering_radius
+    assert replay.translation_m == control.translation_m
+    assert replay.memory_bytes > control.memory_bytes == 0
+    assert replay.frames_kept == len(replay.keyframe_positions_m) == 2
+    assert 0 < replay.min_spacing <= 2 * replay.covering_radius
     assert control.keyframe_positions_m == ()
-    # Stores of finished runs are gone, the first scene and the features stay for other strategies.
+    # Stores of complete runs are removed; the first scene stays for other strategies.
     assert [path.name for path in (out / "runs").iterdir()] == ["first-one-0"]
 
 
-def test_what_is_done_is_not_run_again(
-    arcs: Arcs,
-    options: BenchOptions,
-    done: tuple[Path, list[bench.Step]],
-    monkeypatch: pytest.MonkeyPatch,
+def test_complete_runs_are_not_repeated(
+    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[Step]]
 ) -> None:
-    out, _ = done
-    before = (out / RESULTS).read_bytes()
-    monkeypatch.setattr(strategy_run, "learn_scene", None)
-    monkeypatch.setattr(strategy_run, "learn_jointly", None)
-    assert list(run_bench(arcs, options, out)) == []
-    assert (out / RESULTS).read_bytes() == before
+    before = (complete[0] / RESULTS).read_bytes()
+    assert list(run_bench(arcs, options, complete[0])) == []
+    assert (complete[0] / RESULTS).read_bytes() == before
 
 
-@pytest.mark.parametrize("stop", [1, 2])
-def test_a_stop_between_stages_does_not_show(
+def test_options_that_decide_a_result_are_recorded(complete: tuple[Path, list[Step]]) -> None:
+    settings = json.loads((complete[0] / SETTINGS).read_text())
+    assert settings["fit"]["iterations"] == 12
+    assert settings["localize"]["align"] is True
+    assert settings["localize"]["pnp"]["threshold_px"] > 0
+    assert 0 < settings["acceptance"]["MIN_SUPPORT"] < 1
+
+
+@pytest.mark.parametrize("stages", [1, 2])
+def test_interruption_between_stages_does_not_change_results(
     arcs: Arcs,
     options: BenchOptions,
-    done: tuple[Path, list[bench.Step]],
+    complete: tuple[Path, list[Step]],
     tmp_path: Path,
-    stop: int,
+    stages: int,
 ) -> None:
-    alone = replace(options, strategies=named("er"))
-    steps = run_bench(arcs, alone, tmp_path)
-    for _ in range(stop):
+    one = replace(options, strategies=named("er"))
+    steps = run_bench(arcs, one, tmp_path)
+    for _ in range(stages):
         next(steps)
     steps.close()
-    list(run_bench(arcs, alone, tmp_path))
-    expected = [o for o in read(done[0]) if o.strategy == "er"]
-    assert told(read(tmp_path)) == told(expected)
+    list(run_bench(arcs, one, tmp_path))
+    expected = [r for r in read(complete[0]) if r.strategy == "er"]
+    assert comparable(read(tmp_path)) == comparable(expected)
 
 
-def test_a_stop_inside_a_stage_resumes_it(
-    arcs: Arcs, options: BenchOptions, done: tuple[Path, list[bench.Step]], tmp_path: Path
+def test_interruption_inside_a_stage_does_not_change_results(
+    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[Step]], tmp_path: Path
 ) -> None:
-    alone = replace(options, strategies=named("er"))
-    # What a kill inside the first commit leaves behind.
+    one = replace(options, strategies=named("er"))
+    # A folder that an interrupted commit leaves behind.
     (tmp_path / "runs" / "er-0" / "stages" / ".0001-one").mkdir(parents=True)
 
-    def stop(event: object) -> None:
+    def interrupt(event: object) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        list(run_bench(arcs, alone, tmp_path, stop))
+        list(run_bench(arcs, one, tmp_path, interrupt))
     assert read(tmp_path) == []
-    list(run_bench(arcs, alone, tmp_path))
-    expected = [o for o in read(done[0]) if o.strategy == "er"]
-    assert told(read(tmp_path)) == told(expected)
+    list(run_bench(arcs, one, tmp_path))
+    expected = [r for r in read(complete[0]) if r.strategy == "er"]
+    assert comparable(read(tmp_path)) == comparable(expected)
 
 
-def test_results_make_runs(done: tuple[Path, list[bench.Step]]) -> None:
-    runs = runs_of(read(done[0]))
-    assert [run.strategy for run in runs] == ["er", "finetune", "joint"]
-    assert {run.scenes for run in runs} == {("one", "two")}
+@pytest.mark.parametrize("cut", [1, 3])
+def test_missing_lines_of_a_stage_are_added(
+    cut: int, arcs: Arcs, options: BenchOptions, tmp_path: Path
+) -> None:
+    one = replace(options, strategies=named("evercal"))
+    steps = run_bench(arcs, one, tmp_path)
+    next(steps)
+    next(steps)
+    steps.close()
+    whole = comparable(read(tmp_path))
+    path = tmp_path / RESULTS
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:-cut]))
+    list(run_bench(arcs, one, tmp_path))
+    assert comparable(read(tmp_path)) == whole
+    assert len(whole) == 6
 
 
 @pytest.mark.parametrize(
@@ -167,210 +182,172 @@ def test_results_make_runs(done: tuple[Path, list[bench.Step]]) -> None:
         ({"settings": {"suite": "other"}}, "suite None, now it is 'other'"),
     ],
 )
-def test_other_settings_and_names_that_change_their_meaning_are_refused(
+def test_other_settings_and_strategies_are_refused(
     arcs: Arcs,
     options: BenchOptions,
-    done: tuple[Path, list[bench.Step]],
+    complete: tuple[Path, list[Step]],
     change: dict[str, object],
     message: str,
 ) -> None:
-    before = (done[0] / STRATEGIES).read_bytes()
+    before = (complete[0] / STRATEGIES).read_bytes()
     with pytest.raises(InputError, match=message):
-        next(run_bench(arcs, replace(options, **change), done[0]))  # pyright: ignore[reportArgumentType]
-    assert (done[0] / STRATEGIES).read_bytes() == before
+        next(run_bench(arcs, replace(options, **change), complete[0]))  # pyright: ignore[reportArgumentType]
+    assert (complete[0] / STRATEGIES).read_bytes() == before
 
 
-def test_what_each_strategy_is_stands_beside_the_results(
-    arcs: Arcs, options: BenchOptions, done: tuple[Path, list[bench.Step]], tmp_path: Path
+def test_strategies_are_described_beside_the_results(
+    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[Step]], tmp_path: Path
 ) -> None:
-    told = read_strategies(done[0])
-    assert told == {s.name: s.description() for s in options.strategies}
-    runs = {run.strategy: run for run in runs_of(read(done[0]), told)}
-    assert runs["er"].description == strategy_named("er").description()
+    described = read_strategies(complete[0])
+    assert described == {s.name: s.description() for s in options.strategies}
+    runs = {run.strategy: run for run in runs_of(read(complete[0]), described)}
     assert np.isfinite(runs["er"].memory_mb)
-    assert np.isnan(runs["joint"].memory_mb)  # it needs every frame again
-    # More may join, and what is there stays.
+    assert np.isnan(runs["joint"].memory_mb)
+    # More strategies can be added.
     row = Strategy("er_3", Replay(weight=0.9))
-    asked = replace(options, strategies=(*named("er"), row))
-    shutil.copytree(done[0], tmp_path / "out", ignore=shutil.ignore_patterns("features"))
-    assert begin_bench(arcs, asked, tmp_path / "out") == [(0, row)]
-    assert list(read_strategies(tmp_path / "out")) == ["er", "finetune", "joint", "er_3"]
+    more = replace(options, strategies=(*named("er"), row))
+    out = tmp_path / "out"
+    shutil.copytree(complete[0], out, ignore=shutil.ignore_patterns("features"))
+    assert begin_bench(arcs, more, out) == [(0, row)]
+    assert list(read_strategies(out)) == ["er", "finetune", "joint", "er_3"]
 
 
-def test_one_scene_cannot_be_forgotten(arcs: Arcs, options: BenchOptions, tmp_path: Path) -> None:
+def test_single_scene_is_refused(arcs: Arcs, options: BenchOptions, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="two or more"):
         next(run_bench(arcs[:1], options, tmp_path / "new"))
     assert not (tmp_path / "new").exists()
 
 
-def test_orders(arcs: Arcs) -> None:
-    several = [*arcs, *arcs, *arcs]
-    assert in_order(several, "given", 3) == several
-    assert in_order(several, "reversed", 3) == several[::-1]
-    drawn = [in_order(range(6), "shuffled", seed) for seed in range(20)]  # pyright: ignore[reportArgumentType]
-    assert all(sorted(order) == list(range(6)) for order in drawn)  # pyright: ignore[reportArgumentType]
+def test_orders() -> None:
+    scenes = [Recording(str(i), (), ()) for i in range(6)]
+    assert in_order(scenes, "given", 3) == scenes
+    assert in_order(scenes, "reversed", 3) == scenes[::-1]
+    drawn = [[s.name for s in in_order(scenes, "shuffled", seed)] for seed in range(20)]
+    assert all(sorted(order) == [s.name for s in scenes] for order in drawn)
     assert len({tuple(order) for order in drawn}) > 15
-    assert drawn[3] == in_order(range(6), "shuffled", 3)  # pyright: ignore[reportArgumentType]
+    assert drawn[3] == [s.name for s in in_order(scenes, "shuffled", 3)]
 
 
-def test_suites(tmp_path: Path) -> None:
+def test_suites_load_their_scenes_in_order() -> None:
     assert [scene.name for scene in load_suite("sim-mini")] == ["bedroom", "kitchen", "living"]
-    assert [scene.name for scene in load_suite("sim-mini", None, ["living", "bedroom"])] == [
-        "bedroom",
-        "living",
-    ]
+    some = load_suite("sim-mini", None, ["living", "bedroom"])
+    assert [scene.name for scene in some] == ["bedroom", "living"]
     sizes = [len(SUITES[name].scenes) for name in ("sim-7", "sim-12", "i7s", "i12s")]
     assert sizes == [7, 12, 7, 12]
-    refused: list[tuple[Callable[[], object], str]] = [
-        (lambda: load_suite("nonsense"), "suite 'nonsense': unknown; choose one of sim-mini"),
-        (lambda: load_suite("sim-mini", None, ["attic"]), "scene 'attic': not in suite sim-mini"),
-        (lambda: load_suite("real2"), "--data"),
-        (lambda: load_suite("i7s", tmp_path), "chess is missing; get it from https://www.micro"),
-        (lambda: load_suite("sim-mini", poses=tmp_path), "--poses are for i7s and i12s"),
-        (lambda: load_suite("sim", tmp_path), "bedroom is missing; get it from evercal simulate"),
-    ]
-    for call, message in refused:
-        with pytest.raises(InputError, match=message):
-            call()
 
 
-def test_what_is_held_out_to_choose_settings_is_training_frames() -> None:
-    def look(i: int, posed: bool = True) -> Frame:
-        pose = SE3(np.array([1.0, 0, 0, 0]), np.zeros(3)) if posed else None
-        return Frame(str(i), np.zeros((3, 4, 3), np.uint8), CAMERA, pose)
+@pytest.mark.parametrize(
+    ("load", "message"),
+    [
+        (lambda _: load_suite("nonsense"), "suite 'nonsense': unknown; choose one of sim-mini"),
+        (lambda _: load_suite("sim-mini", None, ["attic"]), "scene 'attic': not in suite sim-mini"),
+        (lambda _: load_suite("real2"), "--data"),
+        (lambda data: load_suite("i7s", data), "chess is missing; get it from https://www.micro"),
+        (lambda data: load_suite("sim-mini", poses=data), "--poses are for i7s and i12s"),
+        (lambda data: load_suite("sim", data), "bedroom is missing; get it from evercal simulate"),
+    ],
+)
+def test_unavailable_suites_are_refused(
+    load: Callable[[Path], object], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=message):
+        load(tmp_path)
 
-    train = (look(-1, posed=False), *(look(i) for i in range(30)))
-    scene = tuning_split(Recording("hall", train, (look(99),)))
-    assert [int(f.name) for f in scene.test] == [6, 7, 8, 21, 22, 23]
-    assert [f.name for f in scene.train] == [
-        str(i) for i in range(30) if i not in (6, 7, 8, 21, 22, 23)
-    ]
-    with pytest.raises(InputError, match=r"hall: 12 of 15 .* leave out --held-out"):
+
+def frame(name: str, x: float | None = 0.0) -> Frame:
+    """A tiny frame at x, without a pose if x is None."""
+    pose = None if x is None else SE3(np.array([1.0, 0, 0, 0]), np.array([x, 0, 0]))
+    return Frame(name, np.zeros((3, 4, 3), np.uint8), CAMERA, pose)
+
+
+def test_tuning_split_uses_training_frames_only() -> None:
+    train = (frame("-1", None), *(frame(str(i)) for i in range(30)))
+    scene = tuning_split(Recording("hall", train, (frame("99"),)))
+    test = [6, 7, 8, 21, 22, 23]
+    assert [int(f.name) for f in scene.test] == test
+    assert [int(f.name) for f in scene.train] == [i for i in range(30) if i not in test]
+    with pytest.raises(InputError, match=r"hall: 12 of 15 .* omit --held-out"):
         tuning_split(Recording("hall", train[:16], ()))
 
 
-def test_the_paper_knows_all_centres_from_the_start(
+def test_regions_share_the_base_frame_and_split_every_frame() -> None:
+    # Three positions; the recording starts at the middle one.
+    xs = [5.0] * 20 + [0.0] * 20 + [9.0] * 20
+    train = tuple(frame(f"train-{i}", x + 0.001 * i) for i, x in enumerate(xs))
+    test = tuple(frame(f"test-{x}", x) for x in (0.2, 8.7, 5.1, 0.1))
+    parts = regions(Recording("hall", train, test), 3)
+    assert [scene.name for scene in parts] == ["hall-1", "hall-2", "hall-3"]
+    assert {scene.base for scene in parts} == {"hall"}
+    assert [scene.train for scene in parts] == [train[:20], train[20:40], train[40:]]
+    assert [len(scene.test) for scene in parts] == [1, 2, 1]
+    assert parts[0].test == test[2:3]
+    for count, message in ((1, "--parts 1"), (4, "are too few"), (61, "too few for --parts 61")):
+        with pytest.raises(InputError, match=message):
+            regions(Recording("hall", train, test), count)
+
+
+def test_backbone_of_the_paper_gets_all_centres_in_advance(
     arcs: Arcs, options: BenchOptions, tmp_path: Path
 ) -> None:
     def stage(seed: int) -> StageOptions:
         few = options.stage(seed)
-        made = on_paper_backbone(replace(few, head=replace(few.head, width=24)))
-        return replace(made, head=replace(made.head, centres_per_scene=5))
+        paper = on_paper_backbone(replace(few, head=replace(few.head, width=24)))
+        return replace(paper, head=replace(paper.head, centres_per_scene=5))
 
-    asked = replace(options, stage=stage, strategies=named("sars_spdd", "joint", "evercal"))
-    how = RunOptions(stage(0), 120, tmp_path / "features", tmp_path)
-    run = strategy_run._Run(asked.strategies[0], list(arcs), how, None)
-    assert (run.stage.grid_scenes, len(run.stage.fixed_centres_m)) == (2, 5)
-    assert run.stage.head.width == 24
-    assert run.stage.head.condition == "descriptor"
-    assert run.stage.fit.iterations == options.stage(0).fit.iterations
-    assert run.stage.fit.peak_rate == PRESETS["paper"].fit.peak_rate
-    steps = list(run_bench(arcs, asked, tmp_path))
-    assert [s.strategy for s in steps] == [s.name for s in asked.strategies for _ in arcs]
+    paper = replace(options, stage=stage, strategies=named("sars_spdd", "joint", "evercal"))
+    steps = list(run_bench(arcs, paper, tmp_path))
+    assert [s.strategy for s in steps] == [s.name for s in paper.strategies for _ in arcs]
     first = Store.open(tmp_path / "runs" / "first-one-0").maps
-    # No scene brings any of its own.
     assert len(first.heads[0].centres) == 5
     assert first.scenes[0].cell.side_m == 5.0
-    ends = {o.strategy: o for o in read(tmp_path) if (o.stage, o.scene) == (1, "two")}
-    # Twelve steps teach this network nothing, but what is remembered answers all the same.
+    ends = {r.strategy: r for r in read(tmp_path) if (r.stage, r.scene) == (1, "two")}
+    # Twelve steps are too few for this network; the map does not need any.
     assert ends["evercal"].correct().sum() > ends["joint"].correct().sum() == 0
 
 
-def test_a_running_note_begins_with_the_first_scene(
+def test_running_state_counts_once_as_memory(
     arcs: Arcs, options: BenchOptions, tmp_path: Path
 ) -> None:
     steps = list(run_bench(arcs, replace(options, strategies=named("ewc_online")), tmp_path))
     sizes = [step.results[0].memory_bytes for step in steps]
-    # One anchor and one sum of importances of the whole head, which grows by what a scene adds.
+    # One anchor and one importance per weight; a scene adds a few weights.
     assert 0 < sizes[0] < sizes[1] < 1.2 * sizes[0]
 
 
-def test_joint_training_may_build_maps_too(
-    arcs: Arcs, options: BenchOptions, done: tuple[Path, list[bench.Step]], tmp_path: Path
+def test_joint_training_can_build_maps(
+    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[Step]], tmp_path: Path
 ) -> None:
     list(run_bench(arcs, replace(options, strategies=named("joint_map")), tmp_path))
-    found = read(tmp_path)
-    ours = {o.scene: o for o in found if o.strategy == "joint_map"}
-    # Its network alone is judged beside both together, and remembers nothing.
-    alone = [o for o in found if o.strategy == "joint_map" + NETWORK]
-    assert {o.scene for o in alone} == {"one", "two"}
-    plain = {o.scene: o for o in read(done[0]) if o.strategy == "joint"}
-    assert ours.keys() == plain.keys() == {"one", "two"}
-    assert ours["two"].frames_kept == len(ours["two"].keyframe_positions_m) == 2
-    assert ours["one"].memory_bytes > plain["one"].memory_bytes == 0
-    # The memory is of both scenes, and answers for both.
-    for scene in ours:
-        assert ours[scene].correct().sum() > plain[scene].correct().sum()
+    results = read(tmp_path)
+    maps = {r.scene: r for r in results if r.strategy == "joint_map"}
+    alone = [r for r in results if r.strategy == "joint_map" + NETWORK]
+    assert {r.scene for r in alone} == {"one", "two"}
+    plain = {r.scene: r for r in read(complete[0]) if r.strategy == "joint"}
+    assert maps["two"].frames_kept == len(maps["two"].keyframe_positions_m) == 2
+    assert maps["one"].memory_bytes > plain["one"].memory_bytes == 0
+    for scene in ("one", "two"):
+        assert maps[scene].correct().sum() > plain[scene].correct().sum()
 
 
 def test_thresholds_of_a_network_beside_a_map_are_fitted_once(
-    arcs: Arcs, options: BenchOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arcs: Arcs, options: BenchOptions, tmp_path: Path
 ) -> None:
-    fitted, fit = [], strategy_run.fitted_record
-
-    def noted(maps: SceneMaps, held_out: Sequence[Frame], scene: int = -1) -> SceneRecord:
-        keyframes = maps.keyframes[scene]
-        if keyframes is not None and not keyframes.landmarks:
-            fitted.append(scene)
-        return fit(maps, held_out, scene)
-
-    monkeypatch.setattr(strategy_run, "fitted_record", noted)
-    both = replace(options, strategies=(replace(strategy_named("er"), name="a", builds_map=True),))
+    strategy = replace(strategy_named("er"), name="a", builds_map=True)
+    both, fits = replace(options, strategies=(strategy,)), tmp_path / "runs" / "a-0.network.json"
     steps = run_bench(arcs, both, tmp_path)
     next(steps)
-    steps.close()  # as if killed: what was fitted for the first scene is still known
-    assert fitted == [0]
-    assert len(list(run_bench(arcs, both, tmp_path))) == 2
-    assert fitted == [0, 1]
-    assert {o.strategy for o in read(tmp_path)} == {"a", "a" + NETWORK}
-    # Beside a map the network learns other frames, so the first scene is not that of the others.
-    assert list((tmp_path / "runs").iterdir()) == []
-
-
-@pytest.mark.parametrize("lines", [1, 2, 3])
-def test_a_stage_whose_lines_a_power_cut_tore_is_made_whole(
-    lines: int, arcs: Arcs, options: BenchOptions, tmp_path: Path
-) -> None:
-    strategy = replace(strategy_named("evercal"), name="a")
-    few = replace(options, strategies=(strategy,))
-    steps = run_bench(arcs, few, tmp_path)
-    next(steps)
-    next(steps)
     steps.close()
-    whole = told(read(tmp_path))
-    path = tmp_path / RESULTS
-    kept = path.read_bytes().splitlines(keepends=True)[:-lines]
-    path.write_bytes(b"".join(kept))
-    list(run_bench(arcs, few, tmp_path))
-    again = told(read(tmp_path))
-    assert len(again) == len(whole) == 6
-
-    def order(result: SceneResult) -> tuple[str, int, str]:
-        return result.strategy, result.stage, result.scene
-
-    assert sorted(again, key=order) == sorted(whole, key=order)
-    runs_of(again)
-
-
-def test_regions_share_the_base_frame_and_split_every_frame() -> None:
-    def look(x: float, name: str) -> Frame:
-        return Frame(
-            name,
-            np.zeros((3, 4, 3), np.uint8),
-            CAMERA,
-            SE3(np.array([1.0, 0, 0, 0]), np.array([x, 0, 0])),
-        )
-
-    # Three places; the recording goes to the middle one first.
-    xs = [5.0] * 20 + [0.0] * 20 + [9.0] * 20
-    train = tuple(look(x + 0.001 * i, f"train-{i}") for i, x in enumerate(xs))
-    test = tuple(look(x, f"test-{x}") for x in (0.2, 8.7, 5.1, 0.1))
-    found = regions(Recording("hall", train, test), 3)
-    assert [scene.name for scene in found] == ["hall-1", "hall-2", "hall-3"]
-    assert {scene.base for scene in found} == {"hall"}
-    assert [scene.train for scene in found] == [train[:20], train[20:40], train[40:]]
-    assert [len(scene.test) for scene in found] == [1, 2, 1]
-    assert found[0].test == test[2:3]
-    for parts, message in ((1, "--parts 1"), (4, "are too few")):
-        with pytest.raises(InputError, match=message):
-            regions(Recording("hall", train, test), parts)
+    # A marked threshold of the first scene survives the interruption.
+    ((_, scale),) = json.loads(fits.read_text())
+    fits.write_text(json.dumps([[0.125, scale]]))
+    steps = run_bench(arcs, both, tmp_path)
+    next(steps)
+    assert len(json.loads(fits.read_text())) == 1
+    next(steps)
+    first, second = json.loads(fits.read_text())
+    assert first == [0.125, scale]
+    assert second[0] != 0.125
+    assert list(steps) == []
+    assert {r.strategy for r in read(tmp_path)} == {"a", "a" + NETWORK}
+    # Beside a map, the first scene is not shared with other strategies.
+    assert list((tmp_path / "runs").iterdir()) == []

@@ -1,4 +1,4 @@
-"""What is published says what was measured: every frame stays right or wrong."""
+"""Published numbers keep every frame correct or incorrect, and tables unchanged."""
 
 import json
 import math
@@ -22,31 +22,28 @@ from evercal.continual.benchmark.published import (
 from evercal.continual.benchmark.results import SETTINGS, SceneResult, append, read
 from evercal.errors import InputError
 from evercal.storage import write_json
-from tests.continual.benchmark.test_comparison import lines
+from tests.continual.benchmark.test_comparison import OURS, THEIRS, lines
 from tests.continual.benchmark.test_results import result
 
 
-def bench(folder: Path, found: list[SceneResult]) -> Path:
+def bench(folder: Path, results: list[SceneResult]) -> Path:
     folder.mkdir(exist_ok=True)
     write_json(folder / SETTINGS, {"suite": "two"})
-    append(folder, found)
+    append(folder, results)
     return folder
 
 
-def published(tmp_path: Path, found: list[SceneResult]) -> Published:
-    made = from_bench(bench(tmp_path / "run", found), "two", "a note")
-    path = write_published(tmp_path, made)
-    assert read_published(path) == made
-    return made
+def published(tmp_path: Path, results: list[SceneResult]) -> Published:
+    """Publish results, and check that they are read as they were written."""
+    summary = from_bench(bench(tmp_path / "run", results), "two", "a note")
+    path = write_published(tmp_path, summary)
+    assert read_published(path) == summary
+    return summary
 
 
-OURS = lines("ours", 0, [[16], [14, 12]]) + lines("ours", 1, [[18], [18, 10]])
-THEIRS = lines("theirs", 0, [[16], [4, 14]])
-
-
-def test_tables_are_those_of_the_bench(tmp_path: Path) -> None:
-    made = published(tmp_path, OURS + THEIRS)
-    runs, before = runs_of(made.results()), runs_of(read(tmp_path / "run"))
+def test_tables_equal_those_of_the_bench(tmp_path: Path) -> None:
+    summary = published(tmp_path, OURS + THEIRS)
+    runs, before = runs_of(summary.results()), runs_of(read(tmp_path / "run"))
     header, *rows = method_rows(runs)
     medians = header.index("median cm, right scene")
     for row, expected in zip(rows, method_rows(before)[1:], strict=True):
@@ -55,16 +52,16 @@ def test_tables_are_those_of_the_bench(tmp_path: Path) -> None:
         assert float(row[medians]) == pytest.approx(float(expected[medians]), abs=0.1)
     for ours, theirs in zip(threshold_rows(runs)[1:], threshold_rows(before)[1:], strict=True):
         assert ours[2:] == theirs[2:]
-        # Errors are published to a tenth of a millimetre: 0.05 % of 20 cm.
+        # Errors are rounded to a tenth of a millimetre: 0.05 % of 20 cm.
         assert float(ours[1]) == pytest.approx(float(theirs[1]), abs=0.11)
     assert difference(runs[:2], runs[2:]) == difference(before[:2], before[2:])
 
 
-def test_only_the_last_stage_is_kept_frame_by_frame(tmp_path: Path) -> None:
-    made = published(tmp_path, OURS)
-    kinds = {(type(of), of.stage) for of in made.results()}
+def test_earlier_stages_are_counts(tmp_path: Path) -> None:
+    results = published(tmp_path, OURS).results()
+    kinds = {(type(result), result.stage) for result in results}
     assert kinds == {(PublishedScene, 0), (SceneResult, 1)}
-    first = made.results()[0]
+    first = results[0]
     assert isinstance(first, PublishedScene)
     assert (first.frames, first.within) == (20, (16, 16, 0, 0, 0))
     assert first.accuracy() == 0.8
@@ -83,7 +80,7 @@ ERRORS = st.floats(0, 0.12) | st.sampled_from([0.005, 0.01, 0.02, 0.05, 0.1, mat
         max_size=12,
     )
 )
-def test_every_frame_stays_right_or_wrong(
+def test_no_frame_changes_between_correct_and_incorrect(
     tmp_path_factory: pytest.TempPathFactory, frames: list[tuple[float, float, bool]]
 ) -> None:
     posed = [math.isfinite(m) and math.isfinite(r) for m, r, _ in frames]
@@ -96,16 +93,16 @@ def test_every_frame_stays_right_or_wrong(
         near_training_frame=(False,) * len(frames),
         squared_mahalanobis=tuple(5.0 + 10 * f[2] if p else math.nan for f, p in both),
     )
-    made = published(tmp_path_factory.mktemp("b"), [one])
-    (whole,) = made.results()
+    summary = published(tmp_path_factory.mktemp("b"), [one])
+    (whole,) = summary.results()
     assert isinstance(whole, SceneResult)
-    # A result that was read has six digits; so have the counts.
+    # Results on disk have six digits.
     six = replace(
         one,
         translation_m=tuple(round(v, 6) if math.isfinite(v) else v for v in one.translation_m),
         rotation_rad=tuple(round(v, 6) if math.isfinite(v) else v for v in one.rotation_rad),
     )
-    (counted,) = made.scenes
+    (counted,) = summary.scenes
     for bound, count in zip(COUNTED, counted.within, strict=True):
         assert whole.correct(bound).tolist() == six.correct(bound).tolist()
         assert count == six.correct(bound).sum() == round(counted.accuracy(bound) * len(frames))
@@ -121,23 +118,23 @@ def test_every_frame_stays_right_or_wrong(
     assert (np.abs(gap) <= 0.51e-4).all()
 
 
-def test_what_is_under_way_or_broken_is_not_published(tmp_path: Path) -> None:
-    begun = lines("late", 0, [[16]])
-    made = published(tmp_path, OURS + begun)
-    assert {of.strategy for of in made.scenes} == {"ours"}
-    with pytest.raises(InputError, match="no run is done"):
+def test_incomplete_and_inconsistent_runs_are_not_published(tmp_path: Path) -> None:
+    incomplete = lines("late", 0, [[16]])
+    summary = published(tmp_path, OURS + incomplete)
+    assert {scene.strategy for scene in summary.scenes} == {"ours"}
+    with pytest.raises(InputError, match="no run is complete"):
         from_bench(tmp_path / "nowhere", "x")
-    other = [replace(of, frames=tuple(f"x{i}" for i in range(20))) for of in THEIRS]
-    with pytest.raises(InputError, match=r"runs judge \w by different frames"):
+    other = [replace(line, frames=tuple(f"x{i}" for i in range(20))) for line in THEIRS]
+    with pytest.raises(InputError, match=r"runs use different test frames of \w"):
         from_bench(bench(tmp_path / "mixed", OURS + other), "x")
 
 
-def test_changed_settings_and_lines_are_named(tmp_path: Path) -> None:
+def test_changed_settings_and_broken_lines_are_refused(tmp_path: Path) -> None:
     published(tmp_path, OURS)
     path = tmp_path / "two.jsonl"
     good = path.read_text()
     path.write_text(good.replace('"suite":"two"', '"suite":"three"'))
-    with pytest.raises(InputError, match="settings are not those"):
+    with pytest.raises(InputError, match="settings do not match their hash"):
         read_published(path)
     path.write_text(good + '["ours", 1, 2]\n')
     with pytest.raises(InputError, match=r"line 8 is not a published result"):
@@ -147,22 +144,28 @@ def test_changed_settings_and_lines_are_named(tmp_path: Path) -> None:
         read_published(path)
 
 
-def test_a_whole_suite_stays_small(tmp_path: Path) -> None:
-    """Seven scenes, 39 frames each, 25 strategies, three seeds; errors of up to 3 m."""
+def test_results_of_a_large_suite_stay_small(tmp_path: Path) -> None:
+    """Seven scenes of 39 frames, 25 strategies, three seeds, errors up to 3 m."""
     rng = np.random.default_rng(0)
     frames = tuple(f"test-{i:06d}" for i in range(39))
-    made = []
+    results = []
     for strategy in range(25):
         for seed in range(3):
             for stage in range(7):
                 for scene in range(stage + 1):
                     errors = tuple(np.exp(rng.uniform(-7, 1, 39)).tolist())
-                    of = result(stage, f"bedroom-{scene}", strategy=f"a_strategy_{strategy}")
-                    near = (False,) * 39
-                    told = {"frames": frames, "wrong_scene": near, "near_training_frame": near}
-                    made.append(
-                        replace(of, seed=seed, translation_m=errors, rotation_rad=errors, **told)
+                    line = result(
+                        stage,
+                        f"bedroom-{scene}",
+                        strategy=f"a_strategy_{strategy}",
+                        seed=seed,
+                        frames=frames,
+                        translation_m=errors,
+                        rotation_rad=errors,
+                        wrong_scene=(False,) * 39,
+                        near_training_frame=(False,) * 39,
                     )
-    path = write_published(tmp_path, from_bench(bench(tmp_path / "run", made), "large"))
+                    results.append(line)
+    path = write_published(tmp_path, from_bench(bench(tmp_path / "run", results), "large"))
     assert path.stat().st_size < 500_000
     assert json.loads(path.read_text().splitlines()[0])["kind"] == "bench"

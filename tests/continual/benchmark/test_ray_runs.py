@@ -1,76 +1,73 @@
-"""The same results from a cluster (Ray on this machine) as from a plain loop."""
+"""Runs on a cluster give the results of a loop, also after failures."""
 
 from __future__ import annotations
 
-import io
 import os
 import pickle
 import sys
-import tarfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 
-from evercal.continual.benchmark import ray_runs as cluster
 from evercal.continual.benchmark.bench import BenchOptions, run_bench
 from evercal.continual.benchmark.ray_runs import run_on_ray
-from evercal.continual.benchmark.results import SceneResult, append, read
-from evercal.continual.strategies import Strategy, strategy_named
+from evercal.continual.benchmark.results import SceneResult, read
+from evercal.continual.strategies import strategy_named
 from evercal.errors import InputError
-from tests.continual.benchmark.test_comparison import lines
+from evercal.recordings import Frame, Recording
 
 if TYPE_CHECKING:
     from evercal.continual.stage import StageOptions
-    from evercal.recordings import Recording
 
 
-def told(folder: Path) -> list[SceneResult]:
-    found = [replace(result, seconds=0.0) for result in read(folder)]
-    return sorted(found, key=lambda o: (o.strategy, o.seed, o.stage, o.scene))
+@pytest.fixture
+def scenes(arcs: tuple[Recording, Recording]) -> list[Recording]:
+    return [replace(scene, train=scene.train[:18], test=scene.test[:3]) for scene in arcs]
 
 
-@pytest.mark.slow
-def test_a_cluster_gives_what_a_loop_gives(
-    arcs: tuple[Recording, Recording], arc_stage: StageOptions, tmp_path: Path
-) -> None:
-    pytest.importorskip("ray", reason="the extra 'ray' is not installed")
-
+@pytest.fixture
+def options(arc_stage: StageOptions) -> BenchOptions:
     def stage(seed: int) -> StageOptions:
         fit = replace(arc_stage.fit, iterations=4, batch=64, replay_batch=32)
         encode = replace(arc_stage.encode, views_per_frame=1, seed=seed)
         return replace(arc_stage, fit=fit, encode=encode, replay_views_per_frame=1, seed=seed)
 
-    few = [replace(scene, train=scene.train[:18], test=scene.test[:3]) for scene in arcs]
-    options = BenchOptions(
-        stage, tuple(map(strategy_named, ("evercal", "joint"))), seeds=(0,), short_side=120
-    )
-    plain, spread = tmp_path / "plain", tmp_path / "spread"
-    list(run_bench(few, replace(options, strategies=options.strategies[1:]), spread))
-    steps = list(run_on_ray(few, options, spread, "local"))
-    assert [(s.strategy, s.done, s.total) for s in steps] == [("evercal", 3, 4), ("evercal", 4, 4)]
-    list(run_bench(few, options, plain))
-    names = [sorted(path.name for path in (at / "views").iterdir()) for at in (plain, spread)]
-    assert (
-        names[0]
-        == names[1]
-        == [f"{s.name}-{r}.npz" for s in options.strategies for r in ("one", "two")]
-    )
-    for a, b in zip(told(plain), told(spread), strict=True):
-        assert (a.strategy, a.stage, a.scene, a.frames) == (b.strategy, b.stage, b.scene, b.frames)
-        # Another process may use another number of threads, and sums round otherwise.
-        assert a.memory_bytes == b.memory_bytes
-        assert a.wrong_scene == pytest.approx(b.wrong_scene)
-    assert list(run_on_ray(few, options, spread, "local")) == []
+    return BenchOptions(stage, (strategy_named("evercal"),), seeds=(0,), short_side=120)
+
+
+def comparable(folder: Path) -> list[SceneResult]:
+    results = [replace(result, seconds=0.0) for result in read(folder)]
+    return sorted(results, key=lambda r: (r.strategy, r.seed, r.stage, r.scene))
 
 
 @pytest.mark.slow
-def test_a_worker_of_a_cluster_that_dies_is_replaced(
-    arcs: tuple[Recording, Recording], arc_stage: StageOptions, tmp_path: Path
+def test_cluster_gives_the_results_of_a_loop(
+    scenes: list[Recording], options: BenchOptions, tmp_path: Path
+) -> None:
+    pytest.importorskip("ray", reason="the extra 'ray' is not installed")
+    options = replace(options, strategies=(*options.strategies, strategy_named("joint")))
+    plain, spread = tmp_path / "plain", tmp_path / "spread"
+    list(run_bench(scenes, replace(options, strategies=options.strategies[1:]), spread))
+    steps = list(run_on_ray(scenes, options, spread, "local"))
+    assert [(s.strategy, s.done, s.total) for s in steps] == [("evercal", 3, 4), ("evercal", 4, 4)]
+    list(run_bench(scenes, options, plain))
+    names = [sorted(path.name for path in (at / "views").iterdir()) for at in (plain, spread)]
+    assert names[0] == names[1]
+    for a, b in zip(comparable(plain), comparable(spread), strict=True):
+        assert (a.strategy, a.stage, a.scene, a.frames) == (b.strategy, b.stage, b.scene, b.frames)
+        # Processes with other numbers of threads round sums differently.
+        assert a.memory_bytes == b.memory_bytes
+        assert a.wrong_scene == b.wrong_scene
+    assert list(run_on_ray(scenes, options, spread, "local")) == []
+
+
+@pytest.mark.slow
+def test_run_of_a_dead_worker_is_retried(
+    scenes: list[Recording], options: BenchOptions, tmp_path: Path
 ) -> None:
     pytest.importorskip("ray", reason="the extra 'ray' is not installed")
     flag, here = tmp_path / "died", os.getpid()
@@ -79,33 +76,34 @@ def test_a_worker_of_a_cluster_that_dies_is_replaced(
         if os.getpid() != here and not flag.exists():
             flag.touch()
             os._exit(1)
-        fit = replace(arc_stage.fit, iterations=4, batch=64, replay_batch=32)
-        return replace(arc_stage, fit=fit, seed=seed)
+        return options.stage(seed)
 
-    few = [replace(scene, train=scene.train[:18], test=scene.test[:3]) for scene in arcs]
-    options = BenchOptions(stage, (strategy_named("evercal"),), seeds=(0,), short_side=120)
-    said: list[str] = []
+    messages: list[str] = []
     out = tmp_path / "out"
-    steps = list(run_on_ray(few, options, out, "local", None, said.append))
+    with_exit = replace(options, stage=stage)
+    steps = list(run_on_ray(scenes, with_exit, out, "local", None, messages.append))
     assert [step.done for step in steps] == [1, 2]
-    (line,) = said
-    assert line.startswith("run evercal-0, try 1 of 4: WorkerCrashedError: ")
-    assert line.count("\n") == 0
-    assert len(read(out)) == 3
+    (message,) = messages
+    assert message.startswith("run evercal-0, attempt 1 of 4: WorkerCrashedError: ")
+    assert message.count("\n") == 0
 
 
-class FakeRay:
-    """Ray's functions that are used here; tasks run in this process, the newest first."""
+class InProcessRay:
+    """Runs tasks in this process when their results are requested.
 
-    def __init__(self, crashes: int = 0, gpus: int = 0) -> None:
-        self.crashes, self.ran = crashes, 0
-        self.up, self.gpus, self.asked = False, gpus, -1
+    Args:
+        shares_disk: Whether workers see the folder of results.
+        crashes: Number of tasks that die before they start.
+        gpus: GPUs of the cluster.
+    """
 
-    def init(self, **_: object) -> None:
-        self.up = True
+    def __init__(self, shares_disk: bool = True, crashes: int = 0, gpus: int = 0) -> None:
+        self.shares_disk, self.crashes, self.gpus = shares_disk, crashes, gpus
+        self.requested_gpus = -1
 
-    def shutdown(self) -> None:
-        self.up = False
+    def init(self, **_: object) -> None: ...
+
+    def shutdown(self) -> None: ...
 
     def put(self, value: object) -> object:
         return value
@@ -114,190 +112,144 @@ class FakeRay:
         return {"CPU": 2.0} | ({"GPU": float(self.gpus)} if self.gpus else {})
 
     def remote(self, max_retries: int, num_gpus: int) -> Callable[[Any], Any]:
-        assert max_retries == 0
-        self.asked = num_gpus
-        return lambda function: SimpleNamespace(remote=partial(_Task, function))
+        self.requested_gpus = num_gpus
+        return _Remote
 
     def wait(self, tasks: list[Any], num_returns: int) -> tuple[list[Any], list[Any]]:
-        assert num_returns == 1
-        return [tasks[-1]], tasks[:-1]
+        return tasks[:1], tasks[1:]
 
     def get(self, task: Any) -> Any:
-        self.ran += 1
-        if self.ran <= self.crashes:
+        scenes, job = task.arguments
+        if self.crashes:
+            self.crashes -= 1
             raise RuntimeError("The worker died.\nLogs above.\nIt ran out of memory.")
-        return pickle.loads(pickle.dumps(task.function(*task.arguments)))
+        if not self.shares_disk:
+            (job.folder.parent / "shared").unlink(missing_ok=True)
+        return pickle.loads(pickle.dumps(task.function(scenes, job)))
 
 
-class _Task:
-    def __init__(self, function: Any, *arguments: object) -> None:
-        self.function, self.arguments = function, arguments
+@dataclass(eq=False)
+class _Remote:
+    function: Any
+    arguments: tuple[Any, ...] = ()
+
+    def remote(self, *arguments: object) -> _Remote:
+        return _Remote(self.function, arguments)
 
 
-SCENES: list[Any] = [SimpleNamespace(name=n, train=[], test=[]) for n in ("one", "two")]
+class FailingFrame(Frame):
+    """A test frame that cannot be read until `repaired` exists."""
 
-
-@dataclass
-class Bench:
-    """Takes the place of `run_bench`: two stages that each add a line; fails where it is told."""
-
-    fail: dict[str, list[int]]
-    """By strategy: before which stage each of its next runs fails."""
+    repaired: Path
     error: type[Exception] = RuntimeError
-    began: list[tuple[str, int, bool]] = field(default_factory=list)
-    """Strategy, stages that were there, and whether the folder lies in the folder of results."""
 
-    def __call__(self, scenes: list[Any], options: BenchOptions, folder: Path) -> Iterator[Any]:
-        (asked,), (seed,) = options.strategies, options.seeds
-        strategy = asked.name
-        there = len({o.stage for o in read(folder)})
-        self.began.append((strategy, there, "ray" in folder.parts))
-        stops = self.fail.get(strategy, [])
-        stop = stops.pop(0) if stops else 2
-        (folder / "views").mkdir(exist_ok=True)
-        (folder / "features").mkdir(exist_ok=True)
-        (folder / "features" / "large").write_bytes(bytes(1000))
-        for stage in range(there, 2):
-            if stage == stop:
-                raise self.error(f"first line\nstage {stage} of {strategy}")
-            append(folder, lines(strategy, seed, [[16], [14, 12]])[stage : 2 * stage + 1])
-            (folder / "views" / f"{strategy}-{stage}.npz").write_bytes(b"view")
-            yield stage
+    def read_image(self) -> np.ndarray:
+        if not self.repaired.exists():
+            self.repaired.touch()
+            raise self.error("first line\nthe disk is gone")
+        return super().read_image()
 
 
-def start(
-    monkeypatch: pytest.MonkeyPatch, ray: FakeRay, bench: Bench, shared: bool, device: str = "auto"
-) -> Callable[[Path], tuple[list[str], list[str], str]]:
-    """A run on the fake: names of the steps, lines of failures, the error at the end."""
-    monkeypatch.setattr(cluster, "_ray", lambda: ray)
-    monkeypatch.setattr(cluster, "run_bench", bench)
-    monkeypatch.setattr(cluster, "begin_bench", lambda _s, o, _f: [(0, n) for n in o.strategies])
-    if not shared:
-        monkeypatch.setattr(cluster, "_reads", lambda _: None)
-
-    def run(out: Path) -> tuple[list[str], list[str], str]:
-        options = BenchOptions(lambda _: None, (Strategy("ours"), Strategy("theirs")), (0,))  # pyright: ignore[reportArgumentType]
-        options = replace(options, device=device)
-        said: list[str] = []
-        steps, error = [], ""
-        try:
-            for step in run_on_ray(SCENES, options, out, "local", None, said.append):
-                steps.append(f"{step.strategy} {step.done}/{step.total}")
-        except InputError as raised:
-            error = str(raised)
-        assert not ray.up
-        return steps, said, error
-
-    return run
+def failing_once(scene: Recording, flag: Path, error: type[Exception]) -> Recording:
+    first = scene.test[0]
+    kind = type("Failing", (FailingFrame,), {"repaired": flag, "error": error})
+    frame = kind(first.name, first.image, first.camera, first.base_from_camera)
+    return replace(scene, test=(frame, *scene.test[1:]))
 
 
-@pytest.mark.parametrize("shared", [True, False])
-def test_a_failed_run_goes_on_inside_its_sequence(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, shared: bool
+@pytest.mark.parametrize("shares_disk", [True, False])
+def test_failed_run_resumes_from_its_last_stage(
+    scenes: list[Recording],
+    options: BenchOptions,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    shares_disk: bool,
 ) -> None:
-    bench = Bench({"ours": [1, 1]})
-    steps, said, error = start(monkeypatch, FakeRay(), bench, shared)(tmp_path)
-    assert steps == ["ours 1/4", "ours 2/4", "theirs 3/4", "theirs 4/4"] or steps == [
-        "theirs 1/4",
-        "theirs 2/4",
-        "ours 3/4",
-        "ours 4/4",
+    monkeypatch.setitem(sys.modules, "ray", InProcessRay(shares_disk))
+    failing = [scenes[0], failing_once(scenes[1], tmp_path / "flag", RuntimeError)]
+    messages, seconds = [], []
+    out, work = tmp_path / "out", tmp_path / "out" / "runs" / "ray"
+
+    def on_failure(message: str) -> None:
+        messages.append(message)
+        seconds.extend(result.seconds for result in read(work / "evercal-0"))
+
+    steps = list(run_on_ray(failing, options, out, "local", None, on_failure))
+    assert [step.done for step in steps] == [1, 2]
+    assert messages == [
+        "run evercal-0, attempt 1 of 4: RuntimeError: the disk is gone;"
+        " resuming from its last checkpoint"
     ]
-    assert error == ""
-    assert said == [
-        f"run ours-0, try {n} of 4: RuntimeError: stage 1 of ours; goes on from its last checkpoint"
-        for n in (1, 2)
-    ]
-    # The second and third try find the first stage done.
-    assert [b for b in bench.began if b[0] == "ours"] == [
-        ("ours", there, shared) for there in (0, 1, 1)
-    ]
-    found = sorted(read(tmp_path), key=lambda o: (o.strategy, o.stage, o.scene))
-    expected = lines("ours", 0, [[16], [14, 12]]) + lines("theirs", 0, [[16], [14, 12]])
-    assert found == sorted(expected, key=lambda o: (o.strategy, o.stage, o.scene))
-    assert {path.name for path in (tmp_path / "views").iterdir()} == {
-        f"{name}-{stage}.npz" for name in ("ours", "theirs") for stage in (0, 1)
-    }
-    # Nothing of the work is left.
-    assert [path.name for path in (tmp_path / "runs" / "ray").iterdir()] == ["shared"]
+    if shares_disk:
+        # The first stage was not learned again.
+        first = [result.seconds for result in read(out) if result.stage == 0]
+        assert seconds == first
+    list(run_bench(scenes, options, tmp_path / "plain"))
+    assert comparable(out) == comparable(tmp_path / "plain")
+    assert {path.name for path in work.iterdir()} <= {"shared"}
 
 
-def test_what_is_sent_back_holds_no_features(tmp_path: Path) -> None:
-    for name in ("features", "runs"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "data").write_bytes(bytes(10))
-    with tarfile.open(fileobj=io.BytesIO(cluster._archive(tmp_path))) as archive:
-        assert archive.getnames() == ["runs", "runs/data"]
-
-
-def test_a_run_that_fails_for_good_is_told_after_the_others(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_input_errors_are_not_retried(
+    scenes: list[Recording],
+    options: BenchOptions,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    bench = Bench({"theirs": [1] * 9})
-    run = start(monkeypatch, FakeRay(), bench, shared=True)
-    steps, said, error = run(tmp_path)
-    assert steps == ["ours 1/4", "ours 2/4"]
-    assert len(said) == 4
-    assert said[-1].endswith("given up")
-    assert error.startswith("1 of 2 runs failed: theirs-0 (RuntimeError: stage 1 of theirs);")
-    assert "\n" not in error
-    # The same command later goes on where it stood.
-    bench.fail.clear()
-    assert {o.strategy for o in read(tmp_path)} == {"ours"}
-    run(tmp_path)
-    assert ("theirs", 1, True) in bench.began[5:]
+    monkeypatch.setitem(sys.modules, "ray", InProcessRay())
+    failing = [failing_once(scenes[0], tmp_path / "flag", InputError), scenes[1]]
+    with pytest.raises(InputError, match=r"1 of 1 runs failed: evercal-0 \(InputError: the disk"):
+        list(run_on_ray(failing, options, tmp_path / "out", "local"))
+    assert "attempt 1 of 4" in capsys.readouterr().err
+    # The same command resumes later.
+    assert len(list(run_on_ray(failing, options, tmp_path / "out", "local"))) == 2
 
 
-def test_what_would_fail_again_is_not_tried_again(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_run_is_given_up_after_four_crashes(
+    scenes: list[Recording],
+    options: BenchOptions,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    bench = Bench({"theirs": [0] * 9}, InputError)
-    steps, said, error = start(monkeypatch, FakeRay(), bench, shared=True)(tmp_path)
-    assert steps == ["ours 1/4", "ours 2/4"]
-    assert len(said) == 1
-    assert "theirs-0 (InputError: stage 0 of theirs)" in error
-
-
-def test_a_worker_that_dies_is_replaced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    steps, said, error = start(monkeypatch, FakeRay(crashes=2), Bench({}), shared=True)(tmp_path)
-    assert len(steps) == 4
-    assert error == ""
-    assert [line.split(": ", 1)[1] for line in said] == [
-        "RuntimeError: It ran out of memory.; goes on from its last checkpoint"
-    ] * 2
+    monkeypatch.setitem(sys.modules, "ray", InProcessRay(crashes=4))
+    messages: list[str] = []
+    with pytest.raises(InputError, match="RuntimeError: It ran out of memory"):
+        list(run_on_ray(scenes, options, tmp_path, "local", None, messages.append))
+    assert [message.rpartition("; ")[2] for message in messages] == [
+        *["resuming from its last checkpoint"] * 3,
+        "given up",
+    ]
 
 
 @pytest.mark.parametrize(
-    ("device", "there", "asked"),
+    ("device", "available", "requested"),
     [("auto", 2, 1), ("cuda", 1, 1), ("cpu", 2, 0), ("auto", 0, 0)],
 )
-def test_a_task_asks_for_a_gpu_where_it_may_use_one(
-    device: str, there: int, asked: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_task_requests_a_gpu_if_it_may_use_one(
+    scenes: list[Recording],
+    options: BenchOptions,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    device: str,
+    available: int,
+    requested: int,
 ) -> None:
-    # Ray hides all GPUs from a task that asks for none.
-    ray = FakeRay(gpus=there)
-    start(monkeypatch, ray, Bench({}), True, device)(tmp_path)
-    assert ray.asked == asked
+    ray = InProcessRay(crashes=4, gpus=available)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    with pytest.raises(InputError, match="out of memory"):
+        list(run_on_ray(scenes, replace(options, device=device), tmp_path, "local"))
+    assert ray.requested_gpus == requested
 
 
-def test_a_cluster_without_gpus_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    _, _, error = start(monkeypatch, FakeRay(), Bench({}), True, "cuda")(tmp_path)
-    assert error == "device 'cuda': the cluster has no GPU; take auto or cpu"
-
-
-def test_failures_go_to_stderr(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_missing_gpu_and_missing_extra_are_refused(
+    scenes: list[Recording],
+    options: BenchOptions,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    start(monkeypatch, FakeRay(), Bench({"ours": [1]}), shared=True)
-    options = BenchOptions(lambda _: None, (Strategy("ours"),), (0,))  # pyright: ignore[reportArgumentType]
-    list(run_on_ray(SCENES, options, tmp_path, "local"))
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.startswith("run ours-0, try 1 of 4: RuntimeError: stage 1 of ours;")
-    assert told.err.count("\n") == 1
-
-
-def test_without_the_extra_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", InProcessRay())
+    with pytest.raises(InputError, match="device 'cuda': the cluster has no GPU"):
+        list(run_on_ray(scenes, replace(options, device="cuda"), tmp_path, "local"))
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"pip install 'evercal\[ray\]'"):
-        cluster._ray()
+        list(run_on_ray(scenes, options, tmp_path, "local"))

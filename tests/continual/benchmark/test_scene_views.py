@@ -1,4 +1,4 @@
-"""What methods see is kept as it was: image, pose, and points of the scene that they meant."""
+"""Views keep image, pose, and points of the estimated scene."""
 
 from __future__ import annotations
 
@@ -32,32 +32,32 @@ def scene(name: str, level: int, depth: Path | None = None) -> Recording:
 
 
 @dataclass
-class Told:
-    """Answers by the grey level of the image: (scene, pose, points)."""
+class FakeLocalizer:
+    """Returns (scene, pose, points) by the grey level of the image."""
 
-    answers: dict[int, tuple[str | None, SE3 | None, list[list[float]]]]
-    asked: list[int] = field(default_factory=list)
+    estimates: dict[int, tuple[str | None, SE3 | None, list[list[float]]]]
+    calls: list[int] = field(default_factory=list)
     maps = type("", (), {"short_side": 12})
 
     def localize(self, image: np.ndarray, camera: Camera) -> PoseEstimate:
-        self.asked.append(int(image[0, 0, 0]))
-        where, pose, points = self.answers[self.asked[-1]]
+        self.calls.append(int(image[0, 0, 0]))
+        name, pose, points = self.estimates[self.calls[-1]]
         status = "ok" if pose is not None else "failed"
         pixels = np.tile([3.5, 3.5], (len(points), 1))
-        return PoseEstimate(status, "", where, pose, None, 0, 0.0, 0.0, pixels, np.array(points))
+        return PoseEstimate(status, "", name, pose, None, 0, 0.0, 0.0, pixels, np.array(points))
 
 
-def test_views_come_back_with_the_points_of_the_scene_that_was_found(tmp_path: Path) -> None:
-    found = SE3(np.array([1.0, 0, 0, 0]), np.array([0.0, 0.03, -1.0]))
-    told = Told(
+def test_views_have_the_points_of_the_estimated_scene(tmp_path: Path) -> None:
+    estimate = SE3(np.array([1.0, 0, 0, 0]), np.array([0.0, 0.03, -1.0]))
+    localizer = FakeLocalizer(
         {
-            10: ("hall", found, [[1.0, 2.0, 3.0]]),
+            10: ("hall", estimate, [[1.0, 2.0, 3.0]]),
             20: ("hall", AHEAD, []),
             30: (None, None, []),
         }
     )
     scenes = [scene("hall", 10), scene("attic", 20), scene("cellar", 30)]
-    keep_views(tmp_path, "er@0.3", cast("Localizer", told), scenes)
+    keep_views(tmp_path, "er@0.3", cast("Localizer", localizer), scenes)
     attic, cellar, hall = read_views(tmp_path)
     assert [v.scene for v in (attic, cellar, hall)] == ["attic", "cellar", "hall"]
     assert {v.strategy for v in (attic, cellar, hall)} == {"er@0.3"}
@@ -67,31 +67,33 @@ def test_views_come_back_with_the_points_of_the_scene_that_was_found(tmp_path: P
     assert hall.frame.camera == CAMERA
     np.testing.assert_array_equal(hall.frame.read_image(), scenes[0].test[0].read_image())
     assert hall.pose is not None
-    np.testing.assert_allclose(hall.pose.matrix(), found.matrix())
-    # What the method says about the hall, for the image of the attic, too.
+    np.testing.assert_allclose(hall.pose.matrix(), estimate.matrix())
+    # The image of the attic was estimated to be in the hall.
     for view in (hall, attic):
         np.testing.assert_array_equal(np.unique(view.points_m, axis=0), [[1, 2, 3]])
         assert set(view.grey) == {10}
     assert len(cellar.points_m) == 0
-    # Nothing is asked again.
-    told.asked.clear()
-    keep_views(tmp_path, "er@0.3", cast("Localizer", told), scenes)
-    assert told.asked == []
+    # Existing views are not computed again.
+    localizer.calls.clear()
+    keep_views(tmp_path, "er@0.3", cast("Localizer", localizer), scenes)
+    assert localizer.calls == []
 
 
-def test_measured_depths_go_before_what_a_network_says(tmp_path: Path) -> None:
+def test_points_come_from_depth_images_if_there_are_any(tmp_path: Path) -> None:
     depth = np.zeros((24, 32), np.uint16)
     depth[:, 16:] = 2000
     assert cv2.imwrite(str(tmp_path / "depth.png"), depth)
-    told = Told({10: ("hall", AHEAD, [[9.0, 9.0, 9.0]])})
-    keep_views(tmp_path, "er", cast("Localizer", told), [scene("hall", 10, tmp_path / "depth.png")])
+    localizer = FakeLocalizer({10: ("hall", AHEAD, [[9.0, 9.0, 9.0]])})
+    keep_views(
+        tmp_path, "er", cast("Localizer", localizer), [scene("hall", 10, tmp_path / "depth.png")]
+    )
     (view,) = read_views(tmp_path)
-    # Two metres ahead of a camera that stands one metre behind the origin, right half only.
+    # Two metres in front of a camera one metre behind the origin, right half of the image.
     np.testing.assert_allclose(view.points_m[:, 2], 1.0)
     assert len(np.unique(view.points_m, axis=0)) == 6 * 4
     assert view.points_m[:, 0].min() == pytest.approx(2 * 0.5 / 30, abs=1e-6)
-    assert told.asked == [10]
+    assert localizer.calls == [10]
 
 
-def test_a_folder_without_views(tmp_path: Path) -> None:
+def test_folder_without_views(tmp_path: Path) -> None:
     assert read_views(tmp_path) == []

@@ -1,1 +1,1 @@
-"""Methods compared over sequences of scenes: suites, runs, results on disk, tables."""
+"""Comparison of strategies over sequences of scenes: suites, runs, results on disk, tables."""

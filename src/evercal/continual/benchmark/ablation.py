@@ -1,6 +1,6 @@
-"""The paper's Table 4 and the grid behind it: what which frames stay and what replay costs give."""
+"""The ablation of the paper (Table 4), and a grid of selectors and penalties."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -27,88 +27,88 @@ ABLATIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("SARS, SPDD", "sars_spdd"),
     ),
 }
-"""Rows of Table 4 and their strategies. As printed, the first step changes the selector and keeps
-iCaRL's penalty, the second changes the penalty from one with true poses to one without."""
+"""Rows of Table 4 and their strategies.
+
+As printed, the first step changes the selector and keeps iCaRL's penalty, which uses true poses.
+The second step replaces it by a penalty without true poses.
+"""
 
 PUBLISHED = {"i7s": (65.2, 72.0, 74.9), "i12s": (66.0, 90.9, 91.8)}
-"""Of the rows as printed, by suite (Li et al., arXiv 2604.15814, Table 4)."""
+"""Final accuracies of the rows as printed, by suite (Li et al., arXiv 2604.15814, Table 4)."""
 
 
 def ablation_rows(runs: Sequence[Run], suite: str = "") -> TableRows:
-    """Table 4: final accuracy and what each step gave, as far as its strategies were run.
+    """Tabulate Table 4: final accuracy, and the gain of each step with its 95 % interval.
 
     Args:
-        runs: whose last stage is done.
-        suite: its name; published numbers stand beside ours where the data are the same.
+        runs: Complete runs. Steps that were not run are left out.
+        suite: Name of the suite. Published numbers are added if the paper has them.
 
     Returns:
-        A header alone where fewer than two steps of an ablation were run.
+        The header alone if fewer than two steps of every ablation were run.
     """
-    grouped, told = by_strategy(runs), PUBLISHED.get(suite)
-    rows = [["ablation", "", "final %", "step", "95 %", *(["published %"] if told else [])]]
+    grouped, published = by_strategy(runs), PUBLISHED.get(suite)
+    header = ["ablation", "", "final %", "step", "95 %", *(["published %"] if published else [])]
+    rows = [header]
     for title, steps in ABLATIONS.items():
         if sum(name in grouped for _, name in steps) < 2:
             continue
         before: list[Run] = []
-        for number, (what, name) in enumerate(steps):
-            if name not in grouped:
-                before = []
-                continue
-            now = grouped[name]
-            final = float(np.mean([run.scores().final_accuracy for run in now]))
-            step = difference(now, before) if before else None
-            cells = ["", ""]
-            if step is not None:
-                cells = [f"{100 * step.mean:+.1f}", f"{100 * step.low:+.1f} {100 * step.high:+.1f}"]
-            published = []
-            if told:
-                published = [f"{told[number]:.1f}" if title == "as printed" else ""]
-            rows.append([title, what, f"{final:.1f}", *cells, *published])
-            before = now
+        for i, (label, name) in enumerate(steps):
+            group = grouped.get(name, [])
+            if group:
+                final = np.mean([run.scores().final_accuracy for run in group])
+                row = [title, label, f"{final:.1f}", *_step(group, before)]
+                if published:
+                    row.append(f"{published[i]:.1f}" if title == "as printed" else "")
+                rows.append(row)
+            before = group
     return rows
+
+
+def _step(runs: Sequence[Run], before: Sequence[Run]) -> list[str]:
+    step = difference(runs, before)
+    if step is None:
+        return ["", ""]
+    return [f"{100 * step.mean:+.1f}", f"{100 * step.low:+.1f} {100 * step.high:+.1f}"]
 
 
 def grid_rows(runs: Sequence[Run]) -> TableRows:
-    """Final accuracy, a row per selector and a column per penalty; TFR in brackets.
+    """Tabulate final accuracy and TFR, a row per selector and a column per penalty.
 
-    Strategies that are more than the two, or weigh the penalty otherwise, have no place in it.
+    Only strategies that are replay with default weights take part.
 
     Returns:
-        A header alone unless two selectors were run with two penalties at least.
+        The header alone unless two selectors and two penalties were run.
     """
-    cells: dict[tuple[str, str], list[Run]] = {}
-    for of in by_strategy(runs).values():
-        place = _place(of[0])
-        if place is not None:
-            cells.setdefault(place, of)
+    groups = {_parts(group[0]): group for group in reversed(by_strategy(runs).values())}
+    cells = {parts: _accuracy_and_forgetting(group) for parts, group in groups.items() if parts}
     selectors = [name for name in SELECTORS if any(s == name for s, _ in cells)]
     penalties = sorted({penalty for _, penalty in cells})
-    rows = [["frames \\ cost", *penalties]]
+    header = ["frames \\ cost", *penalties]
     if len(selectors) < 2 or len(penalties) < 2:
-        return rows
-    for selector in selectors:
-        row = [selector]
-        for penalty in penalties:
-            scores = [run.scores() for run in cells.get((selector, penalty), [])]
-            final = np.mean([s.final_accuracy for s in scores]) if scores else 0.0
-            lost = np.mean([s.total_forgetting for s in scores]) if scores else 0.0
-            row.append(f"{final:.1f} ({lost:.1f})" if scores else "")
-        rows.append(row)
-    return rows
+        return [header]
+    return [header, *([s, *(cells.get((s, p), "") for p in penalties)] for s in selectors)]
 
 
-def _place(run: Run) -> tuple[str, str] | None:
-    """Selector and penalty of a strategy that is replay of nothing but these two."""
+def _accuracy_and_forgetting(runs: Sequence[Run]) -> str:
+    scores = [run.scores() for run in runs]
+    final = np.mean([score.final_accuracy for score in scores])
+    return f"{final:.1f} ({np.mean([score.total_forgetting for score in scores]):.1f})"
+
+
+def _parts(run: Run) -> tuple[str, str] | None:
+    """Return selector and penalty of a strategy that is replay with default weights."""
     method = run.description.get("method")
-    if not isinstance(method, dict) or method.get("kind") != "Replay" or run.description["map"]:
+    if not isinstance(method, Mapping) or method["kind"] != "Replay" or run.description["map"]:
         return None
-    penalty = method["penalty"]
-    assert isinstance(penalty, dict)
-    # The first strategy with a penalty tells how it is weighed; other weights are other rows.
     for strategy in STRATEGIES.values():
         if type(strategy.method) is not Replay:
             continue
-        known = described(strategy.method) | {"selector": method["selector"]}
-        if known["penalty"]["kind"] == penalty["kind"]:  # pyright: ignore[reportIndexIssue]
-            return (str(method["selector"]), str(penalty["kind"])) if known == method else None
+        default = described(strategy.method) | {"selector": method["selector"]}
+        penalty = default["penalty"]
+        assert isinstance(penalty, Mapping)
+        # The first strategy with a penalty defines its default weight.
+        if penalty["kind"] == method["penalty"]["kind"]:
+            return (str(method["selector"]), str(penalty["kind"])) if default == method else None
     return None

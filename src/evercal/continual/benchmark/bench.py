@@ -1,15 +1,15 @@
-"""The benchmark: strategies over a sequence of scenes, what is missing is run, what is done kept.
+"""The benchmark: strategies over a sequence of scenes. Complete runs are kept, others are run.
 
-    OUT/settings.json             what decides the results; a folder of other settings is refused
-    OUT/strategies.json           what each strategy is: method, hyper-parameters, map
+    OUT/settings.json             options that decide the results; other options are refused
+    OUT/strategies.json           description of each strategy: method, hyper-parameters, map
     OUT/results.jsonl             see `benchmark.results`
     OUT/views/                    see `benchmark.scene_views`; of each strategy's first run
     OUT/features/                 encoded views, shared by all runs; may be deleted
-    OUT/runs/STRATEGY-SEED/       a store under way, gone when its sequence is done
-    OUT/runs/STRATEGY-SEED.network.json    thresholds of its network where a map answers beside it
-    OUT/runs/first-SCENE-SEED/    the first scene, which all strategies learn alike
+    OUT/runs/STRATEGY-SEED/       store of a run in progress, removed when the run is complete
+    OUT/runs/STRATEGY-SEED.network.json    thresholds of its network, if it also builds a map
+    OUT/runs/first-SCENE-SEED/    the first scene, shared by strategies that learn it alike
 
-A run that is killed goes on from the checkpoint inside its stage, as `evercal learn` does.
+An interrupted run resumes from the checkpoint inside its stage, as `evercal learn` does.
 """
 
 import json
@@ -30,6 +30,8 @@ from evercal.continual.stage import StageOptions
 from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
 from evercal.features.encoder import ENCODER_FILE
+from evercal.localization import acceptance
+from evercal.localization.query import LocalizeOptions
 from evercal.recordings import Recording
 from evercal.storage import lock_settings, sha256_file, write_json
 
@@ -38,39 +40,39 @@ Order = Literal["given", "reversed", "shuffled"]
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """What is compared."""
+    """Options of a benchmark."""
 
     stage: Callable[[int], StageOptions]
-    """How a scene is learned, given the seed. With `centres: fixed` and none given, those of all
-    scenes are there from the start, in the paper's combined grid."""
+    """Options for learning a scene, given the seed. With `centres: fixed` and no given centres, the
+    centres of all scenes are known from the start, in the paper's combined grid."""
     strategies: tuple[Strategy, ...]
-    """What is compared, each under a name of its own."""
+    """Strategies to compare, each with a unique name."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Runs of each."""
+    """Seeds; every strategy runs once with each."""
     order: Order = "given"
-    """In which the scenes come; `shuffled` differs from seed to seed."""
+    """Order of the scenes; `shuffled` depends on the seed."""
     short_side: int = 240
     """Working size of images, pixels."""
     settings: dict[str, object] = field(default_factory=dict)
-    """What else decides the results, for settings.json."""
+    """Further settings that decide the results, for settings.json."""
     device: str = "auto"
-    """What the networks run on, see `features.device.device_of`."""
+    """Device of the networks, see `features.device.device_of`."""
     features: Path | None = None
-    """Where encoded views are kept; in the folder of results when None."""
+    """Folder of encoded views. Defaults to `OUT/features`."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """A stage that is done."""
+    """A complete stage."""
 
     strategy: str
     """Name of the strategy."""
     seed: int
-    """Which run."""
+    """Seed of the run."""
     results: tuple[SceneResult, ...]
-    """One per scene learned so far; none for the stages before the last of joint training."""
+    """Results of all scenes learned so far; empty before the last stage of joint training."""
     done: int
-    """Stages done so far, those of earlier calls included."""
+    """Complete stages, including those of earlier calls."""
     total: int
     """Stages of the whole benchmark."""
 
@@ -78,31 +80,31 @@ class Step:
 def run_bench(
     scenes: Sequence[Recording], options: BenchOptions, out: Path, on_event: OnEvent | None = None
 ) -> Generator[Step, None, None]:
-    """Runs what is missing.
+    """Run all runs that are not complete.
 
     Args:
-        scenes: two or more, in the order `given`.
-        options: what is compared.
-        out: folder of results; made when missing.
-        on_event: called with everything that happens while a scene is learned.
+        scenes: Two or more scenes in the order `given`.
+        options: Strategies, seeds and options.
+        out: Folder of results, created if missing.
+        on_event: Called with every event while a scene is learned.
 
     Raises:
-        InputError: fewer than two scenes, an unknown strategy, or a folder of other settings.
+        InputError: Fewer than two scenes, or the folder has results of other settings.
 
     Yields:
-        A `Step` after every stage that was run.
+        A `Step` after every stage.
     """
     total = len(options.seeds) * len(options.strategies) * len(scenes)
     missing = begin_bench(scenes, options, out)
-    found = {(o.strategy, o.seed, o.stage, o.scene) for o in results.read(out)}
+    stored = {(r.strategy, r.seed, r.stage, r.scene) for r in results.read(out)}
     done = total - len(missing) * len(scenes)
     features = options.features or out / "features"
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
         how = RunOptions(options.stage(seed), options.short_side, features, out, options.device)
         for stage, these in run_strategy(strategy, ordered, how, on_event):
-            # A kill may have left a part of the lines of a stage.
-            new = [o for o in these if (o.strategy, seed, stage, o.scene) not in found]
+            # An interrupted call may have stored some of the lines of a stage.
+            new = [r for r in these if (r.strategy, seed, stage, r.scene) not in stored]
             results.append(out, new)
             yield Step(strategy.name, seed, these, done + stage + 1, total)
         done += len(scenes)
@@ -111,47 +113,47 @@ def run_bench(
 def begin_bench(
     scenes: Sequence[Recording], options: BenchOptions, out: Path
 ) -> list[tuple[int, Strategy]]:
-    """Checks what is asked against the folder of results.
+    """Check the options against the folder of results.
 
     Returns:
-        (seed, strategy) of the runs whose last stage is not there yet, in order.
+        (seed, strategy) of the runs that are not complete, in order.
 
     Raises:
-        InputError: see `run_bench`.
+        InputError: See `run_bench`.
     """
     if len(scenes) < 2:
-        raise InputError(f"{len(scenes)} scene: forgetting takes two or more; give more scenes")
+        raise InputError(f"{len(scenes)} scene: give two or more to measure forgetting")
     lock_settings(out / results.SETTINGS, _settings(scenes, options))
-    _note_strategies(out, options.strategies)
-    found = results.read(out)
+    _record_strategies(out, options.strategies)
+    stored = results.read(out)
     runs = [(seed, strategy) for seed in options.seeds for strategy in options.strategies]
-    return [run for run in runs if not _done(run, found, len(scenes))]
+    return [run for run in runs if not _complete(run, stored, len(scenes))]
 
 
-def _done(run: tuple[int, Strategy], found: Sequence[SceneResult], scenes: int) -> bool:
-    """Whether the last stage of a run has every line, also of what is judged alone beside it."""
+def _complete(run: tuple[int, Strategy], stored: Sequence[SceneResult], scenes: int) -> bool:
+    """Check that the last stage has a line per scene, under every name of the strategy."""
     seed, strategy = run
-    of = [o for o in found if o.seed == seed and o.strategy.partition(":")[0] == strategy.name]
-    last = Counter(o.strategy for o in of if o.stage == scenes - 1)
-    return bool(of) and all(last[name] == scenes for name in {o.strategy for o in of})
+    lines = [r for r in stored if r.seed == seed and r.strategy.split(":")[0] == strategy.name]
+    last = Counter(r.strategy for r in lines if r.stage == scenes - 1)
+    return bool(lines) and all(last[r.strategy] == scenes for r in lines)
 
 
-def _note_strategies(out: Path, strategies: Sequence[Strategy]) -> None:
-    """Adds what the strategies are to those of the folder, or refuses a name that means another."""
-    noted = results.read_strategies(out)
+def _record_strategies(out: Path, strategies: Sequence[Strategy]) -> None:
+    """Add descriptions to strategies.json, and refuse a name with another description."""
+    recorded = results.read_strategies(out)
     for strategy in strategies:
         now = json.loads(json.dumps(strategy.description()))
-        before = noted.setdefault(strategy.name, now)
+        before = recorded.setdefault(strategy.name, now)
         if before != now:
             raise InputError(
                 f"{out}: strategy {strategy.name!r} was {before}, now it is {now}; give it another"
                 " name or another --out"
             )
-    write_json(out / results.STRATEGIES, noted)
+    write_json(out / results.STRATEGIES, recorded)
 
 
 def in_order(scenes: Sequence[Recording], order: Order, seed: int) -> list[Recording]:
-    """The scenes as a run meets them."""
+    """Return the scenes in order of learning."""
     if order == "reversed":
         return list(scenes)[::-1]
     if order == "shuffled":
@@ -164,6 +166,8 @@ def _settings(scenes: Sequence[Recording], options: BenchOptions) -> dict[str, o
     return {
         **asdict(replace(stage, seed=0, encode=replace(stage.encode, seed=0))),
         "networks": [sha256_file(file)[:12] for file in (ENCODER_FILE, DESCRIPTOR_FILE)],
+        "localize": asdict(LocalizeOptions()),
+        "acceptance": {k: v for k, v in vars(acceptance).items() if k.isupper()},
         "order": options.order,
         "short_side": options.short_side,
         "scenes": [[scene.name, len(scene.train), len(scene.test)] for scene in scenes],

@@ -1,8 +1,9 @@
-"""What the outcomes of a benchmark say: one row per method, and whether differences are real."""
+"""Comparison of strategies: runs, measures of each run, and tables with one row per strategy."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,280 +22,327 @@ from evercal.evaluation.metrics import (
 )
 from evercal.evaluation.tables import Style, table
 
-BOUNDS = (LOOSE, COARSE, MIDDLE, FINE)
-"""Metres and radians under which accuracy is asked."""
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 TableRows = list[list[str]]
-"""A table's cells, its header first."""
+"""Cells of a table, header first."""
+Measures = Mapping[str, Callable[["Run"], float]]
+"""Numbers of a run, by the title of their column."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One strategy with one seed, its whole sequence done."""
+    """A complete run: one strategy with one seed over all scenes."""
 
     strategy: str
-    """Which strategy."""
+    """Name of the strategy."""
     seed: int
-    """Which seed."""
+    """Seed of the run."""
     scenes: tuple[str, ...]
-    """In order of learning."""
+    """Names in order of learning."""
     results: dict[tuple[int, str], SceneResult | PublishedScene]
-    """By stage and scene, the last stage frame by frame; joint training has the last alone."""
+    """By stage and scene. Joint training has the last stage only."""
     description: Mapping[str, object] = field(default_factory=dict)
-    """What the strategy is (`Strategy.description`); empty in older results."""
+    """`Strategy.description`; empty in older results."""
 
     @property
     def last(self) -> list[SceneResult]:
-        """What is known of every scene at the end, in order of learning."""
+        """Results of all scenes after the last stage, in order of learning."""
         return [self.end(scene) for scene in self.scenes]
 
     def end(self, scene: str) -> SceneResult:
-        """What is known of one scene at the end."""
-        found = self.results[len(self.scenes) - 1, scene]
-        assert isinstance(found, SceneResult)
-        return found
+        """Return the results of a scene after the last stage."""
+        result = self.results[len(self.scenes) - 1, scene]
+        assert isinstance(result, SceneResult)
+        return result
 
     @property
     def memory_mb(self) -> float:
-        """Megabytes that stay of the scenes at the end; NaN where all frames are needed again."""
+        """Megabytes remembered at the end; NaN if the strategy needs all frames again."""
         if self.description.get("jointly"):
             return math.nan
         return self.last[0].memory_bytes / 1e6
 
-    def matrix(self, thresholds: tuple[float, float] = COARSE) -> np.ndarray:
-        """(N, N) accuracies in per cent: row i after stage i, column j the scene of stage j.
+    @property
+    def seconds(self) -> float:
+        """Learning time of all stages."""
+        stages = {stage: result.seconds for (stage, _), result in self.results.items()}
+        return float(sum(stages.values()))
 
-        NaN where a scene was not yet learned, and before the last stage of joint training.
+    def matrix(self, thresholds: tuple[float, float] = COARSE) -> np.ndarray:
+        """Return accuracies in per cent, shape (N, N).
+
+        Row i holds the accuracies after stage i, column j those of the scene learned in stage j.
+        Entries that were not measured are NaN.
         """
-        count = len(self.scenes)
-        found = np.full((count, count), math.nan)
+        accuracies = np.full((len(self.scenes), len(self.scenes)), math.nan)
         for (stage, scene), result in self.results.items():
-            column = self.scenes.index(scene)
-            found[stage, column] = 100 * result.accuracy(thresholds)
-        return found
+            accuracies[stage, self.scenes.index(scene)] = 100 * result.accuracy(thresholds)
+        return accuracies
 
     def scores(self, thresholds: tuple[float, float] = COARSE) -> ContinualScores:
-        """Final accuracy and forgetting; the latter NaN for joint training."""
+        """Return final accuracy and forgetting; forgetting is NaN for joint training."""
         matrix = self.matrix(thresholds)
         if not np.isfinite(matrix[np.tril_indices(len(matrix))]).all():
             final, newest = float(matrix[-1].mean()), float(matrix[-1, -1])
             return ContinualScores(final, math.nan, math.nan, math.nan, newest, math.nan)
         return continual_scores(matrix)
 
+    def errors_m(self) -> np.ndarray:
+        """Return the translation errors of all test frames at the end, in metres."""
+        return np.concatenate([result.translation_m for result in self.last])
+
 
 def runs_of(
     results: Sequence[SceneResult | PublishedScene],
     strategies: Mapping[str, Mapping[str, object]] | None = None,
 ) -> list[Run]:
-    """The runs whose last stage is done, in the order of their first lines.
+    """Collect the runs whose last stage is complete, in the order of their first lines.
 
     Args:
-        results: of a folder.
-        strategies: what each strategy is, by name.
+        results: All results of a folder.
+        strategies: Description of each strategy, by name.
 
     Raises:
-        InputError: no run is done.
+        InputError: No run is complete.
     """
     grouped: dict[tuple[str, int], dict[tuple[int, str], SceneResult | PublishedScene]] = {}
     for result in results:
         run = grouped.setdefault((result.strategy, result.seed), {})
         run[result.stage, result.scene] = result
     count = max((result.stage for result in results), default=-1) + 1
-    found = []
-    for (strategy, seed), of in grouped.items():
-        order = tuple(scene for stage, scene in of if stage == count - 1)
+    runs = []
+    for (name, seed), stages in grouped.items():
+        order = tuple(scene for stage, scene in stages if stage == count - 1)
         if len(order) == count:
-            found.append(Run(strategy, seed, order, of, _described(strategy, strategies or {})))
-    if not found:
-        raise InputError("no run is done yet; go on with 'evercal bench'")
-    return found
+            runs.append(Run(name, seed, order, stages, _described(name, strategies or {})))
+    if not runs:
+        raise InputError("no run is complete; continue with 'evercal bench'")
+    return runs
 
 
 def _described(name: str, strategies: Mapping[str, Mapping[str, object]]) -> Mapping[str, object]:
-    """What a row is; one that judges the network of a run alone is that without its map."""
-    of, _, judged = name.partition(":")
-    found = strategies.get(of, {})
-    return {**found, "map": False} if found and f":{judged}" == NETWORK else found
-
-
-def as_text(rows: TableRows, style: Style = "terminal") -> str:
-    """A table as text."""
-    return table(rows[0], rows[1:], style)
-
-
-def method_rows(runs: Sequence[Run]) -> TableRows:
-    """One row per strategy: means over seeds, and the spread of the first column."""
-    rows = [["strategy", "runs", *(name for name, _ in _COLUMNS)]]
-    for name, of in by_strategy(runs).items():
-        first = [_COLUMNS[0][1](run) for run in of]
-        spread = f" ± {np.std(first, ddof=1):.1f}" if len(of) > 1 else ""
-        cells = [_mean([value(run) for run in of]) for _, value in _COLUMNS]
-        rows.append([name, str(len(of)), cells[0] + spread, *cells[1:]])
-    return rows
-
-
-def threshold_rows(runs: Sequence[Run]) -> TableRows:
-    """One row per strategy: `recall_area` at the end and accuracy under several bounds."""
-    bounds = [f"{100 * m:.0f} cm {np.rad2deg(r):.0f} deg" for m, r in BOUNDS]
-    rows = [["strategy", "area to 20 cm", *bounds]]
-    for name, of in by_strategy(runs).items():
-        areas = [recall_area(scene.translation_m) for run in of for scene in run.last]
-        shares = [_mean([run.scores(bound).final_accuracy for run in of]) for bound in BOUNDS]
-        rows.append([name, _mean(areas), *shares])
-    return rows
-
-
-def selector_rows(runs: Sequence[Run]) -> TableRows:
-    """One row per strategy that keeps frames: how they lie among those learned, mean of scenes."""
-    rows = [["strategy", "frames kept", "covering radius", "smallest pair"]]
-    for name, of in by_strategy(runs).items():
-        told = [o for run in of for o in run.results.values() if math.isfinite(o.covering_radius)]
-        if told:
-            cells = [
-                np.mean([getattr(o, key) for o in told])
-                for key in ("covering_radius", "min_spacing")
-            ]
-            frames = f"{np.mean([o.frames_kept for o in told]):.1f}"
-            rows.append([name, frames, *(f"{value:.2f}" for value in cells)])
-    return rows
-
-
-def scene_rows(runs: Sequence[Run]) -> TableRows:
-    """One row per strategy, a column per scene: accuracy when learned and at the end."""
-    names = sorted(runs[0].scenes)
-    rows = [["strategy", *names]]
-    for strategy, of in by_strategy(runs).items():
-        cells = []
-        for name in names:
-            matrices = [(run.matrix(), run.scenes.index(name)) for run in of]
-            learned = _mean([matrix[i, i] for matrix, i in matrices])
-            cells.append(f"{learned} -> {_mean([matrix[-1, i] for matrix, i in matrices])}")
-        rows.append([strategy, *cells])
-    return rows
-
-
-def difference_rows(runs: Sequence[Run], reference: str) -> TableRows:
-    """How much better `reference` ends than each other strategy, on the seeds that both ran.
-
-    Bounds are those of `evaluation.paired_difference` over whole runs of frames and over seeds.
-    """
-    grouped = by_strategy(runs)
-    rows = [["difference in points", "mean", "95 % low", "95 % high"]]
-    for other, of in grouped.items():
-        if other == reference or reference not in grouped:
-            continue
-        d = difference(grouped[reference], of)
-        if d is not None:
-            cells = [f"{100 * value:+.1f}" for value in (d.mean, d.low, d.high)]
-            rows.append([f"{reference} - {other}", *cells])
-    return rows
-
-
-def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
-    """Final accuracy of one strategy less that of another, and 95 % bounds, both within -1 to 1.
-
-    None without a common seed, or where a scene has one test frame, of whose choice nobody can say
-    how much it matters.
-    """
-    pairs = [(a, b) for a in ours for b in theirs if a.seed == b.seed]
-    if not pairs:
-        return None
-    names = sorted(pairs[0][0].scenes)
-
-    def flags(which: int, name: str) -> np.ndarray:
-        ends = [pair[which].end(name) for pair in pairs]
-        return np.array([end.correct() for end in ends], float)
-
-    pieces = [frame_pieces(pairs[0][0].end(name).frames) for name in names]
-    if not all(of[-1] > 0 for of in pieces):
-        return None
-    first, second = ([flags(which, name) for name in names] for which in (0, 1))
-    found = paired_difference(first, second, pieces)
-    return Interval(found.mean, max(found.low, -1.0), min(found.high, 1.0))
+    """Look up a description; `NAME:network` is the strategy NAME without its map."""
+    strategy, _, part = name.partition(":")
+    description = strategies.get(strategy, {})
+    return {**description, "map": False} if description and f":{part}" == NETWORK else description
 
 
 def by_strategy(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Runs grouped, strategies in the order in which they first appear."""
+    """Group runs by strategy, in the order in which strategies first appear."""
     grouped: dict[str, list[Run]] = {}
     for run in runs:
         grouped.setdefault(run.strategy, []).append(run)
     return grouped
 
 
-def summary(runs: Sequence[Run]) -> dict[str, object]:
-    """Everything above for JSON; None where there is no number."""
-    found = {}
-    for name, of in by_strategy(runs).items():
-        found[name] = [
+def _median_cm_in_right_scene(run: Run) -> float:
+    errors = run.errors_m()
+    errors = errors[np.isfinite(errors)]
+    return 100 * float(np.median(errors)) if len(errors) else math.nan
+
+
+def _accuracy_in_right_scene(run: Run) -> float:
+    correct = np.concatenate([result.correct() for result in run.last])
+    in_right_scene = np.isfinite(run.errors_m())
+    return 100 * float(correct[in_right_scene].mean()) if in_right_scene.any() else math.nan
+
+
+METHOD_MEASURES: Measures = {
+    "final %": lambda run: run.scores().final_accuracy,
+    "1 cm 1 deg %": lambda run: run.scores(FINE).final_accuracy,
+    "ACC": lambda run: run.scores().accuracy_along,
+    "last scene %": lambda run: run.scores().last_scene_accuracy,
+    "TFR": lambda run: run.scores().total_forgetting,
+    "forgetting": lambda run: run.scores().forgetting,
+    "BWT": lambda run: run.scores().backward_transfer,
+    "wrong scene %": lambda run: 100 * float(np.mean([np.mean(r.wrong_scene) for r in run.last])),
+    "refused %": lambda run: 100 * float(np.mean([np.mean(r.refused) for r in run.last])),
+    "in 95 % ellipsoid": lambda run: share_inside(
+        np.concatenate([result.squared_mahalanobis for result in run.last])
+    ),
+    "median cm, right scene": _median_cm_in_right_scene,
+    "%, right scene": _accuracy_in_right_scene,
+    "memory MB": lambda run: run.memory_mb,
+    "heads MB": lambda run: run.last[0].head_bytes / 1e6,
+    "s": lambda run: run.seconds,
+}
+LEGEND = """\
+Accuracy: share of all test frames strictly below 5 cm and 5 deg, mean over scenes.
+final: accuracy after the last stage. last scene: accuracy on the scene learned last.
+ACC: mean accuracy over all stages and the scenes learned by then.
+TFR (total forgetting rate): mean drop from the best accuracy of a scene to its final one.
+forgetting: the same drop, with the best taken before the last stage; negative is a gain.
+BWT (backward transfer): mean change from the accuracy just after learning a scene to the end.
+right scene: among frames with a pose in their own scene. s: seconds of learning, all stages.
+NAME:network is the network of a run without its map; NAME:unaligned is the pose from matched
+keyframes, before landmarks are aligned."""
+"""Definitions of the columns of `METHOD_MEASURES`."""
+
+
+def _threshold_measure(thresholds: tuple[float, float]) -> Callable[[Run], float]:
+    return lambda run: run.scores(thresholds).final_accuracy
+
+
+THRESHOLD_MEASURES: Measures = {
+    "area to 20 cm": lambda run: float(np.mean([recall_area(r.translation_m) for r in run.last])),
+    **{
+        f"{100 * metres:.0f} cm {np.rad2deg(radians):.0f} deg": _threshold_measure(
+            (metres, radians)
+        )
+        for metres, radians in (LOOSE, COARSE, MIDDLE, FINE)
+    },
+}
+
+
+def measured(runs: Sequence[Run], measures: Measures) -> "DataFrame":
+    """Tabulate measures: one row per run, indexed by strategy."""
+    import pandas
+
+    rows = [[measure(run) for measure in measures.values()] for run in runs]
+    index = pandas.Index([run.strategy for run in runs], name="strategy")
+    return pandas.DataFrame(rows, index, columns=list(measures))
+
+
+def mean_by_strategy(frame: "DataFrame") -> "DataFrame":
+    """Average over runs; a mean is NaN if one of its values is."""
+    grouped = frame.groupby(level="strategy", sort=False)
+    return grouped.agg(lambda column: float(column.to_numpy().mean()))
+
+
+def as_rows(frame: "DataFrame", digits: int = 1) -> TableRows:
+    """Format a table of numbers, the index as its first column; NaN becomes `-`."""
+    header = [str(frame.index.name), *map(str, frame.columns)]
+    cells = [[number(value, digits) for value in row] for row in frame.to_numpy(float).tolist()]
+    return [header, *([str(name), *row] for name, row in zip(frame.index, cells, strict=True))]
+
+
+def number(value: float, digits: int = 1) -> str:
+    """Format a number; NaN becomes `-`."""
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def as_text(rows: TableRows, style: Style = "terminal") -> str:
+    """Format a table as text."""
+    return table(rows[0], rows[1:], style)
+
+
+def method_rows(runs: Sequence[Run]) -> TableRows:
+    """Tabulate `METHOD_MEASURES`: means over runs, with the spread of the final accuracy."""
+    frame = measured(runs, METHOD_MEASURES)
+    header, *rows = as_rows(mean_by_strategy(frame))
+    final = frame["final %"].groupby(level="strategy", sort=False)
+    for row, count, spread in zip(rows, final.size(), final.std(), strict=True):
+        row.insert(1, str(count))
+        row[2] += f" ± {spread:.1f}" if count > 1 else ""
+    return [[header[0], "runs", *header[1:]], *rows]
+
+
+def threshold_rows(runs: Sequence[Run]) -> TableRows:
+    """Tabulate `recall_area` and final accuracy under several thresholds."""
+    return as_rows(mean_by_strategy(measured(runs, THRESHOLD_MEASURES)))
+
+
+def selector_rows(runs: Sequence[Run]) -> TableRows:
+    """Tabulate how the remembered frames cover those learned, means over scenes."""
+    import pandas
+
+    columns = {
+        "frames_kept": "frames kept",
+        "covering_radius": "covering radius",
+        "min_spacing": "smallest pair",
+    }
+    results = [
+        {"strategy": run.strategy, **{key: getattr(result, key) for key in columns}}
+        for run in runs
+        for result in run.results.values()
+        if math.isfinite(result.covering_radius)
+    ]
+    if not results:
+        return [["strategy", *columns.values()]]
+    frame = pandas.DataFrame(results).set_index("strategy").rename(columns=columns)
+    rows = as_rows(mean_by_strategy(frame), 2)
+    for row in rows[1:]:
+        row[1] = f"{float(row[1]):.1f}"
+    return rows
+
+
+def scene_rows(runs: Sequence[Run]) -> TableRows:
+    """Tabulate the accuracy of each scene: just after learning it -> at the end."""
+    import pandas
+
+    columns = ["strategy", "scene", "learned", "end"]
+    accuracies = [
+        (run.strategy, scene, run.matrix()[i, i], run.matrix()[-1, i])
+        for run in runs
+        for i, scene in enumerate(run.scenes)
+    ]
+    frame = pandas.DataFrame(accuracies, columns=columns)
+    means = frame.pivot_table(index=columns[:2], aggfunc="mean", sort=False)
+    cells = {
+        key: f"{number(learned)} -> {number(end)}"
+        for key, learned, end in zip(means.index, means["learned"], means["end"], strict=True)
+    }
+    names = sorted(runs[0].scenes)
+    rows = [
+        [strategy, *(cells[strategy, name] for name in names)] for strategy in by_strategy(runs)
+    ]
+    return [["strategy", *names], *rows]
+
+
+def difference_rows(runs: Sequence[Run], reference: str) -> TableRows:
+    """Tabulate how much better `reference` ends than each other strategy, on common seeds."""
+    grouped = by_strategy(runs)
+    rows = [["difference in points", "mean", "95 % low", "95 % high"]]
+    for other in grouped:
+        interval = difference(grouped.get(reference, []), grouped[other])
+        if other != reference and interval is not None:
+            bounds = (interval.mean, interval.low, interval.high)
+            rows.append([f"{reference} - {other}", *(f"{100 * value:+.1f}" for value in bounds)])
+    return rows
+
+
+def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
+    """Estimate the difference of final accuracies of two strategies, as shares in [-1, 1].
+
+    Returns:
+        Mean and 95 % interval over runs of frames and seeds (`paired_difference`). None without a
+        common seed, or if a scene has a single test frame.
+    """
+    pairs = [(a, b) for a in ours for b in theirs if a.seed == b.seed]
+    if not pairs:
+        return None
+    names = sorted(pairs[0][0].scenes)
+    pieces = [frame_pieces(pairs[0][0].end(name).frames) for name in names]
+    if any(labels[-1] == 0 for labels in pieces):
+        return None
+    first, second = (
+        [np.array([pair[which].end(name).correct() for pair in pairs], float) for name in names]
+        for which in (0, 1)
+    )
+    interval = paired_difference(first, second, pieces)
+    return Interval(interval.mean, max(interval.low, -1.0), min(interval.high, 1.0))
+
+
+def summary(runs: Sequence[Run]) -> dict[str, list[dict[str, object]]]:
+    """Summarize every run for JSON, by strategy; NaN becomes None."""
+    return {
+        name: [
             {
                 "seed": run.seed,
                 "scenes": list(run.scenes),
                 "accuracy_5cm_5deg": _plain(run.matrix()),
                 "accuracy_1cm_1deg": _plain(run.matrix(FINE)),
-                **{k: _plain(v) for k, v in asdict(run.scores()).items()},
+                **{key: _plain(value) for key, value in asdict(run.scores()).items()},
                 "memory_bytes": run.last[0].memory_bytes,
                 "head_bytes": run.last[0].head_bytes,
-                "seconds": _seconds(run),
+                "seconds": run.seconds,
             }
-            for run in of
+            for run in group
         ]
-    return found
-
-
-def _fine_median_cm(run: Run) -> float:
-    """Median error among frames that were given the right scene: what is lost within a scene."""
-    errors = np.concatenate([o.translation_m for o in run.last])
-    right = errors[np.isfinite(errors)]
-    return 100 * float(np.median(right)) if len(right) else math.nan
-
-
-def _fine_accuracy(run: Run) -> float:
-    """Accuracy among frames that were given the right scene."""
-    right = np.concatenate([np.isfinite(o.translation_m) for o in run.last])
-    correct = np.concatenate([o.correct() for o in run.last])
-    return 100 * float(correct[right].mean()) if right.any() else math.nan
-
-
-def _wrong_scene(run: Run) -> float:
-    return 100 * float(np.mean([np.mean(o.wrong_scene) for o in run.last]))
-
-
-def _refused(run: Run) -> float:
-    return 100 * float(np.mean([np.mean(o.refused) for o in run.last]))
-
-
-def _inside(run: Run) -> float:
-    """Per cent of all poses in the right scene that lie in the ellipsoid stated for them."""
-    return share_inside(np.concatenate([o.squared_mahalanobis for o in run.last]))
-
-
-def _seconds(run: Run) -> float:
-    stages = {stage: result.seconds for (stage, _), result in run.results.items()}
-    return float(sum(stages.values()))
-
-
-_COLUMNS: tuple[tuple[str, Callable[[Run], float]], ...] = (
-    ("final %", lambda run: run.scores().final_accuracy),
-    ("1 cm 1 deg %", lambda run: run.scores(FINE).final_accuracy),
-    ("ACC", lambda run: run.scores().accuracy_along),
-    ("last scene %", lambda run: run.scores().last_scene_accuracy),
-    ("TFR", lambda run: run.scores().total_forgetting),
-    ("forgetting", lambda run: run.scores().forgetting),
-    ("BWT", lambda run: run.scores().backward_transfer),
-    ("wrong scene %", _wrong_scene),
-    ("refused %", _refused),
-    ("in 95 % ellipsoid", _inside),
-    ("median cm, right scene", _fine_median_cm),
-    ("%, right scene", _fine_accuracy),
-    ("memory MB", lambda run: run.memory_mb),
-    ("heads MB", lambda run: run.last[0].head_bytes / 1e6),
-    ("s", _seconds),
-)
-
-
-def _mean(values: Sequence[float]) -> str:
-    value = float(np.mean(values))
-    return "-" if math.isnan(value) else f"{value:.1f}"
+        for name, group in by_strategy(runs).items()
+    }
 
 
 def _plain(value: object) -> object:

@@ -1,9 +1,7 @@
-"""The layout of the paper's tables: scenes down, methods across, error and accuracy each.
+r"""LaTeX tables in the layout of the paper: scenes down, strategies across (needs booktabs).
 
-Tables 1 to 3 are of this kind; Table 4, the ablation, follows where its strategies were run.
-
-Published numbers stand beside ours where the data are the same; they are those of Li et al.,
-"Continual Hand-Eye Calibration for Open-world Robotic Manipulation", arXiv 2604.15814.
+Published numbers are those of Li et al., "Continual Hand-Eye Calibration for Open-world Robotic
+Manipulation", arXiv 2604.15814.
 """
 
 import math
@@ -34,80 +32,73 @@ PUBLISHED: Mapping[str, Mapping[str, tuple[float, float]]] = {
         "sars_spdd": (91.8, 8.1),
     },
 }
-"""By suite and strategy: final accuracy and TFR, per cent."""
+"""Published final accuracy and TFR in per cent, by suite and strategy."""
 
 
 def paper_tables(runs: Sequence[Run], suite: str, ablation: TableRows) -> str:
-    """`paper_table` and, where its strategies were run, `ablation_table`."""
-    found = [paper_table(runs, suite), ablation_table(ablation)]
-    return "\n\n".join(table for table in found if table)
+    """Format `paper_table` and, if its strategies were run, `ablation_table`."""
+    tables = [paper_table(runs, suite), ablation_table(ablation)]
+    return "\n\n".join(table for table in tables if table)
 
 
 def ablation_table(ablation: TableRows) -> str:
-    """A LaTeX table (booktabs) of what `ablation_rows` found; empty if that is a header alone."""
+    """Format the rows of `ablation_rows`; empty without rows."""
     header, *rows = ablation
-    if not rows:
-        return ""
-    lines = [rf"\begin{{tabular}}{{ll{'r' * (len(header) - 2)}}}", r"\toprule"]
-    lines += [rf"{' & '.join(map(_escaped, row))} \\" for row in (header, *rows)]
-    lines.insert(3, r"\midrule")
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
+    return _tabular(f"ll{'r' * (len(header) - 2)}", [header], [rows]) if rows else ""
 
 
 def paper_table(runs: Sequence[Run], suite: str) -> str:
-    """A LaTeX table (booktabs) of final errors and accuracies, means over runs.
+    """Format final errors and accuracies, means over runs.
 
     Args:
-        runs: whose last stage is done.
-        suite: its name; simulated suites are judged at 1 cm and 1 deg as in the paper, others at 5.
+        runs: Complete runs.
+        suite: Name of the suite. Accuracy is at 1 cm and 1 deg for simulated suites, as in the
+            paper, and at 5 cm and 5 deg for others.
     """
     grouped = by_strategy(runs)
     thresholds = FINE if suite.startswith("sim") else COARSE
-    names = list(runs[0].scenes)
-    heads = " & ".join(rf"\multicolumn{{3}}{{c}}{{{_escaped(name)}}}" for name in grouped)
-    units = " & ".join([r"$t$, cm & $r$, deg & Acc"] * len(grouped))
-    lines = [
-        rf"\begin{{tabular}}{{l{'rrr' * len(grouped)}}}",
-        r"\toprule",
-        rf"Scene & {heads} \\",
-        rf" & {units} \\",
-        r"\midrule",
+    scores = [[run.scores(thresholds) for run in group] for group in grouped.values()]
+    means = {
+        "Mean": [_mean([score.final_accuracy for score in group]) for group in scores],
+        "TFR": [_mean([score.total_forgetting for score in group]) for group in scores],
+    }
+    if suite in PUBLISHED:
+        published = [PUBLISHED[suite].get(name, (math.nan, math.nan)) for name in grouped]
+        means["Mean, published"] = [_number(accuracy) for accuracy, _ in published]
+        means["TFR, published"] = [_number(forgetting) for _, forgetting in published]
+    names = [rf"\multicolumn{{3}}{{c}}{{{_escaped(name)}}}" for name in grouped]
+    header = [["Scene", *names], ["", *["$t$, cm", "$r$, deg", "Acc"] * len(grouped)]]
+    body = [
+        [scene, *(cell for group in grouped.values() for cell in _cells(group, scene, thresholds))]
+        for scene in runs[0].scenes
     ]
-    for name in names:
-        cells = [cell for of in grouped.values() for cell in _cells(of, name, thresholds)]
-        lines.append(rf"{_escaped(name)} & {' & '.join(cells)} \\")
-    lines.append(r"\midrule")
-    finals = {name: [run.scores(thresholds) for run in of] for name, of in grouped.items()}
-    rows = [
-        ("Mean", {name: _mean([s.final_accuracy for s in of]) for name, of in finals.items()}),
-        ("TFR", {name: _mean([s.total_forgetting for s in of]) for name, of in finals.items()}),
-    ]
-    told = PUBLISHED.get(suite, {})
-    if told:
-        rows += [
-            ("Mean, published", {name: _number(told.get(name, _NONE)[0]) for name in grouped}),
-            ("TFR, published", {name: _number(told.get(name, _NONE)[1]) for name in grouped}),
-        ]
-    for title, values in rows:
-        spread = " & ".join(f" &  & {values[name]}" for name in grouped)
-        lines.append(rf"{title} & {spread} \\")
+    totals = [[title, *(c for v in values for c in ("", "", v))] for title, values in means.items()]
+    return _tabular(f"l{'rrr' * len(grouped)}", header, [body, totals])
+
+
+def _tabular(
+    columns: str, header: Sequence[Sequence[str]], blocks: Sequence[Sequence[Sequence[str]]]
+) -> str:
+    lines = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
+    lines += [rf"{' & '.join(row)} \\".replace("%", r"\%") for row in header]
+    for block in blocks:
+        lines += [r"\midrule", *(rf"{' & '.join(map(_escaped, row))} \\" for row in block)]
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
 
 
-_NONE = (math.nan, math.nan)
-
-
 def _cells(runs: Sequence[Run], scene: str, thresholds: tuple[float, float]) -> list[str]:
-    """Median error in cm and deg, and accuracy, of a scene at the end."""
+    """Format median error in cm and deg, and accuracy in per cent, of a scene at the end."""
     ends = [run.end(scene) for run in runs]
-    centimetres = [100 * _median(end.translation_m) for end in ends]
-    degrees = [math.degrees(_median(end.rotation_rad)) for end in ends]
-    accuracy = [100 * float(end.correct(thresholds).mean()) for end in ends]
-    return [_mean(centimetres), _mean(degrees), _mean(accuracy)]
+    return [
+        _mean([100 * _median(end.translation_m) for end in ends]),
+        _mean([math.degrees(_median(end.rotation_rad)) for end in ends]),
+        _mean([100 * float(end.correct(thresholds).mean()) for end in ends]),
+    ]
 
 
 def _median(errors: Sequence[float]) -> float:
-    return sorted(errors)[len(errors) // 2]  # a mean of two may be of a number and infinity
+    # The upper median: a mean of the two middle errors may include infinity.
+    return sorted(errors)[len(errors) // 2]
 
 
 def _mean(values: Sequence[float]) -> str:
@@ -120,5 +111,5 @@ def _number(value: float) -> str:
     return r"$\infty$" if math.isinf(value) else f"{value:.1f}"
 
 
-def _escaped(name: str) -> str:
-    return name.replace("_", r"\_").replace("%", r"\%")
+def _escaped(text: str) -> str:
+    return text.replace("_", r"\_").replace("%", r"\%")

@@ -1,11 +1,11 @@
-"""The runs of a benchmark on many machines, through Ray (extra `ray`).
+"""Runs of a benchmark on many machines, through Ray (extra `ray`).
 
-    OUT/runs/ray/shared               tells a worker whether it sees this folder
-    OUT/runs/ray/STRATEGY-SEED/       a run under way where the disk is shared, gone when it is done
+    OUT/runs/ray/shared               lets a worker check whether it shares this disk
+    OUT/runs/ray/STRATEGY-SEED/       run in progress on a shared disk, removed when complete
 
-A run that fails is tried again and goes on inside its sequence, from its last checkpoint: in its
-folder, or, where workers do not see the disk of this machine, from what the failed task sent back.
-A worker that dies without a word on a disk of its own starts its run anew.
+A failed run is retried from its last checkpoint. The checkpoint lies in the folder of the run or,
+if workers do not share the disk, in an archive that the failed task returns. If a worker with its
+own disk dies, its run starts again.
 """
 
 import io
@@ -30,27 +30,27 @@ from evercal.recordings import Recording
 from evercal.storage import write_bytes
 
 TRIES = 4
-"""How often a run is begun or gone on with before it is given up."""
+"""Attempts before a run is given up."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a task needs besides the scenes."""
+    """Input of a task, besides the scenes."""
 
     strategy: str
     """Name of the strategy."""
     pickled: bytes
-    """The strategy, to be read when the plugin is there: its class may be the plugin's."""
+    """The strategy. It is unpickled after the plugin is loaded, which may define its class."""
     options: BenchOptions
-    """With one seed, without strategies."""
+    """Options with one seed and no strategies."""
     plugin: Path | None
-    """File of strategies."""
+    """Python file of further strategies."""
     folder: Path
-    """Of this run, on the disk of the machine that started it."""
+    """Folder of the run on the disk of the machine that started it."""
     token: str
-    """What the file `shared` beside the folder holds: who reads it there sees the same disk."""
+    """Content of the file `shared` beside the folder; a worker that reads it shares the disk."""
     state: bytes | None = None
-    """An archive of what an earlier try had done, where the disk is not shared."""
+    """Archive of an earlier attempt, if the disk is not shared."""
 
     @property
     def name(self) -> str:
@@ -60,18 +60,18 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a task sends back."""
+    """Output of a task."""
 
     results: tuple[SceneResult, ...] = ()
-    """All of the run; none when it failed."""
+    """All results of the run; empty if it failed."""
     views: dict[str, bytes] | None = None
-    """Files of its views."""
+    """Contents of its view files, by name."""
     error: str = ""
-    """Why it failed, in one line."""
-    hopeless: bool = False
-    """Whether it would fail again in the same way."""
+    """Cause of the failure, in one line."""
+    permanent: bool = False
+    """Whether a retry would fail in the same way."""
     state: bytes | None = None
-    """An archive of what is done, where the disk is not shared."""
+    """Archive of the run in progress, if the disk is not shared."""
 
 
 def run_on_ray(
@@ -82,100 +82,99 @@ def run_on_ray(
     plugin: Path | None = None,
     on_failure: Callable[[str], None] | None = None,
 ) -> Iterator[Step]:
-    """Runs what is missing, one task per strategy and seed; see `run_bench`.
+    """Run all runs that are not complete, one task per strategy and seed; see `run_bench`.
 
-    Every task learns its first scene itself, on the CPU or on one GPU. Recordings, plugin and,
-    where they are to be shared, the features must lie under the same paths on all machines.
+    Every task learns its first scene itself, on the CPU or on one GPU. Recordings, plugin and
+    shared features must lie under the same paths on all machines.
 
     Args:
-        scenes: two or more.
-        options: what is compared; the device is that of the workers: auto, cpu or cuda.
-        out: folder of results on this machine.
-        address: of a running Ray cluster, or `local` to start one on this machine.
-        plugin: file of strategies that the workers must know.
-        on_failure: told of every failure, in a line; it goes to stderr when None.
+        scenes: Two or more scenes.
+        options: Options of the benchmark; `device` is that of the workers: auto, cpu or cuda.
+        out: Folder of results on this machine.
+        address: Address of a running Ray cluster, or `local` to start one on this machine.
+        plugin: Python file of further strategies, loaded by the workers.
+        on_failure: Called with a line about every failure. Defaults to printing on stderr.
 
     Raises:
-        InputError: the extra is missing, no cluster at the address, as `run_bench`, or, when all
-            others are done, a run that failed for good.
+        InputError: The extra is missing, there is no cluster at the address, as `run_bench`, or,
+            after all other runs, a run failed permanently.
 
     Yields:
         A `Step` for every stage, run by run as they finish.
     """
     ray = _ray()
     missing = begin_bench(scenes, options, out)
-    tell = on_failure or (lambda line: print(line, file=sys.stderr, flush=True))  # noqa: T201
+    report = on_failure or (lambda line: print(line, file=sys.stderr, flush=True))  # noqa: T201
     _join(ray, address)
     try:
         jobs = _jobs(missing, options, plugin, out)
         total = len(options.seeds) * len(options.strategies) * len(scenes)
         done = total - len(missing) * len(scenes)
-        given_up: list[str] = []
+        failed: list[str] = []
         gpus = _gpus(ray, options.device)
-        for job, outcome in _finished(ray, list(scenes), jobs, gpus, tell):
+        for job, outcome in _finished(ray, list(scenes), jobs, gpus, report):
             if outcome.error:
-                given_up.append(f"{job.name} ({outcome.error})")
+                failed.append(f"{job.name} ({outcome.error})")
                 continue
-            _keep(out, outcome)
+            _store(out, outcome)
             shutil.rmtree(job.folder, ignore_errors=True)
             (seed,) = job.options.seeds
             for stage in range(len(scenes)):
                 done += 1
-                these = tuple(o for o in outcome.results if o.stage == stage)
+                these = tuple(r for r in outcome.results if r.stage == stage)
                 yield Step(job.strategy, seed, these, done, total)
     finally:
         ray.shutdown()
-    if given_up:
+    if failed:
         raise InputError(
-            f"{len(given_up)} of {len(missing)} runs failed: {'; '.join(given_up)}; the others are"
-            f" in {out}, the same command tries these again"
+            f"{len(failed)} of {len(missing)} runs failed: {'; '.join(failed)}; the others are in"
+            f" {out}; the same command retries the failed ones"
         )
 
 
 def _join(ray, address: str) -> None:
-    where = None if address == "local" else address
+    cluster = None if address == "local" else address
     try:
-        ray.init(address=where, ignore_reinit_error=True, log_to_driver=False)
+        ray.init(address=cluster, ignore_reinit_error=True, log_to_driver=False)
     except (ConnectionError, ValueError) as error:
-        raise InputError(f"--ray {address}: no cluster there ({error})") from error
+        raise InputError(f"--ray {address}: no cluster at this address ({error})") from error
 
 
 def _gpus(ray, device: str) -> int:
-    """How many GPUs a task asks for: Ray hides all of them from one that asks for none."""
-    there = ray.cluster_resources().get("GPU", 0) >= 1
-    if device == "cuda" and not there:
-        raise InputError("device 'cuda': the cluster has no GPU; take auto or cpu")
-    return int(there and device != "cpu")
+    """Return the GPUs a task requests. Ray hides all GPUs from a task that requests none."""
+    available = ray.cluster_resources().get("GPU", 0) >= 1
+    if device == "cuda" and not available:
+        raise InputError("device 'cuda': the cluster has no GPU; use auto or cpu")
+    return int(available and device != "cpu")
 
 
 def _jobs(
     missing: Sequence[tuple[int, Strategy]], options: BenchOptions, plugin: Path | None, out: Path
 ) -> list[Job]:
-    around = out.absolute() / "runs" / "ray"
-    around.mkdir(parents=True, exist_ok=True)
-    token = uuid.uuid4().hex
-    write_bytes(around / "shared", token.encode())
+    folder, token = out.absolute() / "runs" / "ray", uuid.uuid4().hex
+    folder.mkdir(parents=True, exist_ok=True)
+    write_bytes(folder / "shared", token.encode())
     return [
         Job(
-            strategy.name,
-            pickle.dumps(strategy),
-            replace(options, strategies=(), seeds=(seed,)),
-            plugin,
-            around / f"{strategy.name}-{seed}",
-            token,
+            strategy=strategy.name,
+            pickled=pickle.dumps(strategy),
+            options=replace(options, strategies=(), seeds=(seed,)),
+            plugin=plugin,
+            folder=folder / f"{strategy.name}-{seed}",
+            token=token,
         )
         for seed, strategy in missing
     ]
 
 
 def _finished(
-    ray, scenes: list[Recording], jobs: Sequence[Job], gpus: int, tell: Callable[[str], None]
+    ray, scenes: list[Recording], jobs: Sequence[Job], gpus: int, report: Callable[[str], None]
 ) -> Iterator[tuple[Job, Outcome]]:
-    """Jobs as they end, well or for good; what fails otherwise is tried again."""
-    # Ray's own repetition would begin a run anew, unseen.
-    how = {"max_retries": 0, "num_gpus": gpus}
-    task, given = ray.remote(**how)(_one_run), ray.put(scenes)
-    tasks = {task.remote(given, job): (job, 1) for job in jobs}
+    """Yield jobs as they succeed or fail permanently; other failures are retried."""
+    # Ray's own retries would not resume from a checkpoint.
+    task = ray.remote(max_retries=0, num_gpus=gpus)(_one_run)
+    shared_scenes = ray.put(scenes)
+    tasks = {task.remote(shared_scenes, job): (job, 1) for job in jobs}
     while tasks:
         (ready,), _ = ray.wait(list(tasks), num_returns=1)
         job, tries = tasks.pop(ready)
@@ -184,20 +183,21 @@ def _finished(
         except Exception as error:  # the worker died, or was killed for its memory
             outcome = Outcome(error=_line(error))
         if outcome.error:
-            last = outcome.hopeless or tries == TRIES
-            what = "given up" if last else "goes on from its last checkpoint"
-            tell(f"run {job.name}, try {tries} of {TRIES}: {outcome.error}; {what}")
-            if not last:
-                again = replace(job, state=outcome.state or job.state)
-                tasks[task.remote(given, again)] = again, tries + 1
+            final = outcome.permanent or tries == TRIES
+            action = "given up" if final else "resuming from its last checkpoint"
+            report(f"run {job.name}, attempt {tries} of {TRIES}: {outcome.error}; {action}")
+            if not final:
+                retry = replace(job, state=outcome.state or job.state)
+                tasks[task.remote(shared_scenes, retry)] = retry, tries + 1
                 continue
         yield job, outcome
 
 
 def _one_run(scenes: list[Recording], job: Job) -> Outcome:
-    """A task: one strategy, one seed, in a folder that the next try finds again."""
+    """Run one strategy with one seed; this is the Ray task."""
     with tempfile.TemporaryDirectory(prefix="evercal-bench-") as temporary:
-        shared = _reads(job.folder.parent / "shared") == job.token
+        token = job.folder.parent / "shared"
+        shared = token.is_file() and token.read_text() == job.token
         folder = job.folder if shared else Path(temporary)
         folder.mkdir(exist_ok=True)
         try:
@@ -213,19 +213,20 @@ def _one_run(scenes: list[Recording], job: Job) -> Outcome:
             return Outcome(tuple(results.read(folder)), views)
         except Exception as error:
             state = None if shared else _archive(folder)
-            return Outcome(error=_line(error), hopeless=isinstance(error, InputError), state=state)
+            permanent = isinstance(error, InputError)
+            return Outcome(error=_line(error), permanent=permanent, state=state)
 
 
-def _keep(out: Path, outcome: Outcome) -> None:
+def _store(out: Path, outcome: Outcome) -> None:
     results.append(out, outcome.results)
+    (out / VIEWS).mkdir(exist_ok=True)
     for name, data in (outcome.views or {}).items():
-        (out / VIEWS).mkdir(exist_ok=True)
         if not (out / VIEWS / name).exists():
             write_bytes(out / VIEWS / name, data)
 
 
 def _archive(folder: Path) -> bytes:
-    """A run under way, without the encoded views: those can be made again."""
+    """Pack a run in progress, without the encoded views, which can be computed again."""
     data = io.BytesIO()
     with tarfile.open(fileobj=data, mode="w") as archive:
         for path in sorted(folder.iterdir()):
@@ -234,17 +235,10 @@ def _archive(folder: Path) -> bytes:
     return data.getvalue()
 
 
-def _reads(path: Path) -> str | None:
-    try:
-        return path.read_text()
-    except OSError:
-        return None
-
-
 def _line(error: Exception) -> str:
-    """The kind of an error and the last line of what it says: Ray puts the traceback before."""
-    said = str(error).strip().splitlines() or [""]
-    return f"{type(error).__name__}: {said[-1].strip()}"
+    """Return type and last line of an error; Ray puts the traceback before it."""
+    lines = str(error).strip().splitlines() or [""]
+    return f"{type(error).__name__}: {lines[-1].strip()}"
 
 
 def _ray():

@@ -1,15 +1,18 @@
-"""What a benchmark's results say, computed once for terminal, page and LaTeX."""
+"""The contents of a benchmark report: its runs and tables, shared by terminal, page and LaTeX."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
 from evercal.continual.benchmark.ablation import ablation_rows, grid_rows
 from evercal.continual.benchmark.comparison import (
+    LEGEND,
     Run,
     TableRows,
+    as_text,
     by_strategy,
     difference_rows,
     method_rows,
@@ -20,6 +23,7 @@ from evercal.continual.benchmark.comparison import (
 )
 from evercal.continual.benchmark.results import RESULTS, SETTINGS, read, read_strategies
 from evercal.errors import InputError
+from evercal.evaluation.tables import Style
 from evercal.storage import read_settings
 
 PLOTTED = 7
@@ -27,7 +31,7 @@ PLOTTED = 7
 
 @dataclass(frozen=True)
 class Tables:
-    """Rows of each table, its header first; a header alone where there is nothing to say."""
+    """Rows of each table, header first. A table without results is its header alone."""
 
     methods: TableRows
     thresholds: TableRows
@@ -38,83 +42,115 @@ class Tables:
     grid: TableRows
     compare_with: TableRows
 
-    def non_empty(self) -> list[TableRows]:
-        """Those with more than a header."""
-        found: list[TableRows] = [getattr(self, part.name) for part in fields(self)]
-        return [rows for rows in found if len(rows) > 1]
+    def non_empty(self) -> dict[str, TableRows]:
+        """Return the tables with results, by title."""
+        tables = {TITLES[part.name]: getattr(self, part.name) for part in fields(self)}
+        return {title: rows for title, rows in tables.items() if len(rows) > 1}
+
+    def as_text(self, style: Style) -> str:
+        """Format all tables, each below its title, with the definitions of the columns."""
+        title = "## {}" if style == "markdown" else "{}"
+        parts = [
+            f"{title.format(name)}\n\n{as_text(rows, style)}"
+            for name, rows in self.non_empty().items()
+        ]
+        return "\n\n".join([*parts, LEGEND])
+
+
+TITLES = {
+    "methods": "Strategies, means over runs",
+    "thresholds": "Final accuracy in per cent, by threshold",
+    "scenes": "Accuracy of each scene: just after learning it -> at the end",
+    "differences": "Differences of final accuracy; the interval excludes 0 if a difference is real",
+    "selectors": "Remembered frames, in scene sides and radians",
+    "ablation": "Ablation after Table 4 of the paper",
+    "grid": "Final accuracy (TFR), by remembered frames and cost of replay",
+    "compare_with": "The same scenes under other settings",
+}
+"""Titles of the fields of `Tables`."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """A folder of results, and the same suite under other settings beside it."""
+    """Runs of a folder of results, and runs of the same suite under other settings."""
 
     suite: str
-    """Its name."""
+    """Name of the suite."""
     runs: list[Run]
-    """Whose last stage is done, those of the strategy that ends best first."""
+    """Complete runs, best strategy first."""
     reference: str
-    """The strategy that the others are compared with."""
+    """Strategy that the others are compared with."""
     compare_with: list[Run] = field(default_factory=list)
-    """Runs of other folders, called `STRATEGY (FOLDER)`."""
+    """Runs of other folders, named `STRATEGY (FOLDER)`."""
 
     @property
     def plotted(self) -> list[str]:
-        """The at most seven strategies of the figures: the reference, then those with most runs."""
-        names = sorted(
+        """At most seven strategies for figures: the reference, then those with most runs."""
+        groups = sorted(
             by_strategy(self.runs).items(),
-            key=lambda item: (item[0] != self.reference, -len(item[1])),  # else the better first
+            key=lambda item: (item[0] != self.reference, -len(item[1])),
         )
-        return [name for name, _ in names[:PLOTTED]]
+        return [name for name, _ in groups[:PLOTTED]]
 
     def tables(self) -> Tables:
-        """Every table."""
-        runs = self.runs
+        """Compute all tables."""
         return Tables(
-            method_rows(runs),
-            threshold_rows(runs),
-            scene_rows(runs),
-            difference_rows(runs, self.reference),
-            selector_rows(runs),
-            ablation_rows(runs, self.suite),
-            grid_rows(runs),
-            method_rows(self.compare_with),
+            methods=method_rows(self.runs),
+            thresholds=threshold_rows(self.runs),
+            scenes=scene_rows(self.runs),
+            differences=difference_rows(self.runs, self.reference),
+            selectors=selector_rows(self.runs),
+            ablation=ablation_rows(self.runs, self.suite),
+            grid=grid_rows(self.runs),
+            compare_with=method_rows(self.compare_with) if self.compare_with else [[]],
         )
+
+
+def require_pandas() -> None:
+    """Check that tables can be computed.
+
+    Raises:
+        InputError: pandas is not installed.
+    """
+    if find_spec("pandas") is None:
+        raise InputError("tables of a benchmark need pandas: pip install 'evercal[bench]'")
 
 
 def read_report(folder: Path, reference: str, compare_with: Sequence[Path] = ()) -> Report:
-    """Reads results.
+    """Read results.
 
     Args:
-        folder: of the results.
-        reference: the strategy that the others are compared with.
-        compare_with: other folders with results of the same scenes, such as under a smaller memory.
+        folder: Folder of results.
+        reference: Strategy that the others are compared with.
+        compare_with: Other folders with results of the same scenes.
 
     Raises:
-        InputError: a folder without results, or with those of other scenes.
+        InputError: A folder has no results, or results of other scenes, or pandas is missing.
     """
+    require_pandas()
     runs, settings = _results(folder)
     others = []
     for other in compare_with:
-        found, theirs = _results(other)
+        more, theirs = _results(other)
         for key in ("suite", "scenes", "judged"):
             if theirs.get(key) != settings.get(key):
                 raise InputError(
-                    f"{other}: {key} {theirs.get(key)} is not that of {folder}, "
-                    f"{settings.get(key)}; only the same frames can be compared"
+                    f"{other}: {key} is {theirs.get(key)}, but {settings.get(key)} in {folder};"
+                    " compare results of the same frames"
                 )
-        others += [replace(run, strategy=f"{run.strategy} ({other.name})") for run in found]
+        others += [replace(run, strategy=f"{run.strategy} ({other.name})") for run in more]
     return Report(str(settings["suite"]), _ranked(runs), reference, _ranked(others))
 
 
 def _ranked(runs: Sequence[Run]) -> list[Run]:
     final = {
-        name: float(np.mean([run.scores().final_accuracy for run in of]))
-        for name, of in by_strategy(runs).items()
+        name: float(np.mean([run.scores().final_accuracy for run in group]))
+        for name, group in by_strategy(runs).items()
     }
     return sorted(runs, key=lambda run: -final[run.strategy])
 
 
-def _results(folder: Path) -> tuple[list[Run], Mapping[str, object]]:
+def _results(folder: Path) -> tuple[list[Run], dict[str, object]]:
     if not (folder / RESULTS).is_file():
         raise InputError(f"{folder}: no results here; make some with 'evercal bench'")
-    return runs_of(read(folder), read_strategies(folder)), read_settings(folder / SETTINGS)
+    return runs_of(read(folder), read_strategies(folder)), dict(read_settings(folder / SETTINGS))

@@ -1,9 +1,9 @@
-"""What methods see: a test image of every scene, and the scene as points for the pose they found.
+"""Views for the report: a test image of each scene, and the scene's points at the estimated pose.
 
     OUT/views/STRATEGY-SCENE.npz
 
-Points are the depths of training frames where the recording has depths, else what the method itself
-answers about training frames, which shows what it still knows. `evercal bench-report` draws them.
+Points come from the depth images of training frames or, without depth, from what the strategy
+itself estimates for training frames. `evercal bench-report` draws them.
 """
 
 import io
@@ -23,31 +23,33 @@ from evercal.storage import write_bytes
 
 VIEWS = "views"
 FRAMES = 24
+"""Training frames that points are taken from."""
 DEPTH_STEP_PX = 4
+"""Every such row and column of a depth image gives a point."""
 
 
 @dataclass(frozen=True, eq=False)
 class SceneView:
-    """One test image and what one method made of it."""
+    """One test image and the estimate of one strategy."""
 
     strategy: str
-    """The method."""
+    """Name of the strategy."""
     scene: str
-    """Whose image it is."""
+    """Scene of the image."""
     frame: Frame
-    """The image, its camera, pose and joint angles."""
+    """Image, camera, true pose and joint angles."""
     found: str | None
-    """The scene in which the method put it; None without a pose."""
+    """Scene of the estimate; None without a pose."""
     pose: SE3 | None
-    """base_from_camera there."""
+    """Estimated base_from_camera."""
     points_m: NDArray[np.float32]
-    """(n, 3) of that scene, base frame."""
+    """Points of the estimated scene in the base frame, shape (n, 3)."""
     grey: NDArray[np.uint8]
-    """(n,) how bright they are."""
+    """Brightness of the points, shape (n,)."""
 
     @property
     def outcome(self) -> str:
-        """In a few words."""
+        """The error, the wrong scene, or that there is no pose."""
         truth = self.frame.base_from_camera
         if self.pose is None or truth is None:
             return "no pose"
@@ -58,7 +60,7 @@ class SceneView:
 
 
 def keep_views(out: Path, strategy: str, localizer: Localizer, scenes: Sequence[Recording]) -> None:
-    """Writes the view of the middle test frame of every scene, unless it is there."""
+    """Write the view of every scene's middle test frame, unless the file exists."""
     for scene in scenes:
         path = out / VIEWS / f"{strategy}-{scene.name}.npz"
         if path.exists():
@@ -66,77 +68,86 @@ def keep_views(out: Path, strategy: str, localizer: Localizer, scenes: Sequence[
         tests = posed_frames(scene.test)
         frame = tests[len(tests) // 2]
         estimate = localizer.localize(frame.read_image(), frame.camera)
-        points, grey = np.zeros((0, 3), np.float32), np.zeros(0, np.uint8)
-        for other in scenes:
-            if other.name == estimate.scene:
-                points, grey = _points(localizer, other)
-        about = {
+        points, grey = _points(localizer, [s for s in scenes if s.name == estimate.scene])
+        header = {
             "strategy": strategy,
             "scene": scene.name,
             "frame": frame.name,
             "camera": frame.camera.to_dict(),
-            "truth": _numbers(frame.base_from_camera),
+            "truth": _to_numbers(frame.base_from_camera),
             "joints_rad": frame.joints_rad,
             "found": estimate.scene,
-            "pose": _numbers(estimate.base_from_camera),
+            "pose": _to_numbers(estimate.base_from_camera),
         }
         data = io.BytesIO()
         np.savez_compressed(
-            data, about=json.dumps(about), image=frame.read_image(), points=points, grey=grey
+            data, about=json.dumps(header), image=frame.read_image(), points=points, grey=grey
         )
         path.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(path, data.getvalue())
 
 
 def read_views(out: Path) -> list[SceneView]:
-    """All views in a folder of results, by scene and strategy; none where there are none."""
+    """Read all views of a folder of results, sorted by strategy and scene."""
     return [_read(path) for path in sorted((out / VIEWS).glob("*.npz"))]
 
 
 def _read(path: Path) -> SceneView:
     with np.load(path) as stored:
-        about = json.loads(str(stored["about"]))
+        header = json.loads(str(stored["about"]))
         image, points, grey = stored["image"], stored["points"], stored["grey"]
-    joints = about["joints_rad"]
-    frame = Frame(
-        about["frame"],
-        image,
-        Camera.from_dict(about["camera"]),
-        _pose(about["truth"]),
-        joints_rad=None if joints is None else tuple(joints),
+    joints = header["joints_rad"]
+    return SceneView(
+        strategy=header["strategy"],
+        scene=header["scene"],
+        frame=Frame(
+            header["frame"],
+            image,
+            Camera.from_dict(header["camera"]),
+            _to_pose(header["truth"]),
+            joints_rad=None if joints is None else tuple(joints),
+        ),
+        found=header["found"],
+        pose=_to_pose(header["pose"]),
+        points_m=points,
+        grey=grey,
     )
-    pose = _pose(about["pose"])
-    return SceneView(about["strategy"], about["scene"], frame, about["found"], pose, points, grey)
 
 
 def _points(
-    localizer: Localizer, scene: Recording
+    localizer: Localizer, scenes: Sequence[Recording]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Points (n, 3) of a scene and their grey values (n,)."""
-    train = posed_frames(scene.train)
-    with_depth = [frame for frame in train if frame.depth is not None]
-    frames = with_depth or train
+    """Return points (n, 3) of scenes and their brightness (n,)."""
     points, grey = [np.zeros((0, 3))], [np.zeros(0)]
-    for number in np.linspace(0, len(frames) - 1, FRAMES).astype(int):
-        frame = frames[number]
-        image = frame.read_image()
-        if with_depth:
-            found, pixels = _measured(frame)
-        else:
-            answer = localizer.localize(image, frame.camera)
-            if answer.scene != scene.name or answer.points_m is None or answer.pixels is None:
-                continue
-            found = answer.points_m
-            size = min(image.shape[:2]) / localizer.maps.short_side
-            pixels = (answer.pixels + 0.5) * size - 0.5
-        x, y = np.clip(np.rint(pixels).astype(int), 0, np.array(image.shape[1::-1]) - 1).T
-        points.append(found)
-        grey.append(image.mean(2)[y, x])
+    for scene in scenes:
+        train = posed_frames(scene.train)
+        with_depth = [frame for frame in train if frame.depth is not None]
+        frames = with_depth or train
+        for i in np.linspace(0, len(frames) - 1, FRAMES).astype(int):
+            frame, image = frames[i], frames[i].read_image()
+            if with_depth:
+                more, pixels = _from_depth(frame)
+            else:
+                more, pixels = _from_estimate(localizer, scene.name, frame, image)
+            x, y = np.clip(np.rint(pixels).astype(int), 0, np.array(image.shape[1::-1]) - 1).T
+            points.append(more)
+            grey.append(image.mean(2)[y, x])
     return np.concatenate(points).astype(np.float32), np.concatenate(grey).astype(np.uint8)
 
 
-def _measured(frame: Frame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(n, 3) points of a frame's depth image in the base frame, and (n, 2) their pixels."""
+def _from_estimate(
+    localizer: Localizer, scene: str, frame: Frame, image: NDArray[np.uint8]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return inlier points (n, 3) of a frame in the base frame and their pixels (n, 2)."""
+    estimate = localizer.localize(image, frame.camera)
+    if estimate.scene != scene or estimate.points_m is None or estimate.pixels is None:
+        return np.zeros((0, 3)), np.zeros((0, 2))
+    scale = min(image.shape[:2]) / localizer.maps.short_side
+    return estimate.points_m, (estimate.pixels + 0.5) * scale - 0.5
+
+
+def _from_depth(frame: Frame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return points (n, 3) of a frame's depth image in the base frame and their pixels (n, 2)."""
     import cv2
 
     assert frame.depth is not None
@@ -147,14 +158,14 @@ def _measured(frame: Frame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     v, u = (DEPTH_STEP_PX * i for i in np.nonzero(depth[::DEPTH_STEP_PX, ::DEPTH_STEP_PX]))
     pixels = np.stack([u, v], 1).astype(float)
     rays = frame.camera.unproject(pixels)
-    known = np.isfinite(rays).all(1)
+    valid = np.isfinite(rays).all(1)
     points = frame.base_from_camera.apply(rays * depth[v, u, None] / 1000)
-    return points[known], pixels[known]
+    return points[valid], pixels[valid]
 
 
-def _numbers(pose: SE3 | None) -> list[list[float]] | None:
+def _to_numbers(pose: SE3 | None) -> list[list[float]] | None:
     return None if pose is None else [pose.rotation_wxyz.tolist(), pose.translation_m.tolist()]
 
 
-def _pose(numbers: list[list[float]] | None) -> SE3 | None:
+def _to_pose(numbers: list[list[float]] | None) -> SE3 | None:
     return None if numbers is None else SE3(np.array(numbers[0]), np.array(numbers[1]))

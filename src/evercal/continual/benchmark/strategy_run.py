@@ -1,4 +1,4 @@
-"""One strategy with one seed over a sequence of scenes, going on where it was interrupted."""
+"""One run: a strategy with a seed over a sequence of scenes, resumed where it was interrupted."""
 
 import json
 import shutil
@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,34 +45,42 @@ from evercal.storage import MANIFEST, write_json
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run is done."""
+    """Options of a run."""
 
     stage: StageOptions
-    """How a scene is learned; its seed is the run's."""
+    """Options for learning a scene, with the seed of the run."""
     short_side: int
     """Working size of images, pixels."""
     features: Path
     """Folder of encoded views, shared by all runs."""
     out: Path
-    """Folder of results; stores under way are in its folder `runs`."""
+    """Folder of results; its subfolder `runs` has the stores of runs in progress."""
     device: str = "cpu"
-    """What the networks run on, see `features.device.device_of`."""
+    """Device of the networks, see `features.device.device_of`."""
+
+
+class StageResults(NamedTuple):
+    """Results after one stage."""
+
+    stage: int
+    """Number of the stage, from 0."""
+    results: tuple[SceneResult, ...]
+    """Results of all scenes learned so far; empty before the last stage of joint training."""
 
 
 def run_strategy(
     strategy: Strategy, scenes: Sequence[Recording], options: RunOptions, on_event: OnEvent | None
-) -> Iterator[tuple[int, tuple[SceneResult, ...]]]:
-    """Learns the scenes in turn and judges all that are known after each.
+) -> Iterator[StageResults]:
+    """Learn the scenes in turn and evaluate all scenes learned so far after each.
 
     Args:
-        strategy: what is learned.
-        scenes: in order of learning.
-        options: how.
-        on_event: called with everything that happens while a scene is learned.
+        strategy: Strategy to run.
+        scenes: Scenes in order of learning.
+        options: Options of the run.
+        on_event: Called with every event while a scene is learned.
 
     Yields:
-        (number, results) of the stages that were not done before, a result for each scene known;
-        no results for the stages before the last of joint training.
+        Results of the stages that were not complete before.
     """
     run = _Run(strategy, scenes, options, on_event)
     return run.jointly() if strategy.jointly else run.stages()
@@ -91,24 +100,44 @@ class _Run:
         self.store = options.out / "runs" / f"{strategy.name}-{options.stage.seed}"
         self._network_fits = self.store.with_name(f"{self.store.name}.network.json")
 
-    def stages(self) -> Iterator[tuple[int, tuple[SceneResult, ...]]]:
-        """See `run_strategy`."""
+    def stages(self) -> Iterator[StageResults]:
+        """Learn scene after scene into a store; see `run_strategy`."""
         self._begin()
         for number in range(len(Store.open(self.store).stages) - 1, len(self.scenes)):
             if number >= len(Store.open(self.store).stages):
-                learn_scene(self.store, self.scenes[number], self._how(), self.on_event)
+                learn_scene(self.store, self.scenes[number], self._learn_options(), self.on_event)
             opened = Store.open(self.store)
-            opened.maps.to(self.device)
-            self._cached(opened.maps)
-            seconds = float(opened.report()["seconds"])
-            yield number, self._judge(opened.maps, number, seconds)
+            maps = self._prepared(opened.maps)
+            yield StageResults(
+                number, self._evaluated(maps, number, float(opened.report()["seconds"]))
+            )
+        self._remove()
+
+    def jointly(self) -> Iterator[StageResults]:
+        """Learn all scenes at once; see `run_strategy`. An interrupted run starts again."""
+        self._remove()
+        maps = self._prepared(open_or_create(self.store, self._learn_options()).maps)
+        splits = [validation_split(scene.train) for scene in self.scenes]
+        train = [replace(s, train=t) for s, (t, _) in zip(self.scenes, splits, strict=True)]
+        began = time.perf_counter()
+        for event in learn_jointly(maps, self.strategy, train, self.stage):
+            if isinstance(event, Stage):
+                maps = event.maps
+            elif self.on_event is not None:
+                self.on_event(event)
+        for number, (_, held_out) in enumerate(splits):
+            maps.scenes[number] = fitted_record(maps, held_out, number)
+        seconds = time.perf_counter() - began
+        last = len(self.scenes) - 1
+        yield from (StageResults(number, ()) for number in range(last))
+        yield StageResults(last, self._evaluated(maps, last, seconds))
         self._remove()
 
     def _remove(self) -> None:
         shutil.rmtree(self.store, ignore_errors=True)
         self._network_fits.unlink(missing_ok=True)
 
-    def _how(self, strategy: Strategy | None = None) -> LearnOptions:
+    def _learn_options(self, strategy: Strategy | None = None) -> LearnOptions:
         return LearnOptions(
             self.stage,
             strategy or self.strategy,
@@ -117,37 +146,42 @@ class _Run:
             cache=self.options.features,
         )
 
-    def _begin(self) -> None:
-        """The first scene, learned once for all strategies that learn it alike.
+    def _prepared(self, maps: SceneMaps) -> SceneMaps:
+        """Move to the device of the run and share encoded views with other runs."""
+        maps.to(self.device)
+        cache_features(maps.encoder, self.options.features)  # pyright: ignore[reportArgumentType]
+        return maps
 
-        What differs between them, the frames that stay, is chosen by each from the same head.
+    def _begin(self) -> None:
+        """Learn the first scene, unless the store has it.
+
+        Strategies that learn the first scene alike share its network. Each selects the frames to
+        remember from the same head.
         """
         if (self.store / MANIFEST).exists():
             return
-        self._remove()  # left by a commit that was killed
+        self._remove()  # left by an interrupted commit
         scene, method = self.scenes[0], self.strategy.method
-        # Beside a map the network learns frames as the map adjusted them.
+        # Beside a map, the network learns frames with the poses and camera that the map adjusted.
         if self.strategy.builds_map or method is None or not method.first_scene_alike:
-            learn_scene(self.store, scene, self._how(), self.on_event)
+            learn_scene(self.store, scene, self._learn_options(), self.on_event)
             return
         shared = self.store.with_name(f"first-{scene.name}-{self.stage.seed}")
         if not (shared / MANIFEST).exists():
-            learn_scene(shared, scene, self._how(STRATEGIES["finetune"]), self.on_event)
+            learn_scene(shared, scene, self._learn_options(STRATEGIES["finetune"]), self.on_event)
         first = Store.open(shared)
         began = time.perf_counter()
-        maps = first.maps.copy_for_training().to(self.device)
+        maps = self._prepared(first.maps.copy_for_training())
         maps.strategy, maps.keyframes, maps.method_states = self.strategy.name, [], []
-        self._cached(maps)
         train, _ = validation_split(scene.train)
-        learned = Learned(train, self._rows(maps, train))
-        stage = finished_stage(maps, method, learned, self.stage)
+        stage = finished_stage(maps, method, Learned(train, self._rows(maps, train)), self.stage)
         report = first.report()
         report["seconds"] = float(report["seconds"]) + time.perf_counter() - began
         report["frames_kept"] = stage.frames_kept
-        open_or_create(self.store, self._how()).commit(maps, report)
+        open_or_create(self.store, self._learn_options()).commit(maps, report)
 
     def _rows(self, maps: SceneMaps, train: Sequence[Frame]) -> Callable[[], FeatureBuffer]:
-        """Rows of the first scene as it was trained on, encoded when they are first asked for."""
+        """Return a function that encodes the training rows of the first scene, once."""
 
         @cache
         def rows() -> FeatureBuffer:
@@ -158,109 +192,86 @@ class _Run:
 
         return rows
 
-    def _cached(self, maps: SceneMaps) -> None:
-        cache_features(maps.encoder, self.options.features)  # pyright: ignore[reportArgumentType]
+    def _evaluated(self, maps: SceneMaps, number: int, seconds: float) -> tuple[SceneResult, ...]:
+        """Evaluate all scenes learned so far.
 
-    def jointly(self) -> Iterator[tuple[int, tuple[SceneResult, ...]]]:
-        """See `run_strategy`; a killed run begins anew."""
-        self._remove()
-        maps = open_or_create(self.store, self._how()).maps.to(self.device)
-        self._cached(maps)
-        split = [validation_split(scene.train) for scene in self.scenes]
-        train_splits = [replace(s, train=t) for s, (t, _) in zip(self.scenes, split, strict=True)]
-        began = time.perf_counter()
-        for event in learn_jointly(maps, self.strategy, train_splits, self.stage):
-            if isinstance(event, Stage):
-                maps = event.maps
-            elif self.on_event is not None:
-                self.on_event(event)
-        for number, (_, aside) in enumerate(split):
-            maps.scenes[number] = fitted_record(maps, aside, number)
-        seconds = time.perf_counter() - began
-        last = len(self.scenes) - 1
-        for number in range(last):
-            yield number, ()
-        yield last, self._judge(maps, last, seconds)
-        self._remove()  # nothing was committed to it
-
-    def _judge(self, maps: SceneMaps, number: int, seconds: float) -> tuple[SceneResult, ...]:
-        """Results of all scenes known; of what answers alone, too, where several things answer."""
+        A map is also evaluated without alignment. A network beside a map is also evaluated alone.
+        """
         name, localizer = self.strategy.name, Localizer(maps)
-        found = self._results(name, localizer, number, seconds)
+        results = self._results(name, localizer, number, seconds)
         if number == len(self.scenes) - 1:
             keep_views(self.options.out, name, localizer, self.scenes)
         if not self.strategy.builds_map:
-            return found
+            return results
         if self.strategy.method is None:
-            localizer = Localizer(maps, LocalizeOptions(align=False))
-            return found + self._results(name + UNALIGNED, localizer, number, seconds)
-        alone = self._network_alone(maps, self.strategy.method.replays)
-        return found + self._results(name + NETWORK, Localizer(alone), number, seconds)
+            suffix, other = UNALIGNED, Localizer(maps, LocalizeOptions(align=False))
+        else:
+            network = self._without_map(maps, self.strategy.method.replays)
+            suffix, other = NETWORK, Localizer(network)
+        return results + self._results(name + suffix, other, number, seconds)
 
-    def _network_alone(self, maps: SceneMaps, replays: bool) -> SceneMaps:
-        """What the network of the same training knows; keyframes stay where it replays them.
+    def _without_map(self, maps: SceneMaps, replays: bool) -> SceneMaps:
+        """Return the network without landmarks; a method that replays keeps the keyframe images.
 
-        Its thresholds are fitted when a scene is learned and then stay, as without a map.
+        As without a map, thresholds are fitted once, when a scene is learned.
         """
-        alone, path = maps.copy_for_training(), self._network_fits
-        path.parent.mkdir(parents=True, exist_ok=True)  # joint training commits no store
-        for i, keyframes in enumerate(alone.keyframes):
+        network, path = maps.copy_for_training(), self._network_fits
+        for i, keyframes in enumerate(network.keyframes):
             assert keyframes is not None, "a map has keyframes"
             images = Keyframes(keyframes.images, keyframes.cameras, keyframes.base_from_camera)
-            alone.keyframes[i] = images if replays else None
+            network.keyframes[i] = images if replays else None
         fits: list[list[float]] = json.loads(path.read_text()) if path.exists() else []
-        for i in range(len(fits), len(alone.scenes)):
-            _, aside = validation_split(self.scenes[i].train)
-            record = fitted_record(alone, aside, i)
+        for i in range(len(fits), len(network.scenes)):
+            _, held_out = validation_split(self.scenes[i].train)
+            record = fitted_record(network, held_out, i)
             fits.append([record.inlier_threshold, record.covariance_scale])
-            write_json(path, fits)
-        alone.scenes = [with_fit(r, *fit) for r, fit in zip(alone.scenes, fits, strict=True)]
-        return alone
+        path.parent.mkdir(parents=True, exist_ok=True)  # joint training commits no store
+        write_json(path, fits)
+        network.scenes = [with_fit(r, *fit) for r, fit in zip(network.scenes, fits, strict=True)]
+        return network
 
     def _results(
         self, name: str, localizer: Localizer, number: int, seconds: float
     ) -> tuple[SceneResult, ...]:
-        maps = localizer.maps
-        found = evaluate(localizer, {s.name: s for s in self.scenes[: number + 1]})
-        size, keyframes = sum(head_bytes(head) for head in maps.heads), maps.keyframes[number]
-        newest = self.scenes[number].name
+        maps, scenes = localizer.maps, self.scenes[: number + 1]
+        frames = evaluate(localizer, {scene.name: scene for scene in scenes})
+        keyframes = maps.keyframes[number]
         return tuple(
             scene_result(
-                [r for r in found if r.scene == scene.name],
+                [frame for frame in frames if frame.scene == scene.name],
                 strategy=name,
                 seed=self.stage.seed,
                 stage=number,
                 seconds=seconds,
                 memory_bytes=memory_bytes(maps, self.strategy),
-                head_bytes=size,
+                head_bytes=sum(head_bytes(head) for head in maps.heads),
                 frames_kept=len(keyframes.images) if keyframes else 0,
-                **(_spread(maps, number, self.scenes) if scene.name == newest else {}),
+                **(_coverage(keyframes, scene) if scene is scenes[-1] else {}),
             )
-            for scene in self.scenes[: number + 1]
+            for scene in scenes
         )
 
 
 def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOptions:
-    """The options with the centres of all scenes, where they are to be known in advance."""
+    """Add the centres of all scenes to options that need them in advance."""
     if stage.head.centres != "fixed" or stage.fixed_centres_m:
         return stage
-    places = [stated_poses(validation_split(scene.train)[0]).translation_m for scene in scenes]
-    found = combined_centres(places, stage.head.centres_per_scene, stage.seed)
-    return replace(stage, grid_scenes=len(scenes), fixed_centres_m=found)
+    positions = [stated_poses(validation_split(scene.train)[0]).translation_m for scene in scenes]
+    centres = combined_centres(positions, stage.head.centres_per_scene, stage.seed)
+    return replace(stage, grid_scenes=len(scenes), fixed_centres_m=centres)
 
 
-def _spread(maps: SceneMaps, number: int, scenes: Sequence[Recording]) -> dict[str, object]:
-    """How the frames kept of a stage's scene lie among those learned."""
-    keyframes = maps.keyframes[number]
+def _coverage(keyframes: Keyframes | None, scene: Recording) -> dict[str, object]:
+    """Measure how the remembered frames of a scene cover its training frames."""
     if keyframes is None or not keyframes.images:
         return {}
-    train, _ = validation_split(scenes[number].train)
+    train, _ = validation_split(scene.train)
     poses = stated_poses(train)
-    stood = keyframes.base_from_camera.translation_m
-    gaps = np.linalg.norm(poses.translation_m[:, None] - stood[None], axis=-1)
-    places = poses.translation_m, poses.rotation_wxyz, gaps.argmin(0)
+    positions = keyframes.base_from_camera.translation_m
+    distances = np.linalg.norm(poses.translation_m[:, None] - positions[None], axis=-1)
+    selection = poses.translation_m, poses.rotation_wxyz, distances.argmin(0)
     return {
-        "keyframe_positions_m": tuple(tuple(round(float(v), 4) for v in row) for row in stood),
-        "covering_radius": covering_radius(*places),
-        "min_spacing": smallest_pair(*places),
+        "keyframe_positions_m": tuple(tuple(round(float(v), 4) for v in p) for p in positions),
+        "covering_radius": covering_radius(*selection),
+        "min_spacing": smallest_pair(*selection),
     }

@@ -1,4 +1,4 @@
-"""Suites: named sequences of scenes that methods are compared on."""
+"""Suites: named sequences of scenes for comparing strategies."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,20 +22,20 @@ from evercal.simulation.cell import SUITES as ROOMS
 
 @dataclass(frozen=True)
 class Suite:
-    """What one name stands for."""
+    """A named sequence of scenes."""
 
     scenes: tuple[str, ...]
-    """Names in order of learning, each a folder of the data."""
+    """Names in order of learning; each is a folder of the data."""
     source: str
-    """Where the data come from, for who has none."""
+    """Source of the data, for messages."""
     load: Callable[[Path | None, Sequence[str]], list[Recording]]
-    """(folder of the data, names) -> scenes."""
+    """Loads scenes, given the folder of the data and their names."""
 
 
 def _folders(data: Path | None, names: Sequence[str]) -> list[Recording]:
     if data is None:
-        raise InputError("this suite needs its recordings: give their folder with --data")
-    # A scene's name is a word: apt1/kitchen becomes apt1-kitchen.
+        raise InputError("this suite needs recordings: give their folder with --data")
+    # Names of scenes have no slashes: apt1/kitchen becomes apt1-kitchen.
     return [load_recording(data / name, name=name.replace("/", "-")) for name in names]
 
 
@@ -80,22 +80,21 @@ SUITES: dict[str, Suite] = {
 def load_suite(
     name: str, data: Path | None = None, only: Sequence[str] = (), poses: Path | None = None
 ) -> list[Recording]:
-    """The scenes of a suite in order of learning.
+    """Load the scenes of a suite in order of learning.
 
     Args:
-        name: key of `SUITES`.
-        data: folder that holds a folder for each scene; not for `sim-mini`.
-        only: names of scenes to take, in the suite's order; all when empty.
-        poses: folder of structure-from-motion poses (`datasets.sfm_poses`) to take instead of those
-            of i7s or i12s.
+        name: Key of `SUITES`.
+        data: Folder with a folder for each scene; unused for `sim-mini`.
+        only: Names of the scenes to load. Defaults to all.
+        poses: Folder of structure-from-motion poses (Brachmann et al., ICCV 2021) for i7s or i12s.
+            Defaults to the original poses.
 
     Raises:
-        InputError: unknown suite or scene; a scene whose folder is missing, with where to get it;
-            poses for another suite.
+        InputError: Unknown suite or scene, a missing folder, or poses for another suite.
     """
     if name not in SUITES:
-        known = ", ".join([*SUITES, "custom", "regions"])
-        raise InputError(f"suite {name!r}: unknown; choose one of {known}")
+        names = ", ".join([*SUITES, "custom", "regions"])
+        raise InputError(f"suite {name!r}: unknown; choose one of {names}")
     if poses is not None and name not in ("i7s", "i12s"):
         raise InputError(f"suite {name}: --poses are for i7s and i12s")
     suite = SUITES[name]
@@ -109,45 +108,45 @@ def load_suite(
         missing = [scene for scene in names if not (data / scene).is_dir()]
         if missing:
             raise InputError(
-                f"suite {name}: {data / missing[0]} is missing; get it from {suite.source}, or "
-                f"leave it out with --scenes"
+                f"suite {name}: {data / missing[0]} is missing; get it from {suite.source}, or"
+                " select other scenes with --scenes"
             )
     scenes = suite.load(data, names)
     if poses is None:
         return scenes
-    called = [scene.replace("/", "_") for scene in names]
-    return [with_sfm_poses(s, poses, n) for s, n in zip(scenes, called, strict=True)]
+    folders = [scene.replace("/", "_") for scene in names]
+    return [with_sfm_poses(s, poses, n) for s, n in zip(scenes, folders, strict=True)]
 
 
 def tuning_split(scene: Recording) -> Recording:
-    """The scene for choosing settings: its test frames are not looked at.
+    """Split training frames for choosing settings; the test frames are not used.
 
-    Of ten equal runs of training frames the third and the eighth are judged, the others learned.
+    Of ten equal runs of training frames, the third and the eighth become test frames.
 
     Raises:
-        InputError: fewer posed training frames than a scene needs after that.
+        InputError: Too few posed training frames remain.
     """
     frames = posed_frames(scene.train)
     tenth = [10 * i // len(frames) for i in range(len(frames))]
-    learned = tuple(f for f, part in zip(frames, tenth, strict=True) if part not in (2, 7))
-    judged = tuple(f for f, part in zip(frames, tenth, strict=True) if part in (2, 7))
-    if len(learned) < MIN_TRAIN_FRAMES:
+    train = tuple(f for f, part in zip(frames, tenth, strict=True) if part not in (2, 7))
+    test = tuple(f for f, part in zip(frames, tenth, strict=True) if part in (2, 7))
+    if len(train) < MIN_TRAIN_FRAMES:
         raise InputError(
-            f"{scene.name}: {len(learned)} of {len(frames)} training frames are left to learn, "
-            f"at least {MIN_TRAIN_FRAMES} are needed; leave out --held-out"
+            f"{scene.name}: {len(train)} of {len(frames)} training frames remain to learn; at least"
+            f" {MIN_TRAIN_FRAMES} are needed; omit --held-out"
         )
-    return replace(scene, train=learned, test=judged)
+    return replace(scene, train=train, test=test)
 
 
 def regions(scene: Recording, parts: int) -> list[Recording]:
-    """One scene as a sequence of its regions, after Bahadir et al. (Mach. Vis. Appl. 2024).
+    """Split a scene into a sequence of regions (Bahadir et al., Mach. Vis. Appl. 2024).
 
-    Regions are k-means cells of the points a metre ahead of the training cameras, in the order in
-    which the recording first comes to them; test frames go to the nearest. All share one base
-    frame, so a pose found in a neighbouring region counts.
+    Regions are k-means clusters of the points one metre in front of the training cameras, in the
+    order in which the recording first reaches them. Test frames belong to the nearest cluster. All
+    regions share one base frame, so a pose in a neighbouring region counts.
 
     Raises:
-        InputError: fewer than two parts, or a region that is too small to learn or to judge.
+        InputError: Fewer than two parts, or a region with too few frames.
     """
     from scipy.cluster.vq import kmeans2, vq
 
@@ -155,24 +154,29 @@ def regions(scene: Recording, parts: int) -> list[Recording]:
         raise InputError(f"--parts {parts}: give at least 2")
     train, test = posed_frames(scene.train), posed_frames(scene.test)
     if len(train) < parts or not test:
-        raise InputError(f"{scene.name}: {len(train)} training and {len(test)} test frames")
+        raise InputError(
+            f"{scene.name}: {len(train)} training and {len(test)} test frames are too few for"
+            f" --parts {parts}"
+        )
     centres, region = kmeans2(_ahead(train), parts, minit="++", rng=np.random.default_rng(0))
     nearest, _ = vq(_ahead(test), centres)
-    found = []
+    recordings = []
     for number, part in enumerate(dict.fromkeys(region.tolist()), start=1):
-        learned = tuple(f for f, r in zip(train, region, strict=True) if r == part)
-        judged = tuple(f for f, r in zip(test, nearest, strict=True) if r == part)
+        part_train = tuple(f for f, r in zip(train, region, strict=True) if r == part)
+        part_test = tuple(f for f, r in zip(test, nearest, strict=True) if r == part)
         name = f"{scene.name}-{number}"
-        if len(learned) < MIN_TRAIN_FRAMES or not judged:
+        if len(part_train) < MIN_TRAIN_FRAMES or not part_test:
             raise InputError(
-                f"{name}: {len(learned)} training and {len(judged)} test frames are too few (at "
-                f"least {MIN_TRAIN_FRAMES} and 1); give fewer --parts"
+                f"{name}: {len(part_train)} training and {len(part_test)} test frames are too few"
+                f" (at least {MIN_TRAIN_FRAMES} and 1); give fewer --parts"
             )
-        found.append(replace(scene, name=name, train=learned, test=judged, base=scene.name))
-    return found
+        recordings.append(
+            replace(scene, name=name, train=part_train, test=part_test, base=scene.name)
+        )
+    return recordings
 
 
 def _ahead(frames: Sequence[Frame]) -> np.ndarray:
-    """(n, 3) points a metre ahead of the cameras."""
+    """Return the points one metre in front of the cameras, shape (n, 3)."""
     poses = stated_poses(frames)
     return poses.translation_m + poses.rotation_matrix()[:, :, 2]
