@@ -1,8 +1,11 @@
 """`Map`: scenes that a robot has learned, and everything that is asked of them.
 
 Learning a scene reads through three files: `Map.learn` here, `mapping.build.build_map`, and
-`mapping.store.MapStore.commit`.
+`mapping.store.MapStore.commit`. Methods import what they need, so that a robot that only locates
+images loads no module that learns or calibrates.
 """
+
+from __future__ import annotations
 
 import os
 import time
@@ -11,35 +14,26 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-import numpy as np
-
-from evercal.calibration.calibration import Calibration, Mount
-from evercal.calibration.drift import Shift, check
-from evercal.calibration.eye_in_hand import (
-    HandEyeReport,
-    hand_eye_report,
-    lacks_camera_poses,
-    posed_by_gripper,
-)
-from evercal.calibration.from_images import Images, ImageSource, calibrate
 from evercal.errors import InputError
 from evercal.features.device import device_of
-from evercal.geometry import SE3, Camera
-from evercal.localization.acceptance import fit_acceptance
-from evercal.localization.estimate import PoseEstimate
-from evercal.localization.fewest_keyframes import MOST_SHARE, fewest_keyframes
-from evercal.localization.localizer import Localizer
-from evercal.localization.query import LocalizeOptions
-from evercal.mapping.build import Adjusted, MapOptions, OnProgress, build_map
-from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.store import MapStore
-from evercal.recordings import Recording, load_recording, posed_recording
-from evercal.recordings.held_out import named_recording, require_frames, split_held_out
+from evercal.recordings.frame import Recording
 
 if TYPE_CHECKING:
+    import numpy as np
     from torch import nn
 
+    from evercal.calibration.calibration import Calibration, Mount
+    from evercal.calibration.drift import Shift
+    from evercal.calibration.eye_in_hand import HandEyeReport
+    from evercal.calibration.from_images import ImageSource
     from evercal.evaluation import Scores
+    from evercal.geometry import SE3, Camera
+    from evercal.localization.estimate import PoseEstimate
+    from evercal.localization.localizer import Localizer
+    from evercal.localization.query import LocalizeOptions
+    from evercal.mapping.build import Adjusted, MapOptions, OnProgress
+    from evercal.mapping.memory_budget import MemoryBudget
 
 PathLike = str | os.PathLike[str]
 
@@ -94,7 +88,7 @@ class Map:
         path: PathLike,
         *,
         device: str = "auto",
-        encoder: "Path | nn.Module | None" = None,
+        encoder: Path | nn.Module | None = None,
         options: LocalizeOptions | None = None,
     ) -> Self:
         """Open a map, or prepare a new one that the first `learn` writes.
@@ -131,6 +125,8 @@ class Map:
         Raises:
             InputError: No scene has been learned.
         """
+        from evercal.localization.localizer import Localizer
+
         if self._localizer is None:
             if not self.scenes:
                 raise InputError(f"map {self.path}: no scene learned yet; run 'evercal learn'")
@@ -166,6 +162,18 @@ class Map:
             InputError: A recording that cannot be used, a name that is taken, or another process
                 is writing into the map.
         """
+        from evercal.calibration.eye_in_hand import (
+            hand_eye_report,
+            lacks_camera_poses,
+            posed_by_gripper,
+        )
+        from evercal.localization.acceptance import fit_acceptance
+        from evercal.localization.fewest_keyframes import fewest_keyframes
+        from evercal.mapping.build import MapOptions, build_map
+        from evercal.mapping.memory_budget import MemoryBudget
+        from evercal.recordings import load_recording, posed_recording
+        from evercal.recordings.held_out import named_recording, require_frames, split_held_out
+
         began = time.perf_counter()
         budget = MemoryBudget.parse(memory)
         loaded = recording if isinstance(recording, Recording) else load_recording(recording)
@@ -229,6 +237,8 @@ class Map:
         Raises:
             InputError: No image was located, or unusable images or poses.
         """
+        from evercal.calibration.from_images import Images, calibrate
+
         given = Images.of(images, camera, robot_poses)
         return calibrate(self.localizer, given, mount, on_image=on_image)
 
@@ -251,6 +261,9 @@ class Map:
         Raises:
             InputError: No image was located, or the calibration is of a camera on the gripper.
         """
+        from evercal.calibration.drift import check
+        from evercal.calibration.from_images import Images
+
         given = Images.of(images, camera)
         return check(self.localizer, given.images, calibration, given.camera, on_image)
 
@@ -258,7 +271,7 @@ class Map:
         self,
         recordings: PathLike | Recording | Sequence[Recording] | Mapping[str, Recording],
         on_frame: Callable[[], object] = lambda: None,
-    ) -> "Scores":
+    ) -> Scores:
         """Score the map on the test frames of recordings.
 
         Args:
@@ -275,6 +288,9 @@ class Map:
 
 def _sized(options: MapOptions, budget: MemoryBudget, short_side: int) -> MapOptions:
     """Options with the memory of a scene and the working size of a map."""
+    from evercal.localization.fewest_keyframes import MOST_SHARE
+    from evercal.mapping.memory_budget import MemoryBudget
+
     if budget.auto:
         budget = MemoryBudget(share=MOST_SHARE)
     return replace(options, memory=budget, size=replace(options.size, cells=short_side))
