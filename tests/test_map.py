@@ -163,15 +163,13 @@ def test_calibration_is_written_and_exported(calibration: Calibration, tmp_path:
 
 
 def test_evaluate(hall_only: Map, hall: Recording, tmp_path: Path) -> None:
-    frames: list[int] = []
     few = replace(hall, test=hall.test[::5])
-    scores = hall_only.evaluate(few, on_frame=lambda: frames.append(1))
-    assert len(frames) == len(few.test)
+    scores = hall_only.evaluate(few)
     assert scores.scenes["hall"].frames == len(few.test)
     assert scores.scenes["hall"].median_translation_cm < 0.5
-    generic.write(tmp_path / "other", few)
-    by_path = hall_only.evaluate({"hall": few}), hall_only.evaluate([few])
-    for other in by_path:
+    generic.write(tmp_path / "hall", few)
+    others = [hall_only.evaluate(each) for each in ({"hall": few}, [few], tmp_path / "hall")]
+    for other in others:
         assert other.scenes["hall"].median_translation_cm == pytest.approx(
             scores.scenes["hall"].median_translation_cm
         )
