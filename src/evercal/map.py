@@ -162,17 +162,16 @@ class Map:
             InputError: A recording that cannot be used, a name that is taken, or another process
                 is writing into the map.
         """
-        from evercal.calibration.eye_in_hand import (
-            hand_eye_report,
-            lacks_camera_poses,
-            posed_by_gripper,
-        )
         from evercal.localization.acceptance import fit_acceptance
-        from evercal.localization.fewest_keyframes import fewest_keyframes
         from evercal.mapping.build import MapOptions, build_map
         from evercal.mapping.memory_budget import MemoryBudget
         from evercal.recordings import load_recording, posed_recording
-        from evercal.recordings.held_out import named_recording, require_frames, split_held_out
+        from evercal.recordings.held_out import (
+            lacks_camera_poses,
+            named_recording,
+            require_frames,
+            split_held_out,
+        )
 
         began = time.perf_counter()
         budget = MemoryBudget.parse(memory)
@@ -182,6 +181,8 @@ class Map:
             contents, start = self._store.contents, None
             options = options or MapOptions()
             if lacks_camera_poses(loaded):
+                from evercal.calibration.eye_in_hand import posed_by_gripper
+
                 posed = posed_by_gripper(loaded, contents.encoder, on_progress)
                 loaded, start, options = posed.recording, posed.start, options.for_hand_eye()
             loaded = posed_recording(loaded)
@@ -190,6 +191,8 @@ class Map:
             options = _sized(options, budget, contents.short_side)
             built = build_map(loaded.name, split.train, contents.encoder, options, on_progress)
             if budget.auto:
+                from evercal.localization.fewest_keyframes import fewest_keyframes
+
                 built = built.take(fewest_keyframes(contents, built, split.train, on_progress))
             scene = fit_acceptance(contents.with_scene(built.scene), split.held_out)
             report = LearnReport(
@@ -202,8 +205,12 @@ class Map:
                 min_support=scene.min_support,
                 landmarks=scene.landmarks,
                 adjusted=built.adjusted,
-                hand_eye=hand_eye_report(start, built, gripper_from_camera) if start else None,
             )
+            if start is not None:
+                from evercal.calibration.eye_in_hand import hand_eye_report
+
+                hand_eye = hand_eye_report(start, built, gripper_from_camera)
+                report = replace(report, hand_eye=hand_eye)
             self._store.commit(scene, asdict(report))
         self._localizer = None
         return report
@@ -286,9 +293,10 @@ class Map:
 
 def _sized(options: MapOptions, budget: MemoryBudget, short_side: int) -> MapOptions:
     """Options with the memory of a scene and the working size of a map."""
-    from evercal.localization.fewest_keyframes import MOST_SHARE
     from evercal.mapping.memory_budget import MemoryBudget
 
     if budget.auto:
+        from evercal.localization.fewest_keyframes import MOST_SHARE
+
         budget = MemoryBudget(share=MOST_SHARE)
     return replace(options, memory=budget, size=replace(options.size, cells=short_side))

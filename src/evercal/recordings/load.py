@@ -1,61 +1,50 @@
 """`load_recording`: recognise the format of a recording and read it."""
 
 import dataclasses
+import importlib
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 from evercal.errors import InputError
-from evercal.recordings.formats import (
-    colmap,
-    generic,
-    lerobot,
-    nerfstudio,
-    ros_bag,
-    seven_scenes,
-    twelve_scenes,
-    wrist,
-)
 from evercal.recordings.frame import Recording
 from evercal.recordings.read_options import ReadOptions, flag
 
 
 @dataclass(frozen=True)
 class Format:
-    """Recognition and reader of one format."""
+    """Recognition and reader of one format; its module is loaded on first use."""
 
-    detect: Callable[[Path], bool]
-    """Whether a folder or file looks like this format."""
-    load: Callable[[Path, ReadOptions], Recording]
-    """Reader."""
+    module: str
+    """Module of `recordings.formats` with functions `detect` and `load`."""
     contents: str
     """Files that identify it, for messages."""
-    uses: tuple[str, ...] = ()
-    """Fields of `ReadOptions` that it uses, apart from `every`."""
 
+    @property
+    def reader(self) -> ModuleType:
+        """The module."""
+        return importlib.import_module(f"evercal.recordings.formats.{self.module}")
 
-def _plain(load: Callable[[Path], Recording]) -> Callable[[Path, ReadOptions], Recording]:
-    return lambda root, _: load(root)
+    @property
+    def uses(self) -> tuple[str, ...]:
+        """Fields of `ReadOptions` that it uses, apart from `every`."""
+        return getattr(self.reader, "USES", ())
+
+    def load(self, root: Path, options: ReadOptions) -> Recording:
+        """Read a recording."""
+        return self.reader.load(root, options) if self.uses else self.reader.load(root)
 
 
 FORMATS = {
-    "generic": Format(generic.detect, _plain(generic.load), "scene.json"),
-    "7scenes": Format(
-        seven_scenes.detect,
-        _plain(seven_scenes.load),
-        "TrainSplit.txt, TestSplit.txt and seq-XX folders",
-    ),
-    "12scenes": Format(twelve_scenes.detect, _plain(twelve_scenes.load), "info.txt and data"),
-    "nerfstudio": Format(nerfstudio.detect, _plain(nerfstudio.load), "transforms.json"),
-    "colmap": Format(colmap.detect, _plain(colmap.load), "sparse/0 with cameras and images"),
-    "wrist": Format(
-        wrist.detect, wrist.load, "images beside base_from_gripper.csv or joints.csv", wrist.USES
-    ),
-    "lerobot": Format(lerobot.detect, lerobot.load, "meta/info.json", lerobot.USES),
-    "rosbag": Format(
-        ros_bag.detect, ros_bag.load, "a .bag or .mcap file or bag folder", ros_bag.USES
-    ),
+    "generic": Format("generic", "scene.json"),
+    "7scenes": Format("seven_scenes", "TrainSplit.txt, TestSplit.txt and seq-XX folders"),
+    "12scenes": Format("twelve_scenes", "info.txt and data"),
+    "nerfstudio": Format("nerfstudio", "transforms.json"),
+    "colmap": Format("colmap", "sparse/0 with cameras and images"),
+    "wrist": Format("wrist", "images beside base_from_gripper.csv or joints.csv"),
+    "lerobot": Format("lerobot", "meta/info.json"),
+    "rosbag": Format("ros_bag", "a .bag or .mcap file or bag folder"),
 }
 """All formats by name, in the order in which they are tried."""
 
@@ -84,7 +73,7 @@ def load_recording(
     if not root.exists():
         raise InputError(f"{root}: no such folder; give the folder of a recorded scene")
     if format is None:
-        format = next((key for key, entry in FORMATS.items() if entry.detect(root)), None)
+        format = next((key for key, entry in FORMATS.items() if entry.reader.detect(root)), None)
     if format is None:
         what = "no known scene format" if root.is_dir() else "a file, not a folder, and no bag"
         known = ", ".join(f"{entry.contents} ({key})" for key, entry in FORMATS.items())
