@@ -320,7 +320,8 @@ def _finish(
         )
         if not options.bundle.common_known:
             # The common transform is part of the answer and not an error to undo.
-            covariance = HAND_EYE_COVARIANCE_SCALE * np.asarray(adjustment.common_covariance)
+            formal = np.asarray(adjustment.common_covariance, np.float64)
+            covariance = HAND_EYE_COVARIANCE_SCALE * formal
             hand_eye = HandEyeCorrection(common, covariance)
             base = frame_covariance(frames.stated @ common, covariance)
             frame = replace(frame, common=SE3.identity(), base_covariance=base)

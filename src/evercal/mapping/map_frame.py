@@ -33,7 +33,7 @@ class FrameCorrection:
 
     poses: SE3
     """(n,) base_from_camera as adjusted, without the common transform."""
-    correction: Array
+    correction: NDArray[np.floating]
     """(n, 6) in the camera frame, metres and radians."""
     radius: tuple[float, float]
     """Correlation length, metres and radians."""
@@ -134,7 +134,7 @@ class MapFrame:
         return pose @ SE3.exp(-self.correction.at(stated)) @ self.common.inverse()
 
 
-def fit_correction(poses: SE3, correction: Array) -> FrameCorrection | None:
+def fit_correction(poses: SE3, correction: NDArray[np.floating]) -> FrameCorrection | None:
     """Fit the correlation length of corrections.
 
     Args:

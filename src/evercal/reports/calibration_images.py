@@ -231,4 +231,6 @@ def _is_other_map(calibration: Calibration, localizer: "SceneLocalizer") -> bool
     scene, digest = calibration.source.get("scene"), calibration.source.get("map")
     if digest is None or scene not in localizer.scenes:
         return digest is not None
-    return map_digest(localizer, str(scene)) != digest
+    from evercal.localization.localizer import Localizer
+
+    return not isinstance(localizer, Localizer) or map_digest(localizer, str(scene)) != digest

@@ -69,7 +69,7 @@ def keep_views(
             continue
         tests = posed_frames(scene.test)
         frame = tests[len(tests) // 2]
-        estimate = localizer.localize(frame.read_image(), frame.camera)
+        estimate = localizer.localize(frame.read_image(), localizer.camera_for(frame.camera))
         points, grey = _points(localizer, [s for s in scenes if s.name == estimate.scene])
         header = {
             "strategy": strategy,
