@@ -77,7 +77,7 @@ class MapOptions:
         """
         bundle = replace(
             self.bundle,
-            common_known=False,
+            common_stated=False,
             common_sigma_m=0.2,
             common_sigma_deg=10.0,
             least_sigma_m=2e-4,
@@ -318,7 +318,7 @@ def _finish(
             correction=fit_correction(adjustment.poses @ common.inverse(), adjustment.correction),
             pose_sigma=(float(np.sqrt(block[:, :3].mean())), float(np.sqrt(block[:, 3:].mean()))),
         )
-        if not options.bundle.common_known:
+        if not options.bundle.common_stated:
             # The common transform is part of the answer and not an error to undo.
             covariance = HAND_EYE_COVARIANCE_SCALE * np.asarray(adjustment.common_covariance)
             hand_eye = HandEyeCorrection(common, covariance)

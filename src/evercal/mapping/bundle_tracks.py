@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from evercal.mapping.bundle_adjustment import BundleTracks
+from evercal.mapping.bundle_equations import BundleTracks
 from evercal.mapping.prepared_frames import PreparedFrames
 from evercal.mapping.tracks import KeyframeTracks, Observations, TrackOptions, joined, observe
 
