@@ -40,7 +40,7 @@ _GROUPS = ((0, 3), (3, 6), (6, 7), (7, 8), (8, 10), (10, 12))
 shift, focal length, principal point, distortion."""
 MIN_NOISE = 0.02
 """Residuals are never taken to be smaller than this, in their own standard deviations."""
-INVALID_SQUARES = 1e4
+INVALID_SQUARES = 1e8
 """Squared residual that an observation without a projection counts with."""
 FIRST_DAMPING, MAX_RAISES = 1e-4, 8
 """Levenberg-Marquardt damping after the first rejected step, and rejections in a row at most."""
@@ -364,7 +364,8 @@ class BundleAdjustment:
 
     def _result(self, tracks: BundleTracks, estimate: Estimate, variances: Variances) -> Adjustment:
         n, parameters = self.n, estimate.parameters
-        residual = np.linalg.solve(tracks.whitening, estimate.linearised.residual[..., None])
+        lin = estimate.linearised
+        residual = np.linalg.solve(tracks.whitening, lin.residual[..., None])[lin.valid, :, 0]
         root = [estimate.root[:, 6 * i : 6 * i + 6] for i in range(n + 1)]
         return Adjustment(
             poses=self.frames.poses(parameters),
@@ -373,7 +374,7 @@ class BundleAdjustment:
             shift_frames=float(parameters.shared[COMMON]),
             sigma_m=float(variances.sigma[0]),
             sigma_rad=float(variances.sigma[3]),
-            residual_px=float(np.median(np.linalg.norm(residual[..., 0], axis=1))),
+            residual_px=float(np.median(np.linalg.norm(residual, axis=1))),
             common_covariance=root[n].T @ root[n],
             correction=self._deviation(parameters),
             weight=np.minimum(variances.weight, 1.0),
@@ -384,7 +385,9 @@ class BundleAdjustment:
 
 def noise_of(linearised: Linearised) -> float:
     """Robust standard deviation of whitened residuals per axis."""
-    squares = (linearised.residual**2).sum(1)
+    squares = (linearised.residual[linearised.valid] ** 2).sum(1)
+    if not len(squares):
+        return MIN_NOISE
     # The median length of two Gaussian axes is 1.177 standard deviations.
     return max(float(np.sqrt(np.median(squares))) / 1.177, MIN_NOISE)
 

@@ -254,4 +254,6 @@ class NormalEquations:
         whitened = root @ slope
         change = -root.T @ whitened
         depths = (-self.depth_slope - self.mixed @ change) / depth
+        if not (np.isfinite(change).all() and np.isfinite(depths).all()):
+            return None
         return Solution(change, depths, root, float(np.linalg.norm(whitened)))
