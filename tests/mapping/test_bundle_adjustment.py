@@ -369,8 +369,9 @@ def test_steps_reach_the_minimum_of_a_slow_solver() -> None:
     )
     deviation = np.sqrt(np.einsum("ij,ij->j", estimate.root, estimate.root))
     assert np.abs(difference / deviation).max() < 0.05
-    depth = estimate.parameters.inverse_depth
-    np.testing.assert_allclose(depth, expected.inverse_depth, rtol=1e-3)
+    observed = np.unique(tracks.landmark)
+    depth, slow_depth = (p.inverse_depth[observed] for p in (estimate.parameters, expected))
+    np.testing.assert_allclose(depth, slow_depth, rtol=1e-3)
 
 
 def collinear(frames: int) -> SE3:
