@@ -19,7 +19,6 @@ from evercal.features.vlad import vlad_for
 from evercal.geometry import SE3, Camera
 from evercal.geometry.uncertain_pose import frame_covariance
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment, BundleOptions
-from evercal.mapping.bundle_tracks import bundle_tracks
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.map_frame import MapFrame, fit_correction
 from evercal.mapping.memory_budget import MemoryBudget
@@ -32,7 +31,13 @@ from evercal.mapping.pose_check import (
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
 from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import select_farthest, spread_poses
-from evercal.mapping.tracks import KeyframeTracks, TrackOptions, open_keyframe, refine_depths
+from evercal.mapping.tracks import (
+    KeyframeTracks,
+    TrackOptions,
+    bundle_tracks,
+    open_keyframe,
+    refine_depths,
+)
 from evercal.recordings.frame import Frame, stated_poses
 
 OnProgress = Callable[[str, int, int], object]
@@ -228,7 +233,7 @@ def _open_keyframes(
         for keyframe in pool.map(open_one, prepared.keyframes):
             keyframes.append(keyframe)
             on_progress("mapping", len(keyframes), len(prepared.keyframes))
-    if not any(keyframe.kept.any() for keyframe in keyframes):
+    if not any(keyframe.confirmed.any() for keyframe in keyframes):
         raise InputError(
             "no two training frames show the same surfaces with parallax: record views from at"
             " least 10 cm apart, or check that the stated poses belong to these images"
@@ -346,7 +351,7 @@ def _keyframes(frames: PreparedFrames, tracks: list[KeyframeTracks]) -> Keyframe
         tuple(frames.cameras[i] for i in numbers),
         frames.poses[np.array(numbers)],
         tuple(torch.from_numpy(k.cell_inverse_depth).half() for k in tracks),
-        tuple(k.landmarks.take(np.flatnonzero(k.kept)) for k in tracks),
+        tuple(k.landmarks.take(np.flatnonzero(k.confirmed)) for k in tracks),
         torch.stack([vlad(frames.features(i)) for i in numbers]).half(),
     )
 
