@@ -17,12 +17,12 @@ import numpy as np
 import torch
 
 from evercal.continual.learn_scene import LearnOptions, learn_scene
+from evercal.continual.networks.descriptor import encode
 from evercal.continual.presets import preset
 from evercal.continual.strategies import strategy_named
 from evercal.evaluation import evaluate, scores
 from evercal.evaluation.metrics import FINEST, correct
 from evercal.evaluation.tables import table
-from evercal.features.encode import encode
 from evercal.features.views import ViewOptions, frame_view
 from evercal.localization.localizer import Localizer
 from evercal.mapping.selection import SarsOptions, select_sars

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from evercal.features.encode import encode
+from evercal.continual.networks.descriptor import encode
 from evercal.features.views import ViewOptions, plain_view
 from evercal.localization.localizer import Localizer
 from evercal.localization.parallel import in_parallel

@@ -41,7 +41,7 @@ from evercal.mapping.tracks import (
 from evercal.recordings.frame import Frame, stated_poses
 
 OnProgress = Callable[[str, int, int], object]
-"""Called with the name of the current step, how much of it is done, and how much there is."""
+"""Called with the name of the current step, its progress, and its total."""
 
 HAND_EYE_COVARIANCE_SCALE = 2.5
 """Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated
@@ -54,7 +54,7 @@ some hundredths of a pixel."""
 
 @dataclass(frozen=True)
 class MapOptions:
-    """How a map is built."""
+    """Options of building a map."""
 
     memory: MemoryBudget = field(default_factory=MemoryBudget)
     """How many keyframes are kept."""
@@ -110,7 +110,7 @@ class Adjusted:
     time_shift_frames: float
     """Delay of the images after their stated poses."""
     wrong_poses: tuple[str, ...]
-    """Frames whose stated pose contradicts the images; they were left out."""
+    """Frames whose stated pose contradicts the images; they are excluded."""
     doubtful_poses: tuple[str, ...]
     """Frames whose stated pose has an unusually large error; they were given less weight."""
 
@@ -179,13 +179,13 @@ def build_map(
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """Frames that take part, encoded, without those whose pose is wrong."""
+    """Encoded frames without those whose stated pose contradicts the images."""
 
     frames: PreparedFrames
     keyframes: list[int]
-    """Which of them become keyframes."""
+    """Numbers of the keyframes."""
     wrong: tuple[str, ...]
-    """Names of the frames that were left out."""
+    """Names of the excluded frames."""
 
 
 def _prepare(
@@ -207,7 +207,7 @@ def _prepare(
     if len(bad):
         prepared = prepared.without(bad)
     start = [new for new, old in enumerate(good) if support[old] in wanted]
-    # Other frames replace keyframes that were left out.
+    # Other frames replace excluded keyframes.
     positions, rotations = prepared.stated.translation_m, prepared.stated.rotation_wxyz
     keyframes = select_farthest(positions, rotations, len(wanted), start=start)
     return _Prepared(prepared, keyframes.tolist(), wrong)
@@ -242,9 +242,9 @@ def _open_keyframes(
 
 
 def _velocity(frames: Sequence[Frame]) -> np.ndarray:
-    """(n, 6) motion per frame, camera frame, where the neighbours in time are frames too.
+    """(n, 6) motion per frame, camera frame; 0 beside gaps of the recording.
 
-    Gaps of the recording are steps much longer than the median one.
+    A gap is a step much longer than the median one.
     """
     poses = stated_poses(frames)
     if len(frames) < 3:
@@ -289,8 +289,8 @@ def _moved(stated: SE3, camera: Camera, adjustment: Adjustment) -> bool:
 
     Args:
         stated: (n,) poses before.
-        camera: intrinsics before, where all frames share a camera.
-        adjustment: of both.
+        camera: intrinsics before, if all frames share a camera.
+        adjustment: the result.
     """
     change = np.linalg.norm((stated.inverse() @ adjustment.poses).log().reshape(-1, 2, 3), axis=2)
     metres, radians = np.median(change, 0)
@@ -310,7 +310,7 @@ def _finish(
     adjustment: Adjustment | None,
     options: MapOptions,
 ) -> BuiltMap:
-    """Everything that is stored of the scene."""
+    """The built map of all adjusted parts."""
     frames, numbers = prepared.frames, [keyframe.frame for keyframe in tracks]
     first = frames.frames[0].camera
     camera = frames.cameras[0].resized(first.width, first.height)
