@@ -153,7 +153,7 @@ class MapStore(StageStore):
         Raises:
             InputError: As `commit`, and where a file of the store is missing or was changed.
         """
-        index = [known.name for known in self.contents.scenes].index(scene.name)
+        index = [stored.name for stored in self.contents.scenes].index(scene.name)
         self.replace(index, lambda folder: write_scene(folder, scene), self._payload())
         self.contents.scenes[index] = scene
 
