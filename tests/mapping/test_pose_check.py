@@ -56,7 +56,7 @@ def test_one_frame_30_cm_away_is_detected(
     assert detected(moved(recording, {frame: shift})) == [frame]
 
 
-def test_two_wrong_frames_and_a_turned_one_are_detected(recording: PreparedFrames) -> None:
+def test_shifted_and_rotated_frames_are_detected(recording: PreparedFrames) -> None:
     up, rotated = SE3.exp(np.array([0, 0.3, 0, 0, 0, 0])), SE3.exp(np.array([0, 0, 0, 0, 0.2, 0]))
     assert detected(moved(recording, {3: up, 10: rotated})) == [3, 10]
 

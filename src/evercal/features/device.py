@@ -7,8 +7,6 @@ from torch import nn
 
 from evercal.errors import InputError
 
-DEVICES = ("auto", "cpu", "cuda")
-
 
 def device_of(name: str | torch.device = "auto") -> torch.device:
     """Parse the name of a device.

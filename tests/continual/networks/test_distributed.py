@@ -302,7 +302,7 @@ def test_batches_hold_neighbours_of_one_size(sizes: list[bool], passes: int, don
 def test_without_torchrun_there_is_nothing_to_join() -> None:
     assert join_processes("cpu") == torch.device("cpu")
     assert processes() == 1
-    with pytest.raises(InputError, match="take auto, cpu or cuda"):
+    with pytest.raises(InputError, match="use auto, cpu or cuda"):
         join_processes("gpu")
 
 
