@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from evercal.mapping.patches import (
     SIDE,
-    Patches,
     align_down,
     align_patches,
     cut_patches,
@@ -205,13 +204,6 @@ def test_whitening_makes_errors_independent() -> None:
     np.testing.assert_allclose(unit, np.broadcast_to(np.eye(2), unit.shape), atol=1e-6)
 
 
-def test_edges_are_located_across_and_not_along() -> None:
-    stripes = (128 + 80 * np.tanh((pixels()[..., 0] - 80) / 3)).astype(np.float32)
-    patch = cut_patches(stripes, np.array([[80.0, 60.0]]))
-    white = whitening(np.eye(2)[None], patch.inverse_hessian, 0.1, 0.8)[0]
-    assert np.linalg.norm(white @ [1, 0]) > 20 * np.linalg.norm(white @ [0, 1])
-
-
 def test_error_along_one_line_is_whitened() -> None:
     rng = np.random.default_rng(0)
     affines = rng.normal(0, 0.2, (7, 2, 2)) + np.eye(2)
@@ -222,11 +214,3 @@ def test_error_along_one_line_is_whitened() -> None:
         spread = affines[i] @ hessian[i] @ affines[i].T + 0.01 * np.eye(2)
         covariance = 0.64 * spread + np.outer(line[i], line[i])
         np.testing.assert_allclose(white @ covariance @ white.T, np.eye(2), atol=1e-9)
-
-
-def test_sets_of_patches_are_joined_in_order() -> None:
-    plain, at = image(picture(0), np.eye(2), np.zeros(2)), spots(20)
-    whole = cut_patches(plain, at)
-    parts = Patches.joined([cut_patches(plain, at[:7]), cut_patches(plain, at[7:])])
-    for name in ("intensity", "descent", "inverse_hessian", "rest"):
-        np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), atol=1e-6)

@@ -1,8 +1,6 @@
 """SARS against a slow twin written from Algorithm 1, and the metric against its formula."""
 
 import math
-import time
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -186,27 +184,6 @@ def test_fill_covers_better_than_the_fixed_radius():
     assert covering_radius(positions, quaternions, filled) < 0.7 * covering_radius(
         positions, quaternions, fixed
     )
-
-
-def test_ten_thousand_poses_cost_little_more_than_their_bare_distances():
-    positions, quaternions = random_walk(np.random.default_rng(8), 10_000, step=0.01)
-    space = PoseSpace.of(positions, quaternions, 1.0)
-    buffer = space.take(np.arange(1000))
-
-    def distances() -> None:
-        for frame in range(len(space)):
-            space.distances(frame, buffer)
-
-    def selection() -> None:
-        assert len(select_sars(positions, quaternions, 1000, SarsOptions(radius=0.0))) == 1000
-
-    def seconds(work: Callable[[], None]) -> float:
-        start = time.process_time()
-        work()
-        return time.process_time() - start
-
-    # 1.5 to 2.5 where measured; a search of all pairs for each frame would be 500 times as much.
-    assert min(seconds(selection) for _ in range(2)) < 8 * max(seconds(distances) for _ in range(2))
 
 
 def test_farthest_equals_slow_twin():

@@ -1,7 +1,7 @@
 """Views: images at the encoder's working size, plain or augmented.
 
-An augmented view is the image of a camera that is rotated about its own centre and has another focal
-length. That image does not depend on the depths, so its pose is exact.
+An augmented view is the image of a camera with another rotation and focal length, but the same
+centre. That image does not depend on the depths, so its pose is exact.
 """
 
 from dataclasses import dataclass

@@ -106,7 +106,7 @@ class Adjusted:
     pose_sigma_mm: float
     """Estimated error of the stated positions, standard deviation per axis."""
     pose_sigma_deg: float
-    """The same of the stated rotations."""
+    """The same for the stated rotations, degrees."""
     time_shift_frames: float
     """Delay of the images after their stated poses."""
     wrong_poses: tuple[str, ...]
@@ -179,7 +179,7 @@ def build_map(
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """Encoded frames without those whose stated pose contradicts the images."""
+    """Encoded frames whose stated poses are consistent with the images."""
 
     frames: PreparedFrames
     keyframes: list[int]

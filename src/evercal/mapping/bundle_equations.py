@@ -239,7 +239,7 @@ class NormalEquations:
     """(p,) the same by inverse depths."""
 
     def solve(self, damping: float) -> Solution | None:
-        """Solve with all diagonal elements raised by a share; None where that is not possible."""
+        """Solve with diagonal elements raised by a share; None if not positive definite."""
         depth = (1 + damping) * self.depth
         eliminated = self.mixed.T @ sparse.diags_array(1 / depth) @ self.mixed
         system = (self.gram - eliminated).toarray() + self.prior

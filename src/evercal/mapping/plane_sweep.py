@@ -152,7 +152,7 @@ class _NormalEquation(NamedTuple):
 
 
 class _SourceView:
-    """Similarity of the cells of a view to those of one other view."""
+    """Similarity of the cells of a view to all cells of one other view."""
 
     def __init__(self, view: PosedCells, other: PosedCells):
         self.other, (self.rows, self.columns) = other, other.grid
@@ -203,7 +203,7 @@ def peak(similarity: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tenso
     """The most similar cell of the 3x3 around a cell, to a fraction of a cell.
 
     Args:
-        similarity: (n, h, w) of n cells to those of a view.
+        similarity: (n, h, w) of n cells to all cells of another view.
         row: (n,) in 1 .. h - 2.
         column: (n,) in 1 .. w - 2.
 

@@ -148,7 +148,7 @@ class MapStore(StageStore):
         """Replace what is stored of a scene beside its keyframes: whole, or not at all.
 
         Args:
-            scene: its map; the name says which scene is replaced.
+            scene: its map; it replaces the scene of the same name.
 
         Raises:
             InputError: As `commit`, and where a file of the store is missing or was changed.

@@ -206,11 +206,7 @@ def refine_depths(
 def bundle_tracks(
     recording: PreparedFrames, keyframes: list[KeyframeTracks], options: TrackOptions
 ) -> BundleTracks:
-    """Observations for bundle adjustment.
-
-    They are those of a spread subset of the landmarks, in all frames that show enough of their
-    keyframe.
-    """
+    """Observe a spread subset of the landmarks in all frames that show enough of their keyframe."""
     most = max(30, min(options.landmarks_per_keyframe, options.bundle_landmarks // len(keyframes)))
     tied = _tied_frames(recording, keyframes, options)
     parts: list[Observations] = []
