@@ -213,7 +213,7 @@ def test_focal_length_is_estimated(factor: float) -> None:
     assert result.camera.fy == pytest.approx(CAMERA.fy, rel=1e-3)
     metres, _ = errors(result.poses, made.truth)
     assert np.median(metres) < 2e-3
-    # It is not adjusted where that is turned off, or where frames have different cameras.
+    # It is not adjusted without `intrinsics`, or if frames have different cameras.
     fixed = adjusted(made, made.truth, wrong, options=BundleOptions(intrinsics=False))
     assert fixed.camera is None
     several = [wrong, *[CAMERA] * (FRAMES - 1)]

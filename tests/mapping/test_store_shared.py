@@ -125,15 +125,15 @@ def test_reader_starts_over_if_a_writer_was_faster(
     moment: str, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writer, writes = MapStore.open(root), iter("w")
-    place, name = (manifest, "sha256_file") if moment == "checksums" else (module, "read_scene")
-    read = getattr(place, name)
+    owner, name = (manifest, "sha256_file") if moment == "checksums" else (module, "read_scene")
+    read = getattr(owner, name)
 
     def interrupted(path: Path) -> object:
         for _ in writes:
             writer.update(changed(writer))
         return read(path)
 
-    monkeypatch.setattr(place, name, interrupted)
+    monkeypatch.setattr(owner, name, interrupted)
     assert MapStore.open(root).contents.scenes[0].min_support == 0.9
     writes = iter("w")
     assert verify(root) == []

@@ -57,7 +57,7 @@ class MapOptions:
     """Options of building a map."""
 
     memory: MemoryBudget = field(default_factory=MemoryBudget)
-    """How many keyframes are kept."""
+    """Number of keyframes."""
     size: WorkingSize = field(default_factory=WorkingSize)
     """Working sizes of images."""
     tracks: TrackOptions = field(default_factory=TrackOptions)
@@ -77,8 +77,8 @@ class MapOptions:
     def for_hand_eye(self) -> "MapOptions":
         """The same options for poses from a rough `gripper_from_camera`.
 
-        The common transform has no prior. Arms place their gripper to some tenths of a millimetre,
-        so stated poses are never taken to be better than that.
+        The common transform has no prior. The poses of arms have errors of some tenths of a
+        millimetre, which bounds the estimated errors of stated poses.
         """
         bundle = replace(
             self.bundle,
@@ -325,7 +325,8 @@ def _finish(
         )
         if not options.bundle.common_stated:
             # The common transform is part of the answer and not an error to undo.
-            covariance = HAND_EYE_COVARIANCE_SCALE * np.asarray(adjustment.common_covariance)
+            covariance = np.asarray(adjustment.common_covariance, np.float64)
+            covariance = HAND_EYE_COVARIANCE_SCALE * covariance
             hand_eye = HandEyeCorrection(common, covariance)
             base = frame_covariance(frames.stated @ common, covariance)
             frame = replace(frame, common=SE3.identity(), base_covariance=base)

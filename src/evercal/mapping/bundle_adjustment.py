@@ -266,19 +266,18 @@ class BundleAdjustment:
         m, p = len(tracks.frame), len(tracks.host)
         root = np.repeat(np.sqrt(weight), 2)
         scaled = sparse.diags_array(root) @ lin.jacobian(tracks, self.n)
-        by_depth = (lin.by_depth * np.sqrt(weight)[:, None]).ravel()
-        columns = np.repeat(tracks.landmark, 2)
-        depth = sparse.csr_array((by_depth, (np.arange(2 * m), columns)), shape=(2 * m, p))
+        landmark, slope = tracks.landmark, weight * (lin.by_depth * lin.residual).sum(1)
+        values = (lin.by_depth * np.sqrt(weight)[:, None]).ravel()
+        columns = np.repeat(landmark, 2)
+        depth = sparse.csr_array((values, (np.arange(2 * m), columns)), shape=(2 * m, p))
         prior, prior_slope = self._prior(estimate.parameters, variances)
         return NormalEquations(
             gram=sparse.csr_array(scaled.T @ scaled),
             mixed=(depth.T @ scaled).tocsr(),
-            depth=np.bincount(tracks.landmark, weight * (lin.by_depth**2).sum(1), p) + 1e-6,
+            depth=np.bincount(landmark, weight * (lin.by_depth**2).sum(1), p) + 1e-6,
             prior=prior,
             slope=scaled.T @ (lin.residual.ravel() * root) + prior_slope,
-            depth_slope=np.bincount(
-                tracks.landmark, weight * (lin.by_depth * lin.residual).sum(1), p
-            ),
+            depth_slope=np.bincount(landmark, slope, p).astype(np.float64),
         )
 
     def _moved(
