@@ -92,7 +92,7 @@ def _wrist_draw(scene: Recording, room: Path, store: Path, draw: int) -> Row:
     report = Map.open(store).learn(recording)
     seconds, result = time.perf_counter() - began, report.hand_eye
     assert result is not None
-    row = _error(result.gripper_from_camera, np.array(result.covariance), truth)
+    row = _error(result.gripper_from_camera.pose, np.array(result.covariance), truth)
     row |= {"start_mm": result.start_mm, "seconds": seconds}
     folder = room / "calibration" / "fixed"
     if folder.is_dir():

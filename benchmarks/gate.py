@@ -17,11 +17,10 @@ import torch
 
 from evercal.continual.learn_scene import NetworkLearnOptions, learn_networks
 from evercal.continual.localizer import open_networks
-from evercal.continual.networks.descriptor import load_descriptor
+from evercal.continual.networks.descriptor import encode, load_descriptor
 from evercal.evaluation import evaluate, scores
 from evercal.evaluation.metrics import FINEST, correct
 from evercal.evaluation.tables import table
-from evercal.features.encode import encode
 from evercal.features.views import ViewOptions, frame_view
 from evercal.localization.localizer import Localizer
 from evercal.map import Map

@@ -14,8 +14,7 @@ import numpy as np
 
 from benchmarks.peer_features import Detector, Features, detect, mutual_matches
 from benchmarks.peer_triangulation import Tracks, TriangulationOptions, triangulate
-from evercal.continual.networks.descriptor import load_descriptor
-from evercal.features.encode import encode
+from evercal.continual.networks.descriptor import encode, load_descriptor
 from evercal.features.encoder import load_encoder
 from evercal.features.views import ViewOptions, plain_view
 from evercal.geometry.camera import Camera
