@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 import torch
-from evercal.mapping.scene_maps import SceneRecord
 
 from evercal.continual.finish_scene import mapped_record
 from evercal.continual.networks.atlas import Cell
@@ -27,6 +26,7 @@ from evercal.mapping.build import (
 )
 from evercal.mapping.bundle_adjustment import Adjustment
 from evercal.mapping.prepared_frames import WorkingSize
+from evercal.mapping.scene_maps import SceneRecord
 from evercal.recordings.frame import Frame, Recording
 from evercal.simulation.box_room import BoxRoom
 

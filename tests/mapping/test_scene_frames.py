@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from evercal.mapping.scene_maps import Alignment, frame_moved_by_cameras, moved_by_frame
 
 from evercal.geometry import SE3, pose_distance
+from evercal.mapping.scene_maps import Alignment, frame_moved_by_cameras, moved_by_frame
 
 POSE = SE3.exp([0.4, -0.7, 1.1, 0.3, 0.9, -0.5])
 

@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evercal.mapping.frame_correction import FrameCorrection
-from evercal.mapping.scene_maps import Alignment, SceneRecord
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evercal.continual.networks.atlas import Cell
 from evercal.geometry import SE3, Camera, pose_distance
+from evercal.mapping.frame_correction import FrameCorrection
+from evercal.mapping.scene_maps import Alignment, SceneRecord
 
 LENS = Camera(320, 240, 300, 300, 159.5, 119.5)
 ALIGNMENT = Alignment(SE3.exp([1.0, -2.0, 0.5, 0.3, -0.9, 0.4]), 0.37)

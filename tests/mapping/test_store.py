@@ -11,8 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from evercal.mapping.scene_maps import Alignment, SceneMaps
-from evercal.mapping.stage_files import head_bytes
 from torch import Tensor
 
 from evercal.continual.networks.head import Head
@@ -21,6 +19,8 @@ from evercal.features import vlad
 from evercal.features.encoder import load_encoder
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.localization.localizer import Localizer
+from evercal.mapping.scene_maps import Alignment, SceneMaps
+from evercal.mapping.stage_files import head_bytes
 from evercal.mapping.store import Checkpoint, Store
 from evercal.recordings.frame import Recording
 from evercal.storage.manifest import MANIFEST, verify, write_manifest

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from evercal.mapping.scene_maps import SceneMaps
 
+from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Checkpoint, Store
 from evercal.storage.manifest import MANIFEST
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from evercal.mapping.scene_maps import Alignment, SceneMaps, SceneRecord
 
 from evercal.cli.align import Align
 from evercal.errors import InputError
 from evercal.geometry.se3 import SE3
 from evercal.mapping import store as module
+from evercal.mapping.scene_maps import Alignment, SceneMaps, SceneRecord
 from evercal.mapping.store import Checkpoint, Store
 from evercal.storage import manifest, verify
 
