@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from evercal.continual.learn_into_store import learn
 
 import evercal
 from evercal.cli.learn import Learn
 from evercal.continual import learn_into_store
-from evercal.continual.learn_into_store import learn
 from evercal.continual.learn_scene import LearnOptions
 from evercal.continual.presets import preset
 from evercal.errors import InputError

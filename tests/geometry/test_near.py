@@ -1,4 +1,4 @@
-"""Which poses lie near others, against a loop."""
+"""Poses near training poses, compared with a loop."""
 
 import math
 
@@ -22,7 +22,7 @@ def test_near_training_agrees_with_a_loop(monkeypatch: pytest.MonkeyPatch) -> No
     assert 10 < near.sum() < 90  # the twin saw both answers
 
 
-def test_near_in_metres_and_near_in_degrees_must_be_one_frame() -> None:
+def test_one_frame_must_be_near_in_metres_and_degrees() -> None:
     here = SE3.identity()
     turned = SE3.exp([0, 0, 0, 0, 0, 6 * DEGREE])
     moved = SE3.exp([0.06, 0, 0, 0, 0, 0])

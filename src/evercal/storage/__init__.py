@@ -1,4 +1,4 @@
-"""Bytes on disk that survive a crash; knows nothing of what they mean."""
+"""Files on disk that survive a crash, whatever they contain."""
 
 from evercal.storage.atomic import recover_folder as recover_folder
 from evercal.storage.atomic import replace_folder as replace_folder
