@@ -349,7 +349,6 @@ def test_steps_reach_the_minimum_of_a_slow_solver() -> None:
 
     slow = scipy.optimize.least_squares(residuals, np.zeros(len(scale)), xtol=1e-14, ftol=1e-14)
     cost = bundle.cost(estimate.linearised, estimate.parameters, variances, noise)
-    # Derivatives by corrections are exact for small rotations.
     assert 2 * slow.cost == pytest.approx(cost, rel=2e-6)
     expected = parameters(slow.x)
     difference = np.concatenate(
