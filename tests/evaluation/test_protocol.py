@@ -175,12 +175,12 @@ def test_unusable_scenes_are_refused(scenes: dict[str, Recording], message: str)
 def test_squared_error_is_in_units_of_the_covariance() -> None:
     """3 cm with a sigma of 1 cm and 2 deg with a sigma of 1 deg: 9 + 4."""
     covariance = np.diag([0.01**2] * 3 + [math.radians(1) ** 2] * 3)
-    estimate = pose(1.03, 2.0)
+    off = pose(1.03, 2.0)
     estimates = {
-        0: estimate("ok", "a", estimate, covariance=covariance),
-        1: estimate("ok", "a", estimate),
-        2: estimate("ok", "b", estimate, covariance=covariance),
-        3: estimate("failed", "a", estimate, covariance=covariance),
+        0: estimate("ok", "a", off, covariance=covariance),
+        1: estimate("ok", "a", off),
+        2: estimate("ok", "b", off, covariance=covariance),
+        3: estimate("failed", "a", off, covariance=covariance),
     }
     scenes = {"a": scene("a", *(frame(i, pose(1.0)) for i in range(4)))}
     first, *others = evaluate(Fake(estimates), scenes)

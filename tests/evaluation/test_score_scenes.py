@@ -1,10 +1,9 @@
-"""`evercal.evaluate` accepts recordings, folders and mappings."""
+"""`evaluate` accepts recordings, folders and mappings."""
 
 from pathlib import Path
 
 import pytest
 
-import evercal
 from evercal.errors import InputError
 from evercal.evaluation.score_scenes import evaluate
 from evercal.geometry import SE3, Camera
@@ -42,7 +41,6 @@ def test_recordings_folders_and_mappings(tmp_path: Path) -> None:
     named = evaluate(Shifted("other"), {"other": folder})
     assert list(named.scenes) == ["other"]
     assert named.mean_accuracy_1cm_1deg == 100.0
-    assert evercal.evaluate is evaluate
 
 
 def test_repeated_name_is_refused() -> None:

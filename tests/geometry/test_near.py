@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from evercal.geometry import SE3, near_training, pose_distance
+from evercal.geometry import SE3, pose_distance
+from evercal.geometry.near import near_training
 
 DEGREE = math.radians(1.0)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from evercal.errors import InputError
-from evercal.storage import lock_settings
+from evercal.storage.settings import lock_settings
 
 
 def test_other_settings_are_refused(tmp_path: Path) -> None:
