@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 from tabulate import tabulate
 from tqdm import tqdm
 
@@ -26,7 +27,6 @@ from evercal.geometry import SE3
 from evercal.localization.localizer import Localizer
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.landmarks import Landmarks, detect
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 from evercal.recordings import Recording, load_recording
 from evercal.simulation.box_room import BoxRoom, default_camera
 

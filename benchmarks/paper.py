@@ -5,6 +5,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+from evercal.mapping.scene_maps import SceneMaps
+
 from benchmarks.peak_memory import peak_gb
 from evercal.continual.benchmark.suites import load_suite
 from evercal.continual.learn import learn
@@ -17,7 +19,6 @@ from evercal.continual.stage import Encoding
 from evercal.continual.strategies import strategy_named
 from evercal.features.device import device_of
 from evercal.features.encoder import load_encoder
-from evercal.mapping.scene_maps import SceneMaps
 from evercal.recordings import stated_poses
 
 REPORT_EVERY = 10

@@ -1,6 +1,7 @@
 """Views of the simulator's rooms, and rendering time."""
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 

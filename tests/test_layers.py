@@ -260,7 +260,11 @@ def test_planted_chains_are_found(tmp_path: Path) -> None:
         },
     )
     graph = import_graph(tmp_path)
-    networks = {"evercal.continual", "evercal.continual.networks", "evercal.continual.networks.loss"}
+    networks = {
+        "evercal.continual",
+        "evercal.continual.networks",
+        "evercal.continual.networks.loss",
+    }
     simulation = {"evercal.simulation", "evercal.simulation.rooms"}
     assert chains(graph, "map", outside_product).keys() == networks
     reached = chains(graph, "mapping", outside_product)

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from evercal.calibration.calibration import read_calibration as read_calibration
     from evercal.calibration.drift import Shift as Shift
     from evercal.calibration.pose_pairs.pairs import PosePairs as PosePairs
-    from evercal.calibration.pose_pairs.solve import SolveOptions as SolveOptions
     from evercal.calibration.pose_pairs.solve import solve as solve
     from evercal.errors import InputError as InputError
     from evercal.evaluation import Scores as Scores
@@ -47,7 +46,6 @@ _PUBLIC = {
     "SE3": "evercal.geometry",
     "Scores": "evercal.evaluation",
     "Shift": "evercal.calibration.drift",
-    "SolveOptions": "evercal.calibration.pose_pairs.solve",
     "UncertainPose": "evercal.geometry",
     "load_recording": "evercal.recordings",
     "read_calibration": "evercal.calibration.calibration",

@@ -257,20 +257,18 @@ class Map:
     def evaluate(
         self,
         recordings: PathLike | Recording | Sequence[Recording] | Mapping[str, Recording],
-        on_frame: Callable[[], object] = lambda: None,
     ) -> "Scores":
         """Score the map on the test frames of recordings.
 
         Args:
             recordings: recordings or the path of one; a mapping gives the scenes' names.
-            on_frame: called after each frame.
 
         Raises:
             InputError: A recording that the map has not learned, or without test frames.
         """
         from evercal.evaluation.score_scenes import evaluate
 
-        return evaluate(self.localizer, recordings, on_frame)
+        return evaluate(self.localizer, recordings)
 
 
 def _sized(options: MapOptions, budget: MemoryBudget, short_side: int) -> MapOptions:

@@ -1,7 +1,5 @@
 """A first `gripper_from_camera` from the motions of pairs of images."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from evercal.continual.stage_map import fitting
 from evercal.mapping.scene_maps import SceneMaps
 
 from evercal.continual.learn import learn
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.stage import Stage, StageOptions
-from evercal.continual.stage_map import fitting
 from evercal.continual.strategies import STRATEGIES
 from evercal.geometry.se3 import SE3, pose_distance
 from evercal.recordings.frame import Frame, Recording

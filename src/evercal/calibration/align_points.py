@@ -65,8 +65,8 @@ def align_by_points(images: Sequence[Picks], scale_known: bool) -> PointAlignmen
     triangulated = _triangulated(images)
     if len(triangulated) < 3:
         raise InputError(
-            f"{len(triangulated)} points were picked in two or more images; give at least three, each"
-            " in two images from different places"
+            f"{len(triangulated)} points were picked in two or more images; give at least three,"
+            " each in two images from different places"
         )
     in_map, in_base = (np.stack(side) for side in zip(*triangulated.values(), strict=True))
     start = _umeyama(in_map, in_base, scale_known)

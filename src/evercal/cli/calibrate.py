@@ -155,7 +155,8 @@ def _rig_lines(rig: "Rig") -> list[str]:
     for pair in rig.relative:
         x, y, z = 1000 * pair.first_from_second.translation_m
         lines.append(
-            f"{pair.first}_from_{pair.second}: {x:+.2f} {y:+.2f} {z:+.2f} mm, standard deviation at"
-            f" most {pair.sigma_mm:.2f} mm and {pair.sigma_deg:.3f} deg (independent errors assumed)"
+            f"{pair.first}_from_{pair.second}: {x:+.2f} {y:+.2f} {z:+.2f} mm, standard deviation"
+            f" at most {pair.sigma_mm:.2f} mm and {pair.sigma_deg:.3f} deg (independent errors"
+            " assumed)"
         )
     return lines

@@ -121,13 +121,12 @@ def _open(store: Path, device: str) -> "Localizer":
 
 def _learn(store: Path, scene: "Recording", device: str, result: "DemoResult") -> None:
     """Add a room to the store."""
-    from evercal.cli.learn_bars import LearnBars
-    from evercal.continual.learn_scene import LearnOptions, learn_scene
-    from evercal.continual.presets import preset
+    from evercal.cli.networks import Bars
+    from evercal.map import Map
     from evercal.reports.demo_page import LearnedRoom
 
-    with LearnBars() as bars:
-        report = learn_scene(store, scene, LearnOptions(preset("fast"), device=device), bars)
+    with Bars() as bars:
+        report = Map.open(store, device=device).learn(scene, on_progress=bars.step)
     result.learned.append(
         LearnedRoom(
             report.scene,
@@ -146,7 +145,8 @@ def _localize_unknown(localizer: "Localizer", scene: "Recording", result: "DemoR
     frames = _spread(scene.test, UNKNOWN_IMAGES)
     with progress_bar(f"images of unknown room {scene.name}", len(frames), "image") as bar:
         for frame in frames:
-            estimate = localizer.localize(frame.read_image(), frame.camera)
+            camera = localizer.camera_for(frame.camera)
+            estimate = localizer.localize(frame.read_image(), camera)
             result.unknown_images += 1
             result.unknown_refused += estimate.status != "ok"
             bar.update()
@@ -191,7 +191,7 @@ def _fixed_camera(localizer: "Localizer", room: "SampleRoom") -> "FixedCamera":
             error_deg=deg,
             sigma_mm=calibration.sigma_mm,
         )
-        shift, _ = check(localizer, _images(bumped), calibration, on_image=bar.update)
+        shift = check(localizer, _images(bumped), calibration, on_image=bar.update)
         camera = replace(camera, shift_mm=shift.translation_mm, bump_detected=shift.moved)
     return camera
 
@@ -215,7 +215,7 @@ def _pictures(localizer: "Localizer", scene: "Recording") -> "list[Picture]":
     pictures = []
     for frame in _spread(scene.test, PICTURES):
         image = frame.read_image()
-        estimate = localizer.localize(image, frame.camera)
+        estimate = localizer.localize(image, localizer.camera_for(frame.camera))
         drawn = draw_landmarks(image, estimate, localizer)
         caption = f"{estimate.scene or estimate.status}: {estimate.inliers} landmarks"
         pictures.append(Picture(encode_image(drawn, "jpg"), caption))

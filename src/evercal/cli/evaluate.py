@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.console import print_json, print_next, progress_bar, require_writable
 from evercal.cli.device import Device
-from evercal.cli.output import check_output
+from evercal.cli.stores import open_localizer
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,15 +17,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure the localization accuracy on the test frames of scenes."""
+    """Measure the localization accuracy on the test frames of scenes.
+
+    Example: evercal evaluate cell.evercal kitchen/ --report report.html
+    """
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the store."""
-    scenes: Annotated[
-        Positional[tuple[str, ...]], arg(metavar="[NAME=]SCENE...", help_behavior_hint="")
-    ]
+    scenes: Annotated[Positional[tuple[str, ...]], arg(metavar="[NAME=]SCENE...")]
     """Folders of recorded scenes. NAME is the scene's name in the store, if it differs."""
-    report: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
+    report: Annotated[Path | None, arg(metavar="FILE.html")] = None
     """HTML report with error curves, trajectories and the worst frames."""
     device: Device = "auto"
     json: bool = False
@@ -35,14 +36,12 @@ class Evaluate:
         """Evaluate and print a table."""
         if not self.scenes:
             raise InputError("no scene given; name one or more scene folders after the store")
-        if self.report is not None:
-            check_output(self.report, "--report")
+        require_writable(self.report, "--report")
         scenes = load_named(self.scenes)
         from evercal.evaluation import evaluate, scores
         from evercal.evaluation.tables import score_table
-        from evercal.localization.localizer import Localizer
 
-        localizer = Localizer.open(self.store, device=self.device)
+        localizer = open_localizer(self.store, self.device)
         with progress_bar("evaluating", 0, "image") as bar:
 
             def show(done: int, total: int) -> None:

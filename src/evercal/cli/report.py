@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar
+from evercal.cli.console import print_json, print_next, progress_bar, require_writable
 from evercal.cli.device import Device
-from evercal.cli.output import check_output
+from evercal.cli.stores import open_localizer
 from evercal.recordings.image_files import image_files
 
 if TYPE_CHECKING:
@@ -18,20 +18,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Report:
-    """Write an HTML report of a calibration: verdict, uncertainty, residuals and overlays."""
+    """Write an HTML report of a calibration: verdict, uncertainty, residuals and overlays.
+
+    Example: evercal report tripod.json --store cell.evercal
+    """
 
     calibration: Annotated[Positional[Path], arg(metavar="CALIBRATION.json")]
     """Calibration file."""
-    store: Annotated[Path | None, arg(metavar="STORE", help_behavior_hint="")] = None
+    store: Annotated[Path | None, arg(metavar="STORE")] = None
     """Folder of the store. Its landmarks are drawn with their residuals."""
     images: Annotated[
         tuple[Path, ...],
         arg(metavar="IMAGE...", help_behavior_hint="(default: images of the calibration)"),
     ] = ()
     """Images of the camera, or a folder of them."""
-    against: Annotated[Path | None, arg(metavar="OLD_CALIBRATION.json", help_behavior_hint="")] = (
-        None
-    )
+    against: Annotated[Path | None, arg(metavar="OLD_CALIBRATION.json")] = None
     """Older calibration of the same camera, to compare with."""
     out: Annotated[Path, arg(metavar="FILE.html")] = Path("report.html")
     """The report, one file including its pictures."""
@@ -41,7 +42,7 @@ class Report:
 
     def run(self) -> int:
         """Write the report."""
-        check_output(self.out, "--out")
+        require_writable(self.out, "--out")
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.verdict import expected_error, tier, verdict
         from evercal.reports.calibration_page import NamedCalibration, calibration_page, difference
@@ -99,9 +100,7 @@ class Report:
             return AnnotatedImages(missing=(reason,))
         localizer = None
         if self.store is not None:
-            from evercal.localization.localizer import Localizer
-
-            localizer = Localizer.open(self.store, device=self.device)
+            localizer = open_localizer(self.store, self.device)
         before = None if older is None else older.calibration
         with progress_bar("drawing", len(files), "image") as bar:
             return annotate_images(calibration, files, before, localizer, on_image=bar.update)

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from evercal.features.weights_file import network_bytes
 from evercal.geometry import SE3
 from evercal.localization.acceptance import fit_acceptance
 from evercal.map import LearnReport
-from evercal.recordings.frame import Recording, posed_recording
+from evercal.recordings.frame import Frame, Recording, posed_recording
 from evercal.recordings.held_out import named_recording, require_frames, split_held_out
 from evercal.storage.stages import is_store
 
@@ -50,8 +50,8 @@ OnEvent = Callable[[Encoding | MapProgress | Progress | Checkpoint], object]
 class NetworkLearnOptions:
     """How a scene is learned into a store of networks."""
 
-    strategy: str = "evercal_network"
-    """Name of the strategy; a store keeps the one it was made with."""
+    strategy: str | Strategy = "evercal_network"
+    """The strategy or its name; a store keeps the one it was made with."""
     preset: str = "fast"
     """Amount of training, see `presets`."""
     memory: str | int = "10%"
@@ -68,6 +68,8 @@ class NetworkLearnOptions:
     """Seed of everything that is drawn at random."""
     stage: StageOptions | None = None
     """Options of the stage in place of preset, memory and centres."""
+    short_side: int | None = None
+    """Working size of images in a new store, pixels; that of the preset by default."""
     cache: Path | None = None
     """Folder for features of views, for many runs over the same frames."""
 
@@ -102,7 +104,8 @@ def learn_networks(
             strategy than the store's, or another process is writing into the store.
     """
     began = time.perf_counter()
-    strategy, stage = strategy_named(options.strategy), options.stage_options()
+    named, stage = options.strategy, options.stage_options()
+    strategy = named if isinstance(named, Strategy) else strategy_named(named)
     opened = _opened(store, strategy, stage, options)
     with opened.writing():
         contents = opened.contents.to(device_of(options.device))
@@ -147,12 +150,14 @@ def learn_networks(
     return report
 
 
-def with_fitted_threshold(scenes: LearnedScenes, held_out: tuple) -> SceneRecord:
-    """The newest record with its threshold: of the map, if there is one, else of the network."""
-    record = scenes.scenes[-1]
+def with_fitted_threshold(
+    scenes: LearnedScenes, held_out: Sequence[Frame], index: int = -1
+) -> SceneRecord:
+    """A record with its threshold: of the map, if there is one, else of the network."""
+    record = scenes.scenes[index]
     if record.map is None:
-        return fit_threshold(scenes, held_out)
-    return replace(record, map=fit_acceptance(scenes.map_contents(), held_out))
+        return fit_threshold(scenes, held_out, index)
+    return replace(record, map=fit_acceptance(scenes.map_contents(), held_out, index))
 
 
 def run_stage(
@@ -190,7 +195,7 @@ def _opened(
     if stage.memory.auto:
         raise InputError("memory auto: only a map selects its keyframes; give a share or bytes")
     if not is_store(store):
-        side = short_side(options.preset)
+        side = options.short_side or short_side(options.preset)
         return NetworkStore.create(store, strategy.name, side, options.encoder)
     if isinstance(options.encoder, Path):
         raise InputError(

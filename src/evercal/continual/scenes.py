@@ -16,6 +16,7 @@ from evercal.features.device import device_of_network
 from evercal.features.encoder import Encoder
 from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
+from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import MapContents, SceneMap
 
 MAX_PROTOTYPES = 256
@@ -50,6 +51,11 @@ class SceneRecord:
         if self.map is not None:
             return self.map.adjusted_camera
         return self.refined_camera or self.camera
+
+    @property
+    def frame(self) -> MapFrame:
+        """Relation of its scene points to the base frame."""
+        return MapFrame() if self.map is None else self.map.frame
 
 
 @dataclass

@@ -2,60 +2,14 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.errors import InputError
-from evercal.evaluation.metrics import FrameResult, Status
-from evercal.geometry import SE3, Camera, near_training, pose_distance, squared_mahalanobis
+from evercal.evaluation.metrics import FrameResult
+from evercal.geometry import near_training, pose_distance
+from evercal.localization.localizer import SceneLocalizer
 from evercal.recordings import Frame, Recording, posed_frames, stated_poses
-
-
-class Estimate(Protocol):
-    """The fields of an estimate that are evaluated.
-
-    An optional `covariance` (6, 6), of translation and rotation, is evaluated too.
-    """
-
-    @property
-    def status(self) -> Status:
-        """`ok`, or why there is no pose."""
-        ...
-
-    @property
-    def scene(self) -> str | None:
-        """Scene of the pose."""
-        ...
-
-    @property
-    def base_from_camera(self) -> SE3 | None:
-        """Pose in the base frame of `scene`; not None if the status is `ok`."""
-        ...
-
-    @property
-    def inliers(self) -> int:
-        """Scene points that agree with the pose."""
-        ...
-
-    @property
-    def inlier_ratio(self) -> float:
-        """Share of scene points that agree with the pose."""
-        ...
-
-
-class SceneLocalizer(Protocol):
-    """A localizer to evaluate."""
-
-    @property
-    def scenes(self) -> Sequence[str]:
-        """Names of the scenes it learned."""
-        ...
-
-    def localize(self, image: NDArray[np.uint8], camera: Camera, /) -> Estimate:
-        """Localize one RGB image, uint8, shape (H, W, 3)."""
-        ...
 
 
 def evaluate(
@@ -123,18 +77,18 @@ def _result(
     localizer: SceneLocalizer, name: str, frame: Frame, near: bool, accepted: set[str]
 ) -> FrameResult:
     start = time.perf_counter()
-    estimate = localizer.localize(frame.read_image(), frame.camera)
+    estimate = localizer.localize(frame.read_image(), localizer.camera_for(frame.camera))
     milliseconds = 1e3 * (time.perf_counter() - start)
     metres = radians = np.inf
     squared = np.nan
-    covariance = getattr(estimate, "covariance", None)
     truth, pose = frame.base_from_camera, estimate.base_from_camera
     if estimate.status == "ok" and estimate.scene in accepted:
         assert truth is not None
         assert pose is not None, "an estimate whose status is ok has a pose"
         metres, radians = pose_distance(truth, pose)
-        if covariance is not None:
-            squared = squared_mahalanobis(pose, covariance, truth)
+        uncertain = estimate.uncertain_pose
+        if uncertain is not None:
+            squared = uncertain.squared_mahalanobis(truth)
     return FrameResult(
         scene=name,
         frame=frame.name,
@@ -147,7 +101,7 @@ def _result(
         inliers=int(estimate.inliers),
         inlier_ratio=float(estimate.inlier_ratio),
         squared_mahalanobis=squared,
-        estimated=found,
+        estimated=pose,
     )
 
 

@@ -35,7 +35,7 @@ class UncertainPose:
 
     pose: SE3
     """parent_from_child, a single transform."""
-    covariance: NDArray[np.floating]
+    covariance: Array
     """(6, 6) of translation in the parent frame (m) and rotation about child axes (rad)."""
 
     def __post_init__(self) -> None:

@@ -27,13 +27,57 @@ from evercal.localization.matching import Matcher
 from evercal.localization.parallel import in_parallel
 from evercal.localization.pnp import PnpResult, solve_pnp
 from evercal.localization.query import Candidate, Hypothesis, LocalizeOptions, Matches, Query
+from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
 from evercal.recordings.images import as_rgb
 
 
+class LearnedScene(Protocol):
+    """A scene of either kind of store."""
+
+    @property
+    def name(self) -> str:
+        """Name of the scene."""
+        ...
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics that its recording states."""
+        ...
+
+    @property
+    def adjusted_camera(self) -> Camera:
+        """The same camera after learning."""
+        ...
+
+    @property
+    def frame(self) -> MapFrame:
+        """Relation of its scene points to the base frame."""
+        ...
+
+
+class LearnedContents(Protocol):
+    """The scenes of either kind of store."""
+
+    @property
+    def short_side(self) -> int:
+        """Shorter image side that the encoder works on, pixels."""
+        ...
+
+    @property
+    def scenes(self) -> Sequence[LearnedScene]:
+        """In order of learning."""
+        ...
+
+
 class SceneLocalizer(Protocol):
     """What both kinds of store answer with: a map's `Localizer`, and that of networks."""
+
+    @property
+    def contents(self) -> LearnedContents:
+        """The scenes."""
+        ...
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -245,22 +289,8 @@ def own_or_stated(stated: Camera, recorded: Sequence[Camera]) -> Camera | None:
     return None if stated in recorded else stated
 
 
-class MappedCamera(Protocol):
-    """The camera that recorded a scene."""
-
-    @property
-    def name(self) -> str:
-        """Name of the scene."""
-        ...
-
-    @property
-    def adjusted_camera(self) -> Camera:
-        """Its intrinsics."""
-        ...
-
-
 def camera_in_scenes(
-    camera: Camera | None, image: np.ndarray, scenes: Sequence[MappedCamera]
+    camera: Camera | None, image: np.ndarray, scenes: Sequence[LearnedScene]
 ) -> list[Camera | None]:
     """Intrinsics of an image in each scene; None where the aspect ratio does not fit.
 

@@ -68,7 +68,8 @@ def refine_pose(
     raw = raw if distortion is None else np.einsum("nij,jn->in", distortion, raw)
     covariance = in_parent_axes(rotation, variance * np.linalg.inv(information))
     quaternion = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
-    return RefinedPose(UncertainPose(SE3(quaternion, position), covariance), np.hypot(*raw))
+    pose = UncertainPose(SE3(quaternion, position), np.asarray(covariance, np.float64))
+    return RefinedPose(pose, np.hypot(*raw))
 
 
 def linearise(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from evercal.geometry import SE3, UncertainPose
 
-Array = NDArray[np.floating]
+Array = NDArray[np.float64]
 
 RADII = ((0.1, 10.0), (0.2, 15.0), (0.4, 25.0))
 """Candidate correlation lengths of corrections, metres and degrees."""

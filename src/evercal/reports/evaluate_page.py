@@ -15,7 +15,7 @@ from evercal.reports.pictures import draw_estimate
 
 if TYPE_CHECKING:
     from evercal.evaluation import FrameResult
-    from evercal.localization.localizer import Localizer
+    from evercal.localization.localizer import SceneLocalizer
     from evercal.recordings import Recording
 
 _WORST = 12
@@ -23,7 +23,7 @@ _AXES_MM = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
 
 
 def evaluation_page(
-    localizer: "Localizer",
+    localizer: "SceneLocalizer",
     scenes: "Mapping[str, Recording]",
     results: "Sequence[FrameResult]",
     store: str,
@@ -31,7 +31,7 @@ def evaluation_page(
     """Write the report of an evaluation.
 
     Args:
-        localizer: Localizer of the store; draws the worst frames.
+        localizer: SceneLocalizer of the store; draws the worst frames.
         scenes: Evaluated recordings by scene name.
         results: Result of `evaluate`.
         store: Path of the store, for the title.
@@ -76,7 +76,7 @@ def _trajectory(scene: "Recording", rows: "Sequence[FrameResult]") -> Picture:
 
 
 def _worst(
-    localizer: "Localizer",
+    localizer: "SceneLocalizer",
     scenes: "Mapping[str, Recording]",
     results: "Sequence[FrameResult]",
 ) -> list[Picture]:
@@ -84,7 +84,7 @@ def _worst(
     for result in sorted(results, key=lambda r: (-r.translation_error_m, r.inlier_ratio))[:_WORST]:
         frame = next(f for f in scenes[result.scene].test if f.name == result.frame)
         image = frame.read_image()
-        estimate = localizer.localize(image, frame.camera)
+        estimate = localizer.localize(image, localizer.camera_for(frame.camera))
         drawn = encode_image(draw_estimate(image, estimate, frame.camera), "jpg")
         pictures.append(Picture(drawn, f"{result.scene} {result.frame}: {_outcome(result)}"))
     return pictures

@@ -6,18 +6,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.geometry import resize_pixels
 from evercal.reports.overlay import overlay_points
 
 if TYPE_CHECKING:
     from evercal.geometry import SE3, Camera
     from evercal.localization.estimate import PoseEstimate
-    from evercal.localization.localizer import Localizer
-    from evercal.mapping.scene_maps import SceneRecord
+    from evercal.localization.localizer import LearnedScene, SceneLocalizer
 
 
-def scene_camera(localizer: "Localizer", scene: str) -> "Camera":
+def scene_camera(localizer: "SceneLocalizer", scene: str) -> "Camera":
     """The camera of a scene's recording."""
-    return _record(localizer, scene).camera
+    return _scene(localizer, scene).adjusted_camera
 
 
 def draw_estimate(
@@ -49,7 +49,7 @@ def draw_estimate(
 def draw_landmarks(
     image: NDArray[np.uint8],
     estimate: "PoseEstimate",
-    localizer: "Localizer",
+    localizer: "SceneLocalizer",
     legend: bool = True,
 ) -> NDArray[np.uint8]:
     """Draw the landmarks detected in an image, coloured by reprojection error.
@@ -71,7 +71,7 @@ def draw_landmarks(
     errors = landmark_errors(estimate, localizer)
     if errors is None:
         return large
-    pixels = (errors.pixels + 0.5) * (height / errors.height) - 0.5
+    pixels = resize_pixels(errors.pixels, height / errors.height)
     text = "reprojection error (px)" if legend else None
     return overlay_points(large, pixels, errors.errors_px, 3.0, (0.0, 1.0), text)
 
@@ -90,7 +90,7 @@ class LandmarkErrors:
 
 def landmark_errors(
     estimate: "PoseEstimate",
-    localizer: "Localizer",
+    localizer: "SceneLocalizer",
     camera: "Camera | None" = None,
     base_from_camera: "SE3 | None" = None,
 ) -> LandmarkErrors | None:
@@ -110,12 +110,13 @@ def landmark_errors(
         return None
     if estimate.pixels is None or estimate.points_m is None:
         return None
-    record = _record(localizer, estimate.scene)
-    working_camera = record.query_camera(camera).short_side_resized(localizer.maps.short_side)
-    points = record.camera_among_landmarks(pose).inverse().apply(estimate.points_m)
+    scene = _scene(localizer, estimate.scene)
+    short_side = localizer.contents.short_side
+    working_camera = (camera or scene.adjusted_camera).short_side_resized(short_side)
+    points = scene.frame.camera_among_points(pose).inverse().apply(estimate.points_m)
     errors = np.linalg.norm(estimate.pixels - working_camera.project(points), axis=1)
     return LandmarkErrors(estimate.pixels, errors, working_camera.height)
 
 
-def _record(localizer: "Localizer", scene: str) -> "SceneRecord":
-    return next(record for record in localizer.maps.scenes if record.name == scene)
+def _scene(localizer: "SceneLocalizer", name: str) -> "LearnedScene":
+    return next(scene for scene in localizer.contents.scenes if scene.name == name)

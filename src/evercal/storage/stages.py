@@ -6,13 +6,8 @@
       stages/0001-NAME/     files of one stage
 
 A file that the manifest does not list is not part of the store. One process writes at a time, under
-<<<<<<< HEAD
-a lock beside the folder. Readers need no lock: they start over if a writer replaced files meanwhile.
-A map and networks are two kinds of store with different files.
-=======
 a lock beside the folder. Readers need no lock: they read again if a writer replaced files.
 What the files mean is up to the kind of store: a map or networks.
->>>>>>> main
 """
 
 import json

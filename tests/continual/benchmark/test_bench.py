@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 
 from evercal.continual.benchmark.bench import BenchOptions, Step, begin_bench, in_order, run_bench
 from evercal.continual.benchmark.comparison import runs_of

@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias, Unpack
+from typing import Any, Literal, TypeAlias, Unpack
 
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.export import image_poses, numbers, ros
@@ -33,7 +33,7 @@ class Format:
     """One line for `--format list`."""
 
 
-_ROWS = (
+_ROWS: tuple[tuple[str, Literal["tf", "optical", "any"], str, Any, str], ...] = (
     ("easy_handeye2", "tf", ".calib", ros.easy_handeye2, "for ~/.ros2/easy_handeye2/calibrations"),
     ("easy_handeye", "tf", ".yaml", ros.easy_handeye, "easy_handeye of ROS 1, ~/.ros/easy_handeye"),
     (

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.geometry import SE3, Camera, pose_distance
-from evercal.localization.localizer import Localizer
+from evercal.geometry import SE3, Camera, pose_distance, resize_pixels
+from evercal.localization.localizer import SceneLocalizer
 from evercal.recordings import Frame, Recording, posed_frames
 from evercal.storage import write_bytes
 
@@ -59,7 +59,9 @@ class SceneView:
         return f"{100 * metres:.1f} cm, {math.degrees(radians):.1f} deg"
 
 
-def keep_views(out: Path, strategy: str, localizer: Localizer, scenes: Sequence[Recording]) -> None:
+def keep_views(
+    out: Path, strategy: str, localizer: SceneLocalizer, scenes: Sequence[Recording]
+) -> None:
     """Write the view of every scene's middle test frame, unless the file exists."""
     for scene in scenes:
         path = out / VIEWS / f"{strategy}-{scene.name}.npz"
@@ -115,7 +117,7 @@ def _read(path: Path) -> SceneView:
 
 
 def _points(
-    localizer: Localizer, scenes: Sequence[Recording]
+    localizer: SceneLocalizer, scenes: Sequence[Recording]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return points (n, 3) of scenes and their brightness (n,)."""
     points, grey = [np.zeros((0, 3))], [np.zeros(0)]
@@ -136,14 +138,14 @@ def _points(
 
 
 def _from_estimate(
-    localizer: Localizer, scene: str, frame: Frame, image: NDArray[np.uint8]
+    localizer: SceneLocalizer, scene: str, frame: Frame, image: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return inlier points (n, 3) of a frame in the base frame and their pixels (n, 2)."""
-    estimate = localizer.localize(image, frame.camera)
+    estimate = localizer.localize(image, localizer.camera_for(frame.camera))
     if estimate.scene != scene or estimate.points_m is None or estimate.pixels is None:
         return np.zeros((0, 3)), np.zeros((0, 2))
-    scale = min(image.shape[:2]) / localizer.maps.short_side
-    return estimate.points_m, (estimate.pixels + 0.5) * scale - 0.5
+    scale = min(image.shape[:2]) / localizer.contents.short_side
+    return estimate.points_m, resize_pixels(estimate.pixels, scale)
 
 
 def _from_depth(frame: Frame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

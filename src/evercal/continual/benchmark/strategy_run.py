@@ -16,31 +16,31 @@ from evercal.continual.benchmark.scene_views import keep_views
 from evercal.continual.finish_scene import Learned, correct_lens, finished_stage, memory_bytes
 from evercal.continual.learn_jointly import learn_jointly
 from evercal.continual.learn_scene import (
-    LearnOptions,
+    NetworkLearnOptions,
     OnEvent,
-    learn_scene,
-    open_or_create,
-    validation_split,
+    learn_networks,
+    with_fitted_threshold,
 )
+from evercal.continual.localizer import NetworkLocalizer, localizer_of
 from evercal.continual.networks.atlas import combined_centres
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.feature_cache import cache_features
+from evercal.continual.scenes import LearnedScenes
 from evercal.continual.stage import Stage, StageOptions
 from evercal.continual.stage_rows import encoded, scene_buffer, view_plan
+from evercal.continual.store import NetworkStore, head_bytes
 from evercal.continual.strategies import STRATEGIES, Strategy
+from evercal.continual.threshold import fit_threshold
 from evercal.evaluation.protocol import evaluate
 from evercal.features.device import device_of
-from evercal.localization.acceptance import fitted_record
-from evercal.localization.localizer import Localizer
+from evercal.localization.localizer import Localizer, SceneLocalizer
 from evercal.localization.query import LocalizeOptions
-from evercal.mapping.build import finished
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.scene_maps import SceneMaps, with_fit
 from evercal.mapping.selection import covering_radius, smallest_pair
-from evercal.mapping.stage_files import head_bytes
-from evercal.mapping.store import Store
 from evercal.recordings import Frame, Recording, stated_poses
-from evercal.storage import MANIFEST, write_json
+from evercal.recordings.held_out import split_held_out
+from evercal.storage import write_json
+from evercal.storage.stages import is_store
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,8 @@ class _Run:
         options: RunOptions,
         on_event: OnEvent | None,
     ):
-        self.strategy, self.scenes, self.on_event = strategy, scenes, on_event
+        self.strategy, self.scenes = strategy, scenes
+        self.on_event: OnEvent = on_event or (lambda _: None)
         self.device = device_of(options.device)
         self.options, self.stage = options, _with_centres(options.stage, scenes)
         self.store = options.out / "runs" / f"{strategy.name}-{options.stage.seed}"
@@ -103,54 +104,57 @@ class _Run:
     def stages(self) -> Iterator[StageResults]:
         """Learn scene after scene into a store; see `run_strategy`."""
         self._begin()
-        for number in range(len(Store.open(self.store).stages) - 1, len(self.scenes)):
-            if number >= len(Store.open(self.store).stages):
-                learn_scene(self.store, self.scenes[number], self._learn_options(), self.on_event)
-            opened = Store.open(self.store)
-            maps = self._prepared(opened.maps)
-            yield StageResults(
-                number, self._evaluated(maps, number, float(opened.report()["seconds"]))
-            )
+        for number in range(len(NetworkStore.open(self.store).stages) - 1, len(self.scenes)):
+            if number >= len(NetworkStore.open(self.store).stages):
+                self._learn(self.store, self.scenes[number], self.strategy)
+            opened = NetworkStore.open(self.store)
+            seconds = float(opened.reports()[-1]["seconds"])
+            scenes = self._prepared(opened.contents)
+            yield StageResults(number, self._evaluated(scenes, number, seconds))
         self._remove()
 
     def jointly(self) -> Iterator[StageResults]:
         """Learn all scenes at once; see `run_strategy`. An interrupted run starts again."""
         self._remove()
-        maps = self._prepared(open_or_create(self.store, self._learn_options()).maps)
-        splits = [validation_split(scene.train) for scene in self.scenes]
-        train = [replace(s, train=t) for s, (t, _) in zip(self.scenes, splits, strict=True)]
+        learned = self._prepared(self._new_store().contents)
+        splits = [split_held_out(scene.train) for scene in self.scenes]
+        train = [replace(s, train=t.train) for s, t in zip(self.scenes, splits, strict=True)]
         began = time.perf_counter()
-        for event in learn_jointly(maps, self.strategy, train, self.stage):
+        for event in learn_jointly(learned, self.strategy, train, self.stage):
             if isinstance(event, Stage):
-                maps = event.maps
-            elif self.on_event is not None:
+                learned = event.scenes
+            else:
                 self.on_event(event)
-        for number, (_, held_out) in enumerate(splits):
-            maps.scenes[number] = fitted_record(maps, held_out, number)
+        for number, split in enumerate(splits):
+            learned.scenes[number] = with_fitted_threshold(learned, split.held_out, number)
         seconds = time.perf_counter() - began
         last = len(self.scenes) - 1
         yield from (StageResults(number, ()) for number in range(last))
-        yield StageResults(last, self._evaluated(maps, last, seconds))
+        yield StageResults(last, self._evaluated(learned, last, seconds))
         self._remove()
 
     def _remove(self) -> None:
         shutil.rmtree(self.store, ignore_errors=True)
         self._network_fits.unlink(missing_ok=True)
 
-    def _learn_options(self, strategy: Strategy | None = None) -> LearnOptions:
-        return LearnOptions(
-            self.stage,
-            strategy or self.strategy,
+    def _learn(self, store: Path, scene: Recording, strategy: Strategy) -> None:
+        options = NetworkLearnOptions(
+            strategy=strategy,
+            stage=self.stage,
             short_side=self.options.short_side,
-            device=self.device,
+            device=str(self.device),
             cache=self.options.features,
         )
+        learn_networks(store, scene, options, self.on_event)
 
-    def _prepared(self, maps: SceneMaps) -> SceneMaps:
+    def _new_store(self) -> NetworkStore:
+        return NetworkStore.create(self.store, self.strategy.name, self.options.short_side)
+
+    def _prepared(self, scenes: LearnedScenes) -> LearnedScenes:
         """Move to the device of the run and share encoded views with other runs."""
-        maps.to(self.device)
-        cache_features(maps.encoder, self.options.features)  # pyright: ignore[reportArgumentType]
-        return maps
+        scenes.to(self.device)
+        cache_features(scenes.encoder, self.options.features)  # pyright: ignore[reportArgumentType]
+        return scenes
 
     def _begin(self) -> None:
         """Learn the first scene, unless the store has it.
@@ -158,84 +162,99 @@ class _Run:
         Strategies that learn the first scene alike share its network. Each selects the frames to
         remember from the same head.
         """
-        if (self.store / MANIFEST).exists():
+        if is_store(self.store):
             return
         self._remove()  # left by an interrupted commit
         scene, method = self.scenes[0], self.strategy.method
         # Beside a map, the network learns frames with the poses and camera that the map adjusted.
         if self.strategy.builds_map or method is None or not method.first_scene_alike:
-            learn_scene(self.store, scene, self._learn_options(), self.on_event)
+            self._learn(self.store, scene, self.strategy)
             return
         shared = self.store.with_name(f"first-{scene.name}-{self.stage.seed}")
-        if not (shared / MANIFEST).exists():
-            learn_scene(shared, scene, self._learn_options(STRATEGIES["finetune"]), self.on_event)
-        first = Store.open(shared)
+        if not is_store(shared):
+            self._learn(shared, scene, STRATEGIES["finetune"])
+        first = NetworkStore.open(shared)
         began = time.perf_counter()
-        maps = self._prepared(first.maps.copy_for_training())
-        maps.strategy, maps.keyframes, maps.method_states = self.strategy.name, [], []
-        train, _ = validation_split(scene.train)
-        stage = finished_stage(maps, method, Learned(train, self._rows(maps, train)), self.stage)
-        report = first.report()
+        scenes = self._prepared(first.contents.copy_for_training())
+        scenes.strategy, scenes.keyframes, scenes.method_states = self.strategy.name, [], []
+        train = split_held_out(scene.train).train
+        learned = Learned(train, self._rows(scenes, train))
+        stage = finished_stage(scenes, method, learned, self.stage)
+        report = first.reports()[-1]
         report["seconds"] = float(report["seconds"]) + time.perf_counter() - began
         report["frames_kept"] = stage.frames_kept
-        open_or_create(self.store, self._learn_options()).commit(maps, report)
+        self._new_store().commit(scenes, report)
 
-    def _rows(self, maps: SceneMaps, train: Sequence[Frame]) -> Callable[[], FeatureBuffer]:
+    def _rows(self, scenes: LearnedScenes, train: Sequence[Frame]) -> Callable[[], FeatureBuffer]:
         """Return a function that encodes the training rows of the first scene, once."""
 
         @cache
         def rows() -> FeatureBuffer:
-            buffer = scene_buffer(0, maps.scenes[0].cell, train, maps.device)
-            finished(encoded(buffer, train, view_plan(self.stage, maps.short_side), maps))
-            correct_lens(buffer, maps.scenes[0])
+            buffer = scene_buffer(0, scenes.scenes[0].cell, train, scenes.device)
+            for _ in encoded(buffer, train, view_plan(self.stage, scenes.short_side), scenes):
+                pass
+            correct_lens(buffer, scenes.scenes[0])
             return buffer
 
         return rows
 
-    def _evaluated(self, maps: SceneMaps, number: int, seconds: float) -> tuple[SceneResult, ...]:
+    def _evaluated(
+        self, scenes: LearnedScenes, number: int, seconds: float
+    ) -> tuple[SceneResult, ...]:
         """Evaluate all scenes learned so far.
 
         A map is also evaluated without alignment. A network beside a map is also evaluated alone.
         """
-        name, localizer = self.strategy.name, Localizer(maps)
-        results = self._results(name, localizer, number, seconds)
+        name, localizer = self.strategy.name, localizer_of(scenes)
+        results = self._results(name, localizer, scenes, number, seconds)
         if number == len(self.scenes) - 1:
             keep_views(self.options.out, name, localizer, self.scenes)
         if not self.strategy.builds_map:
             return results
         if self.strategy.method is None:
-            suffix, other = UNALIGNED, Localizer(maps, LocalizeOptions(align=False))
-        else:
-            network = self._without_map(maps, self.strategy.method.replays)
-            suffix, other = NETWORK, Localizer(network)
-        return results + self._results(name + suffix, other, number, seconds)
+            unaligned = Localizer(scenes.map_contents(), LocalizeOptions(align=False))
+            return results + self._results(name + UNALIGNED, unaligned, scenes, number, seconds)
+        network = self._without_map(scenes, self.strategy.method.replays)
+        alone = NetworkLocalizer(network)
+        return results + self._results(name + NETWORK, alone, network, number, seconds)
 
-    def _without_map(self, maps: SceneMaps, replays: bool) -> SceneMaps:
-        """Return the network without landmarks; a method that replays keeps the keyframe images.
+    def _without_map(self, scenes: LearnedScenes, replays: bool) -> LearnedScenes:
+        """Return the network without maps; a method that replays keeps the keyframe images.
 
         As without a map, thresholds are fitted once, when a scene is learned.
         """
-        network, path = maps.copy_for_training(), self._network_fits
+        network, path = scenes.copy_for_training(), self._network_fits
         for i, keyframes in enumerate(network.keyframes):
             assert keyframes is not None, "a map has keyframes"
             images = Keyframes(keyframes.images, keyframes.cameras, keyframes.base_from_camera)
             network.keyframes[i] = images if replays else None
+            record = network.scenes[i]
+            # Training took the camera that the map adjusted.
+            network.scenes[i] = replace(record, map=None, refined_camera=record.adjusted_camera)
         fits: list[list[float]] = json.loads(path.read_text()) if path.exists() else []
         for i in range(len(fits), len(network.scenes)):
-            _, held_out = validation_split(self.scenes[i].train)
-            record = fitted_record(network, held_out, i)
+            held_out = split_held_out(self.scenes[i].train).held_out
+            record = fit_threshold(network, held_out, i)
             fits.append([record.inlier_threshold, record.covariance_scale])
         path.parent.mkdir(parents=True, exist_ok=True)  # joint training commits no store
         write_json(path, fits)
-        network.scenes = [with_fit(r, *fit) for r, fit in zip(network.scenes, fits, strict=True)]
+        network.scenes = [
+            replace(record, inlier_threshold=threshold, covariance_scale=scale)
+            for record, (threshold, scale) in zip(network.scenes, fits, strict=True)
+        ]
         return network
 
     def _results(
-        self, name: str, localizer: Localizer, number: int, seconds: float
+        self,
+        name: str,
+        localizer: SceneLocalizer,
+        learned: LearnedScenes,
+        number: int,
+        seconds: float,
     ) -> tuple[SceneResult, ...]:
-        maps, scenes = localizer.maps, self.scenes[: number + 1]
+        scenes = self.scenes[: number + 1]
         frames = evaluate(localizer, {scene.name: scene for scene in scenes})
-        keyframes = maps.keyframes[number]
+        keyframes = learned.keyframes[number]
         return tuple(
             scene_result(
                 [frame for frame in frames if frame.scene == scene.name],
@@ -243,8 +262,8 @@ class _Run:
                 seed=self.stage.seed,
                 stage=number,
                 seconds=seconds,
-                memory_bytes=memory_bytes(maps, self.strategy),
-                head_bytes=sum(head_bytes(head) for head in maps.heads),
+                memory_bytes=memory_bytes(learned, self.strategy),
+                head_bytes=sum(head_bytes(head) for head in learned.heads),
                 frames_kept=len(keyframes.images) if keyframes else 0,
                 **(_coverage(keyframes, scene) if scene is scenes[-1] else {}),
             )
@@ -256,7 +275,7 @@ def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOpti
     """Add the centres of all scenes to options that need them in advance."""
     if stage.head.centres != "fixed" or stage.fixed_centres_m:
         return stage
-    positions = [stated_poses(validation_split(scene.train)[0]).translation_m for scene in scenes]
+    positions = [stated_poses(split_held_out(scene.train).train).translation_m for scene in scenes]
     centres = combined_centres(positions, stage.head.centres_per_scene, stage.seed)
     return replace(stage, grid_scenes=len(scenes), fixed_centres_m=centres)
 
@@ -265,8 +284,7 @@ def _coverage(keyframes: Keyframes | None, scene: Recording) -> dict[str, object
     """Measure how the remembered frames of a scene cover its training frames."""
     if keyframes is None or not keyframes.images:
         return {}
-    train, _ = validation_split(scene.train)
-    poses = stated_poses(train)
+    poses = stated_poses(split_held_out(scene.train).train)
     positions = keyframes.base_from_camera.translation_m
     distances = np.linalg.norm(poses.translation_m[:, None] - positions[None], axis=-1)
     selection = poses.translation_m, poses.rotation_wxyz, distances.argmin(0)
