@@ -1,0 +1,189 @@
+"""A store of networks opens as it was written, and returns the checkpoints of a stage."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from evercal.continual.localizer import NetworkLocalizer
+from evercal.continual.networks.head import Head
+from evercal.continual.scenes import LearnedScenes
+from evercal.continual.store import Checkpoint, NetworkStore, head_bytes
+from evercal.errors import InputError
+from evercal.features.encoder import load_encoder
+from evercal.features.vlad import vlad_for
+from evercal.geometry import pose_distance
+from evercal.recordings.frame import Recording
+from evercal.storage import verify
+
+from ..stages import MakeStore, Tree
+
+Stages = dict[str, list[LearnedScenes]]
+
+STRATEGIES = pytest.mark.parametrize(
+    "strategy", ["evercal_network", "evercal_hybrid", "isolation"]
+)
+
+
+def stored(head: Head) -> dict[str, Tensor]:
+    """State of a head with the precision of the file: half, except for its centres."""
+    return {
+        name: value if name == "centres" or not value.is_floating_point() else value.half().float()
+        for name, value in head.state_dict().items()
+    }
+
+
+@STRATEGIES
+def test_store_opens_as_it_was_written(
+    strategy: str, three_stages: Stages, tmp_path: Path, make_store: MakeStore
+) -> None:
+    store, scenes = make_store(tmp_path, three_stages[strategy]), three_stages[strategy][-1]
+    reopened = NetworkStore.open(tmp_path)
+    assert reopened.stages == store.stages
+    assert [report["seconds"] for report in reopened.reports()] == [1.5] * 3
+    contents = reopened.contents
+    assert (contents.strategy, contents.short_side) == (scenes.strategy, scenes.short_side)
+    for a, b in zip(contents.heads, scenes.heads, strict=True):
+        assert a.options == b.options
+        assert not a.training
+        state = stored(b)
+        assert a.state_dict().keys() == state.keys()
+        assert all(torch.equal(value, state[name]) for name, value in a.state_dict().items())
+    for a, b in zip(contents.scenes, scenes.scenes, strict=True):
+        assert torch.equal(a.prototypes, b.prototypes)
+        others = [f.name for f in fields(a) if f.name not in ("prototypes", "map")]
+        assert [getattr(a, name) for name in others] == [getattr(b, name) for name in others]
+        assert (a.map is not None) == (strategy == "evercal_hybrid")
+        if a.map is not None and b.map is not None:
+            assert a.map.adjusted_camera == b.map.adjusted_camera
+            assert a.map.landmarks == b.map.landmarks
+    for a, b in zip(contents.keyframes, scenes.keyframes, strict=True):
+        assert (a is None) == (b is None)
+        if a is not None and b is not None:
+            one, two = a.to_tensors(), b.to_tensors()
+            assert one.keys() == two.keys()
+            for name, value in one.items():
+                torch.testing.assert_close(value, two[name], rtol=0, atol=1e-15)
+    grey = torch.rand(1, 1, 48, 64, generator=torch.Generator().manual_seed(0))
+    features = scenes.encoder(grey)
+    torch.testing.assert_close(contents.encoder(grey), features, rtol=0, atol=1e-6)
+    again = contents.descriptor(features), scenes.descriptor(features)
+    torch.testing.assert_close(*again, rtol=0, atol=1e-6)
+
+
+def test_poses_survive_the_store(
+    arc_scenes: tuple[LearnedScenes, LearnedScenes],
+    arcs: tuple[Recording, Recording],
+    tmp_path: Path,
+    make_store: MakeStore,
+) -> None:
+    make_store(tmp_path, list(arc_scenes))
+    before = NetworkLocalizer(arc_scenes[1])
+    after = NetworkLocalizer(NetworkStore.open(tmp_path).contents)
+    assert after.scenes == ("one", "two")
+    compared = 0
+    for frame in (*arcs[0].test[::4], *arcs[1].test[::4]):
+        a, b = (one.localize(frame.read_image(), frame.camera) for one in (before, after))
+        if a.inlier_ratio < 0.3 or a.base_from_camera is None:
+            continue  # rounding may change the outcome
+        compared += 1
+        assert (a.status, a.scene) == (b.status, b.scene)
+        assert b.base_from_camera is not None
+        metres, radians = pose_distance(a.base_from_camera, b.base_from_camera)
+        assert metres < 0.05
+        assert radians < np.deg2rad(1)
+    assert compared >= 6
+
+
+@pytest.mark.parametrize(("strategy", "heads"), [("evercal_network", [3]), ("isolation", [1, 2, 3])])
+def test_of_a_shared_head_only_the_newest_file_remains(
+    strategy: str,
+    heads: list[int],
+    three_stages: Stages,
+    tmp_path: Path,
+    make_store: MakeStore,
+) -> None:
+    store = make_store(tmp_path, three_stages[strategy])
+    files = sorted(tmp_path.rglob("head.safetensors"))
+    assert [path.parent.name[:4] for path in files] == [f"{number:04d}" for number in heads]
+    counted = head_bytes(store.contents.heads[-1])
+    assert counted < files[-1].stat().st_size < counted + 3000  # the file adds its header
+    assert not (tmp_path / "learning").exists()
+    assert verify(tmp_path) == []
+
+
+@STRATEGIES
+def test_damaged_files_are_refused_by_name(
+    strategy: str, three_stages: Stages, tmp_path: Path, make_store: MakeStore, tree: Tree
+) -> None:
+    make_store(tmp_path, three_stages[strategy][:2])
+    rng = np.random.default_rng(0)
+    for name in tree(tmp_path):
+        file = tmp_path / name
+        content = file.read_bytes()
+        flipped = bytearray(content)
+        flipped[int(rng.integers(len(content)))] ^= 1 << int(rng.integers(8))
+        file.write_bytes(bytes(flipped))
+        with pytest.raises(InputError, match=file.name):
+            NetworkStore.open(tmp_path)
+        file.unlink()
+        with pytest.raises(InputError, match=file.name):
+            NetworkStore.open(tmp_path)
+        file.write_bytes(content)
+    NetworkStore.open(tmp_path)
+
+
+def test_other_folders_are_refused(tmp_path: Path, tree: Tree) -> None:
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_text("x")
+    (tmp_path / "mixed" / "learning").mkdir(parents=True)
+    (tmp_path / "mixed" / "thesis.tex").write_text("x")
+    before = tree(tmp_path)
+    for name in ("file", "photos", "mixed", ""):
+        with pytest.raises(InputError, match=str(tmp_path / name)):
+            NetworkStore.open(tmp_path / name)
+        with pytest.raises(InputError, match="not an evercal store"):
+            NetworkStore.create(tmp_path / name, "evercal_network")
+    NetworkStore.create(tmp_path / "new", "evercal_network")
+    assert tree(tmp_path) == before
+    assert not (tmp_path / "new").exists()
+
+
+def test_checkpoints_belong_to_one_stage(
+    three_stages: Stages, tmp_path: Path, make_store: MakeStore
+) -> None:
+    store = make_store(tmp_path, three_stages["evercal_network"][:1])
+    identity = {"scene": "beta", "options": {"seed": 0, "size": (1, 2)}}
+    assert store.begin(identity) is None
+    assert NetworkStore.open(tmp_path).begin(identity) is None  # nothing is encoded yet
+    rows = [{"x": torch.arange(i, i + 3)} for i in range(12)]
+    for part in rows:
+        store.checkpoint(Checkpoint(part, {}))
+    for step in (4, 7):
+        store.checkpoint(Checkpoint({}, {"step": torch.tensor(step)}))
+    for _ in range(2):
+        resume = NetworkStore.open(tmp_path).begin(identity)
+        assert resume is not None
+        assert [part["x"].tolist() for part in resume.rows] == [part["x"].tolist() for part in rows]
+        assert int(resume.trainer["step"]) == 7
+    assert store.begin({**identity, "scene": "gamma"}) is None
+    assert store.begin(identity) is None
+
+
+def test_centroids_of_an_unshipped_encoder_are_stored_with_maps(
+    three_stages: Stages, tmp_path: Path, make_store: MakeStore
+) -> None:
+    hybrid, network = three_stages["evercal_hybrid"][0], three_stages["evercal_network"][0]
+    make_store(tmp_path / "hybrid", [hybrid])
+    encoder = NetworkStore.open(tmp_path / "hybrid").contents.encoder
+    assert torch.equal(vlad_for(encoder).centroids, vlad_for(hybrid.encoder).centroids)
+    make_store(tmp_path / "shipped", [replace(hybrid, encoder=load_encoder())])
+    make_store(tmp_path / "network", [network])
+    for name, files in (("hybrid", 1), ("shipped", 0), ("network", 0)):
+        assert len(list((tmp_path / name).glob("vlad-*"))) == files

@@ -1,0 +1,157 @@
+"""A store of networks opens at its last complete stage after kill -9 at any step."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from evercal.continual.scenes import LearnedScenes
+from evercal.continual.store import Checkpoint, NetworkStore
+from evercal.storage.stages import is_store
+
+from ..stages import Estimates, MakeStore, Tree
+
+Stages = dict[str, list[LearnedScenes]]
+Record = Callable[[Path, Callable[[], object]], list[Path]]
+
+
+@pytest.fixture
+def every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Record:
+    """Run something on a folder and copy the folder before each of its steps.
+
+    A step is a call that changes names on disk or syncs them. Files are linked, not copied: a
+    store never writes into a file that is in place.
+    """
+
+    def record(root: Path, action: Callable[[], object]) -> list[Path]:
+        snapshots: list[Path] = []
+        copying = [False]
+
+        def copy() -> None:
+            copying[0] = True
+            snapshots.append(tmp_path / "steps" / f"{len(snapshots):04d}" / "store")
+            if root.exists():
+                shutil.copytree(root, snapshots[-1], copy_function=os.link)
+            copying[0] = False
+
+        def watched(function: Callable[..., object]) -> Callable[..., object]:
+            def call(*args: object, **kwargs: object) -> object:
+                if not copying[0]:
+                    copy()
+                return function(*args, **kwargs)
+
+            return call
+
+        with monkeypatch.context() as patch:
+            for name in ("replace", "fsync", "unlink", "rmdir", "mkdir"):
+                patch.setattr(os, name, watched(getattr(os, name)))
+            action()
+        copy()
+        return snapshots
+
+    return record
+
+
+def copied(snapshot: Path, to: Path) -> Path:
+    """A copy that can be changed."""
+    shutil.copytree(snapshot, to)
+    return to
+
+
+def test_second_stage(
+    three_stages: Stages,
+    tmp_path: Path,
+    every_step: Record,
+    make_store: MakeStore,
+    tree: Tree,
+    estimates: Estimates,
+) -> None:
+    stages, root = three_stages["evercal_network"], tmp_path / "store"
+    make_store(root, stages[:1])
+    expected = [estimates(NetworkStore.open(root).contents)]
+    identity = {"scene": "beta"}
+
+    def second() -> None:
+        store = NetworkStore.open(root)
+        store.begin(identity)
+        store.checkpoint(Checkpoint({"a": torch.zeros(3)}, {}))
+        store.checkpoint(Checkpoint({}, {"b": torch.ones(3)}))
+        store.commit(stages[1], {})
+
+    snapshots = every_step(root, second)
+    expected.append(estimates(NetworkStore.open(root).contents))
+    assert expected[0] != expected[1]
+    counts = []
+    for snapshot in snapshots:
+        store = NetworkStore.open(snapshot)
+        counts.append(len(store.stages))
+        assert estimates(store.contents) == expected[counts[-1] - 1]
+    assert counts == sorted(counts)
+    assert len(counts) > 20
+    # The rename of the manifest completes the stage; the old head is removed after it.
+    complete = counts.index(2)
+    assert complete < len(counts) - 1
+    assert (snapshots[complete] / "learning").is_dir()
+    assert len(list(snapshots[complete].rglob("head.safetensors"))) == 2
+    for i in {0, complete // 3, 2 * complete // 3, complete - 1}:
+        store = NetworkStore.open(copied(snapshots[i], tmp_path / f"again-{i}"))
+        resume = store.begin(identity)
+        assert (resume is not None) == bool(list(snapshots[i].glob("learning/rows-*.safetensors")))
+        store.commit(stages[1], {})
+        assert tree(store.root) == tree(root)
+    # The next stage also removes what an interrupted clean-up left.
+    without_kill = tree(make_store(tmp_path / "without-kill", stages).root)
+    for i in range(complete, len(counts)):
+        store = NetworkStore.open(copied(snapshots[i], tmp_path / f"next-{i}"))
+        store.begin({"scene": "gamma"})
+        store.commit(stages[2], {})
+        assert tree(store.root).keys() == without_kill.keys()
+
+
+def test_first_stage(
+    three_stages: Stages,
+    tmp_path: Path,
+    every_step: Record,
+    make_store: MakeStore,
+    tree: Tree,
+    estimates: Estimates,
+) -> None:
+    stages, root = three_stages["evercal_network"], tmp_path / "store"
+    snapshots = every_step(root, lambda: make_store(root, stages[:1]))
+    expected, opened = estimates(NetworkStore.open(root).contents), 0
+    for i, snapshot in enumerate(snapshots):
+        if is_store(snapshot):
+            assert estimates(NetworkStore.open(snapshot).contents) == expected
+            opened += 1
+            continue
+        again = tmp_path / f"again-{i}"
+        if snapshot.exists():
+            copied(snapshot, again)
+        store = NetworkStore.create(again, "evercal_network")
+        resume = store.begin({"scene": "alpha"})
+        assert (resume is not None) == any(again.glob("learning/rows-*.safetensors"))
+        store.commit(stages[0], {"scene": "alpha", "seconds": 1.5})
+        assert tree(again) == tree(root)
+    assert 0 < opened < len(snapshots) - 10
+
+
+def test_checkpoints_of_an_abandoned_stage_are_never_resumed_in_part(
+    three_stages: Stages, tmp_path: Path, every_step: Record, make_store: MakeStore
+) -> None:
+    root = tmp_path / "store"
+    store = make_store(root, three_stages["evercal_network"][:1])
+    store.begin({"scene": "beta"})
+    for i in range(4):
+        store.checkpoint(Checkpoint({"x": torch.tensor([i])}, {}))
+    store.checkpoint(Checkpoint({}, {"y": torch.ones(1)}))
+    for i, snapshot in enumerate(every_step(root, lambda: store.begin({"scene": "gamma"}))):
+        copy = NetworkStore.open(copied(snapshot, tmp_path / str(i)))
+        resume = copy.begin({"scene": "beta"})
+        if resume is not None:
+            assert [int(rows["x"]) for rows in resume.rows] == [0, 1, 2, 3]
+            assert resume.trainer.keys() == {"y"}
