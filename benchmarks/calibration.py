@@ -17,12 +17,11 @@ from benchmarks.accuracy import Row
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.drift import check
 from evercal.calibration.from_images import Images, calibrate
-from evercal.continual.learn_scene import LearnOptions, learn_scene
-from evercal.continual.presets import preset
 from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside
-from evercal.geometry import SE3, pose_distance, squared_mahalanobis
+from evercal.geometry import SE3, UncertainPose, pose_distance
 from evercal.localization.localizer import Localizer
+from evercal.map import Map
 from evercal.recordings import Recording, load_recording
 from evercal.recordings.samples import FOLDER
 
@@ -90,10 +89,10 @@ def as_wrist_recording(scene: Recording, draw: int) -> tuple[Recording, SE3]:
 def _wrist_draw(scene: Recording, room: Path, store: Path, draw: int) -> Row:
     recording, truth = as_wrist_recording(scene, draw)
     began = time.perf_counter()
-    report = learn_scene(store, recording, LearnOptions(preset("fast")))
+    report = Map.open(store).learn(recording)
     seconds, result = time.perf_counter() - began, report.hand_eye
     assert result is not None
-    row = _error(result.gripper_from_camera, np.array(result.covariance), truth)
+    row = _error(result.gripper_from_camera.pose, np.array(result.covariance), truth)
     row |= {"start_mm": result.start_mm, "seconds": seconds}
     folder = room / "calibration" / "fixed"
     if folder.is_dir():
@@ -136,7 +135,7 @@ def bumps(rooms: Sequence[Path], localizer: Localizer, draws: int) -> list[Row]:
                 reference = calibrate(localizer, _take(images, order[5:]))
                 five = _take(images, order[:5]).images
                 for kind, moved in _moved(reference, rng).items():
-                    shift, _ = check(localizer, five, moved)
+                    shift = check(localizer, five, moved)
                     row: Row = {"room": room.name, "camera": recording, "kind": kind}
                     row |= {"moved": shift.moved, "mm": shift.translation_mm}
                     row |= {"deg": shift.rotation_deg, "confidence": shift.confidence}
@@ -160,7 +159,7 @@ def _moved(reference: Calibration, rng: np.random.Generator) -> dict[str, Calibr
 def _learned(rooms: Sequence[Path], store: Path) -> Path:
     if not store.exists():
         for room in tqdm(rooms, "learning"):
-            learn_scene(store, load_recording(room), LearnOptions(preset("fast")))
+            Map.open(store).learn(room)
     return store
 
 
@@ -185,7 +184,7 @@ def _error(estimate: SE3, covariance: np.ndarray, truth: SE3) -> Row:
         "deg": float(np.rad2deg(radians)),
         "sigma_mm": 1000 * float(np.sqrt(np.trace(covariance[:3, :3]) / 3)),
         "sigma_deg": float(np.rad2deg(np.sqrt(np.trace(covariance[3:, 3:]) / 3))),
-        "squared_mahalanobis": squared_mahalanobis(estimate, covariance, truth),
+        "squared_mahalanobis": UncertainPose(estimate, covariance).squared_mahalanobis(truth),
     }
 
 

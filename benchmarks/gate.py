@@ -15,15 +15,15 @@ from typing import Literal
 import numpy as np
 import torch
 
-from evercal.continual.learn_scene import LearnOptions, learn_scene
-from evercal.continual.presets import preset
-from evercal.continual.strategies import strategy_named
+from evercal.continual.learn_scene import NetworkLearnOptions, learn_networks
+from evercal.continual.localizer import open_networks
+from evercal.continual.networks.descriptor import encode, load_descriptor
 from evercal.evaluation import evaluate, scores
 from evercal.evaluation.metrics import FINEST, correct
 from evercal.evaluation.tables import table
-from evercal.features.encode import encode
 from evercal.features.views import ViewOptions, frame_view
 from evercal.localization.localizer import Localizer
+from evercal.map import Map
 from evercal.mapping.selection import SarsOptions, select_sars
 from evercal.recordings.samples import sample_rooms
 
@@ -66,21 +66,21 @@ def measure() -> dict[str, float]:
     room = sample_rooms()[0].scene
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
-        report = learn_scene(Path(folder) / "store", room, LearnOptions(preset("bench")))
+        report = Map.open(Path(folder) / "store").learn(room)
         learning = time.perf_counter() - began
         localizer = Localizer.open(Path(folder) / "store")
-        options = LearnOptions(preset("bench"), strategy_named("evercal_network"))
+        options = NetworkLearnOptions("evercal_network", preset="bench")
         began = time.perf_counter()
-        trained = learn_scene(Path(folder) / "network", room, options)
+        trained = learn_networks(Path(folder) / "network", room, options)
         training = time.perf_counter() - began
-        network = scores(evaluate(Localizer.open(Path(folder) / "network"), {room.name: room}))
+        network = scores(evaluate(open_networks(Path(folder) / "network"), {room.name: room}))
     kernel = _seconds(_reference)
     results = evaluate(localizer, {room.name: room})
     (finest,) = correct(results, FINEST).values()
-    maps = localizer.maps
-    view = frame_view(room.test[0], maps.encoder.stride, ViewOptions())
+    encoder, descriptor = localizer.contents.encoder, load_descriptor()
+    view = frame_view(room.test[0], encoder.stride, ViewOptions())
     image = room.test[0].read_image()
-    encoding = _seconds(lambda: encode([view], maps.encoder, maps.descriptor))
+    encoding = _seconds(lambda: encode([view], encoder, descriptor))
     localizing = _seconds(lambda: localizer.localize(image))
     rng = np.random.default_rng(0)
     positions, rotations = rng.normal(size=(4000, 3)), rng.normal(size=(4000, 4))

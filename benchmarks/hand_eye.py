@@ -15,7 +15,7 @@ from evercal.calibration.pose_pairs.closed_form import motions, park, shah
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve
 from evercal.evaluation.metrics import share_inside
-from evercal.geometry import SE3, pose_distance, squared_mahalanobis
+from evercal.geometry import SE3, pose_distance
 
 
 @dataclass(frozen=True)
@@ -126,11 +126,7 @@ def trials(setting: Setting, count: int, first_seed: int = 0) -> dict[str, float
         off = error(result.parent_from_child, drawn.parent_from_camera)
         mm.append(1000 * np.linalg.norm(off[:3]))
         deg.append(np.rad2deg(np.linalg.norm(off[3:])))
-        squared.append(
-            squared_mahalanobis(
-                result.parent_from_child, result.covariance, drawn.parent_from_camera
-            )
-        )
+        squared.append(result.uncertain_pose.squared_mahalanobis(drawn.parent_from_camera))
         left_out = tuple(i for i, image in enumerate(result.images) if not image.used)
         named.append(left_out == drawn.spoiled)
         if setting.scale is not None:

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from evercal.mapping.scene_maps import SceneMaps, SceneRecord
 from tabulate import tabulate
 from tqdm import tqdm
 
@@ -27,6 +26,8 @@ from evercal.geometry import SE3
 from evercal.localization.localizer import Localizer
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.landmarks import Landmarks, detect
+from evercal.mapping.map_frame import MapFrame
+from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.recordings import Recording, load_recording
 from evercal.simulation.box_room import BoxRoom, default_camera
 
@@ -55,7 +56,7 @@ def run(
     if out.exists():
         raise InputError(f"{out}: exists; remove it or give another --out")
     localizer = Localizer.open(store)
-    recordings, maps = _recordings(scenes), localizer.maps
+    recordings, maps = _recordings(scenes), localizer.contents
     for number in tqdm(range(rooms), "adding", unit="room"):
         add_room(maps, FIRST_SEED + number, keyframes // rooms)
     localizer = Localizer(maps)
@@ -78,7 +79,7 @@ def _recordings(folders: Sequence[Path]) -> list[Recording]:
     return recordings
 
 
-def add_room(maps: SceneMaps, seed: int, count: int) -> None:
+def add_room(maps: MapContents, seed: int, count: int) -> None:
     """Add a box room with `count` keyframes to maps."""
     room, camera = BoxRoom(seed, texture_px=192), default_camera(320, 240)
     rng, vlad = np.random.default_rng(seed), vlad_for(maps.encoder)
@@ -97,22 +98,13 @@ def add_room(maps: SceneMaps, seed: int, count: int) -> None:
         depths.append(torch.full((len(features),), 1 / DEPTH_M).half())
         landmarks.append(Landmarks(pixels, np.full(n, 0.5), np.zeros((n, 2)), np.full(n, 0.01)))
         descriptors.append(vlad(features))
-    record = SceneRecord(
-        f"added-{seed}",
-        camera,
-        maps.atlas().place(np.stack([pose.translation_m for pose in poses])),
-        torch.zeros(0, maps.descriptor.width).half(),
-        count,
+    keyframes = Keyframes(
+        tuple(images),
+        (camera,) * count,
+        SE3.stack(poses),
+        tuple(depths),
+        tuple(landmarks),
+        torch.stack(descriptors).half(),
     )
-    maps.scenes.append(replace(record, min_support=maps.scenes[0].min_support))
-    maps.keyframes.append(
-        Keyframes(
-            tuple(images),
-            (camera,) * count,
-            SE3.stack(poses),
-            tuple(depths),
-            tuple(landmarks),
-            torch.stack(descriptors).half(),
-        )
-    )
-    maps.method_states.append({})
+    scene = SceneMap(f"added-{seed}", camera, camera, keyframes, MapFrame(), count)
+    maps.scenes.append(replace(scene, min_support=maps.scenes[0].min_support))

@@ -15,13 +15,13 @@ from tyro.conf import Positional
 
 from benchmarks.accuracy import Row, accuracy_row, mean_row
 from evercal.calibration.from_images import Images, calibrate
-from evercal.continual.learn_scene import LearnOptions, LearnReport, learn_scene
-from evercal.continual.presets import preset
-from evercal.continual.stage import StageOptions
 from evercal.errors import InputError
 from evercal.evaluation import evaluate
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.localizer import LocalizeOptions, Localizer
+from evercal.map import LearnReport, Map
+from evercal.mapping.build import MapOptions
+from evercal.mapping.memory_budget import MemoryBudget
 from evercal.recordings import Frame, Recording, load_recording, posed_frames
 from evercal.recordings.samples import sample_rooms
 
@@ -63,21 +63,16 @@ def run(
         rows = ablation(out, recordings, memory)
     else:
         rows = {"mini": mini, "fixed": fixed, "badposes": wrong_poses}[what](out, memory)
-    settings = {"stage": asdict(_stage(memory, 0)), "localize": asdict(LocalizeOptions())}
+    options = MapOptions(MemoryBudget(memory))
+    settings = {"map": asdict(options), "localize": asdict(LocalizeOptions())}
     (out / f"{what}.json").write_text(json.dumps({"rows": rows, "settings": settings}, indent=1))
     print(tabulate([list(row.values()) for row in rows], list(rows[0]), "github", floatfmt=".3g"))
 
 
-def _stage(memory: float, seed: int) -> StageOptions:
-    return replace(preset("fast", seed), memory_share=memory)
-
-
-def learned(
-    store: Path, scenes: Sequence[Recording], memory: float, seed: int = 0
-) -> list[LearnReport]:
+def learned(store: Path, scenes: Sequence[Recording], memory: float) -> list[LearnReport]:
     """Learn scenes in turn."""
-    options = LearnOptions(_stage(memory, seed))
-    return [learn_scene(store, scene, options) for scene in scenes]
+    cell = Map.open(store)
+    return [cell.learn(scene, memory=f"{100 * memory:g}%") for scene in scenes]
 
 
 def measured(
@@ -237,7 +232,7 @@ def wrong_poses(out: Path, memory: float, seeds: Sequence[int] = (0, 1, 2)) -> l
             # A common offset belongs to the frame that the recording states.
             test = with_pose_errors(posed_frames(scene.test), "offset", 0)
             spoiled = replace(scene, train=train, test=test if kind == "offset" else scene.test)
-            (report,) = learned(store, [spoiled], memory, seed)
+            (report,) = learned(store, [spoiled], memory)
             localizer, adjusted = Localizer.open(store), report.adjusted
             assert adjusted is not None
             true_common = OFFSET.inverse() if kind == "offset" else SE3.identity()
@@ -250,7 +245,7 @@ def wrong_poses(out: Path, memory: float, seeds: Sequence[int] = (0, 1, 2)) -> l
             rows.append(
                 measured(localizer, spoiled)
                 | {"scene": f"{kind} {seed}"}
-                | _distance("common_error", true_common, localizer.maps.scenes[0].common)
+                | _distance("common_error", true_common, localizer.contents.scenes[0].frame.common)
                 | {
                     "focal_percent": adjusted.focal_percent,
                     "pose_sigma_mm": adjusted.pose_sigma_mm,
@@ -276,7 +271,7 @@ def unknown_images(out: Path, scenes: Sequence[Recording], memory: float) -> lis
     for scene in scenes[1:]:
         images = ((frame.read_image(), frame.camera) for frame in scene.test)
         rows.append(_accepted(localizer, scene.name, images))
-    rng, camera = np.random.default_rng(0), localizer.maps.scenes[0].camera
+    rng, camera = np.random.default_rng(0), localizer.contents.scenes[0].camera
     shape = (camera.height, camera.width, 3)
     hand = cv2.GaussianBlur(rng.integers(90, 160, shape).astype(np.uint8), (0, 0), 25)
     rows.append(_accepted(localizer, "blank", [(np.full(shape, 128, np.uint8), camera)]))
@@ -287,7 +282,9 @@ def unknown_images(out: Path, scenes: Sequence[Recording], memory: float) -> lis
 
 
 def _accepted(localizer: Localizer, name: str, images: Iterable[tuple[Image, Camera]]) -> Row:
-    estimates = [localizer.localize(image, camera) for image, camera in images]
+    estimates = [
+        localizer.localize(image, localizer.camera_for(camera)) for image, camera in images
+    ]
     return {
         "images": name,
         "count": len(estimates),

@@ -5,21 +5,20 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from evercal.mapping.scene_maps import SceneMaps
-
 from benchmarks.peak_memory import peak_gb
 from evercal.continual.benchmark.suites import load_suite
 from evercal.continual.learn import learn
-from evercal.continual.learn_scene import validation_split
 from evercal.continual.networks.atlas import combined_centres
 from evercal.continual.networks.descriptor import load_descriptor
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.presets import PAPER_SIM_STEPS, on_paper_backbone, preset, short_side
+from evercal.continual.scenes import LearnedScenes
 from evercal.continual.stage import Encoding
 from evercal.continual.strategies import strategy_named
 from evercal.features.device import device_of
 from evercal.features.encoder import load_encoder
 from evercal.recordings import stated_poses
+from evercal.recordings.held_out import split_held_out
 
 REPORT_EVERY = 10
 
@@ -41,13 +40,13 @@ def run(
         out: File for loss, seconds and memory every ten steps, JSON lines.
     """
     scenes = load_suite(suite, data)
-    trains = [validation_split(scene.train)[0] for scene in scenes]
+    trains = [split_held_out(scene.train).train for scene in scenes]
     stage = on_paper_backbone(preset("paper"))
     positions = [stated_poses(train).translation_m for train in trains]
     centres = combined_centres(positions, stage.head.centres_per_scene, 0)
     fit = replace(stage.fit, iterations=PAPER_SIM_STEPS)
     stage = replace(stage, fit=fit, grid_scenes=len(scenes), fixed_centres_m=centres)
-    maps = SceneMaps(load_encoder(), load_descriptor(), "sars_spdd", short_side("paper"))
+    maps = LearnedScenes(load_encoder(), load_descriptor(), "sars_spdd", short_side("paper"))
     maps.to(device_of(device))
     out.parent.mkdir(parents=True, exist_ok=True)
     began, cpu = time.perf_counter(), time.process_time()

@@ -47,8 +47,8 @@ class Features:
     """Undistorted pixels, shape (n, 2)."""
     descriptors: np.ndarray
     """uint8 or float16, shape (n, d)."""
-    intrinsics: np.ndarray
-    """fx, fy, cx, cy of the undistorted image, pixels, shape (4,)."""
+    camera: Camera
+    """Camera of the undistorted image."""
 
 
 def detect(image: np.ndarray, camera: Camera, detector: Detector, short_side: int) -> Features:
@@ -65,8 +65,7 @@ def detect(image: np.ndarray, camera: Camera, detector: Detector, short_side: in
     rays = camera.unproject(pixels.astype(float))
     valid = np.isfinite(rays).all(1)
     rays, descriptors = rays[valid], descriptors[valid]
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    return Features(rays[:, :2] * intrinsics[:2] + intrinsics[2:], descriptors, intrinsics)
+    return Features(camera.pinhole.project(rays), descriptors, camera.pinhole)
 
 
 def sift(options: FeatureOptions) -> Detector:

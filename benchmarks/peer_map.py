@@ -14,13 +14,12 @@ import numpy as np
 
 from benchmarks.peer_features import Detector, Features, detect, mutual_matches
 from benchmarks.peer_triangulation import Tracks, TriangulationOptions, triangulate
-from evercal.continual.networks.descriptor import load_descriptor
-from evercal.evaluation.metrics import Status
-from evercal.features.encode import encode
+from evercal.continual.networks.descriptor import encode, load_descriptor
 from evercal.features.encoder import load_encoder
 from evercal.features.views import ViewOptions, plain_view
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
+from evercal.localization.estimate import PoseEstimate
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.recordings.frame import Frame, Recording, stated_poses
 
@@ -78,22 +77,6 @@ class PeerMap:
         """Size of descriptors, points, and global descriptors if they are used."""
         features = sum(frame.descriptors.nbytes + frame.points_m.nbytes for frame in self.frames)
         return features + (0 if self.descriptors is None else self.descriptors.nbytes)
-
-
-@dataclass(frozen=True, eq=False)
-class PeerEstimate:
-    """An estimate for `evercal.evaluation.evaluate`."""
-
-    status: Status
-    """`ok` or `failed`; peers do not reject poses."""
-    scene: str | None
-    """The scene of the map; None without a pose."""
-    base_from_camera: SE3 | None
-    """Estimated pose, metres."""
-    inliers: int
-    """Matches that agree with the pose."""
-    inlier_ratio: float
-    """Share of matches that agree with the pose."""
 
 
 class GlobalDescriber:
@@ -189,7 +172,7 @@ def _tracks(
     for view, (partner, (here, there)) in enumerate(zip(partners, matches, strict=True), start=1):
         pixels[view, here] = described.features[partner].pixels[there]
     views = [frame, *partners]
-    intrinsics = np.stack([described.features[view].intrinsics for view in views])
+    intrinsics = np.stack([_intrinsics(described.features[view].camera) for view in views])
     return Tracks(pixels, intrinsics, described.poses[np.array(views)])
 
 
@@ -218,8 +201,13 @@ class PeerLocalizer:
         self._map, self._detector, self._short_side = built, detector, short_side
         self._describer, self._options = describer, options
 
-    def localize(self, image: np.ndarray, camera: Camera, /) -> PeerEstimate:
+    def camera_for(self, stated: Camera) -> Camera | None:
+        """The stated intrinsics; peers do not adjust them."""
+        return stated
+
+    def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         """Estimate the camera pose of one RGB image, uint8 (h, w, 3)."""
+        assert camera is not None, "peers need intrinsics"
         features = detect(image, camera, self._detector, self._short_side)
         pixels, points = [np.zeros((0, 2))], [np.zeros((0, 3))]
         for frame in self._similar(image, camera):
@@ -230,12 +218,13 @@ class PeerLocalizer:
         result = None
         if len(matched) >= 6:
             pnp = self._options.pnp
-            result = solve_pnp(matched, np.concatenate(points), features.intrinsics, pnp)
+            result = solve_pnp(matched, np.concatenate(points), features.camera, pnp)
         if result is None:
-            return PeerEstimate("failed", None, None, 0, 0.0)
+            return PoseEstimate("failed", "too few matches", None, None, None, 0, 0.0, 0.0)
         inliers = int(result.inliers.sum())
         ratio = inliers / len(matched)
-        return PeerEstimate("ok", self.scenes[0], result.world_from_camera, inliers, ratio)
+        pose = result.pose.pose
+        return PoseEstimate("ok", "", self.scenes[0], pose, None, inliers, ratio, 0.0)
 
     def _similar(self, image: np.ndarray, camera: Camera) -> list[KeptFrame]:
         if self._map.descriptors is None:
@@ -243,3 +232,7 @@ class PeerLocalizer:
         similarity = self._map.descriptors.astype(np.float32) @ self._describer(image, camera)
         order = np.argsort(-similarity, kind="stable")[: self._options.retrieved]
         return [self._map.frames[i] for i in order]
+
+
+def _intrinsics(camera: Camera) -> np.ndarray:
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])

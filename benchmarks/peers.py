@@ -24,14 +24,12 @@ from benchmarks.accuracy import BOUNDS, accuracies
 from benchmarks.peer_features import DETECTORS, Detector, FeatureOptions
 from benchmarks.peer_map import GlobalDescriber, PeerLocalizer, QueryOptions, build, describe
 from benchmarks.peer_triangulation import TriangulationOptions
-from evercal.continual.learn_scene import LearnOptions, learn_scene
-from evercal.continual.presets import preset
 from evercal.errors import InputError
 from evercal.evaluation import evaluate
 from evercal.evaluation.metrics import FrameResult
-from evercal.evaluation.protocol import SceneLocalizer
 from evercal.evaluation.tables import table
-from evercal.localization.localizer import Localizer
+from evercal.localization.localizer import SceneLocalizer
+from evercal.map import Map
 from evercal.mapping.selection import SarsOptions, select_sars
 from evercal.recordings import (
     MIN_TRAIN_FRAMES,
@@ -168,11 +166,11 @@ def evercal_entry(scene: Recording, store: Path, options: PeerOptions) -> Entry:
     """Learn a scene into a new store and localize once."""
     print(f"{scene.name}: evercal learns", file=sys.stderr)
     began = time.perf_counter()
-    stage = replace(preset(options.preset), memory_share=options.share)
-    report = learn_scene(store, scene, LearnOptions(stage=stage))
-    localizer = Localizer.open(store)
+    cell = Map.open(store)
+    report = cell.learn(scene, memory=f"{100 * options.share:g}%")
+    localizer = cell.localizer
     # The first estimate waits until the remembered frames are encoded.
-    localizer.localize(scene.train[0].read_image(), scene.train[0].camera)
+    localizer.localize(scene.train[0].read_image())
     seconds = time.perf_counter() - began
     size = report.memory_bytes + report.head_bytes
     return Entry(_titled("evercal", options), localizer, seconds, size, report.frames_kept)

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 from tabulate import tabulate
 
-from evercal.continual.learn_scene import LearnOptions, learn_scene
-from evercal.continual.presets import preset
 from evercal.evaluation.metrics import scores
 from evercal.evaluation.protocol import evaluate
 from evercal.localization.localizer import Localizer
+from evercal.map import Map
 from evercal.recordings import load_recording
 
 DATA_VARIABLE = "EVERCAL_REAL_DATA"
@@ -59,7 +58,7 @@ def run(data: Path | None = None, out: Path = Path("runs/real"), seed: int = 0) 
 def _measured(folder: Path, name: str, store: Path, seed: int) -> dict[str, float]:
     scene = load_recording(folder)
     began = time.perf_counter()
-    report = learn_scene(store, scene, LearnOptions(stage=preset("fast", seed)))
+    report = Map.open(store).learn(scene)
     seconds = time.perf_counter() - began
     results = evaluate(Localizer.open(store), {name: scene})
     return asdict(scores(results).scenes[name]) | {

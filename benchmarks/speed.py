@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from evercal.features.encode import encode
+from evercal.features.encode import encode_features
 from evercal.features.views import ViewOptions, plain_view
 from evercal.localization.localizer import Localizer
 from evercal.localization.parallel import in_parallel
@@ -39,11 +39,12 @@ def run(store: Path, image: Path, repeat: int = 50) -> None:
         f"localize, decoding included: median {np.median(one):.1f} ms, worst {max(one):.1f} ms,"
         f" {busy:.1f} ms of processor time on {torch.get_num_threads()} threads"
     )
-    maps, pixels = localizer.maps, read_image(image)
+    encoder, short_side = localizer.contents.encoder, localizer.contents.short_side
+    pixels = read_image(image)
     height, width = pixels.shape[:2]
-    camera, options = default_camera(width, height), ViewOptions(maps.short_side)
-    view = plain_view(pixels, camera, maps.encoder.stride, options)
-    features = _milliseconds(lambda: encode([view], maps.encoder, maps.descriptor), repeat)
+    camera, options = default_camera(width, height), ViewOptions(short_side)
+    view = plain_view(pixels, camera, encoder.stride, options)
+    features = _milliseconds(lambda: encode_features([view], encoder), repeat)
     print(f"features of one image: median {np.median(features):.1f} ms, worst {max(features):.1f}")
     list(in_parallel(localize, [image] * 8))
     began, cpu = time.perf_counter(), time.process_time()

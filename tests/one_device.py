@@ -1,6 +1,6 @@
 """Detect tensors on the wrong device on a machine without a GPU.
 
-torch's `meta` device replaces the GPU: its tensors have shapes and no numbers. Many kernels of torch
+torch's `meta` device replaces the GPU: its tensors have shapes and no numbers. Many kernels
 accept a `meta` tensor beside one of the CPU, so every operation is checked here.
 """
 

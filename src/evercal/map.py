@@ -1,8 +1,11 @@
 """`Map`: scenes that a robot has learned, and everything that is asked of them.
 
 Learning a scene reads through three files: `Map.learn` here, `mapping.build.build_map`, and
-`mapping.store.MapStore.commit`.
+`mapping.store.MapStore.commit`. Methods import what they need, so that a robot that only locates
+images loads no module that learns or calibrates.
 """
+
+from __future__ import annotations
 
 import os
 import time
@@ -11,35 +14,26 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-import numpy as np
-
-from evercal.calibration.calibration import Calibration, Mount
-from evercal.calibration.drift import Shift, check
-from evercal.calibration.eye_in_hand import (
-    HandEyeReport,
-    hand_eye_report,
-    lacks_camera_poses,
-    posed_by_gripper,
-)
-from evercal.calibration.from_images import Images, ImageSource, calibrate
 from evercal.errors import InputError
 from evercal.features.device import device_of
-from evercal.geometry import SE3, Camera
-from evercal.localization.acceptance import fit_acceptance
-from evercal.localization.estimate import PoseEstimate
-from evercal.localization.fewest_keyframes import MOST_SHARE, fewest_keyframes
-from evercal.localization.localizer import Localizer
-from evercal.localization.query import LocalizeOptions
-from evercal.mapping.build import Adjusted, MapOptions, OnProgress, build_map
-from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.store import MapStore
-from evercal.recordings import Recording, load_recording, posed_recording
-from evercal.recordings.held_out import named_recording, require_frames, split_held_out
+from evercal.recordings.frame import Recording
 
 if TYPE_CHECKING:
+    import numpy as np
     from torch import nn
 
+    from evercal.calibration.calibration import Calibration, Mount
+    from evercal.calibration.drift import Shift
+    from evercal.calibration.eye_in_hand import HandEyeReport
+    from evercal.calibration.from_images import ImageSource
     from evercal.evaluation import Scores
+    from evercal.geometry import SE3, Camera
+    from evercal.localization.estimate import PoseEstimate
+    from evercal.localization.localizer import Localizer
+    from evercal.localization.query import LocalizeOptions
+    from evercal.mapping.build import Adjusted, MapOptions, OnProgress
+    from evercal.mapping.memory_budget import MemoryBudget
 
 PathLike = str | os.PathLike[str]
 
@@ -94,7 +88,7 @@ class Map:
         path: PathLike,
         *,
         device: str = "auto",
-        encoder: "Path | nn.Module | None" = None,
+        encoder: Path | nn.Module | None = None,
         options: LocalizeOptions | None = None,
     ) -> Self:
         """Open a map, or prepare a new one that the first `learn` writes.
@@ -131,6 +125,8 @@ class Map:
         Raises:
             InputError: No scene has been learned.
         """
+        from evercal.localization.localizer import Localizer
+
         if self._localizer is None:
             if not self.scenes:
                 raise InputError(f"map {self.path}: no scene learned yet; run 'evercal learn'")
@@ -166,6 +162,17 @@ class Map:
             InputError: A recording that cannot be used, a name that is taken, or another process
                 is writing into the map.
         """
+        from evercal.localization.acceptance import fit_acceptance
+        from evercal.mapping.build import MapOptions, build_map
+        from evercal.mapping.memory_budget import MemoryBudget
+        from evercal.recordings import load_recording, posed_recording
+        from evercal.recordings.held_out import (
+            lacks_camera_poses,
+            named_recording,
+            require_frames,
+            split_held_out,
+        )
+
         began = time.perf_counter()
         budget = MemoryBudget.parse(memory)
         loaded = recording if isinstance(recording, Recording) else load_recording(recording)
@@ -174,6 +181,8 @@ class Map:
             contents, start = self._store.contents, None
             options = options or MapOptions()
             if lacks_camera_poses(loaded):
+                from evercal.calibration.eye_in_hand import posed_by_gripper
+
                 posed = posed_by_gripper(loaded, contents.encoder, on_progress)
                 loaded, start, options = posed.recording, posed.start, options.for_hand_eye()
             loaded = posed_recording(loaded)
@@ -182,6 +191,8 @@ class Map:
             options = _sized(options, budget, contents.short_side)
             built = build_map(loaded.name, split.train, contents.encoder, options, on_progress)
             if budget.auto:
+                from evercal.localization.fewest_keyframes import fewest_keyframes
+
                 built = built.take(fewest_keyframes(contents, built, split.train, on_progress))
             scene = fit_acceptance(contents.with_scene(built.scene), split.held_out)
             report = LearnReport(
@@ -194,8 +205,12 @@ class Map:
                 min_support=scene.min_support,
                 landmarks=scene.landmarks,
                 adjusted=built.adjusted,
-                hand_eye=hand_eye_report(start, built, gripper_from_camera) if start else None,
             )
+            if start is not None:
+                from evercal.calibration.eye_in_hand import hand_eye_report
+
+                hand_eye = hand_eye_report(start, built, gripper_from_camera)
+                report = replace(report, hand_eye=hand_eye)
             self._store.commit(scene, asdict(report))
         self._localizer = None
         return report
@@ -229,6 +244,8 @@ class Map:
         Raises:
             InputError: No image was located, or unusable images or poses.
         """
+        from evercal.calibration.from_images import Images, calibrate
+
         given = Images.of(images, camera, robot_poses)
         return calibrate(self.localizer, given, mount, on_image=on_image)
 
@@ -251,13 +268,16 @@ class Map:
         Raises:
             InputError: No image was located, or the calibration is of a camera on the gripper.
         """
+        from evercal.calibration.drift import check
+        from evercal.calibration.from_images import Images
+
         given = Images.of(images, camera)
         return check(self.localizer, given.images, calibration, given.camera, on_image)
 
     def evaluate(
         self,
         recordings: PathLike | Recording | Sequence[Recording] | Mapping[str, Recording],
-    ) -> "Scores":
+    ) -> Scores:
         """Score the map on the test frames of recordings.
 
         Args:
@@ -273,6 +293,10 @@ class Map:
 
 def _sized(options: MapOptions, budget: MemoryBudget, short_side: int) -> MapOptions:
     """Options with the memory of a scene and the working size of a map."""
+    from evercal.mapping.memory_budget import MemoryBudget
+
     if budget.auto:
+        from evercal.localization.fewest_keyframes import MOST_SHARE
+
         budget = MemoryBudget(share=MOST_SHARE)
     return replace(options, memory=budget, size=replace(options.size, cells=short_side))

@@ -1,10 +1,9 @@
-"""Words for devices; what a machine lacks is refused in one line."""
+"""Names of devices; missing devices are refused in one line."""
 
 import pytest
 import torch
 
 from evercal.errors import InputError
-from evercal.features import device as module
 from evercal.features.device import allow_tf32, device_of, device_of_network
 
 from ..one_device import META
@@ -12,7 +11,7 @@ from ..one_device import META
 
 @pytest.fixture
 def gpus(monkeypatch: pytest.MonkeyPatch):
-    """Makes torch say that there are so many CUDA devices, of which number 1 is the current."""
+    """Set the number of CUDA devices that torch reports; the current device is 1."""
 
     def pretend(count: int) -> None:
         monkeypatch.setattr(torch.cuda, "is_available", lambda: count > 0)
@@ -22,7 +21,7 @@ def gpus(monkeypatch: pytest.MonkeyPatch):
     return pretend
 
 
-def test_auto_takes_the_current_cuda_device_where_there_is_one(gpus) -> None:
+def test_auto_is_the_current_cuda_device_if_there_is_one(gpus) -> None:
     gpus(0)
     assert device_of("auto") == device_of() == device_of("cpu") == torch.device("cpu")
     gpus(2)
@@ -32,35 +31,34 @@ def test_auto_takes_the_current_cuda_device_where_there_is_one(gpus) -> None:
 
 
 @pytest.mark.parametrize(
-    ("word", "count", "told"),
+    ("name", "count", "message"),
     [
         ("cuda", 0, "finds no CUDA device"),
         ("cuda:0", 0, "finds no CUDA device"),
         ("cuda:2", 2, "has 2 CUDA devices"),
-        ("gpu", 2, "take auto, cpu or cuda"),
-        ("cuda:x", 2, "take auto, cpu or cuda"),
-        ("cuda:", 2, "take auto, cpu or cuda"),
-        ("mps", 0, "take auto, cpu or cuda"),
-        ("", 0, "take auto, cpu or cuda"),
+        ("gpu", 2, "use auto, cpu or cuda"),
+        ("cuda:x", 2, "use auto, cpu or cuda"),
+        ("cuda:", 2, "use auto, cpu or cuda"),
+        ("mps", 0, "use auto, cpu or cuda"),
+        ("", 0, "use auto, cpu or cuda"),
     ],
 )
-def test_what_is_not_there_is_refused_in_one_line(gpus, word: str, count: int, told: str) -> None:
+def test_missing_devices_are_refused_in_one_line(gpus, name: str, count: int, message: str) -> None:
     gpus(count)
-    with pytest.raises(InputError, match=told) as refused:
-        device_of(word)
-    assert f"device {word!r}" in str(refused.value)
+    with pytest.raises(InputError, match=message) as refused:
+        device_of(name)
+    assert f"device {name!r}" in str(refused.value)
     assert "\n" not in str(refused.value)
 
 
-def test_a_network_is_where_its_weights_or_buffers_are() -> None:
+def test_device_of_a_network_is_that_of_its_weights_or_buffers() -> None:
     assert device_of_network(torch.nn.Linear(2, 2, device=META)) == META
     assert device_of_network(torch.nn.BatchNorm1d(2, affine=False, device=META)) == META
     assert device_of_network(torch.nn.Identity()) == torch.device("cpu")
     assert device_of_network(lambda grey: grey) == torch.device("cpu")
 
 
-def test_nothing_changes_on_the_cpu() -> None:
+def test_tf32_changes_nothing_on_the_cpu() -> None:
     before = torch.get_float32_matmul_precision()
     allow_tf32(torch.device("cpu"))
     assert torch.get_float32_matmul_precision() == before
-    assert module.DEVICES == ("auto", "cpu", "cuda")

@@ -1,4 +1,4 @@
-"""The local encoder: where its cells look, its inference form, and the files it is read from."""
+"""The local encoder: receptive fields, fused form, and weight files."""
 
 from pathlib import Path
 
@@ -34,11 +34,11 @@ def trained() -> LocalEncoder:
     return encoder.eval()
 
 
-def pictures(height: int, width: int, count: int = 2) -> Tensor:
+def images(height: int, width: int, count: int = 2) -> Tensor:
     return torch.rand(count, 1, height, width, generator=torch.Generator().manual_seed(7))
 
 
-def seen_by(encoder: nn.Module, image: Tensor, row: int, column: int) -> np.ndarray:
+def receptive_field(encoder: nn.Module, image: Tensor, row: int, column: int) -> np.ndarray:
     """(n, 2) pixels (u, v) that the output of one cell depends on."""
     image = image.clone().requires_grad_()
     weight = torch.rand(encoder(image).shape[1], generator=torch.Generator().manual_seed(1))
@@ -49,10 +49,10 @@ def seen_by(encoder: nn.Module, image: Tensor, row: int, column: int) -> np.ndar
 
 
 @pytest.mark.parametrize(("row", "column"), [(8, 9), (9, 8), (10, 11)])
-def test_a_cell_looks_at_pixels_symmetric_around_its_centre(
+def test_receptive_fields_are_centred_on_the_cells(
     monkeypatch: pytest.MonkeyPatch, row: int, column: int
 ) -> None:
-    """The standardisation is global and therefore left out; weights > 0 keep every path open."""
+    """Without the global standardisation; positive weights leave every path open."""
     monkeypatch.setattr(module, "standardise", lambda grey: grey)
     torch.manual_seed(0)
     encoder = small(fused=True)
@@ -60,36 +60,36 @@ def test_a_cell_looks_at_pixels_symmetric_around_its_centre(
         if not name.startswith("project"):
             fan_in = parameter[0].numel()
             nn.init.uniform_(parameter, 0.5 / fan_in, 1.5 / fan_in)
-    seen = seen_by(encoder, pictures(160, 176, 1), row, column)
+    pixels = receptive_field(encoder, images(160, 176, 1), row, column)
     centre = np.array([8 * column + 3.5, 8 * row + 3.5])
-    assert seen.min() > 0  # not cut off by the border, or the middle would prove nothing
-    assert (seen.max(0) < [175, 159]).all()
-    np.testing.assert_array_equal((seen.min(0) + seen.max(0)) / 2, centre)
-    np.testing.assert_array_equal(seen.mean(0), centre)
-    # Half a cell off, as with strided 3x3 convolutions, would be caught.
+    assert pixels.min() > 0  # not cut off by the border
+    assert (pixels.max(0) < [175, 159]).all()
+    np.testing.assert_array_equal((pixels.min(0) + pixels.max(0)) / 2, centre)
+    np.testing.assert_array_equal(pixels.mean(0), centre)
+    # Strided 3x3 convolutions are half a cell off.
     strided = nn.Sequential(*(nn.Conv2d(1, 1, 3, 2, 1, bias=False) for _ in range(3)))
-    assert (seen_by(strided, pictures(160, 176, 1), row, column).mean(0) != centre).all()
+    assert (receptive_field(strided, images(160, 176, 1), row, column).mean(0) != centre).all()
 
 
 def test_fused_equals_unfused() -> None:
     encoder = trained()
-    image = pictures(48, 64)
+    image = images(48, 64)
     with torch.no_grad():
         twin = encoder.fuse()
         assert not any(isinstance(layer, nn.BatchNorm2d) for layer in twin.modules())
         torch.testing.assert_close(twin(image), encoder(image), atol=2e-5, rtol=0)
 
 
-def test_fusing_leaves_an_encoder_in_training_in_training() -> None:
+def test_fusing_does_not_change_the_mode_of_an_encoder() -> None:
     encoder = trained().train()
     encoder.fuse()
     assert all(layer.training for layer in encoder.modules())
 
 
 @pytest.mark.parametrize("size", [(48, 64), (241, 323), (55, 57), (8, 8), (15, 9)])
-def test_output_size_and_the_cut_off_rest(size: tuple[int, int]) -> None:
+def test_pixels_beyond_whole_cells_are_cut_off(size: tuple[int, int]) -> None:
     height, width = size
-    image = pictures(height, width)
+    image = images(height, width)
     for encoder in (trained(), AceEncoder(16)):
         with torch.no_grad():
             features = encoder(image)
@@ -100,51 +100,51 @@ def test_output_size_and_the_cut_off_rest(size: tuple[int, int]) -> None:
 
 def test_vectors_have_unit_length() -> None:
     with torch.no_grad():
-        length = trained()(pictures(48, 64)).norm(dim=1)
+        length = trained()(images(48, 64)).norm(dim=1)
     torch.testing.assert_close(length, torch.ones_like(length))
 
 
 @pytest.mark.parametrize(("contrast", "brightness"), [(1.0, 0.3), (0.5, 0.0), (0.4, 0.5)])
-def test_brightness_and_contrast_drop_out(contrast: float, brightness: float) -> None:
-    encoder, image = trained(), pictures(48, 64)
+def test_brightness_and_contrast_have_no_effect(contrast: float, brightness: float) -> None:
+    encoder, image = trained(), images(48, 64)
     with torch.no_grad():
         before, after = encoder(image), encoder(contrast * image + brightness)
-    # Not exactly: the 1e-3 that keeps a black image finite counts a little against contrast.
+    # Not exactly: 1e-3 is added to the contrast, for black images.
     assert float((before * after).sum(1).min()) > 0.9995
 
 
-def test_each_image_of_a_batch_stands_for_itself() -> None:
-    encoder, image = trained(), pictures(48, 64, 3)
+def test_images_of_a_batch_are_independent() -> None:
+    encoder, image = trained(), images(48, 64, 3)
     with torch.no_grad():
         together = encoder(image * torch.tensor([1.0, 0.2, 0.7]).view(3, 1, 1, 1))
         alone = encoder(image[1:2] * 0.2)
     torch.testing.assert_close(together[1:2], alone, atol=1e-5, rtol=0)
 
 
-def test_a_black_image_gives_numbers() -> None:
+def test_features_of_a_black_image_are_finite() -> None:
     with torch.no_grad():
         assert torch.isfinite(trained()(torch.zeros(1, 1, 16, 16))).all()
 
 
-def test_round_trip_through_a_file_rounds_to_half_and_no_more(tmp_path: Path) -> None:
+def test_weight_file_has_half_precision(tmp_path: Path) -> None:
     encoder = trained().fuse()
     path = tmp_path / "encoder.safetensors"
     path.write_bytes(network_bytes(encoder, "encoder"))
-    found = load_encoder(path)
-    assert isinstance(found, LocalEncoder)
-    assert isinstance(found, Encoder)
-    assert (found.width, found.stride, found.settings) == (12, 8, encoder.settings)
-    assert not any(layer.training for layer in found.modules())
+    loaded = load_encoder(path)
+    assert isinstance(loaded, LocalEncoder)
+    assert isinstance(loaded, Encoder)
+    assert (loaded.width, loaded.stride, loaded.settings) == (12, 8, encoder.settings)
+    assert not any(layer.training for layer in loaded.modules())
     with torch.no_grad():
-        expected = encoder.half().float()(pictures(48, 64))
-        torch.testing.assert_close(found(pictures(48, 64)), expected, atol=1e-5, rtol=0)
-    assert network_bytes(found, "encoder") == path.read_bytes()
+        expected = encoder.half().float()(images(48, 64))
+        torch.testing.assert_close(loaded(images(48, 64)), expected, atol=1e-5, rtol=0)
+    assert network_bytes(loaded, "encoder") == path.read_bytes()
 
 
 def test_the_shipped_encoder_loads() -> None:
     encoder = load_encoder()
     with torch.no_grad():
-        features = encoder(pictures(240, 320, 1))
+        features = encoder(images(240, 320, 1))
     assert features.shape == (1, encoder.width, 30, 40)
     assert torch.isfinite(features).all()
 
@@ -183,14 +183,14 @@ def ace_by_hand(state: dict[str, Tensor], grey: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("width", [512, 64])
-def test_aces_file_loads_and_computes_aces_function(tmp_path: Path, width: int) -> None:
+def test_ace_file_computes_the_published_function(tmp_path: Path, width: int) -> None:
     state = ace_state(width)
     torch.save(state, tmp_path / "ace.pt")
     encoder = load_encoder(tmp_path / "ace.pt")
     assert isinstance(encoder, AceEncoder)
     assert isinstance(encoder, Encoder)
     assert encoder.width == width
-    image = pictures(40, 48)
+    image = images(40, 48)
     with torch.no_grad():
         torch.testing.assert_close(encoder(image), ace_by_hand(state, image), atol=1e-5, rtol=1e-5)
     (tmp_path / "own.safetensors").write_bytes(network_bytes(encoder, "encoder"))
@@ -207,7 +207,7 @@ def test_ace_layout_has_the_published_number_of_parameters() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "named"),
+    ("change", "message"),
     [
         ({"conv3.bias": None}, "conv3.bias"),
         ({"res2_skip.weight": None}, "res2_skip.weight"),
@@ -218,15 +218,15 @@ def test_ace_layout_has_the_published_number_of_parameters() -> None:
         ({"conv2.bias": "text"}, "conv2.bias"),
     ],
 )
-def test_a_file_that_is_nearly_aces_is_refused_by_name(
-    tmp_path: Path, change: dict[str, object], named: str
+def test_wrong_tensors_of_an_ace_file_are_refused_by_name(
+    tmp_path: Path, change: dict[str, object], message: str
 ) -> None:
     state = {k: v for k, v in {**ace_state(64), **change}.items() if v is not None}
     torch.save(state, tmp_path / "ace.pt")
-    refused(tmp_path / "ace.pt", named)
+    refused(tmp_path / "ace.pt", message)
 
 
-def test_other_files_are_refused_by_name(tmp_path: Path) -> None:
+def test_other_files_are_refused(tmp_path: Path) -> None:
     refused(tmp_path / "none.pt", "no such file")
     refused(tmp_path, "no such file")
     torch.save([1, 2], tmp_path / "list.pt")
@@ -237,7 +237,7 @@ def test_other_files_are_refused_by_name(tmp_path: Path) -> None:
     refused(tmp_path / "text.pt", "not a readable torch weight file")
 
 
-def test_broken_files_of_ours_are_refused_by_name(tmp_path: Path) -> None:
+def test_broken_encoder_files_are_refused(tmp_path: Path) -> None:
     from safetensors.torch import save
 
     good = network_bytes(trained().fuse(), "encoder")
@@ -257,10 +257,10 @@ def test_broken_files_of_ours_are_refused_by_name(tmp_path: Path) -> None:
         refused(path, "not an evercal encoder")
 
 
-def refused(path: Path, named: str) -> None:
+def refused(path: Path, message: str) -> None:
     with pytest.raises(InputError, match="encoder") as caught:
         load_encoder(path)
-    message = str(caught.value)
-    assert str(path) in message
-    assert named in message
-    assert len(message.splitlines()) == 1
+    text = str(caught.value)
+    assert str(path) in text
+    assert message in text
+    assert len(text.splitlines()) == 1

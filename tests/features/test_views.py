@@ -1,4 +1,4 @@
-"""What the encoder gets to see is what a camera would see: the room is drawn again and compared."""
+"""Views equal images that are rendered for the same camera."""
 
 from dataclasses import replace
 
@@ -22,8 +22,8 @@ from evercal.simulation.box_room import BoxRoom
 PLAIN = Camera(160, 120, 131.0, 128.0, 83.0, 57.0)
 LARGE = Camera(320, 240, 262.0, 256.0, 166.5, 114.5)
 PORTRAIT = Camera(120, 160, 128.0, 131.0, 57.0, 83.0)
-LENS = replace(PLAIN, distortion=(-0.22, 0.07, 0.004, -0.003))
-CAMERAS = {"plain": PLAIN, "large": LARGE, "portrait": PORTRAIT, "lens": LENS}
+DISTORTED = replace(PLAIN, distortion=(-0.22, 0.07, 0.004, -0.003))
+CAMERAS = {"plain": PLAIN, "large": LARGE, "portrait": PORTRAIT, "distorted": DISTORTED}
 OPTIONS = ViewOptions(short_side=120, gamma=0.0)
 
 
@@ -31,9 +31,9 @@ def grey(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
-def shifts(found: np.ndarray, expected: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """(n, 2) by how many pixels `found` is moved against `expected`, in each quarter."""
-    found, expected = (cv2.GaussianBlur(i.astype(float), (0, 0), 1.2) for i in (found, expected))
+def shifts(image: np.ndarray, expected: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """(n, 2) shift of an image against the expected one in each quarter, pixels."""
+    image, expected = (cv2.GaussianBlur(i.astype(float), (0, 0), 1.2) for i in (image, expected))
     dv, du = np.gradient(expected)
     height, width = mask.shape
     moved = []
@@ -44,7 +44,7 @@ def shifts(found: np.ndarray, expected: np.ndarray, mask: np.ndarray) -> np.ndar
             if part.sum() < 400:
                 continue
             slopes = np.stack([-du[part], -dv[part], np.ones(part.sum())], -1)
-            moved.append(np.linalg.lstsq(slopes, (found - expected)[part], rcond=None)[0][:2])
+            moved.append(np.linalg.lstsq(slopes, (image - expected)[part], rcond=None)[0][:2])
     assert len(moved) >= 3
     return np.array(moved)
 
@@ -67,10 +67,10 @@ def virtual_camera(view: View) -> tuple[Camera, SE3]:
     here = cell_centres(height, width, 8)
     matrix, _ = cv2.findHomography(here, view.cell_pixels.astype(float))
     # K R K_v^-1 with K_v = K diag(z, z, 1) leaves R diag(1/z, 1/z, 1) up to scale.
-    turn = np.linalg.inv(frame.matrix()) @ matrix @ frame.matrix()
-    turn = turn / np.linalg.norm(turn[:, 2])
-    zoom = 1 / np.linalg.norm(turn[:, 0])
-    rotation = turn * [zoom, zoom, 1]
+    scaled = np.linalg.inv(frame.matrix()) @ matrix @ frame.matrix()
+    scaled = scaled / np.linalg.norm(scaled[:, 2])
+    zoom = 1 / np.linalg.norm(scaled[:, 0])
+    rotation = scaled * [zoom, zoom, 1]
     np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=2e-4)
     assert np.linalg.det(rotation) > 0
     pose = SE3.from_matrix(np.block([[rotation, np.zeros((3, 1))], [np.eye(4)[3:]]]))
@@ -78,15 +78,15 @@ def virtual_camera(view: View) -> tuple[Camera, SE3]:
 
 
 @pytest.mark.parametrize("kind", CAMERAS)
-def test_an_augmented_view_is_what_the_virtual_camera_sees(kind: str, box: BoxRoom, shoot) -> None:
+def test_augmented_view_is_the_image_of_its_virtual_camera(kind: str, box: BoxRoom, shoot) -> None:
     rng = np.random.default_rng(3)
-    zooms, turns = [], []
+    zooms, rotations = [], []
     for _ in range(4):
         frame = shoot(CAMERAS[kind], box.random_view(rng))
         view = augmented_view(frame, 8, OPTIONS, rng)
         camera, frame_from_view = virtual_camera(view)
         zooms.append(camera.fx / view.intrinsics[0])
-        turns.append(np.abs(frame_from_view.log()[3:]))
+        rotations.append(np.abs(frame_from_view.log()[3:]))
         pose = frame.base_from_camera @ frame_from_view
         expected = grey(box.render(camera, pose))
         mask = inner(view)
@@ -96,14 +96,14 @@ def test_an_augmented_view_is_what_the_virtual_camera_sees(kind: str, box: BoxRo
         assert np.abs(moved.mean(0)).max() < 0.06
         difference = np.abs(view.grey.astype(float) - expected)[mask]
         assert np.median(difference) < 5
-        # A view of another direction is nothing like it.
+        # A view of another direction differs.
         back = frame.base_from_camera @ frame_from_view.inverse()
         wrong = np.abs(view.grey.astype(float) - grey(box.render(camera, back)))[mask]
         assert difference.mean() < 0.35 * wrong.mean()
-    # The draws are within the options, and are draws.
+    # The draws use the range of the options.
     assert 1 / 1.4 - 1e-3 < min(zooms) < 1 < max(zooms) < 1.4 + 1e-3
-    assert (np.max(turns, 0) <= np.deg2rad([6, 6, 20]) + 1e-3).all()
-    assert (np.max(turns, 0) > np.deg2rad([1, 1, 3])).all()
+    assert (np.max(rotations, 0) <= np.deg2rad([6, 6, 20]) + 1e-3).all()
+    assert (np.max(rotations, 0) > np.deg2rad([1, 1, 3])).all()
 
 
 @pytest.mark.parametrize("kind", CAMERAS)
@@ -124,9 +124,9 @@ def test_pose_and_intrinsics_are_those_of_the_frame(kind: str, box: BoxRoom, sho
 
 
 @pytest.mark.parametrize("kind", CAMERAS)
-def test_a_cell_of_a_plain_view_shows_what_its_pixel_says(kind: str, box: BoxRoom, shoot) -> None:
+def test_cells_of_a_plain_view_show_their_ideal_pixels(kind: str, box: BoxRoom, shoot) -> None:
     rng = np.random.default_rng(5)
-    found, expected = [], []
+    actual, expected = [], []
     for _ in range(3):
         frame = shoot(CAMERAS[kind], box.random_view(rng))
         view = frame_view(frame, 8, OPTIONS)
@@ -139,9 +139,9 @@ def test_a_cell_of_a_plain_view_shows_what_its_pixel_says(kind: str, box: BoxRoo
         where = (view.cell_pixels + margin)[:, None]
         expected.append(cv2.remap(drawn, where, None, cv2.INTER_LINEAR))  # type: ignore[call-overload]
         centres = cell_centres(height, width, 8).astype(np.float32)[:, None]
-        seen = cv2.GaussianBlur(view.grey, (0, 0), 1.5)
-        found.append(cv2.remap(seen, centres, None, cv2.INTER_LINEAR))  # type: ignore[call-overload]
-    a, b = (np.concatenate(x).ravel().astype(float) for x in (found, expected))
+        blurred = cv2.GaussianBlur(view.grey, (0, 0), 1.5)
+        actual.append(cv2.remap(blurred, centres, None, cv2.INTER_LINEAR))  # type: ignore[call-overload]
+    a, b = (np.concatenate(x).ravel().astype(float) for x in (actual, expected))
     assert np.corrcoef(a, b)[0, 1] > 0.97
     assert np.median(np.abs(a - b)) < 3
 
@@ -159,19 +159,19 @@ def test_cell_centres_are_the_means_of_the_cells_pixels() -> None:
 
 @pytest.mark.parametrize("kind", CAMERAS)
 def test_cell_pixels_are_free_of_distortion(kind: str) -> None:
-    """A point on the ray of the ideal pixel is seen by the real lens at the cell's centre."""
+    """A point on the ray of an ideal pixel projects to the cell's centre."""
     camera = CAMERAS[kind]
     ideal = replace(camera, distortion=())
     pixels = ideal_cell_pixels(camera, 8)
-    seen = camera.project(2.5 * ideal.unproject(pixels))
+    projected = camera.project(2.5 * ideal.unproject(pixels))
     centres = cell_centres(camera.height, camera.width, 8)
-    np.testing.assert_allclose(seen, centres, atol=1e-3)
-    bent = np.abs(pixels - centres).max()
-    assert bent > 3 if camera.distortion else bent < 1e-4
+    np.testing.assert_allclose(projected, centres, atol=1e-3)
+    shift = np.abs(pixels - centres).max()
+    assert shift > 3 if camera.distortion else shift < 1e-4
 
 
 @pytest.mark.parametrize("kind", CAMERAS)
-def test_valid_cells_are_those_that_the_real_lens_sees(kind: str, box: BoxRoom, shoot) -> None:
+def test_valid_cells_lie_in_the_distorted_image(kind: str, box: BoxRoom, shoot) -> None:
     rng = np.random.default_rng(7)
     small = CAMERAS[kind].short_side_resized(120)
     ideal = replace(small, distortion=())
@@ -188,7 +188,7 @@ def test_valid_cells_are_those_that_the_real_lens_sees(kind: str, box: BoxRoom, 
     assert max(share) == 1.0
 
 
-def test_the_same_draws_give_the_same_view(box: BoxRoom, shoot) -> None:
+def test_views_are_deterministic(box: BoxRoom, shoot) -> None:
     frame = shoot(PLAIN, box.random_view(np.random.default_rng(0)))
     options = ViewOptions(short_side=120)
     one, same, other = (
@@ -200,7 +200,7 @@ def test_the_same_draws_give_the_same_view(box: BoxRoom, shoot) -> None:
     assert (one.grey != other.grey).mean() > 0.5
 
 
-def test_gamma_changes_brightness_alone(box: BoxRoom, shoot) -> None:
+def test_gamma_changes_the_brightness_only(box: BoxRoom, shoot) -> None:
     frame = shoot(PLAIN, box.random_view(np.random.default_rng(0)))
     dark = augmented_view(frame, 8, replace(OPTIONS, gamma=0.8), np.random.default_rng(4))
     plain = augmented_view(frame, 8, OPTIONS, np.random.default_rng(4))
@@ -213,7 +213,7 @@ def test_gamma_changes_brightness_alone(box: BoxRoom, shoot) -> None:
     assert any(a != b for a, b in table)
 
 
-def test_no_turn_and_no_zoom_is_the_plain_view(box: BoxRoom, shoot) -> None:
+def test_view_without_rotation_and_zoom_is_the_plain_view(box: BoxRoom, shoot) -> None:
     still = ViewOptions(short_side=120, zoom=1.0, roll_deg=0, tilt_deg=0, gamma=0.0)
     frame = shoot(PLAIN, box.random_view(np.random.default_rng(0)))
     view = augmented_view(frame, 8, still, np.random.default_rng(0))
@@ -229,22 +229,21 @@ def test_no_turn_and_no_zoom_is_the_plain_view(box: BoxRoom, shoot) -> None:
 def test_working_image(size: tuple[int, int], expected: tuple[int, int] | None) -> None:
     image = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3)).astype(np.uint8)
     camera = Camera(*size, 100.0, 100.0, 40.0, 50.0)
-    found, small = working_image(image, camera, 120)
+    resized, small = working_image(image, camera, 120)
     width, height = expected or size
-    assert found.shape == (height, width) == (small.height, small.width)
+    assert resized.shape == (height, width) == (small.height, small.width)
     assert small == camera.short_side_resized(120)
     again, _ = working_image(grey(image), camera, 120)
-    np.testing.assert_array_equal(found, again)
+    np.testing.assert_array_equal(resized, again)
 
 
 def test_shrinking_averages() -> None:
-    """Every second pixel alone would be all white."""
     image = np.zeros((240, 320), np.uint8)
     image[::2, ::2] = 255
-    found, _ = working_image(image, LARGE, 120)
-    assert np.abs(found.astype(float) - 255 / 4).max() <= 1
+    small, _ = working_image(image, LARGE, 120)
+    assert np.abs(small.astype(float) - 255 / 4).max() <= 1
 
 
-def test_an_image_without_a_pose_is_seen_from_the_identity() -> None:
+def test_plain_view_has_the_identity_as_pose() -> None:
     view = plain_view(np.zeros((120, 160), np.uint8), PLAIN, 8, OPTIONS)
     np.testing.assert_array_equal(view.base_from_camera.matrix(), np.eye(4))

@@ -281,7 +281,7 @@ def hall_view(room: BoxRoom) -> SE3:
     from evercal.simulation.box_room import look_at
 
     eye, heading = np.array([0.0, 0.0, 1.3]), 34 + 0.45
-    return look_at(eye, eye + [np.cos(heading), np.sin(heading), -0.1], 0.0)
+    return look_at(eye, eye + np.array([np.cos(heading), np.sin(heading), -0.1]), 0.0)
 
 
 def test_grey_image_equals_its_rgb_image(localizer: Localizer, views: tuple[Frame, ...]) -> None:

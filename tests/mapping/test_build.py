@@ -2,275 +2,248 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from evercal.continual.finish_scene import mapped_record
-from evercal.continual.networks.atlas import Cell
 from evercal.errors import InputError
-from evercal.features.encoder import load_encoder
-from evercal.geometry.camera import Camera
-from evercal.geometry.se3 import SE3, pose_distance
-from evercal.mapping.build import (
-    MapOptions,
-    Mapping,
-    SceneMap,
-    _moved,
-    build_map,
-    map_steps,
-    spread_frames,
-)
+from evercal.features.encoder import Encoder, load_encoder
+from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
+from evercal.mapping.build import BuiltMap, MapOptions, _moved, build_map, spread_frames
 from evercal.mapping.bundle_adjustment import Adjustment
+from evercal.mapping.keyframes import Keyframes
+from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.prepared_frames import WorkingSize
-from evercal.mapping.scene_maps import SceneRecord
 from evercal.recordings.frame import Frame, Recording
 from evercal.simulation.box_room import BoxRoom
 
-if TYPE_CHECKING:
-    from evercal.continual.stage import Stage
-
-SMALL = MapOptions(size=WorkingSize(cells=120, patches=120))
+SMALL = MapOptions(size=WorkingSize(cells=120, patches=120), memory=MemoryBudget(share=0.2))
 
 
 @pytest.fixture(scope="module")
-def found(hall_stage: Stage) -> SceneMap:
-    assert hall_stage.scene_map is not None
-    return hall_stage.scene_map
+def encoder() -> Encoder:
+    return load_encoder()
 
 
-def moved(frames: tuple[Frame, ...], change: SE3) -> tuple[Frame, ...]:
-    """The frames with `change` multiplied to all poses on the right."""
-    return tuple(
-        replace(frame, base_from_camera=frame.base_from_camera @ change)
-        for frame in frames
-        if frame.base_from_camera is not None
-    )
+def moved(frames: Sequence[Frame], change: SE3) -> list[Frame]:
+    """Frames with all poses multiplied by a change on the right."""
+    return [replace(f, base_from_camera=pose_of(f) @ change) for f in frames]
 
 
-def test_landmarks_are_where_the_room_is(found: SceneMap) -> None:
-    room, off, sure = BoxRoom(34, texture_px=256), [], []
-    keyframes = found.keyframes
+def pose_of(frame: Frame) -> SE3:
+    assert frame.base_from_camera is not None
+    return frame.base_from_camera
+
+
+def rays_of(keyframes: Keyframes, i: int, pixels: np.ndarray) -> np.ndarray:
+    """Rays of pixels (..., 2) of a keyframe in the base frame."""
+    rotation = keyframes.base_from_camera[i].rotation_matrix()
+    return keyframes.cameras[i].unproject(pixels) @ rotation.T
+
+
+def test_landmarks_lie_on_the_surfaces(hall_built: BuiltMap, hall_room: BoxRoom) -> None:
+    keyframes, errors, standardised = hall_built.scene.keyframes, [], []
     for i, marks in enumerate(keyframes.landmarks):
         assert len(marks) > 100
-        pose, camera = keyframes.base_from_camera[i], keyframes.cameras[i]
-        rays = camera.unproject(marks.pixels)
-        _, depth = room.intersect(pose.translation_m, rays @ pose.rotation_matrix().T)
-        error = 1 / marks.inverse_depth / depth - 1
-        off.append(np.abs(error))
-        sure.append(np.abs(marks.inverse_depth - 1 / depth) / marks.sigma)
-    every, claimed = np.concatenate(off), np.concatenate(sure)
-    assert np.median(every) < 0.003
-    assert np.quantile(every, 0.9) < 0.02
-    # A standard deviation is claimed: half of all errors should lie below 0.67 of it.
-    assert 0.1 < np.median(claimed) < 3
+        position = keyframes.base_from_camera[i].translation_m
+        _, depth = hall_room.intersect(position, rays_of(keyframes, i, marks.pixels))
+        errors.append(np.abs(1 / marks.inverse_depth / depth - 1))
+        standardised.append(np.abs(marks.inverse_depth - 1 / depth) / marks.sigma)
+    error = np.concatenate(errors)
+    assert np.median(error) < 0.003
+    assert np.quantile(error, 0.9) < 0.02
+    # Half of all Gaussian errors lie below 0.67 standard deviations.
+    assert 0.1 < np.median(np.concatenate(standardised)) < 3
 
 
-def test_slants_are_those_of_the_surfaces(found: SceneMap) -> None:
-    room, keyframes = BoxRoom(34, texture_px=256), found.keyframes
+def test_slants_are_those_of_the_surfaces(hall_built: BuiltMap, hall_room: BoxRoom) -> None:
+    keyframes = hall_built.scene.keyframes
     steps = np.array([[8.0, 0], [-8, 0], [0, 8], [0, -8], [0, 0]])
     slopes, truths = [], []
     for i, marks in enumerate(keyframes.landmarks):
-        pose, camera = keyframes.base_from_camera[i], keyframes.cameras[i]
-        rays = camera.unproject(marks.pixels[None] + steps[:, None])
-        turned = rays @ pose.rotation_matrix().T
-        near = np.stack([1 / room.intersect(pose.translation_m, ray)[1] for ray in turned])
-        truth = np.stack([near[0] - near[1], near[2] - near[3]], -1) / 16
-        # On a plane, inverse depth is linear in the image; elsewhere there is no one slant.
-        flat = np.abs(near[:2].mean(0) - near[4]) + np.abs(near[2:4].mean(0) - near[4]) < 1e-6
+        position = keyframes.base_from_camera[i].translation_m
+        rays = rays_of(keyframes, i, marks.pixels[None] + steps[:, None])
+        rho = np.stack([1 / hall_room.intersect(position, ray)[1] for ray in rays])
+        truth = np.stack([rho[0] - rho[1], rho[2] - rho[3]], -1) / 16
+        # On a plane, inverse depth is linear in the image; an edge has no slant.
+        flat = np.abs(rho[:2].mean(0) - rho[4]) + np.abs(rho[2:4].mean(0) - rho[4]) < 1e-6
         slopes.append(marks.slope[flat])
         truths.append(truth[flat])
     slope, truth = np.concatenate(slopes), np.concatenate(truths)
     assert len(slope) > 300
-    # Coarse, but better than none.
+    # The slants are coarse, but better than zero.
     assert np.corrcoef(slope.ravel(), truth.ravel())[0, 1] > 0.5
     error = np.linalg.norm(slope - truth, axis=1)
     assert np.median(error) < np.median(np.linalg.norm(truth, axis=1))
 
 
-def test_right_poses_and_a_right_lens_stay(found: SceneMap, hall: Recording) -> None:
-    truth = {f.name: f.base_from_camera for f in hall.train}
-    keyframes, stated = found.keyframes, [f for f in hall.train if f.base_from_camera]
-    assert len(keyframes) == 7
-    for i in range(7):
-        pose = keyframes.base_from_camera[i]
-        nearest = min(pose_distance(pose, p)[0] for p in truth.values() if p is not None)
-        assert nearest < 0.003
-    assert found.camera.fx == pytest.approx(stated[0].camera.fx, rel=2e-3)
-    adjusted = found.adjusted
+def test_exact_poses_and_intrinsics_hardly_change(hall_built: BuiltMap, hall: Recording) -> None:
+    truth = {frame.name: pose_of(frame) for frame in hall.train}
+    scene, adjusted = hall_built.scene, hall_built.adjusted
+    assert len(scene.keyframes) == len(hall_built.keyframe_names) == 7
+    for i, name in enumerate(hall_built.keyframe_names):
+        assert pose_distance(scene.keyframes.base_from_camera[i], truth[name])[0] < 0.003
+    assert scene.adjusted_camera.fx == pytest.approx(hall.train[0].camera.fx, rel=2e-3)
+    assert adjusted.residual_px is not None
     assert adjusted.residual_px < 0.2
     assert adjusted.pose_sigma_mm < 1
     assert adjusted.pose_sigma_deg < 0.05
     assert abs(adjusted.time_shift_frames) < 0.02
     assert (adjusted.wrong_poses, adjusted.doubtful_poses) == ((), ())
-    assert 0 < found.pose_sigma[0] < 0.003
-    assert 0 < found.pose_sigma[1] < 0.003
+    assert 0 < scene.frame.pose_sigma[0] < 0.003
+    assert 0 < scene.frame.pose_sigma[1] < 0.003
 
 
-def test_steps_are_told_in_order(arcs: tuple[Recording, Recording]) -> None:
-    steps = []
-    chosen = spread_frames(arcs[0].train, 3)
-    work = map_steps(arcs[0].train[:16], load_encoder(), chosen[chosen < 16], SMALL)
-    for step in work:
-        assert isinstance(step, Mapping)
-        assert 0 <= step.done <= step.total
-        steps.append(step)
-    order = list(dict.fromkeys(step.what for step in steps))
-    assert order == ["encoding", "mapping", "adjusting"]
-    assert [s.done for s in steps if s.what == "encoding"] == list(range(1, 17))
-    assert steps[-1].done == steps[-1].total
+def test_steps_are_reported_in_order(arcs: tuple[Recording, Recording], encoder: Encoder) -> None:
+    steps: list[tuple[str, int, int]] = []
+    build_map("a", arcs[0].train[:16], encoder, SMALL, lambda *step: steps.append(step))
+    assert list(dict.fromkeys(what for what, _, _ in steps)) == ["encoding", "mapping", "adjusting"]
+    assert [done for what, done, _ in steps if what == "encoding"] == list(range(1, 17))
+    assert all(0 <= done <= total for _, done, total in steps)
+    assert steps[-1][1] == steps[-1][2]
 
 
-def test_a_transform_common_to_all_poses_is_found(arcs: tuple[Recording, Recording]) -> None:
-    frames, encoder = arcs[0].train[:18], load_encoder()
-    off = SE3.exp(np.array([0, 0, 0, 0.012, -0.02, 0.015]))
-    chosen = spread_frames(frames, 4)
-    found = build_map(moved(frames, off.inverse()), encoder, chosen, SMALL)
-    # Adjusted = stated @ common, and stated = true @ off^-1.
-    _, radians = pose_distance(found.common, off)
-    assert radians < 0.004
-    turn = np.deg2rad(found.adjusted.common_rotation_deg)
-    np.testing.assert_allclose(turn, off.log()[3:], atol=4e-3)
-    # Frames as the map sees them stand where they really were.
-    seen = found.adjusted_frames(moved(frames, off.inverse()))
-    assert [frame.name for frame in seen] == [frame.name for frame in frames]
-    for frame, true in zip(seen, frames, strict=True):
-        assert frame.base_from_camera is not None
-        assert true.base_from_camera is not None
-        assert pose_distance(frame.base_from_camera, true.base_from_camera)[1] < 0.004
-        assert frame.camera == found.camera
+def test_common_transform_is_estimated(arcs: tuple[Recording, Recording], encoder: Encoder) -> None:
+    change = SE3.exp(np.array([0, 0, 0, 0.012, -0.02, 0.015]))
+    built = build_map("a", moved(arcs[0].train[:18], change.inverse()), encoder, SMALL)
+    # Adjusted = stated @ common, and stated = true @ change^-1.
+    assert pose_distance(built.scene.frame.common, change)[1] < 0.004
+    rotation = np.deg2rad(built.adjusted.common_rotation_deg)
+    np.testing.assert_allclose(rotation, change.log()[3:], atol=4e-3)
 
 
-def test_a_wrong_clock_bends_no_frame(arcs: tuple[Recording, Recording]) -> None:
+def test_time_shift_is_undone(arcs: tuple[Recording, Recording], encoder: Encoder) -> None:
     """Answers are true poses, though poses are stated half a frame after their images."""
-    true = [frame.base_from_camera for frame in arcs[0].train]
+    true = {frame.name: pose_of(frame) for frame in arcs[0].train}
     frames = [
         replace(frame, base_from_camera=late.base_from_camera)
         for frame, late in zip(arcs[0].train, arcs[0].test, strict=True)
     ]
-    chosen = spread_frames(frames, 6)
-    found = build_map(frames, load_encoder(), chosen, SMALL)
-    assert found.adjusted.time_shift_frames == pytest.approx(-0.5, abs=0.1)
-    cell = Cell((0.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0))
-    plain = SceneRecord("one", frames[0].camera, cell, torch.zeros(0), len(frames))
-    record, off, before = mapped_record(plain, found), [], []
-    for i, place in enumerate(chosen):
-        pose, stated = true[place], frames[place].base_from_camera
-        assert pose is not None
-        assert stated is not None
-        answer, _ = record.stated(found.keyframes.base_from_camera[i], None)
-        off.append(pose_distance(answer, pose)[0])
-        before.append(pose_distance(stated, pose)[0])
-    assert np.median(off) < 0.1 * np.median(before)
-    # A network beside the map learns them at the time of their images; the ends have no velocity.
-    seen = found.adjusted_frames(frames)[1:-1]
-    off = [
-        pose_distance(frame.base_from_camera, pose)[0]
-        for frame, pose in zip(seen, true[1:-1], strict=True)
-        if frame.base_from_camera is not None and pose is not None
-    ]
-    assert np.median(off) < 0.1 * np.median(before)
+    built = build_map("a", frames, encoder, replace(SMALL, memory=MemoryBudget(share=0.25)))
+    assert built.adjusted.time_shift_frames == pytest.approx(-0.5, abs=0.1)
+    stated, before, after = {frame.name: pose_of(frame) for frame in frames}, [], []
+    for i, name in enumerate(built.keyframe_names):
+        pose = UncertainPose.exact(built.scene.keyframes.base_from_camera[i])
+        after.append(pose_distance(built.scene.frame.to_base(pose).pose, true[name])[0])
+        before.append(pose_distance(stated[name], true[name])[0])
+    assert np.median(after) < 0.1 * np.median(before)
 
 
 STEADY = np.zeros(6)
-LENS = Camera(320, 240, 280.0, 280.0, 159.5, 119.5)
+CAMERA = Camera(320, 240, 280.0, 280.0, 159.5, 119.5)
 
 
 @pytest.mark.parametrize(
-    ("change", "camera", "noticed"),
+    ("change", "camera", "noticeable"),
     [
-        (STEADY, LENS, False),
+        (STEADY, CAMERA, False),
         (STEADY, None, False),
-        (np.array([0.005, 0, 0, 0, 0, 0]), LENS, True),  # as a shift in time does
+        (np.array([0.005, 0, 0, 0, 0, 0]), CAMERA, True),
         (np.array([0, 0, 0, 0, 0.001, 0]), None, True),
-        (np.array([1e-5, 0, 0, 0, 1e-5, 0]), LENS, False),
-        (np.eye(10, 6), LENS, False),  # some frames only
-        (STEADY, replace(LENS, cx=160.0), True),
-        (STEADY, replace(LENS, fx=281.0, fy=281.0), True),
-        (STEADY, replace(LENS, distortion=(0.02, 0.0, 0.0, 0.0)), True),
-        (STEADY, replace(LENS, fx=280.001, cx=159.501), False),
+        (np.array([1e-5, 0, 0, 0, 1e-5, 0]), CAMERA, False),
+        (np.eye(10, 6), CAMERA, False),  # less than half of the frames
+        (STEADY, replace(CAMERA, cx=160.0), True),
+        (STEADY, replace(CAMERA, fx=281.0, fy=281.0), True),
+        (STEADY, replace(CAMERA, distortion=(0.02, 0.0, 0.0, 0.0)), True),
+        (STEADY, replace(CAMERA, fx=280.001, cx=159.501), False),
     ],
 )
-def test_what_landmarks_would_notice(
-    change: np.ndarray, camera: Camera | None, noticed: bool
+def test_landmarks_are_tracked_again_after_noticeable_changes(
+    change: np.ndarray, camera: Camera | None, noticeable: bool
 ) -> None:
-    stated, none = SE3.exp(np.random.default_rng(0).normal(size=(10, 6))), np.zeros((10, 6, 6))
-    change = np.broadcast_to(change, (10, 6))
-    poses, common, nearness = (
-        stated @ SE3.exp(change),
-        SE3.identity(),
-        np.full(7, 0.5),
+    stated, zero = SE3.exp(np.random.default_rng(0).normal(size=(10, 6))), np.zeros((10, 6, 6))
+    adjustment = Adjustment(
+        poses=stated @ SE3.exp(np.broadcast_to(change, (10, 6))),
+        camera=camera,
+        common=SE3.identity(),
+        shift_frames=0.0,
+        sigma_m=0.0,
+        sigma_rad=0.0,
+        residual_px=0.1,
+        common_covariance=zero[0],
+        correction=zero[:, 0],
+        weight=np.ones(10),
+        covariance=zero,
+        inverse_depth=np.full(7, 0.5),
     )
-    fixed = (0.0, 0.0, 0.0, 0.1, none[0], none[:, 0], np.ones(10), none, nearness)
-    assert _moved(stated, LENS, Adjustment(poses, camera, common, *fixed)) == noticed
+    assert _moved(stated, CAMERA, adjustment) == noticeable
 
 
-def test_poses_and_lens_may_be_taken_as_stated(arcs: tuple[Recording, Recording]) -> None:
-    frames = arcs[0].train[:10]
-    found = build_map(frames, load_encoder(), [2, 7], replace(SMALL, adjust=False))
-    assert np.abs(found.common.log()).max() == 0
-    assert found.pose_sigma == (0.0, 0.0)
-    assert found.camera == frames[0].camera
-    for i, frame in ((0, frames[2]), (1, frames[7])):
-        assert frame.base_from_camera is not None
-        pose = found.keyframes.base_from_camera[i]
-        assert pose_distance(pose, frame.base_from_camera)[0] < 1e-9
+def test_map_without_adjustment_is_stored(
+    arcs: tuple[Recording, Recording], tmp_path: Path
+) -> None:
+    from evercal.map import Map
+
+    frames = arcs[0].train
+    robot = Map.open(tmp_path / "map")
+    recording = Recording("one", frames, ())
+    report = robot.learn(recording, options=replace(SMALL, adjust=False), memory="15%")
+    assert report.adjusted is not None
+    assert report.adjusted.residual_px is None
+    again = Map.open(tmp_path / "map")
+    assert again.scenes == ("one",)
+    (scene,) = again.localizer.contents.scenes
+    assert np.abs(scene.frame.common.log()).max() == 0
+    assert scene.frame.pose_sigma == (0.0, 0.0)
+    assert scene.adjusted_camera == frames[0].camera
+    stated = SE3.stack([pose_of(frame) for frame in frames])
+    for pose in scene.keyframes.base_from_camera:
+        assert pose_distance(stated, pose)[0].min() < 1e-9
 
 
-def test_a_frame_in_the_wrong_place_is_named_and_left_out(hall: Recording) -> None:
+def test_frame_with_a_wrong_pose_is_excluded(hall: Recording, encoder: Encoder) -> None:
     frames = list(hall.train[::2])
-    (frames[6],) = moved((frames[6],), SE3.exp(np.array([0, 0.3, 0, 0, 0, 0])))
-    chosen = [0, 6, 12]
-    found = build_map(frames, load_encoder(), chosen)
-    assert found.adjusted.wrong_poses == (frames[6].name,)
-    assert len(found.keyframes) == len(found.names) == 3  # another one stands in for it
-    assert frames[6].name not in found.names
-    left = [frame.name for frame in frames if frame.name != frames[6].name]
-    assert [frame.name for frame in found.adjusted_frames(frames)] == left
-    wrong = frames[6].base_from_camera
-    assert wrong is not None
-    places = found.keyframes.base_from_camera
-    assert min(pose_distance(places[i], wrong)[0] for i in range(3)) > 0.05
-    for number in (0, 12):  # and for no other
-        right = frames[number].base_from_camera
-        assert right is not None
-        assert min(pose_distance(places[i], right)[0] for i in range(3)) < 0.003
-
-
-def test_frames_from_one_spot_are_refused(arcs: tuple[Recording, Recording]) -> None:
-    frames = tuple(
-        replace(f, base_from_camera=SE3(f.base_from_camera.rotation_wxyz, np.ones(3)))
-        for f in arcs[0].train[:16]
-        if f.base_from_camera
+    options = MapOptions(memory=MemoryBudget(share=0.5))
+    wrong = int(spread_frames(frames, 7)[3])
+    frames[wrong : wrong + 1] = moved(
+        frames[wrong : wrong + 1], SE3.exp(np.array([0, 0.3, 0, 0, 0, 0]))
     )
-    with pytest.raises(InputError, match=r"no two training frames see the same .* parallax"):
-        build_map(frames, load_encoder(), [0, 8], SMALL)
+    built = build_map("hall", frames, encoder, options)
+    assert built.adjusted.wrong_poses == (frames[wrong].name,)
+    assert len(built.scene.keyframes) == len(built.keyframe_names) == 7  # another one replaces it
+    stated = {frame.name: pose_of(frame) for frame in frames}
+    assert frames[wrong].name not in built.keyframe_names
+    for i, name in enumerate(built.keyframe_names):
+        assert pose_distance(built.scene.keyframes.base_from_camera[i], stated[name])[0] < 0.003
+
+
+def test_frames_with_one_position_are_refused(
+    arcs: tuple[Recording, Recording], encoder: Encoder
+) -> None:
+    frames = [
+        replace(f, base_from_camera=SE3(pose_of(f).rotation_wxyz, np.ones(3)))
+        for f in arcs[0].train[:16]
+    ]
+    with pytest.raises(InputError, match=r"no two training frames show the same .* parallax"):
+        build_map("a", frames, encoder, SMALL)
 
 
 @pytest.mark.parametrize("scale", [0.05, 10.0])
-def test_maps_are_alike_at_other_scales(scale: float, arcs: tuple[Recording, Recording]) -> None:
-    frames, encoder = arcs[0].train[:10], load_encoder()
+def test_maps_are_similar_at_other_scales(
+    scale: float, arcs: tuple[Recording, Recording], encoder: Encoder
+) -> None:
+    frames = arcs[0].train[:10]
     scaled = [
-        replace(f, base_from_camera=SE3(p.rotation_wxyz, scale * p.translation_m))
+        replace(f, base_from_camera=SE3(pose.rotation_wxyz, scale * pose.translation_m))
         for f in frames
-        if (p := f.base_from_camera) is not None
+        for pose in [pose_of(f)]
     ]
     depths = []
     for recorded in (frames, scaled):
-        found = build_map(recorded, encoder, [2, 7], SMALL)
-        assert found.adjusted.wrong_poses == ()
-        depths.append(np.concatenate([1 / m.inverse_depth for m in found.keyframes.landmarks]))
+        built = build_map("a", recorded, encoder, SMALL)
+        assert built.adjusted.wrong_poses == ()
+        marks = built.scene.keyframes.landmarks
+        depths.append(np.concatenate([1 / m.inverse_depth for m in marks]))
     assert len(depths[1]) > 0.9 * len(depths[0])
     assert np.median(depths[1]) == pytest.approx(scale * np.median(depths[0]), rel=0.03)
 
 
-def test_the_same_frames_give_the_same_map(arcs: tuple[Recording, Recording]) -> None:
-    frames, encoder = arcs[1].train[:10], load_encoder()
-    one, two = (build_map(frames, encoder, [2, 7], SMALL) for _ in range(2))
-    a, b = one.keyframes.to_tensors(), two.keyframes.to_tensors()
+def test_maps_are_deterministic(arcs: tuple[Recording, Recording], encoder: Encoder) -> None:
+    one, two = (build_map("a", arcs[1].train[:10], encoder, SMALL) for _ in range(2))
+    a, b = one.scene.keyframes.to_tensors(), two.scene.keyframes.to_tensors()
     assert a.keys() == b.keys()
     for name, value in a.items():
         np.testing.assert_array_equal(value, b[name])
@@ -278,7 +251,7 @@ def test_the_same_frames_give_the_same_map(arcs: tuple[Recording, Recording]) ->
 
 
 @pytest.mark.parametrize("capacity", [1, 5, 24, 100])
-def test_frames_are_spread(capacity: int, arcs: tuple[Recording, Recording]) -> None:
-    chosen = spread_frames(arcs[0].train, capacity).tolist()
-    assert len(chosen) == min(capacity, 24)
-    assert chosen == sorted(set(chosen))
+def test_spread_frames_fill_the_capacity(capacity: int, arcs: tuple[Recording, Recording]) -> None:
+    selected = spread_frames(arcs[0].train, capacity).tolist()
+    assert len(selected) == min(capacity, 24)
+    assert selected == sorted(set(selected))

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from evercal.geometry.camera import Camera
 from evercal.mapping.landmarks import (
     BORDER_PX,
-    MIN_TEXTURE,
     Landmarks,
     detect,
     project_surface,
@@ -19,11 +18,11 @@ from evercal.mapping.landmarks import (
 
 Array = NDArray[np.floating]
 PLAIN = Camera(320, 240, 262.0, 259.0, 161.0, 118.0)
-BENT = Camera(320, 240, 262.0, 259.0, 161.0, 118.0, (-0.2, 0.06, 0.001, -0.002))
+DISTORTED = Camera(320, 240, 262.0, 259.0, 161.0, 118.0, (-0.2, 0.06, 0.001, -0.002))
 
 
 def on_a_plane(camera: Camera, normal: Array, pixels: Array) -> Landmarks:
-    """Landmarks of the plane normal . x = 1, camera frame, with the slopes that a pixel sees."""
+    """Landmarks of the plane normal . x = 1, camera frame, with exact slopes."""
 
     def inverse_depth(at: Array) -> Array:
         return camera.unproject(at) @ normal
@@ -39,52 +38,52 @@ def spots() -> Array:
     return np.stack([u, v], -1).reshape(-1, 2).astype(float)
 
 
-TURN = Rotation.from_rotvec([0.05, -0.2, 0.1]).as_matrix()
-SHIFT = np.array([0.35, -0.2, 0.2])
+ROTATION = Rotation.from_rotvec([0.05, -0.2, 0.1]).as_matrix()
+TRANSLATION = np.array([0.35, -0.2, 0.2])
 
 
-@pytest.mark.parametrize("camera", [PLAIN, BENT], ids=["plain", "bent"])
-def test_patches_warp_as_a_slanted_plane_does(camera: Camera) -> None:
+@pytest.mark.parametrize("camera", [PLAIN, DISTORTED], ids=["plain", "distorted"])
+def test_patches_warp_like_a_slanted_plane(camera: Camera) -> None:
     normal = np.array([0.15, -0.1, 0.5])
     marks = on_a_plane(camera, normal, spots())
     surface = marks.surface(camera)
     np.testing.assert_allclose(surface @ normal, 1, atol=1e-9)  # all three points lie on it
-    which, pixels, affines = project_surface(surface, TURN, SHIFT, camera)
+    which, pixels, affines = project_surface(surface, ROTATION, TRANSLATION, camera)
     assert len(which) > 40
 
-    def seen(at: Array) -> Array:
+    def projected(at: Array) -> Array:
         ray = camera.unproject(at)
-        return camera.project((ray / (ray @ normal)[:, None]) @ TURN.T + SHIFT)
+        return camera.project((ray / (ray @ normal)[:, None]) @ ROTATION.T + TRANSLATION)
 
     at = marks.pixels[which]
-    np.testing.assert_allclose(pixels, seen(at), atol=1e-6)
+    np.testing.assert_allclose(pixels, projected(at), atol=1e-6)
     for column, step in enumerate(np.eye(2)):
-        # Tangents are two pixels long; what is seen beside the point bends a little.
-        slope = (seen(at + 2 * step) - seen(at)) / 2
+        # Tangents are two pixels long, so perspective changes them a little.
+        slope = (projected(at + 2 * step) - projected(at)) / 2
         np.testing.assert_allclose(affines[:, :, column], slope, atol=1e-6)
-        centred = (seen(at + 0.01 * step) - seen(at - 0.01 * step)) / 0.02
+        centred = (projected(at + 0.01 * step) - projected(at - 0.01 * step)) / 0.02
         np.testing.assert_allclose(affines[:, :, column], centred, atol=0.03)
-    # A plane parallel to the image warps otherwise.
+    # A plane parallel to the image has another warp.
     flat = Landmarks(marks.pixels, marks.inverse_depth, 0 * marks.slope, marks.sigma)
-    _, _, other = project_surface(flat.surface(camera), TURN, SHIFT, camera)
+    _, _, other = project_surface(flat.surface(camera), ROTATION, TRANSLATION, camera)
     assert np.abs(np.median(other, 0) - np.median(affines, 0)).max() > 0.03
 
 
-def test_what_is_behind_beside_or_too_slanted_is_not_visible() -> None:
+def test_landmarks_behind_outside_or_too_slanted_are_not_visible() -> None:
     marks = on_a_plane(PLAIN, np.array([0, 0, 0.5]), spots())
     surface, eye = marks.surface(PLAIN), np.eye(3)
-    everything, pixels, affines = project_surface(surface, eye, np.zeros(3), PLAIN)
-    assert everything.tolist() == list(range(len(marks)))
+    visible, pixels, affines = project_surface(surface, eye, np.zeros(3), PLAIN)
+    assert visible.tolist() == list(range(len(marks)))
     np.testing.assert_allclose(pixels, marks.pixels, atol=1e-9)
     np.testing.assert_allclose(affines, np.broadcast_to(np.eye(2), affines.shape), atol=1e-9)
-    # Behind the camera, 2 m away; and right in it.
+    # Behind the camera, and at its centre.
     for forward in (-2.5, -2.0):
         which, _, _ = project_surface(surface, eye, np.array([0, 0, forward]), PLAIN)
         assert len(which) == 0
     # Looking away.
     back = Rotation.from_rotvec([0, np.pi, 0]).as_matrix()
     assert len(project_surface(surface, back, np.zeros(3), PLAIN)[0]) == 0
-    # Outside the image by its margin: the answer of every landmark by itself.
+    # Outside the image or within its margin.
     shift = np.array([0.9, 0.4, 0])
     which, pixels, _ = project_surface(surface, eye, shift, PLAIN)
     at = PLAIN.project(surface[0] + shift)
@@ -97,7 +96,7 @@ def test_what_is_behind_beside_or_too_slanted_is_not_visible() -> None:
     assert len(project_surface(surface, eye, np.array([0, 0, -1.2]), PLAIN)[0]) == 0
     assert len(project_surface(surface, eye, np.array([0, 0, 3.0]), PLAIN)[0]) == 0
     assert len(project_surface(surface, eye, np.array([0, 0, 1.5]), PLAIN)[0]) > 0
-    # From the other side: mirrored.
+    # Mirrored, as seen from behind.
     mirrored = surface * [1, 1, 1]
     mirrored[1:] = 2 * surface[0] - surface[1:]
     mirrored[2] = surface[2]
@@ -108,16 +107,16 @@ def test_slopes_of_a_plane_are_exact_inside() -> None:
     grid, cell = (30, 40), 8.0
     row, column = np.mgrid[0:30, 0:40]
     field = 0.5 + 0.003 * cell * column - 0.002 * cell * row
-    found = slopes(field.ravel(), grid, cell).reshape(30, 40, 2)[5:-5, 5:-5]
-    np.testing.assert_allclose(found, np.broadcast_to([0.003, -0.002], found.shape), atol=1e-6)
-    # One wrong cell does not show.
-    spoilt = field.copy()
-    spoilt[15, 20] = 4.0
-    again = slopes(spoilt.ravel(), grid, cell).reshape(30, 40, 2)[5:-5, 5:-5]
-    np.testing.assert_allclose(again, found, atol=2e-3)
+    result = slopes(field.ravel(), grid, cell).reshape(30, 40, 2)[5:-5, 5:-5]
+    np.testing.assert_allclose(result, np.broadcast_to([0.003, -0.002], result.shape), atol=1e-6)
+    # One wrong cell has no effect.
+    corrupted = field.copy()
+    corrupted[15, 20] = 4.0
+    again = slopes(corrupted.ravel(), grid, cell).reshape(30, 40, 2)[5:-5, 5:-5]
+    np.testing.assert_allclose(again, result, atol=2e-3)
 
 
-def test_the_most_textured_pixel_of_every_cell_is_taken() -> None:
+def test_most_textured_pixel_of_every_cell_is_detected() -> None:
     rng = np.random.default_rng(0)
     grey = np.full((96, 128), 90, np.uint8)
     textured = [(2, 3), (5, 7), (8, 1)]
@@ -125,21 +124,20 @@ def test_the_most_textured_pixel_of_every_cell_is_taken() -> None:
         grey[8 * i : 8 * i + 8, 8 * j : 8 * j + 8] = rng.integers(0, 255, (8, 8))
     pixels, cells = detect(grey, (12, 16), 8.0)
     assert {16 * i + j for i, j in textured} <= set(cells.tolist())
-    # Round the squares the 5x5 window still sees some; elsewhere there is nothing.
+    # The 5x5 window includes texture of neighbouring cells.
     near = {16 * (i + a) + j + b for i, j in textured for a in (-1, 0, 1) for b in (-1, 0, 1)}
     assert set(cells.tolist()) <= near
     assert len(set(cells.tolist())) == len(cells)
     np.testing.assert_array_equal(cells, (pixels[:, 1] // 8) * 16 + pixels[:, 0] // 8)
     inside = (pixels >= BORDER_PX) & (pixels < np.array([128, 96]) - BORDER_PX)
     assert inside.all()
-    none = detect(np.full((96, 128), 90, np.uint8), (12, 16), 8.0)
-    assert none[0].shape == (0, 2)
-    assert len(none[1]) == 0
-    assert MIN_TEXTURE > 0
+    empty = detect(np.full((96, 128), 90, np.uint8), (12, 16), 8.0)
+    assert empty[0].shape == (0, 2)
+    assert len(empty[1]) == 0
 
 
-def test_taking_keeps_the_fields_together() -> None:
-    marks = on_a_plane(BENT, np.array([0.1, 0, 0.5]), spots())
+def test_taking_an_index_takes_all_fields() -> None:
+    marks = on_a_plane(DISTORTED, np.array([0.1, 0, 0.5]), spots())
     some = marks.take(np.array([7, 3]))
     assert len(some) == 2
     for name in ("pixels", "inverse_depth", "slope", "sigma"):

@@ -1,46 +1,108 @@
-"""Corrections that go together in places are taken back; noise is not."""
+"""Poses go from the frame of a map to the base frame and back."""
 
 import numpy as np
-from evercal.mapping.frame_correction import fit_correction
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from evercal.geometry.se3 import SE3, pose_distance
+from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
+from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity, fit_correction
+
+CAMERA = Camera(320, 240, 300, 300, 159.5, 119.5)
+SIMILARITY = Similarity(SE3.exp([1.0, -2.0, 0.5, 0.3, -0.9, 0.4]), 0.37)
+COMMON = SE3.exp([0.01, 0.02, -0.01, 0.02, 0, 0.01])
+POSE = SE3.exp([0.2, 0.1, -0.4, 1.0, 0.2, -0.3])
 
 
-def _walk(n: int, rng: np.random.Generator) -> SE3:
+def walk(n: int, rng: np.random.Generator) -> SE3:
     steps = np.linspace(0, 6, n)
-    place = np.stack([np.cos(steps), np.sin(steps), 0.1 * steps], -1)
-    turn = np.stack([0.2 * np.sin(steps), 0.1 * steps, 0.3 * np.cos(steps)], -1)
-    return SE3.exp(np.concatenate([place + 0.01 * rng.normal(size=(n, 3)), turn], 1))
+    position = np.stack([np.cos(steps), np.sin(steps), 0.1 * steps], -1)
+    rotation = np.stack([0.2 * np.sin(steps), 0.1 * steps, 0.3 * np.cos(steps)], -1)
+    return SE3.exp(np.concatenate([position + 0.01 * rng.normal(size=(n, 3)), rotation], 1))
 
 
-def _bent(poses: SE3) -> np.ndarray:
+def smooth(poses: SE3) -> np.ndarray:
+    """(n, 6) corrections that vary slowly over the positions."""
     x, y, _ = poses.translation_m.T
     zero = np.zeros_like(x)
     return np.stack([0.01 * x, 0.01 * y, zero, 0.005 * y, zero, 0.005 * x], -1)
 
 
-def test_smooth_corrections_are_taken_back() -> None:
+def random_correction(seed: int) -> FrameCorrection:
+    rng = np.random.default_rng(seed)
+    poses = SE3.exp(rng.normal(0, [0.3] * 3 + [0.2] * 3, (12, 6)))
+    return FrameCorrection(poses, rng.normal(0, 0.004, (12, 6)), (0.2, 0.26))
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10_000), corrected=st.booleans(), scaled=st.booleans())
+def test_landmarks_project_to_the_same_pixels_in_both_frames(
+    seed: int, corrected: bool, scaled: bool
+) -> None:
+    frame = MapFrame(
+        common=COMMON,
+        correction=random_correction(seed) if corrected else None,
+        similarity=SIMILARITY if scaled else None,
+    )
+    rng = np.random.default_rng(seed + 1)
+    pose = SE3.exp(rng.normal(0, 0.3, 6))
+    points = pose.apply(rng.uniform([-1, -1, 1], [1, 1, 4], (8, 3)))
+    base = frame.to_base(UncertainPose.exact(pose)).pose
+    pixels = CAMERA.project(pose.inverse().apply(points))
+    camera = frame.camera_among_points(base)
+    again = CAMERA.project(camera.inverse().apply(frame.points_to_base(points)))
+    assert again == pytest.approx(pixels, abs=0.01)
+    assert pose_distance(frame.from_base(base), pose)[0] < 1e-4
+
+
+def test_similarity_has_an_inverse_and_scales_views() -> None:
+    assert max(pose_distance(SIMILARITY.inverse_pose(SIMILARITY.pose(POSE)), POSE)) < 1e-12
+    assert max(pose_distance(Similarity(SE3.identity()).pose(POSE), POSE)) < 1e-12
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    before = POSE.inverse().apply(points)
+    after = SIMILARITY.pose(POSE).inverse().apply(SIMILARITY.points(points))
+    assert after == pytest.approx(0.37 * before)
+
+
+def test_covariance_is_scaled_and_rotated() -> None:
+    frame = MapFrame(
+        pose_sigma=(0.2, 0.3), similarity=Similarity(SE3.exp([0, 0, 0, 0, 0, np.pi / 2]), 2.0)
+    )
+    covariance = np.diag([1.0, 4.0, 9.0, 0.1, 0.2, 0.3])
+    result = frame.to_base(UncertainPose(POSE, covariance)).covariance
+    expected = np.diag([4 * 4.04, 4 * 1.04, 4 * 9.04, 0.19, 0.29, 0.39])
+    assert result == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_error_of_the_base_frame_is_propagated(axis: int) -> None:
+    """The slow twin moves the base frame by a finite difference."""
+    step, unit = np.zeros(6), np.zeros((6, 6))
+    step[axis], unit[axis, axis] = 1e-6, 1.0
+    moved = SE3(SE3.exp(step).rotation_wxyz, step[:3]) @ POSE
+    rotation = (POSE.inverse() @ moved).log()[3:]
+    tangent = np.concatenate([moved.translation_m - POSE.translation_m, rotation]) / 1e-6
+    result = MapFrame(base_covariance=unit).to_base(UncertainPose.exact(POSE))
+    assert result.covariance == pytest.approx(np.outer(tangent, tangent), abs=1e-5)
+
+
+def test_smooth_corrections_are_undone() -> None:
     rng = np.random.default_rng(0)
-    stated = _walk(200, rng)
-    common = SE3.exp([0.02, 0, 0.01, 0.01, 0, 0])
-    adjusted = stated @ common @ SE3.exp(_bent(stated))
-    found = fit_correction(adjusted @ common.inverse(), _bent(stated))
-    assert found is not None
-    new = _walk(57, rng)
-    true = new @ common @ SE3.exp(_bent(new))
+    stated = walk(200, rng)
+    adjusted = stated @ COMMON @ SE3.exp(smooth(stated))
+    correction = fit_correction(adjusted @ COMMON.inverse(), smooth(stated))
+    assert correction is not None
+    frame, new = MapFrame(common=COMMON, correction=correction), walk(57, rng)
+    true = new @ COMMON @ SE3.exp(smooth(new))
     for pose, measured in zip(new, true, strict=True):
-        plain = measured @ common.inverse()
-        back = measured @ SE3.exp(-found.at(plain)) @ common.inverse()
-        assert pose_distance(back, pose)[0] < 0.4 * pose_distance(plain, pose)[0]
+        plain = measured @ COMMON.inverse()
+        corrected = frame.to_base(UncertainPose.exact(measured)).pose
+        assert pose_distance(corrected, pose)[0] < 0.4 * pose_distance(plain, pose)[0]
 
 
-def test_noise_is_not() -> None:
+def test_noise_and_zero_corrections_are_not_fitted() -> None:
     rng = np.random.default_rng(1)
-    stated = _walk(200, rng)
+    stated = walk(200, rng)
     noise = rng.normal(size=(200, 6)) * [0.002, 0.002, 0.002, 0.003, 0.003, 0.003]
     assert fit_correction(stated @ SE3.exp(noise), noise) is None
-
-
-def test_nothing_is_taken_back_where_nothing_was_moved() -> None:
-    stated = _walk(50, np.random.default_rng(2))
-    assert fit_correction(stated, np.zeros((50, 6))) is None
+    assert fit_correction(stated, np.zeros((200, 6))) is None

@@ -1,4 +1,4 @@
-"""Patches are found again where mathematics puts them."""
+"""Patches are aligned at their true positions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from evercal.mapping.patches import (
     SIDE,
-    Patches,
     align_down,
     align_patches,
     cut_patches,
@@ -40,7 +39,7 @@ def pixels() -> Array:
 
 
 def image(of: Picture, affine: Array, shift: Array) -> Array:
-    """What shows at pixel A x + b the value of the function at x."""
+    """An image with the value of the function at x in pixel A x + b."""
     back = np.linalg.inv(affine)
     return of((pixels() - shift) @ back.T).astype(np.float32)
 
@@ -53,41 +52,41 @@ def spots(count: int = 60, margin: int = 35) -> Array:
 
 AFFINES = {
     "shifted": np.eye(2),
-    "turned": np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]]),
+    "rotated": np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]]),
     "sheared": np.array([[1.1, 0.25], [-0.1, 0.85]]),
-    "grown": 1.3 * np.eye(2),
+    "enlarged": 1.3 * np.eye(2),
 }
 
 
-def seen(affine: Array, at: Array) -> tuple[Array, Array]:
-    """An image warped about its middle with a sub-pixel shift, and where the pixels lie in it."""
+def warped(affine: Array, at: Array) -> tuple[Array, Array]:
+    """An image warped about its middle with a sub-pixel shift, and the pixels in it."""
     middle = np.array([WIDTH, HEIGHT]) / 2
     shift = middle - affine @ middle + [0.37, -0.61]
     return image(picture(0), affine, shift), at @ affine.T + shift
 
 
 @pytest.mark.parametrize("name", AFFINES)
-def test_a_warped_patch_is_found_to_a_twentieth_of_a_pixel(name: str) -> None:
+def test_warped_patch_is_aligned_to_a_twentieth_of_a_pixel(name: str) -> None:
     affine, at = AFFINES[name], spots()
-    other, truth = seen(affine, at)
+    other, truth = warped(affine, at)
     patches = cut_patches(image(picture(0), np.eye(2), np.zeros(2)), at)
     start = truth + np.random.default_rng(2).uniform(-1.5, 1.5, truth.shape)
     affines = np.broadcast_to(affine, (len(at), 2, 2))
-    found, correlation = align_patches(patches, other, start, affines, 12)
-    error = np.linalg.norm(found - truth, axis=1)
+    aligned, correlation = align_patches(patches, other, start, affines, 12)
+    error = np.linalg.norm(aligned - truth, axis=1)
     assert np.quantile(error, 0.95) < 0.05
     assert np.quantile(correlation, 0.05) > 0.99
-    # Where the warp is not told, it is worse.
+    # Without the warp it is worse.
     if name != "shifted":
         plain = np.broadcast_to(np.eye(2), (len(at), 2, 2))
         _, without = align_patches(patches, other, start, plain, 12)
         assert np.median(without) < np.median(correlation) - 0.01
 
 
-def test_gain_and_offset_drop_out() -> None:
+def test_gain_and_offset_have_no_effect() -> None:
     at = spots()
     plain = image(picture(0), np.eye(2), np.zeros(2))
-    other, truth = seen(AFFINES["sheared"], at)
+    other, truth = warped(AFFINES["sheared"], at)
     affines = np.broadcast_to(AFFINES["sheared"], (len(at), 2, 2))
     reference = align_patches(cut_patches(plain, at), other, truth + 0.7, affines, 8)
     brighter = align_patches(cut_patches(plain, at), 0.4 * other + 90, truth + 0.7, affines, 8)
@@ -104,23 +103,22 @@ def test_patches_of_another_image_do_not_fit() -> None:
     at = spots()
     patches = cut_patches(image(picture(0), np.eye(2), np.zeros(2)), at)
     affines = np.broadcast_to(np.eye(2), (len(at), 2, 2))
-    stranger = image(picture(77), np.eye(2), np.zeros(2))
-    _, correlation = align_patches(patches, stranger, at, affines, 12)
+    unrelated = image(picture(77), np.eye(2), np.zeros(2))
+    _, correlation = align_patches(patches, unrelated, at, affines, 12)
     assert np.mean(correlation > 0.8) < 0.2
     blank = np.full((HEIGHT, WIDTH), 90, np.float32)
-    found, correlation = align_patches(patches, blank, at, affines, 4)
+    aligned, correlation = align_patches(patches, blank, at, affines, 4)
     assert np.abs(correlation).max() < 0.1
-    assert np.isfinite(found).all()
+    assert np.isfinite(aligned).all()
 
 
-def test_the_step_of_one_patch_is_that_of_least_squares() -> None:
-    # The slow twin: the templates' gradients by hand, one patch, one step.
+def test_step_of_one_patch_is_that_of_least_squares() -> None:
     plain, at = image(picture(3), np.eye(2), np.zeros(2)), np.array([[60.0, 50.0]])
     patches, affine = cut_patches(plain, at), AFFINES["sheared"]
     other = image(picture(3), affine, np.array([10.3, 14.2]))
     truth = at @ affine.T + [10.3, 14.2]
     start = truth + np.array([0.4, -0.3])
-    found, _ = align_patches(patches, other, start, affine[None], 1)
+    aligned, _ = align_patches(patches, other, start, affine[None], 1)
 
     def standardised(values: Array) -> Array:
         return (values - values.mean()) / (values.std() + 1e-3)
@@ -141,10 +139,10 @@ def test_the_step_of_one_patch_is_that_of_least_squares() -> None:
     values = [bilinear(*(start[0] + affine @ step)) for step in np.array(steps, float)]
     difference = standardised(np.array(values)) - standardised(np.array(template))
     step, *_ = np.linalg.lstsq(slope, difference, rcond=None)
-    np.testing.assert_allclose(found[0], start[0] - affine @ step, atol=0.01)
+    np.testing.assert_allclose(aligned[0], start[0] - affine @ step, atol=0.01)
 
 
-def test_coarse_to_fine_reaches_farther() -> None:
+def test_coarse_to_fine_alignment_has_a_larger_reach() -> None:
     at = spots(margin=45)
     plain = image(picture(5), np.eye(2), np.zeros(2))
     other = image(picture(5), np.eye(2), np.array([8.3, -6.6]))
@@ -153,42 +151,42 @@ def test_coarse_to_fine_reaches_farther() -> None:
     levels = [cut_patches(pyramid[i], to_level(at, i)) for i in range(3)]
     affines, others = np.broadcast_to(np.eye(2), (len(at), 2, 2)), image_pyramid(other, 3)
     steps = ((2, 10), (1, 6), (0, 6))
-    found, correlation = align_down(levels, others, at, affines, steps)
-    right = np.linalg.norm(found - truth, axis=1) < 0.05
-    assert right.mean() > 0.8
-    assert np.median(correlation[right]) > 0.99
-    found, _ = align_down(levels, others, at, affines, ((0, 22),))
-    assert np.mean(np.linalg.norm(found - truth, axis=1) < 0.05) < right.mean() - 0.2
+    aligned, correlation = align_down(levels, others, at, affines, steps)
+    good = np.linalg.norm(aligned - truth, axis=1) < 0.05
+    assert good.mean() > 0.8
+    assert np.median(correlation[good]) > 0.99
+    aligned, _ = align_down(levels, others, at, affines, ((0, 22),))
+    assert np.mean(np.linalg.norm(aligned - truth, axis=1) < 0.05) < good.mean() - 0.2
 
 
-def test_many_patches_are_aligned_as_few(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_patches_are_aligned_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     at = spots(50)
-    other, truth = seen(AFFINES["turned"], at)
+    other, truth = warped(AFFINES["rotated"], at)
     patches = cut_patches(image(picture(0), np.eye(2), np.zeros(2)), at)
-    affines = np.broadcast_to(AFFINES["turned"], (len(at), 2, 2))
+    affines = np.broadcast_to(AFFINES["rotated"], (len(at), 2, 2))
     whole = align_patches(patches, other, truth + 0.5, affines, 3)
     monkeypatch.setattr("evercal.mapping.patches._MOST_ROWS", 8)
     parts = align_patches(patches, other, truth + 0.5, affines, 3)
     for a, b in zip(whole, parts, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4)
-    none = align_patches(patches.take(slice(0)), other, truth[:0], affines[:0], 3)
-    assert [len(part) for part in none] == [0, 0]
+    empty = align_patches(patches.take(slice(0)), other, truth[:0], affines[:0], 3)
+    assert [len(part) for part in empty] == [0, 0]
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_levels_are_inverse_and_keep_the_place(level: int) -> None:
+def test_levels_have_inverse_and_consistent_pixels(level: int) -> None:
     at = spots()
     np.testing.assert_allclose(from_level(to_level(at, level), level), at, atol=1e-12)
     np.testing.assert_allclose(to_level(from_level(at, level), level), at, atol=1e-12)
-    # A ramp says of every pixel which column of level 0 it shows.
+    # The value of a ramp is the column of level 0.
     ramp = np.broadcast_to(np.arange(WIDTH, dtype=np.float32), (HEIGHT, WIDTH))
     shown = image_pyramid(ramp, 3)[level]
     assert shown.shape == (HEIGHT >> level, WIDTH >> level)
-    where = np.stack([shown[3], np.full(shown.shape[1], 0.0)], -1)
-    np.testing.assert_allclose(to_level(where, level)[:, 0], np.arange(shown.shape[1]), atol=1e-4)
+    pixel = np.stack([shown[3], np.full(shown.shape[1], 0.0)], -1)
+    np.testing.assert_allclose(to_level(pixel, level)[:, 0], np.arange(shown.shape[1]), atol=1e-4)
 
 
-def test_pyramids_of_odd_sizes_keep_the_place() -> None:
+def test_pyramids_of_odd_sizes_have_consistent_pixels() -> None:
     ramp = np.broadcast_to(np.arange(101, dtype=np.float32), (77, 101))
     halves = image_pyramid(ramp, 3)
     assert [level.shape for level in halves] == [(77, 101), (38, 50), (19, 25)]
@@ -206,14 +204,7 @@ def test_whitening_makes_errors_independent() -> None:
     np.testing.assert_allclose(unit, np.broadcast_to(np.eye(2), unit.shape), atol=1e-6)
 
 
-def test_edges_are_located_across_and_not_along() -> None:
-    stripes = (128 + 80 * np.tanh((pixels()[..., 0] - 80) / 3)).astype(np.float32)
-    patch = cut_patches(stripes, np.array([[80.0, 60.0]]))
-    white = whitening(np.eye(2)[None], patch.inverse_hessian, 0.1, 0.8)[0]
-    assert np.linalg.norm(white @ [1, 0]) > 20 * np.linalg.norm(white @ [0, 1])
-
-
-def test_an_error_along_one_line_is_whitened_too() -> None:
+def test_error_along_one_line_is_whitened() -> None:
     rng = np.random.default_rng(0)
     affines = rng.normal(0, 0.2, (7, 2, 2)) + np.eye(2)
     root = rng.normal(0, 0.3, (7, 2, 2))
@@ -221,13 +212,5 @@ def test_an_error_along_one_line_is_whitened_too() -> None:
     line = rng.normal(0, 0.5, (7, 2))
     for i, white in enumerate(whitening(affines, hessian, 0.1, 0.8, line)):
         spread = affines[i] @ hessian[i] @ affines[i].T + 0.01 * np.eye(2)
-        whole = 0.64 * spread + np.outer(line[i], line[i])
-        np.testing.assert_allclose(white @ whole @ white.T, np.eye(2), atol=1e-9)
-
-
-def test_sets_of_patches_are_joined_in_order() -> None:
-    plain, at = image(picture(0), np.eye(2), np.zeros(2)), spots(20)
-    whole = cut_patches(plain, at)
-    parts = Patches.joined([cut_patches(plain, at[:7]), cut_patches(plain, at[7:])])
-    for name in ("intensity", "descent", "inverse_hessian", "rest"):
-        np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), atol=1e-6)
+        covariance = 0.64 * spread + np.outer(line[i], line[i])
+        np.testing.assert_allclose(white @ covariance @ white.T, np.eye(2), atol=1e-9)

@@ -1,4 +1,4 @@
-"""Depths from other views, in a world of walls whose features are known in closed form."""
+"""Depths of walls whose features are known in closed form."""
 
 import numpy as np
 import pytest
@@ -17,19 +17,19 @@ from evercal.mapping.plane_sweep import (
 
 STRIDE = 8
 CAMERA = Camera(320, 240, 280.0, 280.0, 159.5, 119.5)
-LENS = Camera(320, 240, 280.0, 280.0, 159.5, 119.5, (-0.15, 0.02, 0.0, 0.0))
+DISTORTED = Camera(320, 240, 280.0, 280.0, 159.5, 119.5, (-0.15, 0.02, 0.0, 0.0))
 
 
-def look_from(x: float, y: float = 0.0, turn_rad: float = 0.0) -> SE3:
-    """A camera beside the origin that looks along z, turned about its own y axis."""
-    return SE3.exp(np.array([x, y, 0, 0, 0, 0])) @ SE3.exp(np.array([0, 0, 0, 0, turn_rad, 0]))
+def look_from(x: float, y: float = 0.0, angle_rad: float = 0.0) -> SE3:
+    """A camera beside the origin that looks along z, rotated about its own y axis."""
+    return SE3.exp(np.array([x, y, 0, 0, 0, 0])) @ SE3.exp(np.array([0, 0, 0, 0, angle_rad, 0]))
 
 
 def true_depth(rays: np.ndarray, pose: SE3, wall_m: float, tilt: float) -> np.ndarray:
     """Depth (n,) along the optical axis of the wall z = wall + tilt x."""
-    way = rays @ pose.rotation_matrix().T
+    direction = rays @ pose.rotation_matrix().T
     eye = pose.translation_m
-    along = (wall_m + tilt * eye[0] - eye[2]) / (way[:, 2] - tilt * way[:, 0])
+    along = (wall_m + tilt * eye[0] - eye[2]) / (direction[:, 2] - tilt * direction[:, 0])
     return along
 
 
@@ -47,55 +47,55 @@ def cells(
     return PosedCells(unit, camera, pose, STRIDE)
 
 
-@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("camera", [CAMERA, DISTORTED], ids=["pinhole", "distorted"])
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
-def test_other_views_tell_the_depth(camera: Camera, tilt: float) -> None:
+def test_other_views_determine_the_depth(camera: Camera, tilt: float) -> None:
     view = cells(look_from(0), 2.0, camera, tilt)
     others = [cells(look_from(x, y), 2.0, camera, tilt) for x, y in ((0.3, 0), (-0.2, 0.2))]
     truth = true_depth(view.rays(), view.base_from_camera, 2.0, tilt)
     for off in (0.8, 1.0, 1.3):
-        found = 1 / inverse_depths(view, others, off * truth).numpy()
+        depth = 1 / inverse_depths(view, others, off * truth).numpy()
         inner = truth.reshape(30, 40)[6:24, 8:32].ravel()
-        error = np.abs(found.reshape(30, 40)[6:24, 8:32].ravel() / inner - 1)
+        error = np.abs(depth.reshape(30, 40)[6:24, 8:32].ravel() / inner - 1)
         assert np.median(error) < 0.01
         assert np.quantile(error, 0.9) < 0.03
 
 
-def test_views_of_another_wall_do_not_confirm_a_depth() -> None:
+def test_views_of_another_wall_do_not_determine_the_depth() -> None:
     view = cells(look_from(0), 2.0)
-    strangers = [cells(look_from(0.3), 2.0, seed=5)]
-    found = 1 / inverse_depths(view, strangers, np.full(1200, 1.2)).numpy()
-    assert np.mean(np.abs(found / 2.0 - 1) < 0.02) < 0.2
+    unrelated = [cells(look_from(0.3), 2.0, seed=5)]
+    depth = 1 / inverse_depths(view, unrelated, np.full(1200, 1.2)).numpy()
+    assert np.mean(np.abs(depth / 2.0 - 1) < 0.02) < 0.2
 
 
-def test_without_other_views_the_guess_stands() -> None:
+def test_without_other_views_the_guess_is_returned() -> None:
     view = cells(look_from(0), 2.0)
     guess = np.linspace(0.1, 20.0, 1200)
-    found = inverse_depths(view, [], guess)
-    np.testing.assert_allclose(1 / found.numpy(), np.clip(guess, 0.25, 12.0), rtol=1e-5)
+    inverse = inverse_depths(view, [], guess)
+    np.testing.assert_allclose(1 / inverse.numpy(), np.clip(guess, 0.25, 12.0), rtol=1e-5)
 
 
-def test_good_views_see_the_same_from_the_side() -> None:
+def test_selected_views_have_parallax() -> None:
     view = cells(look_from(0), 2.0)
     near, side, wide = look_from(0.01), look_from(0.3), look_from(2.5)
-    away = look_from(0.3, turn_rad=np.pi)
-    beyond = look_from(0.3, turn_rad=np.deg2rad(75))
+    away = look_from(0.3, angle_rad=np.pi)
+    beyond = look_from(0.3, angle_rad=np.deg2rad(75))
     poses = SE3.stack([look_from(0), near, away, side, beyond, wide])
     depth = np.full(1200, 2.0)
     assert select_source_views(depth, view, poses, [CAMERA] * 6, 5) == [3]
-    # As many as asked for, the best first.
+    # At most `count` views.
     sides = SE3.stack([look_from(0.1), look_from(0.2), look_from(-0.25)])
     assert len(select_source_views(depth, view, sides, [CAMERA] * 3, 2)) == 2
 
 
-def test_a_peak_is_found_between_cells() -> None:
+def test_peak_between_cells() -> None:
     row, column = np.mgrid[0:9, 0:12]
     hill = 1 - 0.02 * ((row - 4.3) ** 2 + (column - 6.8) ** 2)
-    alike = torch.from_numpy(hill).float()[None]
+    similarity = torch.from_numpy(hill).float()[None]
     for start in ((4, 6), (5, 7), (4, 7), (3, 6)):
-        where, value = peak(alike, torch.tensor([start[0]]), torch.tensor([start[1]]))
-        np.testing.assert_allclose(where[0].numpy(), [6.8, 4.3], atol=1e-3)
+        position, value = peak(similarity, torch.tensor([start[0]]), torch.tensor([start[1]]))
+        np.testing.assert_allclose(position[0].numpy(), [6.8, 4.3], atol=1e-3)
         assert float(value) == pytest.approx(hill[4, 7], abs=1e-6)
-    # Never further than half a cell.
+    # At most half a cell.
     flat = parabola(torch.tensor([0.0]), torch.tensor([0.0]), torch.tensor([1.0]))
     assert float(flat) == 0.5

@@ -1,4 +1,4 @@
-"""A stated pose that contradicts the images is named, and no other."""
+"""Stated poses that contradict the images are detected, and no others."""
 
 from __future__ import annotations
 
@@ -35,36 +35,34 @@ def moved(recording: PreparedFrames, changes: dict[int, SE3]) -> PreparedFrames:
     return changed
 
 
-def named(recording: PreparedFrames) -> list[int]:
+def detected(recording: PreparedFrames) -> list[int]:
     options = PoseCheckOptions()
     pairs = matched_pairs(recording, vlad_for(recording.encoder), options)
     return contradicting_frames(recording, pairs, options).tolist()
 
 
-def test_right_poses_contradict_nothing(recording: PreparedFrames) -> None:
-    assert named(recording) == []
+def test_right_poses_are_consistent(recording: PreparedFrames) -> None:
+    assert detected(recording) == []
 
 
-# At the end of the walk, a step along it keeps all patches on their rays: that cannot be told.
+# At the end of the walk, a step along it keeps all matches on their segments.
 @pytest.mark.parametrize(
     ("frame", "direction"), [(0, (0, 1, 0)), (6, (0, 1, 0)), (14, (0, 1, 0)), (6, (1, 0, 0))]
 )
-def test_one_frame_30_cm_away_is_named(
+def test_one_frame_30_cm_away_is_detected(
     frame: int, direction: tuple[float, ...], recording: PreparedFrames
 ) -> None:
     shift = SE3.exp(np.array([*(0.3 * np.array(direction)), 0, 0, 0]))
-    assert named(moved(recording, {frame: shift})) == [frame]
+    assert detected(moved(recording, {frame: shift})) == [frame]
 
 
-def test_two_wrong_frames_and_a_turned_one_are_named(recording: PreparedFrames) -> None:
-    up, turned = SE3.exp(np.array([0, 0.3, 0, 0, 0, 0])), SE3.exp(np.array([0, 0, 0, 0, 0.2, 0]))
-    assert named(moved(recording, {3: up, 10: turned})) == [3, 10]
+def test_shifted_and_rotated_frames_are_detected(recording: PreparedFrames) -> None:
+    up, rotated = SE3.exp(np.array([0, 0.3, 0, 0, 0, 0])), SE3.exp(np.array([0, 0, 0, 0, 0.2, 0]))
+    assert detected(moved(recording, {3: up, 10: rotated})) == [3, 10]
 
 
 @pytest.mark.parametrize("scale", [0.1, 8.0])
-def test_depths_are_looked_for_at_the_scale_of_the_recording(
-    scale: float, recording: PreparedFrames
-) -> None:
+def test_depth_scale_is_that_of_the_recording(scale: float, recording: PreparedFrames) -> None:
     options, vlad = PoseCheckOptions(), vlad_for(recording.encoder)
     pairs, scaled = matched_pairs(recording, vlad, options), moved(recording, {})
     assert depth_scale(recording, pairs) == 1  # as a room is
@@ -75,13 +73,13 @@ def test_depths_are_looked_for_at_the_scale_of_the_recording(
     assert contradicting_frames(scaled, pairs, options).tolist() == []
 
 
-def test_errors_that_bundle_adjustment_corrects_are_left_to_it(recording: PreparedFrames) -> None:
+def test_small_pose_errors_are_accepted(recording: PreparedFrames) -> None:
     rng = np.random.default_rng(0)
     noise = rng.normal(size=(len(recording), 6)) * ([0.005] * 3 + [0.004] * 3)
-    assert named(moved(recording, {i: SE3.exp(n) for i, n in enumerate(noise)})) == []
+    assert detected(moved(recording, {i: SE3.exp(n) for i, n in enumerate(noise)})) == []
 
 
-def test_a_recording_less_some_frames_keeps_the_others_as_they_are(
+def test_excluding_frames_does_not_change_the_others(
     recording: PreparedFrames,
 ) -> None:
     rest = recording.without(np.array([0, 5]))
@@ -91,10 +89,10 @@ def test_a_recording_less_some_frames_keeps_the_others_as_they_are(
         np.testing.assert_array_equal(rest.grey[new], recording.grey[old])
         np.testing.assert_allclose(rest.poses[new].matrix(), recording.poses[old].matrix())
         np.testing.assert_array_equal(rest.features(new), recording.features(old))
-    turn, shift = rest.relative(1, 0)
+    rotation, translation = rest.relative(1, 0)
     one, two = rest.poses[1], rest.poses[0]
-    np.testing.assert_allclose(turn, (one.inverse() @ two).rotation_matrix(), atol=1e-12)
-    np.testing.assert_allclose(shift, (one.inverse() @ two).translation_m, atol=1e-12)
+    np.testing.assert_allclose(rotation, (one.inverse() @ two).rotation_matrix(), atol=1e-12)
+    np.testing.assert_allclose(translation, (one.inverse() @ two).translation_m, atol=1e-12)
     assert rest.cameras == [recording.cameras[i] for i in keep]
 
 

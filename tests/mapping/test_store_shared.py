@@ -1,131 +1,139 @@
-"""Several processes and one store: one writes at a time, readers never see half of it."""
+"""Several processes and one store: one writes at a time, and readers never see half of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 
-from evercal.cli.align import Align
 from evercal.errors import InputError
-from evercal.geometry.se3 import SE3
 from evercal.mapping import store as module
-from evercal.mapping.scene_maps import Alignment, SceneMaps, SceneRecord
-from evercal.mapping.store import Checkpoint, Store
+from evercal.mapping.scene_map import SceneMap
+from evercal.mapping.store import MapStore
 from evercal.storage import manifest, verify
 
-Stages = dict[str, list[SceneMaps]]
-Make = Callable[[Path, list[SceneMaps]], Store]
+Make = Callable[[Path, Sequence[SceneMap]], MapStore]
 Tree = Callable[[Path], dict[str, str]]
 
+WRITER = """
+import sys
+from pathlib import Path
+from evercal.storage.stages import StageStore
+store = StageStore(Path(sys.argv[1]), ["0001-alpha", "0002-beta"], ())
+with store.writing():
+    print("writing", flush=True)
+    sys.stdin.readline()
+"""
 
-def moved(store: Store) -> SceneRecord:
-    """Another record for the first scene."""
-    return replace(store.maps.scenes[0], alignment=Alignment(SE3.exp([1.0, 2, 3, 0, 0, 0])))
+
+def changed(store: MapStore) -> SceneMap:
+    """The first scene with another threshold."""
+    return replace(store.contents.scenes[0], min_support=0.9)
 
 
 @pytest.fixture
-def root(taught: Stages, tmp_path: Path, make: Make) -> Path:
+def root(scenes: list[SceneMap], tmp_path: Path, make: Make) -> Path:
     """A store of two scenes."""
-    return make(tmp_path / "store", taught["evercal"][:2]).root
+    return make(tmp_path / "store", scenes[:2]).root
 
 
-def test_nobody_writes_beside_a_learner(root: Path, taught: Stages, tree: Tree) -> None:
-    learner, aligner = Store.open(root), Store.open(root)
-    with learner.writing():
-        learner.begin({"scene": "gamma"})
-        before = tree(root)
-        with pytest.raises(InputError, match="another process is learning into it"):
-            aligner.replace_record("alpha", moved(aligner))
-        # Refused before anything is read or calculated.
-        with pytest.raises(InputError, match="another process is learning into it"):
-            Align(root, "alpha", robot_poses=root / "missing.csv").run()
-        assert tree(root) == before
-        learner.checkpoint(Checkpoint({"x": torch.zeros(2)}, {}))
-        learner.commit(taught["evercal"][2], {})
-    assert verify(root) == []
-    assert list(root.parent.iterdir()) == [root]
-    # Opened before the scene was there, it would write a list without it.
-    with pytest.raises(InputError, match="changed it meanwhile"):
-        aligner.replace_record("alpha", moved(aligner))
-    with pytest.raises(InputError, match="changed it meanwhile"):
-        aligner.commit(taught["evercal"][2], {})
-    assert len(Store.open(root).stages) == 3
+def test_two_processes_cannot_write_at_once(root: Path, tree: Tree) -> None:
+    """The lock file stays: a process that waits for a removed one would lock a deleted file."""
+    store, lock = MapStore.open(root), root.parent / ".store.lock"
+    before = tree(root)
+    for _ in range(2):
+        command = [sys.executable, "-c", WRITER, str(root)]
+        with subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as writer:
+            assert writer.stdin is not None
+            assert writer.stdout is not None
+            assert writer.stdout.readline() == "writing\n"
+            inode = lock.stat().st_ino
+            with pytest.raises(InputError, match="another process is writing into it"):
+                store.update(changed(store))
+            writer.stdin.write("\n")
+        assert writer.returncode == 0
+        assert lock.stat().st_ino == inode
+    assert tree(root) == before
+    store.update(changed(store))
+    assert MapStore.open(root).contents.scenes[0].min_support == 0.9
 
 
-def test_two_that_began_a_store_at_once(taught: Stages, tmp_path: Path, make: Make) -> None:
-    late = Store(tmp_path / "store", taught["evercal"][0], [], None)
-    make(tmp_path / "store", taught["evercal"][:1])
-    with pytest.raises(InputError, match="changed it meanwhile"):
-        late.commit(taught["evercal"][0], {})
+def test_writer_with_an_outdated_list_is_refused(
+    root: Path, scenes: list[SceneMap], tmp_path: Path, make: Make
+) -> None:
+    late = MapStore.open(root)
+    MapStore.open(root).commit(scenes[2], {})
+    for write in (lambda: late.update(changed(late)), lambda: late.commit(scenes[2], {})):
+        with pytest.raises(InputError, match="another process has changed it"):
+            write()
+    assert len(MapStore.open(root).stages) == 3
+    first = MapStore.create(tmp_path / "new")
+    make(tmp_path / "new", scenes[:1])
+    with pytest.raises(InputError, match="another process has changed it"):
+        first.commit(scenes[0], {})
 
 
-def test_checkpoints_outlive_another_record(root: Path) -> None:
-    store = Store.open(root)
-    store.begin({"scene": "gamma"})
-    store.checkpoint(Checkpoint({"x": torch.zeros(2)}, {}))
-    store.replace_record("alpha", moved(store))
-    assert Store.open(root).begin({"scene": "gamma"}) is not None
-
-
-def test_a_store_has_one_lock_by_whatever_name(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_store_has_one_lock_under_all_its_names(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     link = root.parent / "link" / "other"
     link.parent.mkdir()
     link.symlink_to(root)
     monkeypatch.chdir(root)
-    stores = [Store.open(path) for path in (root, link, Path())]
+    stores = [MapStore.open(path) for path in (root, link, Path())]
     for store in stores:
         with store.writing():
             for other in stores:
                 if other is not store:
                     with pytest.raises(InputError, match="another process"):
-                        other.replace_record("alpha", moved(other))
-        store.abandon()
+                        other.update(changed(other))
     assert verify(root) == []
 
 
 @pytest.mark.parametrize("index", [0, 1])
-def test_a_stage_without_its_files_is_not_listed(
-    index: int, root: Path, taught: Stages, tree: Tree
+def test_scene_with_missing_files_is_not_listed_again(
+    index: int, root: Path, scenes: list[SceneMap]
 ) -> None:
-    store = Store.open(root)
-    (root / "stages" / store.stages[index] / "memory.safetensors").unlink()
+    store = MapStore.open(root)
+    (root / "stages" / store.stages[index] / "keyframes.safetensors").unlink()
     listed = (root / manifest.MANIFEST).read_bytes()
     with pytest.raises(FileNotFoundError):
-        store.commit(taught["evercal"][2], {})
-    with pytest.raises(InputError, match=r"memory\.safetensors: missing"):
-        store.replace_record("alpha", moved(store))
+        store.commit(scenes[2], {})
+    with pytest.raises(InputError, match=r"keyframes\.safetensors: missing"):
+        store.update(changed(store))
     assert (root / manifest.MANIFEST).read_bytes() == listed
 
 
-def test_what_was_damaged_while_a_scene_was_learned_is_noticed(root: Path, taught: Stages) -> None:
-    store = Store.open(root)
-    file = root / "stages" / store.stages[0] / "memory.safetensors"
+def test_damage_is_reported_after_another_scene_is_added(
+    root: Path, scenes: list[SceneMap]
+) -> None:
+    store = MapStore.open(root)
+    file = root / "stages" / store.stages[0] / "keyframes.safetensors"
     file.write_bytes(file.read_bytes()[:-1] + b"\0")
-    store.commit(taught["evercal"][2], {})
+    store.commit(scenes[2], {})
     assert verify(root) == [f"{file}: checksum does not match, its content was changed"]
 
 
-@pytest.mark.parametrize("moment", ["verified", "before a scene", "within a scene"])
-def test_a_reader_starts_over_where_a_writer_was_faster(
+@pytest.mark.parametrize("moment", ["checksums", "scene"])
+def test_reader_starts_over_if_a_writer_was_faster(
     moment: str, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    writer, turns = Store.open(root), iter("w")
-    place, name = (manifest, "sha256_file") if moment == "verified" else (module, "read_record")
-    whole = getattr(place, name)
+    writer, writes = MapStore.open(root), iter("w")
+    owner, name = (manifest, "sha256_file") if moment == "checksums" else (module, "read_scene")
+    read = getattr(owner, name)
 
     def interrupted(path: Path) -> object:
-        found = whole(path) if moment == "within a scene" else None
-        for _ in turns:
-            writer.replace_record("alpha", moved(writer))
-        return found or whole(path)
+        for _ in writes:
+            writer.update(changed(writer))
+        return read(path)
 
-    monkeypatch.setattr(place, name, interrupted)
-    maps = Store.open(root).maps
-    assert maps.scenes[0].alignment is not None
-    assert None not in maps.keyframes
-    turns = iter("w")
+    monkeypatch.setattr(owner, name, interrupted)
+    assert MapStore.open(root).contents.scenes[0].min_support == 0.9
+    writes = iter("w")
     assert verify(root) == []

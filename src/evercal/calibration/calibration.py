@@ -203,7 +203,7 @@ class Calibration:
         """Export to a format of other tools; see `evercal export --format list`.
 
         Args:
-            format: name of the format, such as `easy_handeye2`, `ros2` or `urdf`.
+            format: name of the format, such as `easy_handeye2`, `launch_py` or `urdf`.
             path: file to write. Default: the text is only returned.
             **options: of the format, see `calibration.export`.
 

@@ -21,6 +21,7 @@ from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance_mm_deg
 from evercal.mapping.build import Adjusted, BuiltMap, OnProgress
 from evercal.recordings.frame import Recording
+from evercal.recordings.held_out import lacks_camera_poses as lacks_camera_poses
 
 MOST_FOCAL_PERCENT, MOST_POSE_SIGMA_MM = 1.0, 5.0
 """Larger corrections indicate systematic errors, which the covariance does not contain."""
@@ -78,12 +79,6 @@ class HandEyeReport:
         )
         warnings = [f"Do not rely on it: {warning}." for warning in self.warnings]
         return replace(calibration, verdict=" ".join(warnings or [verdict(calibration)]))
-
-
-def lacks_camera_poses(recording: Recording) -> bool:
-    """Whether a recording states gripper poses but no camera poses."""
-    stated = any(frame.base_from_camera is not None for frame in recording.train)
-    return not stated and any(frame.base_from_gripper is not None for frame in recording.train)
 
 
 @dataclass(frozen=True, eq=False)

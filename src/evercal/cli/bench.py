@@ -160,12 +160,12 @@ class Bench:
         return load_suite(self.suite, self.data, _words(self.scenes), self.poses)
 
     def _stage(self, seed: int) -> "StageOptions":
-        from evercal.cli.learn import parse_memory
         from evercal.continual.presets import PAPER_SIM_STEPS, on_paper_backbone, preset
-        from evercal.mapping.memory_budget import with_memory
 
-        parse_memory(self.memory)
-        stage = with_memory(preset(self.preset, seed), self.memory)
+        try:
+            stage = preset(self.preset, seed).with_memory(self.memory)
+        except InputError as error:
+            raise InputError(f"--{error}") from None
         if "paper" in (self.backbone, self.preset):
             stage = on_paper_backbone(stage)
         preset_steps = stage.fit.iterations

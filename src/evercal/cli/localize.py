@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from evercal.geometry import Camera
     from evercal.localization.estimate import PoseEstimate
-    from evercal.localization.localizer import SceneLocalizer
+    from evercal.localization.localizer import LearnedLocalizer
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Localize:
         return 0 if located else 1
 
     def _answers(
-        self, localizer: "SceneLocalizer", files: list[Path], camera: "Camera | None"
+        self, localizer: "LearnedLocalizer", files: list[Path], camera: "Camera | None"
     ) -> "list[Answer]":
         """The answer for each image; times include decoding."""
         from evercal.localization.parallel import in_parallel

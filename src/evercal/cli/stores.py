@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.localization.localizer import Localizer, SceneLocalizer
+    from evercal.localization.localizer import LearnedLocalizer, Localizer
 
 MAP = "evercal"
 """The strategy of a map."""
@@ -20,7 +20,7 @@ def strategy_of(store: Path) -> str | None:
     return str(read_manifest(store)["strategy"]) if is_store(store) else None
 
 
-def open_localizer(store: Path, device: str) -> "SceneLocalizer":
+def open_localizer(store: Path, device: str) -> "LearnedLocalizer":
     """The localizer of a store of either kind.
 
     Raises:

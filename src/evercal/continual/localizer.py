@@ -16,8 +16,8 @@ from evercal.features.precision import autocast
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import (
+    LearnedLocalizer,
     Localizer,
-    SceneLocalizer,
     camera_in_scenes,
     encode_image,
     own_or_stated,
@@ -43,7 +43,7 @@ class NetworkLocalizeOptions:
     """Short side of the image kept with a query, pixels."""
 
 
-def open_networks(path: Path, device: str = "auto") -> SceneLocalizer:
+def open_networks(path: Path, device: str = "auto") -> LearnedLocalizer:
     """A localizer for a store of networks.
 
     Args:
@@ -60,7 +60,7 @@ def open_networks(path: Path, device: str = "auto") -> SceneLocalizer:
     return localizer_of(scenes.to(where))
 
 
-def localizer_of(scenes: LearnedScenes) -> SceneLocalizer:
+def localizer_of(scenes: LearnedScenes) -> LearnedLocalizer:
     """The localizer for what a strategy learns: a map, networks, or both."""
     if not scenes.heads:
         return Localizer(scenes.map_contents())

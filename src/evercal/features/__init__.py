@@ -1,1 +1,1 @@
-"""Dense features of an image: what the encoder sees of it, encoder, descriptor, their weights."""
+"""Features of an image: views, encoder, image descriptor and their weights."""

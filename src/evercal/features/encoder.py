@@ -1,7 +1,7 @@
-"""The frozen local encoder: an image in, one feature vector per 8x8 pixel cell out.
+"""The frozen local encoder: one feature vector for every cell of 8x8 pixels.
 
-Ours is trained on procedural images alone (`features.pretraining`). ACE's published layout is read
-too, for users who have that file and may use it, and any module with `stride` and `width` will do.
+The shipped weights are trained on procedural images alone (`evercal pretrain`). Weight files in
+ACE's published layout can be read, too, and any module with `stride` and `width` can be used.
 """
 
 from pathlib import Path
@@ -23,10 +23,10 @@ ENCODER_FILE = WEIGHTS / "encoder.safetensors"
 
 @runtime_checkable
 class Encoder(Protocol):
-    """What the rest of the project asks of a local encoder."""
+    """Interface of a local encoder."""
 
     stride: int
-    """Pixels per cell. Cell (i, j) stands for pixel (stride (j + 0.5) - 0.5, same for i)."""
+    """Pixels per cell. Cell (i, j) is centred on pixel (stride (j + 0.5) - 0.5, same for i)."""
     width: int
     """Channels of a feature vector."""
 
@@ -57,18 +57,18 @@ class _Residual(nn.Module):
 
 
 class LocalEncoder(nn.Module):
-    """Stride-8 convolutional encoder whose receptive fields sit exactly on the cell centres.
+    """Stride-8 convolutional encoder with receptive fields centred on the cells.
 
     Space-to-depth and 2x2 convolutions shrink the image, so cell (i, j) is centred on pixel
-    (8 j + 3.5, 8 i + 3.5), pixel (0, 0) being the centre of the first pixel. (Strided 3x3
-    convolutions would be centred on (8 j, 8 i), half a cell off, which scale changes make visible.)
+    (8 j + 3.5, 8 i + 3.5), where (0, 0) is the centre of the first pixel. Strided 3x3 convolutions
+    would be centred on (8 j, 8 i), half a cell off.
 
     Args:
         stem: channels at 1/2 and 1/4 resolution.
         inner: channels at 1/8 resolution.
         blocks: residual blocks (3x3, 1x1, 3x3) at 1/8 resolution.
         width: output channels.
-        fused: batch norm folded into the convolutions (inference); training builds False.
+        fused: batch norm is folded into the convolutions, for inference; False for training.
     """
 
     stride = 8
@@ -97,13 +97,13 @@ class LocalEncoder(nn.Module):
         self.project = nn.Conv2d(inner, width, 1)
 
     def forward(self, grey: Tensor) -> Tensor:
-        """Encodes a batch.
+        """Encode a batch.
 
         Args:
-            grey: (b, 1, h, w) in [0, 1]; the part beyond a multiple of 8 is cut off.
+            grey: (b, 1, h, w) in [0, 1]; pixels beyond a multiple of 8 are cut off.
 
         Returns:
-            (b, width, h // 8, w // 8), each cell's vector with unit length.
+            (b, width, h // 8, w // 8) unit vectors.
         """
         height, width = (side // 8 * 8 for side in grey.shape[-2:])
         x = standardise(grey[..., :height, :width])
@@ -115,7 +115,7 @@ class LocalEncoder(nn.Module):
         return F.normalize(self.project(x).float(), dim=1)
 
     def fuse(self) -> "LocalEncoder":
-        """The same function with batch norm folded in, for inference and shipping."""
+        """The same function with batch norm folded in, for inference."""
         settings, training = self.settings, self.training
         twin = LocalEncoder(
             stem=(settings["stem"][0], settings["stem"][1]),
@@ -136,7 +136,7 @@ class LocalEncoder(nn.Module):
 
 
 def standardise(grey: Tensor) -> Tensor:
-    """Each image to mean 0 and standard deviation 1: exposure and contrast drop out."""
+    """Scale each image to mean 0 and standard deviation 1, which removes exposure and contrast."""
     mean = grey.mean(dim=(-3, -2, -1), keepdim=True)
     deviation = grey.std(dim=(-3, -2, -1), keepdim=True)
     return (grey - mean) / (deviation + 1e-3)
@@ -145,8 +145,8 @@ def standardise(grey: Tensor) -> Tensor:
 class AceEncoder(nn.Module):
     """The layer layout of ACE's published encoder (Brachmann et al., CVPR 2023), without weights.
 
-    Stride 8, grey input normalised as (x - 0.4) / 0.25, `width` output channels. Its weight file
-    has a non-commercial licence of its own and is not shipped here: bring yours.
+    Stride 8, grey input normalised as (x - 0.4) / 0.25, `width` output channels. The weight file
+    has a non-commercial licence of its own and is not shipped.
     """
 
     stride = 8
@@ -170,7 +170,7 @@ class AceEncoder(nn.Module):
         self.res2_skip = conv(256, width, 1)
 
     def forward(self, grey: Tensor) -> Tensor:
-        """(b, 1, h, w) in [0, 1] -> (b, width, h // 8, w // 8); the rest beyond 8 is cut off."""
+        """(b, 1, h, w) in [0, 1] -> (b, width, h // 8, w // 8)."""
         height, width = (side // 8 * 8 for side in grey.shape[-2:])
         x = (grey[..., :height, :width] - 0.4) / 0.25
         for layer in (self.conv1, self.conv2, self.conv3, self.conv4):
@@ -184,10 +184,10 @@ class AceEncoder(nn.Module):
 
 
 def checked_encoder(module: nn.Module) -> Encoder:
-    """A user's module as an encoder, frozen.
+    """Freeze a user's module as an encoder.
 
     Raises:
-        InputError: it lacks `stride` or `width`, or gives something else than (b, width, h, w).
+        InputError: It lacks `stride` or `width`, or its output is not (b, width, h, w).
     """
     if not isinstance(module, Encoder):
         raise InputError(
@@ -200,14 +200,14 @@ def checked_encoder(module: nn.Module) -> Encoder:
         shape = tuple(module(image).shape)
     if shape != (1, module.width, 8, 8):
         raise InputError(
-            f"encoder {type(module).__name__}: made {shape} of a (1, 1, {side}, {side}) image, "
-            f"its stride {module.stride} and width {module.width} promise (1, {module.width}, 8, 8)"
+            f"encoder {type(module).__name__}: made {shape} from a (1, 1, {side}, {side}) image;"
+            f" stride {module.stride} and width {module.width} require (1, {module.width}, 8, 8)"
         )
     return module
 
 
 def own_encoder(module: nn.Module, path: Path) -> Encoder:
-    """A user's module with the weights of a file.
+    """Load the weights of a file into a user's module.
 
     Raises:
         InputError: The weights belong to another module.
@@ -222,14 +222,14 @@ def own_encoder(module: nn.Module, path: Path) -> Encoder:
 
 
 def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:
-    """Reads an encoder, ready for inference.
+    """Load an encoder for inference.
 
     Args:
-        path: a file written by `evercal pretrain` (safetensors), or ACE's published weight file
-            (a torch state dict, read with `weights_only`); the shipped encoder when None.
+        path: a safetensors file of `evercal pretrain`, or ACE's published weight file, a torch
+            state dict that is read with `weights_only`. Default: the shipped encoder.
 
     Raises:
-        InputError: no such file, or a file in neither layout; keys and shapes must match exactly.
+        InputError: No such file, or keys and shapes of neither layout.
     """
     path = ENCODER_FILE if path is None else path
     if not path.is_file():
@@ -239,21 +239,23 @@ def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
-        reason = (str(error).splitlines() or [repr(error)])[0]  # torch's own go on for ten lines
+        reason = (str(error).splitlines() or [repr(error)])[
+            0
+        ]  # torch's own messages have ten lines
         raise InputError(f"encoder {path}: not a readable torch weight file ({reason})") from error
     return ace_encoder_from_state(state, str(path))
 
 
 def ace_encoder_from_state(state: object, name: str) -> AceEncoder:
-    """Builds an `AceEncoder` from a state dict in ACE's layout, strictly.
+    """Build an `AceEncoder` from a state dict in ACE's layout.
 
     Raises:
-        InputError: a key or a shape that is not in the layout; the first one is named.
+        InputError: A missing, unknown or wrongly shaped tensor.
     """
     if not isinstance(state, dict) or "res2_skip.weight" not in state:
         raise InputError(
             f"encoder {name}: not ACE's layout (no tensor 'res2_skip.weight'); "
-            "give ACE's published encoder file or one written by 'evercal pretrain'"
+            "use ACE's published encoder file or a file of 'evercal pretrain'"
         )
     shape = getattr(state["res2_skip.weight"], "shape", ())
     encoder = AceEncoder(int(shape[0]) if len(shape) == 4 else 512)
@@ -273,8 +275,10 @@ def _load_own(path: Path) -> LocalEncoder | AceEncoder:
         if settings.get("layout") == AceEncoder.__name__:
             return ace_encoder_from_state(state, str(path))
         if settings.get("layout", LocalEncoder.__name__) != LocalEncoder.__name__:
-            made = settings["layout"]
-            raise InputError(f"encoder {path}: made by the module {made!r}; give it to open this")
+            raise InputError(
+                f"encoder {path}: weights of the module {settings['layout']!r}; pass that module as"
+                " encoder"
+            )
         stem = (settings["stem"][0], settings["stem"][1])
         encoder = LocalEncoder(stem, settings["inner"], settings["blocks"], settings["width"])
     except (SafetensorError, KeyError, ValueError) as error:

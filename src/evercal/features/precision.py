@@ -1,17 +1,41 @@
-"""Mixed precision where it is fast: bfloat16 on CPUs and GPUs that multiply it in hardware."""
+"""Precision of the networks' products: float32, or bfloat16 where the hardware multiplies it.
 
+By default the hardware decides, so two machines can differ in the last digits of features, and
+thereby of poses. `EVERCAL_PRECISION` sets it: `float32` gives the same arithmetic on every machine,
+`bfloat16` is faster, `auto` is the default.
+"""
+
+import os
 from functools import lru_cache
 
 import torch
 
+from evercal.errors import InputError
+
+VARIABLE = "EVERCAL_PRECISION"
+AUTO, BFLOAT16, FLOAT32 = "auto", "bfloat16", "float32"
+
 
 def fast_bfloat16(device: torch.device | str = "cpu") -> bool:
-    """Whether a device has bfloat16 products: AVX512-BF16, AMX, Arm's BF16, or CUDA from Ampere."""
-    return _fast_bfloat16(torch.device(device).type)
+    """Whether products on a device are calculated in bfloat16.
+
+    Raises:
+        InputError: `EVERCAL_PRECISION` has another value than auto, bfloat16 or float32.
+    """
+    precision = os.environ.get(VARIABLE) or AUTO
+    if precision not in (AUTO, BFLOAT16, FLOAT32):
+        raise InputError(
+            f"{VARIABLE}: {precision!r} is not a precision; set it to auto, bfloat16 or float32"
+        )
+    return precision == BFLOAT16 or (precision == AUTO and has_bfloat16(torch.device(device).type))
 
 
 @lru_cache(maxsize=4)
-def _fast_bfloat16(kind: str) -> bool:
+def has_bfloat16(kind: str) -> bool:
+    """Whether a kind of device has bfloat16 products.
+
+    CPUs with AVX512-BF16, AMX or Arm's BF16 have them, and CUDA devices from Ampere.
+    """
     if kind == "cuda":
         return torch.cuda.is_available() and torch.cuda.is_bf16_supported(False)
     try:
@@ -21,6 +45,6 @@ def _fast_bfloat16(kind: str) -> bool:
 
 
 def autocast(device: torch.device | str = "cpu") -> torch.autocast:
-    """Mixed precision for tensors on `device`, or plain fp32 where that would be slower."""
+    """Mixed precision for tensors on a device, or float32 where `fast_bfloat16` is false."""
     kind = torch.device(device).type
     return torch.autocast(kind, torch.bfloat16, enabled=fast_bfloat16(kind))

@@ -1,8 +1,7 @@
-"""What the encoder gets to see of a frame: the image at working size, plain or as another view.
+"""Views: images at the encoder's working size, plain or augmented.
 
-Another view is the image that the same camera would take after turning about its own centre with
-another focal length: for that motion the image is known exactly whatever the depth, so the pose
-that goes with it is true, not approximate.
+An augmented view is the image of a camera with another rotation and focal length, but the same
+centre. That image does not depend on the depths, so its pose is exact.
 """
 
 from dataclasses import dataclass
@@ -24,28 +23,28 @@ class ViewOptions:
     zoom: float = 1.4
     """Augmented views scale the focal length by a factor drawn from [1 / zoom, zoom]."""
     roll_deg: float = 20.0
-    """Augmented views turn about the optical axis by up to this."""
+    """Largest rotation of augmented views about the optical axis."""
     tilt_deg: float = 6.0
-    """Augmented views turn about the other axes by up to this."""
+    """Largest rotation of augmented views about each other axis."""
     gamma: float = 0.3
     """Standard deviation of the logarithm of the brightness exponent."""
 
 
 @dataclass(frozen=True)
 class View:
-    """One image for the encoder and how its cells see the world."""
+    """One image for the encoder and the rays of its cells."""
 
     grey: np.ndarray
     """(h, w) uint8."""
     cell_pixels: np.ndarray
-    """(cells, 2) float32 pixels of the frame that the cells are centred on, in an ideal pinhole
-    with `intrinsics`; row-major over the (h // stride, w // stride) grid."""
+    """(cells, 2) float32 pixels of the frame at the cell centres, in an ideal pinhole camera with
+    `intrinsics`; row-major over the (h // stride, w // stride) grid."""
     valid: np.ndarray
-    """(cells,) bool: the cell shows something of the image, and `cell_pixels` says what."""
+    """(cells,) bool: the cell shows a part of the image."""
     intrinsics: np.ndarray
     """(4,) fx, fy, cx, cy of the ideal pinhole, pixels."""
     base_from_camera: SE3
-    """Pose of the frame; identity where it has none."""
+    """Pose of the frame; identity without a pose."""
 
 
 def cell_centres(height: int, width: int, stride: int) -> np.ndarray:
@@ -55,10 +54,10 @@ def cell_centres(height: int, width: int, stride: int) -> np.ndarray:
 
 
 def plain_view(image: np.ndarray, camera: Camera, stride: int, options: ViewOptions) -> View:
-    """An image as it is, at working size; only the cell pixels are freed from distortion.
+    """An image at working size; the cell pixels are free of distortion.
 
     Args:
-        image: (h, w, 3) uint8 RGB or (h, w) grey, any size with the camera's proportions.
+        image: (h, w, 3) uint8 RGB or (h, w) grey, any size with the camera's aspect ratio.
         camera: intrinsics; scaled to the working size.
         stride: of the encoder.
         options: working size.
@@ -71,10 +70,9 @@ def plain_view(image: np.ndarray, camera: Camera, stride: int, options: ViewOpti
 
 @lru_cache(maxsize=64)
 def ideal_cell_pixels(camera: Camera, stride: int) -> np.ndarray:
-    """(cells, 2) float32: where the cell centres lie once the lens distortion is taken away.
+    """(cells, 2) float32 pixels of the cell centres after removing the distortion.
 
-    nan where the distortion has no ray for them. The same array for the same camera: not to be
-    written to.
+    NaN where the distortion has no ray for a cell. The array is shared and cannot be written.
     """
     pixels = cell_centres(camera.height, camera.width, stride)
     if camera.distortion:
@@ -95,38 +93,37 @@ def frame_view(frame: Frame, stride: int, options: ViewOptions) -> View:
 def augmented_view(
     frame: Frame, stride: int, options: ViewOptions, rng: np.random.Generator
 ) -> View:
-    """A random other view of a posed frame from the same camera centre.
+    """A random view of a posed frame from the same camera centre.
 
-    Its cells are given by the pixels of the original image that they show, so pose and intrinsics
-    are the frame's own.
+    Cells are given by the pixels of the original image, so pose and intrinsics are the frame's.
     """
     import cv2
 
     grey, camera = working_image(frame.read_image(), frame.camera, options.short_side)
     zoom = options.zoom ** rng.uniform(-1, 1)
     roll, tilt = np.deg2rad(options.roll_deg), np.deg2rad(options.tilt_deg)
-    turn = SE3.exp(np.array([0, 0, 0, *(rng.uniform(-1, 1, 3) * [tilt, tilt, roll])]))
-    camera_from_view = turn.rotation_matrix()
+    rotation = SE3.exp(np.array([0, 0, 0, *(rng.uniform(-1, 1, 3) * [tilt, tilt, roll])]))
+    camera_from_view = rotation.rotation_matrix()
     height, width = grey.shape
     virtual = Camera(width, height, zoom * camera.fx, zoom * camera.fy, camera.cx, camera.cy)
     homography = camera.matrix() @ camera_from_view @ np.linalg.inv(virtual.matrix())
-    turned = virtual.unproject(cell_centres(height, width, stride)) @ camera_from_view.T
+    ray = virtual.unproject(cell_centres(height, width, stride)) @ camera_from_view.T
     if camera.distortion:
         v, u = np.mgrid[0:height, 0:width]
         rays = virtual.unproject(np.stack([u, v], -1).astype(float)) @ camera_from_view.T
-        where = np.nan_to_num(camera.project(rays), nan=-1.0).astype(np.float32)
-        warped = cv2.remap(grey, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)  # type: ignore[call-overload]
+        source = np.nan_to_num(camera.project(rays), nan=-1.0).astype(np.float32)
+        warped = cv2.remap(grey, source, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)  # type: ignore[call-overload]
     else:
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         size, border = (width, height), cv2.BORDER_REFLECT
         warped = cv2.warpPerspective(grey, homography, size, flags=flags, borderMode=border)
     table = (np.arange(256) / 255.0) ** np.exp(rng.normal(0, options.gamma)) * 255
     warped = cv2.LUT(warped, table.astype(np.uint8))
-    source = camera.project(turned)
+    source = camera.project(ray)
     valid = np.all((source >= 0) & (source <= [width - 1, height - 1]), axis=-1)
-    rays = turned[:, :2] / turned[:, 2:]
-    pixels = rays * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    assert frame.base_from_camera is not None, "only posed frames can be learned"
+    plane = ray[:, :2] / ray[:, 2:]
+    pixels = plane * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    assert frame.base_from_camera is not None, "augmented frames have poses"
     return View(warped, pixels.astype(np.float32), valid, _four(camera), frame.base_from_camera)
 
 

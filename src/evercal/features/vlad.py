@@ -1,4 +1,4 @@
-"""VLAD: one vector for a whole image, to retrieve images of one place (Jegou et al., CVPR 2010).
+"""VLAD: one vector for an image, to retrieve similar images (Jegou et al., CVPR 2010).
 
 The features of an image are summed as differences from the nearest of a few centroids. Centroids of
 the shipped encoder come from procedural rooms. Centroids of another encoder are fitted to the first
@@ -29,7 +29,7 @@ _ROWS = 40_000
 
 
 class Vlad:
-    """Sum the features of an image to one vector.
+    """Aggregate the features of an image in one vector.
 
     Args:
         centroids: (k, channels) unit vectors.
@@ -45,13 +45,13 @@ class Vlad:
         """(cells, channels) unit vectors of an image -> (width,) unit vector, on their device."""
         centroids, projection = self._on(features.device)
         nearest = (features @ centroids.T).argmax(1)
-        apart = features - centroids[nearest]
+        difference = features - centroids[nearest]
         if features.device.type == "cpu":
-            sums = torch.zeros_like(centroids).index_add_(0, nearest, apart)
-        else:  # on CUDA `index_add_` adds in any order, which changes the last bits
-            sums = F.one_hot(nearest, len(centroids)).to(apart.dtype).T @ apart
-        whole = F.normalize(sums, dim=1).flatten()
-        return F.normalize(whole @ projection, dim=0)
+            sums = torch.zeros_like(centroids).index_add_(0, nearest, difference)
+        else:  # `index_add_` on CUDA is not deterministic
+            sums = F.one_hot(nearest, len(centroids)).to(difference.dtype).T @ difference
+        vector = F.normalize(sums, dim=1).flatten()
+        return F.normalize(vector @ projection, dim=0)
 
     def _on(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Centroids and projection on a device, cached."""
@@ -60,7 +60,7 @@ class Vlad:
         return self._copies[device]
 
 
-_made: WeakKeyDictionary[Encoder, Vlad] = WeakKeyDictionary()
+_by_encoder: WeakKeyDictionary[Encoder, Vlad] = WeakKeyDictionary()
 
 
 def vlad_for(encoder: Encoder, features: Sequence[Tensor] = ()) -> Vlad:
@@ -68,17 +68,19 @@ def vlad_for(encoder: Encoder, features: Sequence[Tensor] = ()) -> Vlad:
 
     Args:
         encoder: the shipped one, one whose centroids were loaded, or any other.
-        features: (cells, channels) of images; centroids are fitted to them where there are none.
+        features: (cells, channels) of images, to which missing centroids are fitted.
 
     Raises:
         InputError: An encoder without centroids, and no features to fit them to.
     """
-    if encoder not in _made:
+    if encoder not in _by_encoder:
         centroids = shipped_centroids(encoder)
         if centroids is None and not features:
             raise InputError("the encoder has no VLAD centroids; learn a recording with it first")
-        _made[encoder] = _projected(fit_centroids(features) if centroids is None else centroids)
-    return _made[encoder]
+        _by_encoder[encoder] = _projected(
+            fit_centroids(features) if centroids is None else centroids
+        )
+    return _by_encoder[encoder]
 
 
 def shipped_centroids(encoder: Encoder) -> Tensor | None:
@@ -102,7 +104,7 @@ def save_centroids(encoder: Encoder, path: Path) -> None:
 def load_centroids(encoder: Encoder, path: Path) -> None:
     """Load the centroids of an encoder from a file of `save_centroids`."""
     with safe_open(path, "pt") as file:
-        _made[encoder] = _projected(file.get_tensor("centroids").float())
+        _by_encoder[encoder] = _projected(file.get_tensor("centroids").float())
 
 
 def fit_centroids(features: Sequence[Tensor]) -> Tensor:
@@ -121,10 +123,10 @@ def fit_centroids(features: Sequence[Tensor]) -> Tensor:
 
 
 def _projected(centroids: Tensor) -> Vlad:
-    # A fixed random projection preserves angles and a quarter of the numbers.
+    # A fixed random projection to fewer numbers preserves angles.
     shape = (centroids.numel(), WIDTH)
-    drawn = torch.Generator().manual_seed(1)
-    projection = torch.randn(shape, generator=drawn, device="cpu")
+    generator = torch.Generator().manual_seed(1)
+    projection = torch.randn(shape, generator=generator, device="cpu")
     return Vlad(centroids, projection / shape[0] ** 0.5)
 
 

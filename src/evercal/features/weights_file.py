@@ -1,4 +1,4 @@
-"""Encoder and descriptor as safetensors bytes, with what is needed to build them again."""
+"""Networks as safetensors files that contain their settings."""
 
 import json
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ from evercal.errors import InputError
 
 
 def network_bytes(module: torch.nn.Module, kind: str) -> bytes:
-    """A network in half precision; `kind` is the metadata key that its loader looks for."""
+    """Serialise a network in half precision; its settings are the metadata value of `kind`."""
     from safetensors.torch import save
 
     state = {k: v.detach().cpu().half().contiguous() for k, v in module.state_dict().items()}
@@ -19,13 +19,13 @@ def network_bytes(module: torch.nn.Module, kind: str) -> bytes:
 
 
 def load_strictly(module: torch.nn.Module, state: Mapping[str, object], name: str) -> None:
-    """Loads a state dict whose keys and shapes must match exactly.
+    """Load a state dict with exactly the keys and shapes of a module.
 
     Raises:
-        InputError: `name` and the first thing that does not match, in one line.
+        InputError: A mismatch; the message starts with `name`.
     """
     try:
         module.load_state_dict(dict(state), strict=True)
     except RuntimeError as error:
-        first = str(error).splitlines()[1].strip()  # line 0 names torch's class
+        first = str(error).splitlines()[1].strip()  # line 0 is the class of the module
         raise InputError(f"{name}: {first}") from error

@@ -75,11 +75,6 @@ class SceneLocalizer(Protocol):
     """What both kinds of store answer with: a map's `Localizer`, and that of networks."""
 
     @property
-    def contents(self) -> LearnedContents:
-        """The scenes."""
-        ...
-
-    @property
     def scenes(self) -> tuple[str, ...]:
         """Names of the scenes, in order of learning."""
         ...
@@ -90,6 +85,15 @@ class SceneLocalizer(Protocol):
 
     def camera_for(self, stated: Camera) -> Camera | None:
         """The `camera` argument for an image with these stated intrinsics."""
+        ...
+
+
+class LearnedLocalizer(SceneLocalizer, Protocol):
+    """A localizer whose scenes can be inspected."""
+
+    @property
+    def contents(self) -> LearnedContents:
+        """The scenes."""
         ...
 
 

@@ -19,7 +19,6 @@ from evercal.features.vlad import vlad_for
 from evercal.geometry import SE3, Camera
 from evercal.geometry.uncertain_pose import frame_covariance
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment, BundleOptions
-from evercal.mapping.bundle_tracks import bundle_tracks
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.map_frame import MapFrame, fit_correction
 from evercal.mapping.memory_budget import MemoryBudget
@@ -32,11 +31,17 @@ from evercal.mapping.pose_check import (
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
 from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import select_farthest, spread_poses
-from evercal.mapping.tracks import KeyframeTracks, TrackOptions, open_keyframe, refine_depths
+from evercal.mapping.tracks import (
+    KeyframeTracks,
+    TrackOptions,
+    bundle_tracks,
+    open_keyframe,
+    refine_depths,
+)
 from evercal.recordings.frame import Frame, stated_poses
 
 OnProgress = Callable[[str, int, int], object]
-"""Called with the name of the current step, how much of it is done, and how much there is."""
+"""Called with the name of the current step, its progress, and its total."""
 
 HAND_EYE_COVARIANCE_SCALE = 2.5
 """Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated
@@ -49,10 +54,10 @@ some hundredths of a pixel."""
 
 @dataclass(frozen=True)
 class MapOptions:
-    """How a map is built."""
+    """Options of building a map."""
 
     memory: MemoryBudget = field(default_factory=MemoryBudget)
-    """How many keyframes are kept."""
+    """Number of keyframes."""
     size: WorkingSize = field(default_factory=WorkingSize)
     """Working sizes of images."""
     tracks: TrackOptions = field(default_factory=TrackOptions)
@@ -72,12 +77,12 @@ class MapOptions:
     def for_hand_eye(self) -> "MapOptions":
         """The same options for poses from a rough `gripper_from_camera`.
 
-        The common transform has no prior. Arms place their gripper to some tenths of a millimetre,
-        so stated poses are never taken to be better than that.
+        The common transform has no prior. The poses of arms have errors of some tenths of a
+        millimetre, which bounds the estimated errors of stated poses.
         """
         bundle = replace(
             self.bundle,
-            common_known=False,
+            common_stated=False,
             common_sigma_m=0.2,
             common_sigma_deg=10.0,
             least_sigma_m=2e-4,
@@ -101,11 +106,11 @@ class Adjusted:
     pose_sigma_mm: float
     """Estimated error of the stated positions, standard deviation per axis."""
     pose_sigma_deg: float
-    """The same of the stated rotations."""
+    """The same for the stated rotations, degrees."""
     time_shift_frames: float
     """Delay of the images after their stated poses."""
     wrong_poses: tuple[str, ...]
-    """Frames whose stated pose contradicts the images; they were left out."""
+    """Frames whose stated pose contradicts the images; they are excluded."""
     doubtful_poses: tuple[str, ...]
     """Frames whose stated pose has an unusually large error; they were given less weight."""
 
@@ -174,13 +179,13 @@ def build_map(
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """Frames that take part, encoded, without those whose pose is wrong."""
+    """Encoded frames whose stated poses are consistent with the images."""
 
     frames: PreparedFrames
     keyframes: list[int]
-    """Which of them become keyframes."""
+    """Numbers of the keyframes."""
     wrong: tuple[str, ...]
-    """Names of the frames that were left out."""
+    """Names of the excluded frames."""
 
 
 def _prepare(
@@ -202,7 +207,7 @@ def _prepare(
     if len(bad):
         prepared = prepared.without(bad)
     start = [new for new, old in enumerate(good) if support[old] in wanted]
-    # Other frames replace keyframes that were left out.
+    # Other frames replace excluded keyframes.
     positions, rotations = prepared.stated.translation_m, prepared.stated.rotation_wxyz
     keyframes = select_farthest(positions, rotations, len(wanted), start=start)
     return _Prepared(prepared, keyframes.tolist(), wrong)
@@ -228,7 +233,7 @@ def _open_keyframes(
         for keyframe in pool.map(open_one, prepared.keyframes):
             keyframes.append(keyframe)
             on_progress("mapping", len(keyframes), len(prepared.keyframes))
-    if not any(keyframe.kept.any() for keyframe in keyframes):
+    if not any(keyframe.confirmed.any() for keyframe in keyframes):
         raise InputError(
             "no two training frames show the same surfaces with parallax: record views from at"
             " least 10 cm apart, or check that the stated poses belong to these images"
@@ -237,9 +242,9 @@ def _open_keyframes(
 
 
 def _velocity(frames: Sequence[Frame]) -> np.ndarray:
-    """(n, 6) motion per frame, camera frame, where the neighbours in time are frames too.
+    """(n, 6) motion per frame, camera frame; 0 beside gaps of the recording.
 
-    Gaps of the recording are steps much longer than the median one.
+    A gap is a step much longer than the median one.
     """
     poses = stated_poses(frames)
     if len(frames) < 3:
@@ -284,8 +289,8 @@ def _moved(stated: SE3, camera: Camera, adjustment: Adjustment) -> bool:
 
     Args:
         stated: (n,) poses before.
-        camera: intrinsics before, where all frames share a camera.
-        adjustment: of both.
+        camera: intrinsics before, if all frames share a camera.
+        adjustment: the result.
     """
     change = np.linalg.norm((stated.inverse() @ adjustment.poses).log().reshape(-1, 2, 3), axis=2)
     metres, radians = np.median(change, 0)
@@ -305,7 +310,7 @@ def _finish(
     adjustment: Adjustment | None,
     options: MapOptions,
 ) -> BuiltMap:
-    """Everything that is stored of the scene."""
+    """The built map of all adjusted parts."""
     frames, numbers = prepared.frames, [keyframe.frame for keyframe in tracks]
     first = frames.frames[0].camera
     camera = frames.cameras[0].resized(first.width, first.height)
@@ -318,9 +323,10 @@ def _finish(
             correction=fit_correction(adjustment.poses @ common.inverse(), adjustment.correction),
             pose_sigma=(float(np.sqrt(block[:, :3].mean())), float(np.sqrt(block[:, 3:].mean()))),
         )
-        if not options.bundle.common_known:
+        if not options.bundle.common_stated:
             # The common transform is part of the answer and not an error to undo.
-            covariance = HAND_EYE_COVARIANCE_SCALE * np.asarray(adjustment.common_covariance)
+            covariance = np.asarray(adjustment.common_covariance, np.float64)
+            covariance = HAND_EYE_COVARIANCE_SCALE * covariance
             hand_eye = HandEyeCorrection(common, covariance)
             base = frame_covariance(frames.stated @ common, covariance)
             frame = replace(frame, common=SE3.identity(), base_covariance=base)
@@ -346,7 +352,7 @@ def _keyframes(frames: PreparedFrames, tracks: list[KeyframeTracks]) -> Keyframe
         tuple(frames.cameras[i] for i in numbers),
         frames.poses[np.array(numbers)],
         tuple(torch.from_numpy(k.cell_inverse_depth).half() for k in tracks),
-        tuple(k.landmarks.take(np.flatnonzero(k.kept)) for k in tracks),
+        tuple(k.landmarks.take(np.flatnonzero(k.confirmed)) for k in tracks),
         torch.stack([vlad(frames.features(i)) for i in numbers]).half(),
     )
 

@@ -1,9 +1,8 @@
-"""Keyframes: the few frames that stay of a scene, counted in bytes.
+"""Keyframes: the frames of a scene that are stored.
 
-The frames are kept as grey JPEG images at working size, not as feature rows: an image of 320x240
-takes about 25 kB, its 1,200 rows of 128 half floats 307 kB. From the image, the frozen encoder
-makes the same rows again in milliseconds, and augmented views besides. A map adds depths,
-landmarks and a descriptor to each.
+They are grey JPEG images at working size and not features: an image of 320x240 takes about 25 kB,
+its 1,200 features of 128 half floats 307 kB. The frozen encoder computes the same features from the
+image in milliseconds. A map adds depths, landmarks and a descriptor to each.
 """
 
 from collections.abc import Sequence
@@ -32,7 +31,7 @@ _LANDMARK_FIELDS = {
 
 @dataclass(frozen=True)
 class Keyframes:
-    """A few frames of one scene that stay with it."""
+    """The stored frames of one scene."""
 
     images: tuple[bytes, ...]
     """Grey JPEG files at working size."""
@@ -41,13 +40,11 @@ class Keyframes:
     base_from_camera: SE3
     """(n,) poses in the scene's base frame."""
     inverse_depth: tuple[Tensor, ...] = ()
-    """(cells,) half floats of each image, per metre along the optical axis; none where a strategy
-    does not match keyframes."""
-
+    """(cells,) half floats of each image, per metre along the optical axis; empty without a map."""
     landmarks: tuple[Landmarks, ...] = ()
-    """Of each image; none where a strategy builds no map."""
+    """Of each image; empty without a map."""
     descriptors: Tensor | None = None
-    """(n, width) VLAD of each image, half floats; None where a strategy builds no map."""
+    """(n, width) VLAD of each image, half floats; None without a map."""
 
     @property
     def bytes(self) -> int:
@@ -58,15 +55,15 @@ class Keyframes:
         return len(self.images)
 
     def take(self, index: NDArray[np.int64]) -> "Keyframes":
-        """Some of them."""
+        """The keyframes of an index."""
         rows = index.tolist()
         return Keyframes(
-            tuple(self.images[i] for i in rows),
-            tuple(self.cameras[i] for i in rows),
-            self.base_from_camera[index],
-            tuple(self.inverse_depth[i] for i in rows) if self.inverse_depth else (),
-            tuple(self.landmarks[i] for i in rows) if self.landmarks else (),
-            None if self.descriptors is None else self.descriptors[index],
+            images=tuple(self.images[i] for i in rows),
+            cameras=tuple(self.cameras[i] for i in rows),
+            base_from_camera=self.base_from_camera[index],
+            inverse_depth=tuple(self.inverse_depth[i] for i in rows) if self.inverse_depth else (),
+            landmarks=tuple(self.landmarks[i] for i in rows) if self.landmarks else (),
+            descriptors=None if self.descriptors is None else self.descriptors[index],
         )
 
     def grey(self, i: int) -> np.ndarray:
@@ -74,7 +71,7 @@ class Keyframes:
         import cv2
 
         grey = cv2.imdecode(np.frombuffer(self.images[i], np.uint8), cv2.IMREAD_GRAYSCALE)
-        assert grey is not None, "a stored image always decodes: its file is checksummed"
+        assert grey is not None, "stored images have checksums"
         return np.asarray(grey, np.uint8)
 
     def frames(self) -> list[Frame]:
@@ -88,12 +85,13 @@ class Keyframes:
         return frames
 
     def to_tensors(self) -> dict[str, Tensor]:
-        """As named tensors.
+        """Convert to named tensors.
 
-        `images` (bytes, joined), `lengths` (n,), `cameras` (n, 14), `distortion` (n,) number of
-        coefficients, `poses` (n, 7) quaternion wxyz and metres; with depths also `inverse_depth`
-        (joined) and `cells` (n,), how many of each image; with landmarks their fields (joined,
-        `landmark_*`), their `landmark_counts` (n,) and `descriptors` (n, width).
+        Returns:
+            `images` (bytes, concatenated), `lengths` (n,), `cameras` (n, 14), `distortion` (n,)
+            number of coefficients, `poses` (n, 7) quaternion wxyz and metres. With depths also
+            `inverse_depth` (concatenated) and `cells` (n,). With landmarks also their fields
+            (concatenated, `landmark_*`), `landmark_counts` (n,) and `descriptors` (n, width).
         """
         joined = np.frombuffer(b"".join(self.images), np.uint8).copy()
         cameras = np.zeros((len(self.images), 14))
@@ -103,8 +101,7 @@ class Keyframes:
         poses = np.concatenate(
             [self.base_from_camera.rotation_wxyz, self.base_from_camera.translation_m], -1
         )
-        depths = self._map_tensors()
-        return depths | {
+        return self._map_tensors() | {
             "images": torch.from_numpy(joined),
             "lengths": torch.tensor([len(image) for image in self.images]),
             "cameras": torch.from_numpy(cameras),
@@ -142,12 +139,17 @@ class Keyframes:
             fx, fy, cx, cy = rest[:4]
             cameras.append(Camera(int(width), int(height), fx, fy, cx, cy, distortion))
         poses = tensors["poses"].numpy()
-        each: tuple[Tensor, ...] = ()
+        depths: tuple[Tensor, ...] = ()
         if "cells" in tensors:
-            each = tensors["inverse_depth"].split(tensors["cells"].tolist())
-        marks = _landmarks_of(tensors) if "landmark_counts" in tensors else ()
-        found = tensors.get("descriptors")
-        return cls(images, tuple(cameras), SE3(poses[:, :4], poses[:, 4:]), each, marks, found)
+            depths = tensors["inverse_depth"].split(tensors["cells"].tolist())
+        return cls(
+            images=images,
+            cameras=tuple(cameras),
+            base_from_camera=SE3(poses[:, :4], poses[:, 4:]),
+            inverse_depth=depths,
+            landmarks=_landmarks_of(tensors) if "landmark_counts" in tensors else (),
+            descriptors=tensors.get("descriptors"),
+        )
 
 
 def _landmarks_of(tensors: dict[str, Tensor]) -> tuple[Landmarks, ...]:
@@ -160,10 +162,10 @@ def _landmarks_of(tensors: dict[str, Tensor]) -> tuple[Landmarks, ...]:
 
 
 def store_keyframes(frames: Sequence[Frame], short_side: int) -> Keyframes:
-    """Keeps frames at working size.
+    """Store frames at working size.
 
     Args:
-        frames: posed frames, already selected.
+        frames: selected frames with poses.
         short_side: pixels of the shorter image side.
     """
     images, cameras = [], []
@@ -176,9 +178,9 @@ def store_keyframes(frames: Sequence[Frame], short_side: int) -> Keyframes:
 
 
 def jpeg(grey: np.ndarray) -> bytes:
-    """A JPEG file of a (h, w) uint8 image."""
+    """Encode a (h, w) uint8 image as a JPEG file."""
     import cv2
 
-    done, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    assert done, "OpenCV encodes any uint8 image"
+    encoded, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    assert encoded, "OpenCV encodes any uint8 image"
     return data.tobytes()

@@ -1,6 +1,7 @@
-"""Landmarks: textured pixels of a keyframe, each with its depth, its slant and its uncertainty."""
+"""Landmarks: textured pixels of a keyframe with depth, slant and uncertainty."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -13,9 +14,11 @@ Array = NDArray[np.floating]
 MIN_TEXTURE = 1e-4
 """Smallest minimum eigenvalue (cv2.cornerMinEigenVal, 5x5) of a landmark's pixel."""
 BORDER_PX = 6
+"""Landmarks and their projections lie at least this far inside the image."""
 NEAREST_M = 1e-3
 _TANGENT_PX = 2.0
-_LEAST_AREA, _MOST_AREA = 0.2, 5.0
+_MIN_AREA, _MAX_AREA = 0.2, 5.0
+"""Bounds of the area of a warped patch, relative to its keyframe."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +38,7 @@ class Landmarks:
         return len(self.pixels)
 
     def take(self, index: np.ndarray) -> "Landmarks":
-        """Some of them."""
+        """The landmarks of an index."""
         return Landmarks(
             self.pixels[index], self.inverse_depth[index], self.slope[index], self.sigma[index]
         )
@@ -43,8 +46,7 @@ class Landmarks:
     def surface(self, camera: Camera) -> Array:
         """(3, n, 3) points in the keyframe's camera frame, metres.
 
-        The landmarks themselves, and the points of their surface two pixels to the right and two
-        pixels down.
+        The landmarks, and the points of their surfaces two pixels to the right and two pixels down.
 
         Args:
             camera: of the keyframe's image.
@@ -55,21 +57,30 @@ class Landmarks:
         return camera.unproject(pixels) / inverse[..., None]
 
 
+class ProjectedPatches(NamedTuple):
+    """The m visible patches of n landmarks, as a camera should show them."""
+
+    landmark: NDArray[np.int64]
+    """(m,)."""
+    pixels: Array
+    """(m, 2)."""
+    affines: Array
+    """(m, 2, 2) from keyframe pixels to this image."""
+
+
 def project_surface(
     points: Array, rotation: Array, translation_m: Array, camera: Camera
-) -> tuple[NDArray[np.int64], Array, Array]:
-    """Where a camera should see patches, and how they are warped there.
+) -> ProjectedPatches:
+    """Predict positions and warps of patches in an image.
+
+    A patch is visible if it lies in front of the camera, inside the image by a margin, and its size
+    is similar to that in its keyframe.
 
     Args:
         points: (3, n, 3), see `Landmarks.surface`, in any frame.
         rotation: (3, 3) from that frame to the camera's.
         translation_m: (3,) of the same transform.
         camera: intrinsics.
-
-    Returns:
-        Which of the n are visible (m,): in front, inside the image by a margin, and neither much
-        larger nor much smaller than in their keyframe; their pixels (m, 2); the affine maps
-        (m, 2, 2) from keyframe pixels to this image.
     """
     centre = points[0] @ rotation.T + translation_m
     front = np.flatnonzero(centre[:, 2] > NEAREST_M)
@@ -81,14 +92,14 @@ def project_surface(
     tangents = camera.project(np.maximum(beside, [-np.inf, -np.inf, NEAREST_M])) - pixels
     affines = tangents.transpose(1, 2, 0) / _TANGENT_PX
     area = affines[:, 0, 0] * affines[:, 1, 1] - affines[:, 0, 1] * affines[:, 1, 0]
-    right = (area > _LEAST_AREA) & (area < _MOST_AREA)
-    return visible[right], pixels[right], affines[right]
+    similar = (area > _MIN_AREA) & (area < _MAX_AREA)
+    return ProjectedPatches(visible[similar], pixels[similar], affines[similar])
 
 
 def detect(
     grey: np.ndarray, grid: tuple[int, int], cell_px: float
 ) -> tuple[Array, NDArray[np.int64]]:
-    """The most textured pixel of every cell that has texture.
+    """Detect the most textured pixel of every textured cell.
 
     Args:
         grey: (h, w) uint8.
@@ -96,7 +107,7 @@ def detect(
         cell_px: side of a cell in pixels of `grey`.
 
     Returns:
-        Pixels (n, 2) and the cells (n,) they lie in, row-major.
+        Pixels (n, 2) and their cells (n,), row-major.
     """
     texture = cv2.cornerMinEigenVal(grey, 5)
     inner = np.zeros_like(texture)

@@ -1,13 +1,14 @@
 """`MapFrame`: from the frame that a map was adjusted in to the robot's base frame, and back.
 
 Bundle adjustment changes the stated poses of a recording. Three parts of that change are errors of
-the map's frame and not of single frames, so answers undo them: a transform common to all cameras
-(an error of `gripper_from_camera`, or of the sensor that stated the poses), corrections that vary
-slowly over the recording (a drifting depth fusion, an arm that sags), and the similarity of a map
-whose own frame is not the base frame.
+the map's frame and not of single frames, so localization undoes them:
 
-Corrections are undone only where they are correlated: each frame's correction is predicted from
-those of its neighbours. Noise cannot be predicted, so it is not undone.
+- a transform common to all cameras: an error of `gripper_from_camera` or of the sensor that stated
+  the poses;
+- corrections that vary slowly over the recording: a drifting depth fusion, an arm that sags;
+- the similarity of a map whose own frame is not the base frame.
+
+Slow corrections are predicted from neighbouring frames. Noise cannot be predicted and remains.
 """
 
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ Array = NDArray[np.float64]
 
 RADII = ((0.1, 10.0), (0.2, 15.0), (0.4, 25.0))
 """Candidate correlation lengths of corrections, metres and degrees."""
-LEAST_EXPLAINED = 0.3
+MIN_EXPLAINED = 0.3
 """Share of the corrections' variance that neighbours must explain."""
 SHRINKAGE = 0.3
 """Weight of a zero correction, in neighbours."""
@@ -33,7 +34,7 @@ class FrameCorrection:
 
     poses: SE3
     """(n,) base_from_camera as adjusted, without the common transform."""
-    correction: Array
+    correction: NDArray[np.floating]
     """(n, 6) in the camera frame, metres and radians."""
     radius: tuple[float, float]
     """Correlation length, metres and radians."""
@@ -75,14 +76,14 @@ class MapFrame:
     common: SE3 = field(default_factory=SE3.identity)
     """stated_camera_from_camera: adjusted poses are stated poses times this."""
     correction: FrameCorrection | None = None
-    """Slowly varying corrections; None where they are not correlated."""
+    """Slowly varying corrections; None if neighbours do not predict them."""
     pose_sigma: tuple[float, float] = (0.0, 0.0)
     """Standard deviation of the adjusted poses per axis, metres and radians."""
     similarity: Similarity | None = None
-    """From the frame that the recording states to the base frame; None if they are the same."""
+    """From the frame of the recording to the base frame; None if both are the same."""
     base_covariance: Array | None = None
-    """(6, 6) of a small motion of the base frame that all answers share, metres and radians. None
-    where poses were stated in it."""
+    """(6, 6) of a small motion of the base frame that is common to all answers, metres and radians.
+    None for poses that were stated in the base frame."""
 
     def to_base(self, map_from_camera: UncertainPose) -> UncertainPose:
         """Transform a pose that was estimated from landmarks to the base frame.
@@ -134,7 +135,7 @@ class MapFrame:
         return pose @ SE3.exp(-self.correction.at(stated)) @ self.common.inverse()
 
 
-def fit_correction(poses: SE3, correction: Array) -> FrameCorrection | None:
+def fit_correction(poses: SE3, correction: NDArray[np.floating]) -> FrameCorrection | None:
     """Fit the correlation length of corrections.
 
     Args:
@@ -142,12 +143,12 @@ def fit_correction(poses: SE3, correction: Array) -> FrameCorrection | None:
         correction: (n, 6) of each pose, without the common transform and the time shift.
 
     Returns:
-        None where neighbours explain too little of the corrections.
+        None if neighbours explain too little of the corrections.
     """
     scale = np.repeat([np.abs(correction[:, :3]).mean(), np.abs(correction[:, 3:]).mean()], 3)
     if (scale[[0, 3]] < [1e-4, 1e-5]).any():
         return None
-    best: tuple[float, tuple[float, float]] = (LEAST_EXPLAINED, RADII[0])
+    best: tuple[float, tuple[float, float]] = (MIN_EXPLAINED, RADII[0])
     total = float(((correction / scale) ** 2).sum())
     for metres, degrees in RADII:
         radius = (metres, float(np.deg2rad(degrees)))
@@ -157,7 +158,7 @@ def fit_correction(poses: SE3, correction: Array) -> FrameCorrection | None:
         explained = 1 - float((((correction - predicted) / scale) ** 2).sum()) / total
         if explained > best[0]:
             best = (explained, radius)
-    if best[0] <= LEAST_EXPLAINED:
+    if best[0] <= MIN_EXPLAINED:
         return None
     return FrameCorrection(poses, correction, best[1])
 

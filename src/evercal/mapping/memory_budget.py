@@ -1,4 +1,4 @@
-"""Keyframes that a scene keeps: a share of its frames, a size in bytes, or the fewest needed."""
+"""Keyframes per scene: a share of the frames, a size in bytes, or the fewest needed."""
 
 import re
 from collections.abc import Sequence
@@ -32,10 +32,10 @@ class MemoryBudget:
 
     @classmethod
     def parse(cls, memory: str | int) -> "MemoryBudget":
-        """Read a budget as people write it: `10%`, `5MB`, `512KiB`, `100000` or `auto`.
+        """Read a budget: `10%`, `5MB`, `512KiB`, `100000` or `auto`.
 
         Raises:
-            InputError: Another word, or a budget without room for a keyframe.
+            InputError: Another format, or a budget without room for a keyframe.
         """
         text = str(memory).strip()
         if text.lower() == AUTO:

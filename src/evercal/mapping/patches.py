@@ -1,8 +1,8 @@
-"""Image patches that are found again in other views to about a tenth of a pixel.
+"""Image patches that are aligned in other views to about a tenth of a pixel.
 
 Inverse-compositional Lucas-Kanade alignment (Baker and Matthews, IJCV 2004): the templates, their
-gradients and their Hessians belong to a keyframe and are made once; the other image is only
-sampled. Patches are compared with zero mean and unit deviation, so gain and offset drop out.
+gradients and their Hessians belong to a keyframe and are computed once; the other image is only
+sampled. Patches have zero mean and unit deviation, so gain and offset of the image drop out.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ _MEAN = np.full(SIDE * SIDE, 1 / SIDE**2, np.float32)
 
 
 def image_pyramid(grey: np.ndarray, levels: int) -> list[Array]:
-    """Float images (h, w), each half the size of the one before; level 0 is the image itself."""
+    """Float images (h, w), each half the size of the previous one; level 0 is the image."""
     pyramid = [grey.astype(np.float32)]
     for _ in range(levels - 1):
         height, width = (side // 2 for side in pyramid[-1].shape)
@@ -61,14 +61,14 @@ class Patches:
     intensity: Array
     """(n, p) zero mean, unit deviation."""
     descent: Array
-    """(n, 2, p): the step in keyframe pixels that a difference of intensities asks for."""
+    """(n, 2, p) step in keyframe pixels for a difference of intensities."""
     inverse_hessian: Array
     """(n, 2, 2) covariance of the aligned position in pixels per unit of intensity noise."""
     rest: Array
-    """(n, 2) `descent` of the template itself, which every step leaves out."""
+    """(n, 2) `descent` of the template itself, subtracted from every step."""
 
     def take(self, index: np.ndarray | slice) -> "Patches":
-        """Some of them."""
+        """The patches of an index."""
         return Patches(
             self.intensity[index],
             self.descent[index],
@@ -78,7 +78,7 @@ class Patches:
 
     @classmethod
     def joined(cls, parts: Sequence["Patches"]) -> "Patches":
-        """Those of several sets, one set after the other."""
+        """Several sets of patches as one."""
         return cls(
             np.concatenate([part.intensity for part in parts]),
             np.concatenate([part.descent for part in parts]),
@@ -88,10 +88,10 @@ class Patches:
 
 
 def cut_patches(image: Array, pixels: Array) -> Patches:
-    """Patches of 11x11 pixels round (n, 2) pixels of a float image of one pyramid level."""
+    """Patches of 11x11 pixels around (n, 2) pixels of a float image of one pyramid level."""
     n = len(pixels)
-    at = pixels.astype(np.float32)
-    wide = _sample(image, at[:, :1] + _WIDE[:, 0], at[:, 1:] + _WIDE[:, 1])
+    centre = pixels.astype(np.float32)
+    wide = _sample(image, centre[:, :1] + _WIDE[:, 0], centre[:, 1:] + _WIDE[:, 1])
     wide = wide.reshape(n, SIDE + 2, SIDE + 2)
     slope_u = (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2
     slope_v = (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2
@@ -109,13 +109,13 @@ def cut_patches(image: Array, pixels: Array) -> Patches:
 def align_patches(
     patches: Patches, image: Array, centres: Array, affines: Array, iterations: int
 ) -> tuple[Array, Array]:
-    """Moves patches in another image to where they fit.
+    """Align patches in another image.
 
     Args:
         patches: n templates.
         image: float image (h, w) of the same pyramid level.
         centres: (n, 2) pixels to start from.
-        affines: (n, 2, 2) from keyframe pixels to pixels of this image round the centre.
+        affines: (n, 2, 2) from keyframe pixels to pixels of this image around the centre.
         iterations: Gauss-Newton steps.
 
     Returns:
@@ -124,22 +124,23 @@ def align_patches(
     if len(centres) > _MOST_ROWS:
         starts = range(0, len(centres), _MOST_ROWS)
         parts = [slice(start, start + _MOST_ROWS) for start in starts]
-        done = [
+        aligned = [
             align_patches(patches.take(p), image, centres[p], affines[p], iterations) for p in parts
         ]
-        return np.concatenate([d[0] for d in done]), np.concatenate([d[1] for d in done])
+        pixels, correlations = zip(*aligned, strict=True)
+        return np.concatenate(pixels), np.concatenate(correlations)
     affines = affines.astype(np.float32)
-    # One plane for each coordinate: interleaved ones take three times as long to add.
+    # One array for each coordinate: interleaved ones take three times as long to add.
     right, down = affines[:, 0] @ _OFFSETS.T, affines[:, 1] @ _OFFSETS.T
-    at = centres.astype(np.float32)
+    centre = centres.astype(np.float32)
     for _ in range(iterations):
-        values, deviation = _centred(_sample(image, at[:, :1] + right, at[:, 1:] + down))
+        values, deviation = _centred(_sample(image, centre[:, :1] + right, centre[:, 1:] + down))
         step = np.einsum("nkp,np->nk", patches.descent, values) / deviation - patches.rest
         step = step.clip(-_LONGEST_STEP, _LONGEST_STEP)
-        at = at - (affines @ step[..., None])[..., 0]
-    values, deviation = _centred(_sample(image, at[:, :1] + right, at[:, 1:] + down))
+        centre = centre - (affines @ step[..., None])[..., 0]
+    values, deviation = _centred(_sample(image, centre[:, :1] + right, centre[:, 1:] + down))
     product = np.einsum("np,np->n", values, patches.intensity)
-    return at, product / (deviation[:, 0] * values.shape[1])
+    return centre, product / (deviation[:, 0] * values.shape[1])
 
 
 def align_down(
@@ -153,21 +154,21 @@ def align_down(
 
     Args:
         levels: templates of each pyramid level.
-        pyramid: the other image, as `image_pyramid` gives it.
+        pyramid: `image_pyramid` of the other image.
         start: (n, 2) pixels of level 0 to start from.
         affines: (n, 2, 2), see `align_patches`.
-        steps: (level, iterations) in turn.
+        steps: (level, iterations), in order.
 
     Returns:
         Pixels (n, 2) of level 0 and the correlation (n,) at the last level.
     """
-    at, correlation = start, np.zeros(len(start))
+    pixels, correlation = start, np.zeros(len(start))
     for level, iterations in steps:
-        at, correlation = align_patches(
-            levels[level], pyramid[level], to_level(at, level), affines, iterations
+        pixels, correlation = align_patches(
+            levels[level], pyramid[level], to_level(pixels, level), affines, iterations
         )
-        at = from_level(at.astype(np.float64), level)
-    return at, correlation
+        pixels = from_level(pixels.astype(np.float64), level)
+    return pixels, correlation
 
 
 def whitening(
@@ -179,16 +180,15 @@ def whitening(
 ) -> Array:
     """(n, 2, 2) matrices that make the errors of aligned positions independent, of unit variance.
 
-    A patch on an edge is located well across the edge and badly along it; its Hessian says so.
+    A patch on an edge is located well across the edge and badly along it, as its Hessian shows.
 
     Args:
         affines: (n, 2, 2) from keyframe pixels to pixels of the other image.
         inverse_hessian: (n, 2, 2) of the patches.
-        floor_px: error of a perfect patch where `noise` is 1, pixels; it grows with `noise`, so
-            that 0.1 stands for 0.08 px where that is 0.8.
+        floor_px: error of a perfect patch where `noise` is 1, pixels; it grows with `noise`.
         noise: standard deviation of intensities, in deviations of a patch.
-        shift_px: (n, 2) one standard deviation of an error along one line, as that of a landmark
-            whose depth is uncertain.
+        shift_px: (n, 2) one standard deviation of an error along a line, such as the epipolar
+            line of a landmark with an uncertain depth.
     """
     spread = (affines @ inverse_hessian @ affines.transpose(0, 2, 1)).astype(np.float64)
     spread = noise**2 * (spread + floor_px**2 * np.eye(2))

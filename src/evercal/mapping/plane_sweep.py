@@ -1,12 +1,12 @@
-"""How far away the cells of a view are: a plane sweep over other posed views of its scene.
+"""Depths of the cells of a view: a plane sweep over other posed views of its scene.
 
-A single reprojection does not see depth, and a head that fits it view by view has the depth of a
-cell right to no more than some percent. Other views that show the same surface decide it: along a
-cell's ray, features agree best where the surface is (Collins, A space-sweep approach, CVPR 1996).
+Along a cell's ray, the features of other views are most similar where the surface is (Collins, A
+space-sweep approach, CVPR 1996).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,18 +20,21 @@ from evercal.geometry.se3 import SE3
 NEAR_M, USUAL_M, FAR_M = 0.25, 1.5, 12.0
 """Depths in a room; other recordings scale them (`pose_check.depth_scale`)."""
 PLANES = 96
+"""Inverse depths that are tried."""
 SEEN_BY = 4
-"""A depth is scored by the mean similarity over its 4 best views, for others may be occluded."""
+"""A depth is scored by the mean similarity of this many best views; others may be occluded."""
 SMOOTHING = 0.7
-"""Share of a cell's neighbours in its likeness to a depth."""
+"""Share of a cell's neighbours in its similarity."""
 GUESS_WEIGHT, GUESS_SPREAD = 0.2, 0.15
-"""What nearness to the guess is worth, as likeness; spread in parts of the depth."""
+"""Similarity added near the guess, and its standard deviation relative to the depth."""
 PARALLAX_RAD = np.deg2rad([4.0, 20.0, 35.0])
 """Parallax of a good view: at least the first, at most the second, useless from the third on."""
 MIN_SHARED = 0.1
+"""Smallest mean usefulness of a source view."""
 PROBES = 64
-ALIKE = 0.4
+MIN_SIMILARITY = 0.4
 OUTLIER_PX = 4.0
+"""Residuals beyond this have little weight in the refinement."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,24 +58,22 @@ class PosedCells:
     def rays(self) -> np.ndarray:
         """(h * w, 3) rays through the cell centres in the camera frame, at depth 1.
 
-        nan where the distortion has no ray for a cell.
+        NaN where the distortion has no ray for a cell.
         """
-        c, pixels = self.camera, ideal_cell_pixels(self.camera, self.stride).astype(float)
-        plane = (pixels - [c.cx, c.cy]) / [c.fx, c.fy]
-        return np.concatenate([plane, np.ones((len(plane), 1))], 1)
+        return self.camera.pinhole.unproject(ideal_cell_pixels(self.camera, self.stride))
 
 
 def select_source_views(
     depth_m: np.ndarray, view: PosedCells, poses: SE3, cameras: Sequence[Camera], count: int
 ) -> list[int]:
-    """Which of n other views tell the depths of a view best: they see the same under parallax.
+    """Select the views that show the surfaces of a view under good parallax.
 
     Args:
-        depth_m: (h * w,) depths, roughly.
-        view: whose cells these are.
-        poses: (n,) base_from_camera.
+        depth_m: (h * w,) rough depths of the view's cells.
+        view: the view.
+        poses: (n,) base_from_camera of the other views.
         cameras: n, at working size.
-        count: how many at most.
+        count: number of views, at most.
     """
     some = np.linspace(0, len(depth_m) - 1, PROBES).astype(int)
     points = view.base_from_camera.apply(view.rays()[some] * depth_m[some, None])
@@ -83,17 +84,17 @@ def select_source_views(
     within = other @ poses.rotation_matrix()
     front = within[..., 2:] > 0
     within = np.where(front, within, [0, 0, 1])
-    seen = front[..., 0]
+    visible = front[..., 0]
     for camera in set(cameras):
         rows = [i for i, own_camera in enumerate(cameras) if own_camera == camera]
         pixels = camera.project(within[rows])
-        seen[rows] &= ((pixels > 0) & (pixels < [camera.width, camera.height])).all(-1)
+        visible[rows] &= ((pixels > 0) & (pixels < [camera.width, camera.height])).all(-1)
     other /= np.linalg.norm(other, axis=-1, keepdims=True) + 1e-9
     parallax = np.arccos(np.clip((own * other).sum(-1), -1, 1))
     useful = np.clip(parallax / few, 0, 1) * np.clip((many - parallax) / (many - enough), 0, 1)
-    worth = np.where(seen, useful, 0).mean(-1)
-    best = np.argsort(-worth, kind="stable")[:count]
-    return [int(i) for i in best if worth[i] > MIN_SHARED]
+    usefulness = np.where(visible, useful, 0).mean(-1)
+    best = np.argsort(-usefulness, kind="stable")[:count]
+    return [int(i) for i in best if usefulness[i] > MIN_SHARED]
 
 
 def inverse_depths(
@@ -105,16 +106,15 @@ def inverse_depths(
 ) -> Tensor:
     """Inverse depth of every cell along the optical axis.
 
-    First the plane whose cells look most alike in other views and near the guess, then two
-    Gauss-Newton steps along the ray towards the places, to a fraction of a cell, where each other
-    view looks most alike.
+    The plane with the most similar features is refined by two Gauss-Newton steps along the ray,
+    towards the sub-cell peaks of similarity in the other views.
 
     Args:
-        view: whose cells are asked for.
-        others: see `select_source_views`; with none the guess stands.
-        guess_m: (h * w,) depths in metres, roughly right.
-        guess_weight: what nearness to the guess is worth, as similarity; 0 leaves it out.
-        scale: of the depths that are searched, see `NEAR_M`.
+        view: the view.
+        others: see `select_source_views`; without other views the guess is returned.
+        guess_m: (h * w,) rough depths, metres.
+        guess_weight: similarity added near the guess.
+        scale: factor on the depths that are searched, see `NEAR_M`.
 
     Returns:
         (h * w,) per metre, within 1 / 12 and 1 / 0.25 over the scale.
@@ -126,97 +126,104 @@ def inverse_depths(
     sources = [_SourceView(view, other) for other in others]
     planes = torch.linspace(least, most, PLANES)
     spread = planes.expand(len(guess), PLANES)
-    alike = torch.stack([source.along(spread) for source in sources])
-    score = alike.topk(min(SEEN_BY, len(sources)), 0).values.mean(0)
+    similarity = torch.stack([source.along(spread) for source in sources])
+    score = similarity.topk(min(SEEN_BY, len(sources)), 0).values.mean(0)
     volume = score.T.reshape(1, PLANES, *view.grid)
     near = F.avg_pool2d(volume, 3, 1, 1, count_include_pad=False)
     score = (volume + SMOOTHING * (near - volume)).view(PLANES, -1).T
     off = (planes[None] / guess[:, None]).log() / GUESS_SPREAD
     score = score + guess_weight * torch.exp(-0.5 * off * off)
-    found = planes[score.argmax(1)]
+    inverse = planes[score.argmax(1)]
     for _ in range(2):
-        pull, hold = torch.zeros_like(found), torch.full_like(found, 1e-3)
+        gradient, hessian = torch.zeros_like(inverse), torch.full_like(inverse, 1e-3)
         for source in sources:
-            pull_one, hold_one = source.step(found)
-            pull, hold = pull + pull_one, hold + hold_one
-        step = (pull / hold).clamp(-0.1 / scale, 0.1 / scale)
-        found = (found + step).clamp(least, most)
-    return found
+            one = source.normal_equation(inverse)
+            gradient, hessian = gradient + one.gradient, hessian + one.hessian
+        step = (gradient / hessian).clamp(-0.1 / scale, 0.1 / scale)
+        inverse = (inverse + step).clamp(least, most)
+    return inverse
+
+
+class _NormalEquation(NamedTuple):
+    gradient: Tensor
+    """(cells,)."""
+    hessian: Tensor
+    """(cells,)."""
 
 
 class _SourceView:
-    """One other view, asked where it shows what a cell shows."""
+    """Similarity of the cells of a view to all cells of one other view."""
 
     def __init__(self, view: PosedCells, other: PosedCells):
         self.other, (self.rows, self.columns) = other, other.grid
-        turn = other.base_from_camera.inverse() @ view.base_from_camera
-        self.ray = view.rays() @ turn.rotation_matrix().T
-        self.shift = turn.translation_m
-        self.alike = (view.features @ other.features.T).view(-1, *other.grid)
+        other_from_view = other.base_from_camera.inverse() @ view.base_from_camera
+        self.ray = view.rays() @ other_from_view.rotation_matrix().T
+        self.translation = other_from_view.translation_m
+        self.similarity = (view.features @ other.features.T).view(-1, *other.grid)
 
     def pixels(self, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (..., 2) of cells at inverse depths (cells, ...), and which this view may see."""
+        """Pixels (..., 2) of cells at inverse depths (cells, ...), and whether they are visible."""
         ray = self.ray.reshape(len(self.ray), *[1] * (inverse.ndim - 1), 3)
-        point = ray + inverse[..., None] * self.shift
+        point = ray + inverse[..., None] * self.translation
         front = point[..., 2] > 0.05
         pixels = self.other.camera.project(np.where(front[..., None], point, [0, 0, 1]))
         return np.nan_to_num(pixels), front & np.isfinite(pixels).all(-1)
 
     def along(self, inverse: Tensor) -> Tensor:
-        """(cells, planes) likeness at inverse depths, 0 where this view sees nothing."""
+        """(cells, planes) similarity at inverse depths, 0 outside this view."""
         pixels, front = self.pixels(inverse.double().numpy())
         size = np.array([self.columns, self.rows]) * self.other.stride
         inside = front & (pixels > -4).all(-1) & (pixels < size + 4).all(-1)
         grid = torch.from_numpy((pixels + 0.5) / size * 2 - 1).float()
-        found = F.grid_sample(
-            self.alike[:, None], grid[:, None], align_corners=False, padding_mode="border"
+        sampled = F.grid_sample(
+            self.similarity[:, None], grid[:, None], align_corners=False, padding_mode="border"
         )
-        return found[:, 0, 0].clamp(min=0) * torch.from_numpy(inside)
+        return sampled[:, 0, 0].clamp(min=0) * torch.from_numpy(inside)
 
-    def step(self, inverse: Tensor) -> tuple[Tensor, Tensor]:
-        """Right and left side (cells,) of the normal equation of each cell's inverse depth."""
-        at = inverse.double().numpy()
-        pixels, front = self.pixels(at)
+    def normal_equation(self, inverse: Tensor) -> _NormalEquation:
+        """Least squares in the inverse depth of each cell."""
+        rho = inverse.double().numpy()
+        pixels, front = self.pixels(rho)
         delta = 1e-4
-        slope = torch.from_numpy((self.pixels(at + delta)[0] - pixels) / delta).float()
+        slope = torch.from_numpy((self.pixels(rho + delta)[0] - pixels) / delta).float()
         here = torch.from_numpy(pixels).float()
         stride = self.other.stride
         cell = ((here - (stride - 1) / 2) / stride).round()
         last = torch.tensor([self.columns - 2, self.rows - 2])
         inside = torch.from_numpy(front) & (cell >= 1).all(1) & (cell <= last).all(1)
         column, row = cell.clamp(min=1).minimum(last.float()).long().unbind(1)
-        where, likeness = peak(self.alike, row, column)
-        residual = stride * where + (stride - 1) / 2 - here
-        weight = inside * (likeness - ALIKE).clamp(min=0) ** 2
+        position, similarity = peak(self.similarity, row, column)
+        residual = stride * position + (stride - 1) / 2 - here
+        weight = inside * (similarity - MIN_SIMILARITY).clamp(min=0) ** 2
         weight = weight / (1 + (residual.norm(dim=1) / OUTLIER_PX) ** 2)
-        return weight * (slope * residual).sum(1), weight * (slope * slope).sum(1)
+        return _NormalEquation(weight * (slope * residual).sum(1), weight * (slope * slope).sum(1))
 
 
-def peak(alike: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
-    """The most alike cell of the 3x3 round a cell, to a fraction of a cell.
+def peak(similarity: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
+    """The most similar cell of the 3x3 around a cell, to a fraction of a cell.
 
     Args:
-        alike: (n, h, w) likeness of n cells to those of a view.
+        similarity: (n, h, w) of n cells to all cells of another view.
         row: (n,) in 1 .. h - 2.
         column: (n,) in 1 .. w - 2.
 
     Returns:
-        (n, 2) column and row, and the likeness (n,) of the whole cell there.
+        (n, 2) column and row, and the similarity (n,) of the nearest cell.
     """
-    _, height, width = alike.shape
-    n = torch.arange(len(alike))
+    _, height, width = similarity.shape
+    n = torch.arange(len(similarity))
     steps = torch.tensor([(v, u) for v in (-1, 0, 1) for u in (-1, 0, 1)])
-    patch = alike[n[:, None], row[:, None] + steps[:, 0], column[:, None] + steps[:, 1]]
+    patch = similarity[n[:, None], row[:, None] + steps[:, 0], column[:, None] + steps[:, 1]]
     best = steps[patch.argmax(1)]
     row = (row + best[:, 0]).clamp(1, height - 2)
     column = (column + best[:, 1]).clamp(1, width - 2)
-    middle = alike[n, row, column]
-    du = parabola(alike[n, row, column - 1], middle, alike[n, row, column + 1])
-    dv = parabola(alike[n, row - 1, column], middle, alike[n, row + 1, column])
+    middle = similarity[n, row, column]
+    du = parabola(similarity[n, row, column - 1], middle, similarity[n, row, column + 1])
+    dv = parabola(similarity[n, row - 1, column], middle, similarity[n, row + 1, column])
     return torch.stack([column + du, row + dv], 1), middle
 
 
 def parabola(before: Tensor, middle: Tensor, after: Tensor) -> Tensor:
-    """Where a parabola through three values has its top, within half a step of the middle one."""
-    bend = (before - 2 * middle + after).clamp(max=-1e-3)
-    return (0.5 * (before - after) / bend).clamp(-0.5, 0.5)
+    """Maximum of a parabola through three values, relative to the middle; at most half a step."""
+    curvature = (before - 2 * middle + after).clamp(max=-1e-3)
+    return (0.5 * (before - after) / curvature).clamp(-0.5, 0.5)

@@ -1,8 +1,8 @@
-"""Finds frames whose stated pose contradicts the images, before anything is built on it.
+"""Detect frames whose stated pose contradicts the images.
 
-Two frames that look alike show the same surfaces. A patch of one must then lie in the other on the
-segment that its viewing ray spans between the nearest and the farthest depth. Where most patches do
-not, one of the two poses is wrong; the one that contradicts most of its partners is named.
+Similar frames show the same surfaces. A cell of one then matches a cell of the other that lies on
+the segment of its viewing ray between the nearest and the farthest depth. If most matches do not,
+one of the two poses is wrong: the one that contradicts most of its partners.
 """
 
 from dataclasses import dataclass
@@ -14,56 +14,58 @@ from numpy.typing import NDArray
 from evercal.features.precision import fast_bfloat16
 from evercal.features.views import ideal_cell_pixels
 from evercal.features.vlad import Vlad
+from evercal.geometry import Camera
 from evercal.mapping.plane_sweep import FAR_M, NEAR_M, USUAL_M
 from evercal.mapping.prepared_frames import PreparedFrames
 
 Array = NDArray[np.floating]
 
-CLEAR_PX, BESIDE_PX = 16.0, 4.0
-"""Matches tell depths where parallax moves them by more than the first, and they lie nearer to
-their lines than the second: pixels at the encoder's working size."""
-LEAST_DEPTHS = 100
-"""Fewer of them tell nothing."""
+MIN_PARALLAX_PX, MAX_EPIPOLAR_PX = 16.0, 4.0
+"""Matches are triangulated if parallax moves them by more than the first, and they lie nearer to
+their epipolar lines than the second. Pixels at the encoder's working size."""
+MIN_DEPTHS = 100
+"""Triangulated matches that a depth scale needs."""
 
 
 @dataclass(frozen=True)
 class PoseCheckOptions:
-    """What makes a stated pose wrong."""
+    """When a stated pose contradicts the images."""
 
     partners: int = 5
-    """Every frame is compared with this many frames that look most alike."""
+    """Most similar frames that each frame is compared with."""
     max_distance_px: float = 6.0
-    """Median distance of matched patches from their segments in a pair that agrees, pixels at the
+    """Largest median distance of matches from their segments in a consistent pair, pixels at the
     encoder's working size."""
     min_similarity: float = 0.6
     """Smallest cosine of matched features."""
     min_matches: int = 30
-    """Pairs with fewer mutual matches say nothing."""
+    """Pairs with fewer mutual matches are ignored."""
     stride: int = 3
-    """Every so many-th patch is matched."""
+    """Step between the cells of the first frame that are matched."""
 
 
 @dataclass(frozen=True, eq=False)
 class MatchedPair:
-    """Two frames that look alike and what matches between them, pixels of the ideal pinhole."""
+    """Two similar frames and their matches, without distortion."""
 
     first: int
     second: int
     """Numbers of the frames."""
     ray: Array
-    """(n, 3) in the first one's camera frame, at depth 1."""
-    seen: Array
-    """(n, 2) pixels at working size in the second one."""
+    """(n, 3) in the camera frame of the first, at depth 1."""
+    pixels: Array
+    """(n, 2) in the second, at working size."""
 
 
 def matched_pairs(
     recording: PreparedFrames, vlad: Vlad, options: PoseCheckOptions
 ) -> list[MatchedPair]:
-    """Every frame with those that look most alike, where enough of their patches match."""
+    """Match every frame with the most similar ones."""
     count = len(recording)
-    whole = torch.stack([vlad(recording.features(i)) for i in range(count)])
-    alike = (whole @ whole.T).fill_diagonal_(-1).topk(min(options.partners, count - 1)).indices
-    pairs = sorted({(min(i, j), max(i, j)) for i, row in enumerate(alike.tolist()) for j in row})
+    descriptors = torch.stack([vlad(recording.features(i)) for i in range(count)])
+    similarity = (descriptors @ descriptors.T).fill_diagonal_(-1)
+    partners = similarity.topk(min(options.partners, count - 1)).indices.tolist()
+    pairs = sorted({(min(i, j), max(i, j)) for i, row in enumerate(partners) for j in row})
     matched = [_matched(recording, i, j, options) for i, j in pairs]
     return [pair for pair in matched if len(pair.ray) >= options.min_matches]
 
@@ -71,13 +73,13 @@ def matched_pairs(
 def contradicting_frames(
     recording: PreparedFrames, pairs: list[MatchedPair], options: PoseCheckOptions
 ) -> NDArray[np.int64]:
-    """Frames whose stated pose disagrees with most of the frames that look alike."""
+    """Frames whose stated pose contradicts most of their partners."""
     count = len(recording)
-    judged = [(pair.first, pair.second, _distance(recording, pair)) for pair in pairs]
+    rest = [(pair.first, pair.second, _distance(recording, pair)) for pair in pairs]
     bad: list[int] = []
-    while judged:
+    while rest:
         against, total = np.zeros(count), np.zeros(count)
-        for i, j, distance in judged:
+        for i, j, distance in rest:
             for frame in (i, j):
                 total[frame] += 1
                 against[frame] += distance > options.max_distance_px
@@ -86,19 +88,19 @@ def contradicting_frames(
         if share[worst] <= 0.5:
             break
         bad.append(worst)
-        judged = [pair for pair in judged if worst not in pair[:2]]
+        rest = [pair for pair in rest if worst not in pair[:2]]
     return np.array(sorted(bad), np.int64)
 
 
 def depth_scale(recording: PreparedFrames, pairs: list[MatchedPair]) -> float:
-    """How far away surfaces are, in parts of what is usual in a room; 1 where that range fits.
+    """Estimate the usual depth relative to that in a room; 1 if the range of a room fits.
 
-    Recordings have other scales where their unit of length is unknown, and seen from a wrist or in
-    a hall. Matches that parallax moves clearly are triangulated.
+    Recordings have other scales if their unit of length is unknown, on a wrist, or in a hall.
+    Matches with clear parallax are triangulated.
     """
     depths = [_triangulated(recording, pair) for pair in pairs]
     depth = np.concatenate([np.zeros(0), *depths])
-    if len(depth) < LEAST_DEPTHS:
+    if len(depth) < MIN_DEPTHS:
         return 1.0
     near, middle, far = np.quantile(depth, [0.1, 0.5, 0.9])
     usual = near > NEAR_M and far < FAR_M / 2
@@ -106,7 +108,7 @@ def depth_scale(recording: PreparedFrames, pairs: list[MatchedPair]) -> float:
 
 
 def _matched(recording: PreparedFrames, i: int, j: int, options: PoseCheckOptions) -> MatchedPair:
-    """Patches that are most alike both ways."""
+    """Mutual best matches of two frames."""
     a, b = recording.features(i)[:: options.stride], recording.features(j)
     if fast_bfloat16(a.device):
         a, b = a.bfloat16(), b.bfloat16()
@@ -118,43 +120,47 @@ def _matched(recording: PreparedFrames, i: int, j: int, options: PoseCheckOption
     stride = recording.encoder.stride
     camera, other = recording.cell_camera(i), recording.cell_camera(j)
     pixels = ideal_cell_pixels(camera, stride)[(rows[mutual] * options.stride).numpy()]
-    plane = (pixels.astype(np.float64) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    ray = np.concatenate([plane, np.ones((len(plane), 1))], 1)
-    seen = ideal_cell_pixels(other, stride)[best.indices[mutual].numpy()].astype(np.float64)
-    known = np.isfinite(ray).all(1) & np.isfinite(seen).all(1)  # the lens has no ray for some cells
-    return MatchedPair(i, j, ray[known], seen[known])
+    ray = camera.pinhole.unproject(pixels)
+    matched = ideal_cell_pixels(other, stride)[best.indices[mutual].numpy()].astype(np.float64)
+    # Near the edge, the distortion can have no ray for a cell.
+    valid = np.isfinite(ray).all(1) & np.isfinite(matched).all(1)
+    return MatchedPair(i, j, ray[valid], matched[valid])
 
 
 def _distance(recording: PreparedFrames, pair: MatchedPair) -> float:
     """Median distance of matches from their segments."""
     other, scale = recording.cell_camera(pair.second), recording.depth_scale
-    turn, shift = recording.relative(pair.second, pair.first)
-    ends = [
-        _pinhole(other, pair.ray @ turn.T + shift / (scale * depth)) for depth in (FAR_M, NEAR_M)
-    ]
-    return float(np.median(_segment_distance(pair.seen, *ends)))
+    rotation, translation = recording.relative(pair.second, pair.first)
+    start, end = (
+        _pinhole(other, pair.ray @ rotation.T + translation / (scale * depth))
+        for depth in (FAR_M, NEAR_M)
+    )
+    return float(np.median(_segment_distance(pair.pixels, start, end)))
 
 
 def _triangulated(recording: PreparedFrames, pair: MatchedPair) -> Array:
-    """Depths of the matches that parallax moves far along their lines and that lie near them."""
+    """Depths of the matches with clear parallax near their epipolar lines."""
     other = recording.cell_camera(pair.second)
-    turn, shift = recording.relative(pair.second, pair.first)
-    seen = (pair.seen - [other.cx, other.cy]) / [other.fx, other.fy]
-    far = pair.ray @ turn.T
-    # Where (far + shift / depth) is seen: off + along / depth = 0.
-    off, along = far[:, :2] - seen * far[:, 2:], shift[:2] - seen * shift[2]
+    rotation, translation = recording.relative(pair.second, pair.first)
+    plane = other.pinhole.unproject(pair.pixels)[:, :2]
+    far = pair.ray @ rotation.T
+    # The point (far + translation / depth) projects to the match: off + along / depth = 0.
+    off = far[:, :2] - plane * far[:, 2:]
+    along = translation[:2] - plane * translation[2]
     inverse = -(off * along).sum(1) / np.maximum((along**2).sum(1), 1e-18)
     moved = inverse * np.linalg.norm(along, axis=1) * other.fx
     beside = np.linalg.norm(off + along * inverse[:, None], axis=1) * other.fx
-    return 1 / inverse[(moved > CLEAR_PX) & (beside < BESIDE_PX)]
+    return 1 / inverse[(moved > MIN_PARALLAX_PX) & (beside < MAX_EPIPOLAR_PX)]
 
 
-def _pinhole(camera, points: Array) -> Array:
-    plane = points[:, :2] / np.maximum(points[:, 2:], 1e-2)
-    return plane * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+def _pinhole(camera: Camera, points: Array) -> Array:
+    """Pixels (n, 2) of points (n, 3) without distortion; points behind are moved to the front."""
+    depth = np.maximum(points[:, 2:], 1e-2)
+    return camera.pinhole.project(np.concatenate([points[:, :2], depth], 1))
 
 
 def _segment_distance(points: Array, start: Array, end: Array) -> Array:
+    """Distances (n,) of points (n, 2) from segments between start (n, 2) and end (n, 2)."""
     along = end - start
     length = np.maximum((along**2).sum(1), 1e-12)
     share = (((points - start) * along).sum(1) / length).clip(0, 1)

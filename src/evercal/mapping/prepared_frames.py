@@ -1,7 +1,8 @@
-"""The training frames of a scene while its map is built: images, features, poses, lens."""
+"""The training frames of a scene while its map is built: images, features, poses, cameras."""
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from threading import Lock
 
@@ -12,28 +13,28 @@ from torch import Tensor
 from evercal.features.encode import encode_features
 from evercal.features.encoder import Encoder
 from evercal.features.views import View, ViewOptions, plain_view, working_image
-from evercal.geometry.camera import Camera
-from evercal.geometry.se3 import SE3
+from evercal.geometry import SE3, Camera
 from evercal.mapping.patches import image_pyramid
 from evercal.mapping.plane_sweep import PosedCells
 from evercal.recordings.frame import Frame, stated_poses
 
 PYRAMID_LEVELS = 3
 _PYRAMIDS = 128
+"""Image pyramids in memory, at most."""
 
 
 @dataclass(frozen=True)
 class WorkingSize:
-    """Sizes that images are brought to, pixels of the shorter side."""
+    """Sizes that images are resized to, pixels of the shorter side."""
 
     cells: int = 240
     """For the encoder."""
     patches: int = 480
-    """For patches, at most: smaller images stay as they are."""
+    """For patches; smaller images keep their size."""
 
 
 class PreparedFrames:
-    """Posed training frames at working size; poses and lens change while they are adjusted.
+    """Posed training frames at working size; poses and camera change during the adjustment.
 
     Args:
         frames: posed frames of one scene.
@@ -43,8 +44,7 @@ class PreparedFrames:
 
     def __init__(self, frames: Sequence[Frame], encoder: Encoder, size: WorkingSize):
         self.frames, self.encoder, self.size = tuple(frames), encoder, size
-        self.stated = stated_poses(self.frames)
-        self._place(self.stated)
+        self._move(self.stated)
         self.grey: list[NDArray[np.uint8]] = []
         self.cameras: list[Camera] = []
         for frame in self.frames:
@@ -54,47 +54,46 @@ class PreparedFrames:
             self.grey.append(grey)
             self.cameras.append(camera)
         self.depth_scale = 1.0
-        """Of the depths that are looked for, see `plane_sweep.NEAR_M`."""
+        """Factor on the depths that are searched, see `plane_sweep.NEAR_M`."""
         self._features: dict[int, Tensor] = {}
-        self._pyramids: OrderedDict[int, list[np.ndarray]] = OrderedDict()
-        self._lock = Lock()
+        self._pyramids = _Pyramids()
 
-    def without(self, left_out: NDArray[np.int64]) -> "PreparedFrames":
-        """The recording less some frames; what was computed for the others stays."""
-        keep = [i for i in range(len(self)) if i not in set(left_out.tolist())]
-        rest = PreparedFrames.__new__(PreparedFrames)
-        rest.frames, rest.encoder, rest.size = (
-            tuple(self.frames[i] for i in keep),
-            self.encoder,
-            self.size,
-        )
-        rest.depth_scale = self.depth_scale
-        rest.stated = self.stated[np.array(keep)]
-        rest._place(self.poses[np.array(keep)])
-        rest.grey, rest.cameras = [self.grey[i] for i in keep], [self.cameras[i] for i in keep]
-        known = self._features
-        rest._features = {new: known[i] for new, i in enumerate(keep) if i in known}
-        rest._pyramids, rest._lock = OrderedDict(), Lock()
+    def without(self, excluded: NDArray[np.int64]) -> "PreparedFrames":
+        """A copy without some frames; features of the others are not computed again."""
+        index = np.setdiff1d(np.arange(len(self)), excluded)
+        rest = copy(self)
+        rest.frames = tuple(self.frames[i] for i in index)
+        rest.grey = [self.grey[i] for i in index]
+        rest.cameras = [self.cameras[i] for i in index]
+        rest._move(self.poses[index])
+        features = self._features
+        rest._features = {new: features[old] for new, old in enumerate(index) if old in features}
+        rest._pyramids = _Pyramids()
         return rest
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    @property
+    def stated(self) -> SE3:
+        """(n,) base_from_camera as the recording states them."""
+        return stated_poses(self.frames)
 
     def cell_camera(self, i: int) -> Camera:
         """The camera of a frame at the encoder's working size."""
         return self.cameras[i].short_side_resized(self.size.cells)
 
     def cell_px(self, i: int) -> float:
-        """Side of a patch of the feature grid, in pixels of the image that patches are cut from."""
+        """Side of a cell of the feature grid, in pixels of the image that patches are cut from."""
         return self.encoder.stride * self.cameras[i].width / self.cell_camera(i).width
 
     def view(self, i: int) -> View:
-        """What the encoder sees of a frame."""
+        """A frame as the encoder's input."""
         options = ViewOptions(short_side=self.size.cells)
         return plain_view(self.grey[i], self.cameras[i], self.encoder.stride, options)
 
     def features(self, i: int) -> Tensor:
-        """(cells, channels) features of a frame; kept in half precision, on the CPU."""
+        """(cells, channels) features of a frame on the CPU, cached in half precision."""
         if i not in self._features:
             features = encode_features([self.view(i)], self.encoder)
             self._features[i] = features[0].flatten(1).T.half().cpu()
@@ -106,30 +105,42 @@ class PreparedFrames:
         return PosedCells(self.features(i), camera, self.poses[i], stride)
 
     def pyramid(self, i: int) -> list[np.ndarray]:
-        """Image pyramid of a frame; the last ones used stay in memory."""
+        """Image pyramid of a frame."""
+        return self._pyramids.of(i, self.grey[i])
+
+    def relative(self, j: int, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Rotation (3, 3) and translation (3,) of camera j from camera k."""
+        base_from_j, base_from_k = self._matrices[j], self._matrices[k]
+        rotation = base_from_j[:3, :3].T
+        return rotation @ base_from_k[:3, :3], rotation @ (base_from_k - base_from_j)[:3, 3]
+
+    def adjust(self, poses: SE3, camera: Camera | None) -> None:
+        """Replace the poses (n,), base_from_camera, and, if given, the camera of all frames."""
+        self._move(poses)
+        if camera is not None:
+            self.cameras = [camera] * len(self)
+
+    def _move(self, poses: SE3) -> None:
+        # A pose of a batch takes long to multiply; `relative` is called for every observation.
+        self.poses, self._matrices = poses, poses.matrix()
+
+
+class _Pyramids:
+    """The image pyramids that were used last; safe to use from several threads."""
+
+    def __init__(self) -> None:
+        self._pyramids: OrderedDict[int, list[np.ndarray]] = OrderedDict()
+        self._lock = Lock()
+
+    def of(self, i: int, grey: NDArray[np.uint8]) -> list[np.ndarray]:
+        """The pyramid of image i."""
         with self._lock:
             if i in self._pyramids:
                 self._pyramids.move_to_end(i)
                 return self._pyramids[i]
-        pyramid = image_pyramid(self.grey[i], PYRAMID_LEVELS)
+        pyramid = image_pyramid(grey, PYRAMID_LEVELS)
         with self._lock:
             self._pyramids[i] = pyramid
             if len(self._pyramids) > _PYRAMIDS:
                 self._pyramids.popitem(last=False)
         return pyramid
-
-    def relative(self, j: int, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """Rotation (3, 3) and translation (3,) of camera j from camera k."""
-        turn = self.rotation[j].T
-        return turn @ self.rotation[k], turn @ (self.translation_m[k] - self.translation_m[j])
-
-    def adjust(self, poses: SE3, camera: Camera | None) -> None:
-        """Takes over adjusted poses (n,) and, where all frames share one, an adjusted camera."""
-        self._place(poses)
-        if camera is not None:
-            self.cameras = [camera] * len(self)
-
-    def _place(self, poses: SE3) -> None:
-        """Frames are at `poses` (n,), base_from_camera, from now on."""
-        self.poses, self.rotation = poses, poses.rotation_matrix()
-        self.translation_m = poses.translation_m

@@ -1,18 +1,18 @@
-"""Which frames of a scene stay in memory, decided from their camera poses alone.
+"""Selection of the frames of a scene that are stored, from their camera poses alone.
 
-All selectors work inside one scene, take the poses in recorded order and return the kept
+All selectors work inside one scene, take the poses in recorded order and return the selected
 indices in recorded order. Poses are positions in metres, ``(n, 3)``, and unit quaternions
-wxyz, ``(n, 4)``; the frame they are expressed in does not matter, since only distances count.
+wxyz, ``(n, 4)``, in any frame.
 
 The metric is the one of SARS (spatial-aware replay)::
 
     D(a, b) = |p_a - p_b| / longest side + rotation_weight * 2 arccos |q_a . q_b|
 
-with the longest side of the axis-aligned box around the scene's cameras (1 where all cameras
-stand in one place). The angle is computed as ``4 arcsin(chord / 2)``, where ``chord`` is the
-shorter of ``|q_a - q_b|`` and ``|q_a + q_b|``: the same number, but arccos near 1 turns the last
-bit of the dot product into 3e-8 rad, while the chord of two identical rotations (``q`` and
-``-q`` included) is exactly 0. D is symmetric to the last bit, so ties are real ties.
+with the longest side of the axis-aligned box around the scene's cameras (1 if all cameras have
+one position). The angle is computed as ``4 arcsin(chord / 2)``, where ``chord`` is the shorter of
+``|q_a - q_b|`` and ``|q_a + q_b|``. The two are equal, but arccos near 1 is exact to 3e-8 rad only,
+while the chord of identical rotations (``q`` and ``-q`` included) is exactly 0. D is symmetric to
+the last bit, so ties are real ties.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from evercal.geometry.se3 import SE3
 
 @dataclass(frozen=True)
 class SarsOptions:
-    """How SARS judges two poses to be redundant."""
+    """When SARS rejects a pose as redundant."""
 
     radius: float = 0.5
     """Exclusion radius r (scene sides + weighted radians): closer frames are rejected."""
     rotation_weight: float = 1.0
     """Weight lambda of the rotation angle (scene sides per radian)."""
     fill: bool = False
-    """Ignore `radius` and use the largest one that still keeps as many frames as allowed."""
+    """Ignore `radius` and use the largest one that fills the capacity."""
 
     def __post_init__(self) -> None:
         """Refuse negative or non-finite numbers."""
         for name in ("radius", "rotation_weight"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"SarsOptions.{name} is {value}; give a finite number >= 0")
+                raise ValueError(f"SarsOptions.{name} is {value}; it is a finite number >= 0")
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class PoseSpace:
         """Check, scale and transpose ``(n, 3)`` positions and ``(n, 4)`` quaternions.
 
         Raises:
-            ValueError: a wrong shape, a number that is not finite, or a zero quaternion.
+            ValueError: A wrong shape, a number that is not finite, or a zero quaternion.
         """
         positions = np.asarray(positions_m, dtype=np.float64)
         quaternions = np.asarray(quaternions_wxyz, dtype=np.float64)
@@ -100,15 +100,15 @@ class PoseSpace:
         others = self if others is None else others
         step = others.positions - self.positions[:, index, None]
         quaternion = self.quaternions[:, index, None]
-        turn = others.quaternions - quaternion
+        difference = others.quaternions - quaternion
         step *= step
-        turn *= turn
-        chord_squared = turn.sum(axis=0)
+        difference *= difference
+        chord_squared = difference.sum(axis=0)
         far = np.flatnonzero(chord_squared > 2.0)  # q and -q are one rotation
         if far.size:
-            turn = others.quaternions[:, far] + quaternion
-            turn *= turn
-            chord_squared[far] = turn.sum(axis=0)
+            difference = others.quaternions[:, far] + quaternion
+            difference *= difference
+            chord_squared[far] = difference.sum(axis=0)
         angle = np.arcsin(np.sqrt(chord_squared) * 0.5)
         angle *= 4.0 * self.rotation_weight
         angle += np.sqrt(step.sum(axis=0))
@@ -131,7 +131,7 @@ class PoseSpace:
 
 
 class _DenseBuffer:
-    """A full SARS buffer: who is whose nearest neighbour, kept up to date under replacement."""
+    """A full SARS buffer with the nearest neighbour of every member."""
 
     def __init__(self, space: PoseSpace, frames: np.ndarray) -> None:
         """Take the frames that filled the buffer; memory is ``len(frames) ** 2`` float64."""
@@ -140,8 +140,8 @@ class _DenseBuffer:
         self._space = space
         self._pairwise = np.stack([space.distances(int(f), self.poses) for f in frames])
         np.fill_diagonal(self._pairwise, np.inf)
-        # Of several nearest neighbours remember the youngest: the older ones are evicted first,
-        # so that a camera standing still does not force a recomputation on every frame.
+        # Of several nearest neighbours the youngest is stored: older ones are evicted first, so
+        # a camera at rest does not force a recomputation for every frame.
         self._witness = np.empty(len(frames), dtype=np.int64)
         self._nearest = np.empty(len(frames))
         self._search(np.arange(len(frames)))
@@ -176,29 +176,29 @@ def _accept_until_full(space: PoseSpace, radius: float, capacity: int) -> np.nda
     if radius == 0 or capacity == 0:
         return np.arange(min(capacity, len(space)))
     gap = np.full(len(space), np.inf)  # from each frame to its nearest accepted one
-    kept: list[int] = []
+    accepted: list[int] = []
     frame = 0
-    while len(kept) < capacity:
+    while len(accepted) < capacity:
         free = gap[frame:] >= radius
         ahead = int(free.argmax()) if free.size else 0
         if not free.size or not free[ahead]:
             break
         frame += ahead
-        kept.append(frame)
+        accepted.append(frame)
         later = gap[frame + 1 :]
         np.minimum(later, space.distances(frame, space.from_frame(frame + 1)), out=later)
         frame += 1
-    return np.array(kept, dtype=np.int64)
+    return np.array(accepted, dtype=np.int64)
 
 
 def _checked_capacity(capacity: int) -> int:
     if capacity < 0:
-        raise ValueError(f"capacity is {capacity}; give a number of frames >= 0")
+        raise ValueError(f"capacity is {capacity}; it is a number of frames >= 0")
     return int(capacity)
 
 
 def spread_poses(poses: SE3, capacity: int) -> NDArray[np.int64]:
-    """Which of (n,) poses to take: by SARS with the largest radius that fills the capacity."""
+    """Select some of (n,) poses: by SARS with the largest radius that fills the capacity."""
     if len(poses) <= capacity:
         return np.arange(len(poses))
     fill = SarsOptions(fill=True)
@@ -211,29 +211,29 @@ def select_sars(
     capacity: int,
     options: SarsOptions | None = None,
 ) -> np.ndarray:
-    """Keep frames by Algorithm 1 of the paper, run once over the scene in recorded order.
+    """Select frames by Algorithm 1 of the paper, run once over the scene in recorded order.
 
     A frame closer than r to the buffer is rejected. Otherwise it is appended; if the buffer is
     full, the member with the smallest distance to another member leaves first. That distance
     does not count the new frame. A closest pair always ties, and the older of the two leaves.
     With a buffer of one frame, every accepted frame replaces the one before.
 
-    Two things to know. At r = 0.5 few frames are kept. At an r below the step from frame to
-    frame, the closest pair is mostly the two newest frames, so a full buffer follows the camera
-    and leaves its trail uncovered; ``fill`` has neither fault.
+    At r = 0.5 few frames are selected. With r below the step from frame to frame, the closest pair
+    is mostly the two newest frames, so a full buffer follows the camera and covers little of its
+    path. ``fill`` avoids both.
 
     Args:
         positions_m: ``(n, 3)`` camera positions, metres.
         quaternions_wxyz: ``(n, 4)`` camera orientations.
-        capacity: largest number of frames to keep (N_b).
+        capacity: largest number of frames to select (N_b).
         options: radius, rotation weight, and whether to fill the buffer; see `fill_radius`.
 
     Returns:
-        Kept indices, ascending; with ``fill`` exactly ``min(capacity, n)`` of them, without it
-        often fewer than `capacity`. Time O(n * capacity), memory O(n + capacity ** 2).
+        Selected indices, ascending; with ``fill`` exactly ``min(capacity, n)``, without it often
+        fewer than `capacity`. Time O(n * capacity), memory O(n + capacity ** 2).
 
     Raises:
-        ValueError: a negative capacity or a pose that is not usable.
+        ValueError: A negative capacity or an unusable pose.
     """
     options = options or SarsOptions()
     capacity = _checked_capacity(capacity)
@@ -273,35 +273,36 @@ def select_farthest(
     rotation_weight: float = 1.0,
     start: Sequence[int] = (),
 ) -> np.ndarray:
-    """Keep the frames of `start`, or the first one, and then ever the one farthest from those kept.
+    """Farthest-point sampling of poses.
 
-    Farthest-point sampling: its covering radius is at most twice the smallest one possible.
-    It sees the whole scene at once, which SARS does not. Ties go to the earlier frame.
+    Starting from `start`, or the first frame, the frame farthest from all selected ones is added
+    until the capacity is reached; ties go to the earlier frame. The covering radius is at most
+    twice the smallest one possible. Unlike SARS, it needs the whole scene at once.
     """
     space = PoseSpace.of(positions_m, quaternions_wxyz, rotation_weight)
     gap = np.full(len(space), np.inf)
-    kept = list(start)
-    for place in range(min(_checked_capacity(capacity), len(space))):
-        if place == len(kept):
-            kept.append(int(gap.argmax()))
-        np.minimum(gap, space.distances(kept[place]), out=gap)
-        gap[kept[: place + 1]] = -1.0  # a repeat of a kept pose may be kept, no frame twice
-    return np.sort(np.array(kept, np.int64))
+    selected = list(start)
+    for i in range(min(_checked_capacity(capacity), len(space))):
+        if i == len(selected):
+            selected.append(int(gap.argmax()))
+        np.minimum(gap, space.distances(selected[i]), out=gap)
+        gap[selected[: i + 1]] = -1.0  # another frame with the same pose can still be selected
+    return np.sort(np.array(selected, np.int64))
 
 
 def covering_radius(
     positions_m: np.ndarray,
     quaternions_wxyz: np.ndarray,
-    kept: np.ndarray,
+    selected: np.ndarray,
     rotation_weight: float = 1.0,
 ) -> float:
-    """Return the largest distance D from any frame of the scene to its nearest kept frame.
+    """Largest distance D from any frame of the scene to its nearest selected frame.
 
-    0 for a scene without frames, infinite if frames exist and none is kept.
+    0 for a scene without frames; infinite if frames exist and none is selected.
     """
     space = PoseSpace.of(positions_m, quaternions_wxyz, rotation_weight)
     gap = np.full(len(space), np.inf)
-    for frame in np.asarray(kept, dtype=np.int64):
+    for frame in np.asarray(selected, dtype=np.int64):
         np.minimum(gap, space.distances(int(frame)), out=gap)
     return float(gap.max(initial=0.0))
 
@@ -309,11 +310,11 @@ def covering_radius(
 def smallest_pair(
     positions_m: np.ndarray,
     quaternions_wxyz: np.ndarray,
-    kept: np.ndarray,
+    selected: np.ndarray,
     rotation_weight: float = 1.0,
 ) -> float:
-    """Return the smallest distance D between two kept frames; infinite for fewer than two."""
+    """Smallest distance D between two selected frames; infinite for fewer than two."""
     space = PoseSpace.of(positions_m, quaternions_wxyz, rotation_weight)
-    chosen = np.asarray(kept, dtype=np.int64)
-    near = [space.distances(int(a))[chosen[i + 1 :]].min() for i, a in enumerate(chosen[:-1])]
+    index = np.asarray(selected, dtype=np.int64)
+    near = [space.distances(int(a))[index[i + 1 :]].min() for i, a in enumerate(index[:-1])]
     return float(min(near, default=np.inf))

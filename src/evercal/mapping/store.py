@@ -148,12 +148,12 @@ class MapStore(StageStore):
         """Replace what is stored of a scene beside its keyframes: whole, or not at all.
 
         Args:
-            scene: its map; the name says which scene is replaced.
+            scene: its map; it replaces the scene of the same name.
 
         Raises:
             InputError: As `commit`, and where a file of the store is missing or was changed.
         """
-        index = [known.name for known in self.contents.scenes].index(scene.name)
+        index = [stored.name for stored in self.contents.scenes].index(scene.name)
         self.replace(index, lambda folder: write_scene(folder, scene), self._payload())
         self.contents.scenes[index] = scene
 

@@ -1,11 +1,13 @@
-"""Tracks: where landmarks of keyframes are seen in other frames, by patch alignment."""
+"""Tracks: observations of landmarks in other frames, by patch alignment."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.mapping.bundle_equations import BundleTracks
 from evercal.mapping.landmarks import Landmarks, detect, project_surface, slopes
 from evercal.mapping.patches import Patches, align_down, cut_patches, to_level, whitening
 from evercal.mapping.plane_sweep import (
@@ -18,39 +20,62 @@ from evercal.mapping.plane_sweep import (
 from evercal.mapping.prepared_frames import PYRAMID_LEVELS, PreparedFrames
 
 Array = NDArray[np.floating]
+Index = NDArray[np.int64]
+Steps = Sequence[tuple[int, int]]
+"""Pyramid levels and alignment iterations, see `align_down`."""
+
+
+class _DepthRound(NamedTuple):
+    """One round of depth refinement: alignment, then Gauss-Newton steps on the depths."""
+
+    alignment: Steps
+    updates: int
+
+
+_DEPTH_ROUNDS = (
+    _DepthRound(((1, 6),), 1),
+    _DepthRound(((1, 3), (0, 5)), 2),
+    _DepthRound(((0, 4),), 2),
+)
+_WIDE_STEPS: Steps = ((2, 4), (1, 4), (0, 4))
+_PROBES = 64
+"""Cells of a keyframe that are projected into other frames to measure the shared view."""
+_FAR_OFF_PX = 1e3
+"""Residual of a landmark that the distortion of a camera has no pixel for."""
+_OUTLIER_SQUARES = 16.0
+"""Squared whitened residual above which an observation does not count."""
 
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """How landmarks are found in other frames."""
+    """How landmarks are tracked."""
 
     source_views: int = 12
-    """Frames that tell the depths of a keyframe, at most."""
+    """Frames that the depths of a keyframe are swept over, at most."""
     min_correlation: float = 0.8
     """Smallest normalised cross-correlation of an observation."""
     reach_px: float = 12.0
-    """An observation lies at most this far from where it was expected."""
+    """Largest distance of an observation from its prediction, pixels."""
     wide_reach_px: float = 25.0
     """The same while poses are adjusted."""
     frames_per_keyframe: int = 3
-    """Every frame is tied to this many keyframes that see the same, in bundle adjustment."""
+    """Keyframes that each frame is tied to in bundle adjustment."""
     landmarks_per_keyframe: int = 200
-    """Landmarks of a keyframe that take part in bundle adjustment, at most."""
+    """Landmarks of a keyframe in bundle adjustment, at most."""
     bundle_landmarks: int = 6000
-    """Landmarks in bundle adjustment over all keyframes, at most."""
+    """Landmarks of all keyframes in bundle adjustment, at most."""
     min_shared: float = 0.15
-    """Smallest share of a keyframe's view that a frame tied to it must see."""
+    """Share of a keyframe's view that a frame tied to it must show."""
     floor_px: float = 0.1
-    """Alignment error of a perfect patch where `noise` is 1, pixels: with 0.8, 0.08 px at level 0.
-    """
+    """Alignment error of a perfect patch where `noise` is 1, pixels: 0.08 px where it is 0.8."""
     noise: float = 0.8
     """Standard deviation of intensities in aligned patches, in deviations of a patch."""
     min_views: int = 3
-    """A landmark is kept when at least this many frames agree on it."""
+    """Frames that must agree on a landmark."""
     max_residual_px: float = 0.85
-    """And when the root mean square residual per axis is below this."""
+    """Largest root mean square residual of a landmark per axis, pixels."""
     slant: bool = True
-    """Warp patches by the slant of their surface; else they are parallel to the keyframe."""
+    """Warp patches by the slant of their surface; otherwise they are parallel to the keyframe."""
 
 
 @dataclass(eq=False)
@@ -60,33 +85,33 @@ class KeyframeTracks:
     frame: int
     """Its number in the recording."""
     landmarks: Landmarks
-    """As refined so far."""
+    """Landmarks with their current depths."""
     cell_inverse_depth: np.ndarray
     """(cells,) inverse depth of every cell, per metre."""
     patches: tuple[Patches, ...]
     """Templates of the landmarks in every pyramid level."""
     sources: tuple[int, ...]
-    """Frames that see the same under parallax."""
-    kept: NDArray[np.bool_]
+    """Frames that see the same surfaces under parallax."""
+    confirmed: NDArray[np.bool_]
     """(n,) landmarks that enough frames agree on."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Landmarks of one keyframe seen in other frames."""
+    """Landmarks of one keyframe in other frames."""
 
-    landmark: NDArray[np.int64]
+    landmark: Index
     """(m,)."""
-    frame: NDArray[np.int64]
+    frame: Index
     """(m,)."""
     pixels: Array
     """(m, 2)."""
     whitening: Array
-    """(m, 2, 2) see `patches.whitening`."""
+    """(m, 2, 2), see `patches.whitening`."""
 
 
 def open_keyframe(recording: PreparedFrames, frame: int, options: TrackOptions) -> KeyframeTracks:
-    """Landmarks of a keyframe with depths from a plane sweep over other frames."""
+    """Landmarks of a keyframe, with depths from a plane sweep over other frames."""
     view, poses = recording.posed_cells(frame), recording.poses
     cameras = [recording.cell_camera(i) for i in range(len(recording))]
     scale = recording.depth_scale
@@ -98,41 +123,46 @@ def open_keyframe(recording: PreparedFrames, frame: int, options: TrackOptions) 
     near = select_source_views(1 / inverse, view, poses, cameras, options.source_views)
     cell_px = recording.cell_px(frame)
     pixels, cells = detect(recording.grey[frame], view.grid, cell_px)
-    there = np.isfinite(recording.cameras[frame].unproject(pixels)).all(1)
-    pixels, cells = pixels[there], cells[there]
+    has_ray = np.isfinite(recording.cameras[frame].unproject(pixels)).all(1)
+    pixels, cells = pixels[has_ray], cells[has_ray]
     slant = slopes(inverse, view.grid, cell_px) * options.slant
-    marks = Landmarks(pixels, inverse[cells], slant[cells], np.ones(len(cells)))
     pyramid = recording.pyramid(frame)
-    patches = tuple(
-        cut_patches(pyramid[level], to_level(pixels, level)) for level in range(PYRAMID_LEVELS)
+    return KeyframeTracks(
+        frame=frame,
+        landmarks=Landmarks(pixels, inverse[cells], slant[cells], np.ones(len(cells))),
+        cell_inverse_depth=inverse,
+        patches=tuple(
+            cut_patches(pyramid[level], to_level(pixels, level)) for level in range(PYRAMID_LEVELS)
+        ),
+        sources=tuple(near),
+        confirmed=np.zeros(len(cells), bool),
     )
-    kept = np.zeros(len(cells), bool)
-    return KeyframeTracks(frame, marks, inverse, patches, tuple(near), kept)
 
 
 def observe(
     recording: PreparedFrames,
     keyframe: KeyframeTracks,
     frame: int,
-    which: NDArray[np.int64],
-    steps: Sequence[tuple[int, int]],
-    reach_px: float,
+    which: Index,
+    steps: Steps,
     options: TrackOptions,
+    reach_px: float,
 ) -> Observations:
-    """Finds landmarks of a keyframe in another frame.
+    """Align landmarks of a keyframe in another frame.
 
     Args:
         recording: the frames.
-        keyframe: whose landmarks are looked for.
+        keyframe: its landmarks are aligned.
         frame: the other frame.
-        which: (n,) landmarks to look for.
-        steps: pyramid levels and iterations, see `align_down`.
-        reach_px: how far from the expected place an observation may lie.
-        options: how.
+        which: (n,) landmarks to align.
+        steps: pyramid levels and iterations.
+        options: thresholds and noise of observations.
+        reach_px: largest distance of an observation from its prediction.
     """
     surface = keyframe.landmarks.take(which).surface(recording.cameras[keyframe.frame])
-    turn, shift = recording.relative(frame, keyframe.frame)
-    visible, expected, affines = project_surface(surface, turn, shift, recording.cameras[frame])
+    rotation, translation = recording.relative(frame, keyframe.frame)
+    camera = recording.cameras[frame]
+    visible, expected, affines = project_surface(surface, rotation, translation, camera)
     which = which[visible]
     templates = tuple(level.take(which) for level in keyframe.patches)
     pixels, correlation = align_down(templates, recording.pyramid(frame), expected, affines, steps)
@@ -144,40 +174,118 @@ def observe(
     return Observations(which[good], np.full(good.sum(), frame), pixels[good], white)
 
 
-_DEPTH_ROUNDS = ((((1, 6),), 1), (((1, 3), (0, 5)), 2), (((0, 4),), 2))
-"""(levels and iterations of alignment, Gauss-Newton steps) of each round."""
-
-
 def refine_depths(
     recording: PreparedFrames, keyframe: KeyframeTracks, options: TrackOptions, again: bool = False
 ) -> None:
-    """Gauss-Newton on the inverse depths of a keyframe's landmarks; poses stay.
+    """Refine the inverse depths of a keyframe's landmarks by Gauss-Newton; poses are fixed.
 
     Args:
         recording: the frames.
-        keyframe: whose landmarks are refined.
-        options: how.
-        again: depths are nearly right already, so the coarse round is left out.
+        keyframe: its landmarks are refined, in place.
+        options: thresholds and noise of observations.
+        again: the depths are nearly right, so the coarse round is left out.
     """
     if not keyframe.sources or not len(keyframe.landmarks):
         return
-    seen, which = None, np.arange(len(keyframe.landmarks))
+    observations, which = None, np.arange(len(keyframe.landmarks))
     for steps, updates in _DEPTH_ROUNDS[again:]:
-        found = [
-            observe(recording, keyframe, j, which, steps, options.reach_px, options)
+        parts = [
+            observe(recording, keyframe, j, which, steps, options, options.reach_px)
             for j in keyframe.sources
         ]
-        seen = joined(found)
-        # What hardly any frame sees now will not be seen by enough of them later.
-        count = np.bincount(seen.landmark, minlength=len(keyframe.landmarks))
+        observations = _joined(parts)
+        # Landmarks with too few observations at a coarse level are not tried at a finer one.
+        count = np.bincount(observations.landmark, minlength=len(keyframe.landmarks))
         which = np.flatnonzero(count >= options.min_views - 1)
         for _ in range(updates):
-            _depth_step(recording, keyframe, seen)
-    assert seen is not None
-    _judge(recording, keyframe, seen, options)
+            _update_depths(recording, keyframe, observations)
+    assert observations is not None, "there is at least one round"
+    _confirm(recording, keyframe, observations, options)
 
 
-def joined(parts: Sequence[Observations]) -> Observations:
+def bundle_tracks(
+    recording: PreparedFrames, keyframes: list[KeyframeTracks], options: TrackOptions
+) -> BundleTracks:
+    """Observe a spread subset of the landmarks in all frames that show enough of their keyframe."""
+    most = max(30, min(options.landmarks_per_keyframe, options.bundle_landmarks // len(keyframes)))
+    tied = _tied_frames(recording, keyframes, options)
+    parts: list[Observations] = []
+    host, pixels, inverse, start = [], [], [], 0
+    for keyframe, frames in zip(keyframes, tied, strict=True):
+        which = _bundled(keyframe, most)
+        if not len(which):
+            continue
+        number = np.full(len(keyframe.landmarks), -1)
+        number[which] = start + np.arange(len(which))
+        for j in frames:
+            observed = observe(
+                recording, keyframe, j, which, _WIDE_STEPS, options, options.wide_reach_px
+            )
+            parts.append(replace(observed, landmark=number[observed.landmark]))
+        host.append(np.full(len(which), keyframe.frame))
+        pixels.append(keyframe.landmarks.pixels[which])
+        inverse.append(keyframe.landmarks.inverse_depth[which])
+        start += len(which)
+    observed = _joined(parts)
+    often = np.bincount(observed.landmark, minlength=start)[observed.landmark] >= 2
+    return BundleTracks(
+        host=np.concatenate(host),
+        pixels=np.concatenate(pixels),
+        inverse_depth=np.concatenate(inverse),
+        landmark=observed.landmark[often],
+        frame=observed.frame[often],
+        observed=observed.pixels[often],
+        whitening=observed.whitening[often],
+        depth_scale=recording.depth_scale,
+    )
+
+
+def _bundled(keyframe: KeyframeTracks, most: int) -> Index:
+    """The landmarks of a keyframe that take part in bundle adjustment."""
+    which = np.flatnonzero(keyframe.confirmed)
+    if len(which) < most // 2:
+        which = np.arange(len(keyframe.landmarks))
+    if len(which) > most:
+        which = which[np.linspace(0, len(which) - 1, most).astype(int)]
+    return which
+
+
+def _tied_frames(
+    recording: PreparedFrames, keyframes: list[KeyframeTracks], options: TrackOptions
+) -> list[list[int]]:
+    """Frames in which each keyframe's landmarks are observed."""
+    shared = np.stack([_shared_view(recording, keyframe) for keyframe in keyframes])
+    best = np.argsort(-shared, axis=0, kind="stable")[: options.frames_per_keyframe]
+    tied = np.zeros(shared.shape, bool)
+    np.put_along_axis(tied, best, True, axis=0)
+    tied &= shared > options.min_shared
+    return [
+        sorted({*np.flatnonzero(row).tolist(), *keyframe.sources} - {keyframe.frame})
+        for row, keyframe in zip(tied, keyframes, strict=True)
+    ]
+
+
+def _shared_view(recording: PreparedFrames, keyframe: KeyframeTracks) -> np.ndarray:
+    """(n,) share of a keyframe's view that each frame shows from a similar direction."""
+    cells, poses = recording.posed_cells(keyframe.frame), recording.poses
+    some = np.linspace(0, len(keyframe.cell_inverse_depth) - 1, _PROBES).astype(int)
+    local = cells.rays()[some] / keyframe.cell_inverse_depth[some, None]
+    points = cells.base_from_camera.apply(local)
+    direction = points[None] - poses.translation_m[:, None]
+    unit = direction / (np.linalg.norm(direction, axis=-1, keepdims=True) + 1e-9)
+    within = np.einsum("nji,npj->npi", poses.rotation_matrix(), direction)
+    shared = np.zeros(len(recording))
+    for i in range(len(recording)):
+        camera, front = recording.cameras[i], within[i, :, 2] > 0
+        pixel = camera.project(np.where(front[:, None], within[i], [0, 0, 1]))
+        inside = front & (pixel > 0).all(1) & (pixel < [camera.width, camera.height]).all(1)
+        similar = ((unit[i] * unit[keyframe.frame]).sum(1) - 0.7).clip(0, 1) / 0.3
+        shared[i] = np.where(inside, similar, 0).mean()
+    shared[keyframe.frame] = 0
+    return shared
+
+
+def _joined(parts: Sequence[Observations]) -> Observations:
     """Several sets of observations as one."""
     return Observations(
         np.concatenate([part.landmark for part in parts]),
@@ -187,70 +295,77 @@ def joined(parts: Sequence[Observations]) -> Observations:
     )
 
 
-_FAR_OFF_PX = 1e3
-"""Residual of what lies where a lens no longer holds."""
+class _Residuals(NamedTuple):
+    """Residuals of m observations at the current depths."""
+
+    pixels: Array
+    """(m, 2)."""
+    whitened: Array
+    """(m, 2)."""
+    by_depth: Array
+    """(m, 2) derivatives of the predicted whitened pixels by the inverse depth."""
+    weight: Array
+    """(m,) robust weights."""
 
 
 def _residuals(
-    recording: PreparedFrames, keyframe: KeyframeTracks, seen: Observations
-) -> tuple[Array, Array]:
-    """Residuals (m, 2) in pixels and their derivatives (m, 2) by the inverse depth."""
+    recording: PreparedFrames, keyframe: KeyframeTracks, observations: Observations
+) -> _Residuals:
     rays = recording.cameras[keyframe.frame].unproject(keyframe.landmarks.pixels)
     rho = keyframe.landmarks.inverse_depth
-    residual, slope = np.zeros((len(seen.frame), 2)), np.zeros((len(seen.frame), 2))
+    pixels, slope = np.zeros((2, len(observations.frame), 2))
     for j in keyframe.sources:
-        here = seen.frame == j
-        which, camera = seen.landmark[here], recording.cameras[j]
-        turn, shift = recording.relative(j, keyframe.frame)
-        ray, step = rays[which] @ turn.T, 1e-4 * rho[which, None]
-        at = camera.project(_ahead(ray + rho[which, None] * shift))
-        beside = camera.project(_ahead(ray + (rho[which, None] + step) * shift))
-        known = np.isfinite(at + beside).all(1, keepdims=True)
-        residual[here] = np.where(known, seen.pixels[here] - at, _FAR_OFF_PX)
-        slope[here] = np.where(known, (beside - at) / step, 0)
-    return residual, slope
+        rows = observations.frame == j
+        which, camera = observations.landmark[rows], recording.cameras[j]
+        rotation, translation = recording.relative(j, keyframe.frame)
+        ray, step = rays[which] @ rotation.T, 1e-4 * rho[which, None]
+        predicted = camera.project(_in_front(ray + rho[which, None] * translation))
+        beside = camera.project(_in_front(ray + (rho[which, None] + step) * translation))
+        valid = np.isfinite(predicted + beside).all(1, keepdims=True)
+        pixels[rows] = np.where(valid, observations.pixels[rows] - predicted, _FAR_OFF_PX)
+        slope[rows] = np.where(valid, (beside - predicted) / step, 0)
+    whitened = np.einsum("nij,nj->ni", observations.whitening, pixels)
+    slope = np.einsum("nij,nj->ni", observations.whitening, slope)
+    return _Residuals(pixels, whitened, slope, 1 / (1 + (whitened**2).sum(1)))
 
 
-def _ahead(points: Array) -> Array:
+def _in_front(points: Array) -> Array:
+    """Points (n, 3) with a positive depth."""
     return np.concatenate([points[:, :2], np.maximum(points[:, 2:], 1e-3)], 1)
 
 
-def _weighted(
-    recording: PreparedFrames, keyframe: KeyframeTracks, seen: Observations
-) -> tuple[Array, Array, Array, Array]:
-    """Residuals (m, 2) in pixels, whitened residuals and slopes (m, 2), robust weights (m,)."""
-    raw, slope = _residuals(recording, keyframe, seen)
-    residual = np.einsum("nij,nj->ni", seen.whitening, raw)
-    slope = np.einsum("nij,nj->ni", seen.whitening, slope)
-    return raw, residual, slope, 1 / (1 + (residual**2).sum(1))
-
-
-def _depth_step(recording: PreparedFrames, keyframe: KeyframeTracks, seen: Observations) -> None:
-    marks, n = keyframe.landmarks, len(keyframe.landmarks)
-    _, residual, slope, weight = _weighted(recording, keyframe, seen)
-    pull = np.bincount(seen.landmark, weight * (slope * residual).sum(1), n)
-    hold = np.bincount(seen.landmark, weight * (slope**2).sum(1), n) + 1e-9
-    rho = marks.inverse_depth
-    least, most = 0.6 / FAR_M, 1.25 / NEAR_M
-    scale = recording.depth_scale
-    rho = rho + (pull / hold).clip(-0.15 * rho, 0.15 * rho)
-    rho = rho.clip(least / scale, most / scale)
-    keyframe.landmarks = Landmarks(marks.pixels, rho, marks.slope, marks.sigma)
-
-
-def _judge(
-    recording: PreparedFrames, keyframe: KeyframeTracks, seen: Observations, options: TrackOptions
+def _update_depths(
+    recording: PreparedFrames, keyframe: KeyframeTracks, observations: Observations
 ) -> None:
-    """Which landmarks are kept, and the uncertainty of their inverse depths."""
+    """One Gauss-Newton step of the inverse depths."""
     marks, n = keyframe.landmarks, len(keyframe.landmarks)
-    raw, residual, slope, weight = _weighted(recording, keyframe, seen)
+    _, residual, slope, weight = _residuals(recording, keyframe, observations)
+    which = observations.landmark
+    gradient = np.bincount(which, weight * (slope * residual).sum(1), n)
+    hessian = np.bincount(which, weight * (slope**2).sum(1), n) + 1e-9
+    least, most = 0.6 / FAR_M, 1.25 / NEAR_M
+    rho, scale = marks.inverse_depth, recording.depth_scale
+    rho = rho + (gradient / hessian).clip(-0.15 * rho, 0.15 * rho)
+    keyframe.landmarks = replace(marks, inverse_depth=rho.clip(least / scale, most / scale))
+
+
+def _confirm(
+    recording: PreparedFrames,
+    keyframe: KeyframeTracks,
+    observations: Observations,
+    options: TrackOptions,
+) -> None:
+    """Decide which landmarks enough frames agree on, and estimate the errors of their depths."""
+    n = len(keyframe.landmarks)
+    pixels, residual, slope, weight = _residuals(recording, keyframe, observations)
     squares = (residual**2).sum(1)
-    near = squares < 16.0
-    which = seen.landmark[near]
+    near = squares < _OUTLIER_SQUARES
+    which = observations.landmark[near]
     count = np.bincount(which, minlength=n)
-    mean = np.bincount(which, squares[near], n) / np.maximum(count, 1) / 2
-    pixels = np.sqrt(np.bincount(which, (raw[near] ** 2).sum(1), n) / np.maximum(count, 1) / 2)
+    axes = 2 * np.maximum(count, 1)
+    mean = np.bincount(which, squares[near], n) / axes
+    error_px = np.sqrt(np.bincount(which, (pixels[near] ** 2).sum(1), n) / axes)
     information = np.bincount(which, (weight * (slope**2).sum(1))[near], n)
     sigma = np.sqrt(np.maximum(mean, 0.5) / np.maximum(information, 1e-9))
-    keyframe.landmarks = Landmarks(marks.pixels, marks.inverse_depth, marks.slope, sigma)
-    keyframe.kept = (count >= options.min_views) & (pixels < options.max_residual_px)
+    keyframe.landmarks = replace(keyframe.landmarks, sigma=sigma)
+    keyframe.confirmed = (count >= options.min_views) & (error_px < options.max_residual_px)

@@ -1,23 +1,11 @@
-"""Recordings of posed frames, read from the formats of common programs."""
+"""Recordings of posed frames, read from the formats of common programs.
 
-import dataclasses
-import os
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+The readers are loaded on first use: a program that only locates images needs none of them.
+"""
 
-from evercal.errors import InputError
-from evercal.recordings.formats import (
-    colmap,
-    generic,
-    lerobot,
-    nerfstudio,
-    ros_bag,
-    seven_scenes,
-    twelve_scenes,
-    wrist,
-)
-from evercal.recordings.formats.sfm_poses import with_sfm_poses as with_sfm_poses
+import importlib
+from typing import TYPE_CHECKING
+
 from evercal.recordings.frame import MIN_TRAIN_FRAMES as MIN_TRAIN_FRAMES
 from evercal.recordings.frame import Frame as Frame
 from evercal.recordings.frame import Recording as Recording
@@ -28,96 +16,56 @@ from evercal.recordings.images import as_rgb as as_rgb
 from evercal.recordings.images import image_size as image_size
 from evercal.recordings.images import read_image as read_image
 from evercal.recordings.images import write_image as write_image
-from evercal.recordings.poses.robot_poses import RobotPoses as RobotPoses
-from evercal.recordings.poses.robot_poses import read_robot_poses as read_robot_poses
-from evercal.recordings.read_options import ReadOptions as ReadOptions
-from evercal.recordings.read_options import flag
 
+if TYPE_CHECKING:
+    from evercal.recordings.formats import colmap as colmap
+    from evercal.recordings.formats import generic as generic
+    from evercal.recordings.formats import lerobot as lerobot
+    from evercal.recordings.formats import nerfstudio as nerfstudio
+    from evercal.recordings.formats import ros_bag as ros_bag
+    from evercal.recordings.formats import seven_scenes as seven_scenes
+    from evercal.recordings.formats import twelve_scenes as twelve_scenes
+    from evercal.recordings.formats import wrist as wrist
+    from evercal.recordings.formats.sfm_poses import with_sfm_poses as with_sfm_poses
+    from evercal.recordings.load import FORMATS as FORMATS
+    from evercal.recordings.load import Format as Format
+    from evercal.recordings.load import load_recording as load_recording
+    from evercal.recordings.poses.robot_poses import RobotPoses as RobotPoses
+    from evercal.recordings.poses.robot_poses import read_robot_poses as read_robot_poses
+    from evercal.recordings.read_options import ReadOptions as ReadOptions
 
-@dataclass(frozen=True)
-class Format:
-    """Recognition and reader of one format."""
-
-    detect: Callable[[Path], bool]
-    """Whether a folder or file looks like this format."""
-    load: Callable[[Path, ReadOptions], Recording]
-    """Reader."""
-    contents: str
-    """Files that identify it, for messages."""
-    uses: tuple[str, ...] = ()
-    """Fields of `ReadOptions` that it uses, apart from `every`."""
-
-
-def _plain(load: Callable[[Path], Recording]) -> Callable[[Path, ReadOptions], Recording]:
-    return lambda root, _: load(root)
-
-
-FORMATS = {
-    "generic": Format(generic.detect, _plain(generic.load), "scene.json"),
-    "7scenes": Format(
-        seven_scenes.detect,
-        _plain(seven_scenes.load),
-        "TrainSplit.txt, TestSplit.txt and seq-XX folders",
-    ),
-    "12scenes": Format(twelve_scenes.detect, _plain(twelve_scenes.load), "info.txt and data"),
-    "nerfstudio": Format(nerfstudio.detect, _plain(nerfstudio.load), "transforms.json"),
-    "colmap": Format(colmap.detect, _plain(colmap.load), "sparse/0 with cameras and images"),
-    "wrist": Format(
-        wrist.detect, wrist.load, "images beside base_from_gripper.csv or joints.csv", wrist.USES
-    ),
-    "lerobot": Format(lerobot.detect, lerobot.load, "meta/info.json", lerobot.USES),
-    "rosbag": Format(
-        ros_bag.detect, ros_bag.load, "a .bag or .mcap file or bag folder", ros_bag.USES
-    ),
+_READERS = {
+    "FORMATS": "evercal.recordings.load",
+    "Format": "evercal.recordings.load",
+    "ReadOptions": "evercal.recordings.read_options",
+    "RobotPoses": "evercal.recordings.poses.robot_poses",
+    "load_recording": "evercal.recordings.load",
+    "read_robot_poses": "evercal.recordings.poses.robot_poses",
+    "with_sfm_poses": "evercal.recordings.formats.sfm_poses",
 }
-"""All formats by name, in the order in which they are tried."""
+"""Names that are loaded on first use, and the modules that define them."""
 
 
-def load_recording(
-    path: str | os.PathLike[str],
-    format: str | None = None,
-    name: str | None = None,
-    options: ReadOptions | None = None,
-) -> Recording:
-    """Read a recording.
-
-    Args:
-        path: Folder of the recording, or a bag file.
-        format: One of `FORMATS`. If omitted, it is recognised from the files.
-        name: Name of the scene. If omitted, the name in the file or of the folder.
-        options: Information that the recording lacks.
-
-    Raises:
-        InputError: The recording is missing, broken or of an unknown format, or its format does
-            not use an option that was given.
-    """
-    root, options = Path(path), options or ReadOptions()
-    if format is not None and format not in FORMATS:
-        raise InputError(f"format {format!r} is not known; use one of {', '.join(FORMATS)}")
-    if not root.exists():
-        raise InputError(f"{root}: no such folder; give the folder of a recorded scene")
-    if format is None:
-        format = next((key for key, entry in FORMATS.items() if entry.detect(root)), None)
-    if format is None:
-        what = "no known scene format" if root.is_dir() else "a file, not a folder, and no bag"
-        known = ", ".join(f"{entry.contents} ({key})" for key, entry in FORMATS.items())
-        raise InputError(f"{root}: {what}; expected {known}")
-    _refuse_unused(format, options)
-    recording = FORMATS[format].load(root, options)
-    if options.every > 1:
-        train, test = (part[:: options.every] for part in (recording.train, recording.test))
-        recording = dataclasses.replace(recording, train=train, test=test)
-    return recording if name is None else dataclasses.replace(recording, name=name)
+_FORMATS = (
+    "colmap",
+    "generic",
+    "lerobot",
+    "nerfstudio",
+    "ros_bag",
+    "seven_scenes",
+    "twelve_scenes",
+    "wrist",
+)
+"""Modules that are loaded on first use."""
 
 
-def _refuse_unused(format: str, options: ReadOptions) -> None:
-    """Raise for options that the format would silently ignore."""
-    if options.every < 1:
-        raise InputError(f"--every {options.every}: give a number >= 1")
-    for name in options.given():
-        if name != "every" and name not in FORMATS[format].uses:
-            users = [key for key, entry in FORMATS.items() if name in entry.uses]
-            raise InputError(
-                f"{flag(name)}: not used by recordings of format {format}, only by"
-                f" {', '.join(users)}; leave it out"
-            )
+def __getattr__(name: str) -> object:
+    """Load a reader on first use."""
+    if name in _FORMATS:
+        value: object = importlib.import_module(f"evercal.recordings.formats.{name}")
+    elif name in _READERS:
+        value = getattr(importlib.import_module(_READERS[name]), name)
+    else:
+        raise AttributeError(f"module 'evercal.recordings' has no attribute {name!r}")
+    globals()[name] = value
+    return value

@@ -1,4 +1,4 @@
-"""Before a recording is learned: its name, its frames, and which of them are held out."""
+"""Before a recording is learned: its name, its frames and poses, and the held-out frames."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -64,3 +64,9 @@ def require_frames(recording: Recording) -> None:
             f"scene {recording.name!r}: {len(recording.train)} training frames are too few; give at"
             f" least {MIN_TRAIN_FRAMES}"
         )
+
+
+def lacks_camera_poses(recording: Recording) -> bool:
+    """Whether a recording states gripper poses but no camera poses."""
+    stated = any(frame.base_from_camera is not None for frame in recording.train)
+    return not stated and any(frame.base_from_gripper is not None for frame in recording.train)

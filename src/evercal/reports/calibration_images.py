@@ -23,7 +23,7 @@ from evercal.reports.overlay import overlay_points
 from evercal.reports.pictures import landmark_errors
 
 if TYPE_CHECKING:
-    from evercal.localization.localizer import SceneLocalizer
+    from evercal.localization.localizer import LearnedLocalizer
 
 Image = NDArray[np.uint8]
 
@@ -86,7 +86,7 @@ def annotate_images(
     calibration: Calibration,
     files: Sequence[ImageFile],
     older: Calibration | None = None,
-    localizer: "SceneLocalizer | None" = None,
+    localizer: "LearnedLocalizer | None" = None,
     on_image: Callable[[], object] = lambda: None,
 ) -> AnnotatedImages:
     """Draw a calibration into some of its images.
@@ -174,7 +174,7 @@ def _annotate(
     file: ImageFile,
     image: Image,
     axes: tuple[AxesInView, AxesInView | None],
-    localizer: "SceneLocalizer | None",
+    localizer: "LearnedLocalizer | None",
 ) -> AnnotatedImage:
     """Resize an image to the page width and draw landmarks and axes."""
     import cv2
@@ -198,7 +198,7 @@ def _annotate(
 
 
 def _with_landmarks(
-    calibration: Calibration, image: Image, large: Image, localizer: "SceneLocalizer"
+    calibration: Calibration, image: Image, large: Image, localizer: "LearnedLocalizer"
 ) -> tuple[Image, str, int]:
     """The enlarged image with landmarks, a summary of them and their number."""
     estimate = localizer.localize(image, calibration.camera)
@@ -226,9 +226,11 @@ def _use(use: ImageUse | None) -> str:
     return "used" if use.used else f"rejected: {use.reason}"
 
 
-def _is_other_map(calibration: Calibration, localizer: "SceneLocalizer") -> bool:
+def _is_other_map(calibration: Calibration, localizer: "LearnedLocalizer") -> bool:
     """Whether the map differs from that of the calibration, as far as the source states it."""
     scene, digest = calibration.source.get("scene"), calibration.source.get("map")
     if digest is None or scene not in localizer.scenes:
         return digest is not None
-    return map_digest(localizer, str(scene)) != digest
+    from evercal.localization.localizer import Localizer
+
+    return not isinstance(localizer, Localizer) or map_digest(localizer, str(scene)) != digest

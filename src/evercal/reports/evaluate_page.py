@@ -15,7 +15,7 @@ from evercal.reports.pictures import draw_estimate
 
 if TYPE_CHECKING:
     from evercal.evaluation import FrameResult
-    from evercal.localization.localizer import SceneLocalizer
+    from evercal.localization.localizer import LearnedLocalizer
     from evercal.recordings import Recording
 
 _WORST = 12
@@ -23,7 +23,7 @@ _AXES_MM = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
 
 
 def evaluation_page(
-    localizer: "SceneLocalizer",
+    localizer: "LearnedLocalizer",
     scenes: "Mapping[str, Recording]",
     results: "Sequence[FrameResult]",
     store: str,
@@ -31,7 +31,7 @@ def evaluation_page(
     """Write the report of an evaluation.
 
     Args:
-        localizer: SceneLocalizer of the store; draws the worst frames.
+        localizer: LearnedLocalizer of the store; draws the worst frames.
         scenes: Evaluated recordings by scene name.
         results: Result of `evaluate`.
         store: Path of the store, for the title.
@@ -76,7 +76,7 @@ def _trajectory(scene: "Recording", rows: "Sequence[FrameResult]") -> Picture:
 
 
 def _worst(
-    localizer: "SceneLocalizer",
+    localizer: "LearnedLocalizer",
     scenes: "Mapping[str, Recording]",
     results: "Sequence[FrameResult]",
 ) -> list[Picture]:

@@ -12,10 +12,10 @@ from evercal.reports.overlay import overlay_points
 if TYPE_CHECKING:
     from evercal.geometry import SE3, Camera
     from evercal.localization.estimate import PoseEstimate
-    from evercal.localization.localizer import LearnedScene, SceneLocalizer
+    from evercal.localization.localizer import LearnedLocalizer, LearnedScene
 
 
-def scene_camera(localizer: "SceneLocalizer", scene: str) -> "Camera":
+def scene_camera(localizer: "LearnedLocalizer", scene: str) -> "Camera":
     """The camera of a scene's recording."""
     return _scene(localizer, scene).adjusted_camera
 
@@ -49,7 +49,7 @@ def draw_estimate(
 def draw_landmarks(
     image: NDArray[np.uint8],
     estimate: "PoseEstimate",
-    localizer: "SceneLocalizer",
+    localizer: "LearnedLocalizer",
     legend: bool = True,
 ) -> NDArray[np.uint8]:
     """Draw the landmarks detected in an image, coloured by reprojection error.
@@ -90,7 +90,7 @@ class LandmarkErrors:
 
 def landmark_errors(
     estimate: "PoseEstimate",
-    localizer: "SceneLocalizer",
+    localizer: "LearnedLocalizer",
     camera: "Camera | None" = None,
     base_from_camera: "SE3 | None" = None,
 ) -> LandmarkErrors | None:
@@ -118,5 +118,5 @@ def landmark_errors(
     return LandmarkErrors(estimate.pixels, errors, working_camera.height)
 
 
-def _scene(localizer: "SceneLocalizer", name: str) -> "LearnedScene":
+def _scene(localizer: "LearnedLocalizer", name: str) -> "LearnedScene":
     return next(scene for scene in localizer.contents.scenes if scene.name == name)

@@ -27,7 +27,7 @@ from evercal.storage.manifest import MANIFEST, Manifest, write_manifest
 SCHEMA = 4
 STAGES = "stages"
 REPORT = "report.json"
-_STAGE = re.compile(r"\d{4}-[\w.~-]+")
+_STAGE = re.compile(r"\d{4}-[\w.~-]*")
 Result = TypeVar("Result")
 
 

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from evercal.continual.networks import buffer as module
 from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, encode_frames, join
-from evercal.continual.networks.descriptor import GlobalDescriptor
+from evercal.continual.networks.descriptor import GlobalDescriptor, encode
 from evercal.continual.networks.loss import reprojection_error
-from evercal.features.encode import encode
 from evercal.features.encoder import Encoder
 from evercal.features.views import ViewOptions, augmented_view, cell_centres, frame_view
 from evercal.geometry import SE3, Camera

@@ -282,7 +282,7 @@ def test_batches_contain_consecutive_views_of_one_size(
 def test_without_torchrun_there_is_one_process() -> None:
     assert join_processes("cpu") == torch.device("cpu")
     assert processes() == 1
-    with pytest.raises(InputError, match="take auto, cpu or cuda"):
+    with pytest.raises(InputError, match="use auto, cpu or cuda"):
         join_processes("gpu")
 
 

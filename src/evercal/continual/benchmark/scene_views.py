@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, pose_distance, resize_pixels
-from evercal.localization.localizer import SceneLocalizer
+from evercal.localization.localizer import LearnedLocalizer
 from evercal.recordings import Frame, Recording, posed_frames
 from evercal.storage import write_bytes
 
@@ -60,7 +60,7 @@ class SceneView:
 
 
 def keep_views(
-    out: Path, strategy: str, localizer: SceneLocalizer, scenes: Sequence[Recording]
+    out: Path, strategy: str, localizer: LearnedLocalizer, scenes: Sequence[Recording]
 ) -> None:
     """Write the view of every scene's middle test frame, unless the file exists."""
     for scene in scenes:
@@ -69,7 +69,7 @@ def keep_views(
             continue
         tests = posed_frames(scene.test)
         frame = tests[len(tests) // 2]
-        estimate = localizer.localize(frame.read_image(), frame.camera)
+        estimate = localizer.localize(frame.read_image(), localizer.camera_for(frame.camera))
         points, grey = _points(localizer, [s for s in scenes if s.name == estimate.scene])
         header = {
             "strategy": strategy,
@@ -117,7 +117,7 @@ def _read(path: Path) -> SceneView:
 
 
 def _points(
-    localizer: SceneLocalizer, scenes: Sequence[Recording]
+    localizer: LearnedLocalizer, scenes: Sequence[Recording]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return points (n, 3) of scenes and their brightness (n,)."""
     points, grey = [np.zeros((0, 3))], [np.zeros(0)]
@@ -138,7 +138,7 @@ def _points(
 
 
 def _from_estimate(
-    localizer: SceneLocalizer, scene: str, frame: Frame, image: NDArray[np.uint8]
+    localizer: LearnedLocalizer, scene: str, frame: Frame, image: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return inlier points (n, 3) of a frame in the base frame and their pixels (n, 2)."""
     estimate = localizer.localize(image, localizer.camera_for(frame.camera))

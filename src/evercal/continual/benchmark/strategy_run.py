@@ -33,7 +33,7 @@ from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.continual.threshold import fit_threshold
 from evercal.evaluation.protocol import evaluate
 from evercal.features.device import device_of
-from evercal.localization.localizer import Localizer, SceneLocalizer
+from evercal.localization.localizer import LearnedLocalizer, Localizer
 from evercal.localization.query import LocalizeOptions
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.selection import covering_radius, smallest_pair
@@ -247,7 +247,7 @@ class _Run:
     def _results(
         self,
         name: str,
-        localizer: SceneLocalizer,
+        localizer: LearnedLocalizer,
         learned: LearnedScenes,
         number: int,
         seconds: float,

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from evercal.continual.networks.descriptor import Descriptor
+from evercal.continual.networks.descriptor import Descriptor, encode
 from evercal.continual.networks.distributed import gather, processes, rank, shared_out
 from evercal.continual.networks.loss import MAX_RADIUS2, Target
-from evercal.features.encode import ENCODE_BATCH, encode
+from evercal.features.encode import ENCODE_BATCH
 from evercal.features.encoder import Encoder
 from evercal.features.views import View, ViewOptions, augmented_view, frame_view
 from evercal.geometry.se3 import SE3

@@ -1,6 +1,7 @@
 """The global descriptor: one vector per image that identifies the scene."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -8,7 +9,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from evercal.errors import InputError
-from evercal.features.encoder import WEIGHTS
+from evercal.features.encode import encode_features
+from evercal.features.encoder import WEIGHTS, Encoder
+from evercal.features.views import View
 from evercal.features.weights_file import load_strictly
 
 DESCRIPTOR_FILE = WEIGHTS / "descriptor.safetensors"
@@ -106,3 +109,15 @@ def descriptor_for(encoder_file: Path, inputs: int) -> Descriptor:
         if descriptor.settings["inputs"] == inputs:
             return descriptor
     return PooledDescriptor(inputs)
+
+
+@torch.inference_mode()
+def encode(
+    views: Sequence[View], encoder: Encoder, descriptor: Descriptor
+) -> tuple[Tensor, Tensor]:
+    """Features (b, channels, h, w) and descriptors (b, width) of views of one size.
+
+    Both are on the encoder's device, which must be that of the descriptor, too.
+    """
+    features = encode_features(views, encoder)
+    return features, descriptor(features)

@@ -1,0 +1,259 @@
+"""Residuals of bundle adjustment, their derivatives, and the normal equations of one step."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+from scipy.spatial.transform import Rotation
+
+from evercal.geometry import SE3, Camera, cross_matrix
+
+Array = NDArray[np.floating]
+Index = NDArray[np.int64]
+
+COMMON, SHIFT, INTRINSICS = 6, 1, 5
+SHARED = COMMON + SHIFT + INTRINSICS
+"""Shared parameters: common transform, time shift, and intrinsics (logarithm of the focal length,
+principal point in pixels, k1, k2)."""
+MIN_DEPTH = 0.05
+"""Nearer points are projected as if they were at this depth, in units of `depth_scale`."""
+MIN_DISTORTION = 1e-4
+"""Smaller changes of k1 and k2 are ignored."""
+
+
+@dataclass(frozen=True, eq=False)
+class BundleTracks:
+    """Landmarks and their observations."""
+
+    host: Index
+    """(p,) frame that a landmark's patch belongs to."""
+    pixels: Array
+    """(p, 2) pixel in the host frame."""
+    inverse_depth: Array
+    """(p,) per metre."""
+    landmark: Index
+    """(m,) landmark of each observation."""
+    frame: Index
+    """(m,) frame of each observation."""
+    observed: Array
+    """(m, 2) pixels."""
+    whitening: Array
+    """(m, 2, 2), see `patches.whitening`."""
+    depth_scale: float = 1.0
+    """Factor on the usual depths of a room, see `plane_sweep.NEAR_M`."""
+
+    @property
+    def host_frame(self) -> Index:
+        """(m,) host of the landmark of each observation."""
+        return self.host[self.landmark]
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters:
+    """Everything that bundle adjustment estimates."""
+
+    correction: Array
+    """(n, 6) motion of each frame from its stated pose, camera frame, metres and radians."""
+    shared: Array
+    """(12,) see `SHARED`."""
+    inverse_depth: Array
+    """(p,) per metre."""
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Whitened residuals of m observations and their derivatives.
+
+    All values are 0 for observations that are not `valid`.
+    """
+
+    residual: Array
+    """(m, 2)."""
+    by_host: Array
+    """(m, 2, 6) by the correction of the host frame."""
+    by_frame: Array
+    """(m, 2, 6) by the correction of the observing frame."""
+    by_depth: Array
+    """(m, 2) by the inverse depth."""
+    by_intrinsics: Array
+    """(m, 2, 5)."""
+    valid: NDArray[np.bool_]
+    """(m,) False where the distortion of the camera has no pixel for the landmark."""
+
+    def jacobian(self, tracks: BundleTracks, frames: int) -> sparse.csr_array:
+        """(2 m, 6 n + 12) derivatives by corrections and shared parameters."""
+        m, six = len(tracks.frame), np.arange(6)
+        intrinsics = 6 * frames + COMMON + SHIFT + np.arange(INTRINSICS)
+        columns = np.concatenate(
+            [
+                6 * tracks.host_frame[:, None] + six,
+                6 * tracks.frame[:, None] + six,
+                np.broadcast_to(intrinsics, (m, INTRINSICS)),
+            ],
+            1,
+        )
+        values = np.concatenate([self.by_host, self.by_frame, self.by_intrinsics], 2)
+        rows = np.repeat(np.arange(2 * m), columns.shape[1])
+        columns = np.repeat(columns[:, None], 2, 1).ravel()
+        shape = (2 * m, 6 * frames + SHARED)
+        return sparse.csr_array((values.ravel(), (rows, columns)), shape=shape)
+
+
+class StatedFrames:
+    """Stated poses and cameras of n frames, which parameters correct.
+
+    Args:
+        stated: (n,) base_from_camera.
+        cameras: n, at the image size that observations are given in.
+    """
+
+    def __init__(self, stated: SE3, cameras: list[Camera]):
+        self._rotation, self._position = stated.rotation_matrix(), stated.translation_m
+        self._cameras = cameras
+        self.same_camera = all(camera == cameras[0] for camera in cameras)
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+    def poses(self, parameters: Parameters) -> SE3:
+        """(n,) corrected base_from_camera."""
+        rotation, position = self._corrected(parameters)
+        matrix = np.tile(np.eye(4), (len(self), 1, 1))
+        matrix[:, :3, :3], matrix[:, :3, 3] = rotation, position
+        return SE3.from_matrix(matrix)
+
+    def camera(self, parameters: Parameters) -> Camera:
+        """The corrected camera, where all frames share one."""
+        camera, change = self._cameras[0], parameters.shared[COMMON + SHIFT :]
+        if not np.any(change):
+            return camera
+        distortion = np.zeros(max(4, len(camera.distortion)))
+        distortion[: len(camera.distortion)] = camera.distortion
+        distortion[:2] += change[3:]
+        scale = np.exp(change[0])
+        distorts = np.abs(change[3:]).max() > MIN_DISTORTION
+        return replace(
+            camera,
+            fx=camera.fx * scale,
+            fy=camera.fy * scale,
+            cx=camera.cx + change[1],
+            cy=camera.cy + change[2],
+            distortion=tuple(distortion) if distorts else camera.distortion,
+        )
+
+    def linearise(self, tracks: BundleTracks, parameters: Parameters) -> Linearised:
+        """Residuals and derivatives at given parameters."""
+        rotation, position = self._corrected(parameters)
+        k, j = tracks.host_frame, tracks.frame
+        ray, ray_slope = self._rays(tracks, parameters)
+        rho = parameters.inverse_depth[tracks.landmark, None]
+        frame_from_base = rotation[j].transpose(0, 2, 1)
+        frame_from_host = frame_from_base @ rotation[k]
+        point = np.einsum("nij,nj->ni", frame_from_host, ray / rho)
+        point += np.einsum("nij,nj->ni", frame_from_base, position[k] - position[j])
+        point[:, 2] = np.maximum(point[:, 2], MIN_DEPTH * tracks.depth_scale)
+        plane = point[:, :2] / point[:, 2:]
+        pixel, by_plane = np.zeros_like(plane), np.zeros((len(j), 2, 2))
+        by_camera = np.zeros((len(j), 2, INTRINSICS))
+        for camera, rows in self._by_camera(parameters, j):
+            pixel[rows] = camera.project(point[rows])
+            by_plane[rows], by_camera[rows] = camera.slopes(plane[rows])
+        to_plane = np.zeros((len(j), 2, 3))
+        to_plane[:, 0, 0] = to_plane[:, 1, 1] = 1 / point[:, 2]
+        to_plane[:, :, 2] = -plane / point[:, 2:]
+        by_point = by_plane @ to_plane
+        by_host = by_point @ frame_from_host
+        by_ray = by_host[:, :, :2] / rho[..., None]
+        white = tracks.whitening
+        parts = (
+            np.einsum("nij,nj->ni", white, pixel - tracks.observed),
+            white @ np.concatenate([by_host, -by_host @ cross_matrix(ray / rho)], 2),
+            white @ np.concatenate([-by_point, by_point @ cross_matrix(point)], 2),
+            np.einsum("nij,njk,nk->ni", white, -by_host, ray) / rho**2,
+            white @ (by_camera + by_ray @ ray_slope),
+        )
+        # The distortion of the current estimate can be too strong for a landmark near the edge.
+        valid = np.isfinite(pixel).all(1)
+        for part in parts:
+            part[~valid] = 0
+        return Linearised(*parts, valid)
+
+    def _rays(self, tracks: BundleTracks, parameters: Parameters) -> tuple[Array, Array]:
+        """Rays (m, 3) of the observed landmarks in their hosts, and derivatives (m, 2, 5)."""
+        ray = np.zeros((len(tracks.host), 3))
+        slope = np.zeros((len(tracks.host), 2, INTRINSICS))
+        for camera, rows in self._by_camera(parameters, tracks.host):
+            ray[rows] = camera.unproject(tracks.pixels[rows])
+            # A pixel is fixed: its ray moves against the change of the projection.
+            by_plane, by_camera = camera.slopes(ray[rows, :2])
+            slope[rows] = -np.linalg.solve(by_plane, by_camera)
+        return ray[tracks.landmark], slope[tracks.landmark]
+
+    def _corrected(self, parameters: Parameters) -> tuple[Array, Array]:
+        """Rotations (n, 3, 3) and positions (n, 3) of the corrected poses."""
+        own = parameters.correction
+        rotation = self._rotation @ Rotation.from_rotvec(own[:, 3:]).as_matrix()
+        return rotation, self._position + np.einsum("nij,nj->ni", self._rotation, own[:, :3])
+
+    def _by_camera(self, parameters: Parameters, frames: Index) -> list[tuple[Camera, Index]]:
+        """Each camera with the rows of `frames` that it took."""
+        if self.same_camera:
+            return [(self.camera(parameters), np.arange(len(frames)))]
+        groups: dict[Camera, list[int]] = {}
+        for i, camera in enumerate(self._cameras):
+            groups.setdefault(camera, []).append(i)
+        return [(c, np.flatnonzero(np.isin(frames, which))) for c, which in groups.items()]
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """One step."""
+
+    change: Array
+    """(6 n + 12,) of corrections and shared parameters."""
+    depths: Array
+    """(p,) of the inverse depths."""
+    root: Array
+    """The covariance of `change` is root.T @ root, if the equations are not damped."""
+    length: float
+    """Length of the step in standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """Least squares in corrections and shared parameters (6 n + 12) and inverse depths (p)."""
+
+    gram: sparse.csr_array
+    """(6 n + 12, 6 n + 12) of the observations."""
+    prior: Array
+    """(6 n + 12, 6 n + 12) of the priors."""
+    mixed: sparse.csr_array
+    """(p, 6 n + 12)."""
+    depth: Array
+    """(p,) diagonal of the inverse depths."""
+    slope: Array
+    """(6 n + 12,) half the gradient of the cost."""
+    depth_slope: Array
+    """(p,) the same by inverse depths."""
+
+    def solve(self, damping: float) -> Solution | None:
+        """Solve with diagonal elements raised by a share; None if not positive definite."""
+        depth = (1 + damping) * self.depth
+        eliminated = self.mixed.T @ sparse.diags_array(1 / depth) @ self.mixed
+        system = (self.gram - eliminated).toarray() + self.prior
+        diagonal = np.arange(len(system))
+        system[diagonal, diagonal] += damping * (self.gram.diagonal() + self.prior.diagonal())
+        try:
+            lower = np.linalg.cholesky(system)
+        except np.linalg.LinAlgError:
+            return None
+        root = lapack.dtrtri(lower, lower=1)[0]  # pyright: ignore[reportAttributeAccessIssue]
+        slope = self.slope - self.mixed.T @ (self.depth_slope / depth)
+        whitened = root @ slope
+        change = -root.T @ whitened
+        depths = (-self.depth_slope - self.mixed @ change) / depth
+        if not (np.isfinite(change).all() and np.isfinite(depths).all()):
+            return None
+        return Solution(change, depths, root, float(np.linalg.norm(whitened)))

@@ -1,0 +1,283 @@
+"""`evercal.Map` as a user has it: learn, localize, calibrate, check, evaluate, export."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evercal import Calibration, InputError, LearnReport, Map, Recording, Shift, read_calibration
+from evercal.geometry import SE3, pose_distance
+from evercal.mapping.store import MapStore
+from evercal.recordings import write_image
+from evercal.recordings.formats import generic
+from evercal.recordings.frame import Frame
+from evercal.storage import MANIFEST, verify, write_manifest
+from evercal.storage.manifest import Manifest
+
+Tree = Callable[[Path], dict[str, str]]
+GRIPPER_FROM_CAMERA = SE3.exp([0.05, -0.02, 0.1, 0.3, 0.2, -1.0])
+
+
+@pytest.fixture(scope="module")
+def learned(
+    hall: Recording, arcs: tuple[Recording, Recording], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Map, tuple[LearnReport, LearnReport]]:
+    """A map of the hall, learned from its folder, and of an arc, learned from a `Recording`."""
+    root = tmp_path_factory.mktemp("map")
+    generic.write(root / "hall", hall)
+    opened = Map.open(root / "new" / "map", device="cpu")
+    assert opened.scenes == ()
+    reports = opened.learn(root / "hall"), opened.learn(arcs[0], name="arc", memory="300kB")
+    return opened, reports
+
+
+@pytest.fixture(scope="module")
+def hall_only(hall: Recording, tmp_path_factory: pytest.TempPathFactory) -> Map:
+    """A map of the hall with a quarter of its frames."""
+    opened = Map.open(str(tmp_path_factory.mktemp("hall") / "map"), device="cpu")
+    opened.learn(hall, memory="25%")
+    return opened
+
+
+@pytest.fixture(scope="module")
+def arm(hall: Recording, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SE3]:
+    """Images of a camera on the gripper beside their poses.csv, and base_from_gripper of each."""
+    folder, frames = tmp_path_factory.mktemp("arm"), hall.test[::3]
+    grippers = SE3.stack([truth_of(f) @ GRIPPER_FROM_CAMERA.inverse() for f in frames])
+    rows = ["image,x,y,z,qw,qx,qy,qz"]
+    for i, (frame, pose) in enumerate(zip(frames, grippers, strict=True)):
+        write_image(folder / f"{i}.png", frame.read_image())
+        rows.append(",".join(map(str, [f"{i}.png", *pose.translation_m, *pose.rotation_wxyz])))
+    (folder / "poses.csv").write_text("\n".join(rows))
+    return folder, grippers
+
+
+def truth_of(frame: Frame) -> SE3:
+    assert frame.base_from_camera is not None
+    return frame.base_from_camera
+
+
+def noisy(frame: Frame, count: int, seed: int = 0) -> list[np.ndarray]:
+    rng, image = np.random.default_rng(seed), frame.read_image().astype(float)
+    return [(image + rng.normal(0, 4, image.shape)).clip(0, 255).astype("u1") for _ in range(count)]
+
+
+def test_learned_scenes_and_their_reports(
+    learned: tuple[Map, tuple[LearnReport, LearnReport]],
+) -> None:
+    opened, (hall, arc) = learned
+    assert opened.scenes == (hall.scene, arc.scene) == ("hall", "arc")
+    assert (hall.train_frames, hall.held_out_frames) == (26, 4)
+    assert hall.frames_kept == 2  # 10 % of 26
+    assert hall.landmarks > 200
+    assert hall.adjusted is not None
+    assert hall.hand_eye is None
+    assert arc.memory_bytes - hall.memory_bytes <= 300_000
+    stored = [json.loads(path.read_text()) for path in sorted(opened.path.rglob("report.json"))]
+    assert [report["scene"] for report in stored] == ["hall", "arc"]
+    assert stored[0]["adjusted"]["residual_px"] == hall.adjusted.residual_px
+
+
+def test_images_of_both_scenes_are_located_also_after_opening_again(
+    learned: tuple[Map, tuple[LearnReport, LearnReport]],
+    hall: Recording,
+    arcs: tuple[Recording, Recording],
+) -> None:
+    for opened in (learned[0], Map.open(learned[0].path, device="cpu")):
+        for name, frame in (("hall", hall.test[7]), ("arc", arcs[0].test[11])):
+            estimate = opened.localize(frame.read_image())
+            assert (estimate.status, estimate.scene) == ("ok", name)
+            assert estimate.base_from_camera is not None
+            assert pose_distance(estimate.base_from_camera, truth_of(frame))[0] < 0.03
+        estimate = opened.localize(hall.test[7].read_image(), hall.test[7].camera)
+        assert estimate.status == "ok"
+
+
+def test_fixed_camera_from_a_folder_files_and_arrays(
+    hall_only: Map, hall: Recording, tmp_path: Path
+) -> None:
+    frame = hall.test[3]
+    images = noisy(frame, 5)
+    for i, image in enumerate(images):
+        write_image(tmp_path / f"{i}.png", image)
+    files = sorted(tmp_path.iterdir())
+    calls: list[int] = []
+    calibrations = [
+        hall_only.calibrate(source, on_image=lambda: calls.append(1))
+        for source in (tmp_path, str(tmp_path), files, images, np.stack(images))
+    ]
+    assert len(calls) == 5 * 5
+    for calibration in calibrations:
+        assert calibration.mount == "eye_to_hand"
+        assert pose_distance(calibration.parent_from_child, truth_of(frame))[0] < 0.004
+        expected = calibrations[0].parent_from_child.matrix()
+        np.testing.assert_array_equal(calibration.parent_from_child.matrix(), expected)
+    assert [use.name for use in calibrations[2].images] == list(map(str, files))
+    [use] = hall_only.calibrate(files[0], camera=frame.camera).images
+    assert use.used
+
+
+@pytest.mark.parametrize("from_file", [True, False])
+def test_camera_on_the_gripper(from_file: bool, hall_only: Map, arm: tuple[Path, SE3]) -> None:
+    folder, grippers = arm
+    poses = folder / "poses.csv" if from_file else grippers
+    calibration = hall_only.calibrate(folder, robot_poses=poses)
+    assert calibration.mount == "eye_in_hand"
+    assert pose_distance(calibration.parent_from_child, GRIPPER_FROM_CAMERA)[0] < 0.004
+    fixed = hall_only.calibrate(folder, robot_poses=poses, mount="eye_to_hand")
+    assert fixed.mount == "eye_to_hand"
+
+
+@pytest.fixture(scope="module")
+def calibration(hall_only: Map, hall: Recording) -> Calibration:
+    return hall_only.calibrate(noisy(hall.test[3], 5), camera=hall.test[3].camera)
+
+
+def test_check_from_one_file(
+    hall_only: Map, hall: Recording, calibration: Calibration, tmp_path: Path
+) -> None:
+    def shift(frame: Frame) -> Shift:
+        write_image(tmp_path / "now.png", noisy(frame, 1, seed=1)[0])
+        return hall_only.check(tmp_path / "now.png", calibration)
+
+    still, bumped = shift(hall.test[3]), shift(hall.test[4])
+    assert still.same_map
+    assert bumped.same_map
+    assert not still.moved
+    assert bumped.moved
+    metres, _ = pose_distance(truth_of(hall.test[3]), truth_of(hall.test[4]))
+    assert bumped.translation_mm == pytest.approx(1000 * metres, abs=3)
+
+
+def test_calibration_is_written_and_exported(calibration: Calibration, tmp_path: Path) -> None:
+    calibration.write(tmp_path / "camera.json")
+    assert read_calibration(tmp_path / "camera.json").to_dict() == calibration.to_dict()
+    text = calibration.export("launch_py", tmp_path / "camera.launch.py")
+    assert text
+    assert (tmp_path / "camera.launch.py").read_text() == text
+
+
+def test_evaluate(hall_only: Map, hall: Recording, tmp_path: Path) -> None:
+    few = replace(hall, test=hall.test[::5])
+    scores = hall_only.evaluate(few)
+    assert scores.scenes["hall"].frames == len(few.test)
+    assert scores.scenes["hall"].median_translation_cm < 0.5
+    generic.write(tmp_path / "hall", few)
+    others = [hall_only.evaluate(each) for each in ({"hall": few}, [few], tmp_path / "hall")]
+    for other in others:
+        assert other.scenes["hall"].median_translation_cm == pytest.approx(
+            scores.scenes["hall"].median_translation_cm
+        )
+    with pytest.raises(InputError, match="attic"):
+        hall_only.evaluate({"attic": few})
+
+
+def test_a_name_that_is_taken_is_refused(hall_only: Map, hall: Recording, tree: Tree) -> None:
+    before = tree(hall_only.path)
+    with pytest.raises(InputError, match="scene 'hall': a scene of this name exists"):
+        hall_only.learn(hall)
+    for name in ("", " ", "a/b", ".hidden", "a=b", "a\n"):
+        with pytest.raises(InputError, match="scene name"):
+            hall_only.learn(hall, name=name)
+    assert tree(hall_only.path) == before
+
+
+@pytest.mark.parametrize("memory", ["0%", "120%", "ten", "-5MB", "0.1", ""])
+def test_memory_that_cannot_be_used_is_refused(
+    memory: str, rooms: tuple[Recording, ...], tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=r"memory .*: give a share of the frames"):
+        Map.open(tmp_path / "map", device="cpu").learn(rooms[0], memory=memory)
+    assert not (tmp_path / "map").exists()
+
+
+def test_memory_in_megabytes_and_auto(
+    learned: tuple[Map, tuple[LearnReport, LearnReport]], hall: Recording, tmp_path: Path
+) -> None:
+    opened = Map.open(tmp_path / "map", device="cpu")
+    one = opened.learn(hall, name="one", memory="0.5MB")
+    assert 0 < one.memory_bytes <= 500_000
+    auto = opened.learn(hall, name="two", memory="auto")
+    assert 1 <= auto.frames_kept <= 7
+    estimate = Map.open(tmp_path / "map", device="cpu").localize(hall.test[9].read_image())
+    assert estimate.base_from_camera is not None
+    assert pose_distance(estimate.base_from_camera, truth_of(hall.test[9]))[0] < 0.01
+
+
+@pytest.mark.parametrize("step", ["encoding", "adjusting"])
+def test_interrupted_learning_leaves_the_map_unchanged(
+    step: str, hall_only: Map, arcs: tuple[Recording, Recording], hall: Recording, tree: Tree
+) -> None:
+    def interrupt(name: str, done: int, total: int) -> None:
+        if name == step:
+            raise KeyboardInterrupt
+
+    before = tree(hall_only.path)
+    with pytest.raises(KeyboardInterrupt):
+        hall_only.learn(arcs[0], on_progress=interrupt)
+    assert tree(hall_only.path) == before
+    assert hall_only.scenes == Map.open(hall_only.path, device="cpu").scenes == ("hall",)
+    assert hall_only.localize(hall.test[9].read_image()).status == "ok"
+    assert verify(hall_only.path) == []
+
+
+def test_interrupted_first_learning_leaves_no_map(
+    arcs: tuple[Recording, Recording], tmp_path: Path
+) -> None:
+    def interrupt(name: str, done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Map.open(tmp_path / "map", device="cpu").learn(arcs[0], on_progress=interrupt)
+    assert Map.open(tmp_path / "map", device="cpu").scenes == ()
+
+
+def test_a_map_without_scenes_is_refused(rooms: tuple[Recording, ...], tmp_path: Path) -> None:
+    opened = Map.open(tmp_path / "map", device="cpu")
+    with pytest.raises(InputError, match=r"map .*: no scene learned yet"):
+        opened.localize(rooms[0].train[0].read_image())
+    with pytest.raises(InputError, match="no scene learned yet"):
+        opened.calibrate([rooms[0].train[0].read_image()])
+
+
+def test_recordings_with_few_frames_are_refused(
+    rooms: tuple[Recording, ...], tmp_path: Path
+) -> None:
+    few = replace(rooms[0], train=rooms[0].train[:3])
+    with pytest.raises(InputError, match="scene 'alpha': 3 training frames are too few"):
+        Map.open(tmp_path / "map", device="cpu").learn(few)
+    with pytest.raises(InputError, match="missing"):
+        Map.open(tmp_path / "map", device="cpu").learn(tmp_path / "missing")
+
+
+def test_stores_of_networks_and_other_folders_are_refused(hall_only: Map, tmp_path: Path) -> None:
+    store = MapStore.open(hall_only.path)
+    root = tmp_path / "networks"
+    root.mkdir()
+    manifest = Manifest.read(store.root)
+    payload = {**manifest.payload, "strategy": "evercal_network", "networks": [], "stages": []}
+    write_manifest(root, payload, [])
+    with pytest.raises(InputError, match=rf"{root}: holds networks of strategy 'evercal_network'"):
+        Map.open(root, device="cpu")
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_bytes(b"")
+    with pytest.raises(InputError, match="photos: exists and is not an evercal store"):
+        Map.open(tmp_path / "photos", device="cpu")
+    (root / MANIFEST).write_text("{")
+    with pytest.raises(InputError, match=MANIFEST):
+        Map.open(root, device="cpu")
+
+
+def test_a_second_object_of_one_map_does_not_overwrite_its_scenes(
+    hall_only: Map, arcs: tuple[Recording, Recording], hall: Recording, tmp_path: Path
+) -> None:
+    first, second = (Map.open(tmp_path / "map", device="cpu") for _ in range(2))
+    first.learn(arcs[0])
+    with pytest.raises(InputError, match="another process has changed it"):
+        second.learn(arcs[1])
+    assert Map.open(tmp_path / "map", device="cpu").scenes == ("one",)
