@@ -24,7 +24,8 @@ from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
 from evercal.evaluation import recall_area
 from evercal.recordings import Recording
-from evercal.storage import read_settings, write_json
+from evercal.storage import write_json
+from evercal.storage.settings import read_settings
 
 Trials = Sequence[Mapping[str, object]]
 WEIGHTS: Trials = [{"weight": w} for w in (0.1, 0.3, 1.0, 3.0)]

@@ -60,7 +60,7 @@ def _room(
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request: pytest.FixtureRequest) -> torch.device:
-    """The CPU, and with `-m gpu` a CUDA device; the test is skipped if there is none."""
+    """The CPU, and with `-m gpu` a CUDA device; the test is skipped without one."""
     import torch
 
     from evercal.features.device import device_of

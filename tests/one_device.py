@@ -1,7 +1,7 @@
 """Detect tensors on the wrong device on a machine without a GPU.
 
-torch's `meta` device replaces the GPU: its tensors have shapes and no numbers. Many kernels
-accept a `meta` tensor beside one of the CPU, so every operation is checked here.
+torch's `meta` device replaces the GPU: its tensors have shapes and no numbers. Many kernels accept
+a `meta` tensor beside one of the CPU, so every operation is checked here.
 """
 
 from collections.abc import Iterable, Iterator

@@ -1,4 +1,4 @@
-"""`import evercal` is cheap, and still gives every public name."""
+"""`import evercal` is fast and provides every public name."""
 
 import subprocess
 import sys
@@ -26,7 +26,7 @@ def test_import_is_fast_and_loads_nothing_heavy() -> None:
     assert time.perf_counter() - start < 10.0  # the interpreter itself, on a busy machine
 
 
-def test_geometry_and_datasets_do_without_torch_and_opencv() -> None:
+def test_geometry_and_recordings_load_no_torch_and_no_opencv() -> None:
     code = "import sys, evercal.geometry, evercal.storage, evercal.recordings; print(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
@@ -34,7 +34,7 @@ def test_geometry_and_datasets_do_without_torch_and_opencv() -> None:
     assert not {"torch", "cv2"} & set(done.stdout.split())
 
 
-def test_every_public_name_is_there_and_others_are_not() -> None:
+def test_public_names() -> None:
     for name in dir(evercal):
         assert getattr(evercal, name) is not None
     with pytest.raises(AttributeError, match="'evercal' has no attribute 'Localiser'"):

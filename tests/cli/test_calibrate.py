@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evercal.mapping.scene_maps import SceneMaps
 
 from evercal.calibration.calibration import read_calibration
 from evercal.geometry import SE3, pose_distance
-from evercal.mapping.scene_maps import SceneMaps
 from evercal.mapping.store import Store
 from evercal.recordings import write_image
 from evercal.recordings.frame import Recording

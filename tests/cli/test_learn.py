@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from evercal.cli.learn_bars import LearnBars
 
 from evercal.cli.learn import check_name, parse_memory
-from evercal.cli.learn_bars import LearnBars
 from evercal.errors import InputError
 from evercal.recordings import Recording, load_recording, posed_recording
 

@@ -16,7 +16,7 @@ from evercal.evaluation import (
     share_inside,
 )
 from evercal.evaluation.metrics import CHI2_6, FINE
-from evercal.geometry import SE3, squared_mahalanobis
+from evercal.geometry import SE3, UncertainPose
 
 DEGREE = math.pi / 180
 
@@ -179,7 +179,7 @@ def test_squared_errors_follow_chi_square_if_the_covariance_is_true() -> None:
     for error in rng.normal(size=(2000, 6)) @ root.T:
         rotated = estimate @ SE3.exp([0, 0, 0, *error[3:]])
         truth = SE3(rotated.rotation_wxyz, estimate.translation_m + error[:3])
-        squared.append(squared_mahalanobis(estimate, root @ root.T, truth))
+        squared.append(UncertainPose(estimate, root @ root.T).squared_mahalanobis(truth))
     assert kstest(squared, chi2(6).cdf).pvalue > 0.01
     assert chi2(6).cdf(CHI2_6) == pytest.approx(0.95, abs=1e-5)
     assert share_inside(squared) == pytest.approx(95, abs=1.5)

@@ -11,30 +11,35 @@ from evercal.errors import InputError
 from evercal.evaluation import evaluate
 from evercal.evaluation.metrics import Status
 from evercal.geometry import SE3, Camera
+from evercal.localization.estimate import PoseEstimate
 from evercal.recordings import Frame, Recording
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 
 
-@dataclass(frozen=True)
-class Estimate:
-    status: Status
-    scene: str | None
-    base_from_camera: SE3 | None
-    inliers: int = 7
-    inlier_ratio: float = 0.25
-    covariance: np.ndarray | None = None
+def estimate(
+    status: Status,
+    scene: str | None,
+    base_from_camera: SE3 | None,
+    inliers: int = 7,
+    inlier_ratio: float = 0.25,
+    covariance: np.ndarray | None = None,
+) -> PoseEstimate:
+    return PoseEstimate(status, "", scene, base_from_camera, covariance, inliers, inlier_ratio, 1.0)
 
 
 @dataclass
 class Fake:
     """Returns estimates by the first pixel of the image, and records their order."""
 
-    estimates: dict[int, Estimate]
+    estimates: dict[int, PoseEstimate]
     scenes: tuple[str, ...] = ("a", "b")
     calls: list[int] = field(default_factory=list)
 
-    def localize(self, image: np.ndarray, camera: Camera) -> Estimate:
+    def camera_for(self, stated: Camera) -> Camera | None:
+        return stated
+
+    def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         assert image.shape == (3, 4, 3)
         assert camera == CAMERA
         self.calls.append(int(image[0, 0, 0]))
@@ -56,7 +61,7 @@ def scene(name: str, *test: Frame, train: tuple[Frame, ...] = ()) -> Recording:
 
 
 def test_pose_in_a_scene_of_the_same_base_frame_is_measured() -> None:
-    estimates = {0: Estimate("ok", "b", pose(1.25)), 1: Estimate("ok", "a", pose(9.0))}
+    estimates = {0: estimate("ok", "b", pose(1.25)), 1: estimate("ok", "a", pose(9.0))}
     for base in ("kitchen", None):
         scenes = {
             "a": replace(scene("a", frame(0, pose(1.0))), base=base),
@@ -74,11 +79,11 @@ def test_pose_in_another_scene_has_infinite_error() -> None:
         "b": scene("y", frame(3, pose(1.0)), frame(4, pose(1.0))),
     }
     estimates = {
-        0: Estimate("ok", "a", pose(1.03, 2.0)),
-        1: Estimate("ok", "b", pose(2.0)),
-        2: Estimate("unknown_scene", None, None),
-        3: Estimate("failed", "b", pose(1.0)),
-        4: Estimate("ok", "b", pose(1.0)),
+        0: estimate("ok", "a", pose(1.03, 2.0)),
+        1: estimate("ok", "b", pose(2.0)),
+        2: estimate("unknown_scene", None, None),
+        3: estimate("failed", "b", pose(1.0)),
+        4: estimate("ok", "b", pose(1.0)),
     }
     results = evaluate(Fake(estimates), scenes)
     assert [r.frame for r in results] == ["f0", "f1", "f2", "f3", "f4"]
@@ -95,7 +100,7 @@ def test_pose_in_another_scene_has_infinite_error() -> None:
 
 def test_images_of_all_scenes_are_shuffled_by_seed() -> None:
     count = 40
-    estimates = {i: Estimate("failed", None, None) for i in range(2 * count)}
+    estimates = {i: estimate("failed", None, None) for i in range(2 * count)}
     scenes = {
         "a": scene("a", *(frame(i, pose(0.0)) for i in range(count))),
         "b": scene("b", *(frame(i + count, pose(0.0)) for i in range(count))),
@@ -115,10 +120,10 @@ def test_images_of_all_scenes_are_shuffled_by_seed() -> None:
 
 def test_localizer_gets_image_and_camera_only() -> None:
     class Strict(Fake):
-        def localize(self, *given: object, **named: object) -> Estimate:
+        def localize(self, *given: object, **named: object) -> PoseEstimate:
             assert [type(value) for value in given] == [np.ndarray, Camera]
             assert not named
-            return Estimate("failed", None, None)
+            return estimate("failed", None, None)
 
     assert len(evaluate(Strict({}), {"a": scene("a", frame(0, pose(0.0)))})) == 1
 
@@ -131,12 +136,12 @@ def test_time_includes_reading_the_image() -> None:
 
     plain = frame(0, pose(0.0))
     slow = Slow(plain.name, plain.image, plain.camera, plain.base_from_camera)
-    (r,) = evaluate(Fake({0: Estimate("failed", None, None)}), {"a": scene("a", slow)})
+    (r,) = evaluate(Fake({0: estimate("failed", None, None)}), {"a": scene("a", slow)})
     assert r.milliseconds >= 20.0
 
 
 def test_near_training_frames_are_of_the_same_scene() -> None:
-    estimates = {i: Estimate("failed", None, None) for i in range(3)}
+    estimates = {i: estimate("failed", None, None) for i in range(3)}
     scenes = {
         "a": scene("a", frame(0, pose(0.0)), frame(1, pose(0.5)), train=(frame(9, pose(0.52)),)),
         "b": scene("b", frame(2, pose(0.5)), train=(frame(8, pose(9.0)), frame(7, None))),
@@ -146,7 +151,7 @@ def test_near_training_frames_are_of_the_same_scene() -> None:
 
 
 def test_frames_without_pose_are_skipped() -> None:
-    estimates = {1: Estimate("failed", None, None)}
+    estimates = {1: estimate("failed", None, None)}
     results = evaluate(Fake(estimates), {"a": scene("a", frame(0, None), frame(1, pose(0.0)))})
     assert [r.frame for r in results] == ["f1"]
 
@@ -170,12 +175,12 @@ def test_unusable_scenes_are_refused(scenes: dict[str, Recording], message: str)
 def test_squared_error_is_in_units_of_the_covariance() -> None:
     """3 cm with a sigma of 1 cm and 2 deg with a sigma of 1 deg: 9 + 4."""
     covariance = np.diag([0.01**2] * 3 + [math.radians(1) ** 2] * 3)
-    estimate = pose(1.03, 2.0)
+    off = pose(1.03, 2.0)
     estimates = {
-        0: Estimate("ok", "a", estimate, covariance=covariance),
-        1: Estimate("ok", "a", estimate),
-        2: Estimate("ok", "b", estimate, covariance=covariance),
-        3: Estimate("failed", "a", estimate, covariance=covariance),
+        0: estimate("ok", "a", off, covariance=covariance),
+        1: estimate("ok", "a", off),
+        2: estimate("ok", "b", off, covariance=covariance),
+        3: estimate("failed", "a", off, covariance=covariance),
     }
     scenes = {"a": scene("a", *(frame(i, pose(1.0)) for i in range(4)))}
     first, *others = evaluate(Fake(estimates), scenes)

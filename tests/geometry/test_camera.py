@@ -46,7 +46,7 @@ def test_unproject_inverts_project_over_the_whole_image(distortion: tuple[float,
     lens=st.sampled_from(LENSES),
 )
 @settings(deadline=None, max_examples=80)
-def test_a_resized_camera_sees_each_point_at_the_same_part_of_the_image(
+def test_resized_camera_projects_points_to_the_same_part_of_the_image(
     size: tuple[int, int], new: tuple[int, int], lens: tuple[float, ...]
 ) -> None:
     camera = Camera(*size, 0.9 * size[0], 1.1 * size[0], 0.4 * size[0], 0.6 * size[1], lens)
@@ -59,7 +59,7 @@ def test_a_resized_camera_sees_each_point_at_the_same_part_of_the_image(
     np.testing.assert_allclose(back.matrix(), camera.matrix(), rtol=1e-9, atol=1e-7)
 
 
-def test_resizing_matches_what_opencv_does_to_pixels() -> None:
+def test_resizing_agrees_with_opencv() -> None:
     """A bright spot's centre of mass moves as the principal point does."""
     image = np.zeros((48, 64), np.float32)
     image[10:14, 40:44] = 1.0
@@ -88,11 +88,11 @@ def test_short_side(size: tuple[int, int], expected: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("distortion", LENSES)
-def test_slopes_are_finite_differences(distortion: tuple[float, ...]) -> None:
+def test_slopes_equal_finite_differences(distortion: tuple[float, ...]) -> None:
     camera, step = camera_with(distortion), 1e-6
     plane = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 2))
 
-    def seen(camera: Camera, move: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    def pixels_of(camera: Camera, move: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
         return camera.project(np.concatenate([plane + move, np.ones((20, 1))], 1))
 
     def changed(size: float) -> list[Camera]:
@@ -105,11 +105,11 @@ def test_slopes_are_finite_differences(distortion: tuple[float, ...]) -> None:
         ]
 
     by_plane, by_lens = camera.slopes(plane)
-    ahead, behind = ([seen(c) for c in changed(size)] for size in (step, -step))
+    ahead, behind = ([pixels_of(c) for c in changed(size)] for size in (step, -step))
     truth = np.stack([a - b for a, b in zip(ahead, behind, strict=True)], -1) / (2 * step)
     np.testing.assert_allclose(by_lens, truth, atol=1e-6 * np.abs(truth).max())
     moves = (step, 0.0), (0.0, step)
-    along = [seen(camera, m) - seen(camera, (-m[0], -m[1])) for m in moves]
+    along = [pixels_of(camera, m) - pixels_of(camera, (-m[0], -m[1])) for m in moves]
     truth = np.stack(along, -1) / (2 * step)
     np.testing.assert_allclose(by_plane, truth, atol=1e-6 * np.abs(truth).max())
 
@@ -117,7 +117,7 @@ def test_slopes_are_finite_differences(distortion: tuple[float, ...]) -> None:
 BARREL = Camera(640, 480, 400.0, 400.0, 319.5, 239.5, (-0.35, 0.0, 0.0, 0.0))
 
 
-def test_a_lens_that_folds_shows_nothing_beyond_the_fold() -> None:
+def test_pixels_beyond_the_fold_have_no_ray() -> None:
     """x (1 - 0.35 x^2) is largest at x = 0.976, where it is 0.651."""
     assert BARREL.widest == pytest.approx((3 * 0.35) ** -0.5)
     points = np.array([[0.97, 0, 1], [0.98, 0, 1], [1.7, 0, 1]])
@@ -125,11 +125,11 @@ def test_a_lens_that_folds_shows_nothing_beyond_the_fold() -> None:
     assert pixels[0] == pytest.approx((319.5 + 400 * 0.97 * (1 - 0.35 * 0.97**2), 239.5))
     assert np.isnan(pixels[1:]).all()
     x, y = np.meshgrid(np.arange(0, 640, 7.0), np.arange(0, 480, 7.0))
-    seen = np.stack([x, y], -1)
-    rays = BARREL.unproject(seen)
+    pixels = np.stack([x, y], -1)
+    rays = BARREL.unproject(pixels)
     there = np.isfinite(rays).all(-1)
     assert (there == (np.hypot(x - 319.5, y - 239.5) < 400 * 0.6506)).all()
-    np.testing.assert_allclose(BARREL.project(rays)[there], seen[there], atol=1e-6)
+    np.testing.assert_allclose(BARREL.project(rays)[there], pixels[there], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -142,11 +142,11 @@ def test_a_lens_that_folds_shows_nothing_beyond_the_fold() -> None:
         ((0.0, 0.0, 0.0, 0.0, 0.0, 0.25, 0.0, 0.0), 2.0),  # x / (1 + x^2 / 4) is largest there
     ],
 )
-def test_how_far_a_lens_holds(distortion: tuple[float, ...], widest: float) -> None:
+def test_range_of_the_distortion(distortion: tuple[float, ...], widest: float) -> None:
     assert camera_with(distortion).widest == pytest.approx(widest)
 
 
-def test_no_distortion_is_the_same_however_it_is_said() -> None:
+def test_zero_coefficients_equal_no_distortion() -> None:
     for count in (4, 5, 8):
         assert camera_with((0.0,) * count) == camera_with(())
     assert camera_with(KINECT).coefficients == (*KINECT, 0.0, 0.0, 0.0)

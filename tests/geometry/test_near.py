@@ -1,11 +1,12 @@
-"""Which poses lie near others, against a loop."""
+"""Poses near training poses, compared with a loop."""
 
 import math
 
 import numpy as np
 import pytest
 
-from evercal.geometry import SE3, near_training, pose_distance
+from evercal.geometry import SE3, pose_distance
+from evercal.geometry.near import near_training
 
 DEGREE = math.radians(1.0)
 
@@ -22,7 +23,7 @@ def test_near_training_agrees_with_a_loop(monkeypatch: pytest.MonkeyPatch) -> No
     assert 10 < near.sum() < 90  # the twin saw both answers
 
 
-def test_near_in_metres_and_near_in_degrees_must_be_one_frame() -> None:
+def test_one_frame_must_be_near_in_metres_and_degrees() -> None:
     here = SE3.identity()
     turned = SE3.exp([0, 0, 0, 0, 0, 6 * DEGREE])
     moved = SE3.exp([0.06, 0, 0, 0, 0, 0])

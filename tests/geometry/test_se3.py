@@ -1,4 +1,4 @@
-"""Group axioms, closed forms and a matrix twin, uniformly, near identity and near half turns."""
+"""Group axioms, closed forms and matrices: uniform, near the identity and near half rotations."""
 
 import math
 
@@ -82,7 +82,7 @@ def test_exp_is_the_matrix_exponential_of_translation_then_rotation() -> None:
         np.testing.assert_allclose(SE3.exp(tangent).matrix(), expm(generator), atol=1e-10)
 
 
-def test_a_quarter_turn_about_z_takes_x_to_y() -> None:
+def test_quarter_rotation_about_z_maps_x_to_y() -> None:
     half = math.sqrt(0.5)
     turned = SE3(np.array([half, 0, 0, half]), np.array([1.0, 2.0, 3.0]))
     np.testing.assert_allclose(turned.apply([1.0, 0.0, 0.0]), [1.0, 3.0, 3.0], atol=1e-15)
@@ -117,7 +117,7 @@ def test_batches_broadcast_index_stack_and_iterate() -> None:
     assert SE3.from_matrix(np.zeros((0, 4, 4))).inverse().shape == (0,)
 
 
-def test_from_matrix_mends_rounding_and_refuses_the_rest() -> None:
+def test_from_matrix_corrects_rounding_and_refuses_other_matrices() -> None:
     pose = random_poses(np.random.default_rng(2), (50,))
     printed = np.round(pose.matrix(), 4)
     mended = SE3.from_matrix(printed)
@@ -140,7 +140,7 @@ def test_from_matrix_mends_rounding_and_refuses_the_rest() -> None:
         SE3.from_matrix(np.eye(3))
 
 
-def test_the_constructor_refuses_what_is_no_transform() -> None:
+def test_constructor_refuses_other_shapes_and_values() -> None:
     with pytest.raises(ValueError, match="length zero"):
         SE3(np.zeros(4), np.zeros(3))
     with pytest.raises(ValueError, match=r"\(2, 4\) and \(3,\)"):
@@ -149,7 +149,7 @@ def test_the_constructor_refuses_what_is_no_transform() -> None:
         SE3(np.array([1.0, 0, 0, 0]), np.array([0.0, np.nan, 0.0]))
 
 
-def test_a_transform_does_not_change_with_the_arrays_it_was_made_from() -> None:
+def test_transform_copies_its_arrays() -> None:
     translation = np.zeros(3)
     pose = SE3(np.array([1.0, 0, 0, 0]), translation)
     translation += 1.0

@@ -97,14 +97,14 @@ def test_distorted_image_is_located(hall: Recording, hall_map: MapContents) -> N
     assert estimate.uncertain_pose.squared_mahalanobis(frame.base_from_camera) < 22.5
 
 
-def texture() -> Array:
+def texture() -> np.ndarray:
     """(240, 320) uint8 with structure of some pixels everywhere."""
     noise = np.random.default_rng(0).uniform(0, 255, (240, 320))
     smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
     return cv2.normalize(smooth, np.empty(0), 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
-def wall(image: Array, count: int) -> AlignedLandmarks:
+def wall(image: np.ndarray, count: int) -> AlignedLandmarks:
     """Landmarks on a wall two metres ahead of a keyframe at the origin."""
     rng = np.random.default_rng(1)
     pixels = rng.integers([20, 20], [300, 220], (count, 2)).astype(float)

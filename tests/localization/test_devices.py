@@ -53,8 +53,8 @@ def test_no_tensor_is_created_on_the_default_device(hall: Recording, hall_map: M
         estimate = localizer.localize(frame.read_image(), frame.camera)
     assert estimate.base_from_camera is not None
     assert expected.base_from_camera is not None
-    matrices = [each.base_from_camera.matrix() for each in (estimate, expected)]
-    assert matrices[0].tobytes() == matrices[1].tobytes()
+    matrix = estimate.base_from_camera.matrix()
+    assert matrix.tobytes() == expected.base_from_camera.matrix().tobytes()
 
 
 def test_vlad_is_computed_on_the_device_of_the_features(device: torch.device) -> None:

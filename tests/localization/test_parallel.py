@@ -12,16 +12,16 @@ from evercal.localization.parallel import in_parallel
 
 
 def test_results_come_in_the_order_of_the_items(two_threads: None) -> None:
-    seen = set()
+    workers = set()
 
     def slowest_first(item: int) -> int:
-        seen.add((threading.get_ident(), torch.get_num_threads()))
+        workers.add((threading.get_ident(), torch.get_num_threads()))
         time.sleep(0.02 if item == 0 else 0.005)
         return item * item
 
     assert list(in_parallel(slowest_first, range(6))) == [i * i for i in range(6)]
-    assert len(seen) == 2
-    assert {threads for _, threads in seen} == {1}
+    assert len(workers) == 2
+    assert {threads for _, threads in workers} == {1}
     assert torch.get_num_threads() == 2
 
 

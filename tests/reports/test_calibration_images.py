@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evercal.mapping.scene_maps import SceneRecord
 from numpy.typing import ArrayLike
 
 from evercal.calibration.calibration import Calibration, ImageUse
-from evercal.continual.networks.atlas import Cell
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
+from evercal.mapping.map_frame import MapFrame
+from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import write_image
 from evercal.reports.calibration_images import annotate_images, select_images
 
@@ -46,13 +46,16 @@ class FixedLocalizer:
     scenes = ("room",)
 
     def __init__(self, pose: SE3 | None) -> None:
-        prototypes: Any = None
-        cell = Cell((0.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0))
-        record = SceneRecord("room", CAMERA, cell, prototypes, 10)
-        self.maps = SimpleNamespace(scenes=[record], short_side=60, keyframes=[None])
+        keyframes: Any = None
+        scene = SceneMap("room", CAMERA, CAMERA, keyframes, MapFrame(), 10)
+        self.contents = SimpleNamespace(scenes=[scene], short_side=60)
         self.pose = pose
 
-    def localize(self, image: np.ndarray, camera: Camera) -> PoseEstimate:
+    def camera_for(self, stated: Camera) -> Camera | None:
+        return stated
+
+    def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
+        assert camera is not None
         if self.pose is None:
             return PoseEstimate("failed", "too dark", None, None, None, 0, 0.0, 1.0)
         points = BASE_FROM_CAMERA.apply([[0.1, 0.1, 1.0], [-0.2, 0.1, 1.0]])

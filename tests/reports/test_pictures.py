@@ -4,11 +4,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from evercal.mapping.scene_maps import SceneRecord
 
-from evercal.continual.networks.atlas import Cell
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
+from evercal.mapping.map_frame import MapFrame
+from evercal.mapping.scene_map import SceneMap
 from evercal.reports.pictures import draw_landmarks
 
 LENS = Camera(320, 240, 300, 300, 159.5, 119.5)
@@ -20,10 +20,9 @@ def answer(pose: SE3 | None, pixels: np.ndarray | None, points: np.ndarray | Non
 
 
 def localizer(common: SE3) -> Any:
-    prototypes: Any = None
-    cell = Cell((0.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0))
-    record = SceneRecord("room", LENS, cell, prototypes, 10, common=common)
-    return SimpleNamespace(maps=SimpleNamespace(scenes=[record], short_side=240))
+    keyframes: Any = None
+    scene = SceneMap("room", LENS, LENS, keyframes, MapFrame(common), 10)
+    return SimpleNamespace(contents=SimpleNamespace(scenes=[scene], short_side=240))
 
 
 def test_landmarks_are_coloured_by_their_reprojection_error() -> None:

@@ -1,4 +1,4 @@
-"""A writer that dies at any step leaves the old content or the new, never a mixture."""
+"""A writer that is killed at any step leaves the old content or the new one."""
 
 import os
 import subprocess
@@ -73,7 +73,7 @@ def test_a_folder_is_old_or_new_at_every_step(tmp_path: Path) -> None:
     assert outcomes[-1] == ("new", "new")
 
 
-def test_a_failed_write_leaves_the_old_file_and_no_litter(
+def test_a_failed_write_leaves_the_old_file_and_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "a"
@@ -89,7 +89,7 @@ def test_a_failed_write_leaves_the_old_file_and_no_litter(
     assert os.listdir(tmp_path) == ["a"]
 
 
-def test_a_new_folder_needs_no_predecessor(tmp_path: Path) -> None:
+def test_a_folder_is_created(tmp_path: Path) -> None:
     (tmp_path / "fresh").mkdir()
     write_bytes(tmp_path / "fresh/a", b"1")
     replace_folder(tmp_path / "fresh", tmp_path / "stage")

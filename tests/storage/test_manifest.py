@@ -1,4 +1,4 @@
-"""Every changed, cut or missing file is found and named."""
+"""Changed, truncated and missing files are named."""
 
 import hashlib
 import json

@@ -1,14 +1,14 @@
-"""Folders of results and the settings they were begun with."""
+"""Settings of a run, stored in its folder of results."""
 
 from pathlib import Path
 
 import pytest
 
 from evercal.errors import InputError
-from evercal.storage import lock_settings
+from evercal.storage.settings import lock_settings
 
 
-def test_first_settings_are_kept_and_others_refused(tmp_path: Path) -> None:
+def test_other_settings_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "new" / "settings.json"
     lock_settings(file, {"steps": 3, "sizes": (1, 2)})
     before = file.read_bytes()

@@ -7,7 +7,8 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.evaluation.metrics import FrameResult
-from evercal.geometry import near_training, pose_distance
+from evercal.geometry import pose_distance
+from evercal.geometry.near import near_training
 from evercal.localization.localizer import SceneLocalizer
 from evercal.recordings import Frame, Recording, posed_frames, stated_poses
 

@@ -2,7 +2,6 @@
 
 from evercal.geometry.camera import Camera as Camera
 from evercal.geometry.camera import resize_pixels as resize_pixels
-from evercal.geometry.near import near_training as near_training
 from evercal.geometry.se3 import SE3 as SE3
 from evercal.geometry.se3 import average_poses as average_poses
 from evercal.geometry.se3 import pose_distance as pose_distance

@@ -18,7 +18,6 @@ from dataclasses import replace
 import numpy as np
 
 from evercal.geometry import UncertainPose, pose_distance
-from evercal.geometry.near import NEAR_M, NEAR_RAD
 from evercal.localization.query import Hypothesis
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.recordings.frame import Frame
@@ -83,6 +82,7 @@ def fit_acceptance(contents: MapContents, held_out: Sequence[Frame], index: int 
         The scene with its threshold: half of the 5 % quantile of the support of well-located
         frames, between `MIN_SUPPORT` and `MAX_SUPPORT`.
     """
+    from evercal.geometry.near import NEAR_M, NEAR_RAD
     from evercal.localization.localizer import Localizer
 
     scenes = list(contents.scenes)

@@ -13,11 +13,10 @@ from torch import Tensor
 from evercal.features.encode import encode_features
 from evercal.features.encoder import Encoder
 from evercal.features.precision import fast_bfloat16
-from evercal.features.views import ViewOptions, plain_view
+from evercal.features.views import ViewOptions, ideal_cell_pixels, plain_view
 from evercal.features.vlad import vlad_for
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.patches import Patches, cut_patches, image_pyramid, to_level
-from evercal.mapping.plane_sweep import PosedCells
 from evercal.mapping.scene_map import MapContents
 
 ALIGNED_LEVELS = 2
@@ -85,7 +84,7 @@ class LoadedKeyframe:
         view = plain_view(keyframes.grey(number), camera, stride, view_options)
         features = encode_features([view], contents.encoder)[0].flatten(1).T
         small = camera.short_side_resized(contents.short_side)
-        rays = PosedCells(features, small, pose, stride).rays()
+        rays = small.pinhole.unproject(ideal_cell_pixels(small, stride))
         depth = 1 / keyframes.inverse_depth[number].double().numpy()
         kind = torch.bfloat16 if fast_bfloat16(features.device) else torch.float32
         points = rays * depth[:, None]

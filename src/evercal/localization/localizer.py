@@ -24,7 +24,6 @@ from evercal.localization.alignment import align_pose
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.matching import Matcher
-from evercal.localization.parallel import in_parallel
 from evercal.localization.pnp import PnpResult, solve_pnp
 from evercal.localization.query import Candidate, Hypothesis, LocalizeOptions, Matches, Query
 from evercal.mapping.map_frame import MapFrame
@@ -177,6 +176,8 @@ class Localizer:
         self, images: Sequence[np.ndarray], cameras: Sequence[Camera | None]
     ) -> list[PoseEstimate]:
         """`localize` for many images in parallel; the answers are the same to the last bit."""
+        from evercal.localization.parallel import in_parallel
+
         pairs = list(zip(images, cameras, strict=True))
         return list(in_parallel(lambda pair: self.localize(*pair), pairs))
 

@@ -8,7 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from evercal.geometry import SE3, Camera, near_training, pose_distance
+from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry.near import near_training
 from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording, posed_frames
 from evercal.recordings.poses.pose_evidence import rotation_warnings
 

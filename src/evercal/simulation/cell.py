@@ -33,7 +33,8 @@ from evercal.simulation.changed_room import changed_room
 from evercal.simulation.furnished.panda import Panda
 from evercal.simulation.furnished.renderer import Renderer, RenderOptions, choose_variant, mitsuba
 from evercal.simulation.furnished.rooms import RESERVED, Room, room
-from evercal.storage import lock_settings, write_bytes, write_json
+from evercal.storage import write_bytes, write_json
+from evercal.storage.settings import lock_settings
 
 CALIBRATION_FRAMES = 25
 

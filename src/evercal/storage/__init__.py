@@ -1,4 +1,4 @@
-"""Bytes on disk that survive a crash; knows nothing of what they mean."""
+"""Files on disk that survive a crash, whatever they contain."""
 
 from evercal.storage.atomic import recover_folder as recover_folder
 from evercal.storage.atomic import replace_folder as replace_folder
@@ -10,5 +10,3 @@ from evercal.storage.manifest import read_manifest as read_manifest
 from evercal.storage.manifest import sha256_file as sha256_file
 from evercal.storage.manifest import verify as verify
 from evercal.storage.manifest import write_manifest as write_manifest
-from evercal.storage.settings import lock_settings as lock_settings
-from evercal.storage.settings import read_settings as read_settings

@@ -1,7 +1,7 @@
 """Files and folders that appear whole or not at all.
 
-Everything is written to a sibling, synced, moved into place by one rename, and the folder that
-holds it is synced too, so that after a power cut there is the old content or the new, never half.
+Content is written to a sibling, synced and renamed; then the folder is synced. After a power cut
+there is the old content or the new one, never a mixture.
 """
 
 import contextlib
@@ -13,10 +13,10 @@ from pathlib import Path
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """Creates or replaces a file with `data`.
+    """Create or replace a file.
 
     Raises:
-        OSError: As the system says (full disk, no right to write); the old file is then untouched.
+        OSError: A full disk or no permission to write; the old file is then unchanged.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
@@ -34,25 +34,25 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
 
 
 def write_json(path: str | os.PathLike[str], obj: object) -> None:
-    """Creates or replaces a file with `obj` as UTF-8 JSON; the same object gives the same bytes.
+    """Create or replace a UTF-8 JSON file; the same object gives the same bytes.
 
     Raises:
-        ValueError: `obj` holds inf or nan, which JSON has no word for.
-        TypeError: `obj` holds something that JSON has no word for.
+        ValueError: `obj` contains inf or nan, which JSON cannot represent.
+        TypeError: `obj` contains another value that JSON cannot represent.
     """
     text = json.dumps(obj, indent=1, ensure_ascii=False, allow_nan=False)
     write_bytes(path, (text + "\n").encode())
 
 
 def replace_folder(temporary: str | os.PathLike[str], final: str | os.PathLike[str]) -> None:
-    """Moves a finished folder to its place, replacing what stood there.
+    """Rename a complete folder, replacing an existing one.
 
-    Systems cannot swap two folders in one portable step. If `final` exists it is first set aside
-    under a fixed name; a crash between the two renames is mended by `recover_folder`.
+    No portable call swaps two folders. An existing `final` is first renamed to a fixed name. After
+    a crash between the two renames, `recover_folder` restores it.
 
     Args:
-        temporary: A folder on the same file system, complete; it is synced here.
-        final: Where it goes.
+        temporary: A complete folder on the same file system; it is synced here.
+        final: Its new path.
     """
     temporary, final = Path(temporary), Path(final)
     for folder, _, names in os.walk(temporary):
@@ -71,7 +71,7 @@ def replace_folder(temporary: str | os.PathLike[str], final: str | os.PathLike[s
 
 
 def recover_folder(final: str | os.PathLike[str]) -> None:
-    """Brings back or clears away what an interrupted `replace_folder` left; else does nothing."""
+    """Restore or remove a folder that an interrupted `replace_folder` has left."""
     final = Path(final)
     aside = _aside(final)
     if not aside.exists():
@@ -93,7 +93,7 @@ def _sync(file: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Makes renames in `folder` last; not every system lets a folder be opened."""
+    """Sync renames in a folder; some systems cannot open a folder and skip this."""
     try:
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError:

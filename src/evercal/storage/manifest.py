@@ -3,8 +3,8 @@
     manifest.json: {"format": "evercal-manifest", "schema": 1, "payload": {...},
                     "files": {"relative/path": {"sha256": hex, "bytes": n}}, "sha256": hex}
 
-Paths are relative with forward slashes. The last entry is the checksum of payload and files
-together, so that a manifest that was changed is noticed too.
+Paths are relative with forward slashes. The last entry is the checksum of payload and files, so
+that a changed manifest is detected too.
 """
 
 import hashlib
@@ -34,16 +34,16 @@ def sha256_file(path: str | os.PathLike[str]) -> str:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a manifest said when it was read."""
+    """The content of a manifest."""
 
     payload: dict[str, Any]
-    """What the writer keeps beside the list."""
+    """Settings of the writer."""
     files: dict[str, FileRecord]
-    """What every listed file was when it was written, by its relative path."""
+    """Checksum and size of every file when it was written, by relative path."""
 
     @classmethod
     def read(cls, root: str | os.PathLike[str]) -> Self:
-        """Reads it once; files are not checked, see `problems`.
+        """Read a manifest; files are not checked, see `problems`.
 
         Raises:
             InputError: No manifest, a broken one, or one of another schema.
@@ -52,23 +52,23 @@ class Manifest:
         return cls(whole["payload"], whole["files"])
 
     def problems(self, root: str | os.PathLike[str]) -> list[str]:
-        """Compares every listed file with its size and checksum.
+        """Compare every listed file with its size and checksum.
 
         Returns:
-            One line per problem, each beginning with the file's path; empty if all is well.
+            One line per problem, beginning with the path of the file; empty if there is none.
         """
-        found = []
+        problems = []
         for relative, record in self.files.items():
             path = Path(root) / relative
             try:
                 size = path.stat().st_size
                 if size != record["bytes"]:
-                    found.append(f"{path}: {size} bytes, expected {record['bytes']}")
+                    problems.append(f"{path}: {size} bytes, expected {record['bytes']}")
                 elif sha256_file(path) != record["sha256"]:
-                    found.append(f"{path}: checksum does not match, its content was changed")
+                    problems.append(f"{path}: checksum does not match, its content was changed")
             except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
-                found.append(f"{path}: missing")
-        return found
+                problems.append(f"{path}: missing")
+        return problems
 
 
 def write_manifest(
@@ -77,28 +77,28 @@ def write_manifest(
     files: Sequence[str],
     before: Manifest | None = None,
 ) -> None:
-    """Puts the manifest of `files`, which must be complete on disk, in place atomically.
+    """Write the manifest of files that are complete on disk, atomically.
 
     Args:
         root: The folder.
-        payload: What the caller wants to keep beside the list; JSON.
+        payload: Settings of the caller, JSON values.
         files: Paths relative to `root`, forward slashes.
-        before: The manifest that is replaced. What it says of a file stays, so that damage done
-            to it since then is still noticed.
+        before: The manifest that is replaced. Its records are kept, so that files that were damaged
+            since then are still detected.
 
     Raises:
-        ValueError: A path that leaves `root`, or a payload that is no JSON.
-        FileNotFoundError: One of the files is not there.
+        ValueError: A path that leaves `root`, or a payload that is not JSON.
+        FileNotFoundError: One of the files is missing.
     """
-    root, known = Path(root), before.files if before else {}
+    root, recorded = Path(root), before.files if before else {}
     records: dict[str, FileRecord] = {}
     for relative in sorted(set(files)):
         if not _stays_inside(relative):
             raise ValueError(f"manifest files lie inside {root}, got {relative!r}")
         path = root / relative
         size = path.stat().st_size
-        records[relative] = known.get(relative) or {"sha256": sha256_file(path), "bytes": size}
-    # Through JSON once, so that the checksum is that of what will be read back.
+        records[relative] = recorded.get(relative) or {"sha256": sha256_file(path), "bytes": size}
+    # Converted to JSON and back, so that the checksum is that of the values that are read.
     body = json.loads(json.dumps({"payload": payload, "files": records}, allow_nan=False))
     write_json(
         root / MANIFEST,
@@ -116,7 +116,7 @@ def read_manifest(root: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def verify(root: str | os.PathLike[str]) -> list[str]:
-    """Compares every listed file with its size and checksum; see `Manifest.problems`.
+    """Compare every listed file with its size and checksum; see `Manifest.problems`.
 
     Raises:
         InputError: As `Manifest.read`.
@@ -124,13 +124,13 @@ def verify(root: str | os.PathLike[str]) -> list[str]:
     while True:
         manifest = Manifest.read(root)
         problems = manifest.problems(root)
-        # What a writer has replaced meanwhile is no problem of the folder.
+        # A writer may have replaced files meanwhile.
         if not problems or Manifest.read(root) == manifest:
             return problems
 
 
 def _read(root: Path) -> dict[str, dict]:
-    """The whole manifest, its shape and own checksum checked."""
+    """The whole manifest after a check of its shape and its own checksum."""
     file = root / MANIFEST
     if not root.is_dir():
         raise InputError(f"{root}: no such folder")

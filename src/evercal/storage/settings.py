@@ -1,4 +1,4 @@
-"""A folder of results remembers what it was begun with."""
+"""Settings of a run, stored in its folder of results."""
 
 import json
 from collections.abc import Mapping
@@ -9,14 +9,14 @@ from evercal.storage.atomic import write_json
 
 
 def lock_settings(path: Path, settings: Mapping[str, object]) -> None:
-    """Notes the settings of a run that may be taken up again, or refuses to mix it with another.
+    """Store the settings of a run that can be resumed; refuse a folder with other settings.
 
     Args:
-        path: file in the folder of results; folder and file are made where they are missing.
-        settings: whatever decides the results, as JSON knows it; compared key by key.
+        path: file in the folder of results; created if it is missing.
+        settings: JSON values that decide the results; compared key by key.
 
     Raises:
-        InputError: the file holds other settings, or none that can be read.
+        InputError: The file contains other settings or cannot be read.
     """
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -33,15 +33,15 @@ def lock_settings(path: Path, settings: Mapping[str, object]) -> None:
 
 
 def read_settings(path: Path) -> dict[str, object]:
-    """What `lock_settings` wrote.
+    """Read the settings that `lock_settings` stored.
 
     Raises:
-        InputError: there is none that can be read.
+        InputError: The file is missing or is not a JSON object.
     """
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(found, dict):
+        settings = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(settings, dict):
             raise ValueError
     except (OSError, ValueError):
-        raise InputError(f"{path}: no settings in JSON; remove the folder and start anew") from None
-    return found
+        raise InputError(f"{path}: no settings in JSON; remove the folder and restart") from None
+    return settings

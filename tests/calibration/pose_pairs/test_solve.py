@@ -20,7 +20,7 @@ from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import BoardCorners, solve
 from evercal.evaluation import share_inside
-from evercal.geometry import SE3, Camera, average_poses, pose_distance, squared_mahalanobis
+from evercal.geometry import SE3, Camera, average_poses, pose_distance
 from evercal.recordings import read_image
 
 from ..boards.printed import grid
@@ -65,11 +65,7 @@ def test_the_covariance_is_not_too_large() -> None:
     for seed in range(40):
         truth = recording(Setting(noisy="both"), 200 + seed)
         result = solve(truth.pairs, "eye_in_hand")
-        distances.append(
-            squared_mahalanobis(
-                result.parent_from_child, result.covariance, truth.parent_from_camera
-            )
-        )
+        distances.append(result.uncertain_pose.squared_mahalanobis(truth.parent_from_camera))
     # Chi-square with six degrees of freedom has mean 6 and median 5.35.
     assert 4.2 < np.mean(distances) < 7.8
     assert 0.25 < np.mean(np.array(distances) < 5.35) < 0.75

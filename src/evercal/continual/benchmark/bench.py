@@ -33,7 +33,8 @@ from evercal.features.encoder import ENCODER_FILE
 from evercal.localization import acceptance
 from evercal.localization.query import LocalizeOptions
 from evercal.recordings import Recording
-from evercal.storage import lock_settings, sha256_file, write_json
+from evercal.storage import sha256_file, write_json
+from evercal.storage.settings import lock_settings
 
 Order = Literal["given", "reversed", "shuffled"]
 

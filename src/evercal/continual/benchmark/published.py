@@ -24,7 +24,8 @@ from evercal.continual.benchmark import results
 from evercal.continual.benchmark.results import SceneResult
 from evercal.errors import InputError
 from evercal.evaluation.metrics import CHI2_6, COARSE, FINE, FINEST, MIDDLE
-from evercal.storage import read_settings, write_bytes
+from evercal.storage import write_bytes
+from evercal.storage.settings import read_settings
 
 LOOSE = (0.10, math.radians(10.0))
 """10 cm and 10 deg, in metres and radians."""

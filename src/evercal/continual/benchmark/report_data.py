@@ -24,7 +24,7 @@ from evercal.continual.benchmark.comparison import (
 from evercal.continual.benchmark.results import RESULTS, SETTINGS, read, read_strategies
 from evercal.errors import InputError
 from evercal.evaluation.tables import Style
-from evercal.storage import read_settings
+from evercal.storage.settings import read_settings
 
 PLOTTED = 7
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.evaluation.metrics import COARSE, FrameResult
-from evercal.storage import read_settings
+from evercal.storage.settings import read_settings
 
 RESULTS, SETTINGS, STRATEGIES = "results.jsonl", "settings.json", "strategies.json"
 NETWORK, UNALIGNED = ":network", ":unaligned"

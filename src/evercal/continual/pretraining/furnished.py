@@ -15,7 +15,8 @@ from evercal.simulation.cell_paths import is_clear
 from evercal.simulation.furnished.panda import HOME_RAD, Panda
 from evercal.simulation.furnished.renderer import Renderer, RenderOptions
 from evercal.simulation.furnished.rooms import KINDS, Room, room
-from evercal.storage import lock_settings, write_bytes
+from evercal.storage import write_bytes
+from evercal.storage.settings import lock_settings
 
 SAMPLES = 8
 OCCLUSION = 0.02
