@@ -58,7 +58,9 @@ class RecordingMethod(Method):
         return {"number": torch.tensor(float(scene.number))}
 
 
-def test_arguments_of_a_method(empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions) -> None:
+def test_arguments_of_a_method(
+    empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions
+) -> None:
     method = RecordingMethod()
     scenes, strategy = empty_scenes("recording"), Strategy("recording", method)
     heads = []
@@ -89,9 +91,7 @@ def test_arguments_of_a_method(empty_scenes: EmptyScenes, rooms: Rooms, quick: S
     for keyframes, room in zip(scenes.keyframes, rooms, strict=True):
         assert keyframes is not None
         selected = stated_poses([room.train[1], room.train[4]])
-        np.testing.assert_allclose(
-            keyframes.base_from_camera.translation_m, selected.translation_m
-        )
+        np.testing.assert_allclose(keyframes.base_from_camera.translation_m, selected.translation_m)
 
 
 @pytest.mark.parametrize("name", STATEFUL)

@@ -304,8 +304,10 @@ def test_replay_prevents_forgetting(
         for frame in recording.test[::3]:
             estimate = localizer.localize(frame.read_image(), frame.camera)
             pose = estimate.base_from_camera
-            located = estimate.scene == recording.name and pose is not None
-            errors.append(pose_distance(pose, posed(frame))[0] if located else np.inf)
+            if pose is None or estimate.scene != recording.name:
+                errors.append(np.inf)
+            else:
+                errors.append(pose_distance(pose, posed(frame))[0])
         return float(np.median(errors))
 
     one, both = arc_scenes

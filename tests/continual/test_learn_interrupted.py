@@ -119,9 +119,7 @@ def test_two_interruptions(
     scenes = first_stages["evercal_network"]
     whole = outcome(second_stage(scenes, rooms, quick))
     monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
-    once = interrupted(
-        second_stage(scenes, rooms, quick), STOPS["halfway through encoding"]
-    )
+    once = interrupted(second_stage(scenes, rooms, quick), STOPS["halfway through encoding"])
     twice = interrupted(second_stage(scenes, rooms, quick, once), STOPS["fifth step"])
     resume = Resume([*once.rows, *twice.rows], twice.trainer)
     again = outcome(second_stage(scenes, rooms, quick, resume))

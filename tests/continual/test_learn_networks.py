@@ -113,8 +113,7 @@ def test_bad_input_is_refused_and_leaves_the_store_unchanged(
 ) -> None:
     before, gamma = tree(learned.root), rooms[2]
     gripper = [
-        replace(f, base_from_camera=None, base_from_gripper=f.base_from_camera)
-        for f in gamma.train
+        replace(f, base_from_camera=None, base_from_gripper=f.base_from_camera) for f in gamma.train
     ]
     few = replace(gamma, train=gamma.train[:15])
     for recording, change, message in (
@@ -263,12 +262,18 @@ def test_other_stages_are_not_resumed(
     ):
         with pytest.raises(Interrupted):
             learn_networks(store, recording, other, stop_at("trainer", 2))
-        events: list[object] = []
+        views: list[int] = []
+        stop = stop_at("rows", 1)
+
+        def watch(
+            event: object, views: list[int] = views, stop: Callable[[object], None] = stop
+        ) -> None:
+            views += [event.done] if isinstance(event, Encoding) else []
+            stop(event)
+
         with pytest.raises(Interrupted):
-            stop = stop_at("rows", 1)
-            learn_networks(store, alpha, options, lambda e, s=stop: (events.append(e), s(e)))
-        assert isinstance(events[0], Encoding)
-        assert events[0].done <= 8
+            learn_networks(store, alpha, options, watch)
+        assert views[0] <= 8
     for room in rooms[:2]:
         learn_networks(store, room, options)
     assert untimed(store) == untimed(learned.root)

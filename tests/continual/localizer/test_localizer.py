@@ -198,9 +198,7 @@ def test_candidates_are_chosen_by_prototypes() -> None:
     world = make_world((CAMERA,) * 4)
     image = world.view(2)
 
-    def candidates(
-        descriptor: list[float], options: NetworkLocalizeOptions
-    ) -> list[int]:
+    def candidates(descriptor: list[float], options: NetworkLocalizeOptions) -> list[int]:
         world.describe(image, descriptor)
         world.head.scenes_asked.clear()
         NetworkLocalizer(world.scenes, options).localize(image)

@@ -41,7 +41,7 @@ def fit(world: World, monkeypatch: pytest.MonkeyPatch) -> Fit:
 
 
 def frames(world: World, shares: np.ndarray) -> list[Frame]:
-    """Views of which shares of the patches have their true point."""
+    """Views with given shares of correct patches."""
     images = [world.view(0, correct=share) for share in shares]
     return [Frame(str(i), image, CAMERA, world.pose(image)) for i, image in enumerate(images)]
 

@@ -72,7 +72,9 @@ class ExactHead(Head):
         self.scenes_asked.append(scene)
         # With condition `descriptor`, the output does not depend on the scene's index.
         coded = self.options.condition == "code"
-        points = {key[1]: value for key, value in self.points.items() if key[0] == scene or not coded}
+        points = {
+            key[1]: value for key, value in self.points.items() if key[0] == scene or not coded
+        }
         levels = (255 * features[:, 0]).round().int().tolist()
         noise = torch.randn(len(levels), 3, generator=torch.Generator().manual_seed(0)) * 3
         rows = [

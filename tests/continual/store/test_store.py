@@ -25,9 +25,7 @@ from ..stages import MakeStore, Tree
 
 Stages = dict[str, list[LearnedScenes]]
 
-STRATEGIES = pytest.mark.parametrize(
-    "strategy", ["evercal_network", "evercal_hybrid", "isolation"]
-)
+STRATEGIES = pytest.mark.parametrize("strategy", ["evercal_network", "evercal_hybrid", "isolation"])
 
 
 def stored(head: Head) -> dict[str, Tensor]:
@@ -100,7 +98,9 @@ def test_poses_survive_the_store(
     assert compared >= 6
 
 
-@pytest.mark.parametrize(("strategy", "heads"), [("evercal_network", [3]), ("isolation", [1, 2, 3])])
+@pytest.mark.parametrize(
+    ("strategy", "heads"), [("evercal_network", [3]), ("isolation", [1, 2, 3])]
+)
 def test_of_a_shared_head_only_the_newest_file_remains(
     strategy: str,
     heads: list[int],
