@@ -22,7 +22,7 @@ from evercal.geometry import SE3, pose_distance
 from evercal.localization.localizer import SceneLocalizer
 from evercal.mapping.build import BuiltMap
 from evercal.mapping.memory_budget import MemoryBudget
-from evercal.recordings.frame import Recording, stated_poses
+from evercal.recordings.frame import Frame, Recording, stated_poses
 from evercal.simulation.box_room import BoxRoom
 
 from ..stages import outcome
@@ -37,13 +37,17 @@ def untrained(arcs: tuple[Recording, Recording], arc_stage: StageOptions) -> Lea
     return outcome(learn(empty, STRATEGIES["evercal_hybrid"], arcs[0], options))
 
 
+def posed(frame: Frame) -> SE3:
+    assert frame.base_from_camera is not None
+    return frame.base_from_camera
+
+
 def median_error_m(localizer: SceneLocalizer, recording: Recording) -> float:
     """Median error of every third test frame; a frame that is not located counts as infinite."""
     errors = []
     for frame in recording.test[::3]:
         pose = localizer.localize(frame.read_image(), frame.camera).base_from_camera
-        assert frame.base_from_camera is not None
-        errors.append(np.inf if pose is None else pose_distance(pose, frame.base_from_camera)[0])
+        errors.append(np.inf if pose is None else pose_distance(pose, posed(frame))[0])
     return float(np.median(errors))
 
 
@@ -68,40 +72,69 @@ class HallHead(Head):
         return HeadOutput(zero, zero[..., None].expand(-1, -1, 3), self.points, zero)
 
 
-@pytest.mark.parametrize("scene", [0, 1])
-def test_poses_of_a_descriptor_conditioned_head_stay_in_their_scene(
-    scene: int, hall: Recording, hall_room: BoxRoom, hall_built: BuiltMap
-) -> None:
-    """Both scenes show the hall with other keyframes, in base frames that are two metres apart.
+MOTION = SE3.exp([2.0, 0, 0, 0, 0, 0])
 
-    The head predicts the points in the cell of one scene. Landmarks of the other scene must not be
-    aligned to its pose.
+
+def hall_twice(
+    hall: Recording, built: BuiltMap, room: BoxRoom, frame: Frame, cell: int, shift: SE3
+) -> LearnedScenes:
+    """Two scenes of the hall with different keyframes; base frames are `MOTION` apart.
+
+    Args:
+        hall: recording of the first scene, `hall`; the second one is `there`.
+        built: map of the hall.
+        room: the hall.
+        frame: whose points the head predicts.
+        cell: scene in whose cell the points are predicted.
+        shift: of the predicted points, in the base frame of that scene.
     """
-    motion, encoder, descriptor = SE3.exp([2.0, 0, 0, 0, 0, 0]), load_encoder(), load_descriptor()
-    here, there = (hall_built.take(np.arange(i, 7, 2)).scene for i in (0, 1))
-    poses = motion @ there.keyframes.base_from_camera
+    encoder, descriptor = load_encoder(), load_descriptor()
+    here, there = (built.take(np.arange(i, 7, 2)).scene for i in (0, 1))
+    poses = MOTION @ there.keyframes.base_from_camera
     moved = replace(there.keyframes, base_from_camera=poses)
     there = replace(there, name="there", keyframes=moved)
     positions, atlas, records = stated_poses(hall.train).translation_m, Atlas(), []
-    for scene_map, shift in ((here, SE3.identity()), (there, motion)):
-        cell = atlas.place(shift.apply(positions))
-        none = torch.zeros(1, descriptor.width).half()
-        camera = hall.train[0].camera
-        records.append(SceneRecord(scene_map.name, camera, cell, none, 30, map=scene_map))
-    frame, shift = hall.test[11], (SE3.identity(), motion)[scene]
-    assert frame.base_from_camera is not None
+    for scene_map, there_from_hall in ((here, SE3.identity()), (there, MOTION)):
+        records.append(
+            SceneRecord(
+                scene_map.name,
+                frame.camera,
+                atlas.place(there_from_hall.apply(positions)),
+                torch.zeros(1, descriptor.width).half(),
+                30,
+                map=scene_map,
+            )
+        )
+    pose = posed(frame)
     rows, columns = 240 // encoder.stride, 320 // encoder.stride
     v, u = np.mgrid[0:rows, 0:columns] * encoder.stride + (encoder.stride - 1) / 2
     rays = frame.camera.unproject(np.stack([u.ravel(), v.ravel()], -1))
-    pose = frame.base_from_camera
-    points, _ = hall_room.intersect(pose.translation_m, rays @ pose.rotation_matrix().T)
-    in_atlas = (records[scene].cell.atlas_from_base @ shift).apply(points)
+    points, _ = room.intersect(pose.translation_m, rays @ pose.rotation_matrix().T)
+    in_atlas = (records[cell].cell.atlas_from_base @ shift).apply(points)
     head = HallHead(encoder.width, descriptor.width, in_atlas)
-    head.grow(torch.zeros(2, 3), 0)
-    head.grow(torch.zeros(2, 3), 0)
-    scenes = LearnedScenes(encoder, descriptor, "evercal_hybrid", 240, [head], records)
+    for _ in records:
+        head.grow(torch.zeros(2, 3), 0)
+    return LearnedScenes(encoder, descriptor, "evercal_hybrid", 240, [head], records)
+
+
+@pytest.mark.parametrize(("cell", "shift"), [(0, SE3.identity()), (1, MOTION)])
+def test_descriptor_conditioned_head_predicts_the_scene(
+    cell: int, shift: SE3, hall: Recording, hall_room: BoxRoom, hall_built: BuiltMap
+) -> None:
+    frame = hall.test[11]
+    scenes = hall_twice(hall, hall_built, hall_room, frame, cell, shift)
     estimate = HybridLocalizer(scenes).localize(frame.read_image(), frame.camera)
     assert estimate.status == "ok"
     assert estimate.base_from_camera is not None
-    expected = {"hall": pose, "there": motion @ pose}[str(estimate.scene)]
+    expected = {"hall": posed(frame), "there": MOTION @ posed(frame)}[str(estimate.scene)]
     assert pose_distance(estimate.base_from_camera, expected)[0] < 0.005
+
+
+def test_landmarks_are_not_aligned_to_a_pose_in_another_scene(
+    hall: Recording, hall_room: BoxRoom, hall_built: BuiltMap
+) -> None:
+    """Points of the hall in the cell of `there` fit the landmarks of the first scene only."""
+    frame = hall.test[0]
+    scenes = hall_twice(hall, hall_built, hall_room, frame, 1, SE3.identity())
+    estimate = HybridLocalizer(scenes).localize(frame.read_image(), frame.camera)
+    assert (estimate.status, estimate.scene) in (("ok", "hall"), ("unknown_scene", None))
