@@ -1,23 +1,46 @@
-"""What must travel with the package does."""
+"""The wheel contains everything the package reads."""
 
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "evercal"
+DATA = (
+    "py.typed",
+    "continual/benchmark/row_files/*.json",
+    "features/weights/*.safetensors",
+    "recordings/sample_cell/**/*.*",
+    "recordings/sample_rooms/**/*.*",
+    "reports/templates/*.html",
+)
+"""Files beside the modules, relative to the package."""
 
 
-@pytest.mark.slow
-def test_a_wheel_holds_the_tables_of_the_benchmark(tmp_path: Path) -> None:
-    pytest.importorskip("hatchling", reason="hatchling, which builds the wheel, is not installed")
-    from hatchling.builders.wheel import WheelBuilder  # pyright: ignore[reportMissingImports]
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
+    """Names in the wheel of `python -m build`."""
+    out = tmp_path_factory.mktemp("dist")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    (path,) = out.glob("evercal-*.whl")
+    with zipfile.ZipFile(path) as archive:
+        return set(archive.namelist())
 
-    (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
-    with zipfile.ZipFile(wheel) as archive:
-        held = set(archive.namelist())
-    source = ROOT / "src"
-    tables = sorted((source / "evercal" / "benchmark" / "row_files").glob("*.json"))
-    assert len(tables) >= 3
-    for path in tables:
-        assert path.relative_to(source).as_posix() in held
+
+@pytest.mark.parametrize("pattern", DATA)
+def test_wheel_contains_the_data(wheel: set[str], pattern: str) -> None:
+    files = [path for path in PACKAGE.glob(pattern) if path.is_file()]
+    assert files
+    assert {path.relative_to(ROOT / "src").as_posix() for path in files} <= wheel
+
+
+def test_wheel_contains_every_module_and_nothing_else(wheel: set[str]) -> None:
+    modules = {path.relative_to(ROOT / "src").as_posix() for path in PACKAGE.rglob("*.py")}
+    assert modules <= wheel
+    assert {name.split("/")[0].split("-")[0] for name in wheel} == {"evercal"}
+    assert not [name for name in wheel if name.startswith("evercal/") and "test" in name]
