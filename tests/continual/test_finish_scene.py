@@ -28,7 +28,6 @@ from .stages import (
     MakeStore,
     Rooms,
     assert_same,
-    finished,
     outcome,
     second_stage,
     weights,
@@ -160,14 +159,3 @@ def test_states_change_the_next_stage(
     ]
     key = "first.1.weight"
     assert not torch.allclose(weights(heads[0])[key], weights(heads[1])[key], atol=1e-5)
-
-
-@pytest.mark.parametrize(("name", "frames"), [("finetune", 0), ("er", 3)])
-def test_stage_counts_its_keyframes(
-    name: str,
-    frames: int,
-    first_stages: dict[str, LearnedScenes],
-    rooms: Rooms,
-    quick: StageOptions,
-) -> None:
-    assert finished(second_stage(first_stages[name], rooms, quick)).frames_kept == frames

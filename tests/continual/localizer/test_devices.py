@@ -10,10 +10,10 @@ import torch
 from evercal.continual.localizer import NetworkLocalizer
 from evercal.continual.scenes import LearnedScenes
 from evercal.geometry import pose_distance
-from evercal.localization.estimate import PoseEstimate
 from evercal.recordings.frame import Recording
 
 from ...one_device import tensors_stay_on_their_device
+from .world import everything
 
 Arcs = tuple[Recording, Recording]
 
@@ -25,14 +25,6 @@ def on_device(scenes: LearnedScenes, device: torch.device) -> LearnedScenes:
     assert moved.to(device) is moved
     assert moved.device == device
     return moved
-
-
-def everything(estimate: PoseEstimate) -> list[object]:
-    """An estimate without its time."""
-    pose = estimate.base_from_camera
-    arrays = [estimate.covariance, estimate.pixels, None if pose is None else pose.matrix()]
-    plain = [estimate.status, estimate.reason, estimate.scene, estimate.inliers]
-    return [*plain, *(None if array is None else array.tobytes() for array in arrays)]
 
 
 def test_poses_are_those_of_the_cpu(

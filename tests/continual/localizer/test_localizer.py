@@ -19,23 +19,12 @@ from evercal.continual.localizer import (
 from evercal.continual.scenes import LearnedScenes
 from evercal.errors import InputError
 from evercal.geometry import Camera, pose_distance
-from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
-from evercal.recordings.frame import Recording
 from evercal.simulation.box_room import default_camera
 
-from .world import CAMERA, make_world, patch_centres
+from .world import CAMERA, everything, make_world, patch_centres
 
 WIDE = Camera(640, 480, 400.0, 410.0, 300.0, 250.0)
-
-
-def everything(estimate: PoseEstimate) -> list[bytes | object]:
-    """An estimate without its time."""
-    arrays = [estimate.covariance, estimate.pixels, estimate.points_m]
-    if estimate.base_from_camera is not None:
-        arrays.append(estimate.base_from_camera.matrix())
-    plain = [estimate.status, estimate.reason, estimate.scene, estimate.inliers, estimate.support]
-    return [*plain, *(None if array is None else array.tobytes() for array in arrays)]
 
 
 @pytest.mark.parametrize("scene", [0, 1, 2])
@@ -103,30 +92,6 @@ def test_batches_equal_single_images(two_threads: None) -> None:
     assert [estimate.scene for estimate in batch[:21]] == [f"scene-{i % 3}" for i in range(21)]
     assert batch[21].status != "ok"
     assert localizer.localize_batch([], []) == []
-
-
-def test_batch_of_real_images(
-    two_threads: None,
-    arc_scenes: tuple[LearnedScenes, LearnedScenes],
-    arcs: tuple[Recording, Recording],
-) -> None:
-    localizer = NetworkLocalizer(arc_scenes[1])
-    images = [f.read_image() for f in (*arcs[0].test[::4], *arcs[1].test[1::4])]
-    batch = localizer.localize_batch(images, [None] * len(images))
-    for image, estimate in zip(images, batch, strict=True):
-        assert everything(localizer.localize(image)) == everything(estimate)
-    assert torch.get_num_threads() == 2
-
-
-def test_estimates_are_deterministic() -> None:
-    world = make_world()
-    image = world.view(1, correct=0.3)
-    localizer = NetworkLocalizer(world.scenes)
-    first = everything(localizer.localize(image))
-    torch.rand(3)
-    localizer.localize(world.view(0))
-    assert everything(localizer.localize(image)) == first
-    assert everything(NetworkLocalizer(world.scenes).localize(image)) == first
 
 
 def test_noise_is_not_located() -> None:
