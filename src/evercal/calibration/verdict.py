@@ -58,12 +58,12 @@ def verdict(calibration: Calibration) -> str:
         )
     else:
         first = f"Good for {found.name} (within {found.mm:g} mm and {found.deg:g} deg)."
-    known = f"The camera's place is known to {_length(mm)} and {deg:.2f} deg"
+    known = f"Expected error {_length(mm)} and {deg:.2f} deg"
     held_out = _held_out(calibration)
     if held_out is None:
         return f"{first} {known}."
     known = (
-        f"{known}; half of the poses that were left out are met within {_length(held_out[0])} and"
+        f"{known}; the median error on held-out poses is {_length(held_out[0])} and"
     )
     return f"{first} {known} {held_out[1]:.2f} deg. {_advice(found, (mm, deg), held_out)}"
 
