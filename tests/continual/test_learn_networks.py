@@ -245,6 +245,7 @@ def test_other_stages_are_not_resumed(
         (replace(alpha, name="other"), options),
         (replace(alpha, train=(moved, *alpha.train[1:])), options),
         (alpha, replace(options, stage=replace(options.stage, seed=3))),
+        (alpha, replace(options, short_side=40)),
     ):
         with pytest.raises(Interrupted):
             learn_networks(store, recording, other, stop_at("trainer", 2))

@@ -211,19 +211,19 @@ class NetworkStore(StageStore):
             identity: everything that the stage depends on (scene, options, seed, stages).
 
         Returns:
-            The checkpoints of an interrupted run of the same stage; None for a fresh start.
+            The checkpoints of an interrupted run of the same stage; None if there are none.
         """
-        folder, asked = self.root / LEARNING, json.loads(json.dumps(identity))
+        folder, current = self.root / LEARNING, json.loads(json.dumps(identity))
         try:
-            begun = json.loads((folder / "stage.json").read_text())
+            previous = json.loads((folder / "stage.json").read_text())
         except (OSError, ValueError):
-            begun = None
-        if begun != asked:
+            previous = None
+        if previous != current:
             # The name goes first, so that a half-removed stage is never resumed.
             (folder / "stage.json").unlink(missing_ok=True)
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
-            write_json(folder / "stage.json", asked)
+            write_json(folder / "stage.json", current)
             return None
         rows = [load_tensors(path) for path in sorted(folder.glob("rows-*.safetensors"))]
         trainer = folder / "trainer.safetensors"
