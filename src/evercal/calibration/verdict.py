@@ -62,9 +62,7 @@ def verdict(calibration: Calibration) -> str:
     held_out = _held_out(calibration)
     if held_out is None:
         return f"{first} {known}."
-    known = (
-        f"{known}; the median error on held-out poses is {_length(held_out[0])} and"
-    )
+    known = f"{known}; the median error on held-out poses is {_length(held_out[0])} and"
     return f"{first} {known} {held_out[1]:.2f} deg. {_advice(found, (mm, deg), held_out)}"
 
 

@@ -26,10 +26,10 @@ from evercal.continual.benchmark.results import (
 from evercal.continual.benchmark.suites import SUITES, load_suite, regions, tuning_split
 from evercal.continual.methods.replay import Replay
 from evercal.continual.presets import on_paper_backbone
+from evercal.continual.store import NetworkStore
 from evercal.continual.strategies import Strategy, strategy_named
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.mapping.store import Store
 from evercal.recordings import Frame, Recording
 
 if TYPE_CHECKING:
@@ -296,7 +296,7 @@ def test_backbone_of_the_paper_gets_all_centres_in_advance(
     paper = replace(options, stage=stage, strategies=named("sars_spdd", "joint", "evercal"))
     steps = list(run_bench(arcs, paper, tmp_path))
     assert [s.strategy for s in steps] == [s.name for s in paper.strategies for _ in arcs]
-    first = Store.open(tmp_path / "runs" / "first-one-0").maps
+    first = NetworkStore.open(tmp_path / "runs" / "first-one-0").contents
     assert len(first.heads[0].centres) == 5
     assert first.scenes[0].cell.side_m == 5.0
     ends = {r.strategy: r for r in read(tmp_path) if (r.stage, r.scene) == (1, "two")}
