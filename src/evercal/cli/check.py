@@ -28,7 +28,7 @@ class Check:
     """New images of one camera, or a folder of them; five or more reveal smaller shifts."""
     reference: Annotated[Path, arg(metavar="FILE")]
     """The camera's calibration from 'evercal calibrate'."""
-    camera: Annotated[Path | None, arg(metavar="FILE")] = None
+    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Intrinsics. Default: those of the reference."""
     device: Device = "auto"
     json: bool = False

@@ -27,6 +27,8 @@ class Detect:
     """Detect a printed board in images and estimate its pose in each, for 'evercal solve'.
 
     Without --camera the intrinsics are estimated from the board.
+
+    Example: evercal detect images/ --board chessboard --size 9x6 --square-mm 25
     """
 
     images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]

@@ -26,7 +26,7 @@ class Evaluate:
     """Folder of the store."""
     scenes: Annotated[Positional[tuple[str, ...]], arg(metavar="[NAME=]SCENE...")]
     """Folders of recorded scenes. NAME is the scene's name in the store, if it differs."""
-    report: Annotated[Path | None, arg(metavar="FILE.html")] = None
+    report: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
     """HTML report with error curves, trajectories and the worst frames."""
     device: Device = "auto"
     json: bool = False

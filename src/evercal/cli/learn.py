@@ -37,18 +37,18 @@ class Learn:
     """Folder of the map; created if it is missing."""
     scene: Annotated[Positional[Path], arg(metavar="RECORDING")]
     """Folder of the recording, or file of a bag."""
-    name: Annotated[str | None, arg(metavar="NAME")] = None
+    name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Name of the scene. Default: the recording's own name."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES|auto")] = "10%"
     """Keyframes to keep: a share of the frames (10%), a size (5MB), or auto for the fewest that
     locate the recording's other frames well."""
-    calibration: Annotated[Path | None, arg(metavar="FILE")] = None
+    calibration: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Output file for the estimated gripper_from_camera, for 'evercal export'."""
-    gripper_from_camera: Annotated[Path | None, arg(metavar="FILE")] = None
+    gripper_from_camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """A rough gripper_from_camera to compare the estimate with: 4x4 matrix or calibration file."""
-    encoder: Annotated[Path | None, arg(metavar="FILE")] = None
+    encoder: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Encoder weights from 'evercal pretrain', for a new store. Default: the shipped weights."""
-    strategy: Annotated[str | None, arg(metavar="NAME")] = None
+    strategy: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """evercal builds a map; every other strategy trains a network. Default: that of the store."""
     reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
     """How the recording is read."""

@@ -25,14 +25,16 @@ class Report:
 
     calibration: Annotated[Positional[Path], arg(metavar="CALIBRATION.json")]
     """Calibration file."""
-    store: Annotated[Path | None, arg(metavar="STORE")] = None
+    store: Annotated[Path | None, arg(metavar="STORE", help_behavior_hint="")] = None
     """Folder of the store. Its landmarks are drawn with their residuals."""
     images: Annotated[
         tuple[Path, ...],
         arg(metavar="IMAGE...", help_behavior_hint="(default: images of the calibration)"),
     ] = ()
     """Images of the camera, or a folder of them."""
-    against: Annotated[Path | None, arg(metavar="OLD_CALIBRATION.json")] = None
+    against: Annotated[Path | None, arg(metavar="OLD_CALIBRATION.json", help_behavior_hint="")] = (
+        None
+    )
     """Older calibration of the same camera, to compare with."""
     out: Annotated[Path, arg(metavar="FILE.html")] = Path("report.html")
     """The report, one file including its pictures."""
