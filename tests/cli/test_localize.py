@@ -23,6 +23,7 @@ KEYS |= {"inlier_ratio", "ms"}
 def images(hall: Recording, tmp_path: Path) -> Path:
     """A folder of an image of the hall and a black one."""
     folder = tmp_path / "images"
+    folder.mkdir()
     write_image(folder / "1-hall.png", hall.test[7].read_image())
     write_image(folder / "2-black.png", np.zeros((240, 320, 3), np.uint8))
     return folder
@@ -81,6 +82,7 @@ def test_overlays_have_the_size_of_their_images(
     run: Any, hall_store: Path, images: Path, hall: Recording, tmp_path: Path
 ) -> None:
     twin, out = tmp_path / "other" / "1-hall.png", tmp_path / "overlays"
+    twin.parent.mkdir()
     write_image(twin, np.repeat(np.repeat(hall.test[8].read_image(), 2, 0), 2, 1))
     assert run("localize", hall_store, twin, images, "--overlay", out).code == 0
     drawn = {path.name: read_image(path) for path in out.iterdir()}
