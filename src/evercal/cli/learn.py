@@ -92,7 +92,10 @@ class Learn:
             return 0
         for line in summary(report):
             print(line)
-        if recording.test:
+        if self.calibration is not None:
+            print(f"wrote {self.calibration}")
+            print_next("evercal", "export", self.calibration, "--format", "easy_handeye2")
+        elif recording.test:
             scene = str(self.scene) if self.name is None else f"{self.name}={self.scene}"
             print_next("evercal", "evaluate", self.store, scene)
         else:
