@@ -27,6 +27,7 @@ ALL = [verb for verbs in VERBS.values() for verb in verbs]
 OTHER_PROGRAMS = {"--once", "--frame-id", "--child-frame-id", "--qw", "--qx", "--qy", "--qz"}
 OTHER_PROGRAMS |= {"--nproc-per-node", "--tyro-print-completion", "--version"}
 """Options in messages that are not those of a verb."""
+SOLVE = ("--robot-poses", "R", "--camera-poses", "C", "--mount", "eye_in_hand")
 
 
 def alone(*words: str) -> tuple[subprocess.CompletedProcess[str], set[str], float]:
@@ -96,7 +97,6 @@ def test_messages_name_existing_options(run: Any, monkeypatch: pytest.MonkeyPatc
         (["learn", "--help"], 0),
         (["demo", "--help"], 0),
         (["learn", "store"], 2),
-        (["learn", "store", "scene", "--memory", "none"], 2),
         (["localize", "store", "missing.png"], 2),
         (["calibrate", "store", "missing.png"], 2),
         (["export", "missing.json", "--format", "urdf"], 2),
@@ -142,7 +142,7 @@ def test_unusable_arguments_are_an_error_object(run: Any, words: list[str], mess
         (["calibrate", "S", "IMAGE", "--out", "DIR"], "--out DIR: is a folder"),
         (["detect", "IMAGE", "--board", "apriltag", "--out", "GONE/b.json"], "--out GONE/b.json"),
         (
-            ["solve", "--robot-poses", "R", "--camera-poses", "C", "--mount", "eye_in_hand", "--out", "GONE/c.json"],
+            ["solve", *SOLVE, "--out", "GONE/c.json"],
             "--out GONE/c.json: folder",
         ),
         (["report", "C", "--out", "GONE/r.html"], "--out GONE/r.html: folder"),

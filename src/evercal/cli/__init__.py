@@ -45,10 +45,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code: 0 done, 1 the answer is no, 2 misuse or bad input, 130 interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    if words == ["--version"]:
-        # `evercal` is loaded before its folders, which do not import it.
-        print(f"evercal {sys.modules['evercal'].__version__}")
-        return 0
     as_json = "--json" in words
     # Spinning threads of torch take up to ten times as long when other programs use the cores, and
     # save a tenth otherwise. Read once, when torch is loaded.
@@ -61,15 +57,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         return _complain(str(error), as_json)
     except BrokenPipeError:
-        # The reader closed the pipe; a second attempt to write must not fail at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_stdout()  # the reader closed the pipe
         return 0
     except OSError as error:  # a full disk, a folder that may not be written
         where = f"{error.filename}: " if error.filename else ""
+        try:
+            sys.stdout.flush()
+        except OSError:
+            _discard_stdout()
         return _complain(f"{where}{error.strerror or error}", as_json)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
+
+
+def _discard_stdout() -> None:
+    """Keep Python from writing to a broken stdout again when it exits."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _complain(message: str, as_json: bool) -> int:
@@ -155,6 +159,10 @@ def _parse(words: list[str], as_json: bool) -> Command | int:
     """The command that the words make, or an exit code."""
     import tyro
 
+    if words == ["--version"]:
+        # `evercal` is loaded before its folders, which do not import it.
+        print(f"evercal {sys.modules['evercal'].__version__}")
+        return 0
     if words in ([], ["--help"], ["-h"]):
         print(_help())
         return 0 if words else 2

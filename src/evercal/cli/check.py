@@ -24,7 +24,7 @@ class Check:
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the map."""
-    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...")]
+    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
     """New images of one camera, or a folder of them; five or more reveal smaller shifts."""
     reference: Annotated[Path, arg(metavar="FILE")]
     """The camera's calibration from 'evercal calibrate'."""

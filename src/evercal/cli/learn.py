@@ -60,13 +60,13 @@ class Learn:
 
     def run(self) -> int:
         """Learn and print a summary."""
+        require_writable(self.calibration, "--calibration")
         from evercal.mapping.memory_budget import MemoryBudget
 
         try:
             MemoryBudget.parse(self.memory)
         except InputError as error:
             raise InputError(f"--{error}") from None
-        require_writable(self.calibration, "--calibration")
         from evercal.calibration.eye_in_hand import lacks_camera_poses
         from evercal.recordings import posed_recording
         from evercal.recordings.held_out import split_held_out

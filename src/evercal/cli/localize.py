@@ -32,7 +32,7 @@ class Localize:
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the store."""
-    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...")]
+    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
     """Image files or folders of them."""
     camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Intrinsics: 3x3 matrix as text, JSON, or ROS camera_info YAML. Default: those of the camera
