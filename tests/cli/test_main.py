@@ -172,16 +172,20 @@ def test_output_paths_are_refused_before_the_work(
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_full_disk_is_one_line() -> None:
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [(["--version"], "No space left on device"), (["info", "x", "--json"], "x: no such folder")],
+)
+def test_full_disk_is_one_line(words: list[str], message: str) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [sys.executable, "-m", "evercal", "--version"],
+            [sys.executable, "-m", "evercal", *words],
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
         )
     assert done.returncode == 2
-    assert done.stderr == "error: No space left on device\n"
+    assert done.stderr == f"error: {message}\n"
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

@@ -82,7 +82,10 @@ def _complain(message: str, as_json: bool) -> int:
     message = " ".join(message.split())
     print(f"error: {message}", file=sys.stderr)
     if as_json:
-        print_json({"error": message})
+        try:
+            print_json({"error": message})
+        except OSError:
+            _discard_stdout()
     return 2
 
 

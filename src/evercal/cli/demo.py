@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 from tyro.conf import arg
 
 from evercal.cli.console import print_json, print_next, progress_bar, require_folder, size
@@ -17,6 +16,8 @@ from evercal.cli.device import Device
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from evercal.evaluation import FrameResult
     from evercal.geometry import SE3
     from evercal.localization.localizer import Localizer
@@ -219,7 +220,7 @@ def _fixed_camera(localizer: "Localizer", room: "SampleRoom") -> "FixedCamera":
     return camera
 
 
-def _images(recording: "Recording") -> list[tuple[str, np.ndarray]]:
+def _images(recording: "Recording") -> "list[tuple[str, np.ndarray]]":
     return [(frame.name, frame.read_image()) for frame in recording.test]
 
 
@@ -247,5 +248,7 @@ def _pictures(localizer: "Localizer", scene: "Recording") -> "list[Picture]":
 
 def _spread(frames: "Sequence[Frame]", count: int) -> "list[Frame]":
     """At most `count` frames, evenly spread."""
+    import numpy as np
+
     indices = (np.arange(count) + 0.5) * len(frames) / count
     return [frames[i] for i in np.unique(indices.astype(int))]
