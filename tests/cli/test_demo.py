@@ -94,7 +94,7 @@ def test_copied_samples_are_recordings_and_nothing_else(
     names = sorted(path.name for path in (tmp_path / "samples").iterdir())
     assert names == ["bedroom", "cell", "kitchen", "living"]
     assert ran.out.splitlines()[-1] == "next: evercal learn cell.evercal samples/cell/wrist"
-    for folder in ("kitchen", "cell/wrist", "cell/tripod"):
+    for folder in ("kitchen", "cell/wrist"):
         assert run("inspect", f"samples/{folder}").code == 0
     again = run("demo", "--copy-samples", "samples", "--json")
     assert again.code == 2
