@@ -72,9 +72,9 @@ class Watch:
         tests, last = 0, time.monotonic()
         while self.idle is None or time.monotonic() - last < self.idle:
             for path, pixels in arrivals.scan():
-                last = time.monotonic()
                 camera = camera_for(self.camera, [path]) or reference.camera
                 recent.extend(locate(localizer, [(path.name, pixels)], camera))
+                last = time.monotonic()
                 if not any(item.is_located for item in recent):
                     self._print(path, {"moved": None, "reason": recent[-1].estimate.reason})
                     continue
