@@ -176,4 +176,4 @@ def test_ellipsoids_weigh_by_poses(tmp_path: Path) -> None:
     publish(tmp_path / "rows.json", "rooms", groups, out=tmp_path)
     page = tables.regenerated("<!-- table: rooms accuracy -->\n<!-- end -->\n", tmp_path)
     inside = [line.split(" | ")[-1] for line in page.splitlines()[3:-1]]
-    assert inside == ["88 % |", "88 % |", "- |"]
+    assert inside == ["**88 %** |", "88 % |", "- |"]
