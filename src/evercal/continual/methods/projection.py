@@ -41,7 +41,7 @@ class GradientProjectionMemory(Method):
         before = scene.earlier[-1] if scene.earlier else {}
         buffer = scene.rows()
         moments = input_moments(scene.head, [buffer], scene.number)
-        moments[OUTPUTS] = hidden_moment(scene.head, buffer)
+        moments[OUTPUTS] = _hidden_moment(scene.head, buffer)
         bases = {}
         for name, moment in moments.items():
             empty = moment.new_zeros(len(moment), 0)
@@ -93,7 +93,7 @@ def _shared_outputs(head: Head) -> list[str]:
 
 
 @torch.no_grad()
-def hidden_moment(head: Head, buffer: FeatureBuffer) -> Tensor:
+def _hidden_moment(head: Head, buffer: FeatureBuffer) -> Tensor:
     """Compute the (width, width) second moment of the last hidden layer over a scene, double."""
     rows = buffer.draw(ROWS, torch.Generator().manual_seed(buffer.scene))
     hidden = head.hidden(rows.features.float(), rows.scene, rows.descriptor).double()

@@ -35,11 +35,7 @@ class EpisodicMemory(Method):
 
 
 class MemoryHooks(TrainingHooks):
-    """Draws the same number of rows from each remembered scene, at least one.
-
-    Args:
-        start: Start of the stage, with at least one memory.
-    """
+    """Draws the same number of rows from each remembered scene, at least one."""
 
     def __init__(self, start: StageStart):
         self.memories = start.memories
@@ -70,12 +66,7 @@ class Replay(EpisodicMemory):
 
 
 class ReplayHooks(MemoryHooks):
-    """Adds the penalty of the replayed rows.
-
-    Args:
-        method: Penalty and weight.
-        start: Start of the stage, with at least one memory.
-    """
+    """Adds the penalty of the replayed rows."""
 
     def __init__(self, method: Replay, start: StageStart):
         super().__init__(start)
@@ -116,7 +107,7 @@ class DarkExperienceReplay(Replay):
         """Replay with the stored points of plain views."""
         for memory in start.memories:
             state = start.states[memory.scene]
-            memory.stored = state["points"].float() + state["origin"]
+            memory.stored = (state["points"].float() + state["origin"]).to(memory.device)
         return super().begin(start)
 
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:

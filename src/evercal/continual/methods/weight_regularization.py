@@ -77,10 +77,9 @@ def tie_cost(head: Head, ties: Sequence[Mapping[str, tuple[Tensor, Tensor]]]) ->
         head: Current head.
         ties: For each earlier scene, by parameter name: anchor and importance of the first rows.
     """
-    cost = torch.zeros((), device=head.centres.device)
-    count = 0
+    cost = torch.zeros((), device=head.device)
+    count = sum(value.numel() for value in head.parameters())
     for name, value in head.named_parameters():
-        count += value.numel()
         for tie in ties:
             anchor, importance = tie[name]
             cost = cost + (importance * (value[: len(anchor)] - anchor).square()).sum()
@@ -204,9 +203,8 @@ class _PathIntegral(_TiedWeights):
         return {k: self._path[k].clamp(min=0) / (value + floor) for k, value in squared.items()}
 
     def state(self) -> dict[str, Tensor]:
-        return {f"path.{k}": v for k, v in self._path.items()} | {
-            f"first.{k}": v for k, v in self._first.items()
-        }
+        first = {f"first.{k}": v for k, v in self._first.items()}
+        return first | {f"path.{k}": v for k, v in self._path.items()}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
         for name in self._path:
@@ -222,7 +220,7 @@ def mean_over_images(
     value: Callable[[Rows], Tensor],
     size: Callable[[Tensor], Tensor],
 ) -> dict[str, Tensor]:
-    """Average a function of gradients over images.
+    """Average a function of gradients over images, by parameter name.
 
     Args:
         head: Head with the parameters.
@@ -230,9 +228,6 @@ def mean_over_images(
         images: Number of images to draw.
         value: Scalar of an image's rows that is differentiated.
         size: Function of the gradient, such as its square.
-
-    Returns:
-        Means by parameter name.
     """
     generator = torch.Generator().manual_seed(buffer.scene)
     parameters = dict(head.named_parameters())

@@ -52,10 +52,6 @@ class PooledDescriptor(nn.Module):
     """A descriptor without trained weights, for encoders that have no descriptor of their own.
 
     It projects the mean and standard deviation of the features by a fixed random matrix.
-
-    Args:
-        inputs: Channels of the local features.
-        width: Length of the descriptor.
     """
 
     projection: Tensor
