@@ -53,10 +53,8 @@ class FrameStatistics:
     @cached_property
     def _first_rows(self) -> Tensor:
         """(n + 1,) first row of each frame, and the end of the last."""
-        count = torch.bincount(self._buffer.tensors["view"].cpu().long(), minlength=len(self))
-        return torch.cat(
-            [torch.zeros(1, dtype=torch.long, device="cpu"), count[: len(self)].cumsum(0)]
-        )
+        view = self._buffer.tensors["view"].cpu()
+        return torch.searchsorted(view, torch.arange(len(self) + 1, device="cpu").to(view.dtype))
 
     def _rows_of(self, frame: int) -> Rows:
         start, end = self._first_rows[frame : frame + 2].tolist()

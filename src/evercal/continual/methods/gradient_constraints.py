@@ -76,10 +76,8 @@ class ConstraintHooks(MemoryHooks):
         sizes = [change.numel() for change in proposed.changes.values()]
         g = torch.stack([_flat(constraint) for constraint in proposed.constraints])
         allowed = self.allowed(_flat(proposed.changes), g, proposed)
-        for (name, like), part in zip(
-            list(proposed.changes.items()), allowed.split(sizes), strict=True
-        ):
-            proposed.changes[name] = part.view_as(like)
+        for name, part in zip(proposed.changes, allowed.split(sizes), strict=True):
+            proposed.changes[name] = part.view_as(proposed.changes[name])
 
     def allowed(self, changes: Tensor, g: Tensor, proposed: ProposedStep) -> Tensor:
         """Apply the method's rule to the change (p,)."""
@@ -112,9 +110,8 @@ class Gem(ConstrainedStep):
 
     def edit(self, changes: Tensor, g: Tensor) -> Tensor:
         """Return the nearest change with <g_t, u> <= 0 for every scene, after the margin."""
-        return super().edit(
-            changes - self.margin * changes.norm() * F.normalize(g, dim=1).sum(0), g
-        )
+        margin = self.margin * changes.norm() * F.normalize(g, dim=1).sum(0)
+        return super().edit(changes - margin, g)
 
 
 @dataclass(frozen=True)

@@ -43,10 +43,9 @@ class _PreconditionedHooks(ReplayHooks):
         moments = input_moments(start.head, start.memories, start.seed)
         self._damping = {
             name: torch.linalg.inv(
-                torch.eye(len(moment), dtype=moment.dtype, device=moment.device)
-                + method.strength * moment
+                torch.eye(len(m), dtype=m.dtype, device=m.device) + method.strength * m
             ).float()
-            for name, moment in moments.items()
+            for name, m in moments.items()
         }
 
     def edit_step(self, proposed: ProposedStep) -> None:

@@ -105,13 +105,9 @@ class FeatureBuffer:
     def add(
         self, views: Sequence[View], features: Tensor, descriptors: Tensor, keep: Tensor
     ) -> None:
-        """Append encoded views.
+        """Append views with features (b, channels, h, w) and descriptors (b, width).
 
-        Args:
-            views: b views.
-            features: (b, channels, h, w), on any device.
-            descriptors: (b, width), on any device.
-            keep: (b, cells) bool, cells whose rows are added.
+        `keep` (b, cells) selects the cells whose rows are added.
         """
         self.append(self.part(self.views, views, (features, descriptors), keep))
 

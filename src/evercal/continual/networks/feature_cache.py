@@ -21,9 +21,8 @@ def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int | None = N
     Args:
         encoder: Changed in place; its weights and class stay the same.
         folder: One file per image; created if missing.
-        limit_bytes: Largest number of bytes to add. By default half of the disk space that is free
-            now stays free, even if other programs write to the disk. Writing also stops on a full
-            disk.
+        limit_bytes: Largest number of bytes to add. By default half of the free disk space stays
+            free. Writing also stops on a full disk.
     """
     weights = hashlib.blake2b(digest_size=8)
     for value in encoder.state_dict().values():
@@ -69,7 +68,6 @@ def _read(path: Path) -> Tensor | None:
 
 
 def _written(path: Path, features: Tensor) -> bool:
-    """Write features to a file; return whether that succeeded."""
     # Atomic but not synced, because features lost in a power failure are encoded again.
     temporary = path.with_name(f".{uuid.uuid4().hex[:8]}.tmp")
     try:

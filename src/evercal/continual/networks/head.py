@@ -67,8 +67,7 @@ class HeadOutput:
 
     def part(self, where: slice) -> "HeadOutput":
         """Return the rows of a slice."""
-        parts = (self.logits, self.offsets, self.points, self.hidden)
-        return HeadOutput(*(part[where] for part in parts))
+        return HeadOutput(*(value[where] for value in vars(self).values()))
 
 
 class Head(nn.Module):
@@ -148,9 +147,7 @@ class Head(nn.Module):
     @property
     def descriptor(self) -> int:
         """Channels of the global descriptor in the input; 0 with condition `code`."""
-        first = self.first[0]
-        assert isinstance(first, nn.Linear)
-        return first.in_features - self.features
+        return self.first[0].weight.shape[1] - self.features  # pyright: ignore
 
     @property
     def layers(self) -> int:

@@ -166,8 +166,7 @@ class HeadTrainer:
 
     def _fresh_costs(self, points: Tensor, rows: Rows, tau_px: float) -> tuple[Tensor, Tensor]:
         """Compute loss and error in pixels of the new rows."""
-        options = self.options
-        correction = None
+        options, correction = self.options, None
         if options.intrinsics_rate > 0 and tau_px < CORRECTION_FROM_PX:
             share = len(points) // len(self.buffers)
             correction = (self.correction * self._correctable).repeat_interleave(share, 0)
@@ -175,11 +174,9 @@ class HeadTrainer:
 
     def _gradients(self, loss: Tensor) -> dict[str, Tensor]:
         """Compute the gradient of a loss by parameter name, keeping the graph."""
-        named = dict(self.head.named_parameters())
-        gradients = torch.autograd.grad(
-            loss, list(named.values()), retain_graph=True, materialize_grads=True
-        )
-        return dict(zip(named, gradients, strict=True))
+        names, values = zip(*self.head.named_parameters(), strict=True)
+        gradients = torch.autograd.grad(loss, values, retain_graph=True, materialize_grads=True)
+        return dict(zip(names, gradients, strict=True))
 
     def _take_step(
         self, losses: Sequence[Tensor], constraints: list[dict[str, Tensor]], schedule: float
@@ -194,9 +191,8 @@ class HeadTrainer:
         if not before:
             return
         with torch.no_grad():
-            values = torch.zeros(0, device=self.head.device)
-            if losses:
-                values = torch.stack([loss.detach() for loss in losses])
+            empty = torch.zeros(0, device=self.head.device)
+            values = torch.stack([loss.detach() for loss in losses]) if losses else empty
             average([values])
             changes = {name: value - before[name] for name, value in named.items()}
             gradients = {
@@ -236,7 +232,6 @@ class HeadTrainer:
 
 
 def _without_prefix(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Select the tensors whose names start with a prefix, and remove the prefix."""
     return {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
 
 
