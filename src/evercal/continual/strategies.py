@@ -48,12 +48,8 @@ class Strategy:
         return plain
 
 
-def _named(*strategies: Strategy) -> dict[str, Strategy]:
-    return {strategy.name: strategy for strategy in strategies}
-
-
 # Settings with the best mean over the suites of `benchmarks tune`; see docs/methods.md.
-STRATEGIES: dict[str, Strategy] = _named(
+_ALL = (
     Strategy(
         "evercal",
         builds_map=True,
@@ -125,6 +121,7 @@ STRATEGIES: dict[str, Strategy] = _named(
         source="all frames of all scenes at once, beside the map",
     ),
 )
+STRATEGIES: dict[str, Strategy] = {strategy.name: strategy for strategy in _ALL}
 
 
 def strategy_named(name: str) -> Strategy:

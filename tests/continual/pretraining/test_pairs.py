@@ -32,12 +32,6 @@ def test_cells_match_the_encoder() -> None:
     np.testing.assert_array_equal(cell_pixels(), cell_centres(HEIGHT, WIDTH, 8))
 
 
-def test_inside_has_a_margin() -> None:
-    pixels = np.array([[0, 0], [3.4, 50], [3.5, 3.5], [WIDTH - 4.5, HEIGHT - 4.5], [50, HEIGHT]])
-    assert inside(pixels).tolist() == [False, False, True, True, False]
-    assert inside(pixels, margin=0).tolist() == [True, True, True, True, False]
-
-
 @pytest.mark.parametrize(("first", "second"), [(0, 1), (1, 0), (2, 3), (4, 6), (7, 5)])
 def test_rays_of_both_cameras_meet(views: RoomViews, first: int, second: int) -> None:
     pair = view_pair(views, first, second, np.random.default_rng(0))

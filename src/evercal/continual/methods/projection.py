@@ -65,7 +65,9 @@ class _ProjectedSteps(TrainingHooks):
             for name, basis in start.states[-1].items()
         }
         outputs = bases.pop(OUTPUTS)
-        shared = _shared_outputs(head)
+        shared = ["offset"] if head.options.offsets == "shared" else []
+        if head.options.condition == "descriptor":
+            shared = ["logit", "offset"]  # all scenes share all outputs
         self._bases: dict[str, Tensor] = bases | dict.fromkeys(shared, outputs)
         layers = [k.removesuffix("weight") + "bias" for k in bases]
         self._fixed = [*layers, *(f"{name}_bias" for name in shared)]
@@ -83,13 +85,6 @@ class _ProjectedSteps(TrainingHooks):
             changes[name].zero_()
         for name, basis in self._bases.items():
             changes[name] = changes[name] - (changes[name] @ basis) @ basis.T
-
-
-def _shared_outputs(head: Head) -> list[str]:
-    """Return the names of output parameters that all scenes share."""
-    if head.options.condition == "descriptor":
-        return ["logit", "offset"]
-    return ["offset"] if head.options.offsets == "shared" else []
 
 
 @torch.no_grad()

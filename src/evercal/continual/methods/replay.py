@@ -3,7 +3,6 @@
 Most methods differ only in the selected frames and the loss of replayed rows; both are fields.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -14,7 +13,7 @@ from torch import Tensor
 from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.methods.method import FinishedScene, Method, StageStart
 from evercal.continual.methods.penalties import Penalty, Reprojection, StoredOutput
-from evercal.continual.networks.buffer import FeatureBuffer, Rows
+from evercal.continual.networks.buffer import Rows
 from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.selectors import SELECTORS
@@ -85,15 +84,6 @@ def teacher_output(teacher: Head, rows: Rows) -> HeadOutput:
     """Apply a frozen head to rows."""
     with torch.no_grad(), autocast(rows.features.device):
         return teacher(rows.features.float(), rows.scene, rows.descriptor)
-
-
-def by_scene(
-    output: HeadOutput, rows: Rows, memories: Sequence[FeatureBuffer]
-) -> list[tuple[HeadOutput, Rows]]:
-    """Split replayed rows by remembered scene; rows are ordered by scene."""
-    each = len(rows.scene) // len(memories)
-    slices = [slice(i * each, (i + 1) * each) for i in range(len(memories))]
-    return [(output.part(where), rows.part(where)) for where in slices]
 
 
 @dataclass(frozen=True)

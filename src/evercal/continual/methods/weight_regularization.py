@@ -62,35 +62,23 @@ class WeightRegularization(Method):
 class _TiedWeights(TrainingHooks):
     def __init__(self, method: WeightRegularization, start: StageStart):
         self.method, self._head = method, start.head
-        self._ties = [_ties(state, start.head) for state in method.needed(start.states)]
+        # Of each earlier scene, by parameter name: anchor and importance of the first rows.
+        named = list(start.head.named_parameters())
+        self._ties = [
+            {k: (s[f"anchor.{k}"].to(v), s[f"importance.{k}"].to(v)) for k, v in named}
+            for s in method.needed(start.states)
+        ]
 
     def regularizer(self) -> Tensor | None:
         if not self._ties:
             return None
-        return self.method.strength * tie_cost(self._head, self._ties)
-
-
-def tie_cost(head: Head, ties: Sequence[Mapping[str, tuple[Tensor, Tensor]]]) -> Tensor:
-    """Compute half the mean over weights of sum_s I_s (w - w_s)^2.
-
-    Args:
-        head: Current head.
-        ties: For each earlier scene, by parameter name: anchor and importance of the first rows.
-    """
-    cost = torch.zeros((), device=head.device)
-    count = sum(value.numel() for value in head.parameters())
-    for name, value in head.named_parameters():
-        for tie in ties:
-            anchor, importance = tie[name]
-            cost = cost + (importance * (value[: len(anchor)] - anchor).square()).sum()
-    return 0.5 / count * cost
-
-
-def _ties(state: MethodState, head: Head) -> dict[str, tuple[Tensor, Tensor]]:
-    return {
-        name: (state[f"anchor.{name}"].to(value), state[f"importance.{name}"].to(value))
-        for name, value in head.named_parameters()
-    }
+        cost = torch.zeros((), device=self._head.device)
+        for name, value in self._head.named_parameters():
+            for tie in self._ties:
+                anchor, importance = tie[name]
+                cost = cost + (importance * (value[: len(anchor)] - anchor).square()).sum()
+        count = sum(value.numel() for value in self._head.parameters())
+        return self.method.strength * (0.5 / count * cost)
 
 
 @dataclass(frozen=True)

@@ -51,23 +51,14 @@ class Rows:
         return _combined([self], lambda v: v[0].to(device, non_blocking=device.type == "cuda"))
 
 
-_TENSORS = [
-    attrgetter(name)
-    for name in (
-        "features",
-        "scene",
-        "descriptor",
-        "index",
-        "target.pixels",
-        "target.intrinsics",
-        "target.camera_from_atlas",
-    )
-]
+_TARGET = "target.pixels", "target.intrinsics", "target.camera_from_atlas"
+_tensors = attrgetter("features", "scene", "descriptor", "index", *_TARGET)
 
 
 def _combined(parts: Sequence[Rows], change: Callable[[list[Tensor]], Tensor]) -> Rows:
     """Apply a function to each kind of tensor of some batches."""
-    features, scene, descriptor, index, *target = (change([*map(get, parts)]) for get in _TENSORS)
+    columns = zip(*map(_tensors, parts), strict=True)
+    features, scene, descriptor, index, *target = (change(list(column)) for column in columns)
     stored = [part.stored for part in parts if part.stored is not None]
     points = change(stored) if stored else None
     return Rows(features, scene, descriptor, Target(*target), index, points)
@@ -102,19 +93,17 @@ class FeatureBuffer:
         self._saved = 0  # leading parts that `take_new` has returned
         self._merged: dict[str, Tensor] | None = None
 
-    def add(
-        self, views: Sequence[View], features: Tensor, descriptors: Tensor, keep: Tensor
-    ) -> None:
-        """Append views with features (b, channels, h, w) and descriptors (b, width).
-
-        `keep` (b, cells) selects the cells whose rows are added.
-        """
-        self.append(self.part(self.views, views, (features, descriptors), keep))
-
     def part(
         self, first: int, views: Sequence[View], encoded: tuple[Tensor, Tensor], keep: Tensor
     ) -> dict[str, Tensor]:
-        """Return the rows of views by name, on the CPU; `first` is the first view's number."""
+        """Return the rows of views by name, on the CPU.
+
+        Args:
+            first: Number of the first view.
+            views: b views.
+            encoded: Features (b, channels, h, w) and descriptors (b, width), on any device.
+            keep: (b, cells) bool, cells whose rows are returned.
+        """
         features, descriptors = encoded
         rows = features.flatten(2).transpose(1, 2)
         poses = SE3.stack([self.atlas_from_base @ view.base_from_camera for view in views])
