@@ -20,13 +20,10 @@ GRADIENT_ROWS = 256
 
 
 class FrameStatistics:
-    """Frames of one scene in recorded order; everything but the poses is computed lazily.
+    """n frames of one scene in recorded order; everything but the poses is computed lazily.
 
-    Args:
-        frames: n posed training frames.
-        head: Head after learning the scene.
-        rows: Returns a buffer whose first n views are the plain views of these frames.
-        seed: Seed of a selector's random draws.
+    `head` has learned the scene, and `rows` returns a buffer whose first n views are the plain
+    views of these frames.
     """
 
     def __init__(

@@ -42,10 +42,8 @@ class Strategy:
     def description(self) -> dict[str, object]:
         """Convert to plain data: method with hyper-parameters, map, joint training."""
         method = None if self.method is None else described(self.method)
-        plain: dict[str, object] = {"method": method, "map": self.builds_map}
-        if self.jointly:
-            plain["jointly"] = True
-        return plain
+        jointly = {"jointly": True} if self.jointly else {}
+        return {"method": method, "map": self.builds_map, **jointly}
 
 
 # Settings with the best mean over the suites of `benchmarks tune`; see docs/methods.md.

@@ -256,21 +256,6 @@ def test_wrong_intrinsics_are_corrected_if_allowed(learnable: Learnable) -> None
             assert (trainer.correction == 0).all()
 
 
-def test_progress_describes_the_last_step(learnable: Learnable) -> None:
-    buffer, _ = learnable()
-    trainer = HeadTrainer(head_for([buffer]), [buffer], replace(OPTIONS, iterations=2), 0)
-    first, second = trainer.run()
-    assert (first.step, second.step, first.total) == (1, 2, 2)
-    assert isinstance(first, Progress)
-    rows = buffer.draw(96, torch.Generator().manual_seed(0))
-    with torch.no_grad(), torch.autocast("cpu", enabled=False):
-        points = head_for([buffer])(rows.features.float(), rows.scene, None).points
-        residual, camera = reprojection_error(points, rows.target)
-    clear = (camera[:, 2] > 0.1) & (residual.abs().sum(-1) < 1000)
-    inside = clear & (residual.norm(dim=-1) < 5)
-    assert first.inlier_share == pytest.approx(float(inside.float().mean()), abs=0.05)
-
-
 class StepRecorder(Replayed):
     """Sums the proposed changes and records the last step."""
 

@@ -43,12 +43,7 @@ class ConstrainedStep(EpisodicMemory):
         return losses
 
     def edit(self, changes: Tensor, g: Tensor) -> Tensor:
-        """Return the nearest change that raises no constrained loss.
-
-        Args:
-            changes: (p,) change by the optimisers, all weights concatenated.
-            g: (t, p) gradients of the losses that `constrained` returns.
-        """
+        """Find the nearest change (p,) that raises no loss, given the gradients (t, p)."""
         return nearest_change(changes, g, g.new_zeros(len(g)))
 
     def loss(self, output: HeadOutput, rows: Rows) -> Tensor:

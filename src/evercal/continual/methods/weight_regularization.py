@@ -208,15 +208,7 @@ def mean_over_images(
     value: Callable[[Rows], Tensor],
     size: Callable[[Tensor], Tensor],
 ) -> dict[str, Tensor]:
-    """Average a function of gradients over images, by parameter name.
-
-    Args:
-        head: Head with the parameters.
-        buffer: Rows of the images.
-        images: Number of images to draw.
-        value: Scalar of an image's rows that is differentiated.
-        size: Function of the gradient, such as its square.
-    """
+    """Average `size` of the gradients of `value` over some images, by parameter name."""
     generator = torch.Generator().manual_seed(buffer.scene)
     parameters = dict(head.named_parameters())
     total = {name: torch.zeros_like(p) for name, p in parameters.items()}

@@ -49,10 +49,7 @@ class Atlas:
         self.cells: list[Cell] = []
 
     def place(self, positions_m: np.ndarray) -> Cell:
-        """Assign a cell to a new scene.
-
-        Args:
-            positions_m: (n, 3) camera positions in the scene's base frame.
+        """Assign a cell to a new scene with (n, 3) camera positions in its base frame.
 
         Raises:
             InputError: Layout `paper` has no cell left.

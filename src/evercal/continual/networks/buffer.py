@@ -96,13 +96,10 @@ class FeatureBuffer:
     def part(
         self, first: int, views: Sequence[View], encoded: tuple[Tensor, Tensor], keep: Tensor
     ) -> dict[str, Tensor]:
-        """Return the rows of views by name, on the CPU.
+        """Return the rows of views by name, on the CPU; `first` is the first view's number.
 
-        Args:
-            first: Number of the first view.
-            views: b views.
-            encoded: Features (b, channels, h, w) and descriptors (b, width), on any device.
-            keep: (b, cells) bool, cells whose rows are returned.
+        `encoded` are features (b, channels, h, w) and descriptors (b, width) on any device. The
+        mask `keep` (b, cells) selects rows.
         """
         features, descriptors = encoded
         rows = features.flatten(2).transpose(1, 2)
@@ -151,12 +148,7 @@ class FeatureBuffer:
         return len(self.tensors["features"])
 
     def correct_lens(self, correction: Tensor) -> None:
-        """Undistort the pixels and correct the intrinsics.
-
-        Args:
-            correction: (5,) correction of the camera that took all frames; see
-                `reprojection_error`.
-        """
+        """Undistort the pixels and correct the intrinsics; see `reprojection_error`."""
         t, view = self.tensors, self.tensors["view"].long()
         focal, dx, dy, k1, k2 = correction.to(t["pixels"]).unbind()
         scale = t["intrinsics"][:, :2]

@@ -34,9 +34,7 @@ def rank() -> int:
 def join_processes(device: str | torch.device = "auto") -> torch.device:
     """Join the process group that torchrun started; without torchrun, only select a device.
 
-    Args:
-        device: Device of the networks, see `device_of`. On CUDA each process of a machine uses the
-            device of its LOCAL_RANK.
+    On CUDA each process of a machine uses the device of its LOCAL_RANK.
 
     Returns:
         The device of this process.
@@ -77,11 +75,7 @@ def average(tensors: Iterable[Tensor]) -> None:
 
 @torch.no_grad()
 def broadcast(tensors: Iterable[Tensor]) -> None:
-    """Replace each tensor by that of the first process, in one exchange per type.
-
-    Args:
-        tensors: Parameters and buffers, with the same order and shapes in every process.
-    """
+    """Replace each tensor by that of the first process, in one exchange per type."""
     _exchange(tensors, lambda flat: distributed.broadcast(flat, 0))
 
 
@@ -111,7 +105,7 @@ def shared_out(work: Sequence[Work], number: int, count: int) -> list[Work | Non
 
 
 def gather(part: Mapping[str, Tensor] | None) -> list[dict[str, Tensor]]:
-    """Collect the named CPU tensors of all processes in order; None is left out."""
+    """Collect the named CPU tensors of all processes in order, without loss."""
     if processes() == 1:
         return [] if part is None else [dict(part)]
     received: list[dict[str, Tensor] | None] = [None] * processes()

@@ -17,11 +17,7 @@ def cache_features(encoder: nn.Module, folder: Path) -> None:
 
     Features get half precision, cached or not, so results do not depend on the cache. Unreadable
     files are replaced. The folder may be deleted at any time. Half of the disk space that is free
-    now stays free, and writing stops on a full disk.
-
-    Args:
-        encoder: Changed in place; its weights and class stay the same.
-        folder: One file per image; created if missing.
+    now stays free, and writing stops on a full disk. The encoder is changed in place.
     """
     weights = hashlib.blake2b(digest_size=8)
     for value in encoder.state_dict().values():

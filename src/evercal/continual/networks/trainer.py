@@ -83,15 +83,8 @@ class HeadTrainer:
     """Trains a head on feature rows; can stop after any step and resume from `state()`.
 
     The rows of a step depend only on the seed and the step number, so a resumed run draws the same
-    rows as an uninterrupted one.
-
-    Args:
-        head: Trained in place on its device, where the buffers must return their rows. All
-            processes start with the weights of the first.
-        buffers: Rows of the scenes being learned.
-        options: Training options.
-        seed: Random seed.
-        hooks: Hooks of a continual-learning method.
+    rows as an uninterrupted one. The head is trained in place on its device, where the buffers must
+    return their rows. All processes start with the weights of the first.
     """
 
     def __init__(
