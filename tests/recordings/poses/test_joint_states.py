@@ -66,7 +66,7 @@ def test_planar_arm_agrees_with_its_closed_form(
 
 
 def test_any_two_links_can_be_chosen(model: RobotModel) -> None:
-    assert (model.base_link, model.end_link()) == ("base", "tip")
+    assert model.chosen_links(None, None) == ("base", "tip")
     assert model.joints_between("base", "tip") == ("shoulder", "elbow", "reach")
     assert model.joints_between("upper", "lower") == ("elbow",)
     assert model.joints_between("tip", "lower") == ("reach",)
@@ -98,7 +98,7 @@ def test_panda_agrees_with_its_published_parameters() -> None:
     file = next(f for f in files if str(f).endswith("panda_description/urdf/panda.urdf"))
     model = RobotModel(Path(file.locate()))
     with pytest.raises(InputError, match=r"has 3 ends; name the link with --gripper-frame"):
-        model.end_link()
+        model.chosen_links(None, None)
     joints = model.joints_between("panda_link0", "panda_link8")
     assert joints == tuple(f"panda_joint{i}" for i in range(1, 8))
     q = np.random.default_rng(1).uniform(-1.5, 0.0, (20, 7))
@@ -157,7 +157,7 @@ def test_json_and_csv_agree(tmp_path: Path, model: RobotModel) -> None:
         ("shoulder,elbow,reach\n90,20,0\n", "joint shoulder is at 90.0.*shoulder_deg"),
         ("shoulder,elbow,reach,elbow_deg\n0,1,0,90\n", "several columns are of joint elbow"),
         ("shoulder,elbow,reach\n0,x,0\n", "column 'elbow': 'x' is not a number"),
-        ("shoulder,elbow,reach\n", "no rows"),
+        ("shoulder,elbow,reach\n", "then rows of joint angles"),
     ],
 )
 def test_wrong_joint_tables_are_refused(

@@ -5,9 +5,9 @@ are radians, or degrees if a name ends in `_deg`, and metres for prismatic joint
 with images or times, or are in the order of the images.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from evercal.recordings.poses.labels import row_labels
 from evercal.recordings.poses.pose_track import MAX_GAP_S
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import Rows, read_rows
+from evercal.recordings.text_files import read_json
 
 _UNITS = ("deg", "rad", "m")
 _STILL_RAD = 0.001
@@ -44,8 +45,7 @@ def read_joint_poses(
         Poses with names or times of the rows, and notes.
 
     Raises:
-        InputError: The file cannot be read, a link or joint is missing, or angles look like
-            degrees.
+        InputError: The file is broken, a link or joint is missing, or angles look like degrees.
     """
     rows = read_joints(path)
     base, gripper = model.chosen_links(base, gripper)
@@ -84,13 +84,7 @@ def in_radians(
     values: NDArray[np.float64],
     units: Sequence[str | None],
 ) -> NDArray[np.float64]:
-    """Convert angles in degrees to radians and leave other values as they are.
-
-    Args:
-        model: The arm.
-        names: (k,) joints.
-        values: (n, k) stated values.
-        units: (k,) "deg", "rad", "m" or None.
+    """Convert angles in degrees to radians and leave other values (n, k) as they are.
 
     Raises:
         InputError: A unit is not known.
@@ -136,20 +130,14 @@ def read_joints(path: Path) -> Rows:
     """
     if path.suffix.lower() == ".csv":
         return read_rows(path, "joint angles")
+    data: dict[str, Any] = read_json(path, "file of joint angles", f"give {_JSON}")
     try:
-        data = json.loads(path.read_bytes())
         columns = tuple(str(name) for name in data["joint_names"])
         values = np.array(data["positions"], dtype=np.float64)
         lists = {key: value for key, value in data.items() if isinstance(value, list)}
         names, times = row_labels(lists, len(values), plural=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        if values.shape != (len(values), len(columns)) or not np.isfinite(values).all():
+            raise ValueError("'positions' are rows of finite numbers, one for each joint")
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: {type(error).__name__} {error}; give {_JSON}") from None
-    rows = len(values)
-    if values.shape != (rows, len(columns)) or not rows or not np.isfinite(values).all():
-        raise InputError(
-            f"{path}: 'positions' is a list of rows of {len(columns)} numbers, one for each of"
-            f" 'joint_names'"
-        )
     return Rows(names, times, columns, values)

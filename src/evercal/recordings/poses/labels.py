@@ -8,7 +8,6 @@ may have any name. In JSON lists beside the poses, names are in the plural: `ima
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import PurePath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,11 +47,12 @@ def find_labels(words: Sequence[str], plural: bool = False) -> Labels:
         name, _ = name_and_unit(word)
         if not plural or name.endswith("s"):
             positions.setdefault(name[:-1] if plural else name, i)
-    name = next((positions[n] for n in _NAMES if n in positions), None)
     stamp = next((positions[n] for n in _STAMPS if n in positions), None)
-    unit = None if stamp is None else name_and_unit(words[stamp])[1]
     return Labels(
-        name, stamp, unit, frozenset(i for n, i in positions.items() if n in _NAMES + _STAMPS)
+        name=next((positions[n] for n in _NAMES if n in positions), None),
+        stamp=stamp,
+        unit=None if stamp is None else name_and_unit(words[stamp])[1],
+        all=frozenset(i for n, i in positions.items() if n in _NAMES + _STAMPS),
     )
 
 
@@ -67,14 +67,14 @@ def name_and_unit(cell: str) -> tuple[str, str | None]:
 
 def _image_column(columns: Mapping[str, Sequence[object]]) -> str | None:
     """Name of the only column with nothing but names of image files, if there is one."""
-    names = [name for name, cells in columns.items() if cells and all(map(_is_image, cells))]
+    names = [
+        name
+        for name, cells in columns.items()
+        if cells and all(str(cell).lower().endswith(IMAGE_ENDINGS) for cell in cells)
+    ]
     if len(names) > 1:
         raise ValueError(f"{' and '.join(names)} name image files; call the right one 'image'")
     return names[0] if names else None
-
-
-def _is_image(cell: object) -> bool:
-    return isinstance(cell, str) and PurePath(cell).suffix.lower() in IMAGE_ENDINGS
 
 
 def row_labels(

@@ -58,15 +58,12 @@ class PairRotations:
 
 
 def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> list[str]:
-    """Compare stated rotations with the images.
+    """Describe contradictions between stated rotations and the images, in sentences.
 
     Args:
         frames: (n,) frames in recorded order.
         poses: (n,) base_from_camera or base_from_gripper.
         of_camera: Whether the poses are base_from_camera.
-
-    Returns:
-        Sentences about contradictions.
 
     Raises:
         InputError: An image cannot be read.

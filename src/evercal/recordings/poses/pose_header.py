@@ -28,14 +28,9 @@ class PoseHeader:
     groups: dict[str, tuple[int, ...]]
     """Columns by group: `position`, `quaternion` (w x y z), `angles` (x y z), ..."""
     units: dict[str, str]
-    """`m`, `mm`, `rad` or `deg` of the groups whose header states it."""
+    """`m` or `mm` of the position, `rad` or `deg` of angles, if the header states them."""
     labels: Labels
     """Columns of image names and times."""
-
-    @property
-    def width(self) -> int:
-        """Number of columns."""
-        return len(self.cells)
 
     @property
     def rotations(self) -> list[str]:
@@ -61,6 +56,8 @@ _ALIASES: dict[str, tuple[tuple[str, ...], ...]] = {
     "q1234": (("q1",), ("q2",), ("q3",), ("q4",)),
 }
 """By group: the possible column names of each of its numbers."""
+_UNITS = {"position": ("m", "mm"), "quaternion": (), "matrix": (), "q1234": ()}
+"""Units of the groups that are not angles."""
 _DEFINED = {"quaternion": "wxyz", "rotation_vector": "ur", "matrix": "matrix", "wpr": "fanuc"}
 """Convention of the groups that define a rotation."""
 _AMBIGUOUS = {
@@ -97,7 +94,7 @@ def pose_header(cells: Sequence[str]) -> PoseHeader | None:
         if len({units[column] for column in columns}) > 1:
             raise ValueError(f"the columns {', '.join(cells[c] for c in columns)} differ in unit")
         groups[group] = columns
-        if units[columns[0]] in ("m", "mm", "rad", "deg"):
+        if units[columns[0]] in _UNITS.get(group, ("rad", "deg")):
             stated[group] = units[columns[0]]
     if all(numbers) or (not groups and any(numbers)):
         return None
@@ -116,11 +113,7 @@ def is_number(cell: str) -> bool:
 def pose_columns(
     header: PoseHeader, given: PoseConvention | None
 ) -> tuple[PoseConvention, list[int]]:
-    """Determine the convention of a table and its columns in the order of the convention.
-
-    Args:
-        header: Header of the table.
-        given: Convention that the user gives. If omitted, the header defines it.
+    """Determine the convention of a table, if none is given, and its columns in that order.
 
     Raises:
         ValueError: The header is ambiguous, or contradicts the given convention.
@@ -131,7 +124,7 @@ def pose_columns(
         return convention, _columns(header, group, convention) or []
     if not header.rotations:
         labels = (header.labels.name, header.labels.stamp)
-        rest = [i for i in range(header.width) if i not in labels]
+        rest = [i for i in range(len(header.cells)) if i not in labels]
         if len(rest) != given.count:
             raise ValueError(
                 f"the header names no known rotation, and its {len(rest)} columns are not"
@@ -171,50 +164,49 @@ def _defined_group(header: PoseHeader) -> str:
 
 def _convention_of(header: PoseHeader, group: str) -> PoseConvention:
     """Convention of a group that defines a rotation, with the header's units."""
-    words = [_DEFINED.get(group, "rpy")]
-    words += [unit for unit in (header.units.get("position"),) if unit in ("m", "mm")]
-    if group in ("rotation_vector", "roll_pitch_yaw", "wpr"):
-        words += [unit for unit in (header.units.get(group),) if unit in ("rad", "deg")]
+    units = (header.units.get("position"), header.units.get(group))
+    name = ":".join([_DEFINED.get(group, "rpy"), *filter(None, units)])
     # The numbers are still checked: a header may have been copied from another file.
-    return replace(pose_convention(":".join(words)), length_stated=False, angle_stated=False)
+    return replace(pose_convention(name), length_stated=False, angle_stated=False)
 
 
 def _columns(header: PoseHeader, group: str, convention: PoseConvention) -> list[int] | None:
     """Columns in the order of a convention, or None if the group holds no such rotation."""
-    columns = header.groups[group]
     layout, base = convention.layout, convention.name.split(":")[0]
-    rotation: list[int] | None = None
-    if group == "matrix" and layout in ("rows", "columns"):
+    fits = {
+        "matrix": layout in ("rows", "columns"),
+        "quaternion": layout in ("wxyz", "xyzw"),
+        "q1234": layout in ("wxyz", "xyzw"),
+        "rotation_vector": layout == "rotation_vector",
+        # KUKA's A rotates about z, and KUKA angles under rx ry rz may be in either order.
+        "angles": convention.has_angles and base != "kuka",
+        "roll_pitch_yaw": layout == "euler",
+        "abc": base == "kuka",
+        "wpr": base == "fanuc",
+    }
+    if not fits[group]:
+        return None
+    columns = header.groups[group]
+    if group == "matrix":
         grid = np.array(columns).reshape(4, 4)
         return (grid if layout == "rows" else grid.T).ravel().tolist()
-    if group == "quaternion" and layout in ("wxyz", "xyzw"):
-        rotation = [*columns] if layout == "wxyz" else [*columns[1:], columns[0]]
-    elif (
-        (group == "q1234" and layout in ("wxyz", "xyzw"))
-        or (group in ("rotation_vector", "angles") and layout == "rotation_vector")
-        or (group, base) in (("abc", "kuka"), ("wpr", "fanuc"))
-    ):
-        rotation = [*columns]
+    if group == "quaternion" and layout == "xyzw":
+        columns = (*columns[1:], columns[0])
     elif group in ("angles", "roll_pitch_yaw") and layout == "euler":
-        # rx and roll rotate about x. KUKA's A rotates about z, and KUKA angles under rx ry rz may
-        # be in either order.
-        if (group, base) == ("angles", "kuka"):
-            return None
-        rotation = [columns["xyz".index(axis)] for axis in convention.euler.lower()]
-    return None if rotation is None else [*header.groups.get("position", ()), *rotation]
+        # rx and roll rotate about x.
+        columns = tuple(columns["xyz".index(axis)] for axis in convention.euler.lower())
+    return [*header.groups.get("position", ()), *columns]
 
 
 def _check_units(header: PoseHeader, group: str, given: PoseConvention) -> None:
     """Raise if the header states another unit than a convention implies."""
     length = "mm" if given.metres_per_unit < 1.0 else "m"
     angle = "deg" if given.degrees else "rad"
-    checks = []
-    if not given.length_stated:
-        checks.append((header.units.get("position"), length, ("m", "mm")))
-    if given.has_angles and not given.angle_stated:
-        checks.append((header.units.get(group), angle, ("rad", "deg")))
-    for stated, implied, units in checks:
-        if stated in units and stated != implied:
+    for stated, implied, final in (
+        (header.units.get("position"), length, given.length_stated),
+        (header.units.get(group), angle, given.angle_stated or not given.has_angles),
+    ):
+        if stated not in (None, implied) and not final:
             raise ConventionError(
                 f"the header says {stated} and the convention {given.name} means {implied}",
                 f"{given.name}:{stated} if the header is right",

@@ -7,7 +7,6 @@ convention, optionally preceded by a stamp, and a name before or after them.
 """
 
 import csv
-import io
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,11 +34,7 @@ class PoseTable:
 
 
 def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
-    """Read a table.
-
-    Args:
-        text: Content of the file.
-        given: Convention of the numbers. If omitted, the header defines it.
+    """Read a table; without a given convention, the header defines it.
 
     Raises:
         ValueError: The text is no table of numbers, or its convention is not defined.
@@ -50,8 +45,8 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
     if header is None:
         return _without_header(rows, given)
     for i, row in enumerate(rows):
-        if len(row) != header.width:
-            raise ValueError(f"row {i + 1} has {len(row)} columns, the header {header.width}")
+        if len(row) != len(header.cells):
+            raise ValueError(f"row {i + 1} has {len(row)} columns, the header {len(header.cells)}")
     convention, columns = pose_columns(header, given)
     cells = dict(zip(header.cells, zip(*rows, strict=True), strict=True))
     names, stamps = row_labels(cells, len(rows))
@@ -71,20 +66,19 @@ def _split(text: str) -> tuple[PoseHeader | None, list[list[str]]]:
         return header, rows[1:]
     before = lines[: lines.index(plain[0])]
     header = pose_header(_cells(before[-1].lstrip("# "))) if before else None
-    return (header if header and header.width == len(rows[0]) else None), rows
+    return (header if header and len(header.cells) == len(rows[0]) else None), rows
 
 
 def _cells(line: str) -> list[str]:
-    for separator in (";", ",", "\t"):
-        if separator in line:
-            cells = next(csv.reader(io.StringIO(line), delimiter=separator, skipinitialspace=True))
-            cells = cells[:-1] if cells and not cells[-1].strip() else cells
-            cells = [cell.strip() for cell in cells]
-            if separator == ";":  # then the comma may be a decimal point
-                points = [cell.replace(",", ".") for cell in cells]
-                return [p if is_number(p) else c for p, c in zip(points, cells, strict=True)]
-            return cells
-    return line.split()
+    separator = next((s for s in (";", ",", "\t") if s in line), None)
+    if separator is None:
+        return line.split()
+    cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    cells = [cell.strip() for cell in (cells if cells[-1].strip() else cells[:-1])]
+    if separator == ";":  # then the comma may be a decimal point
+        points = [cell.replace(",", ".") for cell in cells]
+        cells = [p if is_number(p) else c for p, c in zip(points, cells, strict=True)]
+    return cells
 
 
 def _without_header(rows: list[list[str]], given: PoseConvention | None) -> PoseTable:

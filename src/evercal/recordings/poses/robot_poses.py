@@ -27,6 +27,7 @@ from evercal.recordings.poses.conventions import (
 )
 from evercal.recordings.poses.labels import number_array, row_labels
 from evercal.recordings.poses.pose_table import PoseTable, read_pose_table
+from evercal.recordings.text_files import read_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +70,10 @@ def read_robot_poses(
     try:
         given = _convention(convention, path)
         if path.suffix.lower() == ".npy":
-            return _robot_poses(_npy_table(path, given))
-        text = path.read_text(encoding="utf-8-sig")
+            numbers = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
+            one_pose = numbers.shape == (4, 4)
+            return _robot_poses(_array_table(numbers[None] if one_pose else numbers, given))
+        text = read_text(path, what)
         if path.suffix.lower() == ".json":
             return _robot_poses(_json_table(json.loads(text), given))
         return _robot_poses(read_pose_table(text, given))
@@ -78,13 +81,9 @@ def read_robot_poses(
         raise InputError(f"{path}: {what} is missing; check the path") from None
     except OSError as error:
         raise InputError(f"{path}: {what} cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputError(
-            f"{path}: not a text file; give poses as a table, JSON, TUM lines or .npy"
-        ) from None
     except ConventionError as error:
         raise InputError(f"{path}: {error.naming(option)}") from None
-    except ValueError as error:  # also invalid JSON
+    except (ValueError, EOFError, TypeError) as error:  # also invalid JSON and arrays of text
         raise InputError(f"{path}: {error}") from None
 
 
@@ -111,14 +110,6 @@ def _robot_poses(table: PoseTable) -> RobotPoses:
     return RobotPoses(table.names, table.stamps_s, poses)
 
 
-def _npy_table(path: Path, given: PoseConvention | None) -> PoseTable:
-    try:
-        numbers = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
-    except (EOFError, TypeError) as error:
-        raise ValueError(f"no array of numbers ({error})") from None
-    return _array_table(numbers[None] if numbers.shape == (4, 4) else numbers, given)
-
-
 def _array_table(numbers: NDArray[np.float64], given: PoseConvention | None) -> PoseTable:
     if numbers.ndim == 3:
         convention = given or pose_convention("matrix")
@@ -143,15 +134,13 @@ def _json_table(data: object, given: PoseConvention | None) -> PoseTable:
             names=names if table.names is None else table.names,
             stamps_s=stamps if table.stamps_s is None else table.stamps_s,
         )
-    if isinstance(data, Mapping):
-        data = [data]
-    if not isinstance(data, list) or not data:
-        raise ValueError("JSON of poses is a list of objects, or of lists of numbers")
-    if all(isinstance(entry, list) for entry in data):
-        return _array_table(number_array(data, "a list of poses"), given)
-    if not all(isinstance(entry, Mapping) for entry in data):
-        raise ValueError("JSON of poses is a list of objects, or of lists of numbers, not of both")
-    return _object_table(data, given)
+    entries = [data] if isinstance(data, Mapping) else data
+    if isinstance(entries, list) and entries:
+        if all(isinstance(entry, list) for entry in entries):
+            return _array_table(number_array(entries, "a list of poses"), given)
+        if all(isinstance(entry, Mapping) for entry in entries):
+            return _object_table(entries, given)
+    raise ValueError("JSON of poses is a list of objects, or of lists of numbers, not of both")
 
 
 def _object_table(
@@ -168,19 +157,18 @@ def _object_table(
                 f"'translation_m' and 'quaternion_wxyz' contradict the convention"
                 f" {convention.name}; leave it out, or give wxyz:inverse"
             )
-        translation, quaternion = (
+        parts = [
             number_array([entry[key] for entry in entries], f"'{key}'")
             for key in ("translation_m", "quaternion_wxyz")
-        )
-        if (translation.shape[1:], quaternion.shape[1:]) != ((3,), (4,)):
+        ]
+        if [part.shape[1:] for part in parts] != [(3,), (4,)]:
             raise ValueError("'translation_m' has three numbers and 'quaternion_wxyz' four")
-        numbers = np.concatenate([translation, quaternion], axis=-1)
+        numbers = np.concatenate(parts, axis=-1)
     else:
         raise ValueError(
             "every pose has 'translation_m' and 'quaternion_wxyz', or every pose 'matrix'"
         )
-    keys = dict.fromkeys(key for entry in entries for key in entry)
-    columns = {key: [entry.get(key) for entry in entries] for key in keys}
+    columns = {key: [entry.get(key) for entry in entries] for entry in entries for key in entry}
     return PoseTable(numbers, convention, *row_labels(columns, len(entries)))
 
 

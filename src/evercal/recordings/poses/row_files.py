@@ -13,6 +13,7 @@ from evercal.errors import InputError
 from evercal.recordings.images import IMAGE_ENDINGS
 from evercal.recordings.poses.labels import find_labels, in_unit
 from evercal.recordings.poses.pose_header import is_number
+from evercal.recordings.text_files import read_text
 
 _EARLIEST_S, _LATEST_S = 1e9, 4e9
 """The years 2001 and 2096 in seconds since 1970, the range of plausible times of recordings."""
@@ -33,62 +34,45 @@ class Rows:
 
 
 def read_rows(path: Path, contents: str) -> Rows:
-    """Read a CSV file whose first line names the columns.
-
-    Args:
-        path: The file.
-        contents: What it holds, for messages.
+    """Read a CSV file whose first line names the columns; `contents` describes it in messages.
 
     Raises:
         InputError: The file is missing, lacks a header or rows, or holds a cell that is not a
             finite number.
     """
-    header, *lines = _read_lines(path, contents)
+    text = read_text(path, f"file with {contents}")
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    separator = ";" if lines and ";" in lines[0] else ","
+    cells = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator)]
+    if len(cells) < 2 or all(map(is_number, cells[0])):
+        raise InputError(f"{path}: needs a line of column names, then rows of {contents}")
+    header, *rows = cells
     labels = find_labels(header)
-    if all(is_number(word) for word in header):
-        raise InputError(
-            f"{path}: the first line names no columns; write a header, then {contents}"
-        )
-    if not lines:
-        raise InputError(f"{path}: holds a header and no rows; add {contents}")
-    for row, words in enumerate(lines):
-        if len(words) != len(header):
-            raise InputError(
-                f"{path}: row {row + 1} has {len(words)} cells, the header has {len(header)}"
-            )
     others = [i for i in range(len(header)) if i not in labels.all]
-    columns = [[_number(path, row, header[i], w[i]) for row, w in enumerate(lines)] for i in others]
+    numbers = [*others] if labels.stamp is None else [*others, labels.stamp]
+    values = np.empty((len(rows), len(numbers)))
+    for i, row in enumerate(rows):
+        if len(row) != len(header):
+            raise InputError(
+                f"{path}: row {i + 1} has {len(row)} cells, the header has {len(header)}"
+            )
+        for j, column in enumerate(numbers):
+            values[i, j] = float(row[column]) if is_number(row[column]) else np.nan
+            if not np.isfinite(values[i, j]):
+                raise InputError(
+                    f"{path}: row {i + 1}, column {header[column]!r}: {row[column]!r} is not a"
+                    f" number"
+                )
     stamps = None
     if labels.stamp is not None:
-        column = header[labels.stamp]
-        cells = [_number(path, row, column, w[labels.stamp]) for row, w in enumerate(lines)]
         try:
-            stamps = in_unit(np.array(cells), labels.unit) if labels.unit else in_seconds(cells)
+            stamps = (
+                in_unit(values[:, -1], labels.unit) if labels.unit else in_seconds(values[:, -1])
+            )
         except ValueError as error:
             raise InputError(f"{path}: {error}") from None
-    return Rows(
-        None if labels.name is None else tuple(words[labels.name] for words in lines),
-        stamps,
-        tuple(header[i] for i in others),
-        np.array(columns).reshape(len(others), len(lines)).T,
-    )
-
-
-def _read_lines(path: Path, contents: str) -> list[list[str]]:
-    """Stripped cells of a CSV file without empty lines and comments (#)."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{path}: missing; expected a file with {contents}") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file; expected {contents}") from None
-    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    if not lines:
-        raise InputError(f"{path}: empty; expected {contents}")
-    separator = ";" if ";" in lines[0] else ","
-    return [[word.strip() for word in row] for row in csv.reader(lines, delimiter=separator)]
+    names = None if labels.name is None else tuple(row[labels.name] for row in rows)
+    return Rows(names, stamps, tuple(header[i] for i in others), values[:, : len(others)])
 
 
 def in_seconds(stamps: NDArray[np.float64] | Sequence[float]) -> NDArray[np.float64]:
@@ -127,10 +111,3 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Sorting key that puts `image-2` before `image-10`."""
     parts = re.findall(r"\d+|\D+", name)
     return tuple((0, int(p), p) if p.isdigit() else (1, 0, p) for p in parts)
-
-
-def _number(path: Path, row: int, column: str, word: str) -> float:
-    value = float(word) if is_number(word) else np.nan
-    if not np.isfinite(value):
-        raise InputError(f"{path}: row {row + 1}, column {column!r}: {word!r} is not a number")
-    return value
