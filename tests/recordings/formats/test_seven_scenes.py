@@ -101,7 +101,10 @@ BREAKS = [
     (lambda root: (root / "TestSplit.txt").write_text("office"), r"TestSplit\.txt.*'office'"),
     (lambda root: (root / "TestSplit.txt").write_text("sequence9"), r"TestSplit\.txt.*seq-09"),
     (lambda root: (root / "TestSplit.txt").write_text("sequence1"), "seq-01 is in both"),
-    (lambda root: (root / "TestSplit.txt").write_bytes(b"\xff\xfe"), r"TestSplit\.txt: .*not a text file"),
+    (
+        lambda root: (root / "TestSplit.txt").write_bytes(b"\xff\xfe"),
+        r"TestSplit\.txt: .*not a text file",
+    ),
     (empty_splits, "are empty"),
     (lambda root: shutil.rmtree(root / "seq-02"), "seq-02"),
     (shutil.rmtree, "no such folder"),

@@ -49,16 +49,13 @@ def read_joint_poses(
     """
     rows = read_joints(path)
     base, gripper = model.chosen_links(base, gripper)
-    needed = model.joints_between(base, gripper)
-    if not needed:
+    if not model.joints_between(base, gripper):
         raise InputError(f"{model.path}: no joint moves {gripper} against {base}; name other links")
     names, values = _plain_columns(path, rows, model, unit)
     try:
-        poses = model.base_from_gripper(names, values, base, gripper)
+        poses, notes = model.poses(names, values, base, gripper)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    columns = [names.index(name) for name in needed]
-    notes = [model.note(base, gripper), *model.beyond_limits(needed, values[:, columns])]
     return RobotPoses(rows.names, rows.stamps_s, poses), notes
 
 

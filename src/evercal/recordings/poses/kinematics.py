@@ -71,9 +71,23 @@ class RobotModel:
             )
         return base or self.base_link, gripper or ends[0]
 
-    def note(self, base: str, gripper: str) -> str:
-        """Sentence about the source of gripper poses."""
-        return f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
+    def poses(
+        self,
+        names: Sequence[str],
+        values: NDArray[np.float64],
+        base: str | None,
+        gripper: str | None,
+    ) -> tuple[SE3, list[str]]:
+        """Compute (n,) poses of the gripper and notes about their source and joint limits.
+
+        Arguments are those of `base_from_gripper` and `chosen_links`, and so are the errors.
+        """
+        base, gripper = self.chosen_links(base, gripper)
+        poses = self.base_from_gripper(names, values, base, gripper)
+        note = f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
+        needed = self.joints_between(base, gripper)
+        columns = values[:, [list(names).index(name) for name in needed]]
+        return poses, [note, *self.beyond_limits(needed, columns)]
 
     def joints_between(self, base: str, gripper: str) -> tuple[str, ...]:
         """Moving joints between two links, from the base outwards.

@@ -11,16 +11,10 @@ from evercal.recordings.poses.camera_file import camera_from_ros
 
 
 def bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
-    """Read the first camera_info beside an image topic.
+    """Read the first camera_info beside an image topic, with its topic.
 
-    Args:
-        bag: Open bag.
-        image_topic: `/camera/image_raw` or `/camera/image_raw/compressed`, whose camera_info is
-            `/camera/camera_info`.
-
-    Returns:
-        Topic of the camera_info, and the camera: P without distortion for rectified images, else
-        K and D.
+    The topic of `/camera/image_raw/compressed` is `/camera/camera_info`. Cameras of rectified images
+    are P without distortion, others are K and D.
 
     Raises:
         InputError: There is no camera_info, it is uncalibrated, or its model is not supported.
