@@ -34,38 +34,27 @@ if TYPE_CHECKING:
     from evercal.recordings.poses.robot_poses import read_robot_poses as read_robot_poses
     from evercal.recordings.read_options import ReadOptions as ReadOptions
 
-_READERS = {
-    "FORMATS": "evercal.recordings.load",
-    "Format": "evercal.recordings.load",
-    "ReadOptions": "evercal.recordings.read_options",
-    "RobotPoses": "evercal.recordings.poses.robot_poses",
-    "load_recording": "evercal.recordings.load",
-    "read_robot_poses": "evercal.recordings.poses.robot_poses",
-    "with_sfm_poses": "evercal.recordings.formats.sfm_poses",
+_LOADED_ON_USE = {
+    "FORMATS": "load",
+    "Format": "load",
+    "ReadOptions": "read_options",
+    "RobotPoses": "poses.robot_poses",
+    "load_recording": "load",
+    "read_robot_poses": "poses.robot_poses",
+    "with_sfm_poses": "formats.sfm_poses",
 }
-"""Names that are loaded on first use, and the modules that define them."""
 
 
-_FORMATS = (
-    "colmap",
-    "generic",
-    "lerobot",
-    "nerfstudio",
-    "ros_bag",
-    "seven_scenes",
-    "twelve_scenes",
-    "wrist",
-)
-"""Modules that are loaded on first use."""
+_FORMATS = ["colmap", "generic", "lerobot", "nerfstudio", "ros_bag", "seven_scenes", "twelve_scenes", "wrist"]
 
 
 def __getattr__(name: str) -> object:
     """Load a reader on first use."""
     if name in _FORMATS:
-        value: object = importlib.import_module(f"evercal.recordings.formats.{name}")
-    elif name in _READERS:
-        value = getattr(importlib.import_module(_READERS[name]), name)
+        value: object = importlib.import_module(f"{__name__}.formats.{name}")
+    elif name in _LOADED_ON_USE:
+        value = getattr(importlib.import_module(f"{__name__}.{_LOADED_ON_USE[name]}"), name)
     else:
-        raise AttributeError(f"module 'evercal.recordings' has no attribute {name!r}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value
     return value

@@ -35,10 +35,7 @@ class Frame:
     """Joint angles of the arm at the time of the image, if stated."""
 
     def read_image(self) -> NDArray[np.uint8]:
-        """Read the pixels.
-
-        Returns:
-            (H, W, 3) uint8 RGB.
+        """Read the pixels, (H, W, 3) uint8 RGB.
 
         Raises:
             InputError: The file is missing or broken, or its size differs from the camera's.
@@ -73,7 +70,6 @@ class Recording:
     """Frames of one place in recorded order, with all poses in one base frame."""
 
     name: str
-    """Name of the scene."""
     train: tuple[Frame, ...]
     """Frames to learn from."""
     test: tuple[Frame, ...]

@@ -11,6 +11,7 @@ file is required. Frames of all episodes are training frames with base_from_grip
 dataset must stay inside its folder.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -161,8 +162,7 @@ def _images(
     root: Path, info: Mapping[str, Any], key: str, rows: Sequence[_Row]
 ) -> list[StoredImage]:
     if info["features"][key]["dtype"] == "image":
-        tables = _Tables(root, key)
-        return [_Embedded(tables, row.file, row.index) for row in rows]
+        return [_Embedded(root, key, row.file, row.index) for row in rows]
     videos = Videos(float(info["fps"]))
     starts = _video_starts(root, info, key, {row.episode for row in rows})
     images: list[StoredImage] = []
@@ -203,54 +203,44 @@ def _video_path(root: Path, info: Mapping[str, Any], key: str, numbers: dict[str
         raise InputError(f"{root / INFO}: unusable 'video_path': {error}") from None
 
 
-class _Tables:
-    """Images in parquet files; the last row group is cached."""
-
-    def __init__(self, root: Path, key: str) -> None:
-        self._parquet, self._key, self._root = _parquet(root), key, root
-        self._last: tuple[Path, int, list[Any]] | None = None
-
-    def bytes(self, path: Path, row: int) -> bytes:
-        """Content of the image file in a row."""
-        file = self._parquet.ParquetFile(path)
-        try:
-            group, index = 0, row
-            while index >= file.metadata.row_group(group).num_rows:
-                index -= file.metadata.row_group(group).num_rows
-                group += 1
-            last = self._last
-            if last is None or last[:2] != (path, group):
-                rows = file.read_row_group(group, columns=[self._key])[self._key].to_pylist()
-                last = self._last = path, group, rows
-        finally:
-            file.close()
-        cell = last[2][index]
-        if cell["bytes"]:
-            return bytes(cell["bytes"])
-        where = f"{path}: row {row}: image {cell['path']!r}"
-        try:
-            return (self._root / path_inside(cell["path"], "the path")).read_bytes()
-        except ValueError as error:
-            raise InputError(f"{where}: {error}") from None
-        except OSError as error:
-            raise InputError(f"{where} cannot be read ({error.strerror})") from None
+@functools.lru_cache(maxsize=1)
+def _row_group(path: Path, group: int, key: str) -> list[Any]:
+    with _parquet(path).ParquetFile(path) as file:
+        return file.read_row_group(group, columns=[key])[key].to_pylist()
 
 
 @dataclass(frozen=True, eq=False)
 class _Embedded(StoredImage):
     """An image file in a cell of a table."""
 
-    tables: _Tables
+    root: Path
+    key: str
     path: Path
     row: int
 
     def read(self) -> NDArray[np.uint8]:
         """(H, W, 3) uint8 RGB."""
-        image = decode_image(np.frombuffer(self.tables.bytes(self.path, self.row), np.uint8))
+        image = decode_image(np.frombuffer(self._content(), np.uint8))
         if image is None:
             raise InputError(f"{self.path}: row {self.row} holds no image")
         return image
 
     def file(self) -> tuple[str, bytes] | None:
         """The PNG or JPEG file as it is stored."""
-        return image_file(self.tables.bytes(self.path, self.row))
+        return image_file(self._content())
+
+    def _content(self) -> bytes:
+        with _parquet(self.path).ParquetFile(self.path) as file:
+            groups = range(file.num_row_groups)
+            ends = np.cumsum([file.metadata.row_group(group).num_rows for group in groups])
+        group = int(np.searchsorted(ends, self.row, side="right"))
+        cell = _row_group(self.path, group, self.key)[self.row - int(ends[group])]
+        if cell["bytes"]:
+            return bytes(cell["bytes"])
+        where = f"{self.path}: row {self.row}: image {cell['path']!r}"
+        try:
+            return (self.root / path_inside(cell["path"], "the path")).read_bytes()
+        except ValueError as error:
+            raise InputError(f"{where}: {error}") from None
+        except OSError as error:
+            raise InputError(f"{where} cannot be read ({error.strerror})") from None

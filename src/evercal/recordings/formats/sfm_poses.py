@@ -25,12 +25,9 @@ from evercal.recordings.text_files import read_text
 
 
 def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:
-    """Replace poses and focal lengths of a recording.
+    """Replace poses and focal lengths of a recording and keep its split.
 
-    Args:
-        recording: Images with original poses; its split is kept.
-        folder: Folder of the pose files.
-        name: First part of the file names, such as chess or apt1_kitchen.
+    Files in `folder` begin with `name`, such as chess or apt1_kitchen.
 
     Raises:
         InputError: A file is missing or broken, or holds no frame of the recording.

@@ -62,10 +62,7 @@ class _Open:
 
 
 class Videos:
-    """Cache of open videos of one frame rate; threads may share it.
-
-    Args:
-        fps: Frames per second of all videos.
+    """Cache of open videos with `fps` frames per second; threads may share it.
 
     Raises:
         InputError: The extra `lerobot` is not installed.
@@ -85,14 +82,7 @@ class Videos:
         weakref.finalize(self, _close, self._open)
 
     def frame(self, path: Path, seconds: float) -> NDArray[np.uint8]:
-        """Decode the frame at a time.
-
-        Args:
-            path: Video file.
-            seconds: Time since the first frame.
-
-        Returns:
-            (H, W, 3) uint8 RGB.
+        """Decode the frame at a time in seconds since the first frame to (H, W, 3) uint8 RGB.
 
         Raises:
             InputError: The video is missing, cannot be decoded, or has no frame at this time.

@@ -6,11 +6,15 @@ all kinds, pixel (0, 0) is the centre of the top-left pixel, and images are upri
 """
 
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from evercal.errors import InputError
 from evercal.geometry import Camera
+from evercal.recordings.poses.labels import is_number
 from evercal.recordings.text_files import read_json, read_text
 
 _MODELS = ("plumb_bob", "rational_polynomial", "none", "")
@@ -27,14 +31,14 @@ _ALIASES = {
 def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> Camera:
     """Read the intrinsics of one camera.
 
-    Args:
-        path: The file.
-        size: (width, height) in pixels of the images. Required for a 3x3 matrix and for OpenCV's
-            storage without a size; otherwise the size in the file is used.
+    `size` is (width, height) in pixels of the images. A 3x3 matrix and OpenCV's storage without a
+    size need it; otherwise the size in the file is used.
 
     Raises:
         InputError: The file is missing, of an unknown kind, or holds no usable camera.
     """
+    import yaml
+
     path = Path(path)
     text = read_text(path, "camera file")
     try:
@@ -42,10 +46,21 @@ def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = Non
             return Camera.from_dict(read_json(path, "camera file", _EXPECTED))
         if text.startswith("%YAML:") or "opencv-matrix" in text or "<opencv_storage" in text:
             return camera_from_ros(_stored_by_opencv(text, size))
-        numbers = _plain_numbers(text)
-        if numbers is not None:
-            return _from_matrix(numbers, size)
-        return camera_from_ros(_yaml_mapping(text))
+        words = re.sub(r"#.*|,", " ", text).split()
+        if all(map(is_number, words)):
+            if len(words) != 9:
+                raise ValueError(f"{len(words)} numbers, a 3x3 matrix has 9; {_EXPECTED}")
+            if size is None:
+                raise ValueError("a 3x3 matrix has no image size; give another kind of camera file")
+            return Camera.from_matrix(np.array(words, dtype=float).reshape(3, 3), *size)
+        # A printed message ends with '---', which opens a second, empty document.
+        data = next(yaml.safe_load_all(text), None)
+        if not isinstance(data, dict):
+            raise ValueError(f"no camera in it; {_EXPECTED}")
+        return camera_from_ros(data)
+    except yaml.YAMLError as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: not valid YAML ({reason}); {_EXPECTED}") from None
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -73,36 +88,6 @@ def check_size(source: str, camera: Camera, size: tuple[int, int], images: str) 
 _EXPECTED = (
     "give a 3x3 matrix as text, evercal's camera JSON, a ROS camera_info YAML or OpenCV's storage"
 )
-
-
-def _plain_numbers(text: str) -> list[float] | None:
-    """All words as numbers, without commas and comments; None if a word is not a number."""
-    lines = (line.split("#")[0].replace(",", " ") for line in text.splitlines())
-    try:
-        return [float(word) for line in lines for word in line.split()]
-    except ValueError:
-        return None
-
-
-def _from_matrix(numbers: list[float], size: tuple[int, int] | None) -> Camera:
-    if len(numbers) != 9:
-        raise ValueError(f"{len(numbers)} numbers, a 3x3 matrix has 9; {_EXPECTED}")
-    if size is None:
-        raise ValueError("a 3x3 matrix has no image size; give another kind of camera file")
-    return Camera.from_matrix([numbers[:3], numbers[3:6], numbers[6:]], *size)
-
-
-def _yaml_mapping(text: str) -> Mapping[str, object]:
-    import yaml
-
-    try:
-        # A printed message ends with '---', which opens a second, empty document.
-        data = next(yaml.safe_load_all(text), None)
-    except yaml.YAMLError as error:
-        raise ValueError(f"not valid YAML ({' '.join(str(error).split())}); {_EXPECTED}") from None
-    if not isinstance(data, dict):
-        raise ValueError(f"no camera in it; {_EXPECTED}")
-    return data
 
 
 def _stored_by_opencv(text: str, size: tuple[int, int] | None) -> dict[str, object]:
@@ -140,11 +125,7 @@ def _fields(data: Mapping[str, object]) -> dict[str, object]:
 
 
 def camera_from_ros(data: Mapping[str, object]) -> Camera:
-    """Build the camera of the raw image from the fields of a camera_info.
-
-    Args:
-        data: `width`, `height`, `k`, `d`, `distortion_model` and `roi` of a message, or the fields
-            of a calibration file.
+    """Build the camera of the raw image from the fields of a camera_info or a calibration file.
 
     Raises:
         ValueError: A field is missing or unusable, the distortion model is not supported, or the

@@ -36,11 +36,9 @@ class PoseConvention:
     """How numbers represent a pose."""
 
     name: str
-    """Name with its modifiers, as the user gives it."""
     layout: Layout
     """Translation then this kind of rotation, or a matrix."""
     meaning: str
-    """Description in one line."""
     euler: str = ""
     """scipy's Euler axes: lower case about fixed axes, upper case about moving axes."""
     degrees: bool = False
@@ -48,7 +46,6 @@ class PoseConvention:
     metres_per_unit: float = 1.0
     """0.001 for millimetres."""
     inverse: bool = False
-    """Whether the numbers are the inverse of the pose."""
     opengl: bool = False
     """Whether the camera's axes are x right, y up, z back, else OpenCV's."""
     length_stated: bool = False
@@ -113,7 +110,6 @@ MODIFIERS: dict[str, dict[str, Any]] = {
     "inverse": {"inverse": True},
     "opengl": {"opengl": True},
 }
-"""Fields that each modifier sets."""
 KNOWN_CONVENTIONS = (
     f"{', '.join(CONVENTIONS)}, followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"
 )

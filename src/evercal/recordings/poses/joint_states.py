@@ -32,17 +32,10 @@ def read_joint_poses(
     gripper: str | None = None,
     unit: str | None = None,
 ) -> tuple[RobotPoses, list[str]]:
-    """Read joint angles and compute gripper poses.
+    """Read joint angles and compute gripper poses, with notes.
 
-    Args:
-        path: A CSV or JSON file as above.
-        model: The arm.
-        base: Link. If omitted, the root of the URDF.
-        gripper: Link. If omitted, the only end of the URDF.
-        unit: "rad" or "deg" of angles whose column states no unit. If omitted, radians.
-
-    Returns:
-        Poses with names or times of the rows, and notes.
+    `unit` is "rad" or "deg" of angles whose column states no unit; radians if omitted. Links are
+    those of `RobotModel.chosen_links`.
 
     Raises:
         InputError: The file is broken, a link or joint is missing, or angles look like degrees.
@@ -96,7 +89,7 @@ def in_radians(
 def interpolate(
     times_s: NDArray[np.float64], positions: NDArray[np.float64], stamps_s: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Interpolate the position of one joint.
+    """Interpolate the position of one joint at (m,) seconds.
 
     Args:
         times_s: (n,) times of the positions, in any order.

@@ -17,10 +17,7 @@ _LARGEST_RAD = 4 * np.pi
 
 
 class RobotModel:
-    """Links and joints of a URDF.
-
-    Args:
-        path: The URDF. Its meshes are not read.
+    """Links and joints of a URDF; its meshes are not read.
 
     Raises:
         InputError: The extra `urdf` is not installed, or the file is missing or no URDF.
@@ -110,11 +107,7 @@ class RobotModel:
     ) -> SE3:
         """Compute (n,) poses of the link `gripper` in the link `base`.
 
-        Args:
-            names: (k,) joints, at least those of `joints_between`.
-            values: (n, k) radians, or metres for prismatic joints.
-            base: Link.
-            gripper: Link.
+        Values (n, k) of the k named joints are radians, or metres for prismatic joints.
 
         Raises:
             InputError: A joint has no values, or values are not in radians.

@@ -31,9 +31,7 @@ class Labels:
     """Positions of the labels in a list of columns or keys."""
 
     name: int | None
-    """Image names, if any."""
     stamp: int | None
-    """Times, if any."""
     unit: str | None
     """`s`, `ms`, `us` or `ns` of the times, if stated."""
     all: frozenset[int]
@@ -126,3 +124,12 @@ def in_unit(stamps: NDArray[np.float64], unit: str | None) -> NDArray[np.float64
             f" stamp_ns, stamp_us or stamp_ms"
         )
     return stamps
+
+
+def is_number(cell: str) -> bool:
+    """Whether Python reads a cell as a number."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

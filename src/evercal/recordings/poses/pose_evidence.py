@@ -7,7 +7,7 @@ camera. Inverted poses rotate about other axes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,18 +43,17 @@ GRIPPER_AGREE_DEG, GRIPPER_BETTER = 1.0, 2.0
 _GL = Rotation.from_euler("x", 180, degrees=True)
 
 
-@dataclass(frozen=True, eq=False)
-class PairRotations:
-    """Rotation of the second image of each pair in the frame of the first, as rotation vectors."""
+class PairRotations(NamedTuple):
+    """(n, 3) rotation vectors of the second image of each pair in the frame of the first."""
 
     measured: Array
-    """(n, 3) radians, from the images."""
+    """From the images, radians."""
     stated: Array
-    """(n, 3) radians, from the poses."""
+    """From the poses, radians."""
     inverse: Array
-    """(n, 3) radians, from the inverses of the poses."""
+    """From the inverses of the poses, radians."""
     swapped: Array
-    """(n, 3) radians, from the poses with quaternions in the other order."""
+    """From the poses with quaternions in the other order, radians."""
 
 
 def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> list[str]:
@@ -76,19 +75,15 @@ def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> l
 
 def pair_rotations(frames: Sequence[Frame], poses: SE3) -> PairRotations | None:
     """Measure the rotation of some image pairs; None if too few pairs can be matched."""
-    pairs, measured = [], []
-    for first, second in _pairs(poses):
-        rotation = measured_rotation(frames[first], frames[second])
-        if rotation is not None:
-            pairs.append((first, second))
-            measured.append(rotation)
+    pairs = [(i, j, measured_rotation(frames[i], frames[j])) for i, j in _pairs(poses)]
+    pairs = [pair for pair in pairs if pair[2] is not None]
     if len(pairs) < LEAST_PAIRS:
         return None
-    first, second = np.array(pairs).T
+    first, second, measured = (np.array(part) for part in zip(*pairs, strict=True))
     stated = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
     swapped = Rotation.from_quat(poses.rotation_wxyz)
     return PairRotations(
-        measured=np.array(measured),
+        measured=measured,
         stated=(stated[first].inv() * stated[second]).as_rotvec(),
         inverse=(stated[first] * stated[second].inv()).as_rotvec(),
         swapped=(swapped[first].inv() * swapped[second]).as_rotvec(),

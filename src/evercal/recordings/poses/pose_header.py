@@ -16,7 +16,7 @@ from evercal.recordings.poses.conventions import (
     PoseConvention,
     pose_convention,
 )
-from evercal.recordings.poses.labels import Labels, find_labels, name_and_unit
+from evercal.recordings.poses.labels import Labels, find_labels, is_number, name_and_unit
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,6 @@ class PoseHeader:
     """Columns of a pose table by their meaning."""
 
     cells: tuple[str, ...]
-    """Names of the columns."""
     groups: dict[str, tuple[int, ...]]
     """Columns by group: `position`, `quaternion` (w x y z), `angles` (x y z), ..."""
     units: dict[str, str]
@@ -99,15 +98,6 @@ def pose_header(cells: Sequence[str]) -> PoseHeader | None:
     if all(numbers) or (not groups and any(numbers)):
         return None
     return PoseHeader(tuple(cells), groups, stated, find_labels(cells))
-
-
-def is_number(cell: str) -> bool:
-    """Whether Python reads a cell as a number."""
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def pose_columns(

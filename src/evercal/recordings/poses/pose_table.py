@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.recordings.poses.conventions import KNOWN_CONVENTIONS, ConventionError, PoseConvention
-from evercal.recordings.poses.labels import in_unit, row_labels
-from evercal.recordings.poses.pose_header import PoseHeader, is_number, pose_columns, pose_header
+from evercal.recordings.poses.labels import in_unit, is_number, row_labels
+from evercal.recordings.poses.pose_header import PoseHeader, pose_columns, pose_header
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,6 @@ class PoseTable:
     numbers: Array
     """(n, convention.count)."""
     convention: PoseConvention
-    """Convention of the numbers."""
     names: tuple[str, ...] | None = None
     """(n,) image names, if there are any."""
     stamps_s: Array | None = None

@@ -53,18 +53,17 @@ def read_robot_poses(
     what: str = "file of robot poses",
     option: str | None = None,
 ) -> RobotPoses:
-    """Read a pose file.
+    """Read a pose file; `what` and the command line `option` of the convention are for messages.
 
     Args:
         path: A `.json` or `.npy` file; other endings are read as a table.
         convention: Convention of the numbers, such as `kuka`, `ur` or `matrix:mm`, or `tum` for
             xyzw after a stamp. Required if the file does not define it.
-        what: Kind of file, for messages.
-        option: Command line option of the convention, for messages.
+        what: Kind of file.
+        option: Option such as `--convention`.
 
     Raises:
-        InputError: The file is missing or broken, the convention is missing, or the numbers do not
-            fit it.
+        InputError: The file is missing or broken, or the numbers do not fit the convention.
     """
     path = Path(path)
     try:

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.recordings.images import IMAGE_ENDINGS
-from evercal.recordings.poses.labels import find_labels, in_unit
-from evercal.recordings.poses.pose_header import is_number
+from evercal.recordings.poses.labels import find_labels, in_unit, is_number
 from evercal.recordings.text_files import read_text
 
 _EARLIEST_S, _LATEST_S = 1e9, 4e9

@@ -13,8 +13,8 @@ from evercal.recordings.poses.camera_file import camera_from_ros
 def bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
     """Read the first camera_info beside an image topic, with its topic.
 
-    The topic of `/camera/image_raw/compressed` is `/camera/camera_info`. Cameras of rectified images
-    are P without distortion, others are K and D.
+    The topic of `/camera/image_raw/compressed` is `/camera/camera_info`. Rectified images
+    take P without distortion, others K and D.
 
     Raises:
         InputError: There is no camera_info, it is uncalibrated, or its model is not supported.

@@ -20,9 +20,7 @@ class Message:
     """One message of a bag."""
 
     topic: str
-    """Topic name."""
     kind: str
-    """Type, such as sensor_msgs/msg/Image."""
     logged_ns: int
     """Time of recording, nanoseconds."""
     repeat: int

@@ -31,9 +31,7 @@ class ImagePoses:
     valid: NDArray[np.bool_]
     """(n,) whether each pose was recorded close enough to the image."""
     of_camera: bool
-    """Whether the poses are base_from_camera."""
     notes: list[str]
-    """Frames that were chosen."""
 
 
 def poses_at_images(
