@@ -45,7 +45,16 @@ _LOADED_ON_USE = {
 }
 
 
-_FORMATS = ["colmap", "generic", "lerobot", "nerfstudio", "ros_bag", "seven_scenes", "twelve_scenes", "wrist"]
+_FORMATS = [
+    "colmap",
+    "generic",
+    "lerobot",
+    "nerfstudio",
+    "ros_bag",
+    "seven_scenes",
+    "twelve_scenes",
+    "wrist",
+]
 
 
 def __getattr__(name: str) -> object:

@@ -14,7 +14,7 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.recordings.poses.labels import is_number
+from evercal.recordings.poses.row_files import is_number
 from evercal.recordings.text_files import read_json, read_text
 
 _MODELS = ("plumb_bob", "rational_polynomial", "none", "")

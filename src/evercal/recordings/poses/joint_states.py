@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.recordings.poses.kinematics import RobotModel
-from evercal.recordings.poses.labels import row_labels
 from evercal.recordings.poses.pose_track import MAX_GAP_S
 from evercal.recordings.poses.robot_poses import RobotPoses
-from evercal.recordings.poses.row_files import Rows, read_rows
+from evercal.recordings.poses.row_files import Rows, read_rows, row_labels
 from evercal.recordings.text_files import read_json
 
 _UNITS = ("deg", "rad", "m")

@@ -1,6 +1,6 @@
 """Pose files: a table (CSV, TUM), JSON or NPY, in a named convention.
 
-The header of a table names its columns (`pose_header`, `labels`). JSON is a list of objects with
+The header of a table names its columns (`pose_table`, `row_files`). JSON is a list of objects with
 `translation_m` and `quaternion_wxyz`, or `matrix`, or a list of lists of numbers; it may stand
 under `poses`. NPY is (n, 4, 4), or (n, k) numbers. A convention is required if the file does not
 define the meaning of its numbers. docs/formats.md has examples.
@@ -25,8 +25,8 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
     poses_from_numbers,
 )
-from evercal.recordings.poses.labels import number_array, row_labels
 from evercal.recordings.poses.pose_table import PoseTable, read_pose_table
+from evercal.recordings.poses.row_files import number_array, row_labels
 from evercal.recordings.text_files import read_text
 
 

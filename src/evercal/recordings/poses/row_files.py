@@ -1,8 +1,14 @@
-"""CSV files with a header and one row for each image or time."""
+"""Files with one row for each image or time: labels of the rows, and CSV files with a header.
+
+Labels are columns of a table, or keys of JSON, that hold image names and times. Names are
+case-insensitive, and times may have a unit (`stamp_ns`, `time [ms]`). If there are several
+candidates, the first of the list is used. A column with nothing but names of image files may have
+any name. In JSON lists beside the poses, names are in the plural: `images`, `stamps_s`.
+"""
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
@@ -11,8 +17,128 @@ from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.recordings.images import IMAGE_ENDINGS
-from evercal.recordings.poses.labels import find_labels, in_unit, is_number
 from evercal.recordings.text_files import read_text
+
+_NAMES = (
+    "image", "image_name", "image_file", "image_path", "img", "file", "filename", "file_name",
+    "file_path", "filepath", "path", "name", "frame",
+)  # fmt: skip
+_STAMPS = ("stamp", "timestamp", "time_stamp", "time", "t")
+_UNIT = re.compile(r"[\s_]*[\s_\[(](mm|m|degrees|deg|radians|rad|ns|us|ms|s)[\])]?$|\s*\[\s*\]$")
+_SHORT = {"degrees": "deg", "radians": "rad"}
+_PER_SECOND = {"ms": 1e3, "us": 1e6, "ns": 1e9}
+_LATEST_S = 1e11
+"""The year 5138: a larger stamp is not in seconds."""
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Positions of the labels in a list of columns or keys."""
+
+    name: int | None
+    stamp: int | None
+    unit: str | None
+    """`s`, `ms`, `us` or `ns` of the times, if stated."""
+    all: frozenset[int]
+    """All columns or keys with the name of a label."""
+
+
+def find_labels(words: Sequence[str], plural: bool = False) -> Labels:
+    """Find labels among names of columns, or among plural keys of JSON lists."""
+    positions: dict[str, int] = {}
+    for i, word in enumerate(words):
+        name, _ = name_and_unit(word)
+        if not plural or name.endswith("s"):
+            positions.setdefault(name[:-1] if plural else name, i)
+    stamp = next((positions[n] for n in _STAMPS if n in positions), None)
+    return Labels(
+        name=next((positions[n] for n in _NAMES if n in positions), None),
+        stamp=stamp,
+        unit=None if stamp is None else name_and_unit(words[stamp])[1],
+        all=frozenset(i for n, i in positions.items() if n in _NAMES + _STAMPS),
+    )
+
+
+def name_and_unit(cell: str) -> tuple[str, str | None]:
+    """Split a column's name into its plain name and its unit."""
+    name = re.sub(r"^(pose|transform)[._/]", "", cell.strip().lower())
+    match = _UNIT.search(name)
+    unit = match.group(1) if match else None
+    name = name[: match.start()] if match else name
+    return re.sub(r"[\s.]+", "_", name), _SHORT.get(unit or "", unit)
+
+
+def _image_column(columns: Mapping[str, Sequence[object]]) -> str | None:
+    """Name of the only column with nothing but names of image files, if there is one."""
+    names = [
+        name
+        for name, cells in columns.items()
+        if cells and all(str(cell).lower().endswith(IMAGE_ENDINGS) for cell in cells)
+    ]
+    if len(names) > 1:
+        raise ValueError(f"{' and '.join(names)} name image files; call the right one 'image'")
+    return names[0] if names else None
+
+
+def row_labels(
+    columns: Mapping[str, Sequence[object]], count: int, plural: bool = False
+) -> tuple[tuple[str, ...] | None, NDArray[np.float64] | None]:
+    """Image names and seconds of `count` rows, each None if there is no such column.
+
+    Raises:
+        ValueError: A column is incomplete, a time is no number, or the columns are ambiguous.
+    """
+    keys = [*columns]
+    labels = find_labels(keys, plural)
+    name, stamp = (None if i is None else keys[i] for i in (labels.name, labels.stamp))
+    name = name or _image_column(columns)
+    for key in filter(None, (name, stamp)):
+        if len(columns[key]) != count:
+            raise ValueError(f"{key!r} holds {len(columns[key])} entries for {count} poses")
+        if None in columns[key]:
+            raise ValueError(f"some poses have {key!r}, others lack it; give it to all poses")
+    seconds = None
+    if stamp is not None:
+        seconds = in_unit(number_array(columns[stamp], f"{stamp!r}"), labels.unit)
+    return None if name is None else tuple(map(str, columns[name])), seconds
+
+
+def number_array(values: object, what: str) -> NDArray[np.float64]:
+    """Convert nested lists to an array.
+
+    Raises:
+        ValueError: The lists are ragged or hold something other than numbers.
+    """
+    try:
+        return np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{what} is made of numbers and has the same shape everywhere") from None
+
+
+def in_unit(stamps: NDArray[np.float64], unit: str | None) -> NDArray[np.float64]:
+    """Convert stamps (n,) to seconds from `s`, `ms`, `us` or `ns`; seconds if omitted.
+
+    Raises:
+        ValueError: The unit is omitted, and the numbers are too large for seconds.
+    """
+    if unit in _PER_SECOND:
+        return stamps / _PER_SECOND[unit]
+    if stamps.ndim != 1 or np.abs(stamps).max(initial=0.0) > _LATEST_S:
+        raise ValueError(
+            f"a stamp of {np.abs(stamps).max(initial=0.0):.4g} is not in seconds; call the column"
+            f" stamp_ns, stamp_us or stamp_ms"
+        )
+    return stamps
+
+
+def is_number(cell: str) -> bool:
+    """Whether Python reads a cell as a number."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
 
 _EARLIEST_S, _LATEST_S = 1e9, 4e9
 """The years 2001 and 2096 in seconds since 1970, the range of plausible times of recordings."""
