@@ -182,25 +182,22 @@ def test_wrong_json_is_refused(tmp_path: Path, model: RobotModel, data: str) -> 
         read_joint_poses(file, model)
 
 
-def test_angles_beyond_the_limits_are_noted(tmp_path: Path, model: RobotModel) -> None:
+@pytest.mark.parametrize(
+    ("rows", "note"),
+    [
+        ("3.5,9,0\n", "shoulder goes from 3.50 to 3.50, the URDF allows -3.00 to 3.00"),
+        ("0,-170,0\n0,170,0\n", "elbow goes from -170.00 to 170.00, more than two rotations"),
+        ("0,100,0\n0,103,0\n", None),
+    ],
+)
+def test_angles_beyond_the_limits_are_noted(
+    tmp_path: Path, model: RobotModel, rows: str, note: str | None
+) -> None:
     file = tmp_path / "joints.csv"
-    file.write_text("shoulder,elbow,reach\n3.5,9,0\n")
+    file.write_text("shoulder,elbow,reach\n" + rows)
     _, notes = read_joint_poses(file, model)
-    assert len(notes) == 2
-    assert "shoulder goes from 3.50 to 3.50, the URDF allows -3.00 to 3.00" in notes[1]
-
-
-def test_large_angles_without_limits_are_noted(tmp_path: Path) -> None:
-    (tmp_path / "a.urdf").write_text(
-        '<robot name="a"><link name="base"/><link name="tip"/>'
-        '<joint name="turn" type="continuous"><parent link="base"/><child link="tip"/>'
-        '<axis xyz="0 0 1"/></joint></robot>'
-    )
-    file = tmp_path / "joints.csv"
-    for values, count in (((-170, 170), 1), ((100.0, 103.0), 0)):
-        file.write_text("turn\n" + "".join(f"{value}\n" for value in values))
-        _, notes = read_joint_poses(file, RobotModel(tmp_path / "a.urdf"))
-        assert len(notes) == 1 + count
+    assert len(notes) == (1 if note is None else 2)
+    assert note is None or note in notes[1]
 
 
 def test_joints_are_not_interpolated_over_gaps() -> None:
