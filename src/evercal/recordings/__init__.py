@@ -18,14 +18,7 @@ from evercal.recordings.images import read_image as read_image
 from evercal.recordings.images import write_image as write_image
 
 if TYPE_CHECKING:
-    from evercal.recordings.formats import colmap as colmap
     from evercal.recordings.formats import generic as generic
-    from evercal.recordings.formats import lerobot as lerobot
-    from evercal.recordings.formats import nerfstudio as nerfstudio
-    from evercal.recordings.formats import ros_bag as ros_bag
-    from evercal.recordings.formats import seven_scenes as seven_scenes
-    from evercal.recordings.formats import twelve_scenes as twelve_scenes
-    from evercal.recordings.formats import wrist as wrist
     from evercal.recordings.formats.sfm_poses import with_sfm_poses as with_sfm_poses
     from evercal.recordings.load import FORMATS as FORMATS
     from evercal.recordings.load import Format as Format
@@ -42,28 +35,15 @@ _LOADED_ON_USE = {
     "load_recording": "load",
     "read_robot_poses": "poses.robot_poses",
     "with_sfm_poses": "formats.sfm_poses",
+    "generic": "formats.generic",
 }
-
-
-_FORMATS = [
-    "colmap",
-    "generic",
-    "lerobot",
-    "nerfstudio",
-    "ros_bag",
-    "seven_scenes",
-    "twelve_scenes",
-    "wrist",
-]
 
 
 def __getattr__(name: str) -> object:
     """Load a reader on first use."""
-    if name in _FORMATS:
-        value: object = importlib.import_module(f"{__name__}.formats.{name}")
-    elif name in _LOADED_ON_USE:
-        value = getattr(importlib.import_module(f"{__name__}.{_LOADED_ON_USE[name]}"), name)
-    else:
+    if name not in _LOADED_ON_USE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = importlib.import_module(f"{__name__}.{_LOADED_ON_USE[name]}")
+    value: object = getattr(module, name, module)
     globals()[name] = value
     return value

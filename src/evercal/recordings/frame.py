@@ -11,8 +11,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.images import StoredImage, as_rgb, read_image
 
-MIN_TRAIN_FRAMES = 16
-"""Posed training frames that a scene needs to be learned."""
+MIN_TRAIN_FRAMES = 16  # posed training frames that a scene needs to be learned
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.recordings import Frame, load_recording, nerfstudio, write_image
+from evercal.recordings import Frame, load_recording, write_image
+from evercal.recordings.formats import nerfstudio
 from evercal.recordings.inspection import inspect_recording
 
 LENS = {"fl_x": 40.0, "fl_y": 42.0, "cx": 13.0, "cy": 17.5, "w": 24, "h": 36,

@@ -10,7 +10,8 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.recordings import load_recording, seven_scenes, write_image
+from evercal.recordings import load_recording, write_image
+from evercal.recordings.formats import seven_scenes
 
 
 def write_pose(file: Path, matrix: np.ndarray) -> None:

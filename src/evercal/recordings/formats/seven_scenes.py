@@ -41,8 +41,6 @@ def load(root: str | os.PathLike[str]) -> Recording:
         InputError: The folder, a split, a sequence, a pose or an image is missing or broken.
     """
     root = Path(root)
-    if not root.is_dir():
-        raise InputError(f"{root}: no such folder; give a folder with seq-XX folders in it")
     splits = [_sequences(root, name) for name in _SPLITS]
     shared = sorted({folder.name for folder in splits[0]} & {folder.name for folder in splits[1]})
     if shared:

@@ -21,10 +21,8 @@ from evercal.geometry.se3 import SE3
 Array = NDArray[np.float64]
 Layout = Literal["wxyz", "xyzw", "rotation_vector", "euler", "rows", "columns"]
 
-_FAR_M = 10.0
-"""Largest distance of a gripper from its base, metres."""
-_NEAR_M = 0.01
-"""Smallest distance of a gripper from its base, metres, for at least one pose."""
+_FAR_M = 10.0  # largest distance of a gripper from its base, metres
+_NEAR_M = 0.01  # smallest distance of a gripper from its base, metres, for at least one pose
 _UNIT_TOLERANCE = 1e-2
 """Largest error of the length of a quaternion printed with three digits."""
 _RIGID_TOLERANCE = 1e-2

@@ -18,22 +18,14 @@ from evercal.recordings.frame import Frame
 
 Array = NDArray[np.float64]
 
-PAIRS = 16
-"""Number of image pairs that are compared."""
-LEAST_PAIRS = 6
-"""Matched pairs below which there is no verdict."""
-LEAST_DEG, BEST_DEG = 5.0, 12.0
-"""Smallest and best stated rotation between the images of a pair."""
-MOST_FRAMES_APART = 30
-"""Largest distance between the images of a pair, frames."""
-LEAST_MATCHES = 40
-"""Feature matches, and inliers of them, below which a pair is dropped."""
-LONG_SIDE = 640
-"""Longer side of the images that are matched, pixels."""
-AGREE_DEG = 2.0
-"""Difference up to which rotations agree."""
-STILL_DEG = 1.0
-"""Median measured rotation below which the images stand still."""
+PAIRS = 16  # number of image pairs that are compared
+LEAST_PAIRS = 6  # matched pairs below which there is no verdict
+LEAST_DEG, BEST_DEG = 5.0, 12.0  # smallest and best stated rotation between the images of a pair
+MOST_FRAMES_APART = 30  # largest distance between the images of a pair, frames
+LEAST_MATCHES = 40  # feature matches, and inliers of them, below which a pair is dropped
+LONG_SIDE = 640  # longer side of the images that are matched, pixels
+AGREE_DEG = 2.0  # difference up to which rotations agree
+STILL_DEG = 1.0  # median measured rotation below which the images stand still
 BETTER, CLOSE_DEG = 3.0, 0.5
 """Factor by which another reading of the poses must fit better to be named, and the margin within
 which further readings are named with it."""

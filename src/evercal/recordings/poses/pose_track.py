@@ -10,8 +10,7 @@ from evercal.geometry import SE3, pose_distance
 
 Array = NDArray[np.float64]
 
-MAX_GAP_S = 0.2
-"""Longest time between two poses over which a moving frame is interpolated, seconds."""
+MAX_GAP_S = 0.2  # longest time between two poses over which a moving frame is interpolated, seconds
 STILL_M, STILL_DEG = 0.001, 0.1
 """Motion below which a frame counts as standing still over a gap of any length."""
 

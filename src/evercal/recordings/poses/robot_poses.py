@@ -48,7 +48,7 @@ class RobotPoses:
 
 def read_robot_poses(
     path: str | os.PathLike[str],
-    convention: str | PoseConvention | None = None,
+    convention: str | None = None,
     *,
     what: str = "file of robot poses",
     option: str | None = None,
@@ -86,11 +86,9 @@ def read_robot_poses(
         raise InputError(f"{path}: {error}") from None
 
 
-def _convention(given: str | PoseConvention | None, path: Path) -> PoseConvention | None:
+def _convention(given: str | None, path: Path) -> PoseConvention | None:
     if given is None:
         return pose_convention("xyzw") if path.suffix.lower() == ".tum" else None
-    if isinstance(given, PoseConvention):
-        return given
     base, colon, modifiers = given.strip().lower().partition(":")
     return pose_convention("xyzw" + colon + modifiers if base == "tum" else given)
 

@@ -27,8 +27,7 @@ _STAMPS = ("stamp", "timestamp", "time_stamp", "time", "t")
 _UNIT = re.compile(r"[\s_]*[\s_\[(](mm|m|degrees|deg|radians|rad|ns|us|ms|s)[\])]?$|\s*\[\s*\]$")
 _SHORT = {"degrees": "deg", "radians": "rad"}
 _PER_SECOND = {"ms": 1e3, "us": 1e6, "ns": 1e9}
-_LATEST_S = 1e11
-"""The year 5138: a larger stamp is not in seconds."""
+_LATEST_S = 1e11  # the year 5138: a larger stamp is not in seconds
 
 
 @dataclass(frozen=True)
