@@ -163,7 +163,7 @@ def test_names_without_ending_and_horizontal_angle_of_view(tmp_path: Path) -> No
     ],
 )
 def test_angles_of_view_without_image_size(
-    lens: dict[str, float], focal: tuple[float, float], tmp_path: Path
+    lens: dict[str, Any], focal: tuple[float, float], tmp_path: Path
 ) -> None:
     write(tmp_path, entries(ring(2)), **lens)
     camera = load_recording(tmp_path).train[1].camera

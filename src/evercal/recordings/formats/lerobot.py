@@ -110,7 +110,7 @@ class _Row(NamedTuple):
     seconds: float
     """Time since the start of the episode."""
     file: Path
-    index: int
+    row: int
     """Index of the row in `file`."""
 
 
@@ -126,7 +126,8 @@ def _rows(root: Path, column: str) -> tuple[list[_Row], NDArray[np.float64]]:
     for file in files:
         table = _read_table(file, ["episode_index", "frame_index", "timestamp", column])
         *cells, poses = (table[name].to_pylist() for name in table.column_names)
-        rows += [_Row(*row, file, i) for i, row in enumerate(zip(*cells, strict=True))]
+        for i, (episode, number, seconds) in enumerate(zip(*cells, strict=True)):
+            rows.append(_Row(episode, number, seconds, file, i))
         try:
             values = np.array(poses, dtype=np.float64)
         except (TypeError, ValueError):
@@ -162,7 +163,7 @@ def _images(
     root: Path, info: Mapping[str, Any], key: str, rows: Sequence[_Row]
 ) -> list[StoredImage]:
     if info["features"][key]["dtype"] == "image":
-        return [_Embedded(root, key, row.file, row.index) for row in rows]
+        return [_Embedded(root, key, row.file, row.row) for row in rows]
     videos = Videos(float(info["fps"]))
     starts = _video_starts(root, info, key, {row.episode for row in rows})
     images: list[StoredImage] = []

@@ -34,7 +34,7 @@ def read_joint_poses(
     """Read joint angles and compute gripper poses, with notes.
 
     `unit` is "rad" or "deg" of angles whose column states no unit; radians if omitted. Links are
-    those of `RobotModel.chosen_links`.
+    chosen by `RobotModel.chosen_links`.
 
     Raises:
         InputError: The file is broken, a link or joint is missing, or angles look like degrees.

@@ -75,9 +75,10 @@ class RobotModel:
         base: str | None,
         gripper: str | None,
     ) -> tuple[SE3, list[str]]:
-        """Compute (n,) poses of the gripper and notes about their source and joint limits.
+        """Compute (n,) poses of the gripper, with notes about their source and joint limits.
 
-        Arguments are those of `base_from_gripper` and `chosen_links`, and so are the errors.
+        Raises:
+            InputError: As `chosen_links` and `base_from_gripper`.
         """
         base, gripper = self.chosen_links(base, gripper)
         poses = self.base_from_gripper(names, values, base, gripper)

@@ -71,11 +71,11 @@ def pair_rotations(frames: Sequence[Frame], poses: SE3) -> PairRotations | None:
     pairs = [pair for pair in pairs if pair[2] is not None]
     if len(pairs) < LEAST_PAIRS:
         return None
-    first, second, measured = (np.array(part) for part in zip(*pairs, strict=True))
+    first, second = np.array([pair[:2] for pair in pairs]).T
     stated = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
     swapped = Rotation.from_quat(poses.rotation_wxyz)
     return PairRotations(
-        measured=measured,
+        measured=np.array([pair[2] for pair in pairs]),
         stated=(stated[first].inv() * stated[second]).as_rotvec(),
         inverse=(stated[first] * stated[second].inv()).as_rotvec(),
         swapped=(swapped[first].inv() * swapped[second]).as_rotvec(),

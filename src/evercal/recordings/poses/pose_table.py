@@ -119,7 +119,7 @@ def pose_header(cells: Sequence[str]) -> PoseHeader | None:
 def pose_columns(
     header: PoseHeader, given: PoseConvention | None
 ) -> tuple[PoseConvention, list[int]]:
-    """Determine the convention of a table, if none is given, and its columns in that order.
+    """Convention of a table, as given or by the header, and its columns in that order.
 
     Raises:
         ValueError: The header is ambiguous, or contradicts the given convention.
