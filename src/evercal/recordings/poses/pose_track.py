@@ -42,8 +42,8 @@ class PoseTrack:
         """Interpolate positions linearly and rotations along great circles at (m,) seconds.
 
         Returns:
-            (m,) poses and (m,) whether each is valid. Poses are invalid beyond the ends, and in a gap
-            of more than `max_gap_s` seconds over which the frame moved.
+            (m,) poses and (m,) whether each is valid. Poses are invalid beyond the ends, and in
+            a gap of more than `max_gap_s` seconds over which the frame moved.
         """
         stamps = np.asarray(stamps_s, dtype=np.float64)
         inside = np.clip(stamps, self.stamps_s[0], self.stamps_s[-1])
