@@ -181,7 +181,7 @@ def test_broken_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is missing; check the path"):
         read_board_poses(file)
     for change, message in (
-        ({"format": "other"}, "not board poses"),
+        ({"format": "other"}, "'format' is not"),
         ({"version": 9}, "version 9"),
         ({"board": {"kind": "chessboard"}}, "'board' is invalid"),
         ({"images": [{"name": "a"}]}, "camera_from_board"),
@@ -191,7 +191,7 @@ def test_broken_files_are_refused(tmp_path: Path) -> None:
         file.write_text(json.dumps({**good, **change}))
         with pytest.raises(InputError, match=message):
             read_board_poses(file)
-    with pytest.raises(ValueError, match="not board poses"):
+    with pytest.raises(ValueError, match="'format' is not"):
         BoardPoses.from_dict([])
 
 
