@@ -1,4 +1,4 @@
-"""`check`: has a camera moved since it was calibrated?
+"""`check`: test whether a camera has moved since it was calibrated.
 
 Two poses of one camera in one map share the map's errors, which cancel in their difference. So a
 shift is more accurate than either pose: to the scatter of the images, and a floor for changes of
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DriftOptions:
-    """When a camera counts as moved."""
+    """Thresholds and prior noise of a test."""
 
     confidence: float = 0.99
     """Least confidence that it moved at all."""
@@ -80,18 +80,17 @@ def check(
     """Test whether a camera has moved since its calibration.
 
     Args:
-        localizer: of a map that holds the scene.
+        localizer: Localizer of a map that holds the scene.
         images: (name, (h, w, 3) uint8 RGB) of the camera as it is now.
-        reference: its calibration.
+        reference: Calibration of the camera.
         camera: Intrinsics. Default: those of the reference.
-        on_image: called after each image.
+        on_image: Called after each image.
 
     Raises:
         InputError: No image was located, or the reference is a camera on the gripper.
     """
     located = locate(localizer, images, camera or reference.camera, on_image)
-    fused = fuse(located)
-    return shift_between(reference, fused, located, localizer)
+    return shift_between(reference, fuse(located), located, localizer)
 
 
 def shift_between(
@@ -105,10 +104,10 @@ def shift_between(
 
     Args:
         reference: base_from_camera at the time of the calibration.
-        fused: pose of the camera now.
-        located: the images that were fused.
-        localizer: that located them.
-        options: when a shift counts as a move.
+        fused: Pose of the camera now.
+        located: Images that were fused.
+        localizer: Localizer of these images.
+        options: Thresholds and prior noise.
 
     Raises:
         InputError: The reference is a camera on the gripper.
@@ -154,12 +153,7 @@ def shift_between(
 
 
 def _scatter(measured: Sequence[tuple[Array, int]], options: DriftOptions) -> Array:
-    """Scatter of one image: the measured one, shrunk towards the prior for few images.
-
-    Args:
-        measured: scatters (6, 6), each with its number of images.
-        options: with the prior.
-    """
+    """Shrink measured scatters (6, 6), each with its number of images, towards the prior."""
     usual = [(options.usual_scatter_mm / 1000) ** 2] * 3
     usual += [np.deg2rad(options.usual_scatter_deg) ** 2] * 3
     total, weight = options.usual_weight * np.diag(usual), options.usual_weight

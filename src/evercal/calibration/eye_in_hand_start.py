@@ -12,7 +12,8 @@ which is linear in t_X. The estimate is accurate to a few millimetres.
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -62,13 +63,12 @@ class HandEyeOptions:
     """Pairs that must agree."""
 
 
-@dataclass(frozen=True)
-class PairMotion:
+class PairMotion(NamedTuple):
     """Motion of the camera between two frames, from their images."""
 
     first: int
     second: int
-    """Numbers of the frames."""
+    """Index of the frame."""
     rotation: Rotation
     """second_camera_from_first_camera."""
     direction: Array
@@ -80,38 +80,21 @@ class HandEyeStart:
     """A first `gripper_from_camera`."""
 
     gripper_from_camera: SE3
-    """Single."""
     pairs: int
     """Pairs of frames that agree with it."""
     of_pairs: int
     """Pairs of frames whose motion was estimated."""
-    rotation_deg: float
-    """Median disagreement of the rotations."""
-    direction_deg: float
-    """Median disagreement of the directions of translation."""
 
 
 def rotation_spread_deg(base_from_gripper: SE3) -> Array:
-    """(3,) standard deviations of the rotations about their principal axes, largest first.
-
-    Args:
-        base_from_gripper: (n,).
-    """
+    """Return (3,) standard deviations of n rotations about principal axes, largest first."""
     rotations = Rotation.from_quat(base_from_gripper.rotation_wxyz, scalar_first=True)
     away = (rotations.mean().inv() * rotations).as_rotvec()
     return np.rad2deg(np.linalg.svd(away, compute_uv=False) / np.sqrt(len(away)))
 
 
 def refuse_poor_motion(base_from_gripper: SE3, options: HandEyeOptions) -> None:
-    """Refuse a recording whose motions cannot determine the transform, before any work.
-
-    Args:
-        base_from_gripper: (n,).
-        options: with the least rotation.
-
-    Raises:
-        InputError: hardly any rotation, or rotation about one axis only.
-    """
+    """Refuse a recording with hardly any rotation, or with rotations about one axis only."""
     first, second, _ = rotation_spread_deg(base_from_gripper)
     need = options.least_rotation_deg
     advice = (
@@ -138,39 +121,22 @@ def hand_eye_start(
     """Estimate `gripper_from_camera` from images and gripper poses.
 
     Args:
-        frames: with `base_from_gripper`; their `base_from_camera` is ignored.
-        encoder: for the similarity of frames.
-        options: matching and agreement.
-        on_progress: called as pairs of frames are matched.
+        frames: Frames with `base_from_gripper`; their `base_from_camera` is ignored.
+        encoder: Encoder for the similarity of frames.
+        options: Matching and agreement.
+        on_progress: Called as pairs of frames are matched.
 
     Raises:
         InputError: Too little rotation, or too few frames that show the same place.
-
-    Returns:
-        An estimate accurate to a few millimetres.
     """
     options = options or HandEyeOptions()
-    poses = gripper_poses(frames)
+    poses = SE3.stack([f.base_from_gripper for f in frames if f.base_from_gripper is not None])
     refuse_poor_motion(poses, options)
     if len(frames) > options.frames:
         some = spread_poses(poses, options.frames)
         frames, poses = [frames[i] for i in some], poses[some]
     motions = _pair_motions(frames, encoder, options, on_progress)
     return solve_motions(poses, motions, options)
-
-
-def gripper_poses(frames: Sequence[Frame]) -> SE3:
-    """(n,) base_from_gripper of the frames."""
-    return SE3.stack([f.base_from_gripper for f in frames if f.base_from_gripper is not None])
-
-
-def with_gripper(frames: Sequence[Frame], gripper_from_camera: SE3) -> tuple[Frame, ...]:
-    """Frames with camera poses from their gripper poses."""
-    return tuple(
-        replace(f, base_from_camera=f.base_from_gripper @ gripper_from_camera)
-        for f in frames
-        if f.base_from_gripper is not None
-    )
 
 
 def solve_motions(
@@ -180,8 +146,8 @@ def solve_motions(
 
     Args:
         base_from_gripper: (n,).
-        motions: of pairs among the n frames.
-        options: agreement.
+        motions: Motions between pairs of the n frames.
+        options: Agreement.
 
     Raises:
         InputError: Too few pairs, or too few that agree.
@@ -192,7 +158,7 @@ def solve_motions(
             f" {options.least_pairs} are needed: record more views that overlap, of a place with"
             " texture"
         )
-    first, second = (np.array([getattr(m, w) for m in motions]) for w in ("first", "second"))
+    first, second = np.array([(m.first, m.second) for m in motions]).T
     moved = base_from_gripper[second].inverse() @ base_from_gripper[first]
     gripper_rotation = Rotation.from_quat(moved.rotation_wxyz, scalar_first=True).as_rotvec()
     camera_rotation = np.array([m.rotation.as_rotvec() for m in motions])
@@ -216,13 +182,7 @@ def solve_motions(
             " turning it, and check that the poses are in metres"
         )
     start = SE3(rotation.as_quat(canonical=True, scalar_first=True), translation)
-    return HandEyeStart(
-        start,
-        int(agree.sum()),
-        len(motions),
-        float(np.rad2deg(np.median(distance))),
-        float(np.rad2deg(np.median(apart[agree]))),
-    )
+    return HandEyeStart(start, int(agree.sum()), len(motions))
 
 
 def _refuse_disagreement(agree: NDArray[np.bool_], options: HandEyeOptions) -> None:
