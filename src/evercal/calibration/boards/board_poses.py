@@ -79,11 +79,7 @@ class BoardPoses:
 
     @classmethod
     def from_dict(cls, data: object) -> Self:
-        """Create board poses from the values of `to_dict`.
-
-        Raises:
-            ValueError: The values have another format or version, or are broken.
-        """
+        """Create board poses from the values of `to_dict`, or raise ValueError."""
         return of_format(data, FORMAT, VERSION, cls._from_mapping)
 
     @classmethod
@@ -121,8 +117,8 @@ def board_poses(
     Args:
         board: Board in the images.
         camera: Intrinsics of all images.
-        views: Corners of each image by its name, or the reason for a missing board.
-        camera_from: `file` or `board`.
+        views: Corners by image name, or the reason for a missing board.
+        camera_from: Source of the intrinsics, `file` or `board`.
     """
     fits = {name: _fitted(view, camera) for name, view in views.items()}
     poses = [fit for fit in fits.values() if isinstance(fit, BoardPose)]

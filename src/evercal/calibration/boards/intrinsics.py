@@ -21,7 +21,6 @@ class Intrinsics:
     """A camera and the residuals of the corners."""
 
     camera: Camera
-    """Intrinsics at the size of the images."""
     rms_px: float
     """Root mean square reprojection error."""
     focal_sigma_px: float
@@ -34,13 +33,8 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
     Models of 0, 1 (k1), 2 (k2), 4 (p1 p2) and 5 (k3) distortion coefficients are fitted.
     The Bayesian information criterion selects one, so that few views do not overfit.
 
-    Args:
-        views: Five or more tilted views of a flat board.
-        width: Image width, pixels.
-        height: Image height, pixels.
-
     Raises:
-        InputError: There are too few views, or they do not determine the focal length.
+        InputError: Fewer than five views, or they do not determine the focal length.
     """
     import cv2
 

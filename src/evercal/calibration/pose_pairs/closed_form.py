@@ -27,15 +27,7 @@ class RobotWorld(NamedTuple):
 
 
 def motions(fixed_from_parent: SE3, camera_from_board: SE3) -> tuple[SE3, SE3]:
-    """Compute the motions of parent and camera between all pairs i < j of n poses.
-
-    Args:
-        fixed_from_parent: (n,) poses of the frame that carries the camera.
-        camera_from_board: (n,) poses of the board, which is fixed in `fixed`.
-
-    Returns:
-        (n (n - 1) / 2,) `parent_i_from_parent_j` and `camera_i_from_camera_j`.
-    """
+    """Return `parent_i_from_parent_j` and `camera_i_from_camera_j` for all i < j of n poses."""
     i, j = np.triu_indices(len(fixed_from_parent), 1)
     a = fixed_from_parent[i].inverse() @ fixed_from_parent[j]
     b = camera_from_board[i] @ camera_from_board[j].inverse()
@@ -83,11 +75,6 @@ def shah(fixed_from_parent: SE3, camera_from_board: SE3, scale_known: bool = Tru
     M. Shah, Solving the robot-world/hand-eye calibration problem using the Kronecker product,
     2013. Rotations by 180 degrees need no special treatment.
 
-    Args:
-        fixed_from_parent: (n,), n >= 3.
-        camera_from_board: (n,).
-        scale_known: Whether the translations of `camera_from_board` are in metres.
-
     Raises:
         ValueError: There are fewer than three poses, or the counts differ.
     """
@@ -134,5 +121,4 @@ def _nearest_rotation(matrix: Array) -> Rotation:
 
 
 def _se3(rotation: Rotation, translation: Array) -> SE3:
-    quaternion = rotation.as_quat(canonical=True, scalar_first=True)
-    return SE3(quaternion, np.asarray(translation, dtype=np.float64))
+    return SE3(rotation.as_quat(canonical=True, scalar_first=True), translation)

@@ -89,15 +89,11 @@ def estimate_levels(
 
 
 def working_noise(noise: Array, use: NDArray[np.bool_]) -> Array:
-    """Return the covariance for the weights of a fit: the estimate, made more even.
+    """Return the covariance (n, 6, 6) for the weights of a fit: the estimate, made more even.
 
     Estimated levels may assign almost no noise to some combination of translation and rotation, and
     the fit would then depend on it. A share of isotropic noise, equal for all poses, costs little
     accuracy if the levels are right and makes the fit robust if they are wrong.
-
-    Args:
-        noise: (n, 6, 6) estimated covariance.
-        use: (n,) poses to use.
     """
     mean = noise[use].mean(0)
     metres2, radians2 = np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3

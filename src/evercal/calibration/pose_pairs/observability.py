@@ -34,10 +34,6 @@ class _Spread(NamedTuple):
 def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
     """Check that the pairs determine the calibration.
 
-    Args:
-        pairs: All pairs in the order of the recording.
-        scale_known: Whether the camera's translations are stated to be in metres.
-
     Raises:
         InputError: There are too few different poses, lengths are not in metres, robot or camera
             never moved, or the motion is degenerate: pure translation, pure rotation, or rotation
@@ -72,14 +68,7 @@ def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
 
 
 def require_rotations(base_from_gripper: SE3) -> None:
-    """Check that the gripper rotated about two axes.
-
-    Args:
-        base_from_gripper: (n,) different poses.
-
-    Raises:
-        InputError: The gripper never rotated, or about one axis only.
-    """
+    """Refuse gripper poses (n,) without rotation, or with rotation about one axis only."""
     spread = _rotation_spread(base_from_gripper)
     main, second = np.rad2deg(spread.main_rad), np.rad2deg(spread.second_rad)
     if spread.main_rad < _MIN_ROTATION_RAD:
