@@ -24,26 +24,16 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class DriftOptions:
-    """Thresholds and prior noise of a test."""
-
-    confidence: float = 0.99
-    """Least confidence that it moved at all."""
-    least_mm: float = 0.7
-    """Shifts below this never count as a move, millimetres."""
-    least_deg: float = 0.04
-    """Rotations below this never count as a move, degrees. One of the two must be exceeded."""
-    floor_mm: float = 0.2
-    """Standard deviation per axis from changes of light and objects, millimetres."""
-    floor_deg: float = 0.008
-    """The same for the rotation, degrees."""
-    usual_scatter_mm: float = 0.4
-    """Prior scatter of a single image per axis, millimetres."""
-    usual_scatter_deg: float = 0.01
-    """The same for the rotation, degrees."""
-    usual_weight: float = 5.0
-    """Weight of the prior scatter, in images."""
+CONFIDENCE = 0.99
+"""Least confidence that a camera moved at all."""
+_LEAST_MM, _LEAST_DEG = 0.7, 0.04
+"""A shift counts as a move if it exceeds one of these."""
+_FLOOR = np.repeat([0.2e-3, np.deg2rad(0.008)], 3)
+"""Standard deviation per axis from changes of light and objects, metres and radians."""
+_USUAL_SCATTER = np.repeat([0.4e-3, np.deg2rad(0.01)], 3)
+"""Prior scatter of a single image per axis, metres and radians."""
+_USUAL_WEIGHT = 5.0
+"""Weight of the prior scatter, in images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +88,7 @@ def shift_between(
     fused: Fused,
     located: list[Located],
     localizer: "Localizer",
-    options: DriftOptions | None = None,
+    confidence: float = CONFIDENCE,
 ) -> Shift:
     """Compare a camera with its calibration.
 
@@ -107,14 +97,13 @@ def shift_between(
         fused: Pose of the camera now.
         located: Images that were fused.
         localizer: Localizer of these images.
-        options: Thresholds and prior noise.
+        confidence: Least confidence of a move.
 
     Raises:
         InputError: The reference is a camera on the gripper.
     """
     from scipy import stats
 
-    options = options or DriftOptions()
     if reference.mount != "eye_to_hand":
         raise InputError(
             "the reference is a camera on the gripper, whose pose in the base changes with every"
@@ -123,21 +112,21 @@ def shift_between(
     same = reference.source.get("map") == map_digest(localizer, fused.scene)
     off = deviations(SE3.stack([fused.pose]), reference.parent_from_child)[0]
     count = int(fused.used.sum())
-    floor = [(options.floor_mm / 1000) ** 2] * 3 + [np.deg2rad(options.floor_deg) ** 2] * 3
+    floor = np.diag(_FLOOR**2)
     measured = [(fused.scatter, count)]
     if same:
         # One camera in one map: the scatter of its images is the same before and now.
         before = int(reference.checks.get("images_used", 1))
         measured.append((np.array(reference.checks.get("image_scatter", np.zeros((6, 6)))), before))
-        scatter = _scatter(measured, options)
-        covariance = scatter / count + scatter / before + np.diag(floor)
+        scatter = _scatter(measured)
+        covariance = scatter / count + scatter / before + floor
     else:
         used = [item.covariance for item in fused.select(located)]
-        covariance = _scatter(measured, options) / count + np.diag(floor)
+        covariance = _scatter(measured) / count + floor
         covariance = covariance + reference.covariance + np.mean(used, axis=0)
-    confidence = float(stats.chi2.cdf(off @ np.linalg.solve(covariance, off), 6))
+    probability = float(stats.chi2.cdf(off @ np.linalg.solve(covariance, off), 6))
     millimetres, degrees = length_mm_deg(off)
-    visible = millimetres > options.least_mm or degrees > options.least_deg
+    visible = millimetres > _LEAST_MM or degrees > _LEAST_DEG
     sigma_mm, sigma_deg = axis_deviation(covariance)
     return Shift(
         reference_from_now=reference.parent_from_child.inverse() @ fused.pose,
@@ -145,18 +134,16 @@ def shift_between(
         rotation_deg=degrees,
         sigma_mm=sigma_mm,
         sigma_deg=sigma_deg,
-        confidence=confidence,
-        moved=bool(visible and confidence >= options.confidence),
+        confidence=probability,
+        moved=bool(visible and probability >= confidence),
         same_map=same,
         images=fused.uses,
     )
 
 
-def _scatter(measured: Sequence[tuple[Array, int]], options: DriftOptions) -> Array:
+def _scatter(measured: Sequence[tuple[Array, int]]) -> Array:
     """Shrink measured scatters (6, 6), each with its number of images, towards the prior."""
-    usual = [(options.usual_scatter_mm / 1000) ** 2] * 3
-    usual += [np.deg2rad(options.usual_scatter_deg) ** 2] * 3
-    total, weight = options.usual_weight * np.diag(usual), options.usual_weight
+    total, weight = _USUAL_WEIGHT * np.diag(_USUAL_SCATTER**2), _USUAL_WEIGHT
     for scatter, count in measured:
         total, weight = total + (count - 1) * scatter, weight + count - 1
     return total / weight

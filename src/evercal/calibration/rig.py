@@ -4,36 +4,20 @@ import itertools
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, NamedTuple
 
 from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
-from evercal.geometry import SE3, axis_deviation
+from evercal.geometry import UncertainPose
 from evercal.storage import write_json
 
 
-@dataclass(frozen=True, eq=False)
-class RigPair:
+class RigPair(NamedTuple):
     """Pose of the second camera in the frame of the first."""
 
     first: str
     second: str
-    first_from_second: SE3
-    covariance: NDArray[np.float64]
-    """(6, 6) of translation in the first camera's frame and rotation about the second's axes."""
-
-    @property
-    def sigma_mm(self) -> float:
-        """One standard deviation per axis."""
-        return axis_deviation(self.covariance)[0]
-
-    @property
-    def sigma_deg(self) -> float:
-        """The same for the rotation."""
-        return axis_deviation(self.covariance)[1]
+    first_from_second: UncertainPose
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +38,10 @@ class Rig:
                 {
                     "parent_frame": pair.first,
                     "child_frame": pair.second,
-                    "translation_m": pair.first_from_second.translation_m.tolist(),
-                    "quaternion_wxyz": pair.first_from_second.rotation_wxyz.tolist(),
-                    "matrix": pair.first_from_second.matrix().tolist(),
-                    "covariance": pair.covariance.tolist(),
+                    "translation_m": pair.first_from_second.pose.translation_m.tolist(),
+                    "quaternion_wxyz": pair.first_from_second.pose.rotation_wxyz.tolist(),
+                    "matrix": pair.first_from_second.pose.matrix().tolist(),
+                    "covariance": pair.first_from_second.covariance.tolist(),
                 }
                 for pair in self.relative
             ],
@@ -88,5 +72,5 @@ def rig_of(cameras: Mapping[str, Calibration]) -> Rig:
     pairs = []
     for first, second in itertools.combinations(cameras, 2):
         pose = cameras[first].uncertain_pose.inverse() @ cameras[second].uncertain_pose
-        pairs.append(RigPair(first, second, pose.pose, pose.covariance))
+        pairs.append(RigPair(first, second, pose))
     return Rig(cameras, tuple(pairs))
