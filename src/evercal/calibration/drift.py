@@ -43,21 +43,16 @@ class Shift:
     reference_from_now: SE3
     """Pose of the camera now, in its camera frame at the time of the calibration."""
     translation_mm: float
-    """Length of its translation."""
     rotation_deg: float
-    """Angle of its rotation."""
     sigma_mm: float
     """Standard deviation per axis."""
     sigma_deg: float
-    """The same for the rotation."""
     confidence: float
     """Probability that it moved at all, 0 to 1."""
     moved: bool
-    """Whether it counts as moved."""
     same_map: bool
     """Whether both poses come from one map, so that its errors cancel."""
     images: tuple[ImageUse, ...] = ()
-    """Use of every image."""
 
 
 def check(
@@ -126,7 +121,6 @@ def shift_between(
         covariance = covariance + reference.covariance + np.mean(used, axis=0)
     probability = float(stats.chi2.cdf(off @ np.linalg.solve(covariance, off), 6))
     millimetres, degrees = length_mm_deg(off)
-    visible = millimetres > _LEAST_MM or degrees > _LEAST_DEG
     sigma_mm, sigma_deg = axis_deviation(covariance)
     return Shift(
         reference_from_now=reference.parent_from_child.inverse() @ fused.pose,
@@ -135,7 +129,7 @@ def shift_between(
         sigma_mm=sigma_mm,
         sigma_deg=sigma_deg,
         confidence=probability,
-        moved=bool(visible and probability >= confidence),
+        moved=probability >= confidence and (millimetres > _LEAST_MM or degrees > _LEAST_DEG),
         same_map=same,
         images=fused.uses,
     )

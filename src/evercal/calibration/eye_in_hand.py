@@ -119,7 +119,7 @@ def hand_eye_report(
     start_from_camera = UncertainPose(correction.start_camera_from_camera, correction.covariance)
     estimate = start.gripper_from_camera @ start_from_camera
     start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.gripper_from_camera)
-    given_mm, given_deg = (None, None)
+    given_mm = given_deg = None
     if given is not None:
         given_mm, given_deg = pose_distance_mm_deg(estimate.pose, given)
     return HandEyeReport(

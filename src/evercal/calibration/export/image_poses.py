@@ -47,11 +47,7 @@ def tum(export: Export) -> str:
 
 
 def colmap(export: Export) -> dict[str, str]:
-    """Write a sparse model without points: camera_from_base, quaternion w x y z.
-
-    Raises:
-        InputError: An image name contains white space, which COLMAP's text format cannot hold.
-    """
+    """Write a sparse model without points: camera_from_base, quaternion w x y z."""
     camera, (names, poses) = export.camera, _image_poses(export)
     lines, rows = [], pose_numbers(poses, "wxyz:inverse").tolist()
     for i, (name, row) in enumerate(zip(names, rows, strict=True)):
@@ -74,11 +70,7 @@ def colmap(export: Export) -> dict[str, str]:
 
 
 def nerfstudio(export: Export) -> str:
-    """Write transforms.json: base_from_camera with camera axes x right, y up, z back.
-
-    Raises:
-        InputError: The distortion has terms that nerfstudio does not support.
-    """
+    """Write transforms.json: base_from_camera with camera axes x right, y up, z back."""
     camera, (names, poses) = export.camera, _image_poses(export)
     matrices = pose_numbers(poses, "matrix:opengl").reshape(-1, 4, 4).tolist()
     k1, k2, p1, p2, k3, *rational = camera.coefficients
@@ -90,12 +82,8 @@ def nerfstudio(export: Export) -> str:
         )
     record = {
         "camera_model": "OPENCV",
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx + 0.5,
-        "cy": camera.cy + 0.5,
+        **{"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy},
+        **{"cx": camera.cx + 0.5, "cy": camera.cy + 0.5},
         **{"k1": k1, "k2": k2, "k3": k3, "k4": 0.0, "p1": p1, "p2": p2},
         "frames": [
             {"file_path": name, "transform_matrix": matrix}
@@ -106,11 +94,7 @@ def nerfstudio(export: Export) -> str:
 
 
 def moveit_samples(export: Export) -> str:
-    """Write the pose pairs that MoveIt Calibration solves: 4x4 matrices by row, metres.
-
-    Raises:
-        InputError: A pose has no partner.
-    """
+    """Write the pose pairs that MoveIt Calibration solves: 4x4 matrices by row, metres."""
     robot, target = export.robot_poses, export.target_poses
     if robot is None or target is None:
         raise InputError(

@@ -75,7 +75,7 @@ def urdf(export: Export) -> str:
     """
     numbers = _numbers(export, "rpy")
     xyz, rpy = " ".join(numbers[:3]), " ".join(numbers[3:])
-    name = re.sub(r"[^\w.-]", "_", f"{export.parent}_to_{export.child}")
+    name = _node_name(export, r"\w.-")
     return f"""<joint name={quoteattr(name)} type="fixed">
   <!-- {_xml_comment(export)} -->
   <parent link={quoteattr(export.parent)}/>
@@ -96,8 +96,9 @@ def easy_handeye2(export: Export) -> str:
         "move_group_namespace": "/",
         "move_group": "manipulator",
     }
-    calibration = {"parameters": parameters, "transform": _transform(export)}
-    return yaml.safe_dump(calibration, sort_keys=False)
+    return yaml.safe_dump(
+        {"parameters": parameters, "transform": _transform(export)}, sort_keys=False
+    )
 
 
 def easy_handeye(export: Export) -> str:
@@ -138,11 +139,9 @@ def _numbers(export: Export, convention: str = "xyzw") -> list[str]:
 
 def _transform(export: Export) -> dict[str, dict[str, float]]:
     """Return the fields of geometry_msgs/Transform."""
-    numbers = pose_numbers(export.pose).tolist()
-    return {
-        "translation": dict(zip("xyz", numbers[:3], strict=True)),
-        "rotation": dict(zip("xyzw", numbers[3:], strict=True)),
-    }
+    x, y, z, *rotation = pose_numbers(export.pose).tolist()
+    rotation = dict(zip("xyzw", rotation, strict=True))
+    return {"translation": {"x": x, "y": y, "z": z}, "rotation": rotation}
 
 
 def _flags(export: Export) -> dict[str, str]:
@@ -153,19 +152,17 @@ def _flags(export: Export) -> dict[str, str]:
 
 def _handeye_frames(export: Export) -> dict[str, str]:
     """Return the four frames of a hand-eye setup; the calibration itself names two of them."""
-    base, gripper = export.parent, export.robot_frame or "gripper"
-    if export.calibration.mount == "eye_in_hand":
-        base, gripper = export.robot_frame or "base", export.parent
+    in_hand, other = export.calibration.mount == "eye_in_hand", export.robot_frame
     return {
-        "robot_base_frame": base,
-        "robot_effector_frame": gripper,
+        "robot_base_frame": other or "base" if in_hand else export.parent,
+        "robot_effector_frame": export.parent if in_hand else other or "gripper",
         "tracking_base_frame": export.child,
         "tracking_marker_frame": "no_marker",  # the tools require a name
     }
 
 
-def _node_name(export: Export) -> str:
-    return re.sub(r"\W", "_", f"{export.parent}_to_{export.child}")
+def _node_name(export: Export, allowed: str = r"\w") -> str:
+    return re.sub(f"[^{allowed}]", "_", f"{export.parent}_to_{export.child}")
 
 
 def _xml_comment(export: Export) -> str:

@@ -89,12 +89,7 @@ def agreement(equation: PoseEquation) -> Agreement:
 
 
 def robust_fit(equation: PoseEquation, start: Agreement) -> HandEyeFit:
-    """Refine an estimate and reject outliers.
-
-    Args:
-        equation: At least four sorted poses with rotations about two axes.
-        start: Result of `agreement`.
-    """
+    """Refine the result of `agreement` for at least four sorted poses, and reject outliers."""
     at, inliers = start.at, start.inliers
     if inliers.sum() < MIN_POSES:  # outliers cannot be detected; all poses widen the covariance
         inliers = np.ones(len(equation), dtype=bool)
@@ -129,8 +124,8 @@ def refine(equation: PoseEquation, at: Unknowns, covariance: Array, use: Mask) -
     Args:
         equation: n poses.
         at: Start within a few degrees and centimetres.
-        covariance: (n, 6, 6) covariance of the residuals.
-        use: (n,) poses to use.
+        covariance: (n, 6, 6) of the residuals.
+        use: (n,).
     """
     selected, weight = equation[use], np.linalg.inv(covariance[use])
     for _ in range(30):

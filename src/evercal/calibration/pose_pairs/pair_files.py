@@ -41,7 +41,6 @@ class _CameraPoses:
     """All images of a camera file."""
 
     names: tuple[str, ...] | None
-    """(n,) image names, if the file has them."""
     stamps_s: NDArray[np.float64] | None
     """(n,) times from the file or from the names."""
     poses: list[SE3 | None]

@@ -197,14 +197,13 @@ class PairSolution:
             row = row_of[i]
             lengths = np.linalg.norm(self.fit.residual[row].reshape(2, 3), axis=1)
             mm, deg = 1000 * float(lengths[0]), float(np.rad2deg(lengths[1]))
-            used, reason = bool(self.fit.inliers[row]), ""
-            if not used:
-                sigmas = float(np.sqrt(self.fit.distance2[row] / 6))
-                reason = (
-                    f"disagrees with the others by {mm:.1f} mm and {deg:.2f} deg, {sigmas:.1f}"
-                    f" times their noise"
-                )
-            uses.append(ImageUse(name, used, reason, mm, deg))
+            sigmas = float(np.sqrt(self.fit.distance2[row] / 6))
+            reason = (
+                f"disagrees with the others by {mm:.1f} mm and {deg:.2f} deg, {sigmas:.1f} times"
+                " their noise"
+            )
+            used = bool(self.fit.inliers[row])
+            uses.append(ImageUse(name, used, "" if used else reason, mm, deg))
         return tuple(uses)
 
     def _error_terms(self) -> tuple[ErrorTerm, ...]:
