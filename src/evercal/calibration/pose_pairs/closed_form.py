@@ -106,4 +106,5 @@ def _nearest_rotation(matrix: Array) -> Rotation:
 
 
 def _se3(rotation: Rotation, translation: Array) -> SE3:
-    return SE3(rotation.as_quat(canonical=True, scalar_first=True), translation)
+    quaternion = rotation.as_quat(canonical=True, scalar_first=True)
+    return SE3(quaternion, np.asarray(translation, dtype=np.float64))

@@ -178,9 +178,8 @@ class PoseEquation:
 
 def se3(rotation: Array, translation: Array) -> SE3:
     """Create poses from rotation matrices (..., 3, 3) and translations (..., 3)."""
-    return SE3(
-        Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True), translation
-    )
+    quaternion = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
+    return SE3(quaternion, np.asarray(translation, dtype=np.float64))
 
 
 def _log_slope(rotvec: Array) -> Array:
