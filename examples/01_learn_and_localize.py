@@ -1,9 +1,8 @@
-"""Learns a room from posed images and says where the camera of another image was.
+"""Map a room from posed images and locate another image in it.
 
-    python examples/01_learn_and_localize.py
+    python examples/01_learn_and_localize.py [RECORDING]
 
-The room comes with the package: 91 images with their poses to learn from, others to be judged on.
-Give the folder of a recording of your own to use that instead.
+Without an argument it uses a packaged room with 91 posed images.
 """
 
 import sys
@@ -13,36 +12,33 @@ from pathlib import Path
 import numpy as np
 
 import evercal
-from evercal.geometry import pose_distance
+from evercal.geometry import pose_distance_mm_deg
 from evercal.recordings.samples import FOLDER
 
 
-def main(recording: Path) -> None:
-    """Learns a recording into a store, and locates one of its test images."""
-    scene = evercal.load_recording(recording)
+def main(path: Path) -> None:
+    """Learn a recording and locate one of its test images."""
+    recording = evercal.load_recording(path)
     with tempfile.TemporaryDirectory() as folder:
-        store = Path(folder) / "robot.evercal"
-        report = evercal.learn(store, scene)
-        print(
-            f"{report.scene}: {report.frames_kept} keyframes with {report.landmarks} landmarks,"
-            f" learned in {report.seconds:.0f} s"
-        )
-        localizer = evercal.Localizer.open(store)
-
-    frame = scene.test[0]
-    estimate = localizer.localize(frame.read_image(), frame.camera)
-    if estimate.base_from_camera is None or estimate.covariance is None:
+        cell = evercal.Map.open(Path(folder) / "cell.evercal")
+        report = cell.learn(recording)
+        frame = recording.test[0]
+        estimate = cell.localize(frame.read_image())
+    print(
+        f"mapped {report.scene}: {report.frames_kept} keyframes, {report.landmarks} landmarks,"
+        f" {report.seconds:.0f} s"
+    )
+    if estimate.uncertain_pose is None:
         print(f"no pose: {estimate.reason}")
         return
     np.set_printoptions(precision=4, suppress=True)
-    print(f"the image shows {estimate.scene}; base_from_camera is, in metres,")
-    print(estimate.base_from_camera.matrix())
-    deviation = np.sqrt(np.diag(estimate.covariance))
-    print(f"uncertainty, one standard deviation: {1000 * deviation[:3]} mm")
-    print(f"                                     {np.rad2deg(deviation[3:])} deg")
+    print(f"scene: {estimate.scene}")
+    print(f"base_from_camera, metres:\n{estimate.uncertain_pose.pose.matrix()}")
+    deviation = np.sqrt(np.diag(estimate.uncertain_pose.covariance))
+    print(f"standard deviation: {1000 * deviation[:3]} mm, {np.rad2deg(deviation[3:])} deg")
     if frame.base_from_camera is not None:
-        metres, radians = pose_distance(estimate.base_from_camera, frame.base_from_camera)
-        print(f"error: {1000 * metres:.2f} mm, {np.rad2deg(radians):.3f} deg")
+        mm, deg = pose_distance_mm_deg(estimate.uncertain_pose.pose, frame.base_from_camera)
+        print(f"error: {mm:.2f} mm, {deg:.3f} deg")
 
 
 if __name__ == "__main__":

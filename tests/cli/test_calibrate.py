@@ -1,120 +1,171 @@
-"""`calibrate`, `check`, `watch` and `audit` as a user calls them."""
+"""`calibrate`, `check`, `audit` and `align`."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from evercal.mapping.scene_maps import SceneMaps
 
 from evercal.calibration.calibration import read_calibration
 from evercal.geometry import SE3, pose_distance
-from evercal.mapping.store import Store
 from evercal.recordings import write_image
-from evercal.recordings.frame import Recording
 
-Make = Callable[[Path, list[SceneMaps]], Store]
+if TYPE_CHECKING:
+    from evercal.recordings import Frame, Recording
 
-
-@pytest.fixture(scope="module")
-def hall_store(make: Make, hall_maps: SceneMaps, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("calibrate") / "hall.evercal"
-    make(root, [hall_maps])
-    return root
+CHECK_KEYS = {"moved", "translation_mm", "rotation_deg", "sigma_mm", "sigma_deg", "confidence"}
+CHECK_KEYS |= {"same_map", "reference_from_now", "images", "left_out"}
 
 
-@pytest.fixture(scope="module")
-def images(hall: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four images of a camera that stands still."""
-    folder, rng = tmp_path_factory.mktemp("images"), np.random.default_rng(0)
-    still = hall.test[3].read_image().astype(float)
-    for i in range(4):
-        noisy = (still + rng.normal(0, 4, still.shape)).clip(0, 255).astype("u1")
-        write_image(folder / f"{i}.png", noisy)
-    return folder
+def truth_of(frame: Frame) -> SE3:
+    assert frame.base_from_camera is not None
+    return frame.base_from_camera
 
 
-def test_from_images_to_a_file_and_an_alarm(
-    run: Callable, hall_store: Path, images: Path, hall: Recording, tmp_path: Path
+def test_folder_of_images_is_calibrated_and_checked(
+    run: Any, hall_store: Path, four_images: Path, hall: Recording, tmp_path: Path
 ) -> None:
     out = tmp_path / "calibration.json"
-    done = run("calibrate", hall_store, images, "--out", out)
-    assert done.code == 0, done.err
-    assert "base_from_camera: the pose of camera in base" in done.out
-    assert "4 of 4 used" in done.out
-    found, truth = read_calibration(out), hall.test[3].base_from_camera
-    assert truth is not None
-    assert pose_distance(found.parent_from_child, truth)[0] < 0.004
-    assert run("check", hall_store, images, "--reference", out).code == 0
+    ran = run("calibrate", hall_store, four_images, "--out", out)
+    assert ran.code == 0, ran.err
+    assert "base_from_camera: the pose of camera in base" in ran.out
+    assert "4 of 4 used" in ran.out
+    estimate = read_calibration(out)
+    assert pose_distance(estimate.parent_from_child, truth_of(hall.test[3]))[0] < 0.004
+    assert estimate.source["store"] == str(hall_store)
+    still = run("check", hall_store, four_images, "--reference", out, "--json")
+    assert still.code == 0
+    assert json.loads(still.out).keys() == CHECK_KEYS
+    assert json.loads(still.out)["images"] == 4
     write_image(tmp_path / "moved.png", hall.test[6].read_image())
-    moved = run("check", hall_store, tmp_path / "moved.png", "--reference", out, "--json")
+    moved = run("check", hall_store, tmp_path / "moved.png", "--reference", out)
     assert moved.code == 1
-    assert json.loads(moved.out)["moved"] is True
+    assert moved.out.startswith("The camera has moved by ")
+    assert moved.out.splitlines()[-1].startswith("next: evercal calibrate ")
 
 
-def test_watch_stops_with_one_when_the_camera_moves(
-    run: Callable, hall_store: Path, images: Path, hall: Recording, tmp_path: Path
+def test_cameras_of_a_rig(
+    run: Any, hall_store: Path, four_images: Path, hall: Recording, tmp_path: Path
 ) -> None:
-    out, folder = tmp_path / "calibration.json", tmp_path / "arriving"
-    assert run("calibrate", hall_store, images, "--out", out).code == 0
-    folder.mkdir()
-    words = ("watch", hall_store, folder, "--reference", out, "--interval", "0.05")
-    for path in sorted(images.iterdir())[:3]:
-        (folder / path.name).write_bytes(path.read_bytes())
-    assert run(*words, "--idle", "0.5").code == 0
-    for i in range(3):
-        write_image(folder / f"later-{i}.png", hall.test[6].read_image())
-    assert run(*words, "--idle", "5", "--window", "3").code == 1
+    (tmp_path / "right").mkdir()
+    write_image(tmp_path / "right" / "0.png", hall.test[6].read_image())
+    words = ("calibrate", hall_store, f"left={four_images}", f"right={tmp_path / 'right'}")
+    ran = run(*words, "--out", tmp_path / "rig.json", "--json")
+    assert ran.code == 0, ran.err
+    assert json.loads(ran.out) == json.loads((tmp_path / "rig.json").read_text())
+    left_from_right = truth_of(hall.test[3]).inverse() @ truth_of(hall.test[6])
+    text = run(*words, "--out", tmp_path / "rig.json").out
+    line = next(line for line in text.splitlines() if line.startswith("left_from_right: "))
+    estimate = [float(word) for word in line.split()[1:4]]
+    np.testing.assert_allclose(estimate, 1000 * left_from_right.translation_m, atol=6)
 
 
-def test_audit_lists_what_disagrees(
-    run: Callable, hall_store: Path, hall: Recording, tmp_path: Path
+def test_audit_names_the_episode_with_a_wrong_pose(
+    run: Any, hall_store: Path, hall: Recording, tmp_path: Path
 ) -> None:
     frame = hall.test[3]
-    assert frame.base_from_camera is not None
     for name, shift in (("a", 0.0), ("b", 0.05)):
         (tmp_path / name).mkdir()
         write_image(tmp_path / name / "0.png", frame.read_image())
-        stated = frame.base_from_camera @ SE3.exp([shift, 0, 0, 0, 0, 0])
+        stated = truth_of(frame) @ SE3.exp([shift, 0, 0, 0, 0, 0])
         np.savetxt(tmp_path / name / "base_from_camera.txt", stated.matrix())
-    done = run("audit", hall_store, tmp_path, "--json")
-    assert done.code == 1
-    verdicts = [episode["verdict"] for episode in json.loads(done.out)["episodes"]]
+    ran = run("audit", hall_store, tmp_path, "--json")
+    assert ran.code == 1
+    verdicts = [episode["verdict"] for episode in json.loads(ran.out)["episodes"]]
     assert verdicts == ["right", "wrong"]
+    text = run("audit", hall_store, tmp_path).out
+    assert text.endswith("1 of 2 episodes state a wrong camera pose\n")
+
+
+def test_align_by_points_picked_in_images_beside_the_picks_file(
+    run: Any, hall_store: Path, hall: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Points in front of two cameras, moved by a known transform, restore the transform."""
+    copy = Path(shutil.copytree(hall_store, tmp_path / "map"))
+    frames, folder = hall.test[2:12:3], tmp_path / "picks" / "images"
+    folder.mkdir(parents=True)
+    base_from_map = SE3.exp([0.1, -0.2, 0.05, 0.0, 0.0, 0.3])
+    rng, rows = np.random.default_rng(0), ["image,name,u,v"]
+    center = truth_of(frames[1])
+    points = center.apply(rng.uniform([-0.5, -0.4, 2.0], [0.5, 0.4, 3.0], (6, 3)))
+    for i, frame in enumerate(frames):
+        write_image(folder / f"{i}.png", frame.read_image())
+        pixels = frame.camera.project(truth_of(frame).inverse().apply(points))
+        rows += [f"images/{i}.png,p{j},{u},{v}" for j, (u, v) in enumerate(pixels)]
+    (tmp_path / "picks" / "picks.csv").write_text("\n".join(rows))
+    touched = base_from_map.apply(points)
+    lines = [f"p{j},{x},{y},{z}" for j, (x, y, z) in enumerate(touched)]
+    (tmp_path / "points.csv").write_text("\n".join(["name,x,y,z", *lines]))
+    monkeypatch.chdir(tmp_path)  # not the folder of the picks
+    words = ("align", copy, "hall", "--points", "points.csv", "--picks", "picks/picks.csv")
+    ran = run(*words, "--json")
+    assert ran.code == 0, ran.err
+    record = json.loads(ran.out)
+    estimate = SE3.from_matrix(np.array(record["base_from_map"]))
+    assert pose_distance(estimate, base_from_map)[0] < 0.02
+    assert record["scale"] == 1.0
+    (tmp_path / "points.csv").write_text("\n".join(["name,x,y,z", *lines[1:]]))
+    refused = run(*words)
+    assert refused.code == 2
+    assert "point 'p0' is not in points.csv" in refused.err[0]
+
+
+def test_network_stores_are_refused_by_name(
+    run: Any, network_store: Path, four_images: Path, snapshot: Any, tmp_path: Path
+) -> None:
+    before = snapshot(network_store)
+    (tmp_path / "poses.csv").write_text("x,y,z,qw,qx,qy,qz\n" + "0,0,0,1,0,0,0\n" * 4)
+    aligned = ("align", network_store, "box-room-41", four_images)
+    for words in (
+        ("calibrate", network_store, four_images, "--out", tmp_path / "c.json"),
+        (*aligned, "--robot-poses", tmp_path / "poses.csv"),
+    ):
+        ran = run(*words)
+        assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
+        assert f"{network_store}: holds networks of strategy" in ran.err[0]
+        assert "finetune" in ran.err[0]
+    assert snapshot(network_store) == before
+    assert not (tmp_path / "c.json").exists()
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("calibrate", "STORE"), "no image given"),
         (("calibrate", "STORE", "none.png"), "none.png: image file is missing"),
         (("calibrate", "STORE", "EMPTY"), "no images in this folder"),
-        (("calibrate", "STORE", "IMAGES", "--mount", "eye_in_hand"), "give --robot-poses"),
-        (("calibrate", "STORE", "a=IMAGES", "IMAGES"), "do not go together"),
-        (("calibrate", "STORE", "BLACK"), "none of 1 images was located"),
+        (("calibrate", "STORE", "IMAGES", "--mount", "eye_in_hand"), "--robot-poses"),
+        (("calibrate", "STORE", "a=IMAGES", "IMAGES"), "cannot be mixed"),
+        (("calibrate", "STORE", "a=IMAGES", "--robot-poses", "x"), "cameras of a rig are fixed"),
+        (("calibrate", "STORE", "BLACK"), "0 of 1 images were located"),
         (("check", "STORE", "IMAGES", "--reference", "none.json"), "calibration file is missing"),
-        (("watch", "STORE", "none", "--reference", "none.json"), "no such folder"),
-        (("audit", "STORE", "EMPTY"), "no folders in it"),
+        (("check", "STORE", "EMPTY", "--reference", "none.json"), "no images in this folder"),
+        (("audit", "STORE", "EMPTY"), "EMPTY"),
+        (("audit", "STORE", "EMPTY", "--images", "0"), "--images is at least 1"),
+        (("align", "STORE", "hall"), "either images with --robot-poses, or --points with --picks"),
+        (("align", "STORE", "hall", "--points", "p.csv"), "--points and --picks belong together"),
     ],
 )
 def test_bad_input_is_one_line(
     words: tuple[str, ...],
-    said: str,
-    run: Callable,
+    message: str,
+    run: Any,
     hall_store: Path,
-    images: Path,
+    four_images: Path,
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     (tmp_path / "black").mkdir()
     write_image(tmp_path / "black" / "0.png", np.zeros((240, 320, 3), np.uint8))
-    places = {"STORE": hall_store, "IMAGES": images}
-    places |= {"EMPTY": tmp_path / "empty", "BLACK": tmp_path / "black"}
-    given = [str(places.get(word, word)) for word in words]
-    given = [word.replace("a=IMAGES", f"a={images}") for word in given]
-    done = run(*given)
-    assert done.code == 2
-    assert said in " ".join(done.err)
+    paths = {"STORE": hall_store, "IMAGES": four_images, "a=IMAGES": f"a={four_images}"}
+    paths |= {"EMPTY": tmp_path / "empty", "BLACK": tmp_path / "black"}
+    ran = run(*(paths.get(word, word) for word in words))
+    assert (ran.code, len(ran.err)) == (2, 1)
+    assert message.replace("EMPTY", str(tmp_path / "empty")) in ran.err[0]
+    assert not (tmp_path / "calibration.json").exists()

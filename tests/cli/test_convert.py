@@ -1,4 +1,4 @@
-"""`evercal convert`, and the reading flags that it shares with `inspect` and `learn`."""
+"""`evercal convert`, and the reading options that it shares with `inspect` and `learn`."""
 
 import dataclasses
 import json
@@ -15,7 +15,7 @@ from evercal.recordings import FORMATS, ReadOptions, generic, load_recording, wr
 
 @pytest.fixture
 def wave(tmp_path: Path) -> Path:
-    """A wrist recording of four images; its camera file lies elsewhere."""
+    """A wrist recording of four images; the camera file is in the folder above."""
     root = tmp_path / "wave"
     root.mkdir()
     rows = ["x_m,y_m,z_m,rotvec_x,rotvec_y,rotvec_z"]
@@ -23,57 +23,61 @@ def wave(tmp_path: Path) -> Path:
         write_image(root / f"{i}.png", np.full((24, 32, 3), 10 * i, np.uint8))
         rows.append(f"0.{i},0.2,0.3,0.0,0.{i},0.0")
     (root / "base_from_gripper.csv").write_text("\n".join(rows))
-    (tmp_path / "lens.txt").write_text("30 0 15.5\n0 30 11.5\n0 0 1\n")
+    (tmp_path / "camera.txt").write_text("30 0 15.5\n0 30 11.5\n0 0 1\n")
     return root
 
 
-@pytest.mark.parametrize("flags", [[], ["--hard-link"]])
-def test_a_recording_becomes_a_scene_folder(
-    run: Any, wave: Path, tmp_path: Path, flags: list[str]
+@pytest.mark.parametrize("options", [[], ["--hard-link"]])
+def test_recording_is_converted_to_a_scene_folder(
+    run: Any, wave: Path, tmp_path: Path, options: list[str]
 ) -> None:
     out = tmp_path / "out"
-    words = ["convert", wave, out, "--camera", tmp_path / "lens.txt", "--name", "cell", *flags]
+    words = ["convert", wave, out, "--camera", tmp_path / "camera.txt", "--name", "cell", *options]
     ran = run(*words, "--json")
     assert (ran.code, ran.err) == (0, [])
-    told = json.loads(ran.out)
-    assert (told["name"], told["train"], told["test"], told["untracked"]) == ("cell", 4, 0, 0)
-    assert (told["with_base_from_camera"], told["with_base_from_gripper"]) == (0, 4)
+    record = json.loads(ran.out)
+    assert (record["name"], record["train"], record["test"], record["untracked"]) == (
+        "cell",
+        4,
+        0,
+        0,
+    )
+    assert (record["with_base_from_camera"], record["with_base_from_gripper"]) == (0, 4)
     scene = load_recording(out)
     assert scene.name == "cell"
-    assert scene.notes == tuple(told["notes"])
+    assert scene.notes == tuple(record["notes"])
     assert "in order" in scene.notes[0]
     for i, frame in enumerate(scene.train):
         assert frame.base_from_gripper is not None
         expected = SE3.exp([0, 0, 0, 0, i / 10, 0]).rotation_wxyz
-        placed = SE3(expected, np.array([i / 10, 0.2, 0.3]))
-        assert max(pose_distance(frame.base_from_gripper, placed)) < 1e-12
+        pose = SE3(expected, np.array([i / 10, 0.2, 0.3]))
+        assert max(pose_distance(frame.base_from_gripper, pose)) < 1e-12
         assert int(frame.read_image().mean()) == 10 * i
         assert isinstance(frame.image, Path)
-        assert frame.image.samefile(wave / f"{i}.png") == bool(flags)
-    # The scene is there now: it is not written over.
+        assert frame.image.samefile(wave / f"{i}.png") == bool(options)
     ran = run(*words)
     assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
     assert "already there" in ran.err[0]
 
 
-def test_every_second_image_and_the_words_of_the_next_command(run: Any, wave: Path) -> None:
-    lens = wave.parent / "lens.txt"
-    ran = run("inspect", wave, "--every", 2, "--camera", lens)
+def test_next_command_repeats_the_reading_options(run: Any, wave: Path) -> None:
+    camera = wave.parent / "camera.txt"
+    ran = run("inspect", wave, "--every", 2, "--camera", camera)
     assert "2 training and 0 test frames with the gripper's pose" in ran.out
     assert "gripper moved in 0.20 x 0.00 x 0.00 m" in ran.out
     assert "note: images and poses were paired in order" in ran.out
     last = ran.out.splitlines()[-1]
-    assert last == f"next: evercal learn STORE {wave} --camera {lens} --every 2"
+    assert last == f"next: evercal learn STORE {wave} --camera {camera} --every 2"
 
 
-def test_flags_are_those_of_the_reader(run: Any) -> None:
+def test_options_are_those_of_load_recording(run: Any) -> None:
     names = {field.name: field.default for field in dataclasses.fields(Reading)}
     assert names.pop("format") is None
     assert names == {field.name: field.default for field in dataclasses.fields(ReadOptions)}
     text = run("inspect", "--help").out.replace("│", "")
-    listed = " ".join(text.split())
+    page = " ".join(text.split())
     for name in FORMATS:
-        assert f" {name}" in listed[listed.index("Format of the recording") :]
+        assert f" {name}" in page[page.index("Format of the recording") :]
     for verb in ("learn", "convert", "inspect"):
         shown = run(verb, "--help").out
         for name in names:
@@ -81,11 +85,11 @@ def test_flags_are_those_of_the_reader(run: Any) -> None:
 
 
 @pytest.mark.parametrize("verb", ["convert", "inspect", "learn"])
-def test_misuse_is_one_line(run: Any, wave: Path, tmp_path: Path, verb: str) -> None:
-    lens = tmp_path / "lens.txt"
+def test_bad_input_is_one_line(run: Any, wave: Path, tmp_path: Path, verb: str) -> None:
+    camera = tmp_path / "camera.txt"
     (tmp_path / "file").write_text("x")
     room = tmp_path / "room"
-    generic.write(room, load_recording(wave, options=ReadOptions(camera=lens)))
+    generic.write(room, load_recording(wave, options=ReadOptions(camera=camera)))
     before, after = {
         "convert": ([], [tmp_path / "new"]),
         "inspect": ([], []),
@@ -94,8 +98,8 @@ def test_misuse_is_one_line(run: Any, wave: Path, tmp_path: Path, verb: str) -> 
     for scene, words, message in (
         (wave, [], "no camera file in it"),
         (wave, ["--camera", tmp_path / "no"], "camera file is missing"),
-        (wave, ["--camera", lens, "--image-topic", "/a"], "--image-topic: not used by"),
-        (room, ["--camera", lens], "--camera: not used by recordings of format generic"),
+        (wave, ["--camera", camera, "--image-topic", "/a"], "--image-topic: not used by"),
+        (room, ["--camera", camera], "--camera: not used by recordings of format generic"),
         (room, ["--every", 0], "--every 0: give a number >= 1"),
         (tmp_path / "file", [], "a file, not a folder"),
         (tmp_path / "no", [], "no such folder"),

@@ -84,6 +84,23 @@ def test_other_data_in_the_output_folder_are_refused(
     assert snapshot(tmp_path) == before
 
 
+def test_copied_samples_are_recordings_and_nothing_else(
+    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ran = run("demo", "--copy-samples", "samples")
+    assert (ran.code, ran.err) == (0, [])
+    assert [path.name for path in tmp_path.iterdir()] == ["samples"]
+    names = sorted(path.name for path in (tmp_path / "samples").iterdir())
+    assert names == ["bedroom", "cell", "kitchen", "living"]
+    assert ran.out.splitlines()[-1] == "next: evercal learn cell.evercal samples/cell/wrist"
+    for folder in ("kitchen", "cell/wrist"):
+        assert run("inspect", f"samples/{folder}").code == 0
+    again = run("demo", "--copy-samples", "samples", "--json")
+    assert again.code == 2
+    assert "samples: is not empty" in json.loads(again.out)["error"]
+
+
 def test_headlines_are_medians() -> None:
     test = [
         FrameResult("a", str(i), mm / 1000, 0.001, "ok", "a", False, 1.0, 9, 0.5)

@@ -7,43 +7,68 @@ from typing import Any
 
 import pytest
 
+MAP_KEYS = {"name", "train_frames", "memory_bytes", "keyframes", "camera", "landmarks"}
+MAP_KEYS |= {"min_support", "adjusted"}
 
-def test_info_adds_up(run: Any, store: Path) -> None:
+
+def test_info_of_a_map(run: Any, store: Path) -> None:
     info = json.loads(run("info", store, "--json").out)
     assert info["strategy"] == "evercal"
     assert info["total_bytes"] == sum(f.stat().st_size for f in store.rglob("*") if f.is_file())
-    assert info["memory_bytes"] + info["head_bytes"] < info["total_bytes"]
+    assert 0 < info["memory_bytes"] < info["total_bytes"]
+    assert info["head_bytes"] == 0
     (scene,) = info["scenes"]
-    assert scene["name"] == "box-room-41"
-    assert scene["camera"]["width"] == 320
-    text = run("info", store).out
-    assert "box-room-41" in text
-    assert text.splitlines()[-1] == f"next: evercal verify {store}"
+    assert scene.keys() == MAP_KEYS
+    assert (scene["name"], scene["camera"]["width"]) == ("box-room-41", 320)
+    assert scene["landmarks"] > 50
+    lines = [" ".join(line.split()) for line in run("info", store).out.splitlines()]
+    counts = f"{scene['train_frames']} {scene['keyframes']} {scene['landmarks']} "
+    assert any(line.startswith(f"box-room-41 {counts}") for line in lines)
+    residual = f"box-room-41 {scene['adjusted']['residual_px']:.2f} px "
+    assert any(line.startswith(residual) for line in lines)
+    assert lines[-1] == f"next: evercal verify {store}"
 
 
-def test_verify_names_what_is_damaged(run: Any, store: Path, tmp_path: Path) -> None:
+def test_info_of_a_map_without_reports(run: Any, hall_store: Path) -> None:
+    ran = run("info", hall_store)
+    assert ran.code == 0
+    assert "bundle adjustment" not in ran.out
+
+
+def test_info_of_a_network(run: Any, network_store: Path) -> None:
+    info = json.loads(run("info", network_store, "--json").out)
+    assert info["strategy"] == "finetune"
+    assert info["head_bytes"] > 0
+    (scene,) = info["scenes"]
+    assert "landmarks" not in scene
+    text = run("info", network_store).out
+    assert f"{100 * scene['inlier_threshold']:.0f} % inliers" in text
+    assert "landmarks" not in text
+
+
+def test_damaged_files_are_named(run: Any, store: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(store, tmp_path / "s"))
     assert run("verify", copy).code == 0
     assert json.loads(run("verify", copy, "--json").out)["ok"] is True
-    victim = next(copy.rglob("memory.safetensors"))
-    data = bytearray(victim.read_bytes())
+    keyframes = next(copy.rglob("keyframes.safetensors"))
+    data = bytearray(keyframes.read_bytes())
     data[-1] ^= 1
-    victim.write_bytes(data)
-    next(copy.rglob("prototypes.safetensors")).unlink()
+    keyframes.write_bytes(data)
+    next(copy.rglob("scene.json")).unlink()
     ran = run("verify", copy)
     assert ran.code == 1
-    assert "memory.safetensors: checksum" in ran.out
-    assert "prototypes.safetensors: missing" in ran.out
-    answer = json.loads(run("verify", copy, "--json").out)
-    assert answer["ok"] is False
-    assert len(answer["problems"]) == 2
-    for verb in (["info", copy], ["learn", copy, tmp_path], ["evaluate", copy, tmp_path]):
-        refused = run(*verb)
-        assert (refused.code, refused.out, len(refused.err)) == (2, "", 1)
+    assert "keyframes.safetensors: checksum" in ran.out
+    assert "scene.json: missing" in ran.out
+    record = json.loads(run("verify", copy, "--json").out)
+    assert record["ok"] is False
+    assert len(record["problems"]) == 2
+    for words in (["info", copy], ["learn", copy, tmp_path], ["evaluate", copy, tmp_path]):
+        ran = run(*words)
+        assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
 
 
 @pytest.mark.parametrize("verb", ["info", "verify"])
-def test_what_is_not_a_store_is_refused(run: Any, tmp_path: Path, verb: str) -> None:
+def test_other_folders_are_refused(run: Any, tmp_path: Path, verb: str) -> None:
     for path in (tmp_path, tmp_path / "nowhere"):
         ran = run(verb, path)
         assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)

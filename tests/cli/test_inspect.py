@@ -9,18 +9,18 @@ from evercal.recordings import load_recording
 from evercal.recordings.inspection import Inspection, inspect_recording
 
 
-def test_a_sound_scene_is_described_without_a_warning(run: Any, rooms: Any) -> None:
+def test_sound_recording_has_no_warnings(run: Any, rooms: Any) -> None:
     ran = run("inspect", rooms[0], "--json")
-    found = json.loads(ran.out)
-    assert found.keys() == {field.name for field in dataclasses.fields(Inspection)}
-    assert (found["train"], found["test"], found["untracked"]) == (24, 6, 0)
-    assert found["warnings"] == []
+    record = json.loads(ran.out)
+    assert record.keys() == {field.name for field in dataclasses.fields(Inspection)}
+    assert (record["train"], record["test"], record["untracked"]) == (24, 6, 0)
+    assert record["warnings"] == []
     text = run("inspect", rooms[0]).out
     assert "24 training and 6 test frames" in text
     assert text.splitlines()[-1] == f"next: evercal learn STORE {rooms[0]}"
 
 
-def test_the_same_files_in_both_splits_are_found(rooms: Any) -> None:
+def test_frames_in_both_splits_are_a_warning(rooms: Any) -> None:
     recorded = load_recording(rooms[0])
     both = dataclasses.replace(recorded, test=recorded.train[:6])
     assert "test frames have the pose or the file" in "\n".join(inspect_recording(both).warnings)

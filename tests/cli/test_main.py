@@ -1,6 +1,8 @@
-"""Help, version, complaints and exit codes; none of them waits for torch."""
+"""Help, version, messages, exit codes and output paths of all verbs."""
 
+import ast
 import json
+import os
 import re
 import subprocess
 import sys
@@ -11,36 +13,25 @@ from typing import Any
 import pytest
 
 import evercal
-from evercal import cli
-from evercal.errors import InputError
+from evercal.cli import main
 
-VERBS = (
-    "demo",
-    "learn",
-    "localize",
-    "calibrate",
-    "check",
-    "watch",
-    "audit",
-    "align",
-    "detect",
-    "solve",
-    "export",
-    "report",
-    "evaluate",
-    "info",
-    "verify",
-    "inspect",
-    "convert",
-    "simulate",
-    "bench",
-    "bench-report",
-    "pretrain",
-)
+VERBS = {
+    "Map": ["learn", "localize", "evaluate", "info", "verify"],
+    "Calibrate": ["calibrate", "check", "watch", "audit", "align"],
+    "Boards and pose pairs": ["detect", "solve"],
+    "Results": ["export", "report"],
+    "Recordings": ["inspect", "convert", "simulate", "demo"],
+    "Networks": ["bench", "bench-report", "pretrain"],
+}
+ALL = [verb for verbs in VERBS.values() for verb in verbs]
+OTHER_PROGRAMS = {"--once", "--frame-id", "--child-frame-id", "--qw", "--qx", "--qy", "--qz"}
+OTHER_PROGRAMS |= {"--nproc-per-node", "--tyro-print-completion", "--version"}
+"""Options in messages that are not those of a verb."""
+SOLVE = ("--robot-poses", "R", "--camera-poses", "C", "--mount", "eye_in_hand")
 
 
 def alone(*words: str) -> tuple[subprocess.CompletedProcess[str], set[str], float]:
-    """A command in a process of its own, the modules it loaded, and its seconds."""
+    """A command in its own process, the modules it loaded, and its seconds."""
     code = (
         "import sys; from evercal.cli import main; code = main(sys.argv[1:]);"
         "print('\\nmodules', *sys.modules, file=sys.stderr); sys.exit(code)"
@@ -53,29 +44,61 @@ def alone(*words: str) -> tuple[subprocess.CompletedProcess[str], set[str], floa
     return done, modules, time.perf_counter() - start
 
 
-def test_help_lists_every_verb_at_once() -> None:
+def test_help_lists_every_verb_once_in_its_group() -> None:
     done, modules, seconds = alone("--help")
     assert done.returncode == 0
-    assert tuple(re.findall(r"^│\s+• (\S+)", done.stdout, re.MULTILINE)) == VERBS
+    groups: dict[str, list[str]] = {}
+    for line in done.stdout.splitlines():
+        if heading := re.fullmatch(r"(\w.*):", line):
+            groups[heading[1]] = []
+        elif verb := re.match(r"  (\S+)\s+[A-Z]\w+", line):
+            groups[list(groups)[-1]].append(verb[1])
+    assert groups == VERBS
+    assert max(map(len, done.stdout.splitlines())) <= 100
     assert not {"torch", "cv2", "scipy", "matplotlib", "numpy"} & modules
     assert seconds < 5  # one second where nothing else runs
+
+
+@pytest.mark.parametrize("verb", ALL)
+def test_help_of_a_verb_fits_and_has_an_example(
+    run: Any, verb: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    ran = run(verb, "--help")
+    assert (ran.code, ran.err) == (0, [])
+    assert re.search(rf"^Example: evercal {verb} ", ran.out, re.MULTILINE)
+    assert max(map(len, ran.out.splitlines())) <= 80
+    assert "(default: None)" not in ran.out
+    assert "(default: )" not in ran.out
+    assert "--no-" not in ran.out
+    assert "--json" in ran.out
+    if verb == "learn":
+        assert "--preset {fast,demo,bench,paper}" in ran.out
+
+
+def test_messages_name_existing_options(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    options = set(OTHER_PROGRAMS)
+    for verb in ALL:
+        options |= set(
+            re.findall(r"^│ (?:-h, )?(--[a-z-]+)", run(verb, "--help").out, re.MULTILINE)
+        )
+    assert "--robot-poses" in options
+    for path in Path(evercal.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*[a-z]", node.value))
+                assert named <= options, f"{path}:{node.lineno}"
 
 
 @pytest.mark.parametrize(
     ("words", "code"),
     [
         (["learn", "--help"], 0),
-        (["localize", "--help"], 0),
-        (["evaluate", "--help"], 0),
         (["demo", "--help"], 0),
         (["learn", "store"], 2),
-        (["learn", "store", "scene", "--preset", "slow"], 2),
-        (["learn", "store", "scene", "--memory", "none"], 2),
-        (["localize", "store"], 2),
         (["localize", "store", "missing.png"], 2),
-        (["evaluate", "store"], 2),
-        (["evaluate", "store", "missing"], 2),
-        (["export", "--help"], 0),
+        (["calibrate", "store", "missing.png"], 2),
         (["export", "missing.json", "--format", "urdf"], 2),
         (["lern"], 2),
         ([], 2),
@@ -84,85 +107,103 @@ def test_help_lists_every_verb_at_once() -> None:
 def test_help_and_misuse_do_without_torch(words: list[str], code: int) -> None:
     done, modules, _ = alone(*words)
     assert done.returncode == code
-    assert not {"torch", "cv2", "matplotlib"} & modules
-
-
-def test_arguments_have_names_and_explanations(run: Any) -> None:
-    text = " ".join(run("learn", "--help").out.replace("│", " ").split())
-    for option in ("name", "strategy", "preset", "memory", "centres", "encoder", "format", "seed"):
-        assert f"--{option} " in text
-    assert "STORE SCENE" in text
-    assert "Folder of the recorded scene," in text
-    assert "--no-json" not in text
-
-
-def test_presets_in_the_help_are_those_there_are(run: Any) -> None:
-    from evercal.continual.presets import PRESETS
-
-    text = " ".join(run("learn", "--help").out.replace("│", " ").split())
-    assert f"--preset {{{','.join(PRESETS)}}}" in text
-
-
-def test_the_page_on_methods_names_every_strategy_and_no_other() -> None:
-    from evercal.continual.strategies import STRATEGIES
-
-    page = (Path(__file__).parents[2] / "docs" / "methods.md").read_text()
-    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
-    # Other tests may have composed some more.
-    listed = {name for name in STRATEGIES if name.isidentifier()}
-    assert {name for row in rows for name in re.findall(r"`(\w+)`", row)} == listed
+    assert not {"torch", "matplotlib"} & modules
 
 
 def test_version(run: Any) -> None:
     assert run("--version").out == f"evercal {evercal.__version__}\n"
 
 
-def test_unusable_arguments_are_an_error_object_too(run: Any) -> None:
-    ran = run("learn", "store", "--json")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["learn", "store"], "RECORDING"),
+        (["learn", "a", "b", "--seed", "x"], "--seed"),
+        (["learn", "a", "b", "--preset", "slow"], "--preset"),
+        (["lern"], "lern: no such verb; did you mean 'learn'?"),
+        (["qqqq"], "'evercal --help' lists all verbs"),
+    ],
+)
+def test_unusable_arguments_are_an_error_object(run: Any, words: list[str], message: str) -> None:
+    ran = run(*words, "--json")
     assert ran.code == 2
-    assert "SCENE" in json.loads(ran.out)["error"]
-    assert "SCENE" in "".join(ran.err)
-    ran = run("learn", "a", "b", "--seed", "x", "--json")
-    assert "--seed" in json.loads(ran.out)["error"]
-
-
-class Fails:
-    def __init__(self, error: BaseException):
-        self.error = error
-
-    def run(self) -> int:
-        raise self.error
+    assert message in json.loads(ran.out)["error"]
+    assert message in "".join(ran.err)
 
 
 @pytest.mark.parametrize(
-    ("error", "code", "said"),
+    ("words", "message"),
     [
-        (InputError("scene 'a'\nis bad"), 2, "error: scene 'a' is bad"),
-        (PermissionError(13, "Permission denied", "/x/y"), 2, "error: /x/y: Permission denied"),
-        (OSError(28, "No space left on device"), 2, "error: No space left on device"),
-        (KeyboardInterrupt(), 130, "stopped"),
+        (["learn", "S", "R", "--calibration", "GONE/c.json"], "--calibration GONE/c.json: folder"),
+        (["learn", "S", "R", "--calibration", "DIR"], "--calibration DIR: is a folder"),
+        (["localize", "S", "IMAGE", "--overlay", "FILE/x"], "--overlay FILE/x: cannot be created"),
+        (["evaluate", "S", "R", "--report", "GONE/r.html"], "--report GONE/r.html: folder"),
+        (["calibrate", "S", "IMAGE", "--out", "GONE/c.json"], "--out GONE/c.json: folder"),
+        (["calibrate", "S", "IMAGE", "--out", "DIR"], "--out DIR: is a folder"),
+        (["detect", "IMAGE", "--board", "apriltag", "--out", "GONE/b.json"], "--out GONE/b.json"),
+        (
+            ["solve", *SOLVE, "--out", "GONE/c.json"],
+            "--out GONE/c.json: folder",
+        ),
+        (["report", "C", "--out", "GONE/r.html"], "--out GONE/r.html: folder"),
+        (["convert", "R", "FILE"], "FILE: is a file; give a folder"),
+        (["demo", "--out", "FILE/x"], "--out FILE/x: cannot be created"),
+        (["demo", "--copy-samples", "FILE"], "FILE: is a file; name a new folder"),
+        (["simulate", "sim-mini", "--out", "FILE/x"], "FILE/x"),
+        (["bench", "sim-mini", "--out", "FILE/x"], "FILE/x"),
+        (["pretrain", "--out", "FILE/x"], "FILE/x"),
     ],
 )
-def test_errors_are_one_line_and_an_exit_code(
-    run: Any, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, said: str
+def test_output_paths_are_refused_before_the_work(
+    run: Any, words: list[str], message: str, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(cli, "_parse", lambda words, as_json: Fails(error))
-    ran = run("info", "x")
-    assert (ran.code, ran.err, ran.out) == (code, [said], "")
-    if code == 2:
-        assert json.loads(run("info", "x", "--json").out) == {"error": said[len("error: ") :]}
+    """The inputs do not exist, but the message is about the output."""
+    (tmp_path / "FILE").write_text("x")
+    (tmp_path / "DIR").mkdir()
+    image = Path(evercal.__file__).parent / "recordings" / "sample_cell" / "bumped.jpg"
+    message = re.sub("(GONE|DIR|FILE)", rf"{tmp_path}/\1", message)
+    given = [re.sub("^(GONE|DIR|FILE)", rf"{tmp_path}/\1", word) for word in words]
+    began = time.monotonic()
+    ran = run(*(image if word == "IMAGE" else word for word in given))
+    assert (ran.code, ran.out) == (2, "")
+    assert message in ran.err[-1]
+    assert time.monotonic() - began < 10
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["DIR", "FILE"]
 
 
-def test_a_bug_is_not_dressed_up_as_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli, "_parse", lambda words, as_json: Fails(ValueError("bug")))
-    with pytest.raises(ValueError, match="bug"):
-        cli.main(["info", "x"])
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [(["--version"], "No space left on device"), (["info", "x", "--json"], "x: no such folder")],
+)
+def test_full_disk_is_one_line(words: list[str], message: str) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "evercal", *words],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    assert done.returncode == 2
+    assert done.stderr == f"error: {message}\n"
 
 
-def test_a_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
-    code = "import sys; from evercal.cli import main; sys.exit(main(['--help']))"
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_folder_without_permission_is_refused(run: Any, tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    ran = run("demo", "--copy-samples", tmp_path / "samples")
+    assert (ran.code, len(ran.err)) == (2, 1)
+
+
+def test_bugs_are_not_reported_as_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tyro", None)  # a broken installation
+    with pytest.raises(ImportError):
+        main(["info", "x"])
+
+
+def test_closed_pipe_is_no_error() -> None:
     with subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [sys.executable, "-m", "evercal", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:
         assert process.stdout is not None
         assert process.stderr is not None

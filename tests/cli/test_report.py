@@ -84,7 +84,7 @@ def test_calibration_without_images_or_camera(
         (("c.json", "--images", "gone.png"), "image file is missing"),
         (("c.json", "--store", "gone"), "gone"),
         (("c.json", "--out", "gone/r.html"), "gone does not exist"),
-        (("c.json", "--out", "."), "it is a folder"),
+        (("c.json", "--out", "."), "is a folder"),
         (("c.json", "--against", "hand.json"), "same mount"),
     ],
 )

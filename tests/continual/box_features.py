@@ -28,7 +28,7 @@ def describe() -> GlobalDescriptor:
 
 @pytest.fixture(scope="session")
 def learnable(box: BoxRoom) -> Learnable:
-    """A buffer of a box room whose features are waves of the true point; and those points."""
+    """Make a buffer of a box room whose features are waves of the true points, and the points."""
     waves = np.random.default_rng(0).normal(0, 0.6, (CHANNELS // 2, 3))
 
     def make(

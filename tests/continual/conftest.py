@@ -1,8 +1,8 @@
-"""Small networks that are trained once, and what the strategies know after a room."""
+"""Small networks that are trained once, and what strategies learn from a few rooms."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from evercal.mapping.scene_maps import SceneMaps
-
+    from evercal.continual.scenes import LearnedScenes
     from evercal.continual.stage import StageOptions
-    from evercal.mapping.store import Store
+    from evercal.continual.store import NetworkStore
     from evercal.recordings.frame import Recording
 
-    Blank = Callable[[str], SceneMaps]
-    Rooms = tuple[Recording, Recording, Recording]
+    from .stages import EmptyScenes, Estimates, MakeStore, Rooms
 
 
 @pytest.fixture(scope="session")
@@ -38,12 +36,12 @@ def quick() -> StageOptions:
 
 
 @pytest.fixture(scope="session")
-def blank() -> Callable[[str], SceneMaps]:
-    """Makes a robot that knows nothing, with tiny random networks, given its strategy."""
+def empty_scenes() -> EmptyScenes:
+    """Make `LearnedScenes` without scenes, with tiny random networks, for a strategy."""
     import torch
-    from evercal.mapping.scene_maps import SceneMaps
 
     from evercal.continual.networks.descriptor import GlobalDescriptor
+    from evercal.continual.scenes import LearnedScenes
     from evercal.features.encoder import LocalEncoder
 
     torch.manual_seed(0)
@@ -51,81 +49,91 @@ def blank() -> Callable[[str], SceneMaps]:
     descriptor = GlobalDescriptor(8, maps=2, hidden=4, width=8).eval()
     for parameter in (*encoder.parameters(), *descriptor.parameters()):
         parameter.data = parameter.data.half().float()  # as they are stored
-    return lambda strategy: SceneMaps(encoder, descriptor, strategy, 48)
+    return lambda strategy: LearnedScenes(encoder, descriptor, strategy, 48)
 
 
 @pytest.fixture(scope="session")
-def taught(
-    blank: Callable[[str], SceneMaps],
-    rooms: tuple[Recording, Recording, Recording],
-    quick: StageOptions,
-) -> dict[str, list[SceneMaps]]:
-    """By strategy: what is known after one, two and three rooms."""
-    from evercal.mapping.scene_maps import with_fit
-
+def first_stages(
+    empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions
+) -> dict[str, LearnedScenes]:
+    """Every strategy that learns scene by scene after the first room."""
     from evercal.continual.learn import learn
-    from evercal.continual.stage import Stage
     from evercal.continual.strategies import STRATEGIES
 
-    found: dict[str, list[SceneMaps]] = {}
-    for strategy in ("evercal", "evercal_network", "isolation"):
-        maps, after = blank(strategy), []
-        for scene in rooms:
-            *_, stage = learn(maps, STRATEGIES[strategy], scene, quick)
-            assert isinstance(stage, Stage)
-            maps = stage.maps
-            maps.scenes[-1] = with_fit(maps.scenes[-1], 0.01 * len(maps.scenes), 1.5)
-            after.append(maps)
-        found[strategy] = after
-    return found
+    from .stages import outcome
+
+    return {
+        name: outcome(learn(empty_scenes(name), strategy, rooms[0], quick))
+        for name, strategy in STRATEGIES.items()
+        if not strategy.jointly
+    }
 
 
 @pytest.fixture(scope="session")
-def make() -> Callable[[Path, list[SceneMaps]], Store]:
-    """Makes a store with given stages, the way `teach` does."""
+def three_stages(
+    first_stages: dict[str, LearnedScenes], rooms: Rooms, quick: StageOptions
+) -> dict[str, list[LearnedScenes]]:
+    """By strategy: what is learned after one, two and three rooms."""
+    from evercal.continual.learn import learn
+    from evercal.continual.strategies import STRATEGIES
+
+    from .stages import outcome
+
+    stages: dict[str, list[LearnedScenes]] = {}
+    for name in ("evercal_network", "evercal_hybrid", "isolation"):
+        stages[name] = [first_stages[name].copy_for_training()]
+        for room in rooms[1:]:
+            stages[name].append(outcome(learn(stages[name][-1], STRATEGIES[name], room, quick)))
+        for after in stages[name]:
+            after.scenes = [
+                replace(record, inlier_threshold=0.01 * (i + 1), covariance_scale=1.5)
+                for i, record in enumerate(after.scenes)
+            ]
+    return stages
+
+
+@pytest.fixture(scope="session")
+def make_store() -> MakeStore:
+    """Make a store of given stages, as `learn_networks` does."""
     import torch
 
-    from evercal.mapping.store import Checkpoint, Store
+    from evercal.continual.store import Checkpoint, NetworkStore
 
-    def store(root: Path, stages: list[SceneMaps]) -> Store:
+    def make(root: Path, stages: Sequence[LearnedScenes]) -> NetworkStore:
         first = stages[0]
-        store = Store(root, replace(first, heads=[], scenes=[], keyframes=[]), [], None)
-        for maps in stages:
-            store.begin({"scene": maps.scenes[-1].name})
+        empty = replace(first, heads=[], scenes=[], keyframes=[], method_states=[])
+        store = NetworkStore(root, empty)
+        for scenes in stages:
+            store.begin({"scene": scenes.scenes[-1].name})
             store.checkpoint(Checkpoint({"a": torch.zeros(3)}, {"b": torch.ones(2)}))
-            store.commit(maps, {"scene": maps.scenes[-1].name, "seconds": 1.5})
+            store.commit(scenes, {"scene": scenes.scenes[-1].name, "seconds": 1.5})
         return store
 
-    return store
+    return make
 
 
 @pytest.fixture(scope="session")
-def answers(rooms: tuple[Recording, Recording, Recording]) -> Callable[..., list[bytes]]:
-    """Tells what a robot says to an image of each room and keeps of it, to the last bit."""
-    from evercal.localization.localizer import LocalizeOptions, Localizer
+def estimates(rooms: Rooms) -> Estimates:
+    """Poses of one image of each room by the networks, to the last bit."""
+    from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer
     from evercal.localization.pnp import PnpOptions
 
-    # Networks this small are wide of the mark: only generous bounds give poses to compare.
-    wide = PnpOptions(threshold_px=20.0)
+    # Networks this small are inaccurate: only a wide inlier radius gives poses to compare.
+    options = NetworkLocalizeOptions(pnp=PnpOptions(threshold_px=20.0))
 
-    def ask(maps: SceneMaps, sure: bool | None = None) -> list[bytes]:
-        # The encoder is too small for maps to answer, so what they hold is compared.
-        sure = bool(maps.heads) if sure is None else sure
-        localizer, said = Localizer(maps, LocalizeOptions(pnp=wide)), []
-        for scene in rooms:
-            frame = scene.train[0]
-            found = localizer.localize(frame.read_image(), frame.camera)
-            pose = found.base_from_camera
+    def locate(scenes: LearnedScenes) -> list[bytes]:
+        localizer, values = NetworkLocalizer(scenes, options), []
+        for room in rooms:
+            frame = room.train[0]
+            estimate = localizer.localize(frame.read_image(), frame.camera)
+            pose = estimate.base_from_camera
             numbers = b"" if pose is None else pose.matrix().tobytes()
-            assert found.inliers > 0 or not sure, "an answer without a pose would be like any other"
-            said.append(repr((found.status, found.scene, found.inliers)).encode() + numbers)
-        for kept in maps.keyframes if not maps.heads else []:
-            assert kept is not None
-            assert kept.landmarks
-            said += [value.numpy().tobytes() for value in kept.to_tensors().values()]
-        return said
+            values.append(
+                repr((estimate.status, estimate.scene, estimate.inliers)).encode() + numbers
+            )
+        return values
 
-    return ask
+    return locate
 
 
 @pytest.fixture(scope="session")
@@ -145,38 +153,19 @@ def arc_stage() -> StageOptions:
 
 
 @pytest.fixture(scope="session")
-def arc_maps(
+def arc_scenes(
     arcs: tuple[Recording, Recording], arc_stage: StageOptions
-) -> tuple[SceneMaps, SceneMaps]:
-    """What is known after the first arc, and after both."""
-    from evercal.mapping.scene_maps import SceneMaps
-
+) -> tuple[LearnedScenes, LearnedScenes]:
+    """Networks after the first arc, and after both."""
     from evercal.continual.learn import learn
     from evercal.continual.networks.descriptor import load_descriptor
-    from evercal.continual.stage import Stage
+    from evercal.continual.scenes import LearnedScenes
     from evercal.continual.strategies import STRATEGIES
     from evercal.features.encoder import load_encoder
 
-    maps = [SceneMaps(load_encoder(), load_descriptor(), "evercal_network", 120)]
-    for arc in arcs:
-        *_, stage = learn(maps[-1], STRATEGIES["evercal_network"], arc, arc_stage)
-        assert isinstance(stage, Stage)
-        maps.append(stage.maps)
-    return maps[1], maps[2]
+    from .stages import outcome
 
-
-@pytest.fixture(scope="session")
-def first(blank: Blank, rooms: Rooms, quick: StageOptions) -> dict[str, SceneMaps]:
-    """What each strategy that learns scene by scene knows after `alpha`."""
-    from evercal.continual.learn import learn
-    from evercal.continual.stage import Stage
-    from evercal.continual.strategies import STRATEGIES
-
-    found = {}
-    for name, strategy in STRATEGIES.items():
-        if strategy.jointly:
-            continue
-        *_, stage = learn(blank(name), strategy, rooms[0], quick)
-        assert isinstance(stage, Stage)
-        found[name] = stage.maps
-    return found
+    strategy = STRATEGIES["evercal_network"]
+    empty = LearnedScenes(load_encoder(), load_descriptor(), strategy.name, 120)
+    one = outcome(learn(empty, strategy, arcs[0], arc_stage))
+    return one, outcome(learn(one, strategy, arcs[1], arc_stage))

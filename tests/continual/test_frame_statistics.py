@@ -11,25 +11,23 @@ from evercal.continual.learn import learn
 from evercal.continual.networks.buffer import FeatureBuffer, encode_frames
 from evercal.continual.networks.head import Head, HeadOptions
 from evercal.continual.networks.loss import LossOptions, reprojection_loss
-from evercal.continual.stage import Stage, StageOptions
+from evercal.continual.stage import StageOptions
 from evercal.continual.strategies import STRATEGIES
 from evercal.geometry import SE3
 
-from .stages import Blank, Rooms
+from .stages import EmptyScenes, Rooms, outcome
 
 
 @pytest.fixture(scope="module")
 def captured(
-    blank: Blank, rooms: Rooms, quick: StageOptions
+    empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions
 ) -> tuple[FrameStatistics, Head, FeatureBuffer]:
     """Frames of `alpha` after some training, with two views of each in the buffer."""
     options = replace(quick, fit=replace(quick.fit, iterations=60))
-    *_, stage = learn(blank("finetune"), STRATEGIES["finetune"], rooms[0], options)
-    assert isinstance(stage, Stage)
-    maps = stage.maps
-    buffer = FeatureBuffer(0, maps.scenes[0].cell.atlas_from_base)
-    list(encode_frames(buffer, rooms[0].train, quick.encode, maps.encoder, maps.descriptor))
-    head = maps.heads[0].eval()
+    scenes = outcome(learn(empty_scenes("finetune"), STRATEGIES["finetune"], rooms[0], options))
+    buffer = FeatureBuffer(0, scenes.scenes[0].cell.atlas_from_base)
+    list(encode_frames(buffer, rooms[0].train, quick.encode, scenes.encoder, scenes.descriptor))
+    head = scenes.heads[0].eval()
     return FrameStatistics(rooms[0].train, head, lambda: buffer, 5), head, buffer
 
 

@@ -1,26 +1,29 @@
-"""An interruption of `learn` does not show in what is learned."""
+"""An interrupted `learn` that is resumed has the same outcome as an uninterrupted one."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import pytest
 import torch
-from evercal.mapping.scene_maps import SceneMaps
 from safetensors.torch import load, save
 
 from evercal.continual import stage_rows
 from evercal.continual.networks.trainer import Progress
+from evercal.continual.scenes import LearnedScenes
 from evercal.continual.stage import Encoding, Event, StageOptions
+from evercal.continual.store import Checkpoint, Resume
 from evercal.continual.strategies import STRATEGIES
-from evercal.mapping.store import Checkpoint, Resume
 
-from .stages import Rooms, assert_same, continued, outcome, weights
+from .stages import Rooms, assert_same, outcome, second_stage, weights
+
+TRAINED = [name for name, s in STRATEGIES.items() if s.method is not None and not s.jointly]
 
 
 def saved(checkpoint: Checkpoint) -> Checkpoint:
-    """The checkpoint as a file would give it back."""
+    """The checkpoint as it is read from its files."""
     rows, state = (
         load(save({k: v.contiguous() for k, v in part.items()})) if part else {}
         for part in (checkpoint.rows, checkpoint.trainer)
@@ -28,18 +31,16 @@ def saved(checkpoint: Checkpoint) -> Checkpoint:
     return Checkpoint(rows, state)
 
 
-def interrupted(
-    events: Iterator[Event], stop: Callable[[Sequence[Checkpoint]], bool]
-) -> Resume | None:
-    """Runs until `stop` says so after a checkpoint; None if it ran to the end."""
+def interrupted(events: Iterator[Event], stop: Callable[[Sequence[Checkpoint]], bool]) -> Resume:
+    """The checkpoints at the first one for which `stop` is true."""
     checkpoints: list[Checkpoint] = []
     for event in events:
         if isinstance(event, Checkpoint):
             checkpoints.append(saved(event))
             if stop(checkpoints):
-                fitters = [c.trainer for c in checkpoints if c.trainer]
-                return Resume([c.rows for c in checkpoints if c.rows], (fitters or [{}])[-1])
-    return None
+                states = [c.trainer for c in checkpoints if c.trainer]
+                return Resume([c.rows for c in checkpoints if c.rows], (states or [{}])[-1])
+    raise AssertionError("the stage ended before it was stopped")
 
 
 STOPS: dict[str, Callable[[Sequence[Checkpoint]], bool]] = {
@@ -50,102 +51,93 @@ STOPS: dict[str, Callable[[Sequence[Checkpoint]], bool]] = {
 }
 
 
-def whole_and_interrupted(
-    maps: SceneMaps,
-    rooms: Rooms,
-    options: StageOptions,
-    where: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> tuple[SceneMaps, Resume]:
-    """What the second stage comes to in one go, and what it leaves behind where it is stopped."""
-    whole = outcome(continued(maps, rooms, options))
-    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
-    resume = interrupted(continued(maps, rooms, options), STOPS[where])
-    assert resume is not None
-    return whole, resume
+class Runs(NamedTuple):
+    """The second stage in one run, and in two."""
+
+    whole: LearnedScenes
+    resumed: LearnedScenes
+    events: list[Event]
+    """Events after the interruption."""
 
 
-@pytest.mark.parametrize("where", STOPS)
-@pytest.mark.parametrize("name", ["evercal_network", "sars_spdd", "isolation"])
-def test_an_interruption_does_not_show(
-    name: str,
-    where: str,
-    first: dict[str, SceneMaps],
+@pytest.fixture
+def runs(
+    first_stages: dict[str, LearnedScenes],
     rooms: Rooms,
     quick: StageOptions,
     monkeypatch: pytest.MonkeyPatch,
+) -> Callable[[str, str], Runs]:
+    """Run the second stage of a strategy with and without an interruption."""
+
+    def make(name: str, stop: str) -> Runs:
+        scenes = first_stages[name]
+        whole = outcome(second_stage(scenes, rooms, quick))
+        with monkeypatch.context() as patch:
+            patch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
+            resume = interrupted(second_stage(scenes, rooms, quick), STOPS[stop])
+        events = list(second_stage(scenes, rooms, quick, resume))
+        return Runs(whole, outcome(events), events)
+
+    return make
+
+
+@pytest.mark.parametrize("stop", STOPS)
+@pytest.mark.parametrize("name", ["evercal_network", "evercal_hybrid", "isolation"])
+def test_interruption_does_not_change_the_outcome(
+    name: str, stop: str, runs: Callable[[str, str], Runs]
 ) -> None:
-    maps = first[name]
-    whole, resume = whole_and_interrupted(maps, rooms, quick, where, monkeypatch)
-    again = list(continued(maps, rooms, quick, resume))
-    assert_same(weights(outcome(again).heads[-1]), weights(whole.heads[-1]))
-    a, b = outcome(again), whole
-    assert torch.equal(a.scenes[-1].prototypes, b.scenes[-1].prototypes)
-    # It went on rather than beginning again.
-    steps = [event.step for event in again if isinstance(event, Progress)]
-    views = [event.done for event in again if isinstance(event, Encoding) and event.total == 60]
-    if "step" in where:
-        assert steps[0] == (2 if where == "first step" else 6)
+    whole, resumed, events = runs(name, stop)
+    assert_same(weights(resumed.heads[-1]), weights(whole.heads[-1]))
+    assert torch.equal(resumed.scenes[-1].prototypes, whole.scenes[-1].prototypes)
+    steps = [event.step for event in events if isinstance(event, Progress)]
+    views = [event.done for event in events if isinstance(event, Encoding) and event.total == 60]
+    if "step" in stop:
+        assert steps[0] == (2 if stop == "first step" else 6)
     else:
         assert views[0] > 8
         assert steps[0] == 1
 
 
-def test_interrupted_twice(
-    first: dict[str, SceneMaps],
-    rooms: Rooms,
-    quick: StageOptions,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    maps = first["evercal_network"]
-    whole = outcome(continued(maps, rooms, quick))
-    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
-    once = interrupted(continued(maps, rooms, quick), STOPS["halfway through encoding"])
-    assert once is not None
-    twice = interrupted(continued(maps, rooms, quick, once), STOPS["fifth step"])
-    assert twice is not None
-    resume = Resume([*once.rows, *twice.rows], twice.trainer)
-    again = outcome(continued(maps, rooms, quick, resume))
-    assert_same(weights(again.heads[0]), weights(whole.heads[0]))
-
-
-def test_a_checkpoint_keeps_its_value(
-    first: dict[str, SceneMaps],
-    rooms: Rooms,
-    quick: StageOptions,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    # A consumer may write it while training goes on.
-    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
-    kept: list[tuple[Checkpoint, Checkpoint]] = []
-    for event in continued(first["evercal_network"], rooms, quick):
-        if isinstance(event, Checkpoint):
-            kept.append((event, copy.deepcopy(event)))
-    for event, then in kept:
-        assert_same(dict(event.rows), dict(then.rows))
-        assert_same(dict(event.trainer), dict(then.trainer))
-
-
-TRAINED = [name for name, s in STRATEGIES.items() if s.method is not None and not s.jointly]
-
-
 @pytest.mark.parametrize("name", TRAINED)
-def test_no_method_forgets_where_it_stood(
-    name: str,
-    first: dict[str, SceneMaps],
-    rooms: Rooms,
-    quick: StageOptions,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """After five of eight steps of the second scene; what is kept of the scene is the same, too."""
-    maps = first[name]
-    whole, resume = whole_and_interrupted(maps, rooms, quick, "fifth step", monkeypatch)
-    events = list(continued(maps, rooms, quick, resume))
+def test_methods_resume_within_training(name: str, runs: Callable[[str, str], Runs]) -> None:
+    whole, resumed, events = runs(name, "fifth step")
     assert [event.step for event in events if isinstance(event, Progress)] == [6, 7, 8]
-    again = outcome(events)
-    assert_same(weights(again.heads[-1]), weights(whole.heads[-1]))
-    state, expected = again.method_states[-1], whole.method_states[-1]
+    assert_same(weights(resumed.heads[-1]), weights(whole.heads[-1]))
+    state, expected = resumed.method_states[-1], whole.method_states[-1]
     assert state.keys() == expected.keys()
     for key, value in expected.items():
         # Importances are divided by one another: the last digit may differ.
         torch.testing.assert_close(state[key].float(), value.float(), rtol=1e-2, atol=1e-3)
+
+
+def test_two_interruptions(
+    first_stages: dict[str, LearnedScenes],
+    rooms: Rooms,
+    quick: StageOptions,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scenes = first_stages["evercal_network"]
+    whole = outcome(second_stage(scenes, rooms, quick))
+    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
+    once = interrupted(second_stage(scenes, rooms, quick), STOPS["halfway through encoding"])
+    twice = interrupted(second_stage(scenes, rooms, quick, once), STOPS["fifth step"])
+    resume = Resume([*once.rows, *twice.rows], twice.trainer)
+    again = outcome(second_stage(scenes, rooms, quick, resume))
+    assert_same(weights(again.heads[0]), weights(whole.heads[0]))
+
+
+def test_checkpoints_do_not_change_while_training_continues(
+    first_stages: dict[str, LearnedScenes],
+    rooms: Rooms,
+    quick: StageOptions,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(stage_rows, "CHECKPOINT_SECONDS", 0.0)
+    pairs = [
+        (event, copy.deepcopy(event))
+        for event in second_stage(first_stages["evercal_network"], rooms, quick)
+        if isinstance(event, Checkpoint)
+    ]
+    for event, then in pairs:
+        assert_same(dict(event.rows), dict(then.rows))
+        assert_same(dict(event.trainer), dict(then.trainer))

@@ -15,7 +15,7 @@ from evercal.continual.stage import StageOptions
 from evercal.continual.strategies import STRATEGIES, strategy_named
 from evercal.errors import InputError
 
-from .stages import Blank, Rooms, outcome, weights
+from .stages import EmptyScenes, Rooms, outcome, weights
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "my_strategy.py"
 
@@ -92,17 +92,19 @@ def test_existing_names_are_refused(tmp_path: Path) -> None:
         load_plugin(tmp_path / "mine.txt")
 
 
-def test_example_learns_two_scenes(blank: Blank, rooms: Rooms, quick: StageOptions) -> None:
+def test_example_learns_two_scenes(
+    empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions
+) -> None:
     """The penalty of the example changes the training."""
     (name,) = load_plugin(EXAMPLE)
     strategy = strategy_named(name)
-    before = outcome(learn(blank(name), strategy, rooms[0], quick))
-    maps = outcome(learn(before, strategy, rooms[1], quick))
-    assert [len(selected) for selected in maps.keyframes if selected is not None] == [3, 3]
+    before = outcome(learn(empty_scenes(name), strategy, rooms[0], quick))
+    after = outcome(learn(before, strategy, rooms[1], quick))
+    assert [len(selected) for selected in after.keyframes if selected is not None] == [3, 3]
     method = strategy.method
     assert method is not None
     assert method.penalty == OldOutput(25.0)  # pyright: ignore[reportAttributeAccessIssue]
     free = replace(strategy, method=replace(method, weight=0.0))  # pyright: ignore[reportCallIssue]
     other = outcome(learn(before, free, rooms[1], quick))
     name = "first.1.weight"
-    assert not np.allclose(weights(maps.heads[0])[name], weights(other.heads[0])[name], atol=1e-4)
+    assert not np.allclose(weights(after.heads[0])[name], weights(other.heads[0])[name], atol=1e-4)

@@ -1,9 +1,9 @@
 """A first `gripper_from_camera` from images and gripper poses; bundle adjustment refines it.
 
-Features of frames that look alike are matched, and an essential matrix gives every pair's rotation
-and the direction of its translation. With A the motion of the gripper, (R, d) that of the camera
-and X = gripper_from_camera, A X = X B gives the rotation of X from the axes of rotation (Park and
-Martin, IEEE T-RA 1994) and, since the length l of B's translation is unknown, the translation from
+Features of similar frames are matched. An essential matrix gives the rotation of every pair and the
+direction of its translation. Let A be the motion of the gripper, (R, d) that of the camera, and
+X = gripper_from_camera. A X = X B gives the rotation of X from the axes of rotation (Park and
+Martin, IEEE T-RA 1994). The length l of B's translation is unknown, so its translation follows from
 
     (R_A - I) t_X + t_A = l R_X d,   so   [R_X d]x ((R_A - I) t_X + t_A) = 0,
 

@@ -49,12 +49,12 @@ def verdict(calibration: Calibration) -> str:
     first = f"Unusable: even tabletop tasks ask for {TIERS[-1].mm:g} mm and {TIERS[-1].deg:g} deg."
     if use is not None:
         first = f"Good for {use.name} (within {use.mm:g} mm and {use.deg:g} deg)."
-    known = f"{first} The camera's place is known to {_length(sigma[0])} and {sigma[1]:.2f} deg"
+    first = f"{first} Expected error {_length(sigma[0])} and {sigma[1]:.2f} deg"
     if "held_out_mm" not in checks or "held_out_deg" not in checks:
-        return f"{known}."
+        return f"{first}."
     held_out = float(checks["held_out_mm"]), float(checks["held_out_deg"])
     return (
-        f"{known}; half of the poses that were left out are met within {_length(held_out[0])} and"
+        f"{first}; the median error on held-out poses is {_length(held_out[0])} and"
         f" {held_out[1]:.2f} deg. {_advice(use, sigma, held_out)}"
     )
 

@@ -5,9 +5,12 @@ is `pretrain`, whose options are those of the training.
 """
 
 import contextlib
+import difflib
 import io
 import os
+import shutil
 import sys
+import textwrap
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -42,10 +45,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code: 0 done, 1 the answer is no, 2 misuse or bad input, 130 interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    if words == ["--version"]:
-        # `evercal` is loaded before its folders, which do not import it.
-        print(f"evercal {sys.modules['evercal'].__version__}")
-        return 0
     as_json = "--json" in words
     # Spinning threads of torch take up to ten times as long when other programs use the cores, and
     # save a tenth otherwise. Read once, when torch is loaded.
@@ -58,15 +57,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         return _complain(str(error), as_json)
     except BrokenPipeError:
-        # The reader closed the pipe; a second attempt to write must not fail at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_stdout()  # the reader closed the pipe
         return 0
     except OSError as error:  # a full disk, a folder that may not be written
         where = f"{error.filename}: " if error.filename else ""
+        try:
+            sys.stdout.flush()
+        except OSError:
+            _discard_stdout()
         return _complain(f"{where}{error.strerror or error}", as_json)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
+
+
+def _discard_stdout() -> None:
+    """Keep Python from writing to a broken stdout again when it exits."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _complain(message: str, as_json: bool) -> int:
@@ -75,7 +82,10 @@ def _complain(message: str, as_json: bool) -> int:
     message = " ".join(message.split())
     print(f"error: {message}", file=sys.stderr)
     if as_json:
-        print_json({"error": message})
+        try:
+            print_json({"error": message})
+        except OSError:
+            _discard_stdout()
     return 2
 
 
@@ -152,19 +162,33 @@ def _parse(words: list[str], as_json: bool) -> Command | int:
     """The command that the words make, or an exit code."""
     import tyro
 
+    if words == ["--version"]:
+        # `evercal` is loaded before its folders, which do not import it.
+        print(f"evercal {sys.modules['evercal'].__version__}")
+        return 0
     if words in ([], ["--help"], ["-h"]):
         print(_help())
         return 0 if words else 2
+    verbs = _verbs(words[0])
+    if not words[0].startswith("-") and words[0] not in verbs:
+        similar = difflib.get_close_matches(words[0], verbs, 1)
+        hint = f"did you mean '{similar[0]}'?" if similar else "'evercal --help' lists all verbs"
+        raise InputError(f"{words[0]}: no such verb; {hint}")
     caught = io.StringIO()
+    # tyro draws frames only on a stream whose encoding has them.
+    shown = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding, write_through=True)
     try:
-        with contextlib.redirect_stderr(caught):
+        with contextlib.redirect_stderr(caught), contextlib.redirect_stdout(shown):
             return tyro.extras.subcommand_cli_from_dict(
-                _verbs(words[0]),
+                verbs,
                 prog="evercal",
                 args=words,
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
     except SystemExit as stop:
+        shown.seek(0)
+        page = shown.read()
+        sys.stdout.write(_wrapped(page) if {"-h", "--help"} & {*words} else page)
         sys.stderr.write(caught.getvalue())
         code = 0 if stop.code in (0, None) else 2
         if code and as_json:
@@ -174,12 +198,22 @@ def _parse(words: list[str], as_json: bool) -> Command | int:
         return code
 
 
+def _wrapped(text: str) -> str:
+    """Wrap the lines of a help page that tyro leaves longer than the terminal is wide."""
+    columns = shutil.get_terminal_size().columns
+    lines = []
+    for line in text.splitlines():
+        lines += textwrap.wrap(line, columns, break_on_hyphens=False) or [""]
+    return "\n".join(lines) + "\n"
+
+
 def _box_text(box: str) -> str:
     """The first paragraph of tyro's framed message as one line."""
-    lines = [line.strip("│ ") for line in box.splitlines()]
-    text = []
-    for line in lines[1:]:
-        if line.startswith(("─", "╰")):
-            break
-        text.append(line)
-    return " ".join(text) or "unusable arguments"
+    paragraphs = [""]
+    for line in box.splitlines()[1:]:
+        text = line.strip("│╭╮╰╯─ ")
+        if text.strip("-"):
+            paragraphs[-1] += f" {text}"
+        else:
+            paragraphs.append("")
+    return next((text.strip() for text in paragraphs if text), "unusable arguments")

@@ -32,18 +32,20 @@ class Align:
     """Folder of the map."""
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
     """Name of the scene."""
-    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...")] = ()
+    images: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")
+    ] = ()
     """Images of a camera on the gripper, or a folder of them."""
-    robot_poses: Annotated[Path | None, arg(metavar="FILE")] = None
+    robot_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """base_from_gripper of every image."""
-    convention: Annotated[str | None, arg(metavar="NAME")] = None
+    convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Format of the robot poses, if the file does not state it."""
-    board_poses: Annotated[Path | None, arg(metavar="FILE")] = None
+    board_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Board poses from 'evercal detect', for a fixed camera that observes a board in the
     gripper."""
-    points: Annotated[Path | None, arg(metavar="FILE")] = None
+    points: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Touched points in the base frame: lines of name, x, y, z in metres."""
-    picks: Annotated[Path | None, arg(metavar="FILE")] = None
+    picks: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Points in images: lines of image, name, u, v in pixels; images relative to this file."""
     unknown_scale: bool = False
     """Estimate the scale, for a scene that was not learned in metres."""

@@ -27,7 +27,7 @@ class Audit:
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder whose folders are the episodes: recorded scenes, or images beside a calibration.json
     or a 4x4 matrix base_from_camera.txt."""
-    calibration: Annotated[Path | None, arg(metavar="FILE")] = None
+    calibration: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Pose of the camera in episodes that state none themselves."""
     images: Annotated[int, arg(metavar="N")] = 5
     """Images per episode that are located."""

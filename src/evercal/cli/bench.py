@@ -27,9 +27,11 @@ LEAST_BATCH = 64
 
 @dataclass(frozen=True)
 class Bench:
-    """Compare strategies on a sequence of scenes. The same command resumes.
+    """Compare strategies on a sequence of scenes; the same command resumes.
 
     Under torchrun, several processes share every training.
+
+    Example: evercal bench sim-mini --strategies evercal,finetune,er --seeds 0
     """
 
     suite: Annotated[Positional[str], arg(metavar="SUITE")]

@@ -13,7 +13,10 @@ TABLES, PAGE, LATEX = "tables.md", "report.html", "table.tex"
 
 @dataclass(frozen=True)
 class BenchReport:
-    """Generate tables and report of a benchmark from its results."""
+    """Generate tables and report of a benchmark from its results.
+
+    Example: evercal bench-report evercal-bench/
+    """
 
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder of results."""

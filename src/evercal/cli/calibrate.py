@@ -32,17 +32,19 @@ class Calibrate:
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the map."""
-    images: Annotated[Positional[tuple[str, ...]], arg(metavar="IMAGE...")]
+    images: Annotated[Positional[tuple[str, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
     """Image files or folders of them, all of one camera; or NAME=FOLDER for each camera of a
     rig."""
-    robot_poses: Annotated[Path | None, arg(metavar="FILE")] = None
+    robot_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """base_from_gripper of every image: a pose table, JSON or NPY."""
-    convention: Annotated[str | None, arg(metavar="NAME")] = None
+    convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Format of the robot poses, if the file does not state it."""
-    mount: Literal["eye_to_hand", "eye_in_hand"] | None = None
+    mount: Annotated[Literal["eye_to_hand", "eye_in_hand"] | None, arg(help_behavior_hint="")] = (
+        None
+    )
     """eye_to_hand for a fixed camera, eye_in_hand for one on the gripper. Default: decided from
     the camera's motion."""
-    camera: Annotated[Path | None, arg(metavar="FILE")] = None
+    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Intrinsics of these images. Default: those of the camera that recorded the scene."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("calibration.json")
     """Output file."""

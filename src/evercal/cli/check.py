@@ -24,11 +24,11 @@ class Check:
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the map."""
-    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...")]
+    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
     """New images of one camera, or a folder of them; five or more reveal smaller shifts."""
     reference: Annotated[Path, arg(metavar="FILE")]
     """The camera's calibration from 'evercal calibrate'."""
-    camera: Annotated[Path | None, arg(metavar="FILE")] = None
+    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Intrinsics. Default: those of the reference."""
     device: Device = "auto"
     json: bool = False

@@ -19,7 +19,7 @@ def print_json(record: object) -> None:
     Raises:
         ValueError: It contains inf or nan, which JSON cannot represent.
     """
-    print(json.dumps(record, allow_nan=False))
+    print(json.dumps(record, allow_nan=False), flush=True)
 
 
 def print_next(*words: object) -> None:

@@ -24,7 +24,7 @@ class Convert:
     """Output folder; created if it is missing."""
     reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
     """How the recording is read."""
-    name: Annotated[str | None, arg(metavar="NAME")] = None
+    name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Name of the scene. Default: the recording's own name."""
     hard_link: bool = False
     """Link image files instead of copying them; changes then affect both."""

@@ -9,14 +9,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 from tyro.conf import arg
 
-from evercal.cli.console import print_json, print_next, progress_bar, size
+from evercal.cli.console import print_json, print_next, progress_bar, require_folder, size
 from evercal.cli.device import Device
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from evercal.evaluation import FrameResult
     from evercal.geometry import SE3
     from evercal.localization.localizer import Localizer
@@ -34,16 +35,25 @@ PICTURES = 3
 
 @dataclass(frozen=True)
 class Demo:
-    """Map three rendered rooms, localize images, calibrate cameras and detect a bump."""
+    """Map three rendered rooms, localize images, calibrate cameras and detect a bump.
+
+    With --copy-samples, only copy the recordings of these rooms and of a robot cell.
+
+    Example: evercal demo --out evercal-demo/
+    """
 
     out: Annotated[Path, arg(metavar="DIR")] = Path("evercal-demo")
     """Folder for report.html, the store and a query image."""
+    copy_samples: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """New or empty folder to copy the packaged recordings to, instead of running the demo."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
         """Run the demo; takes about a minute on two cores."""
+        if self.copy_samples is not None:
+            return self._copy_samples(self.copy_samples)
         from evercal.recordings.samples import sample_rooms
 
         result = run_demo(self.out, sample_rooms(), self.device, quiet=self.json)
@@ -54,6 +64,20 @@ class Demo:
             print(f"{number:>12}  {explanation}")
         print(f"wrote {self.out / REPORT} in {result.seconds:.0f} s")
         print_next("evercal", "localize", self.out / STORE, self.out / QUERY)
+        return 0
+
+    def _copy_samples(self, folder: Path) -> int:
+        from evercal.recordings.samples import ROOMS, copy_samples
+
+        copy_samples(folder)
+        if self.json:
+            print_json({"samples": str(folder)})
+            return 0
+        print(
+            f"copied {', '.join(ROOMS)} and the robot cell {folder / 'cell'} to {folder}; the cell"
+            " has recordings of a camera on the gripper (wrist) and of a fixed camera (tripod)"
+        )
+        print_next("evercal", "learn", "cell.evercal", folder / "cell" / "wrist")
         return 0
 
 
@@ -80,7 +104,7 @@ def run_demo(
     if store.exists() and not (store / MANIFEST).is_file():
         raise InputError(f"{store}: exists and is not an evercal store; pass another --out")
     device_of(device)
-    out.mkdir(parents=True, exist_ok=True)
+    require_folder(out, "--out")
     result = DemoResult()
     work = Path(tempfile.mkdtemp(prefix=".demo-", dir=out))
     try:
@@ -196,7 +220,7 @@ def _fixed_camera(localizer: "Localizer", room: "SampleRoom") -> "FixedCamera":
     return camera
 
 
-def _images(recording: "Recording") -> list[tuple[str, np.ndarray]]:
+def _images(recording: "Recording") -> "list[tuple[str, np.ndarray]]":
     return [(frame.name, frame.read_image()) for frame in recording.test]
 
 
@@ -224,5 +248,7 @@ def _pictures(localizer: "Localizer", scene: "Recording") -> "list[Picture]":
 
 def _spread(frames: "Sequence[Frame]", count: int) -> "list[Frame]":
     """At most `count` frames, evenly spread."""
+    import numpy as np
+
     indices = (np.arange(count) + 0.5) * len(frames) / count
     return [frames[i] for i in np.unique(indices.astype(int))]

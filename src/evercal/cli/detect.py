@@ -11,7 +11,6 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar, require_writable
 from evercal.errors import InputError
-from evercal.recordings.image_files import image_files
 
 if TYPE_CHECKING:
     from evercal.calibration.boards.board_poses import BoardPoses
@@ -26,6 +25,8 @@ class Detect:
     """Detect a printed board in images and estimate its pose in each, for 'evercal solve'.
 
     Without --camera the intrinsics are estimated from the board.
+
+    Example: evercal detect images/ --board chessboard --size 9x6 --square-mm 25
     """
 
     images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
@@ -55,6 +56,8 @@ class Detect:
     def run(self) -> int:
         """Detect the board in every image and write the poses."""
         require_writable(self.out, "--out")
+        from evercal.recordings.image_files import image_files
+
         board, files = self._board(), image_files(self.images)
         names = [path.name for path in files]
         repeated = sorted({name for name in names if names.count(name) > 1})

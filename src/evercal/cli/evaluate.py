@@ -24,9 +24,11 @@ class Evaluate:
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the store."""
-    scenes: Annotated[Positional[tuple[str, ...]], arg(metavar="[NAME=]SCENE...")]
+    scenes: Annotated[
+        Positional[tuple[str, ...]], arg(metavar="[NAME=]SCENE...", help_behavior_hint="")
+    ]
     """Folders of recorded scenes. NAME is the scene's name in the store, if it differs."""
-    report: Annotated[Path | None, arg(metavar="FILE.html")] = None
+    report: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
     """HTML report with error curves, trajectories and the worst frames."""
     device: Device = "auto"
     json: bool = False

@@ -20,6 +20,8 @@ class ExportCalibration:
 
     Without `--out` the text is printed. The pose is parent_from_child: the camera in the robot base
     for a fixed camera (eye_to_hand), in the gripper for a camera on the arm (eye_in_hand).
+
+    Example: evercal export tripod.json --format urdf --out camera.urdf
     """
 
     calibration: Annotated[

@@ -35,7 +35,7 @@ class Info:
             from evercal.continual.info import describe
 
             scenes, short_side, heads, sizes = describe(self.store)
-        total = sum(sizes.values())
+        total = sum(file.stat().st_size for file in self.store.rglob("*") if file.is_file())
         memory = sum(bytes for file, bytes in sizes.items() if file.endswith(MEMORY_FILES))
         content = {
             "store": str(self.store),

@@ -37,18 +37,18 @@ class Learn:
     """Folder of the map; created if it is missing."""
     scene: Annotated[Positional[Path], arg(metavar="RECORDING")]
     """Folder of the recording, or file of a bag."""
-    name: Annotated[str | None, arg(metavar="NAME")] = None
+    name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Name of the scene. Default: the recording's own name."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES|auto")] = "10%"
     """Keyframes to keep: a share of the frames (10%), a size (5MB), or auto for the fewest that
     locate the recording's other frames well."""
-    calibration: Annotated[Path | None, arg(metavar="FILE")] = None
+    calibration: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Output file for the estimated gripper_from_camera, for 'evercal export'."""
-    gripper_from_camera: Annotated[Path | None, arg(metavar="FILE")] = None
+    gripper_from_camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """A rough gripper_from_camera to compare the estimate with: 4x4 matrix or calibration file."""
-    encoder: Annotated[Path | None, arg(metavar="FILE")] = None
+    encoder: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Encoder weights from 'evercal pretrain', for a new store. Default: the shipped weights."""
-    strategy: Annotated[str | None, arg(metavar="NAME")] = None
+    strategy: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """evercal builds a map; every other strategy trains a network. Default: that of the store."""
     reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
     """How the recording is read."""
@@ -60,13 +60,13 @@ class Learn:
 
     def run(self) -> int:
         """Learn and print a summary."""
+        require_writable(self.calibration, "--calibration")
         from evercal.mapping.memory_budget import MemoryBudget
 
         try:
             MemoryBudget.parse(self.memory)
         except InputError as error:
             raise InputError(f"--{error}") from None
-        require_writable(self.calibration, "--calibration")
         from evercal.calibration.eye_in_hand import lacks_camera_poses
         from evercal.recordings import posed_recording
         from evercal.recordings.held_out import split_held_out
@@ -92,7 +92,10 @@ class Learn:
             return 0
         for line in summary(report):
             print(line)
-        if recording.test:
+        if self.calibration is not None:
+            print(f"wrote {self.calibration}")
+            print_next("evercal", "export", self.calibration, "--format", "easy_handeye2")
+        elif recording.test:
             scene = str(self.scene) if self.name is None else f"{self.name}={self.scene}"
             print_next("evercal", "evaluate", self.store, scene)
         else:

@@ -32,12 +32,12 @@ class Localize:
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the store."""
-    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...")]
+    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
     """Image files or folders of them."""
-    camera: Annotated[Path | None, arg(metavar="FILE")] = None
+    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Intrinsics: 3x3 matrix as text, JSON, or ROS camera_info YAML. Default: those of the camera
     that recorded the scene."""
-    overlay: Annotated[Path | None, arg(metavar="DIR")] = None
+    overlay: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Output folder for copies of the images with their inliers."""
     device: Device = "auto"
     json: bool = False

@@ -24,7 +24,7 @@ class NetworkOptions:
 
     preset: Literal["fast", "demo", "bench", "paper"] = "fast"
     """Amount of training: fast takes minutes on two cores, paper needs a GPU."""
-    centres: Annotated[int | None, arg(metavar="M")] = None
+    centres: Annotated[int | None, arg(metavar="M", help_behavior_hint="")] = None
     """Cluster centres that a scene adds to the network. Default: those of the preset."""
     seed: int = 0
     """Random seed."""

@@ -12,12 +12,15 @@ from evercal.cli.console import print_json, print_next
 
 @dataclass(frozen=True)
 class Pretrain:
-    """Train the encoder and the descriptor on procedural images (hours)."""
+    """Train the encoder and the descriptor on procedural images (hours).
+
+    Example: evercal pretrain --out weights/
+    """
 
     out: Annotated[Path, arg(metavar="FOLDER")]
     """Output folder of encoder.safetensors, descriptor.safetensors and pretrain.log."""
     work: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """Folder of checkpoints, from which the same command resumes (default: OUT/work)."""
+    """Folder of checkpoints, from which the same command resumes. Default: OUT/work."""
     json: bool = False
     """Print one JSON object."""
 

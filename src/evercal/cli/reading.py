@@ -14,24 +14,24 @@ if TYPE_CHECKING:
 class Reading:
     """How the recording is read; options that do not apply to its format are refused."""
 
-    format: Annotated[str | None, arg(metavar="NAME")] = None
+    format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Format of the recording: generic, 7scenes, 12scenes, nerfstudio, colmap, wrist, lerobot or
     rosbag. Default: recognised from its files."""
-    camera: Annotated[Path | None, arg(metavar="FILE")] = None
+    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Intrinsics of all images, if the recording has none: 3x3 matrix as text, JSON, ROS
     camera_info YAML or OpenCV's storage."""
-    image_topic: Annotated[str | None, arg(metavar="TOPIC")] = None
+    image_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="")] = None
     """Images of a bag or a LeRobot dataset; required if there are several topics."""
-    pose_topic: Annotated[str | None, arg(metavar="TOPIC")] = None
+    pose_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="")] = None
     """tf or joint states of a bag; required if there are several topics."""
-    base_frame: Annotated[str | None, arg(metavar="NAME")] = None
+    base_frame: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """The robot's base, a tf frame of a bag or a link of the URDF."""
-    gripper_frame: Annotated[str | None, arg(metavar="NAME")] = None
+    gripper_frame: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """The gripper: a tf frame of a bag, a link of the URDF, or a feature or arm of a LeRobot
     dataset."""
-    urdf: Annotated[Path | None, arg(metavar="FILE")] = None
+    urdf: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """URDF of the robot, for recordings with joint angles."""
-    pose_convention: Annotated[str | None, arg(metavar="NAME")] = None
+    pose_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Format of the gripper poses, if the file's header does not state it; rad or deg for joint
     angles."""
     every: Annotated[int, arg(metavar="N")] = 1

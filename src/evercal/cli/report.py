@@ -9,7 +9,6 @@ from tyro.conf import Positional, arg
 from evercal.cli.console import print_json, print_next, progress_bar, require_writable
 from evercal.cli.device import Device
 from evercal.cli.stores import open_localizer
-from evercal.recordings.image_files import image_files
 
 if TYPE_CHECKING:
     from evercal.reports.calibration_images import AnnotatedImages
@@ -25,14 +24,14 @@ class Report:
 
     calibration: Annotated[Positional[Path], arg(metavar="CALIBRATION.json")]
     """Calibration file."""
-    store: Annotated[Path | None, arg(metavar="STORE")] = None
+    store: Annotated[Path | None, arg(metavar="STORE", help_behavior_hint="")] = None
     """Folder of the store. Its landmarks are drawn with their residuals."""
     images: Annotated[
         tuple[Path, ...],
         arg(metavar="IMAGE...", help_behavior_hint="(default: images of the calibration)"),
     ] = ()
     """Images of the camera, or a folder of them."""
-    against: Annotated[Path | None, arg(metavar="OLD_CALIBRATION.json")] = None
+    against: Annotated[Path | None, arg(metavar="OLD.json", help_behavior_hint="")] = None
     """Older calibration of the same camera, to compare with."""
     out: Annotated[Path, arg(metavar="FILE.html")] = Path("report.html")
     """The report, one file including its pictures."""
@@ -85,6 +84,7 @@ class Report:
     def _images(
         self, file: "NamedCalibration", older: "NamedCalibration | None"
     ) -> "AnnotatedImages":
+        from evercal.recordings.image_files import image_files
         from evercal.reports.calibration_images import (
             AnnotatedImages,
             annotate_images,

@@ -14,7 +14,10 @@ from evercal.errors import InputError
 
 @dataclass(frozen=True)
 class Simulate:
-    """Render furnished rooms with a robot arm, poses and depth. This needs evercal[sim]."""
+    """Render furnished rooms with a robot arm, poses and depth; needs the extra `sim`.
+
+    Example: evercal simulate sim-mini --out rooms/
+    """
 
     suite: Annotated[Positional[Literal["sim", "sim-7", "sim-12", "sim-mini"]], arg(name="SUITE")]
     """Rooms to render: three (sim), seven, twelve, or the three packaged ones (sim-mini)."""

@@ -19,6 +19,8 @@ class Solve:
     """Calibrate a camera on the gripper or beside the robot from pairs of poses.
 
     Both unknown transforms are estimated jointly, robust to outliers, with their uncertainty.
+
+    Example: evercal solve --robot-poses poses.csv --camera-poses board.json --mount eye_in_hand
     """
 
     robot_poses: Annotated[Path, arg(metavar="FILE")]

@@ -1,8 +1,11 @@
 """`evercal watch`."""
 
 import math
+import sys
 import time
 from collections import deque
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +23,6 @@ from evercal.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from evercal.geometry import Camera
 
 FALSE_ALARMS = 0.01
 """Probability of any false alarm while a folder is watched."""
@@ -45,9 +47,9 @@ class Watch:
     """Newest images that are tested together."""
     interval: Annotated[float, arg(metavar="SECONDS")] = 1.0
     """Interval between scans of the folder."""
-    idle: Annotated[float | None, arg(metavar="SECONDS")] = None
+    idle: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None
     """Stop with exit code 0 after this time without a new image. Default: never."""
-    camera: Annotated[Path | None, arg(metavar="FILE")] = None
+    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Intrinsics. Default: those of the reference."""
     device: Device = "auto"
     json: bool = False
@@ -66,16 +68,13 @@ class Watch:
         reference = read_calibration(self.reference)
         localizer = open_map(self.store, self.device)
         recent: deque[Located] = deque(maxlen=self.window)
-        done: set[Path] = set()
+        arrivals = Arrivals(self.folder)
         tests, last = 0, time.monotonic()
         while self.idle is None or time.monotonic() - last < self.idle:
-            for path in self._new(done):
-                image = self._read(path, reference.camera)
-                if image is None:
-                    continue  # still being written: it is read again
-                done.add(path)
+            for path, pixels in arrivals.scan():
+                camera = camera_for(self.camera, [path]) or reference.camera
+                recent.extend(locate(localizer, [(path.name, pixels)], camera))
                 last = time.monotonic()
-                recent.extend(locate(localizer, [(path.name, image.pixels)], image.camera))
                 if not any(item.is_located for item in recent):
                     self._print(path, {"moved": None, "reason": recent[-1].estimate.reason})
                     continue
@@ -88,29 +87,6 @@ class Watch:
             time.sleep(self.interval)
         return 0
 
-    def _read(self, path: Path, camera: "Camera | None") -> "_Image | None":
-        """An image with its intrinsics; None if the file is incomplete or broken."""
-        from evercal.recordings import read_image
-
-        try:
-            given = camera_for(self.camera, [path])
-            return _Image(read_image(path), given or camera)
-        except (InputError, OSError):
-            if self.camera is not None and not self.camera.is_file():
-                raise
-            return None
-
-    def _new(self, done: set[Path]) -> list[Path]:
-        """Images that were not checked yet, oldest first."""
-        from evercal.recordings.images import IMAGE_ENDINGS
-
-        paths = [
-            path
-            for path in self.folder.iterdir()
-            if path.suffix.lower() in IMAGE_ENDINGS and path not in done
-        ]
-        return sorted(paths, key=lambda path: (path.stat().st_mtime, path.name))
-
     def _print(self, path: Path, record: dict[str, object], line: str = "") -> None:
         if self.json:
             print_json({"image": path.name, **record})
@@ -119,12 +95,41 @@ class Watch:
         print(f"{now} {path.name}: {line or record['reason']}", flush=True)
 
 
-@dataclass(frozen=True, eq=False)
-class _Image:
-    """An image that arrived."""
+class Arrivals:
+    """Images that arrive in a folder.
 
-    pixels: "np.ndarray"
-    camera: "Camera | None"
+    Files that are still being written are read again after they have changed. A file that is not an
+    image and no longer changes is reported once.
+    """
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+        self._done: set[Path] = set()
+        self._broken: dict[Path, tuple[int, int]] = {}
+
+    def scan(self) -> "Iterator[tuple[Path, np.ndarray]]":
+        """Path and pixels of every image that is new and complete, oldest first."""
+        from evercal.recordings import read_image
+        from evercal.recordings.images import IMAGE_ENDINGS
+
+        states: dict[Path, tuple[int, int]] = {}
+        for path in self._folder.iterdir():
+            if path.suffix.lower() in IMAGE_ENDINGS and path not in self._done:
+                with suppress(FileNotFoundError):  # removed or renamed since it was listed
+                    status = path.stat()
+                    states[path] = status.st_mtime_ns, status.st_size
+        for path in sorted(states, key=lambda path: (states[path][0], path.name)):
+            if self._broken.get(path) == states[path]:
+                self._done.add(path)
+                print(f"warning: {path}: not a readable image, skipped", file=sys.stderr)
+                continue
+            try:
+                pixels = read_image(path)
+            except InputError:
+                self._broken[path] = states[path]
+                continue
+            self._done.add(path)
+            yield path, pixels
 
 
 def false_alarm_share(test: int) -> float:

@@ -1,4 +1,4 @@
-"""What is kept of a scene after its stage: keyframes, map, the method's state."""
+"""What is stored of a scene after its stage: keyframes, map, the method's state."""
 
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
@@ -36,15 +36,15 @@ class Learned:
     rows: Callable[[], FeatureBuffer]
     """Their rows with the intrinsics of the training; the first views are not augmented."""
     hooks: TrainingHooks | None = None
-    """Hooks of the training; None for plain training."""
+    """Hooks of the training, if the method has some."""
     built: BuiltMap | None = None
-    """Its map, with which the frames were adjusted; None for strategies without one."""
+    """Its map, with which the frames were adjusted, for strategies that build one."""
 
 
 def finished_stage(
     scenes: LearnedScenes, method: Method, scene: Learned, options: StageOptions
 ) -> Stage:
-    """Select what is kept of the newest scene and add it to `scenes`.
+    """Select what is stored of the newest scene and add it to `scenes`.
 
     Args:
         scenes: with the scene's record and head, without its keyframes and state.
@@ -57,14 +57,14 @@ def finished_stage(
     keyframes = _keyframes(scenes, method, scene, options)
     scenes.keyframes.append(keyframes)
     scenes.method_states.append(_state(scenes, method, scene, options))
-    kept = len(keyframes) if keyframes else 0
-    return Stage(scenes, options.fit.iterations, kept, scene.built)
+    count = len(keyframes) if keyframes else 0
+    return Stage(scenes, options.fit.iterations, count, scene.built)
 
 
 def _keyframes(
     scenes: LearnedScenes, method: Method, scene: Learned, options: StageOptions
 ) -> Keyframes | None:
-    """Keyframes of the map, or those that the method selects."""
+    """Keyframes of the map; without a map, the selection of the method."""
     if scene.built is not None:
         return scene.built.scene.keyframes
     head, _ = scenes.head_for(len(scenes.scenes) - 1)
@@ -91,14 +91,14 @@ def _state(
         assert keyframes is not None, "a method whose state is about keyframes selects some"
         return _returned(keyframe_rows(scenes, len(scenes.scenes) - 1, keyframes, options))
 
-    kept = len(keyframes) if keyframes else 0
+    count = len(keyframes) if keyframes else 0
     return method.after_scene(
         FinishedScene(
             head.eval(),
             local,
             scene.rows,
             remembered,
-            kept,
+            count,
             scenes.method_states,
             scene.hooks,
             options.fit.diffusion if head.options.condition == "descriptor" else 0.0,
@@ -121,7 +121,7 @@ def trained_record(
 
     Args:
         scene: with its training frames as they are stated.
-        cell: its place in the atlas.
+        cell: its cell of the atlas.
         trainer: of the training.
         number: which of the trainer's buffers holds the scene's rows.
         frames: number of its frames; their first views are not augmented.
@@ -130,8 +130,8 @@ def trained_record(
     camera, refined = scene.train[0].camera, None
     if options.intrinsics_rate > 0 and options.iterations > 0 and buffer.correctable:
         refined = corrected_camera(camera, trainer.correction[number].detach())
-    seen = prototypes(buffer.tensors["descriptors"][:frames])
-    return SceneRecord(scene.name, camera, cell, seen, len(scene.train), refined)
+    spread = prototypes(buffer.tensors["descriptors"][:frames])
+    return SceneRecord(scene.name, camera, cell, spread, len(scene.train), refined)
 
 
 def correct_lens(rows: FeatureBuffer, record: SceneRecord) -> None:

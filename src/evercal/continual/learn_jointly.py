@@ -1,4 +1,4 @@
-"""All frames of all scenes at once: the reference for methods that see them one by one."""
+"""Training on all frames of all scenes at once: a reference for continual methods."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -57,11 +57,11 @@ def learn_jointly(
     whole = replace(fit, iterations=fit.iterations * len(recordings), batch=rows)
     trainer = HeadTrainer(head, buffers, whole, options.seed)
     yield from trainer.run()
-    kept = 0
+    frames_kept = 0
     for number, recording in enumerate(recordings):
         count = len(learned[number])
         after.scenes.append(trained_record(recording, cells[number], trainer, number, count))
         rows_of = partial(buffers.__getitem__, number)
         done = Learned(learned[number], rows_of, built=maps[number])
-        kept = finished_stage(after, Method(), done, options).frames_kept
-    yield Stage(after, whole.iterations, kept)
+        frames_kept = finished_stage(after, Method(), done, options).frames_kept
+    yield Stage(after, whole.iterations, frames_kept)

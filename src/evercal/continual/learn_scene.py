@@ -247,5 +247,6 @@ def _identity(
         "camera": recording.train[0].camera.to_dict(),
         "stage": json.loads(json.dumps(asdict(stage))),
         "strategy": strategy.description(),
+        "short_side": opened.contents.short_side,
         "stages": opened.stages,
     }

@@ -40,7 +40,7 @@ class NetworkLocalizeOptions:
     pnp: PnpOptions = field(default_factory=PnpOptions)
     """RANSAC settings."""
     patches_short_side: int = 480
-    """Short side of the image kept with a query, pixels."""
+    """Short side of the image in a query, pixels."""
 
 
 def open_networks(path: Path, device: str = "auto") -> LearnedLocalizer:
@@ -272,11 +272,11 @@ def _moved(
     matches: Matches,
     patches: int,
     records: Sequence[SceneRecord],
-    asked: int,
-    scene: int,
+    source: int,
+    target: int,
 ) -> Hypothesis:
-    """A pose in the base frame of the scene that it lies in, not of the scene that was asked."""
-    across = records[scene].cell.atlas_from_base.inverse() @ records[asked].cell.atlas_from_base
+    """Move a pose from the base frame of one scene into that of another."""
+    across = records[target].cell.atlas_from_base.inverse() @ records[source].cell.atlas_from_base
     pose: UncertainPose = across @ rough.pose
     moved = Matches(matches.pixels, across.apply(matches.points_m))
-    return _from_pnp(PnpResult(pose, rough.inliers), moved, patches, scene)
+    return _from_pnp(PnpResult(pose, rough.inliers), moved, patches, target)

@@ -37,7 +37,7 @@ class SceneRecord:
     train_frames: int
     """Frames it was learned from."""
     refined_camera: Camera | None = None
-    """`camera` as training corrected it; None where the stated one is kept."""
+    """`camera` as training corrected it; None without a correction."""
     inlier_threshold: float = 0.0
     """Poses with a smaller inlier ratio are rejected; fitted to held-out training frames."""
     covariance_scale: float = 1.0
@@ -75,7 +75,7 @@ class LearnedScenes:
     scenes: list[SceneRecord] = field(default_factory=list)
     """In order of arrival; the index is the scene index of head and atlas."""
     keyframes: list[Keyframes | None] = field(default_factory=list)
-    """Remembered keyframes of each scene; None where nothing is kept."""
+    """Remembered keyframes of each scene; None for strategies without memory."""
     method_states: list[Mapping[str, Tensor]] = field(default_factory=list)
     """Named tensors that the method keeps of each scene."""
 
@@ -96,7 +96,7 @@ class LearnedScenes:
 
     @property
     def memory_bytes(self) -> int:
-        """Size of everything kept for later stages: keyframes and method states."""
+        """Size of the memory for later stages: keyframes and method states."""
         frames = sum(keyframes.bytes for keyframes in self.keyframes if keyframes is not None)
         return frames + sum(
             value.nbytes for state in self.method_states for value in state.values()

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from evercal.continual.networks.atlas import camera_clusters
 from evercal.continual.networks.buffer import FeatureBuffer
-from evercal.continual.networks.head import Head
+from evercal.continual.networks.head import Head, fresh_head
 from evercal.continual.scenes import LearnedScenes
 from evercal.continual.stage import StageOptions
 
@@ -30,7 +30,7 @@ def head_for_scene(
         The head, grown by this scene, and the scene's index in it.
     """
     if not scenes.heads:
-        head = fresh_head(scenes, options)
+        head = _head_without_scenes(scenes, options)
     elif own:
         head = scenes.heads[-1].without_scenes()
     else:
@@ -45,19 +45,16 @@ def head_for_all(
     scenes: LearnedScenes, options: StageOptions, positions_m: Sequence[np.ndarray]
 ) -> Head:
     """A new head with room for several scenes, from the camera positions of each in the atlas."""
-    head = fresh_head(scenes, options)
+    head = _head_without_scenes(scenes, options)
     for number, positions in enumerate(positions_m):
         head.grow(_new_centres(head, options, positions), options.seed + number)
     scenes.heads = [head]
     return head
 
 
-def fresh_head(scenes: LearnedScenes, options: StageOptions) -> Head:
-    """A head without scenes."""
-    with torch.random.fork_rng(devices=[]):  # the caller's random numbers do not change
-        torch.manual_seed(options.seed)
-        head = Head(scenes.encoder.width, scenes.descriptor.width, options.head)
-    return head.to(scenes.device)
+def _head_without_scenes(scenes: LearnedScenes, options: StageOptions) -> Head:
+    widths = scenes.encoder.width, scenes.descriptor.width
+    return fresh_head(*widths, options.head, options.seed).to(scenes.device)
 
 
 def whiten(head: Head, buffers: Sequence[FeatureBuffer], seed: int) -> None:

@@ -64,7 +64,7 @@ def encoded(
         plan: views per frame.
         scenes: with encoder and descriptor.
         resume: rows that an interrupted run had encoded.
-        pacer: when to yield checkpoints of new rows; None for never.
+        pacer: when to yield checkpoints of new rows; never by default.
     """
     for rows in resume.rows if resume else ():
         buffer.restore(rows)

@@ -38,7 +38,7 @@ from evercal.features.vlad import load_centroids
 from evercal.features.weights_file import network_bytes
 from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.store import KEYFRAMES, SCENE, is_free, read_scene, write_encoder, write_scene
+from evercal.mapping.store import KEYFRAMES, SCENE, read_scene, write_encoder, write_scene
 from evercal.storage.atomic import write_bytes, write_json
 from evercal.storage.manifest import Manifest
 from evercal.storage.stages import STAGES, StageStore, read_store, write_report
@@ -109,7 +109,7 @@ class NetworkStore(StageStore):
         Raises:
             InputError: `root` holds something that is not a store, or a bad encoder.
         """
-        if root.exists() and not (is_free(root) or (root / LEARNING).is_dir()):
+        if root.exists() and not _is_free(root):
             raise InputError(f"store {root}: exists and is not an evercal store; give another path")
         if encoder is None:
             networks = load_encoder(), load_descriptor()
@@ -211,19 +211,19 @@ class NetworkStore(StageStore):
             identity: everything that the stage depends on (scene, options, seed, stages).
 
         Returns:
-            The checkpoints of an interrupted run of the same stage; None for a fresh start.
+            The checkpoints of an interrupted run of the same stage; None if there are none.
         """
-        folder, asked = self.root / LEARNING, json.loads(json.dumps(identity))
+        folder, current = self.root / LEARNING, json.loads(json.dumps(identity))
         try:
-            begun = json.loads((folder / "stage.json").read_text())
+            previous = json.loads((folder / "stage.json").read_text())
         except (OSError, ValueError):
-            begun = None
-        if begun != asked:
+            previous = None
+        if previous != current:
             # The name goes first, so that a half-removed stage is never resumed.
             (folder / "stage.json").unlink(missing_ok=True)
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
-            write_json(folder / "stage.json", asked)
+            write_json(folder / "stage.json", current)
             return None
         rows = [load_tensors(path) for path in sorted(folder.glob("rows-*.safetensors"))]
         trainer = folder / "trainer.safetensors"
@@ -245,6 +245,12 @@ class NetworkStore(StageStore):
         shutil.rmtree(self.root / LEARNING, ignore_errors=True)
         with suppress(OSError):  # not empty, or called `.`
             self.root.rmdir()
+
+
+def _is_free(root: Path) -> bool:
+    """Whether a folder is empty, or holds only what a killed writer of a store left."""
+    left = (LEARNING, STAGES, "encoder-", "vlad-", "descriptor-", ".")
+    return root.is_dir() and all(path.name.startswith(left) for path in root.iterdir())
 
 
 def head_bytes(head: Head) -> int:

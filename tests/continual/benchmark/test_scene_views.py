@@ -13,7 +13,7 @@ import pytest
 from evercal.continual.benchmark.scene_views import keep_views, read_views
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.localizer import Localizer
+from evercal.localization.localizer import LearnedLocalizer
 from evercal.recordings import Frame, Recording
 
 CAMERA = Camera(32, 24, 30.0, 30.0, 15.5, 11.5)
@@ -37,9 +37,12 @@ class FakeLocalizer:
 
     estimates: dict[int, tuple[str | None, SE3 | None, list[list[float]]]]
     calls: list[int] = field(default_factory=list)
-    maps = type("", (), {"short_side": 12})
+    contents = type("", (), {"short_side": 12})
 
-    def localize(self, image: np.ndarray, camera: Camera) -> PoseEstimate:
+    def camera_for(self, stated: Camera) -> Camera | None:
+        return stated
+
+    def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         self.calls.append(int(image[0, 0, 0]))
         name, pose, points = self.estimates[self.calls[-1]]
         status = "ok" if pose is not None else "failed"
@@ -57,7 +60,7 @@ def test_views_have_the_points_of_the_estimated_scene(tmp_path: Path) -> None:
         }
     )
     scenes = [scene("hall", 10), scene("attic", 20), scene("cellar", 30)]
-    keep_views(tmp_path, "er@0.3", cast("Localizer", localizer), scenes)
+    keep_views(tmp_path, "er@0.3", cast("LearnedLocalizer", localizer), scenes)
     attic, cellar, hall = read_views(tmp_path)
     assert [v.scene for v in (attic, cellar, hall)] == ["attic", "cellar", "hall"]
     assert {v.strategy for v in (attic, cellar, hall)} == {"er@0.3"}
@@ -75,7 +78,7 @@ def test_views_have_the_points_of_the_estimated_scene(tmp_path: Path) -> None:
     assert len(cellar.points_m) == 0
     # Existing views are not computed again.
     localizer.calls.clear()
-    keep_views(tmp_path, "er@0.3", cast("Localizer", localizer), scenes)
+    keep_views(tmp_path, "er@0.3", cast("LearnedLocalizer", localizer), scenes)
     assert localizer.calls == []
 
 
@@ -85,7 +88,10 @@ def test_points_come_from_depth_images_if_there_are_any(tmp_path: Path) -> None:
     assert cv2.imwrite(str(tmp_path / "depth.png"), depth)
     localizer = FakeLocalizer({10: ("hall", AHEAD, [[9.0, 9.0, 9.0]])})
     keep_views(
-        tmp_path, "er", cast("Localizer", localizer), [scene("hall", 10, tmp_path / "depth.png")]
+        tmp_path,
+        "er",
+        cast("LearnedLocalizer", localizer),
+        [scene("hall", 10, tmp_path / "depth.png")],
     )
     (view,) = read_views(tmp_path)
     # Two metres in front of a camera one metre behind the origin, right half of the image.

@@ -1,176 +1,249 @@
-"""From images and cameras to poses; `world` is an oracle, see conftest."""
+"""Localization by networks: candidates, poses, cells, thresholds, and cameras that differ."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from evercal.mapping.scene_maps import SceneMaps
 
+from evercal.continual.localizer import (
+    HybridLocalizer,
+    NetworkLocalizeOptions,
+    NetworkLocalizer,
+    localizer_of,
+    open_networks,
+)
+from evercal.continual.scenes import LearnedScenes
 from evercal.errors import InputError
-from evercal.geometry.camera import Camera
-from evercal.geometry.se3 import pose_distance
-from evercal.localization.estimate import PoseEstimate
+from evercal.geometry import Camera, pose_distance
 from evercal.localization.localizer import Localizer
-from evercal.recordings.frame import Recording
 from evercal.simulation.box_room import default_camera
 
-CAMERA = default_camera(160, 120)
+from .world import CAMERA, everything, make_world, patch_centres
 
-
-def everything(found: PoseEstimate) -> list[bytes | object]:
-    """All of an answer but the time it took."""
-    arrays = [found.covariance, found.pixels, found.points_m]
-    if found.base_from_camera is not None:
-        arrays.append(found.base_from_camera.matrix())
-    plain = [found.status, found.reason, found.scene, found.inliers, found.inlier_ratio]
-    return [*plain, *(None if array is None else array.tobytes() for array in arrays)]
+WIDE = Camera(640, 480, 400.0, 410.0, 300.0, 250.0)
 
 
 @pytest.mark.parametrize("scene", [0, 1, 2])
-def test_true_points_give_the_true_pose_in_the_frame_of_their_scene(scene: int, world: Any) -> None:
-    where = world((CAMERA,) * 3)
-    image = where.view(scene)
-    found = Localizer(where.maps).localize(image, CAMERA)
-    where.assert_right(found, image, f"scene-{scene}")
-    assert found.inliers == 20 * 15
-    assert found.inlier_ratio == 1.0
-    assert found.milliseconds > 0
-    # Pixels and points are those of the image and the scene's own frame.
-    assert found.pixels is not None
-    assert found.points_m is not None
-    assert found.base_from_camera is not None
-    seen = CAMERA.project(found.base_from_camera.inverse().apply(found.points_m))
-    np.testing.assert_allclose(seen, found.pixels, atol=0.01)
+def test_pose_is_in_the_base_frame_of_its_scene(scene: int) -> None:
+    world = make_world((CAMERA,) * 3)
+    image = world.view(scene)
+    localizer = NetworkLocalizer(world.scenes)
+    assert localizer.scenes == ("scene-0", "scene-1", "scene-2")
+    estimate = localizer.localize(image, CAMERA)
+    world.assert_located(estimate, image, f"scene-{scene}")
+    assert estimate.inliers == 20 * 15
+    assert estimate.inlier_ratio == 1.0
+    assert estimate.milliseconds > 0
+    assert estimate.pixels is not None
+    assert estimate.points_m is not None
+    assert estimate.base_from_camera is not None
+    projected = CAMERA.project(estimate.base_from_camera.inverse().apply(estimate.points_m))
+    np.testing.assert_allclose(projected, estimate.pixels, atol=0.01)
 
 
-def test_without_a_camera_that_of_the_scene_is_taken_and_scaled(world: Any) -> None:
-    # Two scenes with different lenses: the wrong one would give a wrong pose.
-    wide = Camera(640, 480, 400.0, 410.0, 300.0, 250.0)
-    where = world((CAMERA, wide))
-    localizer = Localizer(where.maps)
+def test_default_camera_is_that_of_the_scene() -> None:
+    world = make_world((CAMERA, WIDE))
+    localizer = NetworkLocalizer(world.scenes)
     for size in ((640, 480), (320, 240), (160, 120), (80, 60)):
-        image = where.view(1, wide, size)
-        where.assert_right(localizer.localize(image), image, "scene-1")
-        image = where.view(0, CAMERA, size)
-        where.assert_right(localizer.localize(image), image, "scene-0")
-    image = where.view(1, wide)
-    wrong = localizer.localize(image, CAMERA)
-    assert wrong.base_from_camera is None or (
-        pose_distance(wrong.base_from_camera, where.truth[int(image[0, 0, 0])])[0] > 0.05
+        for scene, camera in enumerate((CAMERA, WIDE)):
+            image = world.view(scene, camera, size)
+            world.assert_located(localizer.localize(image), image, f"scene-{scene}")
+    image = world.view(1, WIDE)
+    estimate = localizer.localize(image, CAMERA)
+    assert estimate.base_from_camera is None or (
+        pose_distance(estimate.base_from_camera, world.pose(image))[0] > 0.05
     )
 
 
-def test_a_given_camera_may_have_any_size_and_distortion(world: Any) -> None:
-    where = world()
-    localizer = Localizer(where.maps)
-    bent = Camera(320, 240, 262.0, 262.0, 150.0, 130.0, (-0.2, 0.05, 0.001, -0.002))
-    image = where.view(0, bent)
-    for camera in (bent, bent.resized(640, 480), bent.resized(160, 120)):
-        where.assert_right(localizer.localize(image, camera), image, "scene-0")
+def test_given_camera_can_have_any_size_and_distortion() -> None:
+    world = make_world()
+    localizer = NetworkLocalizer(world.scenes)
+    distorted = Camera(320, 240, 262.0, 262.0, 150.0, 130.0, (-0.2, 0.05, 0.001, -0.002))
+    image = world.view(0, distorted)
+    for camera in (distorted, distorted.resized(640, 480), distorted.resized(160, 120)):
+        world.assert_located(localizer.localize(image, camera), image, "scene-0")
 
 
-def test_portrait_images(world: Any) -> None:
-    tall = Camera(120, 160, 130.0, 130.0, 60.0, 80.0)
-    where = world((CAMERA, tall))
-    localizer = Localizer(where.maps)
-    for size in ((120, 160), (240, 320)):
-        image = where.view(1, tall, size)
-        where.assert_right(localizer.localize(image), image, "scene-1")
-        # Only the proportions decide who is asked.
-        assert where.oracle.asked[-1] == 1
+def test_only_scenes_of_the_image_aspect_ratio_are_tried() -> None:
+    portrait = Camera(120, 160, 130.0, 130.0, 60.0, 80.0)
+    world = make_world((CAMERA, portrait))
+    image = world.view(1, portrait)
+    world.assert_located(NetworkLocalizer(world.scenes).localize(image), image, "scene-1")
+    assert world.head.scenes_asked == [1]
+    with pytest.raises(InputError, match=r"image 160x90.*scene-0 160x120.*scene-1 120x160"):
+        NetworkLocalizer(world.scenes).localize(np.zeros((90, 160, 3), np.uint8))
 
 
-def test_sizes_that_are_rounded_differently_still_fit(world: Any) -> None:
-    # 1272x960 at a short side of 120 is 159 pixels wide, a 160x120 image is 160: one more cell.
-    lens = Camera(1272, 960, 1040.0, 1040.0, 640.0, 480.0)
-    where = world((lens, lens))
-    image = where.view(0, lens, (160, 120))
-    for camera in (None, lens):
-        where.assert_right(Localizer(where.maps).localize(image, camera), image, "scene-0")
-
-
-def test_wrong_proportions_are_refused(world: Any) -> None:
-    where = world((CAMERA, Camera(100, 100, 90, 90, 50, 50)))
-    localizer = Localizer(where.maps)
-    image = np.zeros((90, 160, 3), np.uint8)
-    with pytest.raises(InputError, match=r"camera 160x120 .* image 160x90"):
-        localizer.localize(image, CAMERA)
-    with pytest.raises(InputError, match=r"image 160x90.*scene-0 160x120.*scene-1 100x100"):
-        localizer.localize(image)
-    with pytest.raises(InputError, match="160x90"):
-        localizer.localize_batch([where.view(0), image], [None, None])
-    with pytest.raises(InputError, match="120x160"):
-        localizer.localize(np.zeros((160, 120, 3), np.uint8))
-
-
-@pytest.mark.parametrize(
-    "image",
-    [
-        np.zeros((120, 160, 4), np.uint8),
-        np.zeros((120, 160, 3), np.float32),
-        np.zeros((1, 120, 160, 3), np.uint8),
-        np.zeros(7, np.uint8),
-    ],
-)
-def test_what_is_no_image_is_refused(world: Any, image: np.ndarray) -> None:
-    localizer = Localizer(world((CAMERA,)).maps)
-    with pytest.raises(InputError, match=r"image of shape \(.*give \(height, width, 3\) uint8"):
-        localizer.localize(image)
-
-
-def test_grey_images_are_images_too(world: Any) -> None:
-    where = world()
-    image = where.view(1)
-    localizer = Localizer(where.maps)
-    assert everything(localizer.localize(image[..., 0])) == everything(localizer.localize(image))
-
-
-def test_a_batch_says_what_single_images_say(two_threads: None, world: Any) -> None:
-    tall = Camera(120, 160, 130.0, 130.0, 60.0, 80.0)
-    where = world((CAMERA, tall, CAMERA))
-    images = [where.view(i % 3, (CAMERA, tall, CAMERA)[i % 3], right=0.4) for i in range(21)]
+def test_batches_equal_single_images(two_threads: None) -> None:
+    portrait = Camera(120, 160, 130.0, 130.0, 60.0, 80.0)
+    cameras = (CAMERA, portrait, CAMERA)
+    world = make_world(cameras)
+    images = [world.view(i % 3, cameras[i % 3], correct=0.4) for i in range(21)]
     images.append(np.full((120, 160, 3), 255, np.uint8))
-    cameras = [None if i % 2 else where.maps.scenes[i % 3].camera for i in range(21)] + [None]
-    localizer = Localizer(where.maps)
-    alone = [localizer.localize(image, c) for image, c in zip(images, cameras, strict=True)]
-    together = localizer.localize_batch(images, cameras)
-    assert [everything(a) for a in together] == [everything(a) for a in alone]
-    assert [found.scene for found in together[:21]] == [f"scene-{i % 3}" for i in range(21)]
-    assert together[21].status != "ok"
+    given = [None if i % 2 else cameras[i % 3] for i in range(21)] + [None]
+    localizer = NetworkLocalizer(world.scenes)
+    single = [localizer.localize(image, c) for image, c in zip(images, given, strict=True)]
+    batch = localizer.localize_batch(images, given)
+    assert [everything(a) for a in batch] == [everything(a) for a in single]
+    assert [estimate.scene for estimate in batch[:21]] == [f"scene-{i % 3}" for i in range(21)]
+    assert batch[21].status != "ok"
     assert localizer.localize_batch([], []) == []
 
 
-def test_a_batch_of_real_images(
-    two_threads: None, arc_maps: tuple[SceneMaps, SceneMaps], arcs: tuple[Recording, Recording]
-) -> None:
-    localizer = Localizer(arc_maps[1])
-    frames = [*arcs[0].test[::4], *arcs[1].test[1::4]]
-    images = [frame.read_image() for frame in frames]
-    together = localizer.localize_batch(images, [None] * len(images))
-    for image, found in zip(images, together, strict=True):
-        assert everything(localizer.localize(image)) == everything(found)
-    assert torch.get_num_threads() == 2
+def test_noise_is_not_located() -> None:
+    # Every grey level is that of a view, so each patch has a true point of a different pose.
+    world = make_world(threshold=0.2)
+    for scene in (0, 1) * 60:
+        world.view(scene)
+    localizer = NetworkLocalizer(world.scenes)
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        noise = rng.integers(0, 256, (120, 160, 3)).astype(np.uint8)
+        noise[::2] //= 2  # levels from 10 to 130 in the mean of a patch
+        estimate = localizer.localize(noise)
+        assert estimate.status != "ok"
+        assert estimate.reason
+        assert estimate.scene is None
+        assert estimate.base_from_camera is None
+        assert estimate.covariance is None
+        assert estimate.inlier_ratio < 0.2
 
 
-def test_the_same_image_gives_the_same_bytes(world: Any) -> None:
-    where = world()
-    image = where.view(1, right=0.3)
-    localizer = Localizer(where.maps)
-    first = everything(localizer.localize(image))
-    np.random.default_rng(0).random(5)
-    torch.rand(3)
-    localizer.localize(where.view(0))
-    assert everything(localizer.localize(image)) == first
-    assert everything(Localizer(where.maps).localize(image)) == first
+def test_pose_outside_the_cell_of_its_scene_fails() -> None:
+    # With the index of scene 0, the head predicts points in the cell of scene 1.
+    world = make_world()
+    image = world.view(1, predicted_for=0)
+    world.describe(image, [1.0, 0, 0, 0])
+    estimate = NetworkLocalizer(world.scenes).localize(image)
+    assert estimate.status == "failed"
+    assert "cell" in estimate.reason
+    assert estimate.scene is None
+    assert estimate.base_from_camera is None
+    assert estimate.inliers == 300
 
 
-def test_names_and_refusals(tmp_path: Path, world: Any) -> None:
-    assert Localizer(world((CAMERA,) * 3).maps).scenes == ("scene-0", "scene-1", "scene-2")
-    with pytest.raises(InputError, match=str(tmp_path)):
-        Localizer.open(tmp_path)
-    with pytest.raises(InputError, match="missing"):
-        Localizer.open(str(tmp_path / "missing"))
+def test_image_with_few_patches_fails() -> None:
+    world = make_world((default_camera(160, 120),))
+    world.scenes.short_side = 16  # two rows of two patches
+    estimate = NetworkLocalizer(world.scenes).localize(world.view(0))
+    assert (estimate.status, estimate.reason) == ("failed", "fewer than 6 inliers")
+    assert (estimate.inliers, estimate.inlier_ratio) == (0, 0.0)
+
+
+@pytest.mark.parametrize(("correct", "status"), [(0.35, "unknown_scene"), (0.75, "ok")])
+def test_scenes_have_their_own_threshold(correct: float, status: str) -> None:
+    world = make_world(threshold=0.5)
+    estimate = NetworkLocalizer(world.scenes).localize(world.view(0, correct=correct))
+    assert estimate.status == status
+    assert estimate.inlier_ratio == pytest.approx(correct, abs=0.03)
+    assert (estimate.base_from_camera is None) == (status != "ok")
+    if status == "unknown_scene":
+        assert "scene-0 needs 50 %" in estimate.reason
+    records = world.scenes.scenes
+    records[0] = replace(records[0], inlier_threshold=0.25)
+    assert NetworkLocalizer(world.scenes).localize(world.view(0, correct=correct)).status == "ok"
+
+
+def test_covariance_has_the_scale_of_its_scene() -> None:
+    covariances = []
+    for scale in (1.0, 7.0):
+        world = make_world()
+        world.scenes.scenes[0] = replace(world.scenes.scenes[0], covariance_scale=scale)
+        estimate = NetworkLocalizer(world.scenes).localize(world.view(0))
+        assert estimate.covariance is not None
+        covariances.append(estimate.covariance)
+    np.testing.assert_allclose(covariances[1], 7 * covariances[0], rtol=1e-9)
+
+
+def test_candidates_are_chosen_by_prototypes() -> None:
+    world = make_world((CAMERA,) * 4)
+    image = world.view(2)
+
+    def candidates(descriptor: list[float], options: NetworkLocalizeOptions) -> list[int]:
+        world.describe(image, descriptor)
+        world.head.scenes_asked.clear()
+        NetworkLocalizer(world.scenes, options).localize(image)
+        return list(world.head.scenes_asked)
+
+    options = NetworkLocalizeOptions
+    descriptor = [0.6, 0.5, 0.4, 0.3]  # length 0.927: cosines 0.647, 0.539, 0.431, 0.323
+    assert candidates(descriptor, options(candidates=9, margin=2.0)) == [0, 1, 2, 3]
+    assert candidates(descriptor, options(candidates=3, margin=2.0)) == [0, 1, 2]
+    assert candidates(descriptor, options(candidates=9, margin=0.12)) == [0, 1]
+    assert candidates(descriptor, options(candidates=9, margin=0.23)) == [0, 1, 2]
+    assert candidates([0.1, 0.2, 0.9, 0.3], options(candidates=2, margin=2.0)) == [2, 3]
+    # The most similar prototype of a scene counts.
+    prototypes = torch.tensor([[0.0, 0, 0, 1], [1, 0, 0, 0]]).half()
+    world.scenes.scenes[3] = replace(world.scenes.scenes[3], prototypes=prototypes)
+    assert sorted(candidates([0.9, 0.1, 0.1, 0], options(margin=0.1))) == [0, 3]
+
+
+def test_candidate_with_the_most_support_wins() -> None:
+    world = make_world((CAMERA,) * 3)
+    image = world.view(2)
+    world.describe(image, [1.0, 0.9, 0.95, 0])  # most similar to scene 0
+    world.assert_located(NetworkLocalizer(world.scenes).localize(image), image, "scene-2")
+    assert world.head.scenes_asked == [0, 2, 1]
+    one = NetworkLocalizer(world.scenes, NetworkLocalizeOptions(candidates=1))
+    assert one.localize(image).inlier_ratio < 0.1
+
+
+def test_descriptor_conditioned_head_runs_once_and_the_cell_decides_the_scene() -> None:
+    world = make_world((CAMERA,) * 3, condition="descriptor")
+    localizer = NetworkLocalizer(world.scenes)
+    for scene in (2, 0, 1):
+        image = world.view(scene)
+        world.head.scenes_asked.clear()
+        world.assert_located(localizer.localize(image), image, f"scene-{scene}")
+        assert len(world.head.scenes_asked) == 1
+    image = world.view(1)
+    world.head.points[1, int(image[0, 0, 0])] += 500.0  # outside all cells
+    estimate = localizer.localize(image)
+    assert estimate.status == "failed"
+    assert "cell" in estimate.reason
+
+
+def test_descriptor_conditioned_head_uses_the_camera_of_the_scene() -> None:
+    world = make_world((CAMERA, WIDE), condition="descriptor")
+    for scene, camera in enumerate((CAMERA, WIDE)):
+        image = world.view(scene, camera)
+        estimate = NetworkLocalizer(world.scenes).localize(image)
+        world.assert_located(estimate, image, f"scene-{scene}")
+
+
+def test_pose_moves_to_the_cell_of_another_camera_at_most_once() -> None:
+    """With the camera of either scene, the pose lies in the cell of the other one."""
+    long = replace(CAMERA, fx=2 * CAMERA.fx, fy=2 * CAMERA.fy)
+    world = make_world((CAMERA, long), condition="descriptor")
+    image = world.view(0)
+    first, second = (record.cell for record in world.scenes.scenes)
+    direction = np.subtract(second.centre_m, first.centre_m)
+    boundary = 0.5 * np.add(second.centre_m, first.centre_m)
+    axis = direction / np.linalg.norm(direction)
+    side = np.cross(axis, [0, 0, 1.0])
+    # A plane that CAMERA views from a metre away, 0.2 m inside the second cell; `long` from two.
+    rays = CAMERA.unproject(patch_centres(CAMERA))
+    points = boundary + 1.2 * axis + rays[:, :1] * side + rays[:, 1:2] * np.array([0, 0, -1.0])
+    world.head.points[0, int(image[0, 0, 0])] = torch.from_numpy(points).float()
+    estimate = NetworkLocalizer(world.scenes).localize(image)
+    assert len(world.head.scenes_asked) == 2
+    assert estimate.inlier_ratio > 0.9
+    assert estimate.status == "failed"
+    assert "cell" in estimate.reason
+
+
+def test_folders_without_networks_are_refused(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "missing"):
+        with pytest.raises(InputError, match=str(path)):
+            open_networks(path, "cpu")
+
+
+def test_strategies_have_their_localizer(three_stages: dict[str, list[LearnedScenes]]) -> None:
+    network, hybrid = three_stages["evercal_network"][0], three_stages["evercal_hybrid"][0]
+    assert isinstance(localizer_of(network), NetworkLocalizer)
+    assert isinstance(localizer_of(hybrid), HybridLocalizer)
+    assert type(localizer_of(replace(hybrid, heads=[]))) is Localizer

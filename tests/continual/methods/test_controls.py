@@ -12,16 +12,14 @@ import torch
 from evercal.continual.methods.controls import FineTuning, Isolation
 from evercal.continual.networks.hooks import TrainingHooks
 
-from ..stages import continued, outcome, weights
+from ..stages import outcome, second_stage, weights
 from .by_hand import stage_start, wave_head
 
 if TYPE_CHECKING:
-    from evercal.mapping.scene_maps import SceneMaps
-
     from evercal.continual.networks.head import Head
     from evercal.continual.stage import StageOptions
 
-    from ..stages import Rooms
+    from ..stages import EmptyScenes, Rooms
 
 
 def saved(head: Head) -> bytes:
@@ -41,7 +39,11 @@ def test_controls_add_nothing_to_training() -> None:
 @pytest.mark.parametrize("offsets", ["per_centre", "shared"])
 @pytest.mark.parametrize("condition", ["code", "descriptor"])
 def test_new_head_starts_from_the_shared_weights_of_the_last(
-    condition: str, offsets: str, first: dict[str, SceneMaps], rooms: Rooms, quick: StageOptions
+    condition: str,
+    offsets: str,
+    empty_scenes: EmptyScenes,
+    rooms: Rooms,
+    quick: StageOptions,
 ) -> None:
     """Without training, the second head differs from the first only in the scene's parameters."""
     from evercal.continual.learn import learn
@@ -50,12 +52,11 @@ def test_new_head_starts_from_the_shared_weights_of_the_last(
     isolation = STRATEGIES["isolation"]
     shape = replace(quick.head, offsets=offsets, condition=condition)  # pyright: ignore
     options = replace(quick, head=shape)
-    blank = replace(first["isolation"], heads=[], scenes=[], keyframes=[], method_states=[])
-    maps = outcome(learn(blank, isolation, rooms[0], options))
-    before = saved(maps.heads[0])
+    scenes = outcome(learn(empty_scenes("isolation"), isolation, rooms[0], options))
+    before = saved(scenes.heads[0])
     untrained = replace(options, fit=replace(quick.fit, iterations=0))
-    same = outcome(continued(maps, rooms, untrained))
-    trained = outcome(continued(maps, rooms, options))
+    same = outcome(second_stage(scenes, rooms, untrained))
+    trained = outcome(second_stage(scenes, rooms, options))
     third = outcome(learn(trained, isolation, rooms[2], untrained))
     own = {"code", "logit", "logit_bias", "centres"}
     own |= {"offset", "offset_bias"} if offsets == "per_centre" else set()
@@ -63,7 +64,7 @@ def test_new_head_starts_from_the_shared_weights_of_the_last(
         assert saved(heads[0]) == before
     assert saved(third.heads[1]) == saved(trained.heads[1])
     for new, last in (
-        (same.heads[1], maps.heads[0]),
+        (same.heads[1], scenes.heads[0]),
         (third.heads[2], trained.heads[1]),
     ):
         assert new.scenes == 1
@@ -73,6 +74,6 @@ def test_new_head_starts_from_the_shared_weights_of_the_last(
                 continue
             assert torch.equal(value, weights(last)[name]) != (name in own), name
     assert not torch.equal(
-        weights(trained.heads[1])["first.1.weight"], weights(maps.heads[0])["first.1.weight"]
+        weights(trained.heads[1])["first.1.weight"], weights(scenes.heads[0])["first.1.weight"]
     )
-    assert [maps.head_for(0)[1], trained.head_for(1)[1], third.head_for(2)[1]] == [0, 0, 0]
+    assert [scenes.head_for(0)[1], trained.head_for(1)[1], third.head_for(2)[1]] == [0, 0, 0]

@@ -135,6 +135,7 @@ class _Run:
 
     def _remove(self) -> None:
         shutil.rmtree(self.store, ignore_errors=True)
+        self.store.with_name(f".{self.store.name}.lock").unlink(missing_ok=True)
         self._network_fits.unlink(missing_ok=True)
 
     def _learn(self, store: Path, scene: Recording, strategy: Strategy) -> None:

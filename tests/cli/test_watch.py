@@ -1,0 +1,135 @@
+"""`evercal watch`."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from evercal.cli import main
+from evercal.cli.watch import FALSE_ALARMS, Arrivals, false_alarm_share
+from evercal.recordings import read_image, write_image
+
+if TYPE_CHECKING:
+    from evercal.recordings import Recording
+
+
+@pytest.fixture(scope="module")
+def reference(
+    hall_store: Path, four_images: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    out = tmp_path_factory.mktemp("reference") / "calibration.json"
+    assert main(["calibrate", str(hall_store), str(four_images), "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture
+def words(hall_store: Path, reference: Path, tmp_path: Path) -> tuple[object, ...]:
+    """A command that watches the folder `arriving`."""
+    (tmp_path / "arriving").mkdir()
+    options = ("--reference", reference, "--interval", "0.05")
+    return ("watch", hall_store, tmp_path / "arriving", *options)
+
+
+def test_false_alarm_shares_sum_to_one_percent() -> None:
+    tests = 100_000
+    total = sum(false_alarm_share(test) for test in range(1, tests + 1))
+    rest = FALSE_ALARMS * 6 / math.pi**2 / tests  # the integral of the tail
+    assert total + rest == pytest.approx(0.01, rel=1e-6)
+
+
+def test_no_alarm_while_the_camera_stands_still(
+    run: Any, words: tuple[object, ...], still_images: Path, tmp_path: Path
+) -> None:
+    for path in still_images.iterdir():
+        (tmp_path / "arriving" / path.name).write_bytes(path.read_bytes())
+    ran = run(*words, "--idle", "0.3", "--json")
+    assert ran.code == 0
+    records = [json.loads(line) for line in ran.out.splitlines()]
+    assert sorted(record["image"] for record in records) == sorted(
+        path.name for path in still_images.iterdir()
+    )
+    assert not any(record["moved"] for record in records)
+
+
+def test_moved_camera_ends_the_watch_with_exit_code_1(
+    run: Any, words: tuple[object, ...], hall: Recording, tmp_path: Path
+) -> None:
+    for i in range(4):
+        write_image(tmp_path / "arriving" / f"{i}.png", hall.test[6].read_image())
+    ran = run(*words, "--idle", "20", "--window", "3")
+    assert ran.code == 1
+    assert len(ran.out.splitlines()) == 3  # one image could be an outlier
+    assert "The camera has moved by" in ran.out
+
+
+def test_half_written_file_is_read_when_it_is_complete(four_images: Path, tmp_path: Path) -> None:
+    data = (four_images / "00.png").read_bytes()
+    arrivals, path = Arrivals(tmp_path), tmp_path / "late.png"
+    path.write_bytes(data[: len(data) // 2])
+    assert list(arrivals.scan()) == []
+    path.write_bytes(data)
+    [(arrived, pixels)] = arrivals.scan()
+    assert arrived == path
+    np.testing.assert_array_equal(pixels, read_image(path))
+    assert list(arrivals.scan()) == []
+
+
+def test_broken_file_does_not_end_the_watch_nor_prolong_it(
+    run: Any, words: tuple[object, ...], four_images: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "arriving"
+    (folder / "0-broken.png").write_bytes(b"\x89PNG broken")
+    (folder / "1-folder.png").mkdir()
+    (folder / "2-image.png").write_bytes((four_images / "00.png").read_bytes())
+    ran = run(*words, "--idle", "0.5", "--json")
+    assert ran.code == 0
+    assert [json.loads(line)["image"] for line in ran.out.splitlines()] == ["2-image.png"]
+    warnings = [line for line in ran.err if line.startswith("warning: ")]
+    assert [Path(line.split(": ")[1]).name for line in warnings] == ["0-broken.png", "1-folder.png"]
+
+
+def test_image_of_another_place_is_reported(
+    run: Any, words: tuple[object, ...], tmp_path: Path
+) -> None:
+    write_image(tmp_path / "arriving" / "black.png", np.zeros((240, 320, 3), np.uint8))
+    ran = run(*words, "--idle", "0.2", "--json")
+    assert ran.code == 0
+    record = json.loads(ran.out)
+    assert record["moved"] is None
+    assert record["reason"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--window", "0"), "--window is at least 1"),
+        (("--reference", "none.json"), "calibration file is missing"),
+        (("--camera", "none.txt"), "none.txt: camera file is missing"),
+        (("--camera", "BROKEN"), "camera.txt"),
+    ],
+)
+def test_bad_options_end_the_watch(
+    options: tuple[str, str],
+    message: str,
+    run: Any,
+    words: tuple[object, ...],
+    four_images: Path,
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "camera.txt").write_text("300 0 160")
+    (tmp_path / "arriving" / "0.png").write_bytes((four_images / "00.png").read_bytes())
+    given = [tmp_path / "camera.txt" if word == "BROKEN" else word for word in options]
+    ran = run(*words, "--idle", "0.2", *given)
+    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
+    assert message in ran.err[0]
+
+
+def test_missing_folder_is_refused(run: Any, hall_store: Path, tmp_path: Path) -> None:
+    ran = run("watch", hall_store, tmp_path / "none", "--reference", tmp_path / "none.json")
+    assert ran.code == 2
+    assert "no such folder" in ran.err[0]
