@@ -107,6 +107,7 @@ def prepare_export(
     link, other = options.get("via"), options.get("robot_frame")
     if parent in (child, link):
         raise InputError(f"parent and child frame are both called {parent!r}; rename one of them")
+    link_from_optical = _link_from_optical(child, options)
     for role, frame in {"parent": parent, "child": link or child, "robot": other}.items():
         if frame is not None and not _FRAME.fullmatch(frame):
             raise InputError(
@@ -114,11 +115,11 @@ def prepare_export(
                 f" inner /, such as 'camera_color_optical_frame' (rename with --parent or --child)"
             )
     calibration = replace(calibration, parent_frame=parent, child_frame=child)
-    link_from_optical = _link_from_optical(child, options)
     if link is not None:
         calibration = published_at(calibration, link, link_from_optical)
-    robot = _poses(options.get("robot_poses"), options.get("convention"))
-    return Export(calibration, name, other, robot, _poses(options.get("target_poses"), None))
+    robot = _poses(options.get("robot_poses"), "robot", options.get("convention"))
+    target = _poses(options.get("target_poses"), "target", None)
+    return Export(calibration, name, other, robot, target)
 
 
 def pose_numbers(poses: SE3, convention: str = "xyzw") -> NDArray[np.float64]:
@@ -141,7 +142,7 @@ def _link_from_optical(optical: str, options: ExportOptions) -> SE3:
     return standard_link_from_optical(offset or (0.0, 0.0, 0.0))
 
 
-def _poses(source: PoseSource, convention: str | None) -> RobotPoses | None:
+def _poses(source: PoseSource, role: str, convention: str | None) -> RobotPoses | None:
     if source is None or isinstance(source, RobotPoses):
         return source
-    return read_robot_poses(source, convention, what="file of poses")
+    return read_robot_poses(source, convention, what=f"file of {role} poses")
