@@ -196,7 +196,7 @@ def read_calibration(path: str | os.PathLike[str]) -> Calibration:
     Raises:
         InputError: The file is missing or holds no calibration.
     """
-    return read_json(path, Calibration.from_dict)
+    return read_json(path, "calibration file", Calibration.from_dict)
 
 
 def of_format(
@@ -219,8 +219,10 @@ def of_format(
         raise ValueError(f"an entry has the wrong kind of value ({error})") from None
 
 
-def read_json(path: str | os.PathLike[str], convert: Callable[[object], Content]) -> Content:
-    """Read a JSON file that evercal wrote, and convert its values.
+def read_json(
+    path: str | os.PathLike[str], what: str, convert: Callable[[object], Content]
+) -> Content:
+    """Read a JSON file that evercal wrote, and convert its values; `what` names it in messages.
 
     Raises:
         InputError: The file is missing, or `convert` raises ValueError.
@@ -228,7 +230,7 @@ def read_json(path: str | os.PathLike[str], convert: Callable[[object], Content]
     try:
         return convert(json.loads(Path(path).read_text(encoding="utf-8")))
     except FileNotFoundError:
-        raise InputError(f"{path}: file is missing; check the path") from None
+        raise InputError(f"{path}: {what} is missing; check the path") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except ValueError as error:

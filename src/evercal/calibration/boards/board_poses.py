@@ -103,7 +103,7 @@ def read_board_poses(path: str | os.PathLike[str]) -> BoardPoses:
     Raises:
         InputError: The file is missing or does not hold board poses.
     """
-    return read_json(path, BoardPoses.from_dict)
+    return read_json(path, "file of camera poses", BoardPoses.from_dict)
 
 
 def board_poses(
