@@ -9,7 +9,7 @@ import numpy as np
 
 from evercal.continual.benchmark.published import LOOSE, PublishedScene
 from evercal.continual.benchmark.results import NETWORK, SceneResult
-from evercal.continual.benchmark.statistics import Interval, frame_pieces, paired_difference
+from evercal.continual.benchmark.statistics import Interval, frame_pieces, mean_interval
 from evercal.errors import InputError
 from evercal.evaluation.metrics import (
     COARSE,
@@ -307,7 +307,7 @@ def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
     """Estimate the difference of final accuracies of two strategies, as shares in [-1, 1].
 
     Returns:
-        Mean and 95 % interval over runs of frames and seeds (`paired_difference`). None without a
+        Mean and 95 % interval over runs of frames and seeds (`mean_interval`). None without a
         common seed, or if a scene has a single test frame.
     """
     pairs = [(a, b) for a in ours for b in theirs if a.seed == b.seed]
@@ -317,11 +317,11 @@ def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
     pieces = [frame_pieces(pairs[0][0].end(name).frames) for name in names]
     if any(labels[-1] == 0 for labels in pieces):
         return None
-    first, second = (
-        [np.array([pair[which].end(name).correct() for pair in pairs], float) for name in names]
-        for which in (0, 1)
-    )
-    interval = paired_difference(first, second, pieces)
+    gains = [
+        np.array([a.end(name).correct().astype(float) - b.end(name).correct() for a, b in pairs])
+        for name in names
+    ]
+    interval = mean_interval(gains, pieces)
     return Interval(interval.mean, max(interval.low, -1.0), min(interval.high, 1.0))
 
 
