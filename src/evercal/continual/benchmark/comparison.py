@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -272,23 +272,16 @@ def scene_rows(runs: Sequence[Run]) -> TableRows:
     """Tabulate the accuracy of each scene: just after learning it -> at the end."""
     import pandas
 
-    columns = ["strategy", "scene", "learned", "end"]
-    accuracies = [
+    cells = [
         (run.strategy, scene, run.matrix()[i, i], run.matrix()[-1, i])
         for run in runs
         for i, scene in enumerate(run.scenes)
     ]
-    frame = pandas.DataFrame(accuracies, columns=columns)
-    means = frame.pivot_table(index=columns[:2], aggfunc="mean", sort=False)
-    cells = {
-        key: f"{number(learned)} -> {number(end)}"
-        for key, learned, end in zip(means.index, means["learned"], means["end"], strict=True)
-    }
-    names = sorted(runs[0].scenes)
-    rows = [
-        [strategy, *(cells[strategy, name] for name in names)] for strategy in by_strategy(runs)
-    ]
-    return [["strategy", *names], *rows]
+    frame = pandas.DataFrame(cells, columns=["strategy", "scene", "learned", "end"])
+    means = frame.groupby(["strategy", "scene"], sort=False).mean()
+    text = means["learned"].map(number) + " -> " + means["end"].map(number)
+    by_scene = text.unstack(sort=False)[sorted(runs[0].scenes)].reset_index()
+    return [list(by_scene.columns), *by_scene.to_numpy().tolist()]
 
 
 def difference_rows(runs: Sequence[Run], reference: str) -> TableRows:
@@ -332,9 +325,9 @@ def summary(runs: Sequence[Run]) -> dict[str, list[dict[str, object]]]:
             {
                 "seed": run.seed,
                 "scenes": list(run.scenes),
-                "accuracy_5cm_5deg": _plain(run.matrix()),
-                "accuracy_1cm_1deg": _plain(run.matrix(FINE)),
-                **{key: _plain(value) for key, value in asdict(run.scores()).items()},
+                "accuracy_5cm_5deg": _plain(run.matrix().round(3).tolist()),
+                "accuracy_1cm_1deg": _plain(run.matrix(FINE).round(3).tolist()),
+                **run.scores().to_dict(),
                 "memory_bytes": run.last[0].memory_bytes,
                 "head_bytes": run.last[0].head_bytes,
                 "seconds": run.seconds,
@@ -345,7 +338,5 @@ def summary(runs: Sequence[Run]) -> dict[str, list[dict[str, object]]]:
     }
 
 
-def _plain(value: object) -> object:
-    if isinstance(value, np.ndarray):
-        return [[None if math.isnan(v) else round(v, 3) for v in row] for row in value.tolist()]
-    return None if isinstance(value, float) and math.isnan(value) else value
+def _plain(matrix: list[list[float]]) -> list[list[float | None]]:
+    return [[None if math.isnan(value) else value for value in row] for row in matrix]
