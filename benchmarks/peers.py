@@ -225,7 +225,7 @@ def _load(path: Path, limit: int | None) -> Recording:
     return replace(scene, test=test)
 
 
-def _plain(row: Row) -> Row:
+def _plain(row: Row) -> dict[str, object]:
     """Replace infinity and NaN by None, for JSON."""
     return {
         key: None if isinstance(value, float) and not math.isfinite(value) else value
