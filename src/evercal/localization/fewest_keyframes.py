@@ -43,15 +43,8 @@ def fewest_keyframes(
 ) -> NDArray[np.int64]:
     """Select the fewest keyframes of a new scene.
 
-    Args:
-        contents: the encoder and the scenes learned before.
-        built: the new scene with all its keyframes.
-        frames: posed training frames of the scene, in recorded order.
-        on_progress: for progress bars.
-        options: shares and tolerances.
-
-    Returns:
-        Indices of the keyframes, sorted; all of them if they locate no other frame.
+    `contents` holds the scenes learned before, and `frames` are the posed training frames in
+    recorded order. Returns sorted indices; all keyframes if they locate no other frame.
     """
     options = options or AutoMemoryOptions()
     others = [frame for frame in frames if frame.name not in set(built.keyframe_names)]

@@ -100,10 +100,6 @@ class Localizer:
     """Locates images in the scenes of a map.
 
     Images are encoded and matched on the encoder's device; poses are computed on the CPU.
-
-    Args:
-        contents: encoder and scenes, at least one.
-        options: effort and thresholds.
     """
 
     def __init__(self, contents: MapContents, options: LocalizeOptions | None = None):
@@ -121,11 +117,8 @@ class Localizer:
     ) -> Self:
         """A localizer for a map on disk.
 
-        Args:
-            store: folder of the map.
-            options: effort and thresholds.
-            encoder: the module of a map that was made with a module of the caller's own.
-            device: `auto` (a CUDA device if there is one), `cpu` or `cuda`.
+        The device is `auto` (a CUDA device if there is one), `cpu` or `cuda`. For a map that was
+        made with a module of the caller's own, `encoder` is that module.
 
         Raises:
             InputError: Not a map, an empty one, or a damaged file; no such device.
@@ -298,11 +291,6 @@ def camera_in_scenes(
     camera: Camera | None, image: np.ndarray, scenes: Sequence[LearnedScene]
 ) -> list[Camera | None]:
     """Intrinsics of an image in each scene; None where the aspect ratio does not fit.
-
-    Args:
-        camera: intrinsics that were given.
-        image: (H, W, 3).
-        scenes: with the cameras that recorded them.
 
     Raises:
         InputError: A camera with another aspect ratio than the image's, or no camera given and no

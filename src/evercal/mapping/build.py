@@ -154,12 +154,7 @@ def build_map(
 ) -> BuiltMap:
     """Build the map of a scene.
 
-    Args:
-        name: of the scene.
-        frames: posed training frames in recorded order.
-        encoder: frozen local encoder.
-        options: memory, sizes and priors.
-        on_progress: for progress bars.
+    The frames are posed, in recorded order.
 
     Raises:
         InputError: No two frames show the same surfaces, so nothing can be triangulated.
@@ -285,13 +280,7 @@ def _adjust(
 
 
 def _moved(stated: SE3, camera: Camera, adjustment: Adjustment) -> bool:
-    """Whether the adjustment moved the projections of landmarks noticeably.
-
-    Args:
-        stated: (n,) poses before.
-        camera: intrinsics before, if all frames share a camera.
-        adjustment: the result.
-    """
+    """Whether the adjustment moved the projections of landmarks noticeably."""
     change = np.linalg.norm((stated.inverse() @ adjustment.poses).log().reshape(-1, 2, 3), axis=2)
     metres, radians = np.median(change, 0)
     by_camera = 0.0

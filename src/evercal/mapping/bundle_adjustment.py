@@ -160,11 +160,9 @@ class Estimate:
 class BundleAdjustment:
     """The problem of one recording.
 
-    Args:
-        stated: (n,) base_from_camera as the recording states them.
-        cameras: n, at the image size that patches are cut from; adjusted if all are the same.
-        velocity: (n, 6) motion from frame to frame, camera frame, metres and radians; 0 if unknown.
-        options: priors.
+    Cameras are those of the image size that patches are cut from, and adjusted if all are the same.
+    The velocity (n, 6) is the motion from frame to frame, camera frame, metres and radians; 0 if
+    unknown.
     """
 
     def __init__(self, stated: SE3, cameras: list[Camera], velocity: Array, options: BundleOptions):

@@ -162,12 +162,7 @@ def _landmarks_of(tensors: dict[str, Tensor]) -> tuple[Landmarks, ...]:
 
 
 def store_keyframes(frames: Sequence[Frame], short_side: int) -> Keyframes:
-    """Store frames at working size.
-
-    Args:
-        frames: selected frames with poses.
-        short_side: pixels of the shorter image side.
-    """
+    """Store frames at working size."""
     images, cameras = [], []
     for frame in frames:
         grey, camera = working_image(frame.read_image(), frame.camera, short_side)

@@ -111,15 +111,8 @@ def align_patches(
 ) -> tuple[Array, Array]:
     """Align patches in another image.
 
-    Args:
-        patches: n templates.
-        image: float image (h, w) of the same pyramid level.
-        centres: (n, 2) pixels to start from.
-        affines: (n, 2, 2) from keyframe pixels to pixels of this image around the centre.
-        iterations: Gauss-Newton steps.
-
-    Returns:
-        Pixels (n, 2) and the normalised cross-correlation (n,) there.
+    The affines (n, 2, 2) lead from keyframe pixels to pixels of the other image around the centres
+    (n, 2) to start from. Returns pixels (n, 2) and their normalised cross-correlation (n,).
     """
     if len(centres) > _MOST_ROWS:
         starts = range(0, len(centres), _MOST_ROWS)
@@ -152,15 +145,8 @@ def align_down(
 ) -> tuple[Array, Array]:
     """`align_patches` from coarse to fine.
 
-    Args:
-        levels: templates of each pyramid level.
-        pyramid: `image_pyramid` of the other image.
-        start: (n, 2) pixels of level 0 to start from.
-        affines: (n, 2, 2), see `align_patches`.
-        steps: (level, iterations), in order.
-
-    Returns:
-        Pixels (n, 2) of level 0 and the correlation (n,) at the last level.
+    `start` and the result are (n, 2) pixels of level 0, each step is (level, iterations). Returns
+    the correlation (n,) at the last level too.
     """
     pixels, correlation = start, np.zeros(len(start))
     for level, iterations in steps:

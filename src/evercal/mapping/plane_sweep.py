@@ -68,12 +68,7 @@ def select_source_views(
 ) -> list[int]:
     """Select the views that show the surfaces of a view under good parallax.
 
-    Args:
-        depth_m: (h * w,) rough depths of the view's cells.
-        view: the view.
-        poses: (n,) base_from_camera of the other views.
-        cameras: n, at working size.
-        count: number of views, at most.
+    Rough depths (h * w,) are those of the cells of the view; poses (n,) are base_from_camera.
     """
     some = np.linspace(0, len(depth_m) - 1, PROBES).astype(int)
     points = view.base_from_camera.apply(view.rays()[some] * depth_m[some, None])
@@ -202,13 +197,9 @@ class _SourceView:
 def peak(similarity: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
     """The most similar cell of the 3x3 around a cell, to a fraction of a cell.
 
-    Args:
-        similarity: (n, h, w) of n cells to all cells of another view.
-        row: (n,) in 1 .. h - 2.
-        column: (n,) in 1 .. w - 2.
-
-    Returns:
-        (n, 2) column and row, and the similarity (n,) of the nearest cell.
+    The similarity (n, h, w) is that of n cells to all cells of another view; rows and columns (n,)
+    lie inside its border. Returns (n, 2) column and row, and the similarity (n,) of the nearest
+    cell.
     """
     _, height, width = similarity.shape
     n = torch.arange(len(similarity))

@@ -34,13 +34,7 @@ class WorkingSize:
 
 
 class PreparedFrames:
-    """Posed training frames at working size; poses and camera change during the adjustment.
-
-    Args:
-        frames: posed frames of one scene.
-        encoder: frozen local encoder.
-        size: working sizes.
-    """
+    """Posed training frames at working size; poses and camera change during the adjustment."""
 
     def __init__(self, frames: Sequence[Frame], encoder: Encoder, size: WorkingSize):
         self.frames, self.encoder, self.size = tuple(frames), encoder, size

@@ -38,11 +38,7 @@ SCENE, KEYFRAMES, CORRECTION = "scene.json", "keyframes.safetensors", "correctio
 class MapStore(StageStore):
     """A map on disk and in memory.
 
-    Args:
-        root: folder of the store.
-        contents: encoder and scenes.
-        stages: folder names of the scenes, in order.
-        networks: file names of the encoder and, for an encoder that is not shipped, its centroids.
+    The networks are the files of the encoder and, if it is not shipped, of its centroids.
     """
 
     def __init__(
@@ -59,10 +55,8 @@ class MapStore(StageStore):
     def open(cls, root: Path, encoder: nn.Module | None = None) -> Self:
         """Open a map at its last complete scene.
 
-        Args:
-            root: folder of the store.
-            encoder: the module of a store that was made with a module of the caller's own; its
-                weights are replaced by those in the store.
+        For a store that was made with a module of the caller's own, `encoder` is that module; its
+        weights are replaced by those in the store.
 
         Raises:
             InputError: Not a map, or a file is missing or was changed.
@@ -94,10 +88,8 @@ class MapStore(StageStore):
     ) -> Self:
         """An empty map; nothing is written before the first `commit`.
 
-        Args:
-            root: folder of the store to be; it must not exist or be empty.
-            encoder: a weights file or a module that is an `Encoder`. Default: the shipped weights.
-            short_side: shorter image side that the encoder works on, pixels.
+        `root` must not exist or be empty. The encoder is a weights file, a module that is an
+        `Encoder`, or by default the shipped one.
 
         Raises:
             InputError: `root` holds something else, or a bad encoder.
@@ -126,10 +118,6 @@ class MapStore(StageStore):
     def commit(self, scene: SceneMap, report: Mapping[str, object]) -> None:
         """Add a scene: whole, or not at all.
 
-        Args:
-            scene: its map.
-            report: content of its `report.json`.
-
         Raises:
             InputError: Another process writes into the store, or it cannot be written.
         """
@@ -147,8 +135,7 @@ class MapStore(StageStore):
     def update(self, scene: SceneMap) -> None:
         """Replace what is stored of a scene beside its keyframes: whole, or not at all.
 
-        Args:
-            scene: its map; it replaces the scene of the same name.
+        It replaces the scene of the same name.
 
         Raises:
             InputError: As `commit`, and where a file of the store is missing or was changed.

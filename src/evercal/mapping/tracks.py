@@ -150,14 +150,7 @@ def observe(
 ) -> Observations:
     """Align landmarks of a keyframe in another frame.
 
-    Args:
-        recording: the frames.
-        keyframe: its landmarks are aligned.
-        frame: the other frame.
-        which: (n,) landmarks to align.
-        steps: pyramid levels and iterations.
-        options: thresholds and noise of observations.
-        reach_px: largest distance of an observation from its prediction.
+    `which` (n,) selects landmarks. An observation is at most `reach_px` from its prediction.
     """
     surface = keyframe.landmarks.take(which).surface(recording.cameras[keyframe.frame])
     rotation, translation = recording.relative(frame, keyframe.frame)
@@ -179,11 +172,8 @@ def refine_depths(
 ) -> None:
     """Refine the inverse depths of a keyframe's landmarks by Gauss-Newton; poses are fixed.
 
-    Args:
-        recording: the frames.
-        keyframe: its landmarks are refined, in place.
-        options: thresholds and noise of observations.
-        again: the depths are nearly right, so the coarse round is left out.
+    Landmarks change in place. If the depths are nearly right (`again`), the coarse round is left
+    out.
     """
     if not keyframe.sources or not len(keyframe.landmarks):
         return
