@@ -25,11 +25,9 @@ _ASPECT_TOLERANCE = 0.01
 def resize_pixels(pixels: ArrayLike, scale: float | Array) -> Array:
     """Pixel coordinates in a resized image.
 
-    Resizing scales about the corner of the image, which lies at -0.5 and not at 0.
-
-    Args:
-        pixels: (..., 2), x then y, or any coordinate along one axis.
-        scale: new size over old size; one number, or one for each axis.
+    Resizing scales about the corner of the image, which lies at -0.5 and not at 0. Pixels (..., 2)
+    are x then y, or any coordinate along one axis. The scale is new size over old size; one number,
+    or one for each axis.
     """
     return np.asarray((np.asarray(pixels) + 0.5) * scale - 0.5)
 
@@ -146,12 +144,8 @@ class Camera:
     def project(self, points_camera: ArrayLike) -> Array:
         """Points in the camera frame to pixels.
 
-        Args:
-            points_camera: (..., 3) metres, camera frame.
-
-        Returns:
-            (..., 2) pixels, x then y, not clipped to the image. NaN for points behind the camera
-            or beyond the valid range of the distortion (`widest`).
+        Points (..., 3) give pixels (..., 2), not clipped to the image; NaN for points behind the
+        camera or beyond the valid range of the distortion (`widest`).
         """
         points = np.asarray(points_camera, dtype=np.float64)
         if points.shape[-1:] != (3,):
@@ -166,12 +160,8 @@ class Camera:
     def unproject(self, pixels: ArrayLike) -> Array:
         """Pixels to viewing rays.
 
-        Args:
-            pixels: (..., 2), x then y.
-
-        Returns:
-            (..., 3) rays in the camera frame with z = 1; x and y are NaN for pixels outside the
-            range of the distortion.
+        Pixels (..., 2) give rays (..., 3) in the camera frame with z = 1; x and y are NaN outside
+        the range of the distortion.
         """
         pixels = np.asarray(pixels, dtype=np.float64)
         if pixels.shape[-1:] != (2,):

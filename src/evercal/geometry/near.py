@@ -15,14 +15,8 @@ def near_training(train_poses: SE3, test_poses: SE3) -> NDArray[np.bool_]:
     """Which test frames have a training frame nearer than 5 cm and 5 deg.
 
     The bounds are those of accuracy and as strict, so that the share of such frames is what the
-    best lookup of a training frame could reach without any geometry.
-
-    Args:
-        train_poses: (n,), may be empty.
-        test_poses: (m,) in the same base frame.
-
-    Returns:
-        (m,) bool.
+    best lookup of a training frame could reach without any geometry. Poses (n,) and (m,) give (m,)
+    bool.
 
     Raises:
         ValueError: Something other than two batches of poses.

@@ -121,14 +121,8 @@ def frame_covariance(base_from_camera: SE3, covariance: ArrayLike) -> Array:
     """Covariance of the base frame from a motion that is common to all cameras of a map.
 
     Landmarks move with the cameras that observe them, so an error of `gripper_from_camera` moves
-    the frame of the map by the mean over its cameras.
-
-    Args:
-        base_from_camera: (n,) poses that the map was built from.
-        covariance: (6, 6) of the common motion, camera frame, metres and radians.
-
-    Returns:
-        (6, 6) of a small motion of the base frame, metres and radians.
+    the frame of the map by the mean over its cameras. Both covariances are (6, 6), metres and
+    radians; that of the common motion is in the camera frame.
     """
     mean = base_from_camera.adjoint().mean(0)
     return mean @ np.asarray(covariance) @ mean.T

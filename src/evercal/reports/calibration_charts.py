@@ -19,13 +19,8 @@ _MAX_NUMBERED = 40
 def ellipsoid_outline(covariance: ArrayLike, plane: tuple[int, int], share: float) -> Array:
     """Project an error ellipsoid onto the plane of two axes.
 
-    Args:
-        covariance: (3, 3) of Gaussian errors, any unit squared.
-        plane: Indices of the two axes.
-        share: Probability of an error inside the ellipsoid.
-
-    Returns:
-        (181, 2) closed outline about 0, in the unit of the errors.
+    The outline (181, 2) about 0 has the unit of the errors. `share` is the probability of an error
+    inside the ellipsoid.
     """
     from scipy import stats
 
@@ -39,10 +34,7 @@ def ellipsoid_outline(covariance: ArrayLike, plane: tuple[int, int], share: floa
 def ellipsoid_projections(covariance_mm2: ArrayLike, frame: str, share: float = 0.95) -> bytes:
     """Plot an error ellipsoid along each axis, all at one scale.
 
-    Args:
-        covariance_mm2: (3, 3) of a position, square millimetres.
-        frame: Name of the frame of the axes.
-        share: Probability of an error inside the ellipsoid.
+    The covariance is (3, 3) of a position, square millimetres.
     """
     outlines = [ellipsoid_outline(covariance_mm2, plane, share) for plane in _PLANES]
     reach = 1.15 * max(float(np.abs(outlines).max()), 1e-3)
@@ -66,10 +58,7 @@ def error_terms(
 ) -> bytes:
     """Plot the standard deviations that make up an error, position and rotation side by side.
 
-    Args:
-        names: Terms; the last one is the total.
-        millimetres: One value a term.
-        degrees: One value a term.
+    The last term is the total.
     """
     wrapped = [plain(textwrap.fill(textwrap.shorten(name, 130), 34)) for name in names]
     lines = sum(max(2, 1 + name.count("\n")) for name in wrapped)
@@ -99,11 +88,6 @@ def residual_bars(
     """Plot the residual of each image, numbered from 1; rejected ones are hatched.
 
     Bars much larger than all bars of used images are cut and labelled with their length.
-
-    Args:
-        millimetres: Translation residuals; None if unknown.
-        degrees: Rotation residuals; None if unknown.
-        used: Whether the calibration uses the image.
     """
     figure = new_figure(9.0, 3.9)
     selected = np.array(used, dtype=bool)

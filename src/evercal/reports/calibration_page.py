@@ -79,11 +79,7 @@ def calibration_page(
 ) -> CalibrationPage:
     """Write the report of a calibration.
 
-    Args:
-        file: The calibration.
-        images: Its images with overlays.
-        store: Path of the store whose landmarks are drawn.
-        older: Calibration to compare with.
+    `store` is the path of the store whose landmarks are drawn.
 
     Raises:
         InputError: A check of the calibration is not a number, or `older` has another mount.

@@ -66,10 +66,7 @@ def error_curve(
 ) -> bytes:
     """Plot the share of frames below each translation error.
 
-    Args:
-        groups: By name (frames,) errors in metres, infinite without a pose.
-        limit_mm: Right end of the axis.
-        threshold_mm: Position of a vertical line.
+    Errors (frames,) are in metres, infinite without a pose.
 
     Raises:
         ValueError: A group is empty or contains NaN.
@@ -99,10 +96,8 @@ def error_histogram(
 ) -> bytes:
     """Plot histograms of translation errors, one panel a group.
 
-    Args:
-        groups: By name (frames,) errors in metres, infinite without a pose.
-        limit_mm: Right end of the axis. A separate grey bar counts larger errors.
-        bins: Bars up to `limit_mm`.
+    Errors (frames,) are in metres, infinite without a pose. A separate grey bar counts errors above
+    the limit.
 
     Raises:
         ValueError: A group is empty or contains NaN.
@@ -132,10 +127,7 @@ def trajectory(truth_m: ArrayLike, estimated_m: ArrayLike) -> bytes:
     """Plot true and estimated positions along the two axes with the largest extent.
 
     The plot is limited to the true positions and a margin. The legend counts the estimates outside.
-
-    Args:
-        truth_m: (n, 3) metres, n >= 1, in recorded order.
-        estimated_m: (n, 3) metres, NaN without a pose.
+    Positions (n, 3) are in metres and recorded order, NaN without a pose.
     """
     truth, estimated = np.asarray(truth_m, np.float64), np.asarray(estimated_m, np.float64)
     located = np.isfinite(estimated).all(axis=1)

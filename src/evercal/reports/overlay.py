@@ -25,18 +25,10 @@ def overlay_points(
     """Draw points over an image.
 
     Later points cover earlier ones. Values are drawn over a grey copy of the image. Points outside
-    the image and points that are not finite are omitted.
-
-    Args:
-        image: (H, W, 3) uint8 RGB; not changed.
-        pixels: (n, 2) x and y; 0 is the centre of the first pixel.
-        colours: (n, 3) uint8 RGB, or (n,) values for the viridis colour map. NaN is grey.
-        radius: Pixels.
-        limits: Values at the ends of the colour map; by default the 2nd and 98th percentile.
-        legend: Quantity and unit of the values, written below a colour bar.
-
-    Returns:
-        A new image of the same size.
+    the image and points that are not finite are omitted. Pixels (n, 2) are x and y; 0 is the centre
+    of the first pixel. Colours are (n, 3) uint8 RGB, or (n,) values for the viridis colour map,
+    with NaN in grey. By default its limits are the 2nd and 98th percentile. The legend is the
+    quantity and unit of the values.
 
     Raises:
         ValueError: Shapes that do not match, or a legend without values.
@@ -80,16 +72,8 @@ def overlay_lines(
 ) -> Image:
     """Draw lines over an image, solid ones with a white rim and dashed ones with a black rim.
 
-    Args:
-        image: (H, W, 3) uint8 RGB; not changed.
-        lines: (n, 2) x and y of each line; 0 is the centre of the first pixel. Points that are not
-            finite interrupt the line.
-        colours: RGB, one a line.
-        width: Pixels.
-        dash: Length of dashes and gaps in pixels; None draws solid lines.
-
-    Returns:
-        A new image of the same size.
+    Lines are (n, 2) x and y; 0 is the centre of the first pixel. Points that are not finite
+    interrupt the line. `dash` is the length of dashes and gaps in pixels; None draws solid lines.
 
     Raises:
         ValueError: A line is not (n, 2).

@@ -84,12 +84,7 @@ class Table:
 def render(template: str, **values: object) -> str:
     """Fill in a template; all values are escaped.
 
-    Args:
-        template: Name of a file in the folder `templates`.
-        values: Variables of the template.
-
-    Returns:
-        An HTML document without references to other files.
+    The document has no references to other files.
     """
     return _environment().get_template(template).render(values)
 

@@ -41,10 +41,8 @@ class Surface:
 class BoxRoom:
     """A room generated from a seed.
 
-    Args:
-        seed: Seed of the room. Seeds 9000 to 9999 are reserved for benchmarks.
-        furniture: Number of furniture boxes; random if omitted.
-        texture_px: Side of one texture in pixels.
+    Seeds 9000 to 9999 are reserved for benchmarks. The number of furniture boxes is random if
+    omitted.
     """
 
     def __init__(self, seed: int, furniture: int | None = None, texture_px: int = 384):
@@ -117,13 +115,6 @@ class BoxRoom:
     def render(self, camera: Camera, base_from_camera: SE3) -> np.ndarray:
         """Render an image of an ideal pinhole camera.
 
-        Args:
-            camera: Intrinsics without distortion.
-            base_from_camera: Camera pose.
-
-        Returns:
-            RGB image, uint8, shape (camera.height, camera.width, 3).
-
         Raises:
             ValueError: The camera has distortion.
         """
@@ -144,13 +135,9 @@ class BoxRoom:
     def intersect(self, origin_m: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Intersect rays with the room in closed form.
 
-        Args:
-            origin_m: Ray origins in the base frame, shape (3,) or (n, 3).
-            rays: Directions of any length, shape (n, 3).
-
-        Returns:
-            First intersections (n, 3) in the base frame, NaN for rays that miss, and their depths
-            (n,) in units of the ray length, inf for rays that miss.
+        Origins (3,) or (n, 3) and directions (n, 3) of any length are in the base frame. Returns
+        the first intersections (n, 3), NaN for rays that miss, and depths (n,) in units of the ray
+        length, inf for rays that miss.
         """
         origin = np.broadcast_to(origin_m, rays.shape)
         best = np.full(len(rays), np.inf)
@@ -180,12 +167,8 @@ class BoxRoom:
     def path(self, frames: int, seed: int) -> SE3:
         """A smooth hand-held sweep once around the room.
 
-        Args:
-            frames: Number of poses.
-            seed: Seed of the deviation from the room's common sweep, about 10 to 20 cm and 10 deg.
-
-        Returns:
-            base_from_camera, shape (frames,).
+        Returns base_from_camera (frames,). The seed is that of the deviation from the room's common
+        sweep, about 10 to 20 cm and 10 deg.
         """
         common = np.random.default_rng([self.seed, 0])
         walker = np.random.default_rng([self.seed, seed])
@@ -240,14 +223,7 @@ def default_camera(width: int = 320, height: int = 240) -> Camera:
 def box_room_scene(seed: int, train: int, test: int, camera: Camera | None = None) -> Recording:
     """Record a box room: one sweep of training frames and another of test frames.
 
-    Args:
-        seed: Seed of the room.
-        train: Number of training frames.
-        test: Number of test frames.
-        camera: Intrinsics of every frame; `default_camera()` if omitted.
-
-    Returns:
-        A recording `box-room-SEED` with images in memory.
+    It is called `box-room-SEED`, with images in memory.
     """
     room = BoxRoom(seed)
     intrinsics = camera or default_camera()

@@ -116,10 +116,7 @@ def simulate(
 ) -> Generator[Progress, None, None]:
     """Render a suite and yield the progress after each frame.
 
-    Args:
-        name: One of `SUITES`.
-        out: A new folder, or the folder of an interrupted run with the same settings.
-        options: Deviations from the suite's defaults.
+    `out` is a new folder, or that of an interrupted run with the same settings.
 
     Raises:
         InputError: The suite is unknown, an option is out of range, the disk is too small, `out`

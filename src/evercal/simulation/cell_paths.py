@@ -41,11 +41,6 @@ class Shot:
 def sweep_shots(room: Room, frames: int, seed: int) -> list[Shot]:
     """Plan a moving camera: 70 % training frames, 30 % test frames.
 
-    Args:
-        room: The room whose objects the camera avoids.
-        frames: Number of training and test frames together.
-        seed: Seed of both paths.
-
     Raises:
         InputError: The room has no free path.
     """
@@ -63,11 +58,7 @@ def sweep_shots(room: Room, frames: int, seed: int) -> list[Shot]:
 def changed_shots(room: Room, frames: int, train: SE3, seed: int) -> list[Shot]:
     """Plan the test frames of a moving camera in a changed room.
 
-    Args:
-        room: The room after the change.
-        frames: Number of test frames.
-        train: base_from_camera of the training frames before the change, shape (n,).
-        seed: Seed of the camera and arm paths.
+    `train` holds base_from_camera (n,) of the training frames before the change.
 
     Raises:
         InputError: The room has no free path.

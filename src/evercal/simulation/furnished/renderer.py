@@ -128,11 +128,8 @@ def _works(variant: str, library: str | None) -> bool:
 class Renderer:
     """Renders a set of meshes from any pose.
 
-    Args:
-        meshes: Meshes in the base frame. Meshes of one material are merged for speed; a mesh with
-            a `name` stays separate and can be moved.
-        exposure: Factor on radiance before encoding.
-        max_depth: Longest light path in segments; 4 allows two bounces.
+    Meshes of one material are merged for speed; a mesh with a `name` stays separate and can be
+    moved. The exposure is a factor on radiance.
     """
 
     def __init__(
@@ -176,14 +173,8 @@ class Renderer:
     ) -> np.ndarray:
         """Render one image.
 
-        Args:
-            camera: Pinhole with square pixels and no distortion.
-            base_from_camera: Camera pose, shape (), or poses during the exposure, shape (n,).
-            options: Samples, exposure and noise.
-            seed: Seed of the noise. One variant gives the same pixels for the same seed.
-
-        Returns:
-            sRGB image, uint8, shape (H, W, 3).
+        A batch of poses (n,) base_from_camera is a motion during the exposure. One variant gives
+        the same pixels for the same seed. Returns sRGB (H, W, 3) uint8.
 
         Raises:
             ValueError: The camera has distortion, or fx and fy differ.
@@ -267,12 +258,7 @@ class Renderer:
 def _denoised(light: np.ndarray, features: np.ndarray) -> np.ndarray:
     """Remove sampling noise; textures and edges stay.
 
-    Args:
-        light: Radiance, shape (H, W, 3).
-        features: Albedo and normal of the first surface, shape (H, W, 6).
-
-    Returns:
-        Radiance, shape (H, W, 3).
+    Radiance (H, W, 3), albedo and normal of the first surface (H, W, 6).
     """
     import mitsuba_oidn as oidn  # pyright: ignore[reportMissingImports]
 

@@ -125,10 +125,6 @@ class _Builder:
 def room(kind: str, seed: int) -> Room:
     """Compose a room. The same kind and seed give the same room.
 
-    Args:
-        kind: One of `KINDS`.
-        seed: A seed below 9000.
-
     Raises:
         ValueError: The kind is unknown or the seed is reserved.
     """

@@ -92,13 +92,7 @@ def box(
 ) -> Mesh:
     """A bevelled box on z = 0, centred at x = y = 0.
 
-    Args:
-        x: Length in metres.
-        y: Depth in metres.
-        z: Height in metres.
-        bevel_m: Radius of the edges.
-        bottom: Include the underside.
-        steps: Segments per bevel.
+    Its sides are x, y and z metres, and its edges are rounded in `steps` segments.
     """
     half = np.array([x, y, z]) / 2
     radius = min(bevel_m, 0.499 * min(x, y, z))
@@ -133,11 +127,9 @@ def box(
 def lathe(profile: Sequence[tuple[float, float]], segments: int = 28, smooth: int = 3) -> Mesh:
     """A body of revolution about z.
 
-    Args:
-        profile: (radius, height) pairs in metres, from the bottom of the outside over the rim to
-            the bottom of the inside. The outside is to the right of this direction.
-        segments: Number of segments around z.
-        smooth: Spline pieces per profile step; 1 keeps straight steps.
+    The profile holds (radius, height) pairs in metres, from the bottom of the outside over the rim
+    to the bottom of the inside. The outside is to the right of this direction. Each step is
+    `smooth` spline pieces; 1 keeps straight steps.
     """
     points = np.asarray(profile, float)
     if smooth > 1:
