@@ -14,8 +14,9 @@ from evercal.continual.learn_scene import LearnOptions
 from evercal.continual.presets import preset
 from evercal.errors import InputError
 from evercal.recordings import Recording, generic
-from evercal.simulation.box_room import box_room_scene
 from evercal.storage import write_manifest
+
+from ..box_world import box_room_scene
 
 
 @pytest.fixture

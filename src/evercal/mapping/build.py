@@ -33,7 +33,6 @@ from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import select_farthest, spread_poses
 from evercal.mapping.tracks import (
     KeyframeTracks,
-    TrackOptions,
     bundle_tracks,
     open_keyframe,
     refine_depths,
@@ -60,8 +59,6 @@ class MapOptions:
     """Number of keyframes."""
     size: WorkingSize = field(default_factory=WorkingSize)
     """Working sizes of images."""
-    tracks: TrackOptions = field(default_factory=TrackOptions)
-    """How landmarks are tracked."""
     bundle: BundleOptions = field(default_factory=BundleOptions)
     """Bundle adjustment."""
     check: PoseCheckOptions = field(default_factory=PoseCheckOptions)
@@ -219,8 +216,8 @@ def _open_keyframes(
     """Depths, landmarks and tracks of every keyframe."""
 
     def open_one(frame: int) -> KeyframeTracks:
-        keyframe = open_keyframe(prepared.frames, frame, options.tracks)
-        refine_depths(prepared.frames, keyframe, options.tracks)
+        keyframe = open_keyframe(prepared.frames, frame)
+        refine_depths(prepared.frames, keyframe)
         return keyframe
 
     keyframes = []
@@ -265,13 +262,13 @@ def _adjust(
     adjustment = None
     for number in range(options.rounds):
         on_progress("adjusting", number, options.rounds)
-        tracks = bundle_tracks(prepared, keyframes, options.tracks)
+        tracks = bundle_tracks(prepared, keyframes)
         problem = BundleAdjustment(prepared.stated, stated_cameras, velocity, options.bundle)
         adjustment = problem.solve(tracks)
         prepared.adjust(adjustment.poses, adjustment.camera)
         if not _moved(prepared.stated, stated_cameras[0], adjustment):
             break
-        again = partial(refine_depths, prepared, options=options.tracks, again=True)
+        again = partial(refine_depths, prepared, again=True)
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:
             list(pool.map(again, keyframes))
     on_progress("adjusting", options.rounds, options.rounds)

@@ -76,13 +76,9 @@ class Keyframes:
 
     def frames(self) -> list[Frame]:
         """The keyframes, decoded."""
-        frames = []
-        for i in range(len(self.images)):
-            image = np.repeat(self.grey(i)[..., None], 3, axis=-1)
-            frames.append(
-                Frame(f"memory-{i:05d}", image, self.cameras[i], self.base_from_camera[i])
-            )
-        return frames
+        images = [np.repeat(self.grey(i)[..., None], 3, axis=-1) for i in range(len(self))]
+        views = zip(images, self.cameras, self.base_from_camera, strict=True)
+        return [Frame(f"memory-{i:05d}", *view) for i, view in enumerate(views)]
 
     def to_tensors(self) -> dict[str, Tensor]:
         """Convert to named tensors.
@@ -101,16 +97,13 @@ class Keyframes:
         poses = np.concatenate(
             [self.base_from_camera.rotation_wxyz, self.base_from_camera.translation_m], -1
         )
-        return self._map_tensors() | {
+        tensors = {
             "images": torch.from_numpy(joined),
             "lengths": torch.tensor([len(image) for image in self.images]),
             "cameras": torch.from_numpy(cameras),
             "distortion": torch.tensor([len(c.distortion) for c in self.cameras]),
             "poses": torch.from_numpy(poses.reshape(-1, 7)),
         }
-
-    def _map_tensors(self) -> dict[str, Tensor]:
-        tensors: dict[str, Tensor] = {}
         if self.inverse_depth:
             tensors["inverse_depth"] = torch.cat(self.inverse_depth)
             tensors["cells"] = torch.tensor([len(depth) for depth in self.inverse_depth])

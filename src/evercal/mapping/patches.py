@@ -6,7 +6,7 @@ sampled. Patches have zero mean and unit deviation, so gain and offset of the im
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -54,8 +54,7 @@ def from_level(pixels: Array, level: int) -> Array:
     return resize_pixels(pixels, 2**level)
 
 
-@dataclass(frozen=True, eq=False)
-class Patches:
+class Patches(NamedTuple):
     """Templates of n patches in one level of a keyframe's pyramid."""
 
     intensity: Array
@@ -69,22 +68,12 @@ class Patches:
 
     def take(self, index: np.ndarray | slice) -> "Patches":
         """The patches of an index."""
-        return Patches(
-            self.intensity[index],
-            self.descent[index],
-            self.inverse_hessian[index],
-            self.rest[index],
-        )
+        return Patches(*(values[index] for values in self))
 
     @classmethod
     def joined(cls, parts: Sequence["Patches"]) -> "Patches":
         """Several sets of patches as one."""
-        return cls(
-            np.concatenate([part.intensity for part in parts]),
-            np.concatenate([part.descent for part in parts]),
-            np.concatenate([part.inverse_hessian for part in parts]),
-            np.concatenate([part.rest for part in parts]),
-        )
+        return cls(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def cut_patches(image: Array, pixels: Array) -> Patches:

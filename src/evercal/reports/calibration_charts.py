@@ -43,11 +43,9 @@ def ellipsoid_projections(covariance_mm2: ArrayLike, frame: str, share: float = 
         panel.fill(*outline.T, facecolor=COLOURS[5], alpha=0.35, edgecolor="none")
         panel.plot(*outline.T, color=COLOURS[0], linewidth=1.5)
         panel.plot(0, 0, "+", color=COLOURS[6], markersize=7)
-        panel.set_xlim(-reach, reach)
-        panel.set_ylim(-reach, reach)
-        panel.set_aspect("equal")
-        panel.set_xlabel(plain(f"{'xyz'[a]} of {frame[:24]} (mm)"), fontsize=9)
-        panel.set_ylabel(plain(f"{'xyz'[b]} of {frame[:24]} (mm)"), fontsize=9)
+        panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+        x, y = (plain(f"{'xyz'[axis]} of {frame[:24]} (mm)") for axis in (a, b))
+        panel.set(xlabel=x, ylabel=y)
         panel.locator_params(nbins=7)
         tidy(panel)
     return png_bytes(figure)
@@ -72,9 +70,8 @@ def error_terms(
         for y, value in zip(rows, values, strict=True):
             text = f"{value:.2f}" if unit == "mm" else f"{value:.3f}"
             panel.annotate(text, (value + 0.02 * largest, y), va="center", fontsize=8)
-        panel.set_xlim(0, 1.18 * largest)
-        panel.set_ylim(len(names) - 0.4, -0.6)
-        panel.set_xlabel(f"standard deviation per axis ({unit})", fontsize=9)
+        panel.set(xlim=(0, 1.18 * largest), ylim=(len(names) - 0.4, -0.6))
+        panel.set(xlabel=f"standard deviation per axis ({unit})")
         tidy(panel)
         panel.locator_params(axis="x", nbins=5)
         panel.grid(visible=False, axis="y")
@@ -108,8 +105,7 @@ def residual_bars(
         for x in numbers[np.nan_to_num(heights) > top]:
             text = f"cut, {heights[x - 1]:.3g}"
             panel.annotate(text, (x, top), va="bottom", ha="center", fontsize=7)
-        panel.set_ylim(0, 1.12 * top)
-        panel.set_ylabel(f"residual ({unit})", fontsize=9)
+        panel.set(ylim=(0, 1.12 * top), ylabel=f"residual ({unit})")
         tidy(panel)
         panel.grid(visible=False, axis="x")
     panels[1].set_xlabel("number of the image in the table", fontsize=9)

@@ -12,7 +12,6 @@ import numpy as np
 
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
-from evercal.recordings.frame import Frame, Recording
 from evercal.simulation.furnished.textures import dead_leaves, one_over_f
 
 NEAR_M = 0.05
@@ -218,25 +217,6 @@ def default_camera(width: int = 320, height: int = 240) -> Camera:
     """A pinhole with a 63 deg field of view, as in common indoor data sets."""
     focal = 525.0 / 640.0 * max(width, height)
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-
-
-def box_room_scene(seed: int, train: int, test: int, camera: Camera | None = None) -> Recording:
-    """Record a box room: one sweep of training frames and another of test frames.
-
-    It is called `box-room-SEED`, with images in memory.
-    """
-    room = BoxRoom(seed)
-    intrinsics = camera or default_camera()
-
-    def record(split: str, count: int, path_seed: int) -> tuple[Frame, ...]:
-        poses = room.path(count, path_seed)
-        return tuple(
-            Frame(f"{split}-{i:06d}", room.render(intrinsics, poses[i]), intrinsics, poses[i])
-            for i in range(count)
-        )
-
-    name = f"box-room-{seed}"
-    return Recording(name, record("train", train, 1), record("test", test, 2))
 
 
 def _draw(

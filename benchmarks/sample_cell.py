@@ -7,7 +7,7 @@
     DIR/bumped.jpg                     the fixed camera after a small bump
     DIR/truth.json                     true poses, noise and settings
 
-Render it with `python -m evercal.simulation.sample_cell DIR`.
+Render it with `python benchmarks/sample_cell.py DIR`.
 """
 
 import sys
