@@ -86,13 +86,8 @@ class BoxRoom:
         self, low: np.ndarray, size: np.ndarray, rng: np.random.Generator, inward: bool
     ) -> None:
         ex, ey, ez = np.diag(size)
-        faces = [
-            (low, ex, ez),
-            (low + ey + ex, -ex, ez),
-            (low + ex, ey, ez),
-            (low + ey, -ey, ez),
-            (low + ez, ex, ey),
-        ]
+        faces = [(low, ex, ez), (low + ey + ex, -ex, ez), (low + ex, ey, ez), (low + ey, -ey, ez)]
+        faces.append((low + ez, ex, ey))
         if inward:
             faces.append((low + ey, ex, -ey))
             faces = [(corner + u, -u, v) for corner, u, v in faces]
@@ -118,9 +113,7 @@ class BoxRoom:
             ValueError: The camera has distortion.
         """
         if camera.distortion:
-            raise ValueError(
-                "box rooms are rendered through an ideal pinhole: distortion must be ()"
-            )
+            raise ValueError("box rooms are rendered through an ideal pinhole, without distortion")
         image = np.zeros((camera.height, camera.width, 3), np.uint8)
         nearness = np.zeros((camera.height, camera.width), np.float32)  # 1 / depth
         camera_from_base = base_from_camera.inverse()
@@ -259,9 +252,7 @@ def _draw(
     if not visible.any():
         return
     # The pyramid level follows from texture pixels per image pixel over the visible area.
-    span = (
-        np.ptp(s[visible]) * np.ptp(t[visible]) * pyramid[0].shape[0] ** 2 / max(visible.sum(), 1)
-    )
+    span = np.ptp(s[visible]) * np.ptp(t[visible]) * pyramid[0].shape[0] ** 2 / visible.sum()
     level = int(np.clip(np.round(0.5 * np.log2(max(span, 1.0))), 0, len(pyramid) - 1))
     texture = pyramid[level]
     height, width = texture.shape[:2]

@@ -12,11 +12,9 @@ from evercal.simulation.furnished.furniture import Item
 from evercal.simulation.furnished.materials import Material
 from evercal.simulation.furnished.rooms import Room
 
-SMALL = frozenset(
-    (
-        "ball", "basket", "blocks", "books", "bottle", "bowl", "carton", "jar", "kettle", "lamp",
-        "mug", "plant", "plates", "pot", "radio", "vase",
-    )
+SMALL = (
+    "ball", "basket", "blocks", "books", "bottle", "bowl", "carton", "jar", "kettle", "lamp",
+    "mug", "plant", "plates", "pot", "radio", "vase",
 )  # fmt: skip
 """Kinds of objects that people pick up; all others are furniture or wall objects."""
 CHANGED_SHARE = 1 / 3
