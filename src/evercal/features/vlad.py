@@ -73,9 +73,8 @@ def vlad_for(encoder: Encoder, features: Sequence[Tensor] = ()) -> Vlad:
         centroids = shipped_centroids(encoder)
         if centroids is None and not features:
             raise InputError("the encoder has no VLAD centroids; learn a recording with it first")
-        _by_encoder[encoder] = _projected(
-            fit_centroids(features) if centroids is None else centroids
-        )
+        centroids = fit_centroids(features) if centroids is None else centroids
+        _by_encoder[encoder] = _projected(centroids)
     return _by_encoder[encoder]
 
 

@@ -7,9 +7,9 @@ pixel, as in OpenCV and ROS, so an image covers -0.5 .. width - 0.5 and its midd
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -194,15 +194,7 @@ class Camera:
 
     def to_dict(self) -> dict[str, object]:
         """Plain numbers for JSON."""
-        return {
-            "width": self.width,
-            "height": self.height,
-            "fx": self.fx,
-            "fy": self.fy,
-            "cx": self.cx,
-            "cy": self.cy,
-            "distortion": list(self.distortion),
-        }
+        return {**asdict(self), "distortion": list(self.distortion)}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, object]) -> Self:
@@ -211,21 +203,12 @@ class Camera:
         Raises:
             ValueError: A key is missing or its value is not a number.
         """
-        values: dict[str, float] = {}
-        for name in ("width", "height", "fx", "fy", "cx", "cy"):
-            values[name] = _number(data.get(name), name)
+        names = ("width", "height", "fx", "fy", "cx", "cy")
+        numbers: list[Any] = [_number(data.get(name), name) for name in names]
         distortion = data.get("distortion", ())
         if not isinstance(distortion, (list, tuple)):
             raise ValueError(f"camera 'distortion' is a list of numbers, got {distortion!r}")
-        return cls(
-            values["width"],  # pyright: ignore[reportArgumentType]  # checked when constructed
-            values["height"],  # pyright: ignore[reportArgumentType]
-            values["fx"],
-            values["fy"],
-            values["cx"],
-            values["cy"],
-            tuple(_number(value, "distortion") for value in distortion),
-        )
+        return cls(*numbers, tuple(_number(value, "distortion") for value in distortion))
 
     def _distort(self, plane: Array) -> Array:
         """(..., 2) ideal to distorted points of the plane z = 1."""
@@ -233,13 +216,9 @@ class Camera:
         x, y = plane[..., 0], plane[..., 1]
         r2 = x * x + y * y
         radial, _ = self._radial(r2)
-        return np.stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            ],
-            axis=-1,
-        )
+        u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        return np.stack([u, v], axis=-1)
 
     def _distortion_slope(self, plane: Array) -> Array:
         """(..., 2, 2) derivatives of distorted by ideal points (..., 2) of the plane z = 1."""
@@ -272,9 +251,8 @@ class Camera:
                 break
             (a, b), (_, d) = np.moveaxis(self._distortion_slope(plane), (-2, -1), (0, 1))
             u, v = off[..., 0], off[..., 1]
-            plane = (
-                plane - np.stack([d * u - b * v, a * v - b * u], -1) / (a * d - b * b)[..., None]
-            )
+            step = np.stack([d * u - b * v, a * v - b * u], -1) / (a * d - b * b)[..., None]
+            plane = plane - step
         return np.where(lost[..., None], np.nan, plane)
 
 

@@ -90,12 +90,8 @@ class UncertainPose:
 
         It has a chi-squared distribution with six degrees of freedom if the covariance is right.
         """
-        error = np.concatenate(
-            [
-                truth.translation_m - self.pose.translation_m,
-                (self.pose.inverse() @ truth).log()[3:],
-            ]
-        )
+        shift = truth.translation_m - self.pose.translation_m
+        error = np.concatenate([shift, (self.pose.inverse() @ truth).log()[3:]])
         # A pose from few points can have a singular covariance; its null space is left out.
         return float(error @ np.linalg.pinv(self.covariance) @ error)
 

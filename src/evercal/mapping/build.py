@@ -23,7 +23,6 @@ from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.map_frame import MapFrame, fit_correction
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.pose_check import (
-    PoseCheckOptions,
     contradicting_frames,
     depth_scale,
     matched_pairs,
@@ -61,8 +60,6 @@ class MapOptions:
     """Working sizes of images."""
     bundle: BundleOptions = field(default_factory=BundleOptions)
     """Bundle adjustment."""
-    check: PoseCheckOptions = field(default_factory=PoseCheckOptions)
-    """When a stated pose contradicts the images."""
     support_frames: int = 250
     """Frames that are adjusted beside the keyframes, spread by pose. The dense normal equations
     have six rows for each; more frames add time and no precision."""
@@ -191,9 +188,9 @@ def _prepare(
     for i in range(len(prepared)):
         features.append(prepared.features(i))
         on_progress("encoding", i + 1, len(prepared))
-    pairs = matched_pairs(prepared, vlad_for(encoder, features), options.check)
+    pairs = matched_pairs(prepared, vlad_for(encoder, features))
     prepared.depth_scale = depth_scale(prepared, pairs)
-    bad = contradicting_frames(prepared, pairs, options.check)
+    bad = contradicting_frames(prepared, pairs)
     wrong = tuple(prepared.frames[i].name for i in bad)
     good = sorted(set(range(len(support))) - set(bad.tolist()))
     if len(bad):

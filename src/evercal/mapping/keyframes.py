@@ -94,9 +94,8 @@ class Keyframes:
         for i, c in enumerate(self.cameras):
             cameras[i, :6] = c.width, c.height, c.fx, c.fy, c.cx, c.cy
             cameras[i, 6 : 6 + len(c.distortion)] = c.distortion
-        poses = np.concatenate(
-            [self.base_from_camera.rotation_wxyz, self.base_from_camera.translation_m], -1
-        )
+        pose = self.base_from_camera
+        poses = np.concatenate([pose.rotation_wxyz, pose.translation_m], -1)
         tensors = {
             "images": torch.from_numpy(joined),
             "lengths": torch.tensor([len(image) for image in self.images]),
@@ -124,20 +123,15 @@ class Keyframes:
         images = tuple(
             joined[end - n : end] for end, n in zip(ends, tensors["lengths"].tolist(), strict=True)
         )
-        cameras = []
-        counts = tensors["distortion"].tolist()
-        for row, count in zip(tensors["cameras"].tolist(), counts, strict=True):
-            width, height, *rest = row
-            distortion = tuple(rest[4 : 4 + count])
-            fx, fy, cx, cy = rest[:4]
-            cameras.append(Camera(int(width), int(height), fx, fy, cx, cy, distortion))
+        rows = zip(tensors["cameras"].tolist(), tensors["distortion"].tolist(), strict=True)
+        cameras = tuple(Camera(*row[:6], tuple(row[6 : 6 + count])) for row, count in rows)
         poses = tensors["poses"].numpy()
         depths: tuple[Tensor, ...] = ()
         if "cells" in tensors:
             depths = tensors["inverse_depth"].split(tensors["cells"].tolist())
         return cls(
             images=images,
-            cameras=tuple(cameras),
+            cameras=cameras,
             base_from_camera=SE3(poses[:, :4], poses[:, 4:]),
             inverse_depth=depths,
             landmarks=_landmarks_of(tensors) if "landmark_counts" in tensors else (),

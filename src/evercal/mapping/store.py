@@ -34,6 +34,11 @@ STRATEGY = "evercal"
 """Name of the map among the strategies of `evercal learn`."""
 SCENE, KEYFRAMES, CORRECTION = "scene.json", "keyframes.safetensors", "correction.safetensors"
 
+_FIELDS = (
+    "name", "camera", "adjusted_camera", "train_frames", "min_support", "covariance_scale",
+)  # fmt: skip
+"""Fields of `SceneMap` in scene.json, beside `frame`."""
+
 
 class MapStore(StageStore):
     """A map on disk and in memory.
@@ -173,19 +178,11 @@ def write_encoder(root: Path, encoder: Encoder, centroids: bool = True) -> tuple
 
 def write_scene(folder: Path, scene: SceneMap) -> None:
     """Write everything of a scene but its keyframes into its folder."""
-    frame = scene.frame
-    content: dict[str, object] = {
-        "name": scene.name,
-        "camera": scene.camera.to_dict(),
-        "adjusted_camera": scene.adjusted_camera.to_dict(),
-        "train_frames": scene.train_frames,
-        "min_support": scene.min_support,
-        "covariance_scale": scene.covariance_scale,
-        "frame": frame_to_dict(frame),
-    }
-    write_json(folder / SCENE, content)
-    if frame.correction is not None:
-        save_tensors(folder / CORRECTION, correction_tensors(frame.correction))
+    values = {name: getattr(scene, name) for name in _FIELDS}
+    content = {k: v.to_dict() if isinstance(v, Camera) else v for k, v in values.items()}
+    write_json(folder / SCENE, {**content, "frame": frame_to_dict(scene.frame)})
+    if scene.frame.correction is not None:
+        save_tensors(folder / CORRECTION, correction_tensors(scene.frame.correction))
 
 
 def read_scene(folder: Path) -> SceneMap:
@@ -194,15 +191,11 @@ def read_scene(folder: Path) -> SceneMap:
     correction = None
     if (folder / CORRECTION).exists():
         correction = correction_of(load_tensors(folder / CORRECTION))
+    values = {name: content[name] for name in _FIELDS}
     return SceneMap(
-        name=content["name"],
-        camera=Camera.from_dict(content["camera"]),
-        adjusted_camera=Camera.from_dict(content["adjusted_camera"]),
         keyframes=Keyframes.from_tensors(load_tensors(folder / KEYFRAMES)),
         frame=frame_of(content["frame"], correction),
-        train_frames=content["train_frames"],
-        min_support=content["min_support"],
-        covariance_scale=content["covariance_scale"],
+        **{k: Camera.from_dict(v) if isinstance(v, dict) else v for k, v in values.items()},
     )
 
 
