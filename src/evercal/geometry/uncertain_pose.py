@@ -81,10 +81,6 @@ class UncertainPose:
         slope[3:, 3:] = -rotation
         return UncertainPose(inverse, slope @ self.covariance @ slope.T)
 
-    def widened(self, covariance: ArrayLike) -> "UncertainPose":
-        """The same pose with an independent error (6, 6) added."""
-        return UncertainPose(self.pose, self.covariance + np.asarray(covariance))
-
     def squared_mahalanobis(self, truth: SE3) -> float:
         """Squared distance of the true pose in units of the covariance.
 

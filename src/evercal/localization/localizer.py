@@ -38,22 +38,18 @@ class LearnedScene(Protocol):
     @property
     def name(self) -> str:
         """Name of the scene."""
-        ...
 
     @property
     def camera(self) -> Camera:
         """Intrinsics that its recording states."""
-        ...
 
     @property
     def adjusted_camera(self) -> Camera:
         """The same camera after learning."""
-        ...
 
     @property
     def frame(self) -> MapFrame:
         """Relation of its scene points to the base frame."""
-        ...
 
 
 class LearnedContents(Protocol):
@@ -62,12 +58,10 @@ class LearnedContents(Protocol):
     @property
     def short_side(self) -> int:
         """Shorter image side that the encoder works on, pixels."""
-        ...
 
     @property
     def scenes(self) -> Sequence[LearnedScene]:
         """In order of learning."""
-        ...
 
 
 class SceneLocalizer(Protocol):
@@ -76,15 +70,12 @@ class SceneLocalizer(Protocol):
     @property
     def scenes(self) -> tuple[str, ...]:
         """Names of the scenes, in order of learning."""
-        ...
 
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         """Estimate the camera pose of one image."""
-        ...
 
     def camera_for(self, stated: Camera) -> Camera | None:
         """The `camera` argument for an image with these stated intrinsics."""
-        ...
 
 
 class LearnedLocalizer(SceneLocalizer, Protocol):
@@ -93,7 +84,6 @@ class LearnedLocalizer(SceneLocalizer, Protocol):
     @property
     def contents(self) -> LearnedContents:
         """The scenes."""
-        ...
 
 
 class Localizer:

@@ -223,7 +223,8 @@ def cushion(x: float, y: float, z: float, cells: int = 12) -> Mesh:
 
 def _normals(points: np.ndarray) -> np.ndarray:
     """Upward unit normals of a height field (rows, columns, 3)."""
-    normal = np.cross(*np.gradient(points, axis=(0, 1)))
+    du, dv = np.gradient(points, axis=(0, 1))
+    normal = np.cross(du, dv)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = np.where(length > 1e-12, normal / np.maximum(length, 1e-12), (0.0, 0.0, 1.0))
     return normal * np.where(normal[..., 2:].sum() < 0, -1.0, 1.0)
@@ -254,7 +255,8 @@ def drape(width: float, height: float, fold_m: float, folds: int, seed: int = 0)
     grid_x, grid_z = np.meshgrid(x, z, indexing="ij")
     swing = fold_m * np.sin(phase)[:, None] * (1 - 0.35 * (grid_z / height))
     p = np.stack([grid_x, -swing, grid_z], -1)
-    normal = np.cross(*np.gradient(p, axis=(0, 1)))
+    du, dv = np.gradient(p, axis=(0, 1))
+    normal = np.cross(du, dv)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     return _both_sides(p, normal, np.stack([grid_x * 1.4, grid_z], -1))
 
