@@ -204,11 +204,11 @@ class Camera:
             ValueError: A key is missing or its value is not a number.
         """
         names = ("width", "height", "fx", "fy", "cx", "cy")
-        numbers: list[Any] = [_number(data.get(name), name) for name in names]
+        numbers: dict[str, Any] = {name: _number(data.get(name), name) for name in names}
         distortion = data.get("distortion", ())
         if not isinstance(distortion, (list, tuple)):
             raise ValueError(f"camera 'distortion' is a list of numbers, got {distortion!r}")
-        return cls(*numbers, tuple(_number(value, "distortion") for value in distortion))
+        return cls(**numbers, distortion=tuple(_number(k, "distortion") for k in distortion))
 
     def _distort(self, plane: Array) -> Array:
         """(..., 2) ideal to distorted points of the plane z = 1."""

@@ -123,15 +123,14 @@ class Keyframes:
         images = tuple(
             joined[end - n : end] for end, n in zip(ends, tensors["lengths"].tolist(), strict=True)
         )
-        rows = zip(tensors["cameras"].tolist(), tensors["distortion"].tolist(), strict=True)
-        cameras = tuple(Camera(*row[:6], tuple(row[6 : 6 + count])) for row, count in rows)
+        cameras = zip(tensors["cameras"].tolist(), tensors["distortion"].tolist(), strict=True)
         poses = tensors["poses"].numpy()
         depths: tuple[Tensor, ...] = ()
         if "cells" in tensors:
             depths = tensors["inverse_depth"].split(tensors["cells"].tolist())
         return cls(
             images=images,
-            cameras=cameras,
+            cameras=tuple(Camera(*row[:6], distortion=row[6 : 6 + k]) for row, k in cameras),
             base_from_camera=SE3(poses[:, :4], poses[:, 4:]),
             inverse_depth=depths,
             landmarks=_landmarks_of(tensors) if "landmark_counts" in tensors else (),

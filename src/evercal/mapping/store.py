@@ -11,7 +11,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -191,11 +191,13 @@ def read_scene(folder: Path) -> SceneMap:
     correction = None
     if (folder / CORRECTION).exists():
         correction = correction_of(load_tensors(folder / CORRECTION))
-    values = {name: content[name] for name in _FIELDS}
+    values: dict[str, Any] = {name: content[name] for name in _FIELDS}
+    for name in ("camera", "adjusted_camera"):
+        values[name] = Camera.from_dict(values[name])
     return SceneMap(
         keyframes=Keyframes.from_tensors(load_tensors(folder / KEYFRAMES)),
         frame=frame_of(content["frame"], correction),
-        **{k: Camera.from_dict(v) if isinstance(v, dict) else v for k, v in values.items()},
+        **values,
     )
 
 

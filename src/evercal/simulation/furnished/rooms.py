@@ -234,7 +234,7 @@ def _fill_up(build: _Builder) -> None:
         for _ in range(20):
             spot = rng.uniform((0.25, 0.25), build.size[:2] - 0.25)
             by_wall = np.minimum(spot, build.size[:2] - spot).min() < 0.9
-            if by_wall and build.add(thing.placed(*spot.tolist(), 0.0)):
+            if by_wall and build.add(thing.placed(float(spot[0]), float(spot[1]), 0.0)):
                 break
 
 
