@@ -16,8 +16,8 @@ from evercal.continual.networks.loss import LossOptions, reprojection_loss
 from evercal.features.encoder import LocalEncoder
 from evercal.features.views import ViewOptions
 from evercal.geometry import SE3
-from evercal.simulation.box_room import box_room_scene
 
+from ...box_world import box_room_scene
 from ...one_device import META, OneDevice, tensors_stay_on_their_device
 
 SHAPES = [
