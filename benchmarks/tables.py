@@ -97,6 +97,11 @@ def _runs(sources: Sequence[Published]) -> list[Run]:
     return runs_of([result for source in sources for result in source.results()], strategies)
 
 
+def _bold(row: Sequence[str]) -> list[str]:
+    """Emphasize the row that matters."""
+    return [f"**{cell}**" for cell in row]
+
+
 def _bench(rows_of: Callable[[Sequence[Run]], TableRows]) -> Callable[..., str]:
     """Return a table of strategies; strategies with one run form a second table."""
 
@@ -161,7 +166,7 @@ def _memory(sources: Sequence[Published], _: str) -> str:
 def _accuracy(sources: Sequence[Published], _: str) -> str:
     """Tabulate groups of rooms: shares of all frames, means of the rooms' medians."""
     titles = ["5 cm/5 deg", "2/2", "1/1", "5 mm/0.5 deg"]
-    header = ["scenes (memory 10 %)", "frames", *titles, "median", "wrong scene", "refused"]
+    header = ["scenes (memory 10 %)", *titles, "median", "refused, wrong scene"]
     table = [[*header, "in 95 % ellipsoid"]]
     for source in sources:
         rows = _frame(source).set_index("scene")
@@ -169,10 +174,10 @@ def _accuracy(sources: Sequence[Published], _: str) -> str:
             group = rows.loc[list(names)]
             frames = group["frames"]
             shares = [_share(np.average(group[bound], weights=frames)) for bound in BOUNDS]
-            counts = [f"{group[key].sum():.0f}" for key in ("wrong_scene", "refused")]
-            cells = [f"{frames.sum():.0f}", *shares, _median(group), *counts, _inside(group)]
-            table.append([title, *cells])
-    return markdown(table)
+            refused, wrong = (group[key].sum() for key in ("refused", "wrong_scene"))
+            counts = f"{refused:.0f}, {wrong:.0f} of {frames.sum():.0f}"
+            table.append([title, *shares, _median(group), counts, _inside(group)])
+    return markdown([table[0], _bold(table[1]), *table[2:]])
 
 
 def _degraded(sources: Sequence[Published], _: str) -> str:
@@ -203,7 +208,7 @@ def _fixed(sources: Sequence[Published], _: str) -> str:
     for title, prefix in (("error", "error"), (bump, "bump_error")):
         cells = [f"{row[f'{prefix}_mm']:.2f} mm, {row[f'{prefix}_deg']:.3f} deg" for row in rows]
         table.append([title, *cells])
-    return markdown(table)
+    return markdown([table[0], _bold(table[1]), *table[2:]])
 
 
 POSE_ERRORS = {
@@ -333,7 +338,7 @@ KINDS: dict[str, Callable[[Sequence[Published], str], str]] = {
     "ablation": _ablation,
     "memory": _memory,
     "accuracy": _accuracy,
-    "spoiled": _degraded,
+    "degraded": _degraded,
     "fixed": _fixed,
     "badposes": _bad_poses,
     "trials": _trials,
