@@ -279,7 +279,8 @@ def scene_rows(runs: Sequence[Run]) -> TableRows:
     ]
     frame = pandas.DataFrame(cells, columns=["strategy", "scene", "learned", "end"])
     means = frame.groupby(["strategy", "scene"], sort=False).mean()
-    text = means["learned"].map(number) + " -> " + means["end"].map(number)
+    ends = zip(means["learned"], means["end"], strict=True)
+    text = pandas.Series([f"{number(a)} -> {number(b)}" for a, b in ends], index=means.index)
     by_scene = text.unstack(sort=False)[sorted(runs[0].scenes)].reset_index()
     return [list(by_scene.columns), *by_scene.to_numpy().tolist()]
 
