@@ -7,7 +7,6 @@ import tyro
 
 VERBS = {
     "maps": "accuracy of maps: degraded images, fixed cameras, wrong poses, sequences of scenes",
-    "real": "accuracy of each real scene alone",
     "calibration": "cameras calibrated from images, compared with the simulator's truth",
     "handeye": "pose pairs: errors, ellipsoids, outliers, scale, time",
     "many-keyframes": "localization among thousands of keyframes of other rooms",
@@ -16,7 +15,6 @@ VERBS = {
     "paper": "the first steps of preset paper",
     "trainer": "time of a training step",
     "speed": "time of localization and SARS",
-    "rooms": "views of the simulator's rooms, and rendering time",
     "intervals": "coverage of confidence intervals",
     "publish": "write results to results/NAME.jsonl",
     "tables": "generate the tables of the docs from results/",

@@ -21,22 +21,17 @@ Row = dict[str, str | float]
 """A flat row of a measurement."""
 
 
-def accuracies(results: Sequence[FrameResult]) -> dict[str, float]:
-    """Return the per cent of correct frames under each of `BOUNDS`."""
-    flags = {name: np.concatenate([*correct(results, b).values()]) for name, b in BOUNDS.items()}
-    return {name: 100 * float(of.mean()) for name, of in flags.items()}
-
-
 def accuracy_row(name: str, results: Sequence[FrameResult]) -> Row:
     """Summarize results of frames: accuracy, medians, refusals, ellipsoids, time.
 
     The share inside the 95 % ellipsoids is over all poses in the right scene, including poses with
     large errors.
     """
+    flags = {key: np.concatenate([*correct(results, b).values()]) for key, b in BOUNDS.items()}
     return {
         "scene": name,
         "frames": len(results),
-        **accuracies(results),
+        **{bound: 100 * float(of.mean()) for bound, of in flags.items()},
         "median_mm": 1000 * float(np.median([r.translation_error_m for r in results])),
         "median_deg": float(np.rad2deg(np.median([r.rotation_error_rad for r in results]))),
         "wrong_scene": sum(r.wrong_scene for r in results),

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import Rotation
 from tabulate import tabulate
 from tqdm import tqdm
@@ -18,7 +19,7 @@ from evercal.calibration.calibration import Calibration
 from evercal.calibration.drift import check
 from evercal.calibration.from_images import Images, calibrate
 from evercal.errors import InputError
-from evercal.evaluation.metrics import share_inside
+from evercal.evaluation.metrics import CHI2_6
 from evercal.geometry import SE3, UncertainPose, pose_distance
 from evercal.localization.localizer import Localizer
 from evercal.map import Map
@@ -189,28 +190,11 @@ def _error(estimate: SE3, covariance: np.ndarray, truth: SE3) -> Row:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """Summarize trials, a line per kind of bump or per number of images."""
-    import pandas
-
-    frame, lines = pandas.DataFrame(list(rows)), []
+    """Summarize trials: the share reported as moved, or errors and the share inside ellipsoids."""
+    frame = pd.DataFrame(list(rows))
     if "kind" in frame:
-        for kind, moved in frame.groupby("kind", sort=False)["moved"]:
-            lines.append(f"{kind}: moved in {100 * moved.mean():.1f} % of {len(moved)} trials")
-        return "\n".join(lines)
-    if "images" in frame:
-        counts = frame.groupby("images", sort=False)
-        lines += [_errors(f"camera, {count} images", group, "") for count, group in counts]
-    else:
-        lines.append(_errors("camera", frame, ""))
-    if "fixed_mm" in frame:
-        lines.append(_errors("fixed camera in that map", frame, "fixed_"))
-    return "\n".join(lines)
-
-
-def _errors(title: str, frame, prefix: str) -> str:
-    mm, deg = frame[f"{prefix}mm"], frame[f"{prefix}deg"]
-    inside = share_inside(frame[f"{prefix}squared_mahalanobis"])
-    return (
-        f"{title}: {len(mm)} trials, median {mm.median():.2f} mm and {deg.median():.3f} deg, worst"
-        f" {mm.max():.2f} mm and {deg.max():.3f} deg, {inside:.1f} % inside the 95 % ellipsoid"
-    )
+        return frame.groupby("kind", sort=False)["moved"].agg(["mean", "size"]).to_string()
+    groups = frame.groupby("images" if "images" in frame else lambda _: "wrist", sort=False)
+    errors = groups[list(frame.filter(regex="^(fixed_)?(mm|deg)$"))].agg(["median", "max"])
+    inside = groups[list(frame.filter(like="mahalanobis"))].agg(lambda of: (of < CHI2_6).mean())
+    return f"{errors.to_string()}\n\nshare inside the 95 % ellipsoid\n{inside.to_string()}"

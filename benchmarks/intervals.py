@@ -9,7 +9,7 @@ from scipy.stats import bootstrap, norm
 from tabulate import tabulate
 from tqdm import tqdm
 
-from evercal.continual.benchmark.statistics import blocks, paired_difference
+from evercal.continual.benchmark.statistics import blocks, mean_interval
 
 Scenes = list[np.ndarray]
 """Correctness (seeds, frames) of each scene."""
@@ -92,10 +92,10 @@ def bootstrap_of_runs(method: str) -> Method:
 
 
 def students(a: Scenes, b: Scenes, lengths: Lengths) -> tuple[float, float]:
-    """Return the interval of `paired_difference`, over whole runs or blocks of a single run."""
+    """Return the interval of `mean_interval`, over whole runs or blocks of a single run."""
     runs = np.repeat(np.arange(len(lengths)), lengths)
     labels = blocks(lengths[0]) if len(lengths) == 1 else runs
-    interval = paired_difference(a, b, [labels] * len(a))
+    interval = mean_interval([x - y for x, y in zip(a, b, strict=True)], [labels] * len(a))
     return interval.low, interval.high
 
 

@@ -17,17 +17,16 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from tabulate import tabulate
 from tqdm import tqdm
 from tyro.conf import Positional
 
-from benchmarks.accuracy import BOUNDS, accuracies
+from benchmarks.accuracy import Row, accuracy_row
 from benchmarks.peer_features import DETECTORS, Detector, FeatureOptions
 from benchmarks.peer_map import GlobalDescriber, PeerLocalizer, QueryOptions, build, describe
 from benchmarks.peer_triangulation import TriangulationOptions
 from evercal.errors import InputError
 from evercal.evaluation import evaluate
-from evercal.evaluation.metrics import FrameResult
-from evercal.evaluation.tables import table
 from evercal.localization.localizer import SceneLocalizer
 from evercal.map import Map
 from evercal.mapping.selection import SarsOptions, select_sars
@@ -75,32 +74,6 @@ class Entry:
     """Training frames in its map."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """Results of one method on one scene."""
-
-    method: str
-    """Name and share of the frames in its map."""
-    frames: int
-    """Test frames."""
-    accuracy: dict[str, float]
-    """Per cent, by the names of `BOUNDS`."""
-    median_translation_cm: float
-    """Median over all frames; frames without a pose count as infinite."""
-    median_rotation_deg: float
-    """Median over all frames; frames without a pose count as infinite."""
-    without_pose: int
-    """Test frames without a pose."""
-    ms_per_image: float
-    """Median milliseconds per image, one at a time, decoding included."""
-    build_seconds: float
-    """See `Entry`."""
-    bytes: int
-    """See `Entry`."""
-    frames_kept: int
-    """See `Entry`."""
-
-
 def run(
     scenes: Positional[tuple[Path, ...]],
     methods: tuple[Method, ...] = ("evercal", "sift", "xfeat"),
@@ -133,11 +106,11 @@ def run(
             if json is not None:  # after every row, since the next one may take an hour
                 _write(json, options, limit, rows)
         print(f"\n{scene.name}: {len(scene.train)} training, {len(scene.test)} test frames\n")
-        print(row_table(rows[scene.name]))
+        print(tabulate(rows[scene.name], "keys", floatfmt=".2f"))
 
 
 def _write(path: Path, options: PeerOptions, limit: int | None, rows: dict[str, list[Row]]) -> None:
-    scenes = {name: [to_plain(row) for row in of] for name, of in rows.items()}
+    scenes = {name: [_plain(row) for row in of] for name, of in rows.items()}
     record = {"options": asdict(options), "limit": limit, "scenes": scenes}
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json_format.dumps(record, indent=2) + "\n")
@@ -201,27 +174,6 @@ def peer_entries(
         yield Entry(title, localizer, built.seconds, built.bytes, len(kept))
 
 
-def row_table(rows: Sequence[Row]) -> str:
-    """Format rows for the terminal."""
-    bounds = [f"{name} %" for name in BOUNDS]
-    sizes = ["no pose", "ms", "build s", "MB", "frames kept"]
-    cells = [
-        [
-            row.method,
-            *[f"{share:.1f}" for share in row.accuracy.values()],
-            f"{row.median_translation_cm:.2f}",
-            f"{row.median_rotation_deg:.3f}",
-            str(row.without_pose),
-            f"{row.ms_per_image:.0f}",
-            f"{row.build_seconds:.0f}",
-            f"{row.bytes / 1e6:.2f}",
-            str(row.frames_kept),
-        ]
-        for row in rows
-    ]
-    return table(["method", *bounds, "median cm", "median deg", *sizes], cells, "terminal")
-
-
 def _evaluated(entry: Entry, scene: Recording) -> Row:
     title, total = f"{scene.name}: {entry.name}", len(posed_frames(scene.test))
     with tqdm(total=total, desc=title, leave=False, mininterval=0.5) as bar:
@@ -230,25 +182,14 @@ def _evaluated(entry: Entry, scene: Recording) -> Row:
             bar.update()
 
         results = evaluate(entry.localizer, {scene.name: scene}, on_frame=advance)
-    return _scored(entry, results)
-
-
-def _scored(entry: Entry, results: list[FrameResult]) -> Row:
-    metres = np.array([result.translation_error_m for result in results])
-    radians = np.array([result.rotation_error_rad for result in results])
-    middle = len(results) // 2  # the upper median: the mean of two may include infinity
-    return Row(
-        method=entry.name,
-        frames=len(results),
-        accuracy=accuracies(results),
-        median_translation_cm=100.0 * float(np.sort(metres)[middle]),
-        median_rotation_deg=math.degrees(np.sort(radians)[middle]),
-        without_pose=int(np.isinf(metres).sum()),
-        ms_per_image=float(np.median([result.milliseconds for result in results])),
-        build_seconds=entry.build_seconds,
-        bytes=entry.bytes,
-        frames_kept=entry.frames_kept,
-    )
+    row = accuracy_row(entry.name, results)
+    return {
+        "method": row.pop("scene"),
+        **row,
+        "build_seconds": entry.build_seconds,
+        "bytes": entry.bytes,
+        "frames_kept": entry.frames_kept,
+    }
 
 
 def _titled(name: str, options: PeerOptions) -> str:
@@ -284,9 +225,9 @@ def _load(path: Path, limit: int | None) -> Recording:
     return replace(scene, test=test)
 
 
-def to_plain(row: Row) -> dict[str, object]:
-    """Convert to values for JSON; infinity becomes None."""
+def _plain(row: Row) -> dict[str, object]:
+    """Replace infinity and NaN by None, for JSON."""
     return {
         key: None if isinstance(value, float) and not math.isfinite(value) else value
-        for key, value in asdict(row).items()
+        for key, value in row.items()
     }

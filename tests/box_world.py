@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from evercal.geometry import SE3, Camera
-from evercal.recordings.frame import Frame
-from evercal.simulation.box_room import BoxRoom
+from evercal.recordings.frame import Frame, Recording
+from evercal.simulation.box_room import BoxRoom, default_camera
 
 Shoot = Callable[[Camera, SE3], Frame]
 
@@ -27,6 +27,22 @@ def render_distorted(room: BoxRoom, camera: Camera, pose: SE3) -> np.ndarray:
     image = cv2.GaussianBlur(image, (0, 0), 0.6)
     where = ideal.project(rays).astype(np.float32)
     return cv2.remap(image, where, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
+
+
+def box_room_scene(seed: int, train: int, test: int, camera: Camera | None = None) -> Recording:
+    """A recording `box-room-SEED`: one sweep of training frames and another of test frames."""
+    room = BoxRoom(seed)
+    intrinsics = camera or default_camera()
+
+    def record(split: str, count: int, path_seed: int) -> tuple[Frame, ...]:
+        poses = room.path(count, path_seed)
+        return tuple(
+            Frame(f"{split}-{i:06d}", room.render(intrinsics, poses[i]), intrinsics, poses[i])
+            for i in range(count)
+        )
+
+    name = f"box-room-{seed}"
+    return Recording(name, record("train", train, 1), record("test", test, 2))
 
 
 @pytest.fixture(scope="session")

@@ -22,6 +22,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 if TYPE_CHECKING:
     import torch
 
+    from evercal.continual.stage import StageOptions
     from evercal.mapping.build import BuiltMap
     from evercal.mapping.scene_map import MapContents
     from evercal.recordings.frame import Recording
@@ -151,3 +152,20 @@ def tree() -> Callable[[Path], dict[str, str]]:
         }
 
     return checksums
+
+
+@pytest.fixture(scope="session")
+def quick() -> StageOptions:
+    """A stage of eight steps for `rooms`."""
+    from evercal.continual.networks.buffer import EncodePlan
+    from evercal.continual.networks.head import HeadOptions
+    from evercal.continual.networks.trainer import FitOptions
+    from evercal.continual.stage import StageOptions
+    from evercal.features.views import ViewOptions
+
+    return StageOptions(
+        head=HeadOptions(width=16, centres_per_scene=3),
+        fit=FitOptions(iterations=8, batch=64, replay_batch=32),
+        encode=EncodePlan(views_per_frame=2, cells=24, view=ViewOptions(short_side=48)),
+        replay_views_per_frame=2,
+    )

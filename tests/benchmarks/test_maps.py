@@ -41,7 +41,7 @@ def test_sequence_reports_each_scene_and_their_mean(sequence: Path, tmp_path: Pa
     # Each scene counts its own bytes.
     assert 0.5 < one["bytes"] / two["bytes"] < 2
     settings = json.loads(source.read_text())["settings"]
-    assert settings["stage"]["memory_share"] == 0.25
+    assert settings["map"]["memory"]["share"] == 0.25
     assert settings["localize"]["align"] is True
     assert len(read_published(publish(source, "sequence", {}, out=tmp_path)).rows) == 3
 

@@ -46,7 +46,7 @@ def test_sigmas_are_root_mean_squares_over_the_axes() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": "x"}, "no calibration"),
+        ({"format": "x"}, "'format' is not"),
         ({"version": 2}, "version 2"),
         ({"mount": "eye"}, "'mount'"),
         ({"translation_m": [1, 2, 3]}, "different poses"),

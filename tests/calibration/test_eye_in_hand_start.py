@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.eye_in_hand_start import (
-    HandEyeOptions,
     PairMotion,
     refuse_poor_motion,
     rotation_spread_deg,
@@ -14,7 +13,6 @@ from evercal.calibration.eye_in_hand_start import (
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 
-OPTIONS = HandEyeOptions()
 TRUTH = SE3.exp([0.05, -0.08, 0.12, 0.4, -1.2, 2.0])
 
 
@@ -48,7 +46,7 @@ def motions(poses: SE3, truth: SE3, noise_rad: float = 0.0, wrong: int = 0) -> l
 @pytest.mark.parametrize("seed", range(5))
 def test_exact_motions_give_the_exact_transform(seed: int) -> None:
     poses = grippers(12, seed)
-    start = solve_motions(poses, motions(poses, TRUTH), OPTIONS)
+    start = solve_motions(poses, motions(poses, TRUTH))
     metres, radians = pose_distance(start.gripper_from_camera, TRUTH)
     assert metres < 1e-6
     assert radians < 1e-6
@@ -58,7 +56,7 @@ def test_exact_motions_give_the_exact_transform(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_wrong_pairs_are_rejected(seed: int) -> None:
     poses = grippers(30, seed)
-    start = solve_motions(poses, motions(poses, TRUTH, 0.005, wrong=20), OPTIONS)
+    start = solve_motions(poses, motions(poses, TRUTH, 0.005, wrong=20))
     metres, radians = pose_distance(start.gripper_from_camera, TRUTH)
     assert metres < 0.01
     assert np.rad2deg(radians) < 0.3
@@ -68,13 +66,13 @@ def test_wrong_pairs_are_rejected(seed: int) -> None:
 def test_inverted_poses_are_refused() -> None:
     poses = grippers(20, 0)
     with pytest.raises(InputError, match=r"agree in only .*not the inverse"):
-        solve_motions(poses.inverse(), motions(poses, TRUTH), OPTIONS)
+        solve_motions(poses.inverse(), motions(poses, TRUTH))
 
 
 def test_too_few_pairs_are_refused() -> None:
     poses = grippers(4, 0)
     with pytest.raises(InputError, match="only 6 pairs"):
-        solve_motions(poses, motions(poses, TRUTH), OPTIONS)
+        solve_motions(poses, motions(poses, TRUTH))
 
 
 def test_rotation_spread_by_axis() -> None:
@@ -95,7 +93,7 @@ def test_poor_motion_is_refused(axes: tuple[float, ...], message: str | None) ->
         [rng.normal(0, 0.2, (30, 3)), rng.normal(0, 1, (30, 3)) * np.deg2rad(axes)], 1
     )
     if message is None:
-        refuse_poor_motion(SE3.exp(six), OPTIONS)
+        refuse_poor_motion(SE3.exp(six))
         return
     with pytest.raises(InputError, match=message):
-        refuse_poor_motion(SE3.exp(six), OPTIONS)
+        refuse_poor_motion(SE3.exp(six))

@@ -201,8 +201,8 @@ def test_rig_contains_relative_poses(localizer: Localizer, hall: Recording, nois
     [pair] = rig_of(cameras).relative
     truth = truth_of(frames["left"]).inverse() @ truth_of(frames["right"])
     assert (pair.first, pair.second) == ("left", "right")
-    assert pose_distance(pair.first_from_second, truth)[0] < 0.006
-    assert pair.sigma_mm > max(each.sigma_mm for each in cameras.values()) * 0.7
+    assert pose_distance(pair.first_from_second.pose, truth)[0] < 0.006
+    assert pair.first_from_second.sigma_mm > max(each.sigma_mm for each in cameras.values()) * 0.7
     with pytest.raises(InputError, match="at least two"):
         rig_of({"left": cameras["left"]})
 

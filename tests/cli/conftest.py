@@ -47,7 +47,8 @@ def run(capfd: pytest.CaptureFixture[str]) -> Run:
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Folders of the scenes `box-room-41` and `box-room-42`, 24 training and 6 test frames each."""
     from evercal.recordings import generic
-    from evercal.simulation.box_room import box_room_scene
+
+    from ..box_world import box_room_scene
 
     root = tmp_path_factory.mktemp("rooms")
     for seed in (41, 42):

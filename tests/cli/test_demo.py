@@ -15,7 +15,8 @@ from evercal.geometry import SE3
 from evercal.recordings import Recording
 from evercal.recordings.samples import SampleRoom
 from evercal.reports.demo_page import DemoResult, FixedCamera
-from evercal.simulation.box_room import box_room_scene
+
+from ..box_world import box_room_scene
 
 
 def small_room(seed: int) -> SampleRoom:

@@ -48,7 +48,8 @@ def learnable(box: BoxRoom) -> Learnable:
             grey, valid = np.zeros((120, 160), np.uint8), np.ones(300, bool)
             view = View(grey, pixels.astype(np.float32), valid, intrinsics, pose)
             descriptor = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(1, 6))))
-            buffer.add([view], grid, descriptor, torch.ones(1, 300, dtype=torch.bool))
+            every = torch.ones(1, 300, dtype=torch.bool)
+            buffer.append(buffer.part(buffer.views, [view], (grid, descriptor), every))
             everything.append(torch.from_numpy(ATLAS_FROM_BASE.apply(points)).float())
         return buffer, torch.cat(everything)
 

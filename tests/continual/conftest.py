@@ -19,23 +19,6 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="session")
-def quick() -> StageOptions:
-    """A stage of eight steps for `rooms`."""
-    from evercal.continual.networks.buffer import EncodePlan
-    from evercal.continual.networks.head import HeadOptions
-    from evercal.continual.networks.trainer import FitOptions
-    from evercal.continual.stage import StageOptions
-    from evercal.features.views import ViewOptions
-
-    return StageOptions(
-        head=HeadOptions(width=16, centres_per_scene=3),
-        fit=FitOptions(iterations=8, batch=64, replay_batch=32),
-        encode=EncodePlan(views_per_frame=2, cells=24, view=ViewOptions(short_side=48)),
-        replay_views_per_frame=2,
-    )
-
-
-@pytest.fixture(scope="session")
 def empty_scenes() -> EmptyScenes:
     """Make `LearnedScenes` without scenes, with tiny random networks, for a strategy."""
     import torch

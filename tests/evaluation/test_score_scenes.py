@@ -9,7 +9,8 @@ from evercal.evaluation.score_scenes import evaluate
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.recordings import generic
-from evercal.simulation.box_room import box_room_scene
+
+from ..box_world import box_room_scene
 
 
 class Shifted:

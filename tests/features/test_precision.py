@@ -10,7 +10,7 @@ from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
 from evercal.features.precision import VARIABLE, autocast, fast_bfloat16, has_bfloat16
 from evercal.features.vlad import vlad_for
-from evercal.mapping.pose_check import MatchedPair, PoseCheckOptions, matched_pairs
+from evercal.mapping.pose_check import MatchedPair, matched_pairs
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
 from evercal.recordings.frame import Recording
 
@@ -66,9 +66,9 @@ def test_float32_gives_the_same_matches_whatever_the_hardware(
     def matches(precision: str) -> list[MatchedPair]:
         monkeypatch.setenv(VARIABLE, precision)
         recording = PreparedFrames(frames, load_encoder(), WorkingSize(120, 120))
-        vlad = vlad_for(recording.encoder)
-        return matched_pairs(recording, vlad, PoseCheckOptions(min_matches=5))
+        return matched_pairs(recording, vlad_for(recording.encoder))
 
+    monkeypatch.setattr("evercal.mapping.pose_check.MIN_MATCHES", 5)
     monkeypatch.setattr("evercal.features.precision.has_bfloat16", lambda kind: False)
     without = matches("auto")
     monkeypatch.setattr("evercal.features.precision.has_bfloat16", lambda kind: True)

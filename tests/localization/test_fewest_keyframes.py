@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evercal.geometry import pose_distance
-from evercal.localization.fewest_keyframes import AutoMemoryOptions, fewest_keyframes
+from evercal.localization.fewest_keyframes import fewest_keyframes
 from evercal.localization.localizer import Localizer
 from evercal.mapping.build import BuiltMap
 from evercal.mapping.scene_map import MapContents
@@ -34,10 +34,14 @@ def test_few_keyframes_locate_the_other_frames(
 
 
 def test_all_keyframes_are_kept_if_fewer_are_worse(
-    hall: Recording, hall_built: BuiltMap, empty: MapContents
+    hall: Recording,
+    hall_built: BuiltMap,
+    empty: MapContents,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    strict = AutoMemoryOptions(shares=(0.05, 0.2), most_m=1e-9, probes=8)
-    selected = fewest_keyframes(empty, hall_built, hall.train, options=strict)
+    for name, value in {"SHARES": (0.05, 0.2), "MOST_M": 1e-9, "PROBES": 8}.items():
+        monkeypatch.setattr(f"evercal.localization.fewest_keyframes.{name}", value)
+    selected = fewest_keyframes(empty, hall_built, hall.train)
     np.testing.assert_array_equal(selected, np.arange(7))
 
 

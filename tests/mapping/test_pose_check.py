@@ -9,7 +9,6 @@ from evercal.features.encoder import load_encoder
 from evercal.features.vlad import vlad_for
 from evercal.geometry.se3 import SE3
 from evercal.mapping.pose_check import (
-    PoseCheckOptions,
     _segment_distance,
     contradicting_frames,
     depth_scale,
@@ -36,9 +35,8 @@ def moved(recording: PreparedFrames, changes: dict[int, SE3]) -> PreparedFrames:
 
 
 def detected(recording: PreparedFrames) -> list[int]:
-    options = PoseCheckOptions()
-    pairs = matched_pairs(recording, vlad_for(recording.encoder), options)
-    return contradicting_frames(recording, pairs, options).tolist()
+    pairs = matched_pairs(recording, vlad_for(recording.encoder))
+    return contradicting_frames(recording, pairs).tolist()
 
 
 def test_right_poses_are_consistent(recording: PreparedFrames) -> None:
@@ -63,14 +61,14 @@ def test_shifted_and_rotated_frames_are_detected(recording: PreparedFrames) -> N
 
 @pytest.mark.parametrize("scale", [0.1, 8.0])
 def test_depth_scale_is_that_of_the_recording(scale: float, recording: PreparedFrames) -> None:
-    options, vlad = PoseCheckOptions(), vlad_for(recording.encoder)
-    pairs, scaled = matched_pairs(recording, vlad, options), moved(recording, {})
+    vlad = vlad_for(recording.encoder)
+    pairs, scaled = matched_pairs(recording, vlad), moved(recording, {})
     assert depth_scale(recording, pairs) == 1  # as a room is
     poses = recording.poses
     scaled.adjust(SE3(poses.rotation_wxyz, scale * poses.translation_m), None)
     scaled.depth_scale = depth_scale(scaled, pairs)
     assert 0.3 * scale < scaled.depth_scale < 3 * scale
-    assert contradicting_frames(scaled, pairs, options).tolist() == []
+    assert contradicting_frames(scaled, pairs).tolist() == []
 
 
 def test_small_pose_errors_are_accepted(recording: PreparedFrames) -> None:

@@ -8,10 +8,8 @@ import pytest
 from evercal.mapping.selection import (
     PoseSpace,
     SarsOptions,
-    covering_radius,
     select_farthest,
     select_sars,
-    smallest_pair,
 )
 
 
@@ -56,6 +54,10 @@ def grid_walk(rng, n):
 def metric_table(positions, quaternions, weight=1.0):
     space = PoseSpace.of(positions, quaternions, weight)
     return np.stack([space.distances(i) for i in range(len(space))])
+
+
+def covering_radius(positions, quaternions, selected):
+    return metric_table(positions, quaternions)[selected].min(0).max()
 
 
 def test_metric_equals_the_formula():
@@ -208,16 +210,6 @@ def test_farthest_selects_its_start():
     assert select_farthest(positions, quaternions, 2, start=[1, 3]).tolist() == [1, 3]
 
 
-def test_covering_radius_is_the_largest_gap():
-    positions, quaternions = random_walk(np.random.default_rng(10), 60)
-    table = metric_table(positions, quaternions)
-    selected = np.array([3, 20, 55])
-    slow = max(min(table[i, j] for j in selected) for i in range(60))
-    assert covering_radius(positions, quaternions, selected) == slow
-    assert covering_radius(positions, quaternions, selected[:0]) == math.inf
-    assert covering_radius(positions[:0], quaternions[:0], selected[:0]) == 0.0
-
-
 def test_scene_without_frames():
     empty = np.zeros((0, 3)), np.zeros((0, 4))
     assert select_sars(*empty, 5).size == 0
@@ -245,14 +237,3 @@ def test_options_are_checked():
         SarsOptions(radius=-0.1)
     with pytest.raises(ValueError, match="rotation_weight"):
         SarsOptions(rotation_weight=math.nan)
-
-
-def test_smallest_pair_by_hand():
-    # A metre along x is the longest side; the second pair is 0.25 m and 0.1 rad apart.
-    positions = np.array([[0.0, 0, 0], [0.25, 0, 0], [1.0, 0, 0]])
-    rotated = [math.cos(0.05), 0, 0, math.sin(0.05)]
-    quaternions = np.array([[1.0, 0, 0, 0], rotated, [-1.0, 0, 0, 0]])
-    selected = np.array([0, 1, 2])
-    assert smallest_pair(positions, quaternions, selected) == pytest.approx(0.35)
-    assert smallest_pair(positions, quaternions, selected[[0, 2]]) == pytest.approx(1.0)
-    assert smallest_pair(positions, quaternions, selected[:1]) == math.inf

@@ -41,25 +41,25 @@ def test_summary_of_a_straight_path() -> None:
 
 def test_planted_faults_are_reported() -> None:
     assert warned(recording_of(TRAIN, TEST)) == ""
-    still = SE3(TRAIN.rotation_wxyz, np.zeros((200, 3)))
-    rigid = SE3(np.tile(TRAIN.rotation_wxyz[0], (200, 1)), TRAIN.translation_m)
-    millimetres = SE3(TRAIN.rotation_wxyz, 1000 * TRAIN.translation_m)
-    kilometres = SE3(TRAIN.rotation_wxyz, 0.001 * TRAIN.translation_m)
-    shuffled = TRAIN[np.random.default_rng(0).permutation(200)]
-    assert "stand at one point" in warned(recording_of(still, TEST))
-    assert "look the same way" in warned(recording_of(rigid, TEST))
-    assert "millimetres" in warned(recording_of(millimetres, TEST))
-    assert "in metres" in warned(recording_of(kilometres, TEST))
-    assert "recorded order" in warned(recording_of(shuffled, TEST))
+    rotations, translations = TRAIN.rotation_wxyz, TRAIN.translation_m
+    for train, message in (
+        (SE3(rotations, np.zeros((200, 3))), "stand at one point"),
+        (SE3(np.tile(rotations[0], (200, 1)), translations), "look the same way"),
+        (SE3(rotations, 1000 * translations), "millimetres"),
+        (SE3(rotations, 0.001 * translations), "in metres"),
+        (TRAIN[np.random.default_rng(0).permutation(200)], "recorded order"),
+        (TRAIN[:5], "16 or more"),
+    ):
+        assert message in warned(recording_of(train, TEST))
     assert "test frames have the pose" in warned(recording_of(TRAIN, TRAIN[:40]))
     assert "have no pose" in warned(recording_of(TRAIN, TEST, untracked=300))
-    assert "16 or more" in warned(recording_of(TRAIN[:5], TEST))
     assert "nothing to measure" in warned(recording_of(TRAIN, TEST[:0]))
-    assert "far from the middle" in warned(
-        recording_of(TRAIN, TEST, Camera(32, 24, 26, 26, 25, 11))
-    )
-    assert "sees" in warned(recording_of(TRAIN, TEST, Camera(32, 24, 525, 525, 15.5, 11.5)))
-    assert "square pixels" in warned(recording_of(TRAIN, TEST, Camera(32, 24, 26, 40, 15.5, 11.5)))
+    for lens, message in (
+        ((26, 26, 25, 11), "far from the middle"),
+        ((525, 525, 15.5, 11.5), "sees"),
+        ((26, 40, 15.5, 11.5), "square pixels"),
+    ):
+        assert message in warned(recording_of(TRAIN, TEST, Camera(32, 24, *lens)))
 
 
 def test_other_conventions_are_reported() -> None:

@@ -12,9 +12,10 @@ from evercal.recordings import generic, load_recording
 from evercal.simulation.box_room import (
     BoxRoom,
     Surface,
-    box_room_scene,
     look_at,
 )
+
+from ..box_world import box_room_scene
 
 CAMERA = Camera(160, 120, 140.0, 135.0, 83.0, 57.0)
 SEEDS = (11, 12, 13)

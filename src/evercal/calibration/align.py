@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from evercal.calibration.align_points import Picks, align_by_points
 from evercal.calibration.from_images import scene_named
-from evercal.calibration.located import Located, locate
+from evercal.calibration.located import locate
 from evercal.calibration.pose_pairs.disagreement import require_agreement
 from evercal.calibration.pose_pairs.hand_eye import HandEyeFit, agreement, robust_fit
 from evercal.calibration.pose_pairs.observability import require_observable
@@ -38,7 +38,6 @@ class MapAlignment:
     """Pose and scale of a map in the base frame."""
 
     similarity: Similarity
-    """From the map to the base frame."""
     base_covariance: Array
     """(6, 6), see `MapFrame.base_covariance`."""
     used: int
@@ -48,12 +47,12 @@ class MapAlignment:
     residual: str
     """Root mean square residual, with its unit."""
     gripper_from_camera: SE3 | None = None
-    """Estimated with it: of the camera on the gripper, or of the board that it holds."""
+    """Estimated pose of the camera on the gripper, or of the board that it holds."""
     sigma: tuple[float, float] = (0.0, 0.0)
     """Standard deviation per axis in the middle of the scene, millimetres and degrees."""
 
     def applied_to(self, scene: SceneMap) -> SceneMap:
-        """The scene with answers in the base frame."""
+        """Return the scene with answers in the base frame."""
         frame = replace(
             scene.frame, similarity=self.similarity, base_covariance=self.base_covariance
         )
@@ -61,11 +60,7 @@ class MapAlignment:
 
 
 def _in_own_frame(localizer: "Localizer", name: str) -> "Localizer":
-    """A localizer that answers in the frame that a scene was learned in.
-
-    Raises:
-        InputError: No such scene.
-    """
+    """Return a localizer that answers in the frame that a scene was learned in."""
     from evercal.localization.localizer import Localizer
 
     scene, contents = scene_named(localizer, name), localizer.contents
@@ -84,24 +79,24 @@ def align_by_gripper(
     scale_known: bool = True,
     camera_from_board: Mapping[str, SE3] | None = None,
 ) -> MapAlignment:
-    """Finds the base frame from images of a camera on the gripper, or of a board that it holds.
+    """Estimate the base frame from images of a camera on the gripper, or of a board that it holds.
 
     Args:
-        localizer: of the store.
-        scene: which of its scenes; its alignment so far is not looked at.
+        localizer: Localizer of the store.
+        scene: Name of the scene; its previous alignment is ignored.
         images: (name, (h, w, 3) uint8 RGB), five or more from places that turn about two axes.
-        base_from_gripper: (n,) where the gripper was.
-        scale_known: whether the scene was learned in metres.
-        camera_from_board: by name of the image, where the camera stands anywhere in the scene and
-            the gripper holds a board; images without one are left out.
+        base_from_gripper: (n,) gripper poses.
+        scale_known: Whether the scene was learned in metres.
+        camera_from_board: Board poses by image name, for a fixed camera and a board in the gripper;
+            images without a board are left out.
 
     Raises:
-        InputError: the scale is unknown and a board is given, too few images were located in the
-            scene, or the motions leave the answer open.
+        InputError: The scale is unknown and a board is given, too few images were located in the
+            scene, or the motions do not determine the base frame.
     """
     localizer = _in_own_frame(localizer, scene)
-    located = [item for item in locate(localizer, images) if item.is_located]
     index = {name: i for i, (name, _) in enumerate(images)}
+    located = [item for item in locate(localizer, images) if item.is_located]
     located = [item for item in located if item.estimate.scene == scene]
     if camera_from_board is not None:
         if not scale_known:
@@ -120,13 +115,7 @@ def align_by_gripper(
             f"{len(located)} of {len(images)} images were located in {scene}; give at least"
             f" {LEAST_IMAGES} that show it from places that turn about two axes"
         )
-    rows = np.array([index[item.name] for item in located])
-    return _solved(located, base_from_gripper[rows], scale_known, len(images))
-
-
-def _solved(
-    located: Sequence[Located], base_from_gripper: SE3, scale_known: bool, given: int
-) -> MapAlignment:
+    base_from_gripper = base_from_gripper[np.array([index[item.name] for item in located])]
     map_from_camera = SE3.stack([item.pose for item in located])
     names = tuple(item.name for item in located)
     pairs = PosePairs(names, base_from_gripper, map_from_camera.inverse())
@@ -142,7 +131,7 @@ def _solved(
         similarity,
         covariance,
         int(fit.inliers.sum()),
-        given,
+        len(images),
         f"{1000 * rms[0]:.1f} mm and {np.rad2deg(rms[1]):.2f} deg root mean square",
         fit.at.parent_from_camera,
         sigma,
@@ -181,17 +170,17 @@ def aligned_by_points(
     picks: Sequence[tuple[str, NDArray[np.uint8], Mapping[str, Array]]],
     scale_known: bool = True,
 ) -> MapAlignment:
-    """Finds the base frame from touched points.
+    """Estimate the base frame from touched points.
 
     Args:
-        localizer: of the store.
-        scene: which of its scenes.
+        localizer: Localizer of the store.
+        scene: Name of the scene.
         points: (3,) by name, base frame, metres.
         picks: (name, (h, w, 3) uint8 RGB, pixels (2,) by name of the point) of each image.
-        scale_known: whether the scene was learned in metres.
+        scale_known: Whether the scene was learned in metres.
 
     Raises:
-        InputError: fewer than two images located, or too few points.
+        InputError: Fewer than two images were located, or there are too few points.
     """
     localizer, images = _in_own_frame(localizer, scene), []
     own = scene_named(localizer, scene)
@@ -200,19 +189,18 @@ def aligned_by_points(
         if not item.is_located or item.estimate.scene != scene:
             continue
         camera = own.adjusted_camera.resized(image.shape[1], image.shape[0])
-        names = tuple(pixels)
-        touched = np.stack([points[key] for key in names])
-        picked = np.stack([pixels[key] for key in names])
+        touched, picked = np.stack([points[key] for key in pixels]), np.stack([*pixels.values()])
         # Picks are triangulated from the pose that observes the landmarks.
-        images.append(Picks(own.frame.from_base(item.pose), camera, touched, names, picked))
+        map_from_camera = own.frame.from_base(item.pose)
+        images.append(Picks(map_from_camera, camera, touched, tuple(pixels), picked))
     if len(images) < 2:
         raise InputError(
             f"{len(images)} of {len(picks)} images with picks were located in {scene}; at least"
             " two are needed"
         )
     fit = align_by_points(images, scale_known)
-    middle = np.mean([points[name] for name in points], axis=0)
-    radius = np.sqrt(np.mean([((p - middle) ** 2).sum() for p in points.values()]) / 3)
+    middle = np.mean([*points.values()], axis=0)
+    radius = np.sqrt(((np.stack([*points.values()]) - middle) ** 2).sum(1).mean() / 3)
     covariance = fit.covariance[:6, :6].copy()
     covariance[:3, :3] += np.eye(3) * fit.covariance[6, 6] * radius**2
     return MapAlignment(

@@ -5,6 +5,7 @@ give its position in the map. A similarity (seven parameters) relates the two, b
 the reprojection errors.
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,13 +28,11 @@ class Picks:
     """One image with the points that were picked in it."""
 
     map_from_camera: SE3
-    """Pose of the image's camera in the map."""
     camera: Camera
-    """Intrinsics of the image."""
     points: Array
-    """(k, 3) of the points, base frame, metres."""
+    """(k, 3) in the base frame, metres."""
     names: tuple[str, ...]
-    """(k,) of the points."""
+    """(k,) names of the points."""
     pixels: Array
     """(k, 2)."""
 
@@ -55,12 +54,12 @@ def align_by_points(images: Sequence[Picks], scale_known: bool) -> PointAlignmen
     """Estimate the pose and scale of a map in the base frame.
 
     Args:
-        images: with at least three named points that are not on one line; each point in two images
-            that look from different places.
-        scale_known: whether the map is in metres.
+        images: Images of at least three points that are not on one line, each picked in two images
+            from different places.
+        scale_known: Whether the map is in metres.
 
     Raises:
-        InputError: too few points, or all on one line.
+        InputError: There are too few points, or all are on one line.
     """
     triangulated = _triangulated(images)
     if len(triangulated) < 3:
@@ -71,26 +70,24 @@ def align_by_points(images: Sequence[Picks], scale_known: bool) -> PointAlignmen
     in_map, in_base = (np.stack(side) for side in zip(*triangulated.values(), strict=True))
     start = _umeyama(in_map, in_base, scale_known)
     centre = in_base.mean(0)
+    before = Rotation.from_quat(start.base_from_map.rotation_wxyz, scalar_first=True)
+    shift = start.base_from_map.translation_m - centre
 
     def moved(small: Array) -> Similarity:
-        grown = start.scale * (1.0 if scale_known else float(np.exp(small[6])))
+        growth = 1.0 if scale_known else float(np.exp(small[6]))
         rotation = Rotation.from_rotvec(small[3:6])
-        shift = start.base_from_map.translation_m - centre
-        before = Rotation.from_quat(start.base_from_map.rotation_wxyz, scalar_first=True)
         both = (rotation * before).as_quat(canonical=True, scalar_first=True)
-        growth = grown / start.scale
-        return Similarity(SE3(both, rotation.apply(shift) * growth + centre + small[:3]), grown)
+        translation = rotation.apply(shift) * growth + centre + small[:3]
+        return Similarity(SE3(both, translation), start.scale * growth)
 
     def residuals(small: Array) -> Array:
         return np.concatenate([_distances(image, moved(small)) for image in images])
 
     fit = least_squares(residuals, np.zeros(6 if scale_known else 7), loss="cauchy", f_scale=2.0)
     off = residuals(fit.x)
-    spare = max(len(off) - len(fit.x), 1)
-    sigma = max(float(np.sqrt((off**2).sum() / spare)), PICK_SIGMA_PX)
-    small = sigma**2 * np.linalg.inv(fit.jac.T @ fit.jac)
+    sigma = max(np.sqrt((off**2).sum() / max(len(off) - len(fit.x), 1)), PICK_SIGMA_PX)
     covariance = np.zeros((7, 7))
-    covariance[: len(fit.x), : len(fit.x)] = small
+    covariance[: len(fit.x), : len(fit.x)] = sigma**2 * np.linalg.inv(fit.jac.T @ fit.jac)
     # From a motion about the points' centre to one about the base's origin.
     slope = np.eye(7)
     slope[:3, 3:6] = cross_matrix(centre)
@@ -106,38 +103,28 @@ def _distances(image: Picks, similarity: Similarity) -> Array:
 
 
 def _triangulated(images: Sequence[Picks]) -> dict[str, tuple[Array, Array]]:
-    """By name the point in the map and in the base, of points that two images show."""
-    rays: dict[str, list[tuple[Array, Array]]] = {}
+    """Return each point that two images show in the map and in the base, by name."""
+    centres, across = defaultdict(list), defaultdict(list)
     base: dict[str, Array] = {}
     for image in images:
         rotation = image.map_from_camera.rotation_matrix()
         for name, point, pixel in zip(image.names, image.points, image.pixels, strict=True):
             ray = rotation @ image.camera.unproject(pixel)
-            if not np.isfinite(ray).all():
-                continue
-            rays.setdefault(name, []).append(
-                (image.map_from_camera.translation_m, ray / np.linalg.norm(ray))
-            )
-            base[name] = point
+            if np.isfinite(ray).all():
+                across[name].append(np.eye(3) - np.outer(ray, ray) / (ray @ ray))
+                centres[name].append(image.map_from_camera.translation_m)
+                base[name] = point
     points = {}
-    for name, observed in rays.items():
-        across = [np.eye(3) - np.outer(ray, ray) for _, ray in observed]
-        total = np.sum(across, axis=0)
-        if len(observed) < 2 or np.linalg.cond(total) > 1e6:
-            continue
-        right = np.sum(
-            [a @ position for a, (position, _) in zip(across, observed, strict=True)], axis=0
-        )
-        points[name] = (np.linalg.solve(total, right), base[name])
+    for name, point in base.items():
+        total = np.sum(across[name], axis=0)
+        if len(across[name]) >= 2 and np.linalg.cond(total) <= 1e6:
+            right = np.einsum("nij,nj->i", across[name], centres[name])
+            points[name] = (np.linalg.solve(total, right), point)
     return points
 
 
 def _umeyama(source: Array, target: Array, scale_known: bool) -> Similarity:
-    """Least squares similarity (Umeyama, PAMI 1991).
-
-    Raises:
-        InputError: all points on one line.
-    """
+    """Least squares similarity (Umeyama, PAMI 1991)."""
     a, b = source - source.mean(0), target - target.mean(0)
     spread = np.linalg.svd(b, compute_uv=False)
     if spread[1] < 0.02 * spread[0]:

@@ -1,10 +1,10 @@
-"""Which recorded episodes state a camera pose that their images disagree with."""
+"""Detect recorded episodes whose images disagree with the stated camera pose."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,30 +25,28 @@ POSE_FILES = ("calibration.json", "base_from_camera.txt")
 
 @dataclass(frozen=True)
 class AuditOptions:
-    """When an episode disagrees."""
+    """Limits of agreement."""
 
     images: int = 5
-    """Images of an episode that are looked at, spread over it."""
+    """Images of an episode to locate, spread over it."""
     most_mm: float = 5.0
-    """Largest difference of position that is still right, millimetres."""
+    """Largest difference of position in agreement, millimetres."""
     most_deg: float = 0.5
-    """Largest difference of rotation that is still right, degrees."""
+    """Largest difference of rotation in agreement, degrees."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """What was found about one episode."""
+    """Result for one episode."""
 
     name: str
-    """Of its folder."""
+    """Name of its folder."""
     verdict: Literal["right", "wrong", "unknown"]
-    """Whether its stated camera pose fits its images; unknown where they could not be located."""
+    """Whether its stated camera pose fits its images; unknown if no image was located."""
     reason: str
-    """One sentence."""
     translation_mm: float | None = None
-    """Between the stated pose and the one found."""
+    """Distance between the stated pose and the images."""
     rotation_deg: float | None = None
-    """The same for the rotation."""
 
 
 def audit(
@@ -58,44 +56,39 @@ def audit(
     options: AuditOptions | None = None,
     on_episode: Callable[[], object] = lambda: None,
 ) -> list[Episode]:
-    """Compares stated camera poses with images, episode by episode.
+    """Compare stated camera poses with images, episode by episode.
 
     Args:
-        localizer: of a store that knows the scene.
-        folder: its folders are the episodes: recorded scenes with camera poses, or images beside a
+        localizer: Localizer of a store that holds the scene.
+        folder: Folder of the episodes: recorded scenes with camera poses, or images beside a
             `calibration.json` or a 4x4 matrix `base_from_camera.txt`.
-        stated: base_from_camera of all episodes that state none themselves.
-        options: when an episode disagrees.
-        on_episode: called after each.
+        stated: base_from_camera of the episodes without a pose of their own.
+        options: Limits of agreement.
+        on_episode: Called after each episode.
 
     Raises:
-        InputError: no folder in it, or an episode that states no pose and none was given.
+        InputError: There is no episode, or an episode without a camera pose.
     """
-    options = options or AuditOptions()
-    episodes = episode_folders(folder)
     audited = []
-    for episode in episodes:
-        audited.append(_audited(localizer, episode, stated, options))
+    for episode in episode_folders(folder):
+        audited.append(_audited(localizer, episode, stated, options or AuditOptions()))
         on_episode()
     return audited
 
 
 def episode_folders(folder: Path) -> list[Path]:
-    """The folders of the episodes, in order of name.
+    """Return the folders of the episodes, sorted by name.
 
     Raises:
-        InputError: not a folder, or none in it.
+        InputError: There is no folder.
     """
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give the one that holds the episodes")
-    inside = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    inside = sorted(p for p in folder.glob("*/") if not p.name.startswith("."))
     if not inside:
-        raise InputError(f"{folder}: no folders in it; every episode is one folder")
+        raise InputError(f"{folder}: no folders in it; give the folder that holds the episodes")
     return inside
 
 
-@dataclass(frozen=True, eq=False)
-class _Shot:
+class _Shot(NamedTuple):
     """An image with the pose that is stated for it."""
 
     name: str
@@ -111,9 +104,8 @@ def _audited(
     chosen = np.unique(np.linspace(0, len(shots) - 1, options.images).round().astype(int))
     differences, reason = [], ""
     for shot in (shots[i] for i in chosen):
-        [item] = locate(
-            localizer, [(shot.name, shot.read())], _camera_argument(localizer, shot.camera)
-        )
+        camera = None if shot.camera is None else localizer.camera_for(shot.camera)
+        [item] = locate(localizer, [(shot.name, shot.read())], camera)
         if item.is_located:
             in_stated = shot.base_from_camera.inverse() @ item.pose
             differences.append(Located(shot.name, item.estimate, in_stated, item.covariance))
@@ -124,12 +116,8 @@ def _audited(
     off = deviations(SE3.stack([fuse(differences).pose]), SE3.identity())[0]
     millimetres, degrees = length_mm_deg(off)
     wrong = millimetres > options.most_mm or degrees > options.most_deg
-    told = f"stated pose is {millimetres:.1f} mm and {degrees:.2f} deg from where it was found"
-    return Episode(episode.name, "wrong" if wrong else "right", told, millimetres, degrees)
-
-
-def _camera_argument(localizer: "Localizer", stated: Camera | None) -> Camera | None:
-    return None if stated is None else localizer.camera_for(stated)
+    reason = f"stated pose is {millimetres:.1f} mm and {degrees:.2f} deg from where it was found"
+    return Episode(episode.name, "wrong" if wrong else "right", reason, millimetres, degrees)
 
 
 def _shots(episode: Path, stated: SE3 | None) -> list[_Shot]:

@@ -8,16 +8,15 @@
      "error_terms": [...], "checks": {...}, "verdict": "...", "source": {...}, "created": "..."}
 
 Metres, radians, quaternions w, x, y, z, OpenCV camera axes. `matrix`, `meaning` and the sigmas
-repeat what stands beside them, for people and for programs that read one of them; reading a file
-checks that they agree.
+repeat other values, for people and for programs that read one of them.
 """
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, Self, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,67 +27,62 @@ from evercal.storage import write_json
 
 FORMAT, VERSION = "evercal-calibration", 1
 Mount = Literal["eye_to_hand", "eye_in_hand"]
+Content = TypeVar("Content")
 
 
 @dataclass(frozen=True)
 class ImageUse:
-    """What became of one image or pose pair."""
+    """Use of one image or pose pair."""
 
     name: str
-    """Of the image or the row."""
     used: bool
-    """Whether the answer rests on it."""
     reason: str = ""
-    """Why it was left out; empty if it was used."""
+    """Reason for leaving it out; empty if it was used."""
     residual_mm: float | None = None
-    """How far its translation lies from what the answer predicts."""
+    """Distance of its translation from the prediction."""
     residual_deg: float | None = None
     """The same for its rotation."""
 
 
 @dataclass(frozen=True)
 class ErrorTerm:
-    """One source of error inside the covariance, as one standard deviation a direction."""
+    """One source of error in the covariance: root mean square of the deviations of three axes."""
 
     name: str
-    """What it is, for people."""
     translation_mm: float
-    """Root mean square of the three axes."""
     rotation_deg: float
-    """Root mean square of the three axes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Where a camera is: `parent_from_child`.
+    """Pose of a camera: `parent_from_child`.
 
     Raises:
-        ValueError: A covariance that is not (6, 6), finite, symmetric and positive semi-definite,
-            or two frames of one name.
+        ValueError: The covariance is not (6, 6), finite, symmetric and positive semi-definite, or
+            both frames have one name.
     """
 
     mount: Mount
     """`eye_to_hand`: the camera stands still. `eye_in_hand`: the gripper carries it."""
     parent_from_child: SE3
-    """Single transform."""
     covariance: NDArray[np.float64]
     """(6, 6) of (translation in the parent frame, metres; rotation about child axes, radians)."""
     parent_frame: str = "base"
-    """`base` for eye_to_hand, `gripper` for eye_in_hand, or the robot's own names for them."""
+    """`base` for eye_to_hand, `gripper` for eye_in_hand, or the robot's names of them."""
     child_frame: str = "camera"
     """The camera's optical frame: x right, y down, z forward."""
     camera: Camera | None = None
-    """Intrinsics that it holds for."""
+    """Intrinsics of the images."""
     images: tuple[ImageUse, ...] = ()
-    """What was given, in that order."""
+    """All images in the given order."""
     error_terms: tuple[ErrorTerm, ...] = ()
-    """What the covariance is made of."""
+    """Parts of the covariance."""
     checks: Mapping[str, Any] = field(default_factory=dict)
-    """Numbers of the checks that were made, JSON values: `held_out_mm`, `repeatability_mm`, ..."""
+    """Results of the checks, JSON values: `held_out_mm`, `repeatability_mm`, ..."""
     verdict: str = ""
-    """What it is good for, one or two sentences."""
+    """Uses that it serves, one or two sentences."""
     source: Mapping[str, Any] = field(default_factory=dict)
-    """Which command, store, scene and options made it, JSON values."""
+    """Command, store, scene and options, JSON values."""
     created: str = ""
     """ISO 8601 time with zone."""
 
@@ -126,7 +120,7 @@ class Calibration:
         return axis_deviation(self.covariance)[1]
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values, see the top of this file."""
+        """Return the JSON values described at the top of this file."""
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -151,81 +145,92 @@ class Calibration:
 
     @classmethod
     def from_dict(cls, data: object) -> Self:
-        """The reverse of `to_dict`.
+        """Create a calibration from the values of `to_dict`.
 
         Raises:
-            ValueError: Not a calibration, of another version, or one that contradicts itself.
+            ValueError: The values have another format or version, or contradict each other.
         """
-        if not isinstance(data, dict) or data.get("format") != FORMAT:
-            raise ValueError(f"no calibration: 'format' is not {FORMAT!r}")
-        if data.get("version") != VERSION:
-            raise ValueError(f"version {data.get('version')!r}; this evercal reads {VERSION}")
+        return of_format(data, FORMAT, VERSION, cls._from_mapping)
+
+    @classmethod
+    def _from_mapping(cls, data: Mapping[str, Any]) -> Self:
         if data.get("mount") not in get_args(Mount):
             raise ValueError(f"'mount' is one of {get_args(Mount)}, got {data.get('mount')!r}")
-        try:
-            pose = SE3(data["quaternion_wxyz"], data["translation_m"])
-            covariance = np.asarray(data["covariance"], dtype=np.float64)
-            lens = data.get("camera")
-            found = cls(
-                data["mount"],
-                pose,
-                covariance,
-                str(data["parent_frame"]),
-                str(data["child_frame"]),
-                None if lens is None else Camera.from_dict(lens),
-                tuple(ImageUse(**image) for image in data.get("images", [])),
-                tuple(ErrorTerm(**term) for term in data.get("error_terms", [])),
-                data.get("checks", {}),
-                str(data.get("verdict", "")),
-                data.get("source", {}),
-                str(data.get("created", "")),
+        pose, lens = SE3(data["quaternion_wxyz"], data["translation_m"]), data.get("camera")
+        if "matrix" in data and max(pose_distance(pose, SE3.from_matrix(data["matrix"]))) > 1e-6:
+            raise ValueError(
+                "'matrix' and 'translation_m', 'quaternion_wxyz' are different poses; the file was"
+                " edited by hand: change all of them or leave 'matrix' out"
             )
-        except KeyError as error:
-            raise ValueError(f"{error} is missing") from None
-        except TypeError as error:
-            raise ValueError(f"an entry has the wrong kind of value ({error})") from None
-        if "matrix" in data:
-            metres, radians = pose_distance(pose, SE3.from_matrix(data["matrix"]))
-            if metres > 1e-6 or radians > 1e-6:
-                raise ValueError(
-                    "'matrix' and 'translation_m', 'quaternion_wxyz' say different poses; it was"
-                    " edited by hand: change all of them or leave 'matrix' out"
-                )
-        return found
+        return cls(
+            mount=data["mount"],
+            parent_from_child=pose,
+            covariance=np.asarray(data["covariance"], dtype=np.float64),
+            parent_frame=str(data["parent_frame"]),
+            child_frame=str(data["child_frame"]),
+            camera=None if lens is None else Camera.from_dict(lens),
+            images=tuple(ImageUse(**image) for image in data.get("images", [])),
+            error_terms=tuple(ErrorTerm(**term) for term in data.get("error_terms", [])),
+            checks=data.get("checks", {}),
+            verdict=str(data.get("verdict", "")),
+            source=data.get("source", {}),
+            created=str(data.get("created", "")),
+        )
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Create or replace the file, whole or not at all."""
+        """Write the file atomically."""
         write_json(path, self.to_dict())
 
     def export(
         self, format: str, path: str | os.PathLike[str] | None = None, **options: Any
     ) -> str:
-        """Export to a format of other tools; see `evercal export --format list`.
-
-        Args:
-            format: name of the format, such as `easy_handeye2`, `launch_py` or `urdf`.
-            path: file to write. Default: the text is only returned.
-            **options: of the format, see `calibration.export`.
-
-        Raises:
-            InputError: Unknown format, or one that does not fit this calibration.
-        """
+        """Export to a format of other tools, see `export_calibration`."""
         from evercal.calibration.export import export_calibration
 
         return export_calibration(self, format, path, **options)
 
 
 def read_calibration(path: str | os.PathLike[str]) -> Calibration:
-    """Reads a calibration file.
+    """Read a calibration file.
 
     Raises:
-        InputError: Missing, no JSON, or no calibration.
+        InputError: The file is missing or holds no calibration.
     """
-    path = Path(path)
+    return read_json(path, "calibration file", Calibration.from_dict)
+
+
+def of_format(
+    data: object, format: str, version: int, read: Callable[[Mapping[str, Any]], Content]
+) -> Content:
+    """Convert JSON values that state their format and version.
+
+    Raises:
+        ValueError: The format or version is another one, or an entry is missing or broken.
+    """
+    if not isinstance(data, dict) or data.get("format") != format:
+        raise ValueError(f"'format' is not {format!r}")
+    if data.get("version") != version:
+        raise ValueError(f"version {data.get('version')!r}; this evercal reads {version}")
     try:
-        return Calibration.from_dict(json.loads(path.read_text(encoding="utf-8")))
+        return read(data)
+    except KeyError as error:
+        raise ValueError(f"{error} is missing") from None
+    except TypeError as error:
+        raise ValueError(f"an entry has the wrong kind of value ({error})") from None
+
+
+def read_json(
+    path: str | os.PathLike[str], what: str, convert: Callable[[object], Content]
+) -> Content:
+    """Read a JSON file that evercal wrote, and convert its values; `what` names it in messages.
+
+    Raises:
+        InputError: The file is missing, or `convert` raises ValueError.
+    """
+    try:
+        return convert(json.loads(Path(path).read_text(encoding="utf-8")))
     except FileNotFoundError:
-        raise InputError(f"{path}: calibration file is missing; check the path") from None
+        raise InputError(f"{path}: {what} is missing; check the path") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except ValueError as error:
@@ -233,10 +238,10 @@ def read_calibration(path: str | os.PathLike[str]) -> Calibration:
 
 
 def read_transform(path: str | os.PathLike[str]) -> SE3:
-    """A rigid transform from a calibration file or from a 4x4 matrix as text.
+    """Read a rigid transform from a calibration file or from a 4x4 matrix as text.
 
     Raises:
-        InputError: Missing, or neither of the two.
+        InputError: The file is missing or holds neither.
     """
     path = Path(path)
     try:

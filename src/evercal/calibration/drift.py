@@ -1,4 +1,4 @@
-"""`check`: has a camera moved since it was calibrated?
+"""`check`: test whether a camera has moved since it was calibrated.
 
 Two poses of one camera in one map share the map's errors, which cancel in their difference. So a
 shift is more accurate than either pose: to the scatter of the images, and a floor for changes of
@@ -24,26 +24,16 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class DriftOptions:
-    """When a camera counts as moved."""
-
-    confidence: float = 0.99
-    """Least confidence that it moved at all."""
-    least_mm: float = 0.7
-    """Shifts below this never count as a move, millimetres."""
-    least_deg: float = 0.04
-    """Rotations below this never count as a move, degrees. One of the two must be exceeded."""
-    floor_mm: float = 0.2
-    """Standard deviation per axis from changes of light and objects, millimetres."""
-    floor_deg: float = 0.008
-    """The same for the rotation, degrees."""
-    usual_scatter_mm: float = 0.4
-    """Prior scatter of a single image per axis, millimetres."""
-    usual_scatter_deg: float = 0.01
-    """The same for the rotation, degrees."""
-    usual_weight: float = 5.0
-    """Weight of the prior scatter, in images."""
+CONFIDENCE = 0.99
+"""Least confidence that a camera moved at all."""
+_LEAST_MM, _LEAST_DEG = 0.7, 0.04
+"""A shift counts as a move if it exceeds one of these."""
+_FLOOR = np.repeat([0.2e-3, np.deg2rad(0.008)], 3)
+"""Standard deviation per axis from changes of light and objects, metres and radians."""
+_USUAL_SCATTER = np.repeat([0.4e-3, np.deg2rad(0.01)], 3)
+"""Prior scatter of a single image per axis, metres and radians."""
+_USUAL_WEIGHT = 5.0
+"""Weight of the prior scatter, in images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,21 +43,16 @@ class Shift:
     reference_from_now: SE3
     """Pose of the camera now, in its camera frame at the time of the calibration."""
     translation_mm: float
-    """Length of its translation."""
     rotation_deg: float
-    """Angle of its rotation."""
     sigma_mm: float
     """Standard deviation per axis."""
     sigma_deg: float
-    """The same for the rotation."""
     confidence: float
     """Probability that it moved at all, 0 to 1."""
     moved: bool
-    """Whether it counts as moved."""
     same_map: bool
     """Whether both poses come from one map, so that its errors cancel."""
     images: tuple[ImageUse, ...] = ()
-    """Use of every image."""
 
 
 def check(
@@ -80,18 +65,17 @@ def check(
     """Test whether a camera has moved since its calibration.
 
     Args:
-        localizer: of a map that holds the scene.
+        localizer: Localizer of a map that holds the scene.
         images: (name, (h, w, 3) uint8 RGB) of the camera as it is now.
-        reference: its calibration.
+        reference: Calibration of the camera.
         camera: Intrinsics. Default: those of the reference.
-        on_image: called after each image.
+        on_image: Called after each image.
 
     Raises:
         InputError: No image was located, or the reference is a camera on the gripper.
     """
     located = locate(localizer, images, camera or reference.camera, on_image)
-    fused = fuse(located)
-    return shift_between(reference, fused, located, localizer)
+    return shift_between(reference, fuse(located), located, localizer)
 
 
 def shift_between(
@@ -99,23 +83,22 @@ def shift_between(
     fused: Fused,
     located: list[Located],
     localizer: "Localizer",
-    options: DriftOptions | None = None,
+    confidence: float = CONFIDENCE,
 ) -> Shift:
     """Compare a camera with its calibration.
 
     Args:
         reference: base_from_camera at the time of the calibration.
-        fused: pose of the camera now.
-        located: the images that were fused.
-        localizer: that located them.
-        options: when a shift counts as a move.
+        fused: Pose of the camera now.
+        located: Images that were fused.
+        localizer: Localizer of these images.
+        confidence: Least confidence of a move.
 
     Raises:
         InputError: The reference is a camera on the gripper.
     """
     from scipy import stats
 
-    options = options or DriftOptions()
     if reference.mount != "eye_to_hand":
         raise InputError(
             "the reference is a camera on the gripper, whose pose in the base changes with every"
@@ -124,21 +107,20 @@ def shift_between(
     same = reference.source.get("map") == map_digest(localizer, fused.scene)
     off = deviations(SE3.stack([fused.pose]), reference.parent_from_child)[0]
     count = int(fused.used.sum())
-    floor = [(options.floor_mm / 1000) ** 2] * 3 + [np.deg2rad(options.floor_deg) ** 2] * 3
+    floor = np.diag(_FLOOR**2)
     measured = [(fused.scatter, count)]
     if same:
         # One camera in one map: the scatter of its images is the same before and now.
         before = int(reference.checks.get("images_used", 1))
         measured.append((np.array(reference.checks.get("image_scatter", np.zeros((6, 6)))), before))
-        scatter = _scatter(measured, options)
-        covariance = scatter / count + scatter / before + np.diag(floor)
+        scatter = _scatter(measured)
+        covariance = scatter / count + scatter / before + floor
     else:
         used = [item.covariance for item in fused.select(located)]
-        covariance = _scatter(measured, options) / count + np.diag(floor)
+        covariance = _scatter(measured) / count + floor
         covariance = covariance + reference.covariance + np.mean(used, axis=0)
-    confidence = float(stats.chi2.cdf(off @ np.linalg.solve(covariance, off), 6))
+    probability = float(stats.chi2.cdf(off @ np.linalg.solve(covariance, off), 6))
     millimetres, degrees = length_mm_deg(off)
-    visible = millimetres > options.least_mm or degrees > options.least_deg
     sigma_mm, sigma_deg = axis_deviation(covariance)
     return Shift(
         reference_from_now=reference.parent_from_child.inverse() @ fused.pose,
@@ -146,23 +128,16 @@ def shift_between(
         rotation_deg=degrees,
         sigma_mm=sigma_mm,
         sigma_deg=sigma_deg,
-        confidence=confidence,
-        moved=bool(visible and confidence >= options.confidence),
+        confidence=probability,
+        moved=probability >= confidence and (millimetres > _LEAST_MM or degrees > _LEAST_DEG),
         same_map=same,
         images=fused.uses,
     )
 
 
-def _scatter(measured: Sequence[tuple[Array, int]], options: DriftOptions) -> Array:
-    """Scatter of one image: the measured one, shrunk towards the prior for few images.
-
-    Args:
-        measured: scatters (6, 6), each with its number of images.
-        options: with the prior.
-    """
-    usual = [(options.usual_scatter_mm / 1000) ** 2] * 3
-    usual += [np.deg2rad(options.usual_scatter_deg) ** 2] * 3
-    total, weight = options.usual_weight * np.diag(usual), options.usual_weight
+def _scatter(measured: Sequence[tuple[Array, int]]) -> Array:
+    """Shrink measured scatters (6, 6), each with its number of images, towards the prior."""
+    total, weight = _USUAL_WEIGHT * np.diag(_USUAL_SCATTER**2), _USUAL_WEIGHT
     for scatter, count in measured:
         total, weight = total + (count - 1) * scatter, weight + count - 1
     return total / weight

@@ -6,15 +6,12 @@ refines it together with all poses and landmarks. This file connects the two and
 
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from typing import NamedTuple
 
 import numpy as np
 
 from evercal.calibration.calibration import Calibration
-from evercal.calibration.eye_in_hand_start import (
-    HandEyeStart,
-    hand_eye_start,
-    with_gripper,
-)
+from evercal.calibration.eye_in_hand_start import HandEyeStart, hand_eye_start
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
@@ -32,9 +29,7 @@ class HandEyeReport:
     """The estimated camera on the gripper, as JSON values."""
 
     translation_m: tuple[float, ...]
-    """Of gripper_from_camera."""
     quaternion_wxyz: tuple[float, ...]
-    """Of gripper_from_camera."""
     covariance: tuple[tuple[float, ...], ...]
     """(6, 6) of translation in the gripper frame, metres, and rotation about camera axes,
     radians."""
@@ -45,11 +40,9 @@ class HandEyeReport:
     start_mm: float
     """Change of the first estimate by bundle adjustment."""
     start_deg: float
-    """The same for the rotation."""
     given_mm: float | None = None
     """Distance from a given `gripper_from_camera`, such as from CAD."""
     given_deg: float | None = None
-    """The same for the rotation."""
     warnings: tuple[str, ...] = ()
     """Reasons not to rely on the estimate."""
 
@@ -60,13 +53,7 @@ class HandEyeReport:
         return UncertainPose(pose, np.array(self.covariance))
 
     def calibration(self, camera: Camera, scene: str, frames: int) -> Calibration:
-        """The estimate as a calibration.
-
-        Args:
-            camera: intrinsics as adjusted by the map.
-            scene: name of the scene.
-            frames: number of frames that it rests on.
-        """
+        """Return the estimate as a calibration with the intrinsics that the map adjusted."""
         estimate = self.gripper_from_camera
         calibration = Calibration(
             "eye_in_hand",
@@ -81,14 +68,11 @@ class HandEyeReport:
         return replace(calibration, verdict=" ".join(warnings or [verdict(calibration)]))
 
 
-@dataclass(frozen=True, eq=False)
-class PosedByGripper:
-    """A recording with rough camera poses."""
+class PosedByGripper(NamedTuple):
+    """A recording with rough camera poses from a first estimate of `gripper_from_camera`."""
 
     recording: Recording
-    """With camera poses from gripper poses and the first estimate."""
     start: HandEyeStart
-    """The first estimate of `gripper_from_camera`."""
 
 
 def posed_by_gripper(
@@ -97,12 +81,12 @@ def posed_by_gripper(
     """Estimate rough camera poses of a recording that states gripper poses.
 
     Args:
-        recording: frames without a gripper pose count as untracked.
-        encoder: for the similarity of frames.
-        on_progress: called as pairs of frames are matched.
+        recording: Frames without a gripper pose count as untracked.
+        encoder: Encoder for the similarity of frames.
+        on_progress: Called as pairs of frames are matched.
 
     Raises:
-        InputError: see `hand_eye_start`; the message begins with the recording's name.
+        InputError: See `hand_eye_start`.
     """
     frames = tuple(frame for frame in recording.train if frame.base_from_gripper is not None)
     try:
@@ -110,7 +94,11 @@ def posed_by_gripper(
     except InputError as error:
         raise InputError(f"{recording.name}: {error}") from None
     lost = len(recording.train) - len(frames)
-    train = with_gripper(frames, start.gripper_from_camera)
+    train = tuple(
+        replace(frame, base_from_camera=frame.base_from_gripper @ start.gripper_from_camera)
+        for frame in frames
+        if frame.base_from_gripper is not None
+    )
     posed = replace(recording, train=train, untracked=recording.untracked + lost)
     return PosedByGripper(posed, start)
 
@@ -118,12 +106,12 @@ def posed_by_gripper(
 def hand_eye_report(
     start: HandEyeStart, built: BuiltMap, given: SE3 | None = None
 ) -> HandEyeReport:
-    """The estimate after bundle adjustment.
+    """Return the estimate after bundle adjustment.
 
     Args:
-        start: the first estimate.
-        built: the map, built with `MapOptions.for_hand_eye`.
-        given: `gripper_from_camera` from elsewhere, to compare with.
+        start: First estimate.
+        built: Map that was built with `MapOptions.for_hand_eye`.
+        given: `gripper_from_camera` from another source, to compare with.
     """
     correction = built.hand_eye
     assert correction is not None, "the map was built for a hand-eye calibration"
@@ -131,7 +119,7 @@ def hand_eye_report(
     start_from_camera = UncertainPose(correction.start_camera_from_camera, correction.covariance)
     estimate = start.gripper_from_camera @ start_from_camera
     start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.gripper_from_camera)
-    given_mm, given_deg = (None, None)
+    given_mm = given_deg = None
     if given is not None:
         given_mm, given_deg = pose_distance_mm_deg(estimate.pose, given)
     return HandEyeReport(

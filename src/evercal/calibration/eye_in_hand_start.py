@@ -12,7 +12,8 @@ which is linear in t_X. The estimate is accurate to a few millimetres.
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -32,43 +33,24 @@ from evercal.recordings.frame import Frame
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class HandEyeOptions:
-    """Matching of frames and agreement of their motions."""
-
-    frames: int = 120
-    """Frames used, at most, spread over the gripper's poses."""
-    partners: int = 6
-    """Number of most similar frames that every frame is matched to."""
-    features: int = 1500
-    """SIFT features of an image, at most."""
-    contrast: float = 0.01
-    """Smallest contrast of a feature, of OpenCV's SIFT."""
-    ratio: float = 0.85
-    """Largest ratio of the distances to the nearest and the second nearest feature."""
-    max_epipolar_px: float = 1.0
-    """Largest distance of a match from its epipolar line, pixels."""
-    min_inliers: int = 20
-    """Pairs with fewer inliers of the essential matrix are ignored."""
-    angle_tolerance_deg: float = 3.0
-    """Largest difference of the rotation angles of gripper and camera; they are equal in theory."""
-    most_rotation_deg: float = 5.0
-    """A pair agrees when its rotation differs by less than this, degrees."""
-    most_direction_deg: float = 10.0
-    """And when the direction of its translation differs by less than this, degrees."""
-    least_rotation_deg: float = 4.0
-    """The gripper must turn by at least this much about a second axis, standard deviation."""
-    least_pairs: int = 12
-    """Pairs that must agree."""
+FRAMES, PARTNERS = 120, 6
+"""Maximum number of frames, and number of most similar frames that each is matched to."""
+FEATURES, CONTRAST, RATIO = 1500, 0.01, 0.85
+"""SIFT features of an image, their contrast, and the ratio of distances in Lowe's test."""
+EPIPOLAR_PX, MIN_INLIERS = 1.0, 20
+"""Distance of a match from its epipolar line, and matches of a pair of frames."""
+ANGLE_DEG, ROTATION_DEG, DIRECTION_DEG = 3.0, 5.0, 10.0
+"""Largest difference of the rotation angles, the rotations and the directions of a pair."""
+LEAST_ROTATION_DEG, LEAST_PAIRS = 4.0, 12
+"""Standard deviation of the rotations about a second axis, and pairs that must agree."""
 
 
-@dataclass(frozen=True)
-class PairMotion:
+class PairMotion(NamedTuple):
     """Motion of the camera between two frames, from their images."""
 
     first: int
     second: int
-    """Numbers of the frames."""
+    """Index of the frame."""
     rotation: Rotation
     """second_camera_from_first_camera."""
     direction: Array
@@ -80,49 +62,31 @@ class HandEyeStart:
     """A first `gripper_from_camera`."""
 
     gripper_from_camera: SE3
-    """Single."""
     pairs: int
     """Pairs of frames that agree with it."""
     of_pairs: int
     """Pairs of frames whose motion was estimated."""
-    rotation_deg: float
-    """Median disagreement of the rotations."""
-    direction_deg: float
-    """Median disagreement of the directions of translation."""
 
 
 def rotation_spread_deg(base_from_gripper: SE3) -> Array:
-    """(3,) standard deviations of the rotations about their principal axes, largest first.
-
-    Args:
-        base_from_gripper: (n,).
-    """
+    """Return (3,) standard deviations of n rotations about principal axes, largest first."""
     rotations = Rotation.from_quat(base_from_gripper.rotation_wxyz, scalar_first=True)
     away = (rotations.mean().inv() * rotations).as_rotvec()
     return np.rad2deg(np.linalg.svd(away, compute_uv=False) / np.sqrt(len(away)))
 
 
-def refuse_poor_motion(base_from_gripper: SE3, options: HandEyeOptions) -> None:
-    """Refuse a recording whose motions cannot determine the transform, before any work.
-
-    Args:
-        base_from_gripper: (n,).
-        options: with the least rotation.
-
-    Raises:
-        InputError: hardly any rotation, or rotation about one axis only.
-    """
+def refuse_poor_motion(base_from_gripper: SE3) -> None:
+    """Refuse a recording with hardly any rotation, or with rotations about one axis only."""
     first, second, _ = rotation_spread_deg(base_from_gripper)
-    need = options.least_rotation_deg
     advice = (
         "record views that tilt the camera up and down and turn it left and right by 15 to 45 deg"
     )
-    if first < need:
+    if first < LEAST_ROTATION_DEG:
         raise InputError(
             f"the gripper turns by {first:.1f} deg (standard deviation): without rotation the"
             f" position of the camera on it is undetermined; {advice}"
         )
-    if second < need:
+    if second < LEAST_ROTATION_DEG:
         raise InputError(
             f"the gripper turns about one axis only ({first:.1f} deg about it, {second:.1f} deg"
             f" about the next): the camera's position along that axis is undetermined; {advice}"
@@ -132,101 +96,72 @@ def refuse_poor_motion(base_from_gripper: SE3, options: HandEyeOptions) -> None:
 def hand_eye_start(
     frames: Sequence[Frame],
     encoder: Encoder,
-    options: HandEyeOptions | None = None,
     on_progress: OnProgress = lambda *_: None,
 ) -> HandEyeStart:
     """Estimate `gripper_from_camera` from images and gripper poses.
 
     Args:
-        frames: with `base_from_gripper`; their `base_from_camera` is ignored.
-        encoder: for the similarity of frames.
-        options: matching and agreement.
-        on_progress: called as pairs of frames are matched.
+        frames: Frames with `base_from_gripper`; their `base_from_camera` is ignored.
+        encoder: Encoder for the similarity of frames.
+        on_progress: Called as pairs of frames are matched.
 
     Raises:
         InputError: Too little rotation, or too few frames that show the same place.
-
-    Returns:
-        An estimate accurate to a few millimetres.
     """
-    options = options or HandEyeOptions()
-    poses = gripper_poses(frames)
-    refuse_poor_motion(poses, options)
-    if len(frames) > options.frames:
-        some = spread_poses(poses, options.frames)
+    poses = SE3.stack([f.base_from_gripper for f in frames if f.base_from_gripper is not None])
+    refuse_poor_motion(poses)
+    if len(frames) > FRAMES:
+        some = spread_poses(poses, FRAMES)
         frames, poses = [frames[i] for i in some], poses[some]
-    motions = _pair_motions(frames, encoder, options, on_progress)
-    return solve_motions(poses, motions, options)
+    motions = _pair_motions(frames, encoder, on_progress)
+    return solve_motions(poses, motions)
 
 
-def gripper_poses(frames: Sequence[Frame]) -> SE3:
-    """(n,) base_from_gripper of the frames."""
-    return SE3.stack([f.base_from_gripper for f in frames if f.base_from_gripper is not None])
-
-
-def with_gripper(frames: Sequence[Frame], gripper_from_camera: SE3) -> tuple[Frame, ...]:
-    """Frames with camera poses from their gripper poses."""
-    return tuple(
-        replace(f, base_from_camera=f.base_from_gripper @ gripper_from_camera)
-        for f in frames
-        if f.base_from_gripper is not None
-    )
-
-
-def solve_motions(
-    base_from_gripper: SE3, motions: Sequence[PairMotion], options: HandEyeOptions
-) -> HandEyeStart:
+def solve_motions(base_from_gripper: SE3, motions: Sequence[PairMotion]) -> HandEyeStart:
     """Solve A X = X B for `gripper_from_camera`.
 
     Args:
         base_from_gripper: (n,).
-        motions: of pairs among the n frames.
-        options: agreement.
+        motions: Motions between pairs of the n frames.
 
     Raises:
         InputError: Too few pairs, or too few that agree.
     """
-    if len(motions) < options.least_pairs:
+    if len(motions) < LEAST_PAIRS:
         raise InputError(
             f"only {len(motions)} pairs of images show the same place from two sides, at least"
-            f" {options.least_pairs} are needed: record more views that overlap, of a place with"
+            f" {LEAST_PAIRS} are needed: record more views that overlap, of a place with"
             " texture"
         )
-    first, second = (np.array([getattr(m, w) for m in motions]) for w in ("first", "second"))
+    first, second = np.array([(m.first, m.second) for m in motions]).T
     moved = base_from_gripper[second].inverse() @ base_from_gripper[first]
     gripper_rotation = Rotation.from_quat(moved.rotation_wxyz, scalar_first=True).as_rotvec()
     camera_rotation = np.array([m.rotation.as_rotvec() for m in motions])
     difference = np.linalg.norm(gripper_rotation, axis=1) - np.linalg.norm(camera_rotation, axis=1)
-    same_angle = np.abs(difference) < np.deg2rad(options.angle_tolerance_deg)
-    _refuse_disagreement(same_angle, options)
+    same_angle = np.abs(difference) < np.deg2rad(ANGLE_DEG)
+    _refuse_disagreement(same_angle)
     rotation, distance = _robust_rotation(gripper_rotation[same_angle], camera_rotation[same_angle])
     agree = np.zeros(len(motions), bool)
     limit = 4 * max(1.48 * float(np.median(distance)), 1e-3)
-    limit = min(limit, np.deg2rad(options.most_rotation_deg))
+    limit = min(limit, np.deg2rad(ROTATION_DEG))
     agree[np.flatnonzero(same_angle)[distance < limit]] = True
-    _refuse_disagreement(agree, options)
+    _refuse_disagreement(agree)
     towards = rotation.apply(np.array([m.direction for m in motions]))
     translation, apart = _robust_translation(moved, towards, agree)
     # The direction of a small sideways motion is noise, so few pairs may be enough.
-    agree &= apart < np.deg2rad(options.most_direction_deg)
-    if agree.sum() < options.least_pairs:
+    agree &= apart < np.deg2rad(DIRECTION_DEG)
+    if agree.sum() < LEAST_PAIRS:
         raise InputError(
             f"the directions in which gripper and images moved agree in only {agree.sum()} of"
             f" {len(agree)} pairs of frames: move the camera sideways by 10 cm or more as well as"
             " turning it, and check that the poses are in metres"
         )
     start = SE3(rotation.as_quat(canonical=True, scalar_first=True), translation)
-    return HandEyeStart(
-        start,
-        int(agree.sum()),
-        len(motions),
-        float(np.rad2deg(np.median(distance))),
-        float(np.rad2deg(np.median(apart[agree]))),
-    )
+    return HandEyeStart(start, int(agree.sum()), len(motions))
 
 
-def _refuse_disagreement(agree: NDArray[np.bool_], options: HandEyeOptions) -> None:
-    if agree.sum() < max(options.least_pairs, 0.2 * len(agree)):
+def _refuse_disagreement(agree: NDArray[np.bool_]) -> None:
+    if agree.sum() < max(LEAST_PAIRS, 0.2 * len(agree)):
         raise InputError(
             f"the gripper's motion and the images agree in only {agree.sum()} of {len(agree)} pairs"
             " of frames: check that the poses belong to these images, that they are poses of the"
@@ -270,7 +205,7 @@ def _robust_translation(
 
 
 def _pair_motions(
-    frames: Sequence[Frame], encoder: Encoder, options: HandEyeOptions, on_progress: OnProgress
+    frames: Sequence[Frame], encoder: Encoder, on_progress: OnProgress
 ) -> list[PairMotion]:
     """Motions of similar frames with enough inliers."""
     images, cameras, features = [], [], []
@@ -285,23 +220,23 @@ def _pair_motions(
     vlad = vlad_for(encoder, features)
     descriptors = torch.stack([vlad(rows) for rows in features])
     similarity = (descriptors @ descriptors.T).fill_diagonal_(-1)
-    nearest = similarity.topk(min(options.partners, len(frames) - 1)).indices.tolist()
+    nearest = similarity.topk(min(PARTNERS, len(frames) - 1)).indices.tolist()
     pairs = sorted({(min(i, j), max(i, j)) for i, row in enumerate(nearest) for j in row})
     motions: list[PairMotion] = []
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        points = list(pool.map(lambda image: _sift(image, options), images))
-        jobs = pool.map(lambda pair: _motion(pair, points, cameras, options), pairs)
+        points = list(pool.map(lambda image: _sift(image), images))
+        jobs = pool.map(lambda pair: _motion(pair, points, cameras), pairs)
         for done, motion in enumerate(jobs, start=1):
             motions += [motion] if motion is not None else []
             on_progress("matching", done, len(pairs))
     return motions
 
 
-def _sift(image: NDArray[np.uint8], options: HandEyeOptions) -> tuple[Array, NDArray[np.float32]]:
+def _sift(image: NDArray[np.uint8]) -> tuple[Array, NDArray[np.float32]]:
     """Pixels (n, 2) and descriptors (n, 128) of unit length, RootSIFT (Arandjelovic, CVPR 2012)."""
     import cv2
 
-    sift = cv2.SIFT.create(nfeatures=options.features, contrastThreshold=options.contrast)
+    sift = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=CONTRAST)
     points, descriptors = sift.detectAndCompute(image, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
     if not points:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
@@ -318,12 +253,11 @@ def _motion(
     pair: tuple[int, int],
     features: list[tuple[Array, NDArray[np.float32]]],
     cameras: list[Camera],
-    options: HandEyeOptions,
 ) -> PairMotion | None:
     import poselib
 
     (pixels_a, a), (pixels_b, b) = (features[i] for i in pair)
-    if min(len(a), len(b)) < options.min_inliers:
+    if min(len(a), len(b)) < MIN_INLIERS:
         return None
     similar = a @ b.T
     best = similar.argmax(1)
@@ -332,9 +266,9 @@ def _motion(
     mutual = similar.argmax(0)[best] == rows
     similar[rows, best] = -1
     second = similar.max(1)
-    distinct = np.maximum(2 - 2 * top, 0) < options.ratio**2 * np.maximum(2 - 2 * second, 1e-9)
+    distinct = np.maximum(2 - 2 * top, 0) < RATIO**2 * np.maximum(2 - 2 * second, 1e-9)
     good = mutual & distinct
-    if good.sum() < options.min_inliers:
+    if good.sum() < MIN_INLIERS:
         return None
     # Undistorted here, so that PoseLib needs no camera model.
     first, second = (cameras[i] for i in pair)
@@ -346,10 +280,10 @@ def _motion(
         ideal_b[valid],
         _ideal(first),
         _ideal(second),
-        {"max_epipolar_error": options.max_epipolar_px},
+        {"max_epipolar_error": EPIPOLAR_PX},
         {},
     )
-    if info["num_inliers"] < options.min_inliers:
+    if info["num_inliers"] < MIN_INLIERS:
         return None
     direction = np.asarray(pose.t) / max(float(np.linalg.norm(pose.t)), 1e-12)
     return PairMotion(*pair, Rotation.from_matrix(pose.R), direction)

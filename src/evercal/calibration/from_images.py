@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from evercal.calibration.calibration import Calibration, ErrorTerm, Mount
 from evercal.calibration.located import (
     Fused,
-    FusionOptions,
     Located,
     deviations,
     fuse,
@@ -29,7 +28,7 @@ from evercal.calibration.located import (
 )
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, axis_deviation
+from evercal.geometry import SE3, Camera, axis_deviation, pose_distance
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings import read_image
 from evercal.recordings.image_files import image_files
@@ -52,7 +51,7 @@ ImageSource = (
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """Images of one camera, with what is known about them."""
+    """Images of one camera, with intrinsics and gripper poses if known."""
 
     images: Sequence[tuple[str, NDArray[np.uint8]]]
     """(name, (h, w, 3) uint8 RGB)."""
@@ -72,15 +71,14 @@ class Images:
         """Read images from files or take them from arrays.
 
         Args:
-            source: a folder, image files, or arrays.
-            camera: intrinsics at any size of the same aspect ratio.
+            source: A folder, image files, or arrays.
+            camera: Intrinsics at any size of the same aspect ratio.
             robot_poses: base_from_gripper of every image: (n,) poses, or a file whose rows are
                 paired with image files by name, by time or in order.
-            convention: format of the file's numbers, if it does not state it.
+            convention: Convention of the file's numbers, if it does not state it.
 
         Raises:
-            InputError: A file is missing or no image, poses that do not fit the images, or a file
-                of poses for images from arrays.
+            InputError: A file is missing or broken, or poses do not fit the images.
         """
         single = isinstance(source, str | os.PathLike) or (
             isinstance(source, np.ndarray) and source.ndim < 4
@@ -105,18 +103,15 @@ def calibrate(
     localizer: "Localizer",
     given: Images,
     mount: Mount | None = None,
-    options: FusionOptions | None = None,
     on_image: Callable[[], object] = lambda: None,
 ) -> Calibration:
     """Estimate the pose of a camera from images of a mapped scene.
 
     Args:
-        localizer: of a map that holds the scene.
-        given: images and, for a camera on the gripper, the gripper's poses.
-        mount: `eye_to_hand` or `eye_in_hand`. Default: eye_in_hand if there are gripper poses and
-            the camera moves.
-        options: when a pose counts as an outlier.
-        on_image: called after each image.
+        localizer: Localizer of a map that holds the scene.
+        given: Images and, for a camera on the gripper, the gripper's poses.
+        mount: Default: eye_in_hand if there are gripper poses and the camera moves.
+        on_image: Called after each image.
 
     Returns:
         base_from_camera for eye_to_hand, gripper_from_camera for eye_in_hand.
@@ -138,7 +133,7 @@ def calibrate(
     moved = located
     if mount == "eye_in_hand" and grippers is not None:
         moved = in_gripper_frame(located, grippers)
-    fused = fuse(moved, options)
+    fused = fuse(moved)
     scene = scene_named(localizer, fused.scene)
     camera = given.camera or scene.adjusted_camera
     height, width = given.images[0][1].shape[:2]
@@ -169,11 +164,7 @@ def calibrate(
 
 
 def scene_named(localizer: "Localizer", name: str) -> SceneMap:
-    """The map of a scene.
-
-    Raises:
-        InputError: The map holds no such scene.
-    """
+    """Return the map of a scene, or raise InputError."""
     for scene in localizer.contents.scenes:
         if scene.name == name:
             return scene
@@ -181,7 +172,7 @@ def scene_named(localizer: "Localizer", name: str) -> SceneMap:
 
 
 def map_digest(localizer: "Localizer", name: str) -> str:
-    """Identifies a scene's map and base frame: two answers with one digest share their errors."""
+    """Identify a scene's map and base frame: poses with the same digest share their errors."""
     scene = scene_named(localizer, name)
     digest = hashlib.sha256(name.encode())
     digest.update(scene.keyframes.base_from_camera.matrix().tobytes())
@@ -198,9 +189,8 @@ def _stands_still(located: Sequence[Located]) -> bool:
     if len(items) < 2:
         return True
     off = deviations(SE3.stack([item.pose for item in items]), fuse(items).pose)
-    distance = np.linalg.norm(off[:, :3], axis=1)
-    angle = np.linalg.norm(off[:, 3:], axis=1)
-    return bool(np.median(distance) < 0.01 and np.median(angle) < np.deg2rad(1.0))
+    metres, radians = np.median(np.linalg.norm(off.reshape(-1, 2, 3), axis=2), axis=0)
+    return bool(metres < 0.01 and radians < np.deg2rad(1.0))
 
 
 def _from_one_spot(located: Sequence[Located], fused: Fused) -> tuple[Array, tuple[ErrorTerm, ...]]:
@@ -219,17 +209,22 @@ def _from_many_spots(
     located: Sequence[Located], moved: Sequence[Located], fused: Fused
 ) -> tuple[Array, tuple[ErrorTerm, ...]]:
     """Covariance of a camera on the gripper: the scatter among spots, and that of one spot."""
+    from scipy import stats
+
     used = fused.select(moved)
     spots = _spots([item.pose for item in fused.select(located)])
     count = int(spots.max()) + 1
     own = np.mean([item.covariance for item in used], axis=0) / count
     off = deviations(SE3.stack([item.pose for item in used]), fused.pose)
     means = np.stack([off[spots == spot].mean(0) for spot in range(count)])
+    freedom = max(count - 1, 1)
     # The scatter contains errors of the robot's poses, which the images do not show.
-    scatter = means.T @ means / max(count - 1, 1) / count
+    scatter = means.T @ means / freedom / count
     larger = np.maximum(np.diag(scatter), np.diag(own))
     scale = np.sqrt(larger / np.maximum(np.diag(own), 1e-18))
-    covariance = own * np.outer(scale, scale) * _small_sample(count)
+    # Student factor of a covariance that was estimated from few spots.
+    student = float((stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975)) ** 2)
+    covariance = own * np.outer(scale, scale) * student
     terms = (
         _term(f"images from {count} spots", own),
         _term("scatter among spots, with the errors of the robot's poses", scatter),
@@ -237,29 +232,16 @@ def _from_many_spots(
     return covariance, terms
 
 
-def _small_sample(count: int) -> float:
-    """Student factor on a covariance that was estimated from few spots."""
-    from scipy import stats
-
-    freedom = max(count - 1, 1)
-    return float((stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975)) ** 2)
-
-
 def _spots(poses: Sequence[SE3]) -> NDArray[np.int64]:
     """(n,) index of the spot of each pose, in order of appearance."""
     centres: list[SE3] = []
     numbers = []
     for pose in poses:
-        off = [deviations(SE3.stack([pose]), centre)[0] for centre in centres]
-        near = [
-            i
-            for i, d in enumerate(off)
-            if np.linalg.norm(d[:3]) < SPOT_M and np.linalg.norm(d[3:]) < SPOT_RAD
-        ]
-        if not near:
+        distances = (pose_distance(centre, pose) for centre in centres)
+        near = (i for i, (m, rad) in enumerate(distances) if m < SPOT_M and rad < SPOT_RAD)
+        numbers.append(next(near, len(centres)))
+        if numbers[-1] == len(centres):
             centres.append(pose)
-            near = [len(centres) - 1]
-        numbers.append(near[0])
     return np.array(numbers)
 
 

@@ -18,18 +18,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Item = TypeVar("Item")
-
-
-@dataclass(frozen=True)
-class FusionOptions:
-    """When a pose is an outlier."""
-
-    outlier_sigmas: float = 5.0
-    """Robust standard deviations from the mean beyond which a pose is an outlier."""
-    least_mm: float = 2.0
-    """Distances below this are never outliers, millimetres."""
-    least_deg: float = 0.15
-    """The same for rotations, degrees."""
+_OUTLIER_SIGMAS = 5.0
+"""Robust standard deviations from the mean beyond which a pose is an outlier."""
+_LEAST_M, _LEAST_RAD = 0.002, np.deg2rad(0.15)
+"""Smaller distances are never outliers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +29,9 @@ class Located:
     """One image and its pose estimate."""
 
     name: str
-    """Of the image."""
     estimate: "PoseEstimate"
-    """Of the localizer."""
     pose: SE3
-    """The pose to fuse: base_from_camera or gripper_from_camera. Identity where the estimate is
-    not ok."""
+    """Pose to fuse: base_from_camera or gripper_from_camera. Identity if it was not located."""
     covariance: Array
     """(6, 6) of translation in the parent frame and rotation about camera axes."""
 
@@ -57,7 +46,6 @@ class Fused:
     """Robust mean of many poses of one transform."""
 
     pose: SE3
-    """Single."""
     scatter: Array
     """(6, 6) covariance of one pose about the others."""
     used: NDArray[np.bool_]
@@ -65,10 +53,9 @@ class Fused:
     uses: tuple[ImageUse, ...]
     """(n,) use of every image, or the reason for rejecting it."""
     scene: str
-    """Name of the scene."""
 
     def select(self, items: Sequence[Item]) -> list[Item]:
-        """The items (n,) of the images that were used."""
+        """Return the items of the images that were used."""
         return [item for item, used in zip(items, self.used, strict=True) if used]
 
 
@@ -81,10 +68,10 @@ def locate(
     """Locate every image.
 
     Args:
-        localizer: of a map.
+        localizer: Localizer of a map.
         images: (name, (h, w, 3) uint8 RGB).
         camera: Intrinsics. Default: those of the camera that recorded the scene.
-        on_image: called after each.
+        on_image: Called after each image.
     """
     located = []
     for name, image in images:
@@ -96,12 +83,7 @@ def locate(
 
 
 def in_gripper_frame(located: Sequence[Located], base_from_gripper: SE3) -> list[Located]:
-    """The same images with `gripper_from_camera` as the pose.
-
-    Args:
-        located: n images.
-        base_from_gripper: (n,) gripper poses.
-    """
+    """Return the n images with `gripper_from_camera` as the pose."""
     moved = []
     for item, gripper in zip(located, base_from_gripper, strict=True):
         pose = gripper.inverse() @ UncertainPose(item.pose, item.covariance)
@@ -109,17 +91,12 @@ def in_gripper_frame(located: Sequence[Located], base_from_gripper: SE3) -> list
     return moved
 
 
-def fuse(located: Sequence[Located], options: FusionOptions | None = None) -> Fused:
+def fuse(located: Sequence[Located]) -> Fused:
     """Fuse poses of one transform, with a reason for every image that is rejected.
 
-    Args:
-        located: images that should all give the same pose.
-        options: when a pose is an outlier.
-
     Raises:
-        InputError: no image was located.
+        InputError: No image was located.
     """
-    options = options or FusionOptions()
     names = Counter(item.estimate.scene for item in located if item.is_located)
     if not names:
         first = located[0].estimate.reason if located else "no image was given"
@@ -138,7 +115,7 @@ def fuse(located: Sequence[Located], options: FusionOptions | None = None) -> Fu
     poses = SE3.stack([located[i].pose for i in usable])
     mean = average_poses(poses)
     off = deviations(poses, mean)
-    far = _far(off, options)
+    far = _far(off)
     for row, i in enumerate(usable):
         if far[row]:
             millimetres, degrees = length_mm_deg(off[row])
@@ -157,37 +134,27 @@ def fuse(located: Sequence[Located], options: FusionOptions | None = None) -> Fu
 
 
 def deviations(poses: SE3, mean: SE3) -> Array:
-    """(n, 6) deviations of poses: translation in the parent frame, rotation about child axes."""
+    """Return (n, 6) translations in the parent frame and rotations about child axes."""
     shift = poses.translation_m - mean.translation_m
     rotation = (mean.inverse() @ poses).log()[:, 3:]
     return np.concatenate([shift, rotation], axis=1)
 
 
-def _far(off: Array, options: FusionOptions) -> NDArray[np.bool_]:
-    """(n,) outliers: beyond a number of robust deviations and beyond a least distance."""
-    far = np.zeros(len(off), bool)
-    for part, least in (
-        (off[:, :3], options.least_mm / 1000),
-        (off[:, 3:], np.deg2rad(options.least_deg)),
-    ):
-        distance = np.linalg.norm(part, axis=1)
-        # For three Gaussian axes the median distance is 1.54 standard deviations.
-        spread = float(np.median(distance)) / 1.54
-        far |= distance > max(options.outlier_sigmas * spread, least)
-    return far
+def _far(off: Array) -> NDArray[np.bool_]:
+    """Return (n,) outliers among deviations."""
+    distance = np.linalg.norm(off.reshape(-1, 2, 3), axis=2)
+    # For three Gaussian axes the median distance is 1.54 standard deviations.
+    spread = np.median(distance, axis=0) / 1.54
+    return (distance > np.maximum(_OUTLIER_SIGMAS * spread, (_LEAST_M, _LEAST_RAD))).any(1)
 
 
 def length_mm_deg(off: Array) -> tuple[float, float]:
-    """Length of one deviation (6,) in millimetres and degrees."""
+    """Return the length of one deviation (6,) in millimetres and degrees."""
     return 1000 * float(np.linalg.norm(off[:3])), float(np.rad2deg(np.linalg.norm(off[3:])))
 
 
 def halves_apart(poses: SE3) -> tuple[float, float] | None:
-    """Millimetres and degrees between the means of even and odd poses.
-
-    Args:
-        poses: (n,). The result is None for fewer than four.
-    """
+    """Return millimetres and degrees between the means of even and odd poses, at least four."""
     if len(poses) < 4:
         return None
     first, second = (average_poses(poses[start::2]) for start in (0, 1))

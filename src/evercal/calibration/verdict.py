@@ -1,20 +1,16 @@
-"""What a calibration is good for, in plain words."""
+"""Uses that a calibration is good for, in plain words."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from evercal.calibration.calibration import Calibration
 
 
-@dataclass(frozen=True)
-class Tier:
-    """A use and what it asks for."""
+class Tier(NamedTuple):
+    """A use and the errors that it tolerates."""
 
     name: str
-    """The use."""
     mm: float
-    """Error in millimetres that it bears."""
     deg: float
-    """Error in degrees that it bears."""
 
 
 TIERS = (
@@ -22,14 +18,13 @@ TIERS = (
     Tier("bin picking", 3.0, 0.3),
     Tier("tabletop tasks", 10.0, 1.0),
 )
-"""The most demanding first; what misses the last one is unusable."""
+"""The most demanding first; a calibration that misses the last one is unusable."""
 
 
 def tier(calibration: Calibration) -> Tier | None:
-    """The most demanding use that it serves, None if it serves none.
+    """Return the most demanding use that a calibration serves.
 
-    The uncertainty of the answer decides, as the expected distance in space, and where a check on
-    poses that were left out was made, its error as well: a small uncertainty beside a large error
+    Its uncertainty and the errors of its checks decide: a small uncertainty beside a large error
     means that the model of rigid motion does not hold.
     """
     mm, deg = expected_error(calibration)
@@ -37,11 +32,11 @@ def tier(calibration: Calibration) -> Tier | None:
 
 
 def expected_error(calibration: Calibration) -> tuple[float, float]:
-    """Millimetres and degrees: the largest of the uncertainty and of what the checks found.
+    """Return millimetres and degrees: the largest of the uncertainty and the errors of the checks.
 
-    Two halves of the data differ by twice as much as the answer from both is off.
+    Two halves of the data differ by twice the error of their mean.
     """
-    mm, deg = _expected(calibration)
+    mm, deg = _sigma_in_space(calibration)
     for check, share in (("held_out", 1.0), ("repeatability", 0.5)):
         mm = max(mm, share * float(calibration.checks.get(f"{check}_mm") or 0.0))
         deg = max(deg, share * float(calibration.checks.get(f"{check}_deg") or 0.0))
@@ -49,28 +44,26 @@ def expected_error(calibration: Calibration) -> tuple[float, float]:
 
 
 def verdict(calibration: Calibration) -> str:
-    """One to three sentences: what it is good for, why, and what would make it better."""
-    found = tier(calibration)
-    mm, deg = _expected(calibration)
-    if found is None:
-        first = (
-            f"Unusable: even tabletop tasks ask for {TIERS[-1].mm:g} mm and {TIERS[-1].deg:g} deg."
-        )
-    else:
-        first = f"Good for {found.name} (within {found.mm:g} mm and {found.deg:g} deg)."
-    known = f"Expected error {_length(mm)} and {deg:.2f} deg"
-    held_out = _held_out(calibration)
-    if held_out is None:
-        return f"{first} {known}."
-    known = f"{known}; the median error on held-out poses is {_length(held_out[0])} and"
-    return f"{first} {known} {held_out[1]:.2f} deg. {_advice(found, (mm, deg), held_out)}"
+    """Return one to three sentences: possible uses, the reason, and advice."""
+    use, sigma, checks = tier(calibration), _sigma_in_space(calibration), calibration.checks
+    first = f"Unusable: even tabletop tasks ask for {TIERS[-1].mm:g} mm and {TIERS[-1].deg:g} deg."
+    if use is not None:
+        first = f"Good for {use.name} (within {use.mm:g} mm and {use.deg:g} deg)."
+    first = f"{first} Expected error {_length(sigma[0])} and {sigma[1]:.2f} deg"
+    if "held_out_mm" not in checks or "held_out_deg" not in checks:
+        return f"{first}."
+    held_out = float(checks["held_out_mm"]), float(checks["held_out_deg"])
+    return (
+        f"{first}; the median error on held-out poses is {_length(held_out[0])} and"
+        f" {held_out[1]:.2f} deg. {_advice(use, sigma, held_out)}"
+    )
 
 
-def _advice(found: Tier | None, known: tuple[float, float], held_out: tuple[float, float]) -> str:
-    if found is TIERS[0]:
+def _advice(use: Tier | None, sigma: tuple[float, float], held_out: tuple[float, float]) -> str:
+    if use is TIERS[0]:
         return "Check it on the robot before use: touch a point that the camera sees."
-    wanted = TIERS[-1] if found is None else TIERS[TIERS.index(found) - 1]
-    sigma_lacks = known[0] >= wanted.mm or known[1] >= wanted.deg
+    wanted = TIERS[-1] if use is None else TIERS[TIERS.index(use) - 1]
+    sigma_lacks = sigma[0] >= wanted.mm or sigma[1] >= wanted.deg
     held_out_lacks = held_out[0] >= wanted.mm or held_out[1] >= wanted.deg
     if sigma_lacks and not held_out_lacks:
         return f"More poses, tilted more about two axes, bring it nearer to {wanted.name}."
@@ -86,16 +79,9 @@ def _advice(found: Tier | None, known: tuple[float, float], held_out: tuple[floa
     )
 
 
-def _expected(calibration: Calibration) -> tuple[float, float]:
+def _sigma_in_space(calibration: Calibration) -> tuple[float, float]:
     """Root mean square error in space, millimetres and degrees."""
     return 3**0.5 * calibration.sigma_mm, 3**0.5 * calibration.sigma_deg
-
-
-def _held_out(calibration: Calibration) -> tuple[float, float] | None:
-    checks = calibration.checks
-    if "held_out_mm" not in checks or "held_out_deg" not in checks:
-        return None
-    return float(checks["held_out_mm"]), float(checks["held_out_deg"])
 
 
 def _length(mm: float) -> str:

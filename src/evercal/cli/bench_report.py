@@ -51,23 +51,23 @@ def show_report(
     from evercal.continual.benchmark.bench_views import view_pictures
     from evercal.continual.benchmark.comparison import summary
     from evercal.continual.benchmark.latex import paper_tables
-    from evercal.continual.benchmark.report_data import read_report
+    from evercal.continual.benchmark.report_data import read_report, tables_text
     from evercal.simulation.cell import SUITES
     from evercal.storage import write_bytes
 
     report = read_report(folder, reference, compare_with)
     tables = report.tables()
-    write_bytes(folder / TABLES, (tables.as_text("markdown") + "\n").encode())
+    write_bytes(folder / TABLES, (tables_text(tables, "markdown") + "\n").encode())
     suite = SUITES.get(report.suite)
     rooms = {name: (kind, seed) for name, kind, seed in suite.rooms} if suite else {}
     views = view_pictures(folder, report.plotted, rooms)
     write_bytes(folder / PAGE, bench_page(report, tables, views).encode())
-    latex = paper_tables(report.runs, report.suite, tables.ablation)
+    latex = paper_tables(report.runs, report.suite, tables.get("ablation"))
     write_bytes(folder / LATEX, (latex + "\n").encode())
     if as_json:
         print_json({"strategies": summary([*report.runs, *report.compare_with])})
         return 0
-    print(tables.as_text("terminal"))
+    print(tables_text(tables, "terminal"))
     print(f"wrote {folder / PAGE}, {TABLES} and {LATEX}")
     print_next("evercal", "bench-report", folder)
     return 0

@@ -155,10 +155,11 @@ def _rig_lines(rig: "Rig") -> list[str]:
         first, *rest = calibration_lines(calibration)
         lines += [f"{name}: {first}", *rest]
     for pair in rig.relative:
-        x, y, z = 1000 * pair.first_from_second.translation_m
+        pose = pair.first_from_second
+        x, y, z = 1000 * pose.pose.translation_m
         lines.append(
             f"{pair.first}_from_{pair.second}: {x:+.2f} {y:+.2f} {z:+.2f} mm, standard deviation"
-            f" at most {pair.sigma_mm:.2f} mm and {pair.sigma_deg:.3f} deg (independent errors"
+            f" at most {pose.sigma_mm:.2f} mm and {pose.sigma_deg:.3f} deg (independent errors"
             " assumed)"
         )
     return lines

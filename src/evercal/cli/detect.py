@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from evercal.calibration.boards.board_poses import BoardPoses
     from evercal.calibration.boards.corners import BoardView
     from evercal.calibration.boards.detection import Board
-    from evercal.geometry import Camera
 
 _DICTIONARIES = {"chessboard": "", "charuco": "4X4_50", "apriltag": "APRILTAG_36h11"}
 
@@ -68,9 +67,12 @@ class Detect:
         from evercal.calibration.boards.corners import BoardView
         from evercal.calibration.boards.intrinsics import calibrate_camera
         from evercal.recordings import image_size
+        from evercal.recordings.poses.camera_file import read_camera_of_size
 
         width, height = image_size(files[0])
-        camera, source = self._camera(width, height), "file"
+        camera, source = None, "file"
+        if self.camera is not None:
+            camera = read_camera_of_size(self.camera, (width, height), "the first image")
         views = self._detected(files, board, width, height)
         detected = [view for view in views.values() if isinstance(view, BoardView)]
         if not detected:
@@ -103,19 +105,6 @@ class Detect:
             dictionary=self.dictionary or _DICTIONARIES[self.board],
             tag=self.tag,
         )
-
-    def _camera(self, width: int, height: int) -> "Camera | None":
-        from evercal.recordings.poses.camera_file import read_camera
-
-        if self.camera is None:
-            return None
-        camera = read_camera(self.camera, (width, height))
-        if (camera.width, camera.height) != (width, height):
-            raise InputError(
-                f"{self.camera}: is for images of {camera.width}x{camera.height}, these are"
-                f" {width}x{height}; give the intrinsics of this image size"
-            )
-        return camera
 
     def _detected(
         self, files: Sequence[Path], board: "Board", width: int, height: int

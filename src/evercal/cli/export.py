@@ -61,6 +61,7 @@ class ExportCalibration:
         """Read all inputs before writing the output."""
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.export.formats import FORMATS, export_files
+        from evercal.calibration.export.request import ExportOptions
 
         if self.format == "list" or (self.format is None and self.calibration is None):
             return self._list()
@@ -68,22 +69,9 @@ class ExportCalibration:
             raise InputError(f"no format given; add --format NAME, one of {', '.join(FORMATS)}")
         if self.calibration is None:
             raise InputError("no calibration given; name its JSON file after 'export'")
-        exported = export_files(
-            read_calibration(self.calibration),
-            self.format,
-            self.out,
-            parent=self.parent,
-            child=self.child,
-            via=self.via,
-            via_transform=self.via_transform,
-            via_offset=self.via_offset,
-            via_optical=self.via_optical,
-            robot_frame=self.robot_frame,
-            robot_poses=self.robot_poses,
-            target_poses=self.target_poses,
-            convention=self.convention,
-        )
-        self._print(exported)
+        options = {key: getattr(self, key) for key in ExportOptions.__annotations__}
+        calibration = read_calibration(self.calibration)
+        self._print(export_files(calibration, self.format, self.out, **options))
         return 0
 
     def _print(self, exported: "Exported") -> None:

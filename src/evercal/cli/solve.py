@@ -51,17 +51,9 @@ class Solve:
         require_writable(self.out, "--out")
         from evercal.calibration.verdict import tier
 
-        source = {
-            "command": "solve",
-            "robot_poses": str(self.robot_poses),
-            "camera_poses": str(self.camera_poses),
-            "mount": self.mount,
-            "scale": self.scale,
-            "time_offset": self.time_offset,
-            "robot_convention": self.robot_convention,
-            "camera_convention": self.camera_convention,
-            "invert": self.invert,
-        }
+        options = {key: value for key, value in vars(self).items() if key not in ("out", "json")}
+        files = {key: str(options[key]) for key in ("robot_poses", "camera_poses")}
+        source = {"command": "solve", **options, **files}
         calibration = self._with_image_paths(replace(self._solved(), source=source))
         calibration.write(self.out)
         if self.json:

@@ -62,7 +62,7 @@ class Watch:
         if self.window < 1 or self.interval <= 0:
             raise InputError("--window is at least 1 and --interval is above 0")
         from evercal.calibration.calibration import read_calibration
-        from evercal.calibration.drift import DriftOptions, shift_between
+        from evercal.calibration.drift import shift_between
         from evercal.calibration.located import Located, fuse, locate
 
         reference = read_calibration(self.reference)
@@ -79,8 +79,8 @@ class Watch:
                     self._print(path, {"moved": None, "reason": recent[-1].estimate.reason})
                     continue
                 tests += 1
-                options = DriftOptions(confidence=1 - false_alarm_share(tests))
-                shift = shift_between(reference, fuse(recent), list(recent), localizer, options)
+                confidence = 1 - false_alarm_share(tests)
+                shift = shift_between(reference, fuse(recent), list(recent), localizer, confidence)
                 self._print(path, shift_dict(shift), shift_line(shift))
                 if shift.moved and len(recent) >= min(3, self.window):
                     return 1

@@ -20,13 +20,10 @@ GRADIENT_ROWS = 256
 
 
 class FrameStatistics:
-    """Frames of one scene in recorded order; everything but the poses is computed lazily.
+    """n frames of one scene in recorded order; everything but the poses is computed lazily.
 
-    Args:
-        frames: n posed training frames.
-        head: Head after learning the scene.
-        rows: Returns a buffer whose first n views are the plain views of these frames.
-        seed: Seed of a selector's random draws.
+    `head` has learned the scene, and `rows` returns a buffer whose first n views are the plain
+    views of these frames.
     """
 
     def __init__(
@@ -53,10 +50,8 @@ class FrameStatistics:
     @cached_property
     def _first_rows(self) -> Tensor:
         """(n + 1,) first row of each frame, and the end of the last."""
-        count = torch.bincount(self._buffer.tensors["view"].cpu().long(), minlength=len(self))
-        return torch.cat(
-            [torch.zeros(1, dtype=torch.long, device="cpu"), count[: len(self)].cumsum(0)]
-        )
+        view = self._buffer.tensors["view"].cpu()
+        return torch.searchsorted(view, torch.arange(len(self) + 1, device="cpu").to(view.dtype))
 
     def _rows_of(self, frame: int) -> Rows:
         start, end = self._first_rows[frame : frame + 2].tolist()

@@ -1,15 +1,12 @@
 """Presets of the training effort per scene."""
 
 from dataclasses import replace
-from typing import Literal
 
 from evercal.continual.networks.buffer import EncodePlan
 from evercal.continual.networks.head import HeadOptions
 from evercal.continual.networks.loss import LossOptions
 from evercal.continual.networks.trainer import FitOptions
 from evercal.continual.stage import StageOptions
-
-Preset = Literal["fast", "demo", "bench", "paper"]
 
 PRESETS: dict[str, StageOptions] = {
     # At most 240 s per scene on two cores.

@@ -21,11 +21,6 @@ def select_reservoir(count: int, capacity: int, rng: np.random.Generator) -> np.
 
     Frames are appended until the buffer is full. Later the n-th frame draws one of n slots and
     replaces its frame if the slot is in the buffer (Vitter, 1985, algorithm R).
-
-    Args:
-        count: Frames in the stream.
-        capacity: Frames to select.
-        rng: Source of the random draws.
     """
     selected = list(range(min(count, capacity)))
     for frame in range(capacity, count):
@@ -41,12 +36,7 @@ def select_hybrid(features: np.ndarray, capacity: int, rng: np.random.Generator)
     Only novel frames enter the reservoir's stream: their distance to the last novel frame exceeds
     the median distance of neighbouring frames. The measure is ours, because only the abstract of
     the original was available. If too few frames are novel, a reservoir of the others fills the
-    rest.
-
-    Args:
-        features: (n, c) of the frames in recorded order; rows are scaled to unit length.
-        capacity: Frames to select.
-        rng: Source of the random draws.
+    rest. The rows of features (n, c) are scaled to unit length.
     """
     unit = _unit(features)
     step = 1 - (unit[1:] * unit[:-1]).sum(1)
@@ -65,11 +55,7 @@ def select_herding(features: np.ndarray, capacity: int) -> np.ndarray:
     """Herding of iCaRL (Rebuffi et al., CVPR 2017, Algorithm 4).
 
     Each next frame is the one that brings the mean of the selection closest to the mean of all
-    frames. Ties go to the earlier frame.
-
-    Args:
-        features: (n, c) of the frames; rows are scaled to unit length.
-        capacity: Frames to select.
+    frames. Ties go to the earlier frame. The rows of features (n, c) are scaled to unit length.
     """
     unit = _unit(features)
     mean = unit.mean(0) if len(unit) else np.zeros(features.shape[1])
@@ -84,14 +70,10 @@ def select_herding(features: np.ndarray, capacity: int) -> np.ndarray:
 
 
 def leverage_scores(features: np.ndarray, rank: int) -> np.ndarray:
-    """Compute rank-r leverage: squared row norms of the first r left singular vectors.
+    """Compute rank-r leverage: squared row norms of the first r left singular vectors of (n, c).
 
     The scores sum to the rank. FedCBDR prints the full left factor, whose rows all have norm 1; the
     thin one is used here.
-
-    Args:
-        features: (n, c).
-        rank: Largest number of singular vectors.
     """
     left, values, _ = np.linalg.svd(np.asarray(features, np.float64), full_matrices=False)
     used = int((values > values.max(initial=0) * 1e-9).sum())
@@ -105,12 +87,6 @@ def select_leverage(
 
     Frames are drawn without replacement, with probabilities proportional to their leverage.
     Encryption and bias weights, which serve several parties, are omitted.
-
-    Args:
-        features: (n, c) of the frames.
-        capacity: Frames to select.
-        rng: Source of the random draws.
-        rank: See `leverage_scores`.
     """
     score = leverage_scores(features, rank)
     # Frames without leverage can still fill the capacity.
@@ -165,12 +141,8 @@ def select_gradients(gradients: np.ndarray, capacity: int, rng: np.random.Genera
 
     A frame's score c is one plus its largest cosine with a few buffered frames. Frames are appended
     until the buffer is full. Later a frame enters only if c < 1, which means opposed gradients. It
-    then replaces a buffered frame i, drawn by its score c_i, with probability c_i / (c_i + c).
-
-    Args:
-        gradients: (n, p) gradient of the loss on each frame.
-        capacity: Frames to select.
-        rng: Source of the random draws.
+    then replaces a buffered frame i, drawn by its score c_i, with probability c_i / (c_i + c). The
+    gradients (n, p) are those of the loss on each frame.
     """
     unit = _unit(gradients)
     selected: list[int] = []

@@ -42,18 +42,12 @@ class Strategy:
     def description(self) -> dict[str, object]:
         """Convert to plain data: method with hyper-parameters, map, joint training."""
         method = None if self.method is None else described(self.method)
-        plain: dict[str, object] = {"method": method, "map": self.builds_map}
-        if self.jointly:
-            plain["jointly"] = True
-        return plain
-
-
-def _named(*strategies: Strategy) -> dict[str, Strategy]:
-    return {strategy.name: strategy for strategy in strategies}
+        jointly = {"jointly": True} if self.jointly else {}
+        return {"method": method, "map": self.builds_map, **jointly}
 
 
 # Settings with the best mean over the suites of `benchmarks tune`; see docs/methods.md.
-STRATEGIES: dict[str, Strategy] = _named(
+_ALL = (
     Strategy(
         "evercal",
         builds_map=True,
@@ -125,6 +119,7 @@ STRATEGIES: dict[str, Strategy] = _named(
         source="all frames of all scenes at once, beside the map",
     ),
 )
+STRATEGIES: dict[str, Strategy] = {strategy.name: strategy for strategy in _ALL}
 
 
 def strategy_named(name: str) -> Strategy:

@@ -21,10 +21,7 @@ def encode_features(
 ) -> Tensor:
     """Features (b, channels, h, w) of views of one size, fp32.
 
-    Args:
-        views: b views.
-        encoder: frozen local encoder; it runs on the device of its weights.
-        device: device of the features. Default: that of the encoder.
+    By default they are on the device of the encoder's weights, on which it runs.
     """
     own = device_of_network(encoder)
     grey = torch.from_numpy(np.stack([view.grey for view in views]))[:, None].to(own)

@@ -5,7 +5,7 @@ ACE's published layout can be read, too, and any module with `stride` and `width
 """
 
 from pathlib import Path
-from typing import Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -32,7 +32,6 @@ class Encoder(Protocol):
 
     def __call__(self, grey: Tensor) -> Tensor:
         """(b, 1, h, w) in [0, 1] -> (b, width, h // stride, w // stride)."""
-        ...
 
 
 class _ConvBlock(nn.Sequential):
@@ -83,7 +82,9 @@ class LocalEncoder(nn.Module):
     ):
         super().__init__()
         self.width = width
-        self.settings = {"stem": list(stem), "inner": inner, "blocks": blocks, "width": width}
+        self.settings: dict[str, Any] = {
+            "stem": list(stem), "inner": inner, "blocks": blocks, "width": width,
+        }  # fmt: skip
         self.stem = nn.ModuleList(
             [
                 _ConvBlock(4, stem[0], 3, 1, fused),
@@ -116,13 +117,7 @@ class LocalEncoder(nn.Module):
 
     def fuse(self) -> "LocalEncoder":
         """The same function with batch norm folded in, for inference."""
-        settings, training = self.settings, self.training
-        twin = LocalEncoder(
-            stem=(settings["stem"][0], settings["stem"][1]),
-            inner=settings["inner"],
-            blocks=settings["blocks"],
-            width=settings["width"],
-        )
+        training, twin = self.training, LocalEncoder(**self.settings)
         source = [m for m in self.modules() if isinstance(m, _ConvBlock)]
         target = [m for m in twin.modules() if isinstance(m, _ConvBlock)]
         for a, b in zip(source, target, strict=True):
@@ -213,11 +208,7 @@ def own_encoder(module: nn.Module, path: Path) -> Encoder:
         InputError: The weights belong to another module.
     """
     state = {name: value.float() for name, value in load_tensors(path).items()}
-    try:
-        module.load_state_dict(state, strict=True)
-    except RuntimeError as error:
-        first = str(error).splitlines()[-1].strip()
-        raise InputError(f"{path}: not the weights of the given encoder ({first})") from None
+    load_strictly(module, state, f"{path}: not the weights of the given encoder")
     return checked_encoder(module)
 
 
@@ -239,9 +230,8 @@ def load_encoder(path: Path | None = None) -> LocalEncoder | AceEncoder:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
-        reason = (str(error).splitlines() or [repr(error)])[
-            0
-        ]  # torch's own messages have ten lines
+        # torch's own messages have ten lines.
+        reason = (str(error).splitlines() or [repr(error)])[0]
         raise InputError(f"encoder {path}: not a readable torch weight file ({reason})") from error
     return ace_encoder_from_state(state, str(path))
 
@@ -279,8 +269,8 @@ def _load_own(path: Path) -> LocalEncoder | AceEncoder:
                 f"encoder {path}: weights of the module {settings['layout']!r}; pass that module as"
                 " encoder"
             )
-        stem = (settings["stem"][0], settings["stem"][1])
-        encoder = LocalEncoder(stem, settings["inner"], settings["blocks"], settings["width"])
+        names = ("stem", "inner", "blocks", "width")
+        encoder = LocalEncoder(**{name: settings[name] for name in names})
     except (SafetensorError, KeyError, ValueError) as error:
         raise InputError(f"encoder {path}: not an evercal encoder file ({error!r})") from error
     load_strictly(encoder, state, f"encoder {path}: not an evercal encoder file")

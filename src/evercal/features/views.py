@@ -56,11 +56,7 @@ def cell_centres(height: int, width: int, stride: int) -> np.ndarray:
 def plain_view(image: np.ndarray, camera: Camera, stride: int, options: ViewOptions) -> View:
     """An image at working size; the cell pixels are free of distortion.
 
-    Args:
-        image: (h, w, 3) uint8 RGB or (h, w) grey, any size with the camera's aspect ratio.
-        camera: intrinsics; scaled to the working size.
-        stride: of the encoder.
-        options: working size.
+    The image, (h, w, 3) uint8 RGB or (h, w) grey, may have any size with the camera's aspect ratio.
     """
     grey, camera = working_image(image, camera, options.short_side)
     pixels = ideal_cell_pixels(camera, stride)

@@ -31,9 +31,7 @@ _ROWS = 40_000
 class Vlad:
     """Aggregate the features of an image in one vector.
 
-    Args:
-        centroids: (k, channels) unit vectors.
-        projection: (k * channels, width).
+    Centroids (k, channels) are unit vectors; the projection is (k * channels, width).
     """
 
     def __init__(self, centroids: Tensor, projection: Tensor):
@@ -66,9 +64,7 @@ _by_encoder: WeakKeyDictionary[Encoder, Vlad] = WeakKeyDictionary()
 def vlad_for(encoder: Encoder, features: Sequence[Tensor] = ()) -> Vlad:
     """The VLAD of an encoder.
 
-    Args:
-        encoder: the shipped one, one whose centroids were loaded, or any other.
-        features: (cells, channels) of images, to which missing centroids are fitted.
+    Missing centroids are fitted to features (cells, channels) of images.
 
     Raises:
         InputError: An encoder without centroids, and no features to fit them to.
@@ -77,9 +73,8 @@ def vlad_for(encoder: Encoder, features: Sequence[Tensor] = ()) -> Vlad:
         centroids = shipped_centroids(encoder)
         if centroids is None and not features:
             raise InputError("the encoder has no VLAD centroids; learn a recording with it first")
-        _by_encoder[encoder] = _projected(
-            fit_centroids(features) if centroids is None else centroids
-        )
+        centroids = fit_centroids(features) if centroids is None else centroids
+        _by_encoder[encoder] = _projected(centroids)
     return _by_encoder[encoder]
 
 

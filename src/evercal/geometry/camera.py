@@ -7,9 +7,9 @@ pixel, as in OpenCV and ROS, so an image covers -0.5 .. width - 0.5 and its midd
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,11 +25,9 @@ _ASPECT_TOLERANCE = 0.01
 def resize_pixels(pixels: ArrayLike, scale: float | Array) -> Array:
     """Pixel coordinates in a resized image.
 
-    Resizing scales about the corner of the image, which lies at -0.5 and not at 0.
-
-    Args:
-        pixels: (..., 2), x then y, or any coordinate along one axis.
-        scale: new size over old size; one number, or one for each axis.
+    Resizing scales about the corner of the image, which lies at -0.5 and not at 0. Pixels (..., 2)
+    are x then y, or any coordinate along one axis. The scale is new size over old size; one number,
+    or one for each axis.
     """
     return np.asarray((np.asarray(pixels) + 0.5) * scale - 0.5)
 
@@ -146,12 +144,8 @@ class Camera:
     def project(self, points_camera: ArrayLike) -> Array:
         """Points in the camera frame to pixels.
 
-        Args:
-            points_camera: (..., 3) metres, camera frame.
-
-        Returns:
-            (..., 2) pixels, x then y, not clipped to the image. NaN for points behind the camera
-            or beyond the valid range of the distortion (`widest`).
+        Points (..., 3) give pixels (..., 2), not clipped to the image; NaN for points behind the
+        camera or beyond the valid range of the distortion (`widest`).
         """
         points = np.asarray(points_camera, dtype=np.float64)
         if points.shape[-1:] != (3,):
@@ -166,12 +160,8 @@ class Camera:
     def unproject(self, pixels: ArrayLike) -> Array:
         """Pixels to viewing rays.
 
-        Args:
-            pixels: (..., 2), x then y.
-
-        Returns:
-            (..., 3) rays in the camera frame with z = 1; x and y are NaN for pixels outside the
-            range of the distortion.
+        Pixels (..., 2) give rays (..., 3) in the camera frame with z = 1; x and y are NaN outside
+        the range of the distortion.
         """
         pixels = np.asarray(pixels, dtype=np.float64)
         if pixels.shape[-1:] != (2,):
@@ -204,15 +194,7 @@ class Camera:
 
     def to_dict(self) -> dict[str, object]:
         """Plain numbers for JSON."""
-        return {
-            "width": self.width,
-            "height": self.height,
-            "fx": self.fx,
-            "fy": self.fy,
-            "cx": self.cx,
-            "cy": self.cy,
-            "distortion": list(self.distortion),
-        }
+        return {**asdict(self), "distortion": list(self.distortion)}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, object]) -> Self:
@@ -221,21 +203,12 @@ class Camera:
         Raises:
             ValueError: A key is missing or its value is not a number.
         """
-        values: dict[str, float] = {}
-        for name in ("width", "height", "fx", "fy", "cx", "cy"):
-            values[name] = _number(data.get(name), name)
+        names = ("width", "height", "fx", "fy", "cx", "cy")
+        numbers: dict[str, Any] = {name: _number(data.get(name), name) for name in names}
         distortion = data.get("distortion", ())
         if not isinstance(distortion, (list, tuple)):
             raise ValueError(f"camera 'distortion' is a list of numbers, got {distortion!r}")
-        return cls(
-            values["width"],  # pyright: ignore[reportArgumentType]  # checked when constructed
-            values["height"],  # pyright: ignore[reportArgumentType]
-            values["fx"],
-            values["fy"],
-            values["cx"],
-            values["cy"],
-            tuple(_number(value, "distortion") for value in distortion),
-        )
+        return cls(**numbers, distortion=tuple(_number(k, "distortion") for k in distortion))
 
     def _distort(self, plane: Array) -> Array:
         """(..., 2) ideal to distorted points of the plane z = 1."""
@@ -243,13 +216,9 @@ class Camera:
         x, y = plane[..., 0], plane[..., 1]
         r2 = x * x + y * y
         radial, _ = self._radial(r2)
-        return np.stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            ],
-            axis=-1,
-        )
+        u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        return np.stack([u, v], axis=-1)
 
     def _distortion_slope(self, plane: Array) -> Array:
         """(..., 2, 2) derivatives of distorted by ideal points (..., 2) of the plane z = 1."""
@@ -282,9 +251,8 @@ class Camera:
                 break
             (a, b), (_, d) = np.moveaxis(self._distortion_slope(plane), (-2, -1), (0, 1))
             u, v = off[..., 0], off[..., 1]
-            plane = (
-                plane - np.stack([d * u - b * v, a * v - b * u], -1) / (a * d - b * b)[..., None]
-            )
+            step = np.stack([d * u - b * v, a * v - b * u], -1) / (a * d - b * b)[..., None]
+            plane = plane - step
         return np.where(lost[..., None], np.nan, plane)
 
 

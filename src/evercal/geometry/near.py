@@ -15,22 +15,9 @@ def near_training(train_poses: SE3, test_poses: SE3) -> NDArray[np.bool_]:
     """Which test frames have a training frame nearer than 5 cm and 5 deg.
 
     The bounds are those of accuracy and as strict, so that the share of such frames is what the
-    best lookup of a training frame could reach without any geometry.
-
-    Args:
-        train_poses: (n,), may be empty.
-        test_poses: (m,) in the same base frame.
-
-    Returns:
-        (m,) bool.
-
-    Raises:
-        ValueError: Something other than two batches of poses.
+    best lookup of a training frame could reach without any geometry. Poses (n,) and (m,) give (m,)
+    bool.
     """
-    if len(train_poses.shape) != 1 or len(test_poses.shape) != 1:
-        raise ValueError(
-            f"near_training takes poses (n,) and (m,), got {train_poses.shape}, {test_poses.shape}"
-        )
     near = np.zeros(len(test_poses), dtype=np.bool_)
     rows = max(1, _PAIRS_AT_ONCE // max(1, len(train_poses)))
     for start in range(0, len(test_poses), rows):

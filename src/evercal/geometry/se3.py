@@ -58,10 +58,8 @@ class SE3:
     def from_matrix(cls, matrix: ArrayLike, tolerance: float = 1e-3) -> Self:
         """Convert homogeneous matrices.
 
-        Args:
-            matrix: (..., 4, 4) or (..., 3, 4).
-            tolerance: Largest entry of `R^T R - I` that counts as rounding. The nearest rotation is
-                used.
+        Shapes are (..., 4, 4) or (..., 3, 4). The nearest rotation is used; `tolerance` is the
+        largest entry of `R^T R - I` that counts as rounding.
 
         Raises:
             ValueError: Wrong shape, numbers that are not finite, a last row other than 0 0 0 1, or
@@ -193,12 +191,8 @@ class SE3:
 def pose_distance(a: SE3, b: SE3) -> tuple[Array, Array]:
     """Distance between transforms into the same frame.
 
-    Args:
-        a: Batch shape (...).
-        b: Batch shape that broadcasts with that of `a`.
-
-    Returns:
-        Metres (...) between the origins and radians (...) in [0, pi] between the rotations.
+    Metres (...) between the origins and radians (...) in [0, pi] between the rotations; batch
+    shapes broadcast.
     """
     metres = np.linalg.norm(a.translation_m - b.translation_m, axis=-1)
     conjugate = a.rotation_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
@@ -219,10 +213,6 @@ def average_poses(poses: SE3, weights: ArrayLike | None = None) -> SE3:
 
     Iteratively reweighted mean, started at the medoid. Weights are Tukey's biweight of the distance
     to the current mean, cut at four median distances, in metres and in radians.
-
-    Args:
-        poses: (n,), n >= 1.
-        weights: (n,) not negative, with a positive sum. Default: equal weights.
 
     Raises:
         ValueError: No poses, or weights that do not fit.
@@ -252,15 +242,11 @@ def _quaternion_product(a: Array, b: Array) -> Array:
     """Hamilton product of (..., 4) wxyz; written out because it is an inner loop."""
     aw, ax, ay, az = np.moveaxis(a, -1, 0)
     bw, bx, by, bz = np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
-    )
+    w = aw * bw - ax * bx - ay * by - az * bz
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by - ax * bz + ay * bw + az * bx
+    z = aw * bz + ax * by - ay * bx + az * bw
+    return np.stack([w, x, y, z], axis=-1)
 
 
 def _medoid(poses: SE3, weights: Array) -> SE3:

@@ -81,21 +81,13 @@ class UncertainPose:
         slope[3:, 3:] = -rotation
         return UncertainPose(inverse, slope @ self.covariance @ slope.T)
 
-    def widened(self, covariance: ArrayLike) -> "UncertainPose":
-        """The same pose with an independent error (6, 6) added."""
-        return UncertainPose(self.pose, self.covariance + np.asarray(covariance))
-
     def squared_mahalanobis(self, truth: SE3) -> float:
         """Squared distance of the true pose in units of the covariance.
 
         It has a chi-squared distribution with six degrees of freedom if the covariance is right.
         """
-        error = np.concatenate(
-            [
-                truth.translation_m - self.pose.translation_m,
-                (self.pose.inverse() @ truth).log()[3:],
-            ]
-        )
+        shift = truth.translation_m - self.pose.translation_m
+        error = np.concatenate([shift, (self.pose.inverse() @ truth).log()[3:]])
         # A pose from few points can have a singular covariance; its null space is left out.
         return float(error @ np.linalg.pinv(self.covariance) @ error)
 
@@ -121,14 +113,8 @@ def frame_covariance(base_from_camera: SE3, covariance: ArrayLike) -> Array:
     """Covariance of the base frame from a motion that is common to all cameras of a map.
 
     Landmarks move with the cameras that observe them, so an error of `gripper_from_camera` moves
-    the frame of the map by the mean over its cameras.
-
-    Args:
-        base_from_camera: (n,) poses that the map was built from.
-        covariance: (6, 6) of the common motion, camera frame, metres and radians.
-
-    Returns:
-        (6, 6) of a small motion of the base frame, metres and radians.
+    the frame of the map by the mean over its cameras. Both covariances are (6, 6), metres and
+    radians; that of the common motion is in the camera frame.
     """
     mean = base_from_camera.adjoint().mean(0)
     return mean @ np.asarray(covariance) @ mean.T

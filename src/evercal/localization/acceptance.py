@@ -44,13 +44,7 @@ def support(hypothesis: Hypothesis) -> float:
 
 
 def accepted(hypothesis: Hypothesis, scene: SceneMap, times: float = 1.0) -> bool:
-    """Whether a pose has enough support in its scene.
-
-    Args:
-        hypothesis: a pose in the scene.
-        scene: with its threshold.
-        times: factor on the threshold.
-    """
+    """Whether a pose has enough support in its scene."""
     return hypothesis.inliers > 0 and support(hypothesis) >= times * scene.min_support
 
 
@@ -74,14 +68,8 @@ def widened(hypothesis: Hypothesis, scene: SceneMap) -> UncertainPose:
 def fit_acceptance(contents: MapContents, held_out: Sequence[Frame], index: int = -1) -> SceneMap:
     """Fit the threshold of a scene to frames that its map was not built from.
 
-    Args:
-        contents: all scenes.
-        held_out: training frames that were held out.
-        index: of the scene; the newest by default.
-
-    Returns:
-        The scene with its threshold: half of the 5 % quantile of the support of well-located
-        frames, between `MIN_SUPPORT` and `MAX_SUPPORT`.
+    The scene is the newest by default. Its threshold is half of the 5 % quantile of the support of
+    well-located frames, between `MIN_SUPPORT` and `MAX_SUPPORT`.
     """
     from evercal.geometry.near import NEAR_M, NEAR_RAD
     from evercal.localization.localizer import Localizer

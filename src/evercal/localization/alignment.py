@@ -138,15 +138,8 @@ def align_pose(
 ) -> Alignment | None:
     """Refine a rough pose by the landmarks of keyframes.
 
-    Args:
-        pyramid: of the image, see `image_pyramid`.
-        camera: intrinsics of its first level, distortion included.
-        keyframes: landmarks of keyframes that show the same place.
-        start: map_from_camera, roughly.
-        options: rounds and thresholds.
-
-    Returns:
-        None if too few landmarks match.
+    The camera is that of the first level of the pyramid, and the start is map_from_camera, roughly.
+    Returns None if too few landmarks match.
     """
     pose, refined, matched = start, None, None
     target = _Target.of(keyframes)

@@ -1,7 +1,7 @@
 """`--memory auto`: the fewest keyframes that locate a recording's other frames well."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,22 +16,14 @@ from evercal.recordings.frame import Frame
 
 MOST_SHARE = 0.3
 """Share of the frames that are keyframes at first."""
-
-
-@dataclass(frozen=True)
-class AutoMemoryOptions:
-    """How many keyframes a scene gets."""
-
-    shares: tuple[float, ...] = (0.05, 0.07, 0.1, 0.14, 0.2, MOST_SHARE)
-    """Shares of the frames that are tried, smallest first."""
-    probes: int = 60
-    """Other frames that are located, spread over the recording."""
-    least_located: float = 0.98
-    """Share of the probes located by all keyframes that a subset must locate as well."""
-    most_m: float = 0.005
-    """Largest distance from the pose by all keyframes, metres."""
-    most_deg: float = 0.5
-    """The same for the rotation, degrees."""
+SHARES = (0.05, 0.07, 0.1, 0.14, 0.2, MOST_SHARE)
+"""Shares of the frames that are tried, smallest first."""
+PROBES = 60
+"""Other frames that are located, spread over the recording."""
+LEAST_LOCATED = 0.98
+"""Share of the probes located by all keyframes that a subset must locate as well."""
+MOST_M, MOST_DEG = 0.005, 0.5
+"""Largest distance from the pose by all keyframes."""
 
 
 def fewest_keyframes(
@@ -39,38 +31,26 @@ def fewest_keyframes(
     built: BuiltMap,
     frames: Sequence[Frame],
     on_progress: OnProgress = lambda *_: None,
-    options: AutoMemoryOptions | None = None,
 ) -> NDArray[np.int64]:
     """Select the fewest keyframes of a new scene.
 
-    Args:
-        contents: the encoder and the scenes learned before.
-        built: the new scene with all its keyframes.
-        frames: posed training frames of the scene, in recorded order.
-        on_progress: for progress bars.
-        options: shares and tolerances.
-
-    Returns:
-        Indices of the keyframes, sorted; all of them if they locate no other frame.
+    `contents` holds the scenes learned before, and `frames` are the posed training frames in
+    recorded order. Returns sorted indices; all keyframes if they locate no other frame.
     """
-    options = options or AutoMemoryOptions()
     others = [frame for frame in frames if frame.name not in set(built.keyframe_names)]
     poses = built.scene.keyframes.base_from_camera
     everything = np.arange(len(poses))
-    spread = np.linspace(0, len(others) - 1, min(options.probes, len(others))).round().astype(int)
+    spread = np.linspace(0, len(others) - 1, min(PROBES, len(others))).round().astype(int)
     located = _located(contents, built, everything, [others[i] for i in spread])
     probes = [others[i] for i, pose in zip(spread, located, strict=True) if pose is not None]
     reference = [pose for pose in located if pose is not None]
-    sizes = sorted({max(1, int(share * built.scene.train_frames)) for share in options.shares})
+    sizes = sorted({max(1, int(share * built.scene.train_frames)) for share in SHARES})
     for step, size in enumerate(size for size in sizes if size < len(poses)):
         on_progress("selecting keyframes", step + 1, len(sizes))
         selected = spread_poses(poses, size)
         poses_of_few = _located(contents, built, selected, probes)
-        good = [
-            _close(pose, truth, options)
-            for pose, truth in zip(poses_of_few, reference, strict=True)
-        ]
-        if good and sum(good) >= options.least_located * len(probes):
+        good = [_close(*pair) for pair in zip(poses_of_few, reference, strict=True)]
+        if good and sum(good) >= LEAST_LOCATED * len(probes):
             everything = selected
             break
     on_progress("selecting keyframes", len(sizes), len(sizes))
@@ -92,8 +72,8 @@ def _located(
     ]
 
 
-def _close(pose: SE3 | None, reference: SE3, options: AutoMemoryOptions) -> bool:
+def _close(pose: SE3 | None, reference: SE3) -> bool:
     if pose is None:
         return False
     metres, radians = pose_distance(pose, reference)
-    return bool(metres < options.most_m and radians < np.deg2rad(options.most_deg))
+    return bool(metres < MOST_M and radians < np.deg2rad(MOST_DEG))

@@ -50,11 +50,6 @@ class LoadedKeyframe:
     """A keyframe that is prepared for matching, or for alignment, on first use.
 
     Few of the keyframes that are matched are ever aligned.
-
-    Args:
-        contents: whose encoder computes the features.
-        keyframes: of a scene.
-        number: index of the keyframe.
     """
 
     def __init__(self, contents: MapContents, keyframes: Keyframes, number: int):
@@ -110,9 +105,7 @@ class LoadedKeyframe:
 class KeyframeBank:
     """The keyframes of all scenes of a map.
 
-    Args:
-        contents: encoder and scenes, at least one.
-        most_loaded: keyframes that stay decoded in memory (up to 3 MB each).
+    `most_loaded` keyframes stay decoded in memory (up to 3 MB each).
     """
 
     def __init__(self, contents: MapContents, most_loaded: int):
@@ -136,11 +129,8 @@ class KeyframeBank:
     def retrieve(self, features: Tensor, scenes: Sequence[int]) -> NDArray[np.int64]:
         """Rank the keyframes of given scenes by the similarity of their descriptors.
 
-        One matrix-vector product: 3 ms for 10,000 keyframes, so no index is needed.
-
-        Args:
-            features: (cells, channels) of the query, on the encoder's device.
-            scenes: indices of the scenes.
+        One matrix-vector product: 3 ms for 10,000 keyframes, so no index is needed. Features are
+        (cells, channels), on the encoder's device.
         """
         vlad = vlad_for(self._contents.encoder)(features)
         similarity = (self._descriptors @ vlad).cpu().numpy()

@@ -38,22 +38,18 @@ class LearnedScene(Protocol):
     @property
     def name(self) -> str:
         """Name of the scene."""
-        ...
 
     @property
     def camera(self) -> Camera:
         """Intrinsics that its recording states."""
-        ...
 
     @property
     def adjusted_camera(self) -> Camera:
         """The same camera after learning."""
-        ...
 
     @property
     def frame(self) -> MapFrame:
         """Relation of its scene points to the base frame."""
-        ...
 
 
 class LearnedContents(Protocol):
@@ -62,12 +58,10 @@ class LearnedContents(Protocol):
     @property
     def short_side(self) -> int:
         """Shorter image side that the encoder works on, pixels."""
-        ...
 
     @property
     def scenes(self) -> Sequence[LearnedScene]:
         """In order of learning."""
-        ...
 
 
 class SceneLocalizer(Protocol):
@@ -76,15 +70,12 @@ class SceneLocalizer(Protocol):
     @property
     def scenes(self) -> tuple[str, ...]:
         """Names of the scenes, in order of learning."""
-        ...
 
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         """Estimate the camera pose of one image."""
-        ...
 
     def camera_for(self, stated: Camera) -> Camera | None:
         """The `camera` argument for an image with these stated intrinsics."""
-        ...
 
 
 class LearnedLocalizer(SceneLocalizer, Protocol):
@@ -93,17 +84,12 @@ class LearnedLocalizer(SceneLocalizer, Protocol):
     @property
     def contents(self) -> LearnedContents:
         """The scenes."""
-        ...
 
 
 class Localizer:
     """Locates images in the scenes of a map.
 
     Images are encoded and matched on the encoder's device; poses are computed on the CPU.
-
-    Args:
-        contents: encoder and scenes, at least one.
-        options: effort and thresholds.
     """
 
     def __init__(self, contents: MapContents, options: LocalizeOptions | None = None):
@@ -121,11 +107,8 @@ class Localizer:
     ) -> Self:
         """A localizer for a map on disk.
 
-        Args:
-            store: folder of the map.
-            options: effort and thresholds.
-            encoder: the module of a map that was made with a module of the caller's own.
-            device: `auto` (a CUDA device if there is one), `cpu` or `cuda`.
+        The device is `auto` (a CUDA device if there is one), `cpu` or `cuda`. For a map that was
+        made with a module of the caller's own, `encoder` is that module.
 
         Raises:
             InputError: Not a map, an empty one, or a damaged file; no such device.
@@ -298,11 +281,6 @@ def camera_in_scenes(
     camera: Camera | None, image: np.ndarray, scenes: Sequence[LearnedScene]
 ) -> list[Camera | None]:
     """Intrinsics of an image in each scene; None where the aspect ratio does not fit.
-
-    Args:
-        camera: intrinsics that were given.
-        image: (H, W, 3).
-        scenes: with the cameras that recorded them.
 
     Raises:
         InputError: A camera with another aspect ratio than the image's, or no camera given and no

@@ -13,12 +13,7 @@ from evercal.localization.query import Attempt, Candidate, LocalizeOptions, Matc
 
 
 class Matcher:
-    """Retrieval and matching.
-
-    Args:
-        bank: the keyframes of all scenes.
-        options: numbers of keyframes and thresholds.
-    """
+    """Retrieval and matching."""
 
     def __init__(self, bank: KeyframeBank, options: LocalizeOptions):
         self._bank, self._options = bank, options
@@ -27,14 +22,10 @@ class Matcher:
     def candidates(self, query: Query, usable: list[int], attempt: Attempt) -> list[Candidate]:
         """Scenes to try, most likely first.
 
-        The global descriptor ranks keyframes, and patches of the image vote among the first ones.
-        A scene is tried with the keyframes that got most votes. If these are too few, its next
-        keyframes in the ranking are added.
-
-        Args:
-            query: the image.
-            usable: indices of scenes whose camera fits the image.
-            attempt: numbers of keyframes.
+        The global descriptor ranks keyframes, and patches of the image vote among the first ones. A
+        scene is tried with the keyframes that got most votes. If these are too few, its next
+        keyframes in the ranking are added. `usable` are indices of scenes whose camera fits the
+        image.
         """
         features = query.features.flatten(1).T
         ranked = self._bank.retrieve(features, usable)
@@ -66,12 +57,8 @@ class Matcher:
     ) -> Matches:
         """Match patches of the image to the points of a scene's keyframes.
 
-        Args:
-            query: the image.
-            candidate: the scene and its keyframes.
-            camera: intrinsics of the image at the encoder's working size.
-            near: map_from_camera, roughly. A patch is then matched only to points that project
-                within `LocalizeOptions.guided_px` of it.
+        The camera is at the encoder's working size. If `near`, roughly map_from_camera, is given, a
+        patch is matched only to points that project within `LocalizeOptions.guided_px` of it.
         """
         stride = candidate.match_stride if self._options.align else 1
         patches, pixels = strided_patches(query, camera, self._bank.encoder.stride, stride)

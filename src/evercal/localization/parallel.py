@@ -18,10 +18,6 @@ Result = TypeVar("Result")
 def in_parallel(work: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
     """Results of a function in the order of the items, from as many workers as torch has threads.
 
-    Args:
-        work: called for each item, from several threads.
-        items: for example paths of images.
-
     Raises:
         Exception: whatever `work` raises, when its turn comes; items not begun are left out.
     """

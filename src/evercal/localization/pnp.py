@@ -37,14 +37,8 @@ def solve_pnp(
 ) -> PnpResult | None:
     """Estimate the pose of a camera from 2D-3D matches.
 
-    Args:
-        pixels: (n, 2) in the ideal pinhole of the camera.
-        points_m: (n, 3) matching points.
-        camera: intrinsics; its distortion is ignored.
-        options: RANSAC settings.
-
-    Returns:
-        The pose, or None for fewer than 6 inliers.
+    Pixels (n, 2) lie in the ideal pinhole of the camera, whose distortion is ignored. Returns None
+    for fewer than 6 inliers.
     """
     import poselib
 

@@ -35,15 +35,9 @@ def refine_pose(
 ) -> RefinedPose:
     """Minimise whitened reprojection errors with Cauchy weights.
 
-    Args:
-        pixels: (n, 2) in the ideal pinhole.
-        points_m: (n, 3).
-        whitening: (n, 2, 2) matrices that give errors in the image unit variance.
-        camera: intrinsics; its distortion is ignored.
-        start: points_from_camera, roughly.
-        iterations: Gauss-Newton steps, at most.
-        distortion: (n, 2, 2) derivatives of image pixels by those of the ideal pinhole; None where
-            they are the same.
+    Pixels (n, 2) lie in the ideal pinhole, and the start is points_from_camera. The whitening (n,
+    2, 2) gives errors in the image unit variance. The distortion (n, 2, 2) holds derivatives of
+    image pixels by those of the ideal pinhole.
     """
     whitening = whitening if distortion is None else whitening @ distortion
     rotation, position = start.rotation_matrix(), start.translation_m
@@ -77,12 +71,7 @@ def linearise(
 ) -> tuple[Array, Array]:
     """Reprojection errors and their derivatives by the pose.
 
-    Args:
-        pixels: (n, 2) in the ideal pinhole.
-        points_m: (n, 3).
-        rotation: (3, 3) of points_from_camera.
-        position: (3,) of points_from_camera.
-        camera: intrinsics; its distortion is ignored.
+    Pixels (n, 2) lie in the ideal pinhole; rotation and position are those of points_from_camera.
 
     Returns:
         Residuals (2, n), and derivatives (2, 6, n) by a motion (translation, rotation) in the

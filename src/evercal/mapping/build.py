@@ -23,7 +23,6 @@ from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.map_frame import MapFrame, fit_correction
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.pose_check import (
-    PoseCheckOptions,
     contradicting_frames,
     depth_scale,
     matched_pairs,
@@ -33,7 +32,6 @@ from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import select_farthest, spread_poses
 from evercal.mapping.tracks import (
     KeyframeTracks,
-    TrackOptions,
     bundle_tracks,
     open_keyframe,
     refine_depths,
@@ -60,12 +58,8 @@ class MapOptions:
     """Number of keyframes."""
     size: WorkingSize = field(default_factory=WorkingSize)
     """Working sizes of images."""
-    tracks: TrackOptions = field(default_factory=TrackOptions)
-    """How landmarks are tracked."""
     bundle: BundleOptions = field(default_factory=BundleOptions)
     """Bundle adjustment."""
-    check: PoseCheckOptions = field(default_factory=PoseCheckOptions)
-    """When a stated pose contradicts the images."""
     support_frames: int = 250
     """Frames that are adjusted beside the keyframes, spread by pose. The dense normal equations
     have six rows for each; more frames add time and no precision."""
@@ -154,12 +148,7 @@ def build_map(
 ) -> BuiltMap:
     """Build the map of a scene.
 
-    Args:
-        name: of the scene.
-        frames: posed training frames in recorded order.
-        encoder: frozen local encoder.
-        options: memory, sizes and priors.
-        on_progress: for progress bars.
+    The frames are posed, in recorded order.
 
     Raises:
         InputError: No two frames show the same surfaces, so nothing can be triangulated.
@@ -199,9 +188,9 @@ def _prepare(
     for i in range(len(prepared)):
         features.append(prepared.features(i))
         on_progress("encoding", i + 1, len(prepared))
-    pairs = matched_pairs(prepared, vlad_for(encoder, features), options.check)
+    pairs = matched_pairs(prepared, vlad_for(encoder, features))
     prepared.depth_scale = depth_scale(prepared, pairs)
-    bad = contradicting_frames(prepared, pairs, options.check)
+    bad = contradicting_frames(prepared, pairs)
     wrong = tuple(prepared.frames[i].name for i in bad)
     good = sorted(set(range(len(support))) - set(bad.tolist()))
     if len(bad):
@@ -224,8 +213,8 @@ def _open_keyframes(
     """Depths, landmarks and tracks of every keyframe."""
 
     def open_one(frame: int) -> KeyframeTracks:
-        keyframe = open_keyframe(prepared.frames, frame, options.tracks)
-        refine_depths(prepared.frames, keyframe, options.tracks)
+        keyframe = open_keyframe(prepared.frames, frame)
+        refine_depths(prepared.frames, keyframe)
         return keyframe
 
     keyframes = []
@@ -270,13 +259,13 @@ def _adjust(
     adjustment = None
     for number in range(options.rounds):
         on_progress("adjusting", number, options.rounds)
-        tracks = bundle_tracks(prepared, keyframes, options.tracks)
+        tracks = bundle_tracks(prepared, keyframes)
         problem = BundleAdjustment(prepared.stated, stated_cameras, velocity, options.bundle)
         adjustment = problem.solve(tracks)
         prepared.adjust(adjustment.poses, adjustment.camera)
         if not _moved(prepared.stated, stated_cameras[0], adjustment):
             break
-        again = partial(refine_depths, prepared, options=options.tracks, again=True)
+        again = partial(refine_depths, prepared, again=True)
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:
             list(pool.map(again, keyframes))
     on_progress("adjusting", options.rounds, options.rounds)
@@ -285,13 +274,7 @@ def _adjust(
 
 
 def _moved(stated: SE3, camera: Camera, adjustment: Adjustment) -> bool:
-    """Whether the adjustment moved the projections of landmarks noticeably.
-
-    Args:
-        stated: (n,) poses before.
-        camera: intrinsics before, if all frames share a camera.
-        adjustment: the result.
-    """
+    """Whether the adjustment moved the projections of landmarks noticeably."""
     change = np.linalg.norm((stated.inverse() @ adjustment.poses).log().reshape(-1, 2, 3), axis=2)
     metres, radians = np.median(change, 0)
     by_camera = 0.0

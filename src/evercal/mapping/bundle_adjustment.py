@@ -136,11 +136,10 @@ class Variances:
 
     def close_to(self, other: "Variances") -> bool:
         """Whether two priors are the same in all digits that matter."""
-        pairs = zip(self._all(), other._all(), strict=True)
-        return all(np.allclose(a, b, rtol=CONVERGED, atol=0) for a, b in pairs)
-
-    def _all(self) -> tuple[Array, ...]:
-        return self.sigma, self.weight, self.shared
+        return all(
+            np.allclose(values, vars(other)[name], rtol=CONVERGED, atol=0)
+            for name, values in vars(self).items()
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,11 +159,9 @@ class Estimate:
 class BundleAdjustment:
     """The problem of one recording.
 
-    Args:
-        stated: (n,) base_from_camera as the recording states them.
-        cameras: n, at the image size that patches are cut from; adjusted if all are the same.
-        velocity: (n, 6) motion from frame to frame, camera frame, metres and radians; 0 if unknown.
-        options: priors.
+    Cameras are those of the image size that patches are cut from, and adjusted if all are the same.
+    The velocity (n, 6) is the motion from frame to frame, camera frame, metres and radians; 0 if
+    unknown.
     """
 
     def __init__(self, stated: SE3, cameras: list[Camera], velocity: Array, options: BundleOptions):
@@ -284,12 +281,12 @@ class BundleAdjustment:
         self, tracks: BundleTracks, parameters: Parameters, solution: Solution
     ) -> Parameters:
         """Parameters after a step; depths change by a fifth at most and stay plausible."""
-        n, rho, scale = self.n, parameters.inverse_depth, tracks.depth_scale
-        depth = (rho + solution.depths.clip(-0.2 * rho, 0.2 * rho)).clip(0.03 / scale, 6 / scale)
+        correction, shared = np.split(solution.change, [6 * self.n])
+        rho, scale = parameters.inverse_depth, tracks.depth_scale
         return Parameters(
-            parameters.correction + solution.change[: 6 * n].reshape(n, 6),
-            parameters.shared + solution.change[6 * n :],
-            depth,
+            parameters.correction + correction.reshape(-1, 6),
+            parameters.shared + shared,
+            (rho + solution.depths.clip(-0.2 * rho, 0.2 * rho)).clip(0.03 / scale, 6 / scale),
         )
 
     def _deviation(self, parameters: Parameters) -> Array:

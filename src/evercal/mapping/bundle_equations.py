@@ -104,9 +104,7 @@ class Linearised:
 class StatedFrames:
     """Stated poses and cameras of n frames, which parameters correct.
 
-    Args:
-        stated: (n,) base_from_camera.
-        cameras: n, at the image size that observations are given in.
+    Cameras are those of the image size that observations are given in.
     """
 
     def __init__(self, stated: SE3, cameras: list[Camera]):

@@ -76,13 +76,9 @@ class Keyframes:
 
     def frames(self) -> list[Frame]:
         """The keyframes, decoded."""
-        frames = []
-        for i in range(len(self.images)):
-            image = np.repeat(self.grey(i)[..., None], 3, axis=-1)
-            frames.append(
-                Frame(f"memory-{i:05d}", image, self.cameras[i], self.base_from_camera[i])
-            )
-        return frames
+        images = [np.repeat(self.grey(i)[..., None], 3, axis=-1) for i in range(len(self))]
+        views = zip(images, self.cameras, self.base_from_camera, strict=True)
+        return [Frame(f"memory-{i:05d}", *view) for i, view in enumerate(views)]
 
     def to_tensors(self) -> dict[str, Tensor]:
         """Convert to named tensors.
@@ -98,19 +94,15 @@ class Keyframes:
         for i, c in enumerate(self.cameras):
             cameras[i, :6] = c.width, c.height, c.fx, c.fy, c.cx, c.cy
             cameras[i, 6 : 6 + len(c.distortion)] = c.distortion
-        poses = np.concatenate(
-            [self.base_from_camera.rotation_wxyz, self.base_from_camera.translation_m], -1
-        )
-        return self._map_tensors() | {
+        pose = self.base_from_camera
+        poses = np.concatenate([pose.rotation_wxyz, pose.translation_m], -1)
+        tensors = {
             "images": torch.from_numpy(joined),
             "lengths": torch.tensor([len(image) for image in self.images]),
             "cameras": torch.from_numpy(cameras),
             "distortion": torch.tensor([len(c.distortion) for c in self.cameras]),
             "poses": torch.from_numpy(poses.reshape(-1, 7)),
         }
-
-    def _map_tensors(self) -> dict[str, Tensor]:
-        tensors: dict[str, Tensor] = {}
         if self.inverse_depth:
             tensors["inverse_depth"] = torch.cat(self.inverse_depth)
             tensors["cells"] = torch.tensor([len(depth) for depth in self.inverse_depth])
@@ -131,20 +123,14 @@ class Keyframes:
         images = tuple(
             joined[end - n : end] for end, n in zip(ends, tensors["lengths"].tolist(), strict=True)
         )
-        cameras = []
-        counts = tensors["distortion"].tolist()
-        for row, count in zip(tensors["cameras"].tolist(), counts, strict=True):
-            width, height, *rest = row
-            distortion = tuple(rest[4 : 4 + count])
-            fx, fy, cx, cy = rest[:4]
-            cameras.append(Camera(int(width), int(height), fx, fy, cx, cy, distortion))
+        cameras = zip(tensors["cameras"].tolist(), tensors["distortion"].tolist(), strict=True)
         poses = tensors["poses"].numpy()
         depths: tuple[Tensor, ...] = ()
         if "cells" in tensors:
             depths = tensors["inverse_depth"].split(tensors["cells"].tolist())
         return cls(
             images=images,
-            cameras=tuple(cameras),
+            cameras=tuple(Camera(*row[:6], distortion=row[6 : 6 + k]) for row, k in cameras),
             base_from_camera=SE3(poses[:, :4], poses[:, 4:]),
             inverse_depth=depths,
             landmarks=_landmarks_of(tensors) if "landmark_counts" in tensors else (),
@@ -162,12 +148,7 @@ def _landmarks_of(tensors: dict[str, Tensor]) -> tuple[Landmarks, ...]:
 
 
 def store_keyframes(frames: Sequence[Frame], short_side: int) -> Keyframes:
-    """Store frames at working size.
-
-    Args:
-        frames: selected frames with poses.
-        short_side: pixels of the shorter image side.
-    """
+    """Store frames at working size."""
     images, cameras = [], []
     for frame in frames:
         grey, camera = working_image(frame.read_image(), frame.camera, short_side)

@@ -47,9 +47,6 @@ class Landmarks:
         """(3, n, 3) points in the keyframe's camera frame, metres.
 
         The landmarks, and the points of their surfaces two pixels to the right and two pixels down.
-
-        Args:
-            camera: of the keyframe's image.
         """
         steps = np.array([[0, 0], [_TANGENT_PX, 0], [0, _TANGENT_PX]])
         pixels = self.pixels[None] + steps[:, None]
@@ -74,13 +71,8 @@ def project_surface(
     """Predict positions and warps of patches in an image.
 
     A patch is visible if it lies in front of the camera, inside the image by a margin, and its size
-    is similar to that in its keyframe.
-
-    Args:
-        points: (3, n, 3), see `Landmarks.surface`, in any frame.
-        rotation: (3, 3) from that frame to the camera's.
-        translation_m: (3,) of the same transform.
-        camera: intrinsics.
+    is similar to that in its keyframe. Points (3, n, 3) are those of `Landmarks.surface`, in any
+    frame; rotation and translation lead from there to the camera.
     """
     centre = points[0] @ rotation.T + translation_m
     front = np.flatnonzero(centre[:, 2] > NEAREST_M)
@@ -101,13 +93,8 @@ def detect(
 ) -> tuple[Array, NDArray[np.int64]]:
     """Detect the most textured pixel of every textured cell.
 
-    Args:
-        grey: (h, w) uint8.
-        grid: rows and columns of cells.
-        cell_px: side of a cell in pixels of `grey`.
-
-    Returns:
-        Pixels (n, 2) and their cells (n,), row-major.
+    The image (h, w) is uint8, and a cell has `cell_px` pixels. Returns pixels (n, 2) and their
+    cells (n,), row-major.
     """
     texture = cv2.cornerMinEigenVal(grey, 5)
     inner = np.zeros_like(texture)

@@ -138,12 +138,8 @@ class MapFrame:
 def fit_correction(poses: SE3, correction: NDArray[np.floating]) -> FrameCorrection | None:
     """Fit the correlation length of corrections.
 
-    Args:
-        poses: (n,) see `FrameCorrection`.
-        correction: (n, 6) of each pose, without the common transform and the time shift.
-
-    Returns:
-        None if neighbours explain too little of the corrections.
+    Corrections (n, 6) are without the common transform and the time shift. Returns None if
+    neighbours explain too little of them.
     """
     scale = np.repeat([np.abs(correction[:, :3]).mean(), np.abs(correction[:, 3:]).mean()], 3)
     if (scale[[0, 3]] < [1e-4, 1e-5]).any():

@@ -55,10 +55,6 @@ class MemoryBudget:
         """Number of keyframes, at least 1.
 
         For a budget in bytes, as many as fit by the size of their images, from a sample.
-
-        Args:
-            frames: training frames of the scene.
-            short_side: shorter side of stored images, pixels.
         """
         if self.bytes is None:
             return max(1, int(self.share * len(frames) + 1e-9))

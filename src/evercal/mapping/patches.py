@@ -6,7 +6,7 @@ sampled. Patches have zero mean and unit deviation, so gain and offset of the im
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -54,8 +54,7 @@ def from_level(pixels: Array, level: int) -> Array:
     return resize_pixels(pixels, 2**level)
 
 
-@dataclass(frozen=True, eq=False)
-class Patches:
+class Patches(NamedTuple):
     """Templates of n patches in one level of a keyframe's pyramid."""
 
     intensity: Array
@@ -69,22 +68,12 @@ class Patches:
 
     def take(self, index: np.ndarray | slice) -> "Patches":
         """The patches of an index."""
-        return Patches(
-            self.intensity[index],
-            self.descent[index],
-            self.inverse_hessian[index],
-            self.rest[index],
-        )
+        return Patches(*(values[index] for values in self))
 
     @classmethod
     def joined(cls, parts: Sequence["Patches"]) -> "Patches":
         """Several sets of patches as one."""
-        return cls(
-            np.concatenate([part.intensity for part in parts]),
-            np.concatenate([part.descent for part in parts]),
-            np.concatenate([part.inverse_hessian for part in parts]),
-            np.concatenate([part.rest for part in parts]),
-        )
+        return cls(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def cut_patches(image: Array, pixels: Array) -> Patches:
@@ -111,15 +100,8 @@ def align_patches(
 ) -> tuple[Array, Array]:
     """Align patches in another image.
 
-    Args:
-        patches: n templates.
-        image: float image (h, w) of the same pyramid level.
-        centres: (n, 2) pixels to start from.
-        affines: (n, 2, 2) from keyframe pixels to pixels of this image around the centre.
-        iterations: Gauss-Newton steps.
-
-    Returns:
-        Pixels (n, 2) and the normalised cross-correlation (n,) there.
+    The affines (n, 2, 2) lead from keyframe pixels to pixels of the other image around the centres
+    (n, 2) to start from. Returns pixels (n, 2) and their normalised cross-correlation (n,).
     """
     if len(centres) > _MOST_ROWS:
         starts = range(0, len(centres), _MOST_ROWS)
@@ -152,15 +134,8 @@ def align_down(
 ) -> tuple[Array, Array]:
     """`align_patches` from coarse to fine.
 
-    Args:
-        levels: templates of each pyramid level.
-        pyramid: `image_pyramid` of the other image.
-        start: (n, 2) pixels of level 0 to start from.
-        affines: (n, 2, 2), see `align_patches`.
-        steps: (level, iterations), in order.
-
-    Returns:
-        Pixels (n, 2) of level 0 and the correlation (n,) at the last level.
+    `start` and the result are (n, 2) pixels of level 0, each step is (level, iterations). Returns
+    the correlation (n,) at the last level too.
     """
     pixels, correlation = start, np.zeros(len(start))
     for level, iterations in steps:

@@ -6,7 +6,6 @@ space-sweep approach, CVPR 1996).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,8 +24,6 @@ SEEN_BY = 4
 """A depth is scored by the mean similarity of this many best views; others may be occluded."""
 SMOOTHING = 0.7
 """Share of a cell's neighbours in its similarity."""
-GUESS_WEIGHT, GUESS_SPREAD = 0.2, 0.15
-"""Similarity added near the guess, and its standard deviation relative to the depth."""
 PARALLAX_RAD = np.deg2rad([4.0, 20.0, 35.0])
 """Parallax of a good view: at least the first, at most the second, useless from the third on."""
 MIN_SHARED = 0.1
@@ -68,12 +65,7 @@ def select_source_views(
 ) -> list[int]:
     """Select the views that show the surfaces of a view under good parallax.
 
-    Args:
-        depth_m: (h * w,) rough depths of the view's cells.
-        view: the view.
-        poses: (n,) base_from_camera of the other views.
-        cameras: n, at working size.
-        count: number of views, at most.
+    Rough depths (h * w,) are those of the cells of the view; poses (n,) are base_from_camera.
     """
     some = np.linspace(0, len(depth_m) - 1, PROBES).astype(int)
     points = view.base_from_camera.apply(view.rays()[some] * depth_m[some, None])
@@ -101,7 +93,6 @@ def inverse_depths(
     view: PosedCells,
     others: Sequence[PosedCells],
     guess_m: np.ndarray,
-    guess_weight: float = GUESS_WEIGHT,
     scale: float = 1.0,
 ) -> Tensor:
     """Inverse depth of every cell along the optical axis.
@@ -113,7 +104,6 @@ def inverse_depths(
         view: the view.
         others: see `select_source_views`; without other views the guess is returned.
         guess_m: (h * w,) rough depths, metres.
-        guess_weight: similarity added near the guess.
         scale: factor on the depths that are searched, see `NEAR_M`.
 
     Returns:
@@ -131,24 +121,15 @@ def inverse_depths(
     volume = score.T.reshape(1, PLANES, *view.grid)
     near = F.avg_pool2d(volume, 3, 1, 1, count_include_pad=False)
     score = (volume + SMOOTHING * (near - volume)).view(PLANES, -1).T
-    off = (planes[None] / guess[:, None]).log() / GUESS_SPREAD
-    score = score + guess_weight * torch.exp(-0.5 * off * off)
     inverse = planes[score.argmax(1)]
     for _ in range(2):
         gradient, hessian = torch.zeros_like(inverse), torch.full_like(inverse, 1e-3)
         for source in sources:
-            one = source.normal_equation(inverse)
-            gradient, hessian = gradient + one.gradient, hessian + one.hessian
+            slope, curvature = source.normal_equation(inverse)
+            gradient, hessian = gradient + slope, hessian + curvature
         step = (gradient / hessian).clamp(-0.1 / scale, 0.1 / scale)
         inverse = (inverse + step).clamp(least, most)
     return inverse
-
-
-class _NormalEquation(NamedTuple):
-    gradient: Tensor
-    """(cells,)."""
-    hessian: Tensor
-    """(cells,)."""
 
 
 class _SourceView:
@@ -180,8 +161,8 @@ class _SourceView:
         )
         return sampled[:, 0, 0].clamp(min=0) * torch.from_numpy(inside)
 
-    def normal_equation(self, inverse: Tensor) -> _NormalEquation:
-        """Least squares in the inverse depth of each cell."""
+    def normal_equation(self, inverse: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient and Hessian (cells,) of least squares in the inverse depth of each cell."""
         rho = inverse.double().numpy()
         pixels, front = self.pixels(rho)
         delta = 1e-4
@@ -196,19 +177,15 @@ class _SourceView:
         residual = stride * position + (stride - 1) / 2 - here
         weight = inside * (similarity - MIN_SIMILARITY).clamp(min=0) ** 2
         weight = weight / (1 + (residual.norm(dim=1) / OUTLIER_PX) ** 2)
-        return _NormalEquation(weight * (slope * residual).sum(1), weight * (slope * slope).sum(1))
+        return weight * (slope * residual).sum(1), weight * (slope * slope).sum(1)
 
 
 def peak(similarity: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
     """The most similar cell of the 3x3 around a cell, to a fraction of a cell.
 
-    Args:
-        similarity: (n, h, w) of n cells to all cells of another view.
-        row: (n,) in 1 .. h - 2.
-        column: (n,) in 1 .. w - 2.
-
-    Returns:
-        (n, 2) column and row, and the similarity (n,) of the nearest cell.
+    The similarity (n, h, w) is that of n cells to all cells of another view; rows and columns (n,)
+    lie inside its border. Returns (n, 2) column and row, and the similarity (n,) of the nearest
+    cell.
     """
     _, height, width = similarity.shape
     n = torch.arange(len(similarity))

@@ -25,23 +25,17 @@ MIN_PARALLAX_PX, MAX_EPIPOLAR_PX = 16.0, 4.0
 their epipolar lines than the second. Pixels at the encoder's working size."""
 MIN_DEPTHS = 100
 """Triangulated matches that a depth scale needs."""
-
-
-@dataclass(frozen=True)
-class PoseCheckOptions:
-    """When a stated pose contradicts the images."""
-
-    partners: int = 5
-    """Most similar frames that each frame is compared with."""
-    max_distance_px: float = 6.0
-    """Largest median distance of matches from their segments in a consistent pair, pixels at the
-    encoder's working size."""
-    min_similarity: float = 0.6
-    """Smallest cosine of matched features."""
-    min_matches: int = 30
-    """Pairs with fewer mutual matches are ignored."""
-    stride: int = 3
-    """Step between the cells of the first frame that are matched."""
+PARTNERS = 5
+"""Most similar frames that each frame is compared with."""
+MAX_DISTANCE_PX = 6.0
+"""Largest median distance of matches from their segments in a consistent pair, pixels
+at the encoder's working size."""
+MIN_SIMILARITY = 0.6
+"""Smallest cosine of matched features."""
+MIN_MATCHES = 30
+"""Pairs with fewer mutual matches are ignored."""
+STRIDE = 3
+"""Step between the cells of the first frame that are matched."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,22 +51,18 @@ class MatchedPair:
     """(n, 2) in the second, at working size."""
 
 
-def matched_pairs(
-    recording: PreparedFrames, vlad: Vlad, options: PoseCheckOptions
-) -> list[MatchedPair]:
+def matched_pairs(recording: PreparedFrames, vlad: Vlad) -> list[MatchedPair]:
     """Match every frame with the most similar ones."""
     count = len(recording)
     descriptors = torch.stack([vlad(recording.features(i)) for i in range(count)])
     similarity = (descriptors @ descriptors.T).fill_diagonal_(-1)
-    partners = similarity.topk(min(options.partners, count - 1)).indices.tolist()
+    partners = similarity.topk(min(PARTNERS, count - 1)).indices.tolist()
     pairs = sorted({(min(i, j), max(i, j)) for i, row in enumerate(partners) for j in row})
-    matched = [_matched(recording, i, j, options) for i, j in pairs]
-    return [pair for pair in matched if len(pair.ray) >= options.min_matches]
+    matched = [_matched(recording, i, j) for i, j in pairs]
+    return [pair for pair in matched if len(pair.ray) >= MIN_MATCHES]
 
 
-def contradicting_frames(
-    recording: PreparedFrames, pairs: list[MatchedPair], options: PoseCheckOptions
-) -> NDArray[np.int64]:
+def contradicting_frames(recording: PreparedFrames, pairs: list[MatchedPair]) -> NDArray[np.int64]:
     """Frames whose stated pose contradicts most of their partners."""
     count = len(recording)
     rest = [(pair.first, pair.second, _distance(recording, pair)) for pair in pairs]
@@ -82,7 +72,7 @@ def contradicting_frames(
         for i, j, distance in rest:
             for frame in (i, j):
                 total[frame] += 1
-                against[frame] += distance > options.max_distance_px
+                against[frame] += distance > MAX_DISTANCE_PX
         share = np.where(total >= 2, against / np.maximum(total, 1), 0)
         worst = int(np.lexsort((against, share))[-1])
         if share[worst] <= 0.5:
@@ -107,19 +97,19 @@ def depth_scale(recording: PreparedFrames, pairs: list[MatchedPair]) -> float:
     return 1.0 if usual else float(middle / USUAL_M)
 
 
-def _matched(recording: PreparedFrames, i: int, j: int, options: PoseCheckOptions) -> MatchedPair:
+def _matched(recording: PreparedFrames, i: int, j: int) -> MatchedPair:
     """Mutual best matches of two frames."""
-    a, b = recording.features(i)[:: options.stride], recording.features(j)
+    a, b = recording.features(i)[::STRIDE], recording.features(j)
     if fast_bfloat16(a.device):
         a, b = a.bfloat16(), b.bfloat16()
     similar = a @ b.T
     best = similar.max(1)
     back = similar.argmax(0)
     rows = torch.arange(len(a))
-    mutual = (back[best.indices] == rows) & (best.values > options.min_similarity)
+    mutual = (back[best.indices] == rows) & (best.values > MIN_SIMILARITY)
     stride = recording.encoder.stride
     camera, other = recording.cell_camera(i), recording.cell_camera(j)
-    pixels = ideal_cell_pixels(camera, stride)[(rows[mutual] * options.stride).numpy()]
+    pixels = ideal_cell_pixels(camera, stride)[(rows[mutual] * STRIDE).numpy()]
     ray = camera.pinhole.unproject(pixels)
     matched = ideal_cell_pixels(other, stride)[best.indices[mutual].numpy()].astype(np.float64)
     # Near the edge, the distortion can have no ray for a cell.

@@ -1,10 +1,9 @@
 """The training frames of a scene while its map is built: images, features, poses, cameras."""
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
-from threading import Lock
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,13 +33,7 @@ class WorkingSize:
 
 
 class PreparedFrames:
-    """Posed training frames at working size; poses and camera change during the adjustment.
-
-    Args:
-        frames: posed frames of one scene.
-        encoder: frozen local encoder.
-        size: working sizes.
-    """
+    """Posed training frames at working size; poses and camera change during the adjustment."""
 
     def __init__(self, frames: Sequence[Frame], encoder: Encoder, size: WorkingSize):
         self.frames, self.encoder, self.size = tuple(frames), encoder, size
@@ -49,14 +42,14 @@ class PreparedFrames:
         self.cameras: list[Camera] = []
         for frame in self.frames:
             image = frame.read_image()
-            short = min(size.patches, *image.shape[:2])
-            grey, camera = working_image(image, frame.camera, short)
+            short_side = min(size.patches, *image.shape[:2])
+            grey, camera = working_image(image, frame.camera, short_side)
             self.grey.append(grey)
             self.cameras.append(camera)
         self.depth_scale = 1.0
         """Factor on the depths that are searched, see `plane_sweep.NEAR_M`."""
         self._features: dict[int, Tensor] = {}
-        self._pyramids = _Pyramids()
+        self._cache_pyramids()
 
     def without(self, excluded: NDArray[np.int64]) -> "PreparedFrames":
         """A copy without some frames; features of the others are not computed again."""
@@ -68,7 +61,7 @@ class PreparedFrames:
         rest._move(self.poses[index])
         features = self._features
         rest._features = {new: features[old] for new, old in enumerate(index) if old in features}
-        rest._pyramids = _Pyramids()
+        rest._cache_pyramids()
         return rest
 
     def __len__(self) -> int:
@@ -106,7 +99,11 @@ class PreparedFrames:
 
     def pyramid(self, i: int) -> list[np.ndarray]:
         """Image pyramid of a frame."""
-        return self._pyramids.of(i, self.grey[i])
+        return self._pyramid(i)
+
+    def _cache_pyramids(self) -> None:
+        grey = self.grey
+        self._pyramid = lru_cache(_PYRAMIDS)(lambda i: image_pyramid(grey[i], PYRAMID_LEVELS))
 
     def relative(self, j: int, k: int) -> tuple[np.ndarray, np.ndarray]:
         """Rotation (3, 3) and translation (3,) of camera j from camera k."""
@@ -123,24 +120,3 @@ class PreparedFrames:
     def _move(self, poses: SE3) -> None:
         # A pose of a batch takes long to multiply; `relative` is called for every observation.
         self.poses, self._matrices = poses, poses.matrix()
-
-
-class _Pyramids:
-    """The image pyramids that were used last; safe to use from several threads."""
-
-    def __init__(self) -> None:
-        self._pyramids: OrderedDict[int, list[np.ndarray]] = OrderedDict()
-        self._lock = Lock()
-
-    def of(self, i: int, grey: NDArray[np.uint8]) -> list[np.ndarray]:
-        """The pyramid of image i."""
-        with self._lock:
-            if i in self._pyramids:
-                self._pyramids.move_to_end(i)
-                return self._pyramids[i]
-        pyramid = image_pyramid(grey, PYRAMID_LEVELS)
-        with self._lock:
-            self._pyramids[i] = pyramid
-            if len(self._pyramids) > _PYRAMIDS:
-                self._pyramids.popitem(last=False)
-        return pyramid

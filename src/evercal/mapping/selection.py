@@ -48,17 +48,14 @@ class SarsOptions:
 
 @dataclass(frozen=True)
 class PoseSpace:
-    """The poses of one scene, scaled for the metric and stored one component per row.
-
-    Attributes:
-        positions: ``(3, n)`` positions divided by the longest side of their box.
-        quaternions: ``(4, n)`` unit quaternions, wxyz.
-        rotation_weight: scene sides per radian.
-    """
+    """The poses of one scene, scaled for the metric and stored one component per row."""
 
     positions: np.ndarray
+    """(3, n) positions divided by the longest side of their box."""
     quaternions: np.ndarray
+    """(4, n) unit quaternions, wxyz."""
     rotation_weight: float
+    """Scene sides per radian."""
 
     @classmethod
     def of(
@@ -71,11 +68,9 @@ class PoseSpace:
         """
         positions = np.asarray(positions_m, dtype=np.float64)
         quaternions = np.asarray(quaternions_wxyz, dtype=np.float64)
-        if positions.ndim != 2 or positions.shape[1] != 3:
-            raise ValueError(f"positions_m has shape {positions.shape}; give (n, 3)")
-        if quaternions.shape != (len(positions), 4):
+        if positions.shape[1:] != (3,) or quaternions.shape != (len(positions), 4):
             raise ValueError(
-                f"quaternions_wxyz has shape {quaternions.shape}; give ({len(positions)}, 4)"
+                f"poses are (n, 3) and (n, 4), got {positions.shape} and {quaternions.shape}"
             )
         norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
         bad = ~np.isfinite(positions).all(axis=1) | ~np.isfinite(norms[:, 0]) | (norms[:, 0] == 0)
@@ -95,80 +90,14 @@ class PoseSpace:
         """Return the number of poses."""
         return self.positions.shape[1]
 
-    def distances(self, index: int, others: PoseSpace | None = None) -> np.ndarray:
-        """Return D from pose `index` to every pose of `others` (default: of this space)."""
-        others = self if others is None else others
-        step = others.positions - self.positions[:, index, None]
-        quaternion = self.quaternions[:, index, None]
-        difference = others.quaternions - quaternion
-        step *= step
-        difference *= difference
-        chord_squared = difference.sum(axis=0)
-        far = np.flatnonzero(chord_squared > 2.0)  # q and -q are one rotation
-        if far.size:
-            difference = others.quaternions[:, far] + quaternion
-            difference *= difference
-            chord_squared[far] = difference.sum(axis=0)
-        angle = np.arcsin(np.sqrt(chord_squared) * 0.5)
-        angle *= 4.0 * self.rotation_weight
-        angle += np.sqrt(step.sum(axis=0))
-        return angle
-
-    def from_frame(self, first: int) -> PoseSpace:
-        """Return a view of the poses from frame `first` on."""
-        return PoseSpace(
-            self.positions[:, first:], self.quaternions[:, first:], self.rotation_weight
-        )
-
-    def take(self, indices: np.ndarray) -> PoseSpace:
-        """Return a copy of the poses at `indices`."""
-        # np.take keeps rows contiguous; fancy indexing would not, and distances are 3x slower.
-        return PoseSpace(
-            self.positions.take(indices, axis=1),
-            self.quaternions.take(indices, axis=1),
-            self.rotation_weight,
-        )
-
-
-class _DenseBuffer:
-    """A full SARS buffer with the nearest neighbour of every member."""
-
-    def __init__(self, space: PoseSpace, frames: np.ndarray) -> None:
-        """Take the frames that filled the buffer; memory is ``len(frames) ** 2`` float64."""
-        self.frames = frames.copy()
-        self.poses = space.take(frames)
-        self._space = space
-        self._pairwise = np.stack([space.distances(int(f), self.poses) for f in frames])
-        np.fill_diagonal(self._pairwise, np.inf)
-        # Of several nearest neighbours the youngest is stored: older ones are evicted first, so
-        # a camera at rest does not force a recomputation for every frame.
-        self._witness = np.empty(len(frames), dtype=np.int64)
-        self._nearest = np.empty(len(frames))
-        self._search(np.arange(len(frames)))
-
-    def _search(self, slots: np.ndarray) -> None:
-        rows = self._pairwise[slots]
-        nearest = rows.min(axis=1)
-        self._nearest[slots] = nearest
-        self._witness[slots] = np.where(rows == nearest[:, None], self.frames, -1).argmax(axis=1)
-
-    def replace_densest(self, frame: int, row: np.ndarray) -> None:
-        """Evict the member nearest to another one (ties: the older), then put `frame` there."""
-        ties = np.flatnonzero(self._nearest == self._nearest.min())
-        slot = int(ties[self.frames[ties].argmin()])
-        self.frames[slot] = frame
-        self.poses.positions[:, slot] = self._space.positions[:, frame]
-        self.poses.quaternions[:, slot] = self._space.quaternions[:, frame]
-        row[slot] = np.inf
-        self._pairwise[slot] = row
-        self._pairwise[:, slot] = row
-        closer = row <= self._nearest
-        orphans = self._witness == slot
-        orphans &= ~closer
-        orphans[slot] = True
-        np.minimum(self._nearest, row, out=self._nearest)
-        self._witness[closer] = slot
-        self._search(np.flatnonzero(orphans))
+    def distances(self, index: int, others: slice | np.ndarray = slice(None)) -> np.ndarray:
+        """Return D from pose `index` to the poses of another index, by default to all."""
+        here, quaternion = self.positions[:, index, None], self.quaternions[:, index, None]
+        step, turned = self.positions[:, others] - here, self.quaternions[:, others]
+        # q and -q are one rotation.
+        chords = [((turned + sign * quaternion) ** 2).sum(axis=0) for sign in (-1, 1)]
+        angle = 4.0 * self.rotation_weight * np.arcsin(np.sqrt(np.minimum(*chords)) * 0.5)
+        return angle + np.sqrt((step**2).sum(axis=0))
 
 
 def _accept_until_full(space: PoseSpace, radius: float, capacity: int) -> np.ndarray:
@@ -186,15 +115,9 @@ def _accept_until_full(space: PoseSpace, radius: float, capacity: int) -> np.nda
         frame += ahead
         accepted.append(frame)
         later = gap[frame + 1 :]
-        np.minimum(later, space.distances(frame, space.from_frame(frame + 1)), out=later)
+        np.minimum(later, space.distances(frame, slice(frame + 1, None)), out=later)
         frame += 1
     return np.array(accepted, dtype=np.int64)
-
-
-def _checked_capacity(capacity: int) -> int:
-    if capacity < 0:
-        raise ValueError(f"capacity is {capacity}; it is a number of frames >= 0")
-    return int(capacity)
 
 
 def spread_poses(poses: SE3, capacity: int) -> NDArray[np.int64]:
@@ -226,7 +149,7 @@ def select_sars(
         positions_m: ``(n, 3)`` camera positions, metres.
         quaternions_wxyz: ``(n, 4)`` camera orientations.
         capacity: largest number of frames to select (N_b).
-        options: radius, rotation weight, and whether to fill the buffer; see `fill_radius`.
+        options: radius, rotation weight, and whether to fill the buffer.
 
     Returns:
         Selected indices, ascending; with ``fill`` exactly ``min(capacity, n)``, without it often
@@ -236,7 +159,8 @@ def select_sars(
         ValueError: A negative capacity or an unusable pose.
     """
     options = options or SarsOptions()
-    capacity = _checked_capacity(capacity)
+    if capacity < 0:
+        raise ValueError(f"capacity is {capacity}; it is a number of frames >= 0")
     space = PoseSpace.of(positions_m, quaternions_wxyz, options.rotation_weight)
     radius = _largest_radius(space, capacity, 1e-5) if options.fill else options.radius
     accepted = _accept_until_full(space, radius, capacity)
@@ -244,12 +168,23 @@ def select_sars(
         return accepted
     if accepted[-1] == len(space) - 1:
         return accepted
-    buffer = _DenseBuffer(space, accepted)
+    frames = accepted.copy()
+    pairwise = np.stack([space.distances(int(frame), frames) for frame in frames])
+    np.fill_diagonal(pairwise, np.inf)
+    nearest = pairwise.min(axis=1)
     for frame in range(int(accepted[-1]) + 1, len(space)):
-        row = space.distances(frame, buffer.poses)
-        if row.min() >= radius:
-            buffer.replace_densest(frame, row)
-    return np.sort(buffer.frames)
+        row = space.distances(frame, frames)
+        if row.min() < radius:
+            continue
+        ties = np.flatnonzero(nearest == nearest.min())
+        slot = int(ties[frames[ties].argmin()])
+        orphans = nearest == pairwise[slot]
+        orphans[slot] = True
+        frames[slot], row[slot] = frame, np.inf
+        pairwise[slot] = pairwise[:, slot] = row
+        np.minimum(nearest, row, out=nearest)
+        nearest[orphans] = pairwise[orphans].min(axis=1)
+    return np.sort(frames)
 
 
 def _largest_radius(space: PoseSpace, capacity: int, tolerance: float) -> float:
@@ -282,39 +217,9 @@ def select_farthest(
     space = PoseSpace.of(positions_m, quaternions_wxyz, rotation_weight)
     gap = np.full(len(space), np.inf)
     selected = list(start)
-    for i in range(min(_checked_capacity(capacity), len(space))):
+    for i in range(min(capacity, len(space))):
         if i == len(selected):
             selected.append(int(gap.argmax()))
         np.minimum(gap, space.distances(selected[i]), out=gap)
         gap[selected[: i + 1]] = -1.0  # another frame with the same pose can still be selected
     return np.sort(np.array(selected, np.int64))
-
-
-def covering_radius(
-    positions_m: np.ndarray,
-    quaternions_wxyz: np.ndarray,
-    selected: np.ndarray,
-    rotation_weight: float = 1.0,
-) -> float:
-    """Largest distance D from any frame of the scene to its nearest selected frame.
-
-    0 for a scene without frames; infinite if frames exist and none is selected.
-    """
-    space = PoseSpace.of(positions_m, quaternions_wxyz, rotation_weight)
-    gap = np.full(len(space), np.inf)
-    for frame in np.asarray(selected, dtype=np.int64):
-        np.minimum(gap, space.distances(int(frame)), out=gap)
-    return float(gap.max(initial=0.0))
-
-
-def smallest_pair(
-    positions_m: np.ndarray,
-    quaternions_wxyz: np.ndarray,
-    selected: np.ndarray,
-    rotation_weight: float = 1.0,
-) -> float:
-    """Smallest distance D between two selected frames; infinite for fewer than two."""
-    space = PoseSpace.of(positions_m, quaternions_wxyz, rotation_weight)
-    index = np.asarray(selected, dtype=np.int64)
-    near = [space.distances(int(a))[index[i + 1 :]].min() for i, a in enumerate(index[:-1])]
-    return float(min(near, default=np.inf))

@@ -11,7 +11,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -34,15 +34,16 @@ STRATEGY = "evercal"
 """Name of the map among the strategies of `evercal learn`."""
 SCENE, KEYFRAMES, CORRECTION = "scene.json", "keyframes.safetensors", "correction.safetensors"
 
+_FIELDS = (
+    "name", "camera", "adjusted_camera", "train_frames", "min_support", "covariance_scale",
+)  # fmt: skip
+"""Fields of `SceneMap` in scene.json, beside `frame`."""
+
 
 class MapStore(StageStore):
     """A map on disk and in memory.
 
-    Args:
-        root: folder of the store.
-        contents: encoder and scenes.
-        stages: folder names of the scenes, in order.
-        networks: file names of the encoder and, for an encoder that is not shipped, its centroids.
+    The networks are the files of the encoder and, if it is not shipped, of its centroids.
     """
 
     def __init__(
@@ -59,10 +60,8 @@ class MapStore(StageStore):
     def open(cls, root: Path, encoder: nn.Module | None = None) -> Self:
         """Open a map at its last complete scene.
 
-        Args:
-            root: folder of the store.
-            encoder: the module of a store that was made with a module of the caller's own; its
-                weights are replaced by those in the store.
+        For a store that was made with a module of the caller's own, `encoder` is that module; its
+        weights are replaced by those in the store.
 
         Raises:
             InputError: Not a map, or a file is missing or was changed.
@@ -94,10 +93,8 @@ class MapStore(StageStore):
     ) -> Self:
         """An empty map; nothing is written before the first `commit`.
 
-        Args:
-            root: folder of the store to be; it must not exist or be empty.
-            encoder: a weights file or a module that is an `Encoder`. Default: the shipped weights.
-            short_side: shorter image side that the encoder works on, pixels.
+        `root` must not exist or be empty. The encoder is a weights file, a module that is an
+        `Encoder`, or by default the shipped one.
 
         Raises:
             InputError: `root` holds something else, or a bad encoder.
@@ -126,10 +123,6 @@ class MapStore(StageStore):
     def commit(self, scene: SceneMap, report: Mapping[str, object]) -> None:
         """Add a scene: whole, or not at all.
 
-        Args:
-            scene: its map.
-            report: content of its `report.json`.
-
         Raises:
             InputError: Another process writes into the store, or it cannot be written.
         """
@@ -147,8 +140,7 @@ class MapStore(StageStore):
     def update(self, scene: SceneMap) -> None:
         """Replace what is stored of a scene beside its keyframes: whole, or not at all.
 
-        Args:
-            scene: its map; it replaces the scene of the same name.
+        It replaces the scene of the same name.
 
         Raises:
             InputError: As `commit`, and where a file of the store is missing or was changed.
@@ -186,19 +178,11 @@ def write_encoder(root: Path, encoder: Encoder, centroids: bool = True) -> tuple
 
 def write_scene(folder: Path, scene: SceneMap) -> None:
     """Write everything of a scene but its keyframes into its folder."""
-    frame = scene.frame
-    content: dict[str, object] = {
-        "name": scene.name,
-        "camera": scene.camera.to_dict(),
-        "adjusted_camera": scene.adjusted_camera.to_dict(),
-        "train_frames": scene.train_frames,
-        "min_support": scene.min_support,
-        "covariance_scale": scene.covariance_scale,
-        "frame": frame_to_dict(frame),
-    }
-    write_json(folder / SCENE, content)
-    if frame.correction is not None:
-        save_tensors(folder / CORRECTION, correction_tensors(frame.correction))
+    values = {name: getattr(scene, name) for name in _FIELDS}
+    content = {k: v.to_dict() if isinstance(v, Camera) else v for k, v in values.items()}
+    write_json(folder / SCENE, {**content, "frame": frame_to_dict(scene.frame)})
+    if scene.frame.correction is not None:
+        save_tensors(folder / CORRECTION, correction_tensors(scene.frame.correction))
 
 
 def read_scene(folder: Path) -> SceneMap:
@@ -207,15 +191,13 @@ def read_scene(folder: Path) -> SceneMap:
     correction = None
     if (folder / CORRECTION).exists():
         correction = correction_of(load_tensors(folder / CORRECTION))
+    values: dict[str, Any] = {name: content[name] for name in _FIELDS}
+    for name in ("camera", "adjusted_camera"):
+        values[name] = Camera.from_dict(values[name])
     return SceneMap(
-        name=content["name"],
-        camera=Camera.from_dict(content["camera"]),
-        adjusted_camera=Camera.from_dict(content["adjusted_camera"]),
         keyframes=Keyframes.from_tensors(load_tensors(folder / KEYFRAMES)),
         frame=frame_of(content["frame"], correction),
-        train_frames=content["train_frames"],
-        min_support=content["min_support"],
-        covariance_scale=content["covariance_scale"],
+        **values,
     )
 
 

@@ -25,18 +25,12 @@ Steps = Sequence[tuple[int, int]]
 """Pyramid levels and alignment iterations, see `align_down`."""
 
 
-class _DepthRound(NamedTuple):
-    """One round of depth refinement: alignment, then Gauss-Newton steps on the depths."""
-
-    alignment: Steps
-    updates: int
-
-
-_DEPTH_ROUNDS = (
-    _DepthRound(((1, 6),), 1),
-    _DepthRound(((1, 3), (0, 5)), 2),
-    _DepthRound(((0, 4),), 2),
+_DEPTH_ROUNDS: tuple[tuple[Steps, int], ...] = (
+    (((1, 6),), 1),
+    (((1, 3), (0, 5)), 2),
+    (((0, 4),), 2),
 )
+"""Rounds of depth refinement: alignment, and the number of Gauss-Newton steps after it."""
 _WIDE_STEPS: Steps = ((2, 4), (1, 4), (0, 4))
 _PROBES = 64
 """Cells of a keyframe that are projected into other frames to measure the shared view."""
@@ -44,38 +38,30 @@ _FAR_OFF_PX = 1e3
 """Residual of a landmark that the distortion of a camera has no pixel for."""
 _OUTLIER_SQUARES = 16.0
 """Squared whitened residual above which an observation does not count."""
-
-
-@dataclass(frozen=True)
-class TrackOptions:
-    """How landmarks are tracked."""
-
-    source_views: int = 12
-    """Frames that the depths of a keyframe are swept over, at most."""
-    min_correlation: float = 0.8
-    """Smallest normalised cross-correlation of an observation."""
-    reach_px: float = 12.0
-    """Largest distance of an observation from its prediction, pixels."""
-    wide_reach_px: float = 25.0
-    """The same while poses are adjusted."""
-    frames_per_keyframe: int = 3
-    """Keyframes that each frame is tied to in bundle adjustment."""
-    landmarks_per_keyframe: int = 200
-    """Landmarks of a keyframe in bundle adjustment, at most."""
-    bundle_landmarks: int = 6000
-    """Landmarks of all keyframes in bundle adjustment, at most."""
-    min_shared: float = 0.15
-    """Share of a keyframe's view that a frame tied to it must show."""
-    floor_px: float = 0.1
-    """Alignment error of a perfect patch where `noise` is 1, pixels: 0.08 px where it is 0.8."""
-    noise: float = 0.8
-    """Standard deviation of intensities in aligned patches, in deviations of a patch."""
-    min_views: int = 3
-    """Frames that must agree on a landmark."""
-    max_residual_px: float = 0.85
-    """Largest root mean square residual of a landmark per axis, pixels."""
-    slant: bool = True
-    """Warp patches by the slant of their surface; otherwise they are parallel to the keyframe."""
+SOURCE_VIEWS = 12
+"""Frames that the depths of a keyframe are swept over, at most."""
+MIN_CORRELATION = 0.8
+"""Smallest normalised cross-correlation of an observation."""
+REACH_PX = 12.0
+"""Largest distance of an observation from its prediction, pixels."""
+WIDE_REACH_PX = 25.0
+"""The same while poses are adjusted."""
+FRAMES_PER_KEYFRAME = 3
+"""Keyframes that each frame is tied to in bundle adjustment."""
+LANDMARKS_PER_KEYFRAME = 200
+"""Landmarks of a keyframe in bundle adjustment, at most."""
+BUNDLE_LANDMARKS = 6000
+"""Landmarks of all keyframes in bundle adjustment, at most."""
+MIN_SHARED = 0.15
+"""Share of a keyframe's view that a frame tied to it must show."""
+FLOOR_PX = 0.1
+"""Alignment error of a perfect patch where the noise is 1, pixels: 0.08 px where it is 0.8."""
+NOISE = 0.8
+"""Standard deviation of intensities in aligned patches, in deviations of a patch."""
+MIN_VIEWS = 3
+"""Frames that must agree on a landmark."""
+MAX_RESIDUAL_PX = 0.85
+"""Largest root mean square residual of a landmark per axis, pixels."""
 
 
 @dataclass(eq=False)
@@ -96,8 +82,7 @@ class KeyframeTracks:
     """(n,) landmarks that enough frames agree on."""
 
 
-@dataclass(frozen=True, eq=False)
-class Observations:
+class Observations(NamedTuple):
     """Landmarks of one keyframe in other frames."""
 
     landmark: Index
@@ -110,22 +95,22 @@ class Observations:
     """(m, 2, 2), see `patches.whitening`."""
 
 
-def open_keyframe(recording: PreparedFrames, frame: int, options: TrackOptions) -> KeyframeTracks:
+def open_keyframe(recording: PreparedFrames, frame: int) -> KeyframeTracks:
     """Landmarks of a keyframe, with depths from a plane sweep over other frames."""
     view, poses = recording.posed_cells(frame), recording.poses
     cameras = [recording.cell_camera(i) for i in range(len(recording))]
     scale = recording.depth_scale
     guess = np.full(len(view.features), scale * USUAL_M)
-    near = select_source_views(guess, view, poses, cameras, options.source_views)
+    near = select_source_views(guess, view, poses, cameras, SOURCE_VIEWS)
     others = [recording.posed_cells(i) for i in near]
-    swept = inverse_depths(view, others, guess, guess_weight=0.0, scale=scale)
+    swept = inverse_depths(view, others, guess, scale)
     inverse = swept.double().numpy()
-    near = select_source_views(1 / inverse, view, poses, cameras, options.source_views)
+    near = select_source_views(1 / inverse, view, poses, cameras, SOURCE_VIEWS)
     cell_px = recording.cell_px(frame)
     pixels, cells = detect(recording.grey[frame], view.grid, cell_px)
     has_ray = np.isfinite(recording.cameras[frame].unproject(pixels)).all(1)
     pixels, cells = pixels[has_ray], cells[has_ray]
-    slant = slopes(inverse, view.grid, cell_px) * options.slant
+    slant = slopes(inverse, view.grid, cell_px)
     pyramid = recording.pyramid(frame)
     return KeyframeTracks(
         frame=frame,
@@ -145,19 +130,11 @@ def observe(
     frame: int,
     which: Index,
     steps: Steps,
-    options: TrackOptions,
     reach_px: float,
 ) -> Observations:
     """Align landmarks of a keyframe in another frame.
 
-    Args:
-        recording: the frames.
-        keyframe: its landmarks are aligned.
-        frame: the other frame.
-        which: (n,) landmarks to align.
-        steps: pyramid levels and iterations.
-        options: thresholds and noise of observations.
-        reach_px: largest distance of an observation from its prediction.
+    `which` (n,) selects landmarks. An observation is at most `reach_px` from its prediction.
     """
     surface = keyframe.landmarks.take(which).surface(recording.cameras[keyframe.frame])
     rotation, translation = recording.relative(frame, keyframe.frame)
@@ -166,49 +143,39 @@ def observe(
     which = which[visible]
     templates = tuple(level.take(which) for level in keyframe.patches)
     pixels, correlation = align_down(templates, recording.pyramid(frame), expected, affines, steps)
-    good = correlation > options.min_correlation
+    good = correlation > MIN_CORRELATION
     good &= np.linalg.norm(pixels - expected, axis=1) < reach_px
     last = steps[-1][0]
     spread = templates[last].inverse_hessian[good]
-    white = whitening(affines[good], spread, options.floor_px, options.noise) / 2**last
+    white = whitening(affines[good], spread, FLOOR_PX, NOISE) / 2**last
     return Observations(which[good], np.full(good.sum(), frame), pixels[good], white)
 
 
-def refine_depths(
-    recording: PreparedFrames, keyframe: KeyframeTracks, options: TrackOptions, again: bool = False
-) -> None:
+def refine_depths(recording: PreparedFrames, keyframe: KeyframeTracks, again: bool = False) -> None:
     """Refine the inverse depths of a keyframe's landmarks by Gauss-Newton; poses are fixed.
 
-    Args:
-        recording: the frames.
-        keyframe: its landmarks are refined, in place.
-        options: thresholds and noise of observations.
-        again: the depths are nearly right, so the coarse round is left out.
+    Landmarks change in place. If the depths are nearly right (`again`), the coarse round is left
+    out.
     """
     if not keyframe.sources or not len(keyframe.landmarks):
         return
     observations, which = None, np.arange(len(keyframe.landmarks))
     for steps, updates in _DEPTH_ROUNDS[again:]:
-        parts = [
-            observe(recording, keyframe, j, which, steps, options, options.reach_px)
-            for j in keyframe.sources
-        ]
+        parts = [observe(recording, keyframe, j, which, steps, REACH_PX) for j in keyframe.sources]
         observations = _joined(parts)
         # Landmarks with too few observations at a coarse level are not tried at a finer one.
         count = np.bincount(observations.landmark, minlength=len(keyframe.landmarks))
-        which = np.flatnonzero(count >= options.min_views - 1)
+        which = np.flatnonzero(count >= MIN_VIEWS - 1)
         for _ in range(updates):
             _update_depths(recording, keyframe, observations)
     assert observations is not None, "there is at least one round"
-    _confirm(recording, keyframe, observations, options)
+    _confirm(recording, keyframe, observations)
 
 
-def bundle_tracks(
-    recording: PreparedFrames, keyframes: list[KeyframeTracks], options: TrackOptions
-) -> BundleTracks:
+def bundle_tracks(recording: PreparedFrames, keyframes: list[KeyframeTracks]) -> BundleTracks:
     """Observe a spread subset of the landmarks in all frames that show enough of their keyframe."""
-    most = max(30, min(options.landmarks_per_keyframe, options.bundle_landmarks // len(keyframes)))
-    tied = _tied_frames(recording, keyframes, options)
+    most = max(30, min(LANDMARKS_PER_KEYFRAME, BUNDLE_LANDMARKS // len(keyframes)))
+    tied = _tied_frames(recording, keyframes)
     parts: list[Observations] = []
     host, pixels, inverse, start = [], [], [], 0
     for keyframe, frames in zip(keyframes, tied, strict=True):
@@ -218,10 +185,8 @@ def bundle_tracks(
         number = np.full(len(keyframe.landmarks), -1)
         number[which] = start + np.arange(len(which))
         for j in frames:
-            observed = observe(
-                recording, keyframe, j, which, _WIDE_STEPS, options, options.wide_reach_px
-            )
-            parts.append(replace(observed, landmark=number[observed.landmark]))
+            observed = observe(recording, keyframe, j, which, _WIDE_STEPS, WIDE_REACH_PX)
+            parts.append(observed._replace(landmark=number[observed.landmark]))
         host.append(np.full(len(which), keyframe.frame))
         pixels.append(keyframe.landmarks.pixels[which])
         inverse.append(keyframe.landmarks.inverse_depth[which])
@@ -250,15 +215,13 @@ def _bundled(keyframe: KeyframeTracks, most: int) -> Index:
     return which
 
 
-def _tied_frames(
-    recording: PreparedFrames, keyframes: list[KeyframeTracks], options: TrackOptions
-) -> list[list[int]]:
+def _tied_frames(recording: PreparedFrames, keyframes: list[KeyframeTracks]) -> list[list[int]]:
     """Frames in which each keyframe's landmarks are observed."""
     shared = np.stack([_shared_view(recording, keyframe) for keyframe in keyframes])
-    best = np.argsort(-shared, axis=0, kind="stable")[: options.frames_per_keyframe]
+    best = np.argsort(-shared, axis=0, kind="stable")[:FRAMES_PER_KEYFRAME]
     tied = np.zeros(shared.shape, bool)
     np.put_along_axis(tied, best, True, axis=0)
-    tied &= shared > options.min_shared
+    tied &= shared > MIN_SHARED
     return [
         sorted({*np.flatnonzero(row).tolist(), *keyframe.sources} - {keyframe.frame})
         for row, keyframe in zip(tied, keyframes, strict=True)
@@ -286,13 +249,7 @@ def _shared_view(recording: PreparedFrames, keyframe: KeyframeTracks) -> np.ndar
 
 
 def _joined(parts: Sequence[Observations]) -> Observations:
-    """Several sets of observations as one."""
-    return Observations(
-        np.concatenate([part.landmark for part in parts]),
-        np.concatenate([part.frame for part in parts]),
-        np.concatenate([part.pixels for part in parts]),
-        np.concatenate([part.whitening for part in parts]),
-    )
+    return Observations(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 class _Residuals(NamedTuple):
@@ -353,7 +310,6 @@ def _confirm(
     recording: PreparedFrames,
     keyframe: KeyframeTracks,
     observations: Observations,
-    options: TrackOptions,
 ) -> None:
     """Decide which landmarks enough frames agree on, and estimate the errors of their depths."""
     n = len(keyframe.landmarks)
@@ -368,4 +324,4 @@ def _confirm(
     information = np.bincount(which, (weight * (slope**2).sum(1))[near], n)
     sigma = np.sqrt(np.maximum(mean, 0.5) / np.maximum(information, 1e-9))
     keyframe.landmarks = replace(keyframe.landmarks, sigma=sigma)
-    keyframe.confirmed = (count >= options.min_views) & (error_px < options.max_residual_px)
+    keyframe.confirmed = (count >= MIN_VIEWS) & (error_px < MAX_RESIDUAL_PX)

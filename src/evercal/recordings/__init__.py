@@ -18,14 +18,7 @@ from evercal.recordings.images import read_image as read_image
 from evercal.recordings.images import write_image as write_image
 
 if TYPE_CHECKING:
-    from evercal.recordings.formats import colmap as colmap
     from evercal.recordings.formats import generic as generic
-    from evercal.recordings.formats import lerobot as lerobot
-    from evercal.recordings.formats import nerfstudio as nerfstudio
-    from evercal.recordings.formats import ros_bag as ros_bag
-    from evercal.recordings.formats import seven_scenes as seven_scenes
-    from evercal.recordings.formats import twelve_scenes as twelve_scenes
-    from evercal.recordings.formats import wrist as wrist
     from evercal.recordings.formats.sfm_poses import with_sfm_poses as with_sfm_poses
     from evercal.recordings.load import FORMATS as FORMATS
     from evercal.recordings.load import Format as Format
@@ -34,38 +27,23 @@ if TYPE_CHECKING:
     from evercal.recordings.poses.robot_poses import read_robot_poses as read_robot_poses
     from evercal.recordings.read_options import ReadOptions as ReadOptions
 
-_READERS = {
-    "FORMATS": "evercal.recordings.load",
-    "Format": "evercal.recordings.load",
-    "ReadOptions": "evercal.recordings.read_options",
-    "RobotPoses": "evercal.recordings.poses.robot_poses",
-    "load_recording": "evercal.recordings.load",
-    "read_robot_poses": "evercal.recordings.poses.robot_poses",
-    "with_sfm_poses": "evercal.recordings.formats.sfm_poses",
+_LOADED_ON_USE = {
+    "FORMATS": "load",
+    "Format": "load",
+    "ReadOptions": "read_options",
+    "RobotPoses": "poses.robot_poses",
+    "load_recording": "load",
+    "read_robot_poses": "poses.robot_poses",
+    "with_sfm_poses": "formats.sfm_poses",
+    "generic": "formats.generic",
 }
-"""Names that are loaded on first use, and the modules that define them."""
-
-
-_FORMATS = (
-    "colmap",
-    "generic",
-    "lerobot",
-    "nerfstudio",
-    "ros_bag",
-    "seven_scenes",
-    "twelve_scenes",
-    "wrist",
-)
-"""Modules that are loaded on first use."""
 
 
 def __getattr__(name: str) -> object:
     """Load a reader on first use."""
-    if name in _FORMATS:
-        value: object = importlib.import_module(f"evercal.recordings.formats.{name}")
-    elif name in _READERS:
-        value = getattr(importlib.import_module(_READERS[name]), name)
-    else:
-        raise AttributeError(f"module 'evercal.recordings' has no attribute {name!r}")
+    if name not in _LOADED_ON_USE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = importlib.import_module(f"{__name__}.{_LOADED_ON_USE[name]}")
+    value: object = getattr(module, name, module)
     globals()[name] = value
     return value

@@ -11,8 +11,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.images import StoredImage, as_rgb, read_image
 
-MIN_TRAIN_FRAMES = 16
-"""Posed training frames that a scene needs to be learned."""
+MIN_TRAIN_FRAMES = 16  # posed training frames that a scene needs to be learned
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +34,7 @@ class Frame:
     """Joint angles of the arm at the time of the image, if stated."""
 
     def read_image(self) -> NDArray[np.uint8]:
-        """Read the pixels.
-
-        Returns:
-            (H, W, 3) uint8 RGB.
+        """Read the pixels, (H, W, 3) uint8 RGB.
 
         Raises:
             InputError: The file is missing or broken, or its size differs from the camera's.
@@ -73,7 +69,6 @@ class Recording:
     """Frames of one place in recorded order, with all poses in one base frame."""
 
     name: str
-    """Name of the scene."""
     train: tuple[Frame, ...]
     """Frames to learn from."""
     test: tuple[Frame, ...]

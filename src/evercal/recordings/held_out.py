@@ -15,7 +15,6 @@ class HeldOutSplit:
     """Training frames of a recording in two parts."""
 
     train: tuple[Frame, ...]
-    """Frames to learn."""
     held_out: tuple[Frame, ...]
     """Frames that acceptance is fitted to: blocks of 4 in every 100, at least one block."""
 
@@ -32,15 +31,10 @@ def split_held_out(frames: Sequence[Frame]) -> HeldOutSplit:
 
 
 def named_recording(recording: Recording, name: str | None, taken: Iterable[str]) -> Recording:
-    """A recording under the name that its scene will have.
-
-    Args:
-        recording: any recording.
-        name: of the scene; the recording's own name by default.
-        taken: names of the scenes learned before.
+    """A recording under the name that its scene will have; its own name by default.
 
     Raises:
-        InputError: A name that is taken, or that is no single word of a path.
+        InputError: A name that is among the names `taken`, or that is no single word of a path.
     """
     name = recording.name if name is None else name
     if not name.strip() or name.startswith(".") or re.search(r"[/\\=\x00-\x1f]", name):

@@ -18,10 +18,7 @@ class StoredImage(ABC):
 
     @abstractmethod
     def read(self) -> NDArray[np.uint8]:
-        """Decode the image.
-
-        Returns:
-            (H, W, 3) uint8 RGB.
+        """Decode the image to (H, W, 3) uint8 RGB.
 
         Raises:
             InputError: The image cannot be read or decoded.
@@ -33,17 +30,12 @@ class StoredImage(ABC):
 
 
 def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
-    """Convert an image in memory to 8-bit RGB.
-
-    Grey becomes equal red, green and blue. Alpha is dropped. 16-bit values are divided by 257 and
-    rounded, so that 65535 becomes 255.
+    """Convert an image in memory to (H, W, 3) uint8 RGB.
 
     Args:
         image: (H, W), (H, W, 1), (H, W, 3) RGB or (H, W, 4) RGBA; uint8 or uint16, or nested lists
-            of integers from 0 to 255.
-
-    Returns:
-        (H, W, 3) uint8 RGB.
+            of integers from 0 to 255. Grey becomes equal red, green and blue. Alpha is dropped.
+            16-bit values are divided by 257 and rounded, so that 65535 becomes 255.
 
     Raises:
         InputError: The image is empty or has another shape or type.
@@ -70,18 +62,12 @@ def as_rgb(image: ArrayLike) -> NDArray[np.uint8]:
 
 
 def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
-    """Read an image file, turned upright as its EXIF orientation states.
+    """Read a grey, RGB or RGBA image file, turned upright as its EXIF orientation states.
 
-    Intrinsics are those of the upright image.
-
-    Args:
-        path: PNG, JPEG or another file that OpenCV decodes; grey, RGB or RGBA of 8 or 16 bits.
-
-    Returns:
-        (H, W, 3) uint8 RGB, converted as by `as_rgb`.
+    Intrinsics are those of the upright image. It is converted as by `as_rgb`.
 
     Raises:
-        InputError: The file is missing, is a folder, or is not an image.
+        InputError: The file is missing, is a folder, or is not an image of 8 or 16 bits.
     """
     path = Path(path)
     try:
@@ -99,14 +85,7 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
 
 
 def decode_image(data: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
-    """Decode the content of an image file, turned upright as its EXIF orientation states.
-
-    Args:
-        data: (n,) uint8 bytes of a file.
-
-    Returns:
-        (H, W, 3) uint8 RGB, or None if the bytes are not an image of 8 or 16 bits.
-    """
+    """Decode (n,) uint8 bytes of an image file as by `read_image`; None if they are no image."""
     import cv2
 
     # IMREAD_UNCHANGED would ignore the orientation; ANYDEPTH keeps 16 bits for as_rgb to round.

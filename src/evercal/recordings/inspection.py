@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Literal
 
@@ -29,7 +30,6 @@ class Inspection:
     """Summary of a recording."""
 
     name: str
-    """Name of the scene."""
     poses: Literal["camera", "gripper", "none"]
     """Owner of the stated poses; the camera if both are stated."""
     train: int
@@ -51,9 +51,7 @@ class Inspection:
     near_training: float | None
     """Per cent of test frames with a training frame within 5 cm and 5 deg; None without frames."""
     notes: tuple[str, ...]
-    """Choices and omissions of the reader."""
     warnings: tuple[str, ...]
-    """Suspected errors."""
 
 
 def inspect_recording(recording: Recording) -> Inspection:
@@ -63,13 +61,14 @@ def inspect_recording(recording: Recording) -> Inspection:
         InputError: An image cannot be read, or its size differs from the camera's.
     """
     both = (*recording.train, *recording.test)
-    owner = "camera" if posed_frames(both) else "gripper" if any(map(_of_gripper, both)) else "none"
-    pose_of = _of_gripper if owner == "gripper" else _of_camera
+    grippers = any(frame.base_from_gripper for frame in both)
+    owner = "camera" if posed_frames(both) else "gripper" if grippers else "none"
+    pose_of = attrgetter("base_from_gripper" if owner == "gripper" else "base_from_camera")
     train, test = (tuple(filter(pose_of, part)) for part in (recording.train, recording.test))
     cameras = Counter(frame.camera for frame in both)
     for size in {(camera.width, camera.height) for camera in cameras}:
         next(f for f in both if (f.camera.width, f.camera.height) == size).read_image()
-    poses, tested = (SE3.stack([p for f in part if (p := pose_of(f))]) for part in (train, test))
+    poses, tested = (SE3.stack([*map(pose_of, part)]) for part in (train, test))
     metres = radians = None
     if len(train) > 1:
         metres, radians = pose_distance(poses[:-1], poses[1:])
@@ -97,14 +96,6 @@ def inspect_recording(recording: Recording) -> Inspection:
         notes=recording.notes,
         warnings=tuple(warnings),
     )
-
-
-def _of_camera(frame: Frame) -> SE3 | None:
-    return frame.base_from_camera
-
-
-def _of_gripper(frame: Frame) -> SE3 | None:
-    return frame.base_from_gripper
 
 
 def _camera_lines(cameras: Counter[Camera]) -> tuple[str, ...]:
@@ -149,12 +140,9 @@ def _warn_cameras(cameras: Counter[Camera]) -> list[str]:
     warnings = []
     for camera in cameras:
         name = f"camera {camera.width}x{camera.height}"
-        offset = max(
-            abs((camera.cx + 0.5) / camera.width - 0.5),
-            abs((camera.cy + 0.5) / camera.height - 0.5),
-        )
+        middle = (camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height
         view = np.rad2deg(2 * np.arctan(camera.width / (2 * camera.fx)))
-        if offset > 0.2:
+        if max(abs(share - 0.5) for share in middle) > 0.2:
             warnings.append(
                 f"{name}: principal point ({camera.cx:.0f}, {camera.cy:.0f}) is far from the"
                 f" middle; are the intrinsics those of this image size?"
@@ -171,59 +159,56 @@ def _warn_cameras(cameras: Counter[Camera]) -> list[str]:
 
 
 def _warn_motion(poses: SE3, extent: np.ndarray, step: float, of_camera: bool) -> list[str]:
-    warnings = [] if of_camera else _warn_reach(poses)
     rotation_deg = np.rad2deg(pose_distance(poses[0], poses)[1].max())
-    if extent.max() < SAME_M:
-        warnings.append(
-            f"all training frames stand at one point, rotating by {rotation_deg:.0f}"
-            f" deg; a map takes views from several. Are the translations there, and in metres?"
-        )
-    elif extent.max() < SMALLEST_EXTENT_M:
-        warnings.append(
-            f"the training camera moves by {100 * extent.max():.1f} cm only; points may get no"
-            f" depth. Are the translations in metres?"
-        )
-    if rotation_deg < SAME_DEG:
-        warnings.append("all training frames look the same way; are the rotations missing?")
-    if extent.max() > LARGEST_EXTENT_M:
-        warnings.append(
-            f"the camera moves over {extent.max():.0f} m; are the poses in millimetres?"
-        )
-    elif step > LARGEST_STEP_M and of_camera:
-        warnings.append(
-            f"consecutive frames are {step:.2f} m apart; are they in recorded order and in metres?"
-        )
-    if of_camera and rotation_deg > LEAST_ROTATION_DEG:
-        about_x, _, about_z = rotation_shares(poses)
-        if about_x > LARGEST_PITCH_SHARE:
-            warnings.append(
-                f"{100 * about_x:.0f} % of the rotation is a nod about the image's x axis; are"
-                f" quaternions in the order w x y z, and camera axes right, down, forward?"
-            )
-        if about_z > LARGEST_ROLL_SHARE:
-            warnings.append(
-                f"{100 * about_z:.0f} % of the rotation is a roll about the viewing axis; are poses"
-                f" base_from_camera, not their inverse, and camera axes right, down, forward?"
-            )
-    return warnings
-
-
-def _warn_reach(poses: SE3) -> list[str]:
     reach = float(np.median(np.linalg.norm(poses.translation_m, axis=1)))
-    if reach <= LARGEST_REACH_M:
-        return []
-    return [
-        f"the gripper is {reach:.1f} m from the robot's base, farther than arms reach; are the"
-        f" poses in millimetres?"
+    far = extent.max() > LARGEST_EXTENT_M
+    rotates = of_camera and rotation_deg > LEAST_ROTATION_DEG
+    about_x, _, about_z = rotation_shares(poses)
+    checks = [
+        (
+            reach > LARGEST_REACH_M and not of_camera,
+            f"the gripper is {reach:.1f} m from the robot's base, farther than arms reach; are the"
+            f" poses in millimetres?",
+        ),
+        (
+            extent.max() < SAME_M,
+            f"all training frames stand at one point, rotating by {rotation_deg:.0f} deg; a map"
+            f" takes views from several. Are the translations there, and in metres?",
+        ),
+        (
+            SAME_M <= extent.max() < SMALLEST_EXTENT_M,
+            f"the training camera moves by {100 * extent.max():.1f} cm only; points may get no"
+            f" depth. Are the translations in metres?",
+        ),
+        (
+            rotation_deg < SAME_DEG,
+            "all training frames look the same way; are the rotations missing?",
+        ),
+        (far, f"the camera moves over {extent.max():.0f} m; are the poses in millimetres?"),
+        (
+            step > LARGEST_STEP_M and of_camera and not far,
+            f"consecutive frames are {step:.2f} m apart; are they in recorded order and in metres?",
+        ),
+        (
+            rotates and about_x > LARGEST_PITCH_SHARE,
+            f"{100 * about_x:.0f} % of the rotation is a nod about the image's x axis; are"
+            f" quaternions in the order w x y z, and camera axes right, down, forward?",
+        ),
+        (
+            rotates and about_z > LARGEST_ROLL_SHARE,
+            f"{100 * about_z:.0f} % of the rotation is a roll about the viewing axis; are poses"
+            f" base_from_camera, not their inverse, and camera axes right, down, forward?",
+        ),
     ]
+    return [warning for applies, warning in checks if applies]
 
 
 def rotation_shares(poses: SE3) -> tuple[float, float, float]:
     """Shares of the camera's x, y and z axis in the rotation from frame to frame; their sum is 1.
 
     A camera that is carried about mostly pans about its y axis. Inverted poses appear to roll, and
-    quaternions in another order or body axes (x forward) appear to nod. Jumps between recordings
-    are ignored. Without rotation, all shares are a third.
+    quaternions in another order or body axes (x forward) to nod. Jumps between recordings are
+    ignored. Without rotation, all shares are a third.
     """
     rotations = (poses[:-1].inverse() @ poses[1:]).log()[:, 3:]
     small = np.linalg.norm(rotations, axis=1) < np.deg2rad(LARGEST_ROTATION_STEP_DEG)

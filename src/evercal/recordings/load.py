@@ -55,7 +55,7 @@ def load_recording(
     name: str | None = None,
     options: ReadOptions | None = None,
 ) -> Recording:
-    """Read a recording.
+    """Read a folder or a bag file.
 
     Args:
         path: Folder of the recording, or a bag file.

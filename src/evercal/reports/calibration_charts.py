@@ -19,13 +19,8 @@ _MAX_NUMBERED = 40
 def ellipsoid_outline(covariance: ArrayLike, plane: tuple[int, int], share: float) -> Array:
     """Project an error ellipsoid onto the plane of two axes.
 
-    Args:
-        covariance: (3, 3) of Gaussian errors, any unit squared.
-        plane: Indices of the two axes.
-        share: Probability of an error inside the ellipsoid.
-
-    Returns:
-        (181, 2) closed outline about 0, in the unit of the errors.
+    The outline (181, 2) about 0 has the unit of the errors. `share` is the probability of an error
+    inside the ellipsoid.
     """
     from scipy import stats
 
@@ -39,10 +34,7 @@ def ellipsoid_outline(covariance: ArrayLike, plane: tuple[int, int], share: floa
 def ellipsoid_projections(covariance_mm2: ArrayLike, frame: str, share: float = 0.95) -> bytes:
     """Plot an error ellipsoid along each axis, all at one scale.
 
-    Args:
-        covariance_mm2: (3, 3) of a position, square millimetres.
-        frame: Name of the frame of the axes.
-        share: Probability of an error inside the ellipsoid.
+    The covariance is (3, 3) of a position, square millimetres.
     """
     outlines = [ellipsoid_outline(covariance_mm2, plane, share) for plane in _PLANES]
     reach = 1.15 * max(float(np.abs(outlines).max()), 1e-3)
@@ -51,11 +43,9 @@ def ellipsoid_projections(covariance_mm2: ArrayLike, frame: str, share: float = 
         panel.fill(*outline.T, facecolor=COLOURS[5], alpha=0.35, edgecolor="none")
         panel.plot(*outline.T, color=COLOURS[0], linewidth=1.5)
         panel.plot(0, 0, "+", color=COLOURS[6], markersize=7)
-        panel.set_xlim(-reach, reach)
-        panel.set_ylim(-reach, reach)
-        panel.set_aspect("equal")
-        panel.set_xlabel(plain(f"{'xyz'[a]} of {frame[:24]} (mm)"), fontsize=9)
-        panel.set_ylabel(plain(f"{'xyz'[b]} of {frame[:24]} (mm)"), fontsize=9)
+        panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+        x, y = (plain(f"{'xyz'[axis]} of {frame[:24]} (mm)") for axis in (a, b))
+        panel.set(xlabel=x, ylabel=y)
         panel.locator_params(nbins=7)
         tidy(panel)
     return png_bytes(figure)
@@ -66,10 +56,7 @@ def error_terms(
 ) -> bytes:
     """Plot the standard deviations that make up an error, position and rotation side by side.
 
-    Args:
-        names: Terms; the last one is the total.
-        millimetres: One value a term.
-        degrees: One value a term.
+    The last term is the total.
     """
     wrapped = [plain(textwrap.fill(textwrap.shorten(name, 130), 34)) for name in names]
     lines = sum(max(2, 1 + name.count("\n")) for name in wrapped)
@@ -83,9 +70,8 @@ def error_terms(
         for y, value in zip(rows, values, strict=True):
             text = f"{value:.2f}" if unit == "mm" else f"{value:.3f}"
             panel.annotate(text, (value + 0.02 * largest, y), va="center", fontsize=8)
-        panel.set_xlim(0, 1.18 * largest)
-        panel.set_ylim(len(names) - 0.4, -0.6)
-        panel.set_xlabel(f"standard deviation per axis ({unit})", fontsize=9)
+        panel.set(xlim=(0, 1.18 * largest), ylim=(len(names) - 0.4, -0.6))
+        panel.set(xlabel=f"standard deviation per axis ({unit})")
         tidy(panel)
         panel.locator_params(axis="x", nbins=5)
         panel.grid(visible=False, axis="y")
@@ -99,11 +85,6 @@ def residual_bars(
     """Plot the residual of each image, numbered from 1; rejected ones are hatched.
 
     Bars much larger than all bars of used images are cut and labelled with their length.
-
-    Args:
-        millimetres: Translation residuals; None if unknown.
-        degrees: Rotation residuals; None if unknown.
-        used: Whether the calibration uses the image.
     """
     figure = new_figure(9.0, 3.9)
     selected = np.array(used, dtype=bool)
@@ -124,8 +105,7 @@ def residual_bars(
         for x in numbers[np.nan_to_num(heights) > top]:
             text = f"cut, {heights[x - 1]:.3g}"
             panel.annotate(text, (x, top), va="bottom", ha="center", fontsize=7)
-        panel.set_ylim(0, 1.12 * top)
-        panel.set_ylabel(f"residual ({unit})", fontsize=9)
+        panel.set(ylim=(0, 1.12 * top), ylabel=f"residual ({unit})")
         tidy(panel)
         panel.grid(visible=False, axis="x")
     panels[1].set_xlabel("number of the image in the table", fontsize=9)

@@ -91,12 +91,7 @@ def annotate_images(
 ) -> AnnotatedImages:
     """Draw a calibration into some of its images.
 
-    Args:
-        calibration: The calibration.
-        files: Result of `select_images`.
-        older: Another calibration, drawn pale and dashed.
-        localizer: Detects landmarks in the images.
-        on_image: Called after each image.
+    The older calibration is drawn pale and dashed; the localizer detects landmarks.
     """
     camera = calibration.camera
     if camera is None:
@@ -134,14 +129,9 @@ def select_images(
 ) -> tuple[list[ImageFile], str]:
     """Choose the images to draw into.
 
-    Args:
-        calibration: The calibration.
-        folder: Folder of its file; relative image names are also searched here.
-        given: Files to use instead of the images of the calibration.
-
-    Returns:
-        At most `MAX_IMAGES` files, spread over all, including a rejected one if there is any.
-        Without files, a sentence with the reason.
+    Relative names are also searched in `folder`; `given` files replace the images of the
+    calibration. Returns at most `MAX_IMAGES` files, spread over all, including a rejected one if
+    there is any. Without files, the sentence has the reason.
     """
     if given:
         uses = {Path(use.name).resolve(): use for use in calibration.images}

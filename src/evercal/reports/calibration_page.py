@@ -79,11 +79,7 @@ def calibration_page(
 ) -> CalibrationPage:
     """Write the report of a calibration.
 
-    Args:
-        file: The calibration.
-        images: Its images with overlays.
-        store: Path of the store whose landmarks are drawn.
-        older: Calibration to compare with.
+    `store` is the path of the store whose landmarks are drawn.
 
     Raises:
         InputError: A check of the calibration is not a number, or `older` has another mount.
@@ -223,9 +219,8 @@ def _check_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
             rows.append((title, _fixed(mm, 2), _fixed(deg, 3)))
     scatter = _scatter(calibration.checks.get("image_scatter"))
     if scatter is not None:
-        rows.append(
-            ("scatter of single images, per axis", _fixed(scatter[0], 2), _fixed(scatter[1], 3))
-        )
+        mm, deg = scatter
+        rows.append(("scatter of single images, per axis", _fixed(mm, 2), _fixed(deg, 3)))
     return rows
 
 
@@ -261,14 +256,12 @@ def _source_rows(file: NamedCalibration) -> list[tuple[str, str]]:
     if calibration.created:
         rows.append(("created", calibration.created))
     if camera is not None:
+        distortion = ", ".join(f"{value:g}" for value in camera.distortion)
         rows += [
             ("image size", f"{camera.width}x{camera.height} pixels"),
             ("focal lengths fx, fy", f"{camera.fx:.3f}, {camera.fy:.3f} pixels"),
             ("principal point cx, cy", f"{camera.cx:.3f}, {camera.cy:.3f} pixels"),
-            (
-                "distortion k1 k2 p1 p2 k3 ...",
-                ", ".join(f"{value:g}" for value in camera.distortion) or "none",
-            ),
+            ("distortion k1 k2 p1 p2 k3 ...", distortion or "none"),
         ]
     titled = {f"{key}_{unit}" for key in _CHECKS for unit in ("mm", "deg")} | {"image_scatter"}
     rows += [

@@ -46,6 +46,8 @@ def tidy(panel: "Axes") -> None:
     panel.grid(color="0.9", linewidth=0.6)
     panel.set_axisbelow(True)
     panel.tick_params(labelsize=8)
+    panel.xaxis.label.set_fontsize(9)
+    panel.yaxis.label.set_fontsize(9)
     panel.spines[["top", "right"]].set_visible(False)
 
 
@@ -66,10 +68,7 @@ def error_curve(
 ) -> bytes:
     """Plot the share of frames below each translation error.
 
-    Args:
-        groups: By name (frames,) errors in metres, infinite without a pose.
-        limit_mm: Right end of the axis.
-        threshold_mm: Position of a vertical line.
+    Errors (frames,) are in metres, infinite without a pose.
 
     Raises:
         ValueError: A group is empty or contains NaN.
@@ -85,10 +84,8 @@ def error_curve(
         panel.step(x, np.append(share, share[-1]), where="post", **style)
     if threshold_mm is not None:
         panel.axvline(threshold_mm, color="0.5", linewidth=1, linestyle=(0, (2, 2)), zorder=0)
-    panel.set_xlim(0, limit_mm)
-    panel.set_ylim(-3, 103)
-    panel.set_xlabel("translation error (mm)", fontsize=9)
-    panel.set_ylabel("share of frames (%)", fontsize=9)
+    panel.set(xlim=(0, limit_mm), ylim=(-3, 103))
+    panel.set(xlabel="translation error (mm)", ylabel="share of frames (%)")
     tidy(panel)
     panel.legend(loc="lower right", fontsize=9, frameon=False)
     return png_bytes(figure)
@@ -99,10 +96,8 @@ def error_histogram(
 ) -> bytes:
     """Plot histograms of translation errors, one panel a group.
 
-    Args:
-        groups: By name (frames,) errors in metres, infinite without a pose.
-        limit_mm: Right end of the axis. A separate grey bar counts larger errors.
-        bins: Bars up to `limit_mm`.
+    Errors (frames,) are in metres, infinite without a pose. A separate grey bar counts errors above
+    the limit.
 
     Raises:
         ValueError: A group is empty or contains NaN.
@@ -132,10 +127,7 @@ def trajectory(truth_m: ArrayLike, estimated_m: ArrayLike) -> bytes:
     """Plot true and estimated positions along the two axes with the largest extent.
 
     The plot is limited to the true positions and a margin. The legend counts the estimates outside.
-
-    Args:
-        truth_m: (n, 3) metres, n >= 1, in recorded order.
-        estimated_m: (n, 3) metres, NaN without a pose.
+    Positions (n, 3) are in metres and recorded order, NaN without a pose.
     """
     truth, estimated = np.asarray(truth_m, np.float64), np.asarray(estimated_m, np.float64)
     located = np.isfinite(estimated).all(axis=1)
@@ -156,11 +148,9 @@ def trajectory(truth_m: ArrayLike, estimated_m: ArrayLike) -> bytes:
         panel.plot(*true[~located].T, "x", color=COLOURS[6], markersize=5, label=label)
     if (outside := int((located & ~inside).sum())) > 0:
         panel.plot([], [], color=COLOURS[1], label=f"estimated outside this plot ({outside})")
-    panel.set_xlim(low[0] - margin, high[0] + margin)
-    panel.set_ylim(low[1] - margin, high[1] + margin)
-    panel.set_aspect("equal")
-    panel.set_xlabel(f"{'xyz'[axes[0]]} (m)", fontsize=9)
-    panel.set_ylabel(f"{'xyz'[axes[1]]} (m)", fontsize=9)
+    xlim, ylim = np.stack([low - margin, high + margin], 1)
+    panel.set(xlim=xlim, ylim=ylim, aspect="equal")
+    panel.set(xlabel=f"{'xyz'[axes[0]]} (m)", ylabel=f"{'xyz'[axes[1]]} (m)")
     tidy(panel)
     figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=9)
     return png_bytes(figure)

@@ -104,12 +104,7 @@ class DemoResult:
 
 
 def demo_page(result: DemoResult, pictures: Sequence[Picture]) -> str:
-    """Write the report of a demo.
-
-    Args:
-        result: Measurements.
-        pictures: Images with detected landmarks.
-    """
+    """Write the report of a demo."""
     errors: dict[str, list[float]] = {}
     for row in result.test:
         errors.setdefault(row.scene, []).append(row.translation_error_m)

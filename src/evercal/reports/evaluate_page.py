@@ -30,11 +30,7 @@ def evaluation_page(
 ) -> str:
     """Write the report of an evaluation.
 
-    Args:
-        localizer: LearnedLocalizer of the store; draws the worst frames.
-        scenes: Evaluated recordings by scene name.
-        results: Result of `evaluate`.
-        store: Path of the store, for the title.
+    The localizer draws the worst frames.
     """
     summary = scores(results)
     by_scene = {name: [r for r in results if r.scene == name] for name in summary.scenes}

@@ -41,10 +41,8 @@ class AxesInView:
     def scaled(self, scale: float, offset: ArrayLike | None = None) -> "AxesInView":
         """The same axes in a resized or cropped copy of the image.
 
-        Args:
-            scale: Pixels of the copy per pixel of the original.
-            offset: (2,) position of the original's pixel (0, 0) in the copy; None for a resized
-                copy of the whole image.
+        `offset` (2,) is the position of the original's pixel (0, 0) in the copy; None for a resized
+        copy of the whole image.
         """
         # Resizing scales about the image corner at -0.5.
         shift = np.full(2, 0.5 * scale - 0.5) if offset is None else np.asarray(offset, np.float64)
@@ -53,13 +51,7 @@ class AxesInView:
 
 
 def axes_in_view(camera: Camera, camera_from_frame: SE3, length_m: float = LENGTH_M) -> AxesInView:
-    """Project the axes of a frame.
-
-    Args:
-        camera: Intrinsics.
-        camera_from_frame: Single pose.
-        length_m: Length of the axes.
-    """
+    """Project the axes of a frame."""
     origin = camera_from_frame.translation_m
     rotation = camera_from_frame.rotation_matrix()
     share = np.linspace(0.0, 1.0, _STEPS + 1)
@@ -74,11 +66,8 @@ def axes_in_view(camera: Camera, camera_from_frame: SE3, length_m: float = LENGT
 def draw_axes(image: Image, axes: AxesInView, name: str = "", older: bool = False) -> Image:
     """Draw the axes of a frame into a copy of an image.
 
-    Args:
-        image: (H, W, 3) uint8 RGB.
-        axes: In pixels of this image (`AxesInView.scaled`).
-        name: Name of the frame, written at its origin; ASCII.
-        older: Draw them pale and dashed.
+    They are given in pixels of this image (`AxesInView.scaled`). The name is written at the origin.
+    Older axes are pale and dashed.
     """
     width = max(2, round(image.shape[1] / 220))
     if older:
@@ -96,15 +85,8 @@ def close_up(
 ) -> Image | None:
     """Enlarge the part of an image around the origin of a frame and draw its axes.
 
-    Args:
-        image: (H, W, 3) uint8 RGB.
-        camera: Intrinsics of any size with the aspect ratio of the image; unit of the axes.
-        axes: Axes to draw.
-        older: Axes to draw pale and dashed.
-        width: Width and height of the result, pixels.
-
-    Returns:
-        (width, width, 3); None if the origin is outside the image or the axes are large anyway.
+    The camera is of any size with the aspect ratio of the image. Returns (width, width, 3); None if
+    the origin is outside the image or the axes are large anyway.
     """
     import cv2
 
@@ -125,13 +107,7 @@ def close_up(
 
 
 def draw_directions(image: Image, axes: AxesInView, name: str = "") -> Image:
-    """Draw the directions of the axes in the lower left corner of a copy of an image.
-
-    Args:
-        image: (H, W, 3) uint8 RGB.
-        axes: Axes of the frame.
-        name: Name of the frame; ASCII.
-    """
+    """Draw the directions of the axes in the lower left corner of a copy of an image."""
     height, width = image.shape[:2]
     length = 0.09 * min(width, height)
     origin = np.array([1.6 * length, height - 2.0 * length])

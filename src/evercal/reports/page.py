@@ -15,20 +15,12 @@ _TEMPLATES = Path(__file__).parent / "templates"
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A chart (PNG) or a photograph (JPEG). Dark mode inverts charts only.
-
-    Raises:
-        ValueError: The data are neither PNG nor JPEG.
-    """
+    """A chart (PNG) or a photograph (JPEG). Dark mode inverts charts only."""
 
     data: bytes
     """Content of the image file."""
     caption: str = ""
     """Text below the picture, also its alternative text."""
-
-    def __post_init__(self) -> None:
-        if not self.data.startswith((b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")):
-            raise ValueError(f"a picture is a PNG or JPEG file, got {self.data[:8]!r}")
 
     @property
     def kind(self) -> Literal["png", "jpeg"]:
@@ -43,11 +35,7 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A table. Columns of numbers are aligned right, columns without any value are hidden.
-
-    Raises:
-        ValueError: The length of a row differs from that of the header.
-    """
+    """A table. Columns of numbers are aligned right, columns without any value are hidden."""
 
     header: Sequence[str]
     """Column titles."""
@@ -55,11 +43,6 @@ class Table:
     """Cells. Numbers are written by `str`, so round them first."""
     caption: str = ""
     """Title of the table."""
-
-    def __post_init__(self) -> None:
-        for row in self.rows:
-            if len(row) != len(self.header):
-                raise ValueError(f"a row of this table has {len(self.header)} cells, got {row}")
 
     @classmethod
     def of_records(cls, records: Sequence[Any], caption: str = "") -> Self:
@@ -70,10 +53,8 @@ class Table:
     @property
     def columns(self) -> list[int]:
         """Indices of the columns to show."""
-        count = len(self.header)
-        return [
-            i for i in range(count) if not self.rows or not all(_blank(row[i]) for row in self.rows)
-        ]
+        shown = range(len(self.header))
+        return [i for i in shown if not self.rows or not all(_blank(row[i]) for row in self.rows)]
 
     @property
     def numeric(self) -> set[int]:
@@ -84,12 +65,7 @@ class Table:
 def render(template: str, **values: object) -> str:
     """Fill in a template; all values are escaped.
 
-    Args:
-        template: Name of a file in the folder `templates`.
-        values: Variables of the template.
-
-    Returns:
-        An HTML document without references to other files.
+    The document has no references to other files.
     """
     return _environment().get_template(template).render(values)
 

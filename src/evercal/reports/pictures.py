@@ -25,14 +25,8 @@ def draw_estimate(
 ) -> NDArray[np.uint8]:
     """Draw the inlier scene points at the estimated pose, coloured by depth.
 
-    Args:
-        image: (H, W, 3) uint8 RGB.
-        estimate: Estimate for this image; without a pose nothing is drawn.
-        camera: Intrinsics, of any size with the aspect ratio of the image.
-        legend: Whether to draw a colour bar.
-
-    Returns:
-        A new image of the same size.
+    The camera may have any size with the aspect ratio of the image. Without a pose nothing is
+    drawn.
     """
     height, width = image.shape[:2]
     if estimate.base_from_camera is None or estimate.points_m is None:
@@ -54,15 +48,8 @@ def draw_landmarks(
 ) -> NDArray[np.uint8]:
     """Draw the landmarks detected in an image, coloured by reprojection error.
 
-    Args:
-        image: (H, W, 3) uint8 RGB.
-        estimate: Estimate for this image, made with the camera of the scene. Without a pose
-            nothing is drawn.
-        localizer: Localizer of the estimate.
-        legend: Whether to draw a colour bar.
-
-    Returns:
-        A new image of twice the size.
+    The result is twice the size. The estimate was made with the camera of the scene; without a pose
+    nothing is drawn.
     """
     import cv2
 
@@ -96,14 +83,8 @@ def landmark_errors(
 ) -> LandmarkErrors | None:
     """Compute the reprojection errors of the landmarks detected in an image.
 
-    Args:
-        estimate: Estimate for the image.
-        localizer: Localizer of the estimate.
-        camera: Intrinsics used for the estimate; None stands for the camera of the scene.
-        base_from_camera: Pose to project with, by default that of the estimate.
-
-    Returns:
-        None if the estimate has no pose or no landmarks.
+    The camera is by default that of the scene, the pose that of the estimate. Returns None if the
+    estimate has no pose or no landmarks.
     """
     pose = base_from_camera or estimate.base_from_camera
     if pose is None or estimate.scene is None or estimate.base_from_camera is None:

@@ -12,7 +12,6 @@ import numpy as np
 
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
-from evercal.recordings.frame import Frame, Recording
 from evercal.simulation.furnished.textures import dead_leaves, one_over_f
 
 NEAR_M = 0.05
@@ -41,10 +40,8 @@ class Surface:
 class BoxRoom:
     """A room generated from a seed.
 
-    Args:
-        seed: Seed of the room. Seeds 9000 to 9999 are reserved for benchmarks.
-        furniture: Number of furniture boxes; random if omitted.
-        texture_px: Side of one texture in pixels.
+    Seeds 9000 to 9999 are reserved for benchmarks. The number of furniture boxes is random if
+    omitted.
     """
 
     def __init__(self, seed: int, furniture: int | None = None, texture_px: int = 384):
@@ -89,13 +86,8 @@ class BoxRoom:
         self, low: np.ndarray, size: np.ndarray, rng: np.random.Generator, inward: bool
     ) -> None:
         ex, ey, ez = np.diag(size)
-        faces = [
-            (low, ex, ez),
-            (low + ey + ex, -ex, ez),
-            (low + ex, ey, ez),
-            (low + ey, -ey, ez),
-            (low + ez, ex, ey),
-        ]
+        faces = [(low, ex, ez), (low + ey + ex, -ex, ez), (low + ex, ey, ez), (low + ey, -ey, ez)]
+        faces.append((low + ez, ex, ey))
         if inward:
             faces.append((low + ey, ex, -ey))
             faces = [(corner + u, -u, v) for corner, u, v in faces]
@@ -117,20 +109,11 @@ class BoxRoom:
     def render(self, camera: Camera, base_from_camera: SE3) -> np.ndarray:
         """Render an image of an ideal pinhole camera.
 
-        Args:
-            camera: Intrinsics without distortion.
-            base_from_camera: Camera pose.
-
-        Returns:
-            RGB image, uint8, shape (camera.height, camera.width, 3).
-
         Raises:
             ValueError: The camera has distortion.
         """
         if camera.distortion:
-            raise ValueError(
-                "box rooms are rendered through an ideal pinhole: distortion must be ()"
-            )
+            raise ValueError("box rooms are rendered through an ideal pinhole, without distortion")
         image = np.zeros((camera.height, camera.width, 3), np.uint8)
         nearness = np.zeros((camera.height, camera.width), np.float32)  # 1 / depth
         camera_from_base = base_from_camera.inverse()
@@ -144,13 +127,9 @@ class BoxRoom:
     def intersect(self, origin_m: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Intersect rays with the room in closed form.
 
-        Args:
-            origin_m: Ray origins in the base frame, shape (3,) or (n, 3).
-            rays: Directions of any length, shape (n, 3).
-
-        Returns:
-            First intersections (n, 3) in the base frame, NaN for rays that miss, and their depths
-            (n,) in units of the ray length, inf for rays that miss.
+        Origins (3,) or (n, 3) and directions (n, 3) of any length are in the base frame. Returns
+        the first intersections (n, 3), NaN for rays that miss, and depths (n,) in units of the ray
+        length, inf for rays that miss.
         """
         origin = np.broadcast_to(origin_m, rays.shape)
         best = np.full(len(rays), np.inf)
@@ -180,12 +159,8 @@ class BoxRoom:
     def path(self, frames: int, seed: int) -> SE3:
         """A smooth hand-held sweep once around the room.
 
-        Args:
-            frames: Number of poses.
-            seed: Seed of the deviation from the room's common sweep, about 10 to 20 cm and 10 deg.
-
-        Returns:
-            base_from_camera, shape (frames,).
+        Returns base_from_camera (frames,). The seed is that of the deviation from the room's common
+        sweep, about 10 to 20 cm and 10 deg.
         """
         common = np.random.default_rng([self.seed, 0])
         walker = np.random.default_rng([self.seed, seed])
@@ -237,32 +212,6 @@ def default_camera(width: int = 320, height: int = 240) -> Camera:
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
-def box_room_scene(seed: int, train: int, test: int, camera: Camera | None = None) -> Recording:
-    """Record a box room: one sweep of training frames and another of test frames.
-
-    Args:
-        seed: Seed of the room.
-        train: Number of training frames.
-        test: Number of test frames.
-        camera: Intrinsics of every frame; `default_camera()` if omitted.
-
-    Returns:
-        A recording `box-room-SEED` with images in memory.
-    """
-    room = BoxRoom(seed)
-    intrinsics = camera or default_camera()
-
-    def record(split: str, count: int, path_seed: int) -> tuple[Frame, ...]:
-        poses = room.path(count, path_seed)
-        return tuple(
-            Frame(f"{split}-{i:06d}", room.render(intrinsics, poses[i]), intrinsics, poses[i])
-            for i in range(count)
-        )
-
-    name = f"box-room-{seed}"
-    return Recording(name, record("train", train, 1), record("test", test, 2))
-
-
 def _draw(
     image: np.ndarray,
     nearness: np.ndarray,
@@ -303,9 +252,7 @@ def _draw(
     if not visible.any():
         return
     # The pyramid level follows from texture pixels per image pixel over the visible area.
-    span = (
-        np.ptp(s[visible]) * np.ptp(t[visible]) * pyramid[0].shape[0] ** 2 / max(visible.sum(), 1)
-    )
+    span = np.ptp(s[visible]) * np.ptp(t[visible]) * pyramid[0].shape[0] ** 2 / visible.sum()
     level = int(np.clip(np.round(0.5 * np.log2(max(span, 1.0))), 0, len(pyramid) - 1))
     texture = pyramid[level]
     height, width = texture.shape[:2]

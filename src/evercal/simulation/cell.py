@@ -116,10 +116,7 @@ def simulate(
 ) -> Generator[Progress, None, None]:
     """Render a suite and yield the progress after each frame.
 
-    Args:
-        name: One of `SUITES`.
-        out: A new folder, or the folder of an interrupted run with the same settings.
-        options: Deviations from the suite's defaults.
+    `out` is a new folder, or that of an interrupted run with the same settings.
 
     Raises:
         InputError: The suite is unknown, an option is out of range, the disk is too small, `out`
@@ -161,15 +158,8 @@ def simulate(
             shots = changed_shots(after, suite.changed, train, options.seed)
             plans.append((after, [(out / scene / "changed", shots)]))
         for state, recordings in plans:
-            writer = _Writer(
-                room=state,
-                panda=panda,
-                camera=default_camera(width, height),
-                suite=suite,
-                seed=options.seed,
-                options=render,
-                settings=settings,
-            )
+            camera = default_camera(width, height)
+            writer = _Writer(state, panda, camera, suite, options.seed, render, settings)
             for root, shots in recordings:
                 for _ in writer.record(root, scene, shots):
                     done += 1
@@ -215,13 +205,9 @@ def _recordings(
     folder = root / "calibration"
     hand = _hand_shots(before, panda, gripper_from_camera, seed)
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(
-        folder / "truth.json",
-        {
-            "gripper_from_camera": generic.pose_to_dict(gripper_from_camera),
-            "fixed_camera_from_bumped_camera": generic.pose_to_dict(bump),
-        },
-    )
+    truth = {"gripper_from_camera": gripper_from_camera, "fixed_camera_from_bumped_camera": bump}
+    poses = {name: generic.pose_to_dict(pose) for name, pose in truth.items()}
+    write_json(folder / "truth.json", poses)
     return [
         (root, sweep_shots(before, frames, seed)),
         (folder / "fixed", fixed),
@@ -246,7 +232,7 @@ def _hand_shots(before: Room, panda: Panda, gripper_from_camera: SE3, seed: int)
     )
 
 
-@dataclass(kw_only=True, eq=False)
+@dataclass(eq=False)
 class _Writer:
     """Renders the missing frames of recordings in one room."""
 

@@ -41,11 +41,6 @@ class Shot:
 def sweep_shots(room: Room, frames: int, seed: int) -> list[Shot]:
     """Plan a moving camera: 70 % training frames, 30 % test frames.
 
-    Args:
-        room: The room whose objects the camera avoids.
-        frames: Number of training and test frames together.
-        seed: Seed of both paths.
-
     Raises:
         InputError: The room has no free path.
     """
@@ -63,11 +58,7 @@ def sweep_shots(room: Room, frames: int, seed: int) -> list[Shot]:
 def changed_shots(room: Room, frames: int, train: SE3, seed: int) -> list[Shot]:
     """Plan the test frames of a moving camera in a changed room.
 
-    Args:
-        room: The room after the change.
-        frames: Number of test frames.
-        train: base_from_camera of the training frames before the change, shape (n,).
-        seed: Seed of the camera and arm paths.
+    `train` holds base_from_camera (n,) of the training frames before the change.
 
     Raises:
         InputError: The room has no free path.
@@ -97,12 +88,9 @@ def fixed_shots(room: Room, frames: int, seed: int) -> FixedShots:
     pose = _free_path(room, 200, [seed, 5])[int(rng.integers(200))]
     direction = rng.standard_normal(3)
     direction /= np.linalg.norm(direction)
-    tangent = np.zeros(6)
-    if seed % 2 == 0:
-        tangent[:3] = 0.005 * direction
-    else:
-        tangent[3:] = np.deg2rad(0.5) * direction
-    bump = SE3.exp(tangent)
+    still, moves = np.zeros(3), seed % 2 == 0
+    parts = (0.005 * direction, still) if moves else (still, np.deg2rad(0.5) * direction)
+    bump = SE3.exp(np.concatenate(parts))
     arms = _arm_path(2 * frames, [seed, 6], hold=1, cycles=3.0)
     before = [Shot(f"fixed-{i:06d}", "test", pose, arms[i]) for i in range(frames)]
     moved = pose @ bump
@@ -174,9 +162,8 @@ def _sweep(frames: int, rng: np.random.Generator) -> SE3:
     azimuth = wave(-1.9, 1.9, 1.0)
     distance = wave(0.85, 1.9, 1.63)
     elevation = wave(0.28, 0.95, 0.71)
-    target = WORK_AREA_M + np.stack(
-        [wave(-0.45, 0.15, 0.9), wave(-0.35, 0.35, 1.2), wave(-0.1, 0.3, 1.4)], -1
-    )
+    gaze = [wave(-0.45, 0.15, 0.9), wave(-0.35, 0.35, 1.2), wave(-0.1, 0.3, 1.4)]
+    target = WORK_AREA_M + np.stack(gaze, -1)
     roll = wave(-0.12, 0.12, 0.8)
     x, y = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
     direction = np.stack([x, y, np.sin(elevation)], -1)

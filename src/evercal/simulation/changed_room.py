@@ -12,11 +12,9 @@ from evercal.simulation.furnished.furniture import Item
 from evercal.simulation.furnished.materials import Material
 from evercal.simulation.furnished.rooms import Room
 
-SMALL = frozenset(
-    (
-        "ball", "basket", "blocks", "books", "bottle", "bowl", "carton", "jar", "kettle", "lamp",
-        "mug", "plant", "plates", "pot", "radio", "vase",
-    )
+SMALL = (
+    "ball", "basket", "blocks", "books", "bottle", "bowl", "carton", "jar", "kettle", "lamp",
+    "mug", "plant", "plates", "pot", "radio", "vase",
 )  # fmt: skip
 """Kinds of objects that people pick up; all others are furniture or wall objects."""
 CHANGED_SHARE = 1 / 3
@@ -35,13 +33,7 @@ _WORK_M = np.array([0.45, 0.0])
 def changed_room(before: Room, seed: int) -> Room:
     """Change a room. The same room and seed give the same change.
 
-    Args:
-        before: The room before the change; it is not modified.
-        seed: Seed of the change.
-
-    Returns:
-        A room of the same kind and seed in the same base frame. Unchanged objects keep their
-        order; lamps that are off or dimmed have new materials.
+    Unchanged objects keep their order; lamps that are off or dimmed have new materials.
     """
     items = _rearranged(before, np.random.default_rng([seed, 12, before.seed]))
     lamps = [i for i, item in enumerate(items) if any(mat.emission > 0 for _, mat in item.parts)]

@@ -16,13 +16,8 @@ def untextured_renders(
 ) -> list[np.ndarray]:
     """Render a room and its robot in one colour.
 
-    Args:
-        model: Kind and seed of the room.
-        frames: Frames with the cameras and joint angles to use.
-        poses: base_from_camera for each frame.
-
-    Returns:
-        Images (H, W, 3) uint8; an empty list if the extra `sim` is not installed.
+    The model is the kind and seed of the room; poses are base_from_camera. Returns images (H, W, 3)
+    uint8; an empty list if the extra `sim` is not installed.
     """
     try:
         panda = Panda()

@@ -49,10 +49,6 @@ def replace_folder(temporary: str | os.PathLike[str], final: str | os.PathLike[s
 
     No portable call swaps two folders. An existing `final` is first renamed to a fixed name. After
     a crash between the two renames, `recover_folder` restores it.
-
-    Args:
-        temporary: A complete folder on the same file system; it is synced here.
-        final: Its new path.
     """
     temporary, final = Path(temporary), Path(final)
     for folder, _, names in os.walk(temporary):

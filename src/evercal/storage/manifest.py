@@ -79,12 +79,8 @@ def write_manifest(
 ) -> None:
     """Write the manifest of files that are complete on disk, atomically.
 
-    Args:
-        root: The folder.
-        payload: Settings of the caller, JSON values.
-        files: Paths relative to `root`, forward slashes.
-        before: The manifest that is replaced. Its records are kept, so that files that were damaged
-            since then are still detected.
+    Files are relative to `root`, with forward slashes. Records of the manifest `before` are kept,
+    so that files that were damaged since then are still detected.
 
     Raises:
         ValueError: A path that leaves `root`, or a payload that is not JSON.

@@ -11,9 +11,7 @@ from evercal.storage.atomic import write_json
 def lock_settings(path: Path, settings: Mapping[str, object]) -> None:
     """Store the settings of a run that can be resumed; refuse a folder with other settings.
 
-    Args:
-        path: file in the folder of results; created if it is missing.
-        settings: JSON values that decide the results; compared key by key.
+    The file is created if it is missing. Settings are JSON values, compared key by key.
 
     Raises:
         InputError: The file contains other settings or cannot be read.

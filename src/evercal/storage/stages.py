@@ -39,10 +39,6 @@ def is_store(root: Path) -> bool:
 def read_store(root: Path, read: Callable[[Manifest], Result]) -> Result:
     """Read a store; start over when a writer replaces files meanwhile.
 
-    Args:
-        root: folder of the store.
-        read: reads the files that the manifest lists.
-
     Raises:
         InputError: Not a store, a file missing or changed, or a store of another version.
     """
@@ -86,10 +82,7 @@ def _listed(root: Path, manifest: Manifest, key: str) -> list[object]:
 class StageStore:
     """Stages on disk.
 
-    Args:
-        root: folder of the store; nothing is written before the first stage is added.
-        stages: folder names of the stages, in order.
-        networks: file names of the networks that all stages share.
+    Nothing is written before the first stage is added. All stages share the networks.
     """
 
     def __init__(self, root: Path, stages: Sequence[str], networks: Sequence[str]):
@@ -140,11 +133,8 @@ class StageStore:
     ) -> None:
         """Add a stage: whole, or not at all.
 
-        Args:
-            name: of the scene; characters that a folder name cannot hold are replaced.
-            write: writes the stage's files into an empty folder.
-            payload: settings of the store, for the manifest.
-            superseded: which files of earlier stages, by name, are dropped.
+        Characters of the name that a folder cannot hold are replaced. `write` fills an empty
+        folder, and `superseded` files of earlier stages are dropped.
 
         Raises:
             InputError: As `writing`.
@@ -161,10 +151,7 @@ class StageStore:
     ) -> None:
         """Replace a stage: whole, or not at all.
 
-        Args:
-            index: number of the stage.
-            write: changes files in a copy of the stage's folder.
-            payload: settings of the store, for the manifest.
+        `write` changes files in a copy of the stage's folder.
 
         Raises:
             InputError: As `writing`, and where a file of the store is missing or was changed.

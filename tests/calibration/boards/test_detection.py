@@ -147,7 +147,6 @@ def test_distortion_is_estimated() -> None:
     camera = replace(CAMERA, distortion=(-0.2, 0.08, 0.0, 0.0))
     result = calibrate_camera(simulated(15, 0.1, camera)[0], 640, 480)
     assert result.camera.distortion[0] == pytest.approx(-0.2, abs=0.05)
-    assert result.rms_px == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
 
 
 def test_intrinsics_require_five_tilted_views() -> None:
@@ -181,7 +180,7 @@ def test_broken_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is missing; check the path"):
         read_board_poses(file)
     for change, message in (
-        ({"format": "other"}, "not board poses"),
+        ({"format": "other"}, "'format' is not"),
         ({"version": 9}, "version 9"),
         ({"board": {"kind": "chessboard"}}, "'board' is invalid"),
         ({"images": [{"name": "a"}]}, "camera_from_board"),
@@ -191,7 +190,7 @@ def test_broken_files_are_refused(tmp_path: Path) -> None:
         file.write_text(json.dumps({**good, **change}))
         with pytest.raises(InputError, match=message):
             read_board_poses(file)
-    with pytest.raises(ValueError, match="not board poses"):
+    with pytest.raises(ValueError, match="'format' is not"):
         BoardPoses.from_dict([])
 
 

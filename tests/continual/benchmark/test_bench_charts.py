@@ -74,10 +74,3 @@ def test_keyframe_panels_share_their_limits(figures: list[Figure]) -> None:
     first, second = figures[0].axes
     assert [first.get_title(), second.get_title()] == ["ours (9)", "all (4)"]
     assert first.get_xlim() == second.get_xlim()
-
-
-def test_mismatched_shapes_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"m: 2 scenes need \(2, 2\)"):
-        forgetting_curves({"m": np.zeros((3, 3))}, ["a", "b"])
-    with pytest.raises(ValueError, match="3 scenes need as many numbers"):
-        scene_bars({"m": [1.0]}, ["a", "b", "c"])

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from evercal.continual.benchmark import results
-from evercal.continual.benchmark.report_data import read_report
+from evercal.continual.benchmark.report_data import TITLES, read_report, tables_text
 from evercal.continual.benchmark.results import SETTINGS, STRATEGIES
 from evercal.continual.strategies import strategy_named
 from evercal.errors import InputError
@@ -30,21 +30,20 @@ def folder(root: Path, name: str, correct: int, **settings: object) -> Path:
 
 def test_tables_without_results_are_omitted(tmp_path: Path) -> None:
     tables = read_report(folder(tmp_path, "large", 18), "evercal").tables()
-    assert [row[0] for row in tables.methods] == ["strategy", "evercal", "joint"]
-    assert tables.differences[1][:2] == ["evercal - joint", "+40.0"]
+    assert [row[0] for row in tables["methods"]] == ["strategy", "evercal", "joint"]
+    assert tables["differences"][1][:2] == ["evercal - joint", "+40.0"]
     # Without remembered frames, ablation and other folders.
-    shown = [tables.methods, tables.thresholds, tables.scenes, tables.differences]
-    assert list(tables.non_empty().values()) == shown
-    text = tables.as_text("terminal")
-    assert all(title in text for title in tables.non_empty())
+    assert list(tables) == ["methods", "thresholds", "scenes", "differences"]
+    text = tables_text(tables, "terminal")
+    assert all(TITLES[name] in text for name in tables)
     assert "TFR (total forgetting rate): mean drop" in text
 
 
 def test_results_under_other_settings_are_compared(tmp_path: Path) -> None:
     large, small = folder(tmp_path, "large", 18), folder(tmp_path, "small", 14, memory_share=0.01)
     tables = read_report(large, "evercal", [small]).tables()
-    assert [row[0] for row in tables.methods[1:]] == ["evercal", "joint"]
-    header, *rows = tables.compare_with
+    assert [row[0] for row in tables["methods"][1:]] == ["evercal", "joint"]
+    header, *rows = tables["compare_with"]
     final, memory = header.index("final %"), header.index("memory MB")
     # Joint training needs all frames again, so it has no memory to compare.
     assert [(row[0], row[final], row[memory]) for row in rows] == [
@@ -80,5 +79,5 @@ def test_strategies_are_ranked_and_seven_plotted(tmp_path: Path) -> None:
         results.append(here, lines(name, 0, [[16], [correct, correct]]))
     report = read_report(here, "evercal")
     ranked = ["co2l", "der", "gss", "mir", "agem", "gem", "evercal", "joint", "er"]
-    assert [row[0] for row in report.tables().methods[1:]] == ranked
+    assert [row[0] for row in report.tables()["methods"][1:]] == ranked
     assert report.plotted == ["evercal", "er", "co2l", "der", "gss", "mir", "agem"]

@@ -197,8 +197,11 @@ def proposed_of(
 
 
 def edited(method: ConstrainedStep, proposed: ProposedStep, references: list[float]) -> list[float]:
-    g = torch.stack([one["w"] for one in proposed.constraints])
-    actual = method.edit(proposed.changes["w"], g, proposed, torch.tensor(references))
+    g, change = torch.stack([one["w"] for one in proposed.constraints]), proposed.changes["w"]
+    if isinstance(method, EpisodicConstraint):
+        actual = method.edit_step(change, g, proposed, torch.tensor(references))
+    else:
+        actual = method.edit(change, g)
     return [round(float(value), 6) for value in actual]
 
 

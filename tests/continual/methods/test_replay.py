@@ -1,7 +1,7 @@
 """Replay: division of rows, weights, and stored points."""
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -13,7 +13,6 @@ from evercal.continual.methods.replay import (
     DarkExperienceReplay,
     Replay,
     ReplayHooks,
-    by_scene,
 )
 from evercal.continual.networks.buffer import Rows, join
 from evercal.continual.networks.head import HeadOutput
@@ -64,16 +63,6 @@ def test_replayed_rows_are_divided_among_scenes(scenes: int, each: int) -> None:
         assert [len(part.scene) for part in parts] == [each] * scenes
         assert [set(part.scene.tolist()) for part in parts] == [{i % 4} for i in range(scenes)]
     assert sum(len(part.scene) for part in drawn(hooks)) <= max(60, scenes)
-
-
-def test_rows_are_split_by_scene() -> None:
-    memories = [wave_buffer(i) for i in range(3)]
-    parts = [memory.draw(4, torch.Generator().manual_seed(i)) for i, memory in enumerate(memories)]
-    output = head_output([[float(i), 0.0, 1.0] for i in range(12)])
-    actual = by_scene(output, join(parts), memories)
-    for i, (lines, part) in enumerate(actual):
-        assert part.index.tolist() == parts[i].index.tolist()
-        assert lines.points[:, 0].tolist() == list(range(4 * i, 4 * i + 4))
 
 
 def test_first_scene_has_no_replay() -> None:
@@ -142,4 +131,3 @@ def test_stored_points_return_to_their_rows() -> None:
     actual = hooks.cost(output, replayed, 0.5)
     assert actual is not None
     assert float(actual.detach()) == pytest.approx(truth, abs=2 * 0.5 * 50 * 3 * 5e-3)
-    assert replace(method, weight=2.0).weight == 2.0

@@ -128,17 +128,6 @@ def test_probability_of_a_new_centre_is_charged():
     assert (gradient[:, 8] > 0).all()  # gradient descent lowers the logit of the new centre
 
 
-def test_inactive_centres_are_free():
-    student, teacher = two_rows()
-    before = spdd_loss(student, teacher, SpddOptions(active_centres=2))
-    outside = tensor([[0.0, 1.0, 0.0, 1.0], [1.0, 0.0, 1.0, 0.0]])
-    student.logits = student.logits + 100 * outside
-    student.offsets = student.offsets + 7 * outside[:, :, None]
-    after = spdd_loss(student, teacher, SpddOptions(active_centres=2))
-    assert after.prior.item() == before.prior.item()
-    assert after.metric.item() == before.metric.item()
-
-
 def test_shared_offsets():
     student, teacher = two_rows()
     teacher.offsets = tensor([[[0.0, 1.0, 2.0]], [[3.0, 3.0, 3.0]]])
@@ -212,12 +201,6 @@ def test_masked_centre_equals_missing_centre(who):
     assert masked.total.item() == pytest.approx(without.total.item(), rel=1e-12)
 
 
-def test_nan_of_the_student_propagates():
-    teacher, student = random_output(3, 6, 20), random_output(3, 6, 21)
-    student.logits[1] = math.nan
-    assert math.isnan(spdd_loss(student, teacher, SpddOptions()).total.item())
-
-
 @pytest.mark.parametrize("centres", [1, 2, 3, 49, 50, 51, 80])
 def test_at_most_fifty_centres_are_active(centres):
     teacher, student = random_output(3, centres, 22), random_output(3, centres, 23)
@@ -238,22 +221,8 @@ def test_no_rows_have_no_loss():
 
 
 @pytest.mark.parametrize(
-    ("student", "teacher", "message"),
-    [
-        (random_output(3, 5, 0), random_output(3, 6, 0), "centres are only added"),
-        (random_output(2, 6, 0), random_output(3, 6, 0), "2 rows"),
-        (random_output(3, 6, 0, shared=True), random_output(3, 6, 0), "offsets"),
-    ],
+    "wrong", [{"temperature": 0.0}, {"active_centres": 0}, {"prior_weight": -1.0}]
 )
-def test_inconsistent_shapes_are_refused(student, teacher, message):
-    with pytest.raises(ValueError, match=message):
-        spdd_loss(student, teacher, SpddOptions())
-
-
-def test_options_are_checked():
-    with pytest.raises(ValueError, match="temperature"):
-        SpddOptions(temperature=0.0)
-    with pytest.raises(ValueError, match="active_centres"):
-        SpddOptions(active_centres=0)
-    with pytest.raises(ValueError, match="prior_weight"):
-        SpddOptions(prior_weight=-1.0)
+def test_invalid_options_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        SpddOptions(**wrong)

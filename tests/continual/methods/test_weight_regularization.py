@@ -14,7 +14,6 @@ from evercal.continual.methods.weight_regularization import (
     SynapticIntelligence,
     WeightRegularization,
     mean_over_images,
-    scaled_to_mean_one,
 )
 from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import ProposedStep
@@ -64,13 +63,6 @@ def test_rows_of_later_scenes_are_free() -> None:
     with torch.no_grad():
         head.code[0, 0, 0] += 7
     assert cost(ewc, head, [state]) > 0
-
-
-def test_importances_have_mean_one() -> None:
-    actual = scaled_to_mean_one({"a": torch.tensor([1.0, 5.0]), "b": torch.tensor([[6.0, 0.0]])})
-    assert actual["a"].tolist() == pytest.approx([1 / 3, 5 / 3])
-    assert actual["b"].tolist() == [[2.0, 0.0]]
-    assert scaled_to_mean_one({"a": torch.zeros(3)})["a"].tolist() == [0, 0, 0]
 
 
 @pytest.fixture

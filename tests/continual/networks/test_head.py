@@ -264,10 +264,3 @@ def test_fresh_head_depends_on_its_seed_only() -> None:
     assert not torch.equal(first.offset, other.offset)
     Head.from_state(FEATURES, DESCRIPTOR, SHAPES[1], first.state_dict())
     assert torch.equal(torch.random.get_rng_state(), before)
-
-
-@pytest.mark.parametrize("options", SHAPES)
-def test_sizes_are_those_of_the_inputs(options: HeadOptions) -> None:
-    head = grown(options, 1)
-    assert head.features == FEATURES
-    assert head.descriptor == (DESCRIPTOR if options.condition == "descriptor" else 0)

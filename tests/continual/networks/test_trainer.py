@@ -110,13 +110,6 @@ def test_rate_follows_one_cycle_of_torch(iterations: int, warm: float) -> None:
     assert one_cycle(options, iterations) == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("iterations", [1, 2, 5])
-def test_short_schedules_have_positive_rates(iterations: int) -> None:
-    options = FitOptions(iterations=iterations)
-    rates = [one_cycle(options, step) for step in range(iterations)]
-    assert all(0 < rate <= options.peak_rate for rate in rates)
-
-
 @pytest.mark.parametrize("stop", [3, 10, 17])
 @pytest.mark.parametrize("condition", ["code", "descriptor"])
 @pytest.mark.parametrize("kind", [Replayed, Counted])
@@ -161,37 +154,6 @@ def test_state_is_a_copy(learnable: Learnable) -> None:
     before = {key: value.clone() for key, value in state.items()}
     list(islice(trainer.run(), 4))
     assert all(torch.equal(state[key], value) for key, value in before.items())
-
-
-class RecordingBuffer(FeatureBuffer):
-    """Records the drawn rows."""
-
-    drawn: list[Tensor]
-
-    def draw(self, count: int, generator: torch.Generator) -> Rows:
-        rows = super().draw(count, generator)
-        self.drawn.append(rows.index)
-        return rows
-
-
-def test_rows_depend_on_seed_and_step_only(learnable: Learnable) -> None:
-    plain, _ = learnable()
-
-    def drawn(seed: int, start: int, options: FitOptions = OPTIONS) -> list[Tensor]:
-        buffer = RecordingBuffer(0, ATLAS_FROM_BASE)
-        buffer.restore(plain.tensors)
-        buffer.drawn = []
-        trainer = HeadTrainer(head_for([plain]), [buffer], options, seed)
-        trainer.step = start
-        list(trainer.run())
-        return buffer.drawn
-
-    whole = drawn(2, 0)
-    assert len(whole) == 20
-    assert len({tuple(index.tolist()) for index in whole}) == 20
-    late = drawn(2, 13, replace(OPTIONS, peak_rate=1e-4))
-    assert all(torch.equal(a, b) for a, b in zip(late, whole[13:], strict=True))
-    assert not any(torch.equal(a, b) for a, b in zip(whole, drawn(3, 0), strict=True))
 
 
 def test_replay_cost_is_minimised_on_even_shares(learnable: Learnable) -> None:
@@ -292,42 +254,6 @@ def test_wrong_intrinsics_are_corrected_if_allowed(learnable: Learnable) -> None
             assert trainer.correction[0, 0] > 0.015
         else:
             assert (trainer.correction == 0).all()
-
-
-def test_progress_describes_the_last_step(learnable: Learnable) -> None:
-    buffer, _ = learnable()
-    trainer = HeadTrainer(head_for([buffer]), [buffer], replace(OPTIONS, iterations=2), 0)
-    first, second = trainer.run()
-    assert (first.step, second.step, first.total) == (1, 2, 2)
-    assert isinstance(first, Progress)
-    rows = buffer.draw(96, torch.Generator().manual_seed(0))
-    with torch.no_grad(), torch.autocast("cpu", enabled=False):
-        points = head_for([buffer])(rows.features.float(), rows.scene, None).points
-        residual, camera = reprojection_error(points, rows.target)
-    clear = (camera[:, 2] > 0.1) & (residual.abs().sum(-1) < 1000)
-    inside = clear & (residual.norm(dim=-1) < 5)
-    assert first.inlier_share == pytest.approx(float(inside.float().mean()), abs=0.05)
-
-
-class Regularized(TrainingHooks):
-    """Ties the logits to their initial values."""
-
-    def __init__(self, head: Head, strength: float):
-        self.head, self.strength, self.anchor = head, strength, head.logit.detach().clone()
-
-    def regularizer(self) -> Tensor | None:
-        return self.strength * (self.head.logit - self.anchor).square().sum()
-
-
-def test_regularizer_constrains_the_weights(learnable: Learnable) -> None:
-    buffer, _ = learnable()
-    norms = []
-    for strength in (0.0, 1e3):
-        head = head_for([buffer])
-        hooks = Regularized(head, strength)
-        list(HeadTrainer(head, [buffer], OPTIONS, 0, hooks).run())
-        norms.append(float((head.logit.detach() - hooks.anchor).norm()))
-    assert norms[1] < 0.3 * norms[0]
 
 
 class StepRecorder(Replayed):

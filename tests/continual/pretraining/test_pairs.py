@@ -15,7 +15,6 @@ from evercal.continual.pretraining.pairs import (
     random_homography,
     view_pair,
 )
-from evercal.features.views import cell_centres
 from evercal.simulation.box_room import BoxRoom
 
 from .conftest import SEED
@@ -26,16 +25,6 @@ def hit(views: RoomViews, index: int, pixels: np.ndarray) -> np.ndarray:
     pose = views.base_from_camera[index]
     rays = views.cameras[index].unproject(pixels) @ pose.rotation_matrix().T
     return views.geometry.intersect(pose.translation_m, rays)[0]
-
-
-def test_cells_match_the_encoder() -> None:
-    np.testing.assert_array_equal(cell_pixels(), cell_centres(HEIGHT, WIDTH, 8))
-
-
-def test_inside_has_a_margin() -> None:
-    pixels = np.array([[0, 0], [3.4, 50], [3.5, 3.5], [WIDTH - 4.5, HEIGHT - 4.5], [50, HEIGHT]])
-    assert inside(pixels).tolist() == [False, False, True, True, False]
-    assert inside(pixels, margin=0).tolist() == [True, True, True, True, False]
 
 
 @pytest.mark.parametrize(("first", "second"), [(0, 1), (1, 0), (2, 3), (4, 6), (7, 5)])

@@ -170,7 +170,7 @@ FIRST = ("frames", 0)
 BREAKS = [
     (("format",), "other", "'format' is not 'evercal-scene'"),
     (("version",), 2, "version 2, this evercal reads 1"),
-    (("frames",), [], "no frames"),
+    (("frames",), [], "at least one frame"),
     (("frames",), {}, "'frames' is a list"),
     (("cameras",), [], "'cameras' is an object"),
     (("cameras", "1", "fx"), -1, "camera '1': camera fx"),

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.recordings import Frame, load_recording, nerfstudio, write_image
+from evercal.recordings import Frame, load_recording, write_image
+from evercal.recordings.formats import nerfstudio
 from evercal.recordings.inspection import inspect_recording
 
 LENS = {"fl_x": 40.0, "fl_y": 42.0, "cx": 13.0, "cy": 17.5, "w": 24, "h": 36,
@@ -153,17 +154,21 @@ def test_names_without_ending_and_horizontal_angle_of_view(tmp_path: Path) -> No
     assert frame.read_image().shape == (36, 24, 3)
 
 
-def test_vertical_angle_of_view_without_image_size(tmp_path: Path) -> None:
-    write(tmp_path, entries(ring(2)), camera_angle_y=0.5)
+@pytest.mark.parametrize(
+    ("lens", "focal"),
+    [
+        ({"camera_angle_y": 0.5}, (18 / np.tan(0.25), 18 / np.tan(0.25))),
+        ({"camera_angle_x": 0.4, "camera_angle_y": 0.5}, (12 / np.tan(0.2), 18 / np.tan(0.25))),
+        ({"fl_x": 40.0, "camera_angle_y": 0.5}, (40.0, 18 / np.tan(0.25))),
+    ],
+)
+def test_angles_of_view_without_image_size(
+    lens: dict[str, Any], focal: tuple[float, float], tmp_path: Path
+) -> None:
+    write(tmp_path, entries(ring(2)), **lens)
     camera = load_recording(tmp_path).train[1].camera
     assert (camera.width, camera.height) == (24, 36)
-    assert camera.fx == camera.fy == pytest.approx(18 / np.tan(0.25))
-    write(tmp_path, entries(ring(2)), camera_angle_x=0.4, camera_angle_y=0.5)
-    camera = load_recording(tmp_path).train[1].camera
-    assert (camera.fx, camera.fy) == pytest.approx((12 / np.tan(0.2), 18 / np.tan(0.25)))
-    write(tmp_path, entries(ring(2)), fl_x=40.0, camera_angle_y=0.5)
-    camera = load_recording(tmp_path).train[1].camera
-    assert (camera.fx, camera.fy) == pytest.approx((40.0, 18 / np.tan(0.25)))
+    assert (camera.fx, camera.fy) == pytest.approx(focal)
 
 
 BREAKS: list[tuple[dict[str, Any], str]] = [

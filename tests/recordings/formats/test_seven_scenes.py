@@ -10,7 +10,8 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.recordings import load_recording, seven_scenes, write_image
+from evercal.recordings import load_recording, write_image
+from evercal.recordings.formats import seven_scenes
 
 
 def write_pose(file: Path, matrix: np.ndarray) -> None:
@@ -81,64 +82,43 @@ def test_rotation_with_few_digits_and_jpeg_frames_are_accepted(kitchen: Path) ->
     assert int(frame.read_image().max()) == 0
 
 
-def break_pose(root: Path, text: str) -> None:
-    (root / "seq-02/frame-000002.pose.txt").write_text(text)
-
-
-def keep_only_poses(root: Path) -> None:
-    for image in (root / "seq-02").glob("*.png"):
-        image.unlink()
-
-
-def empty_splits(root: Path) -> None:
-    for name in ("TrainSplit.txt", "TestSplit.txt"):
-        (root / name).write_text("\n")
-
-
-ROTATION_OF_TWO = "2 0 0 0\n0 2 0 0\n0 0 2 0\n0 0 0 1\n"
+POSE = "seq-02/frame-000002.pose.txt"
 BREAKS = [
-    (lambda root: (root / "TestSplit.txt").unlink(), r"TestSplit\.txt: split file is missing"),
-    (lambda root: (root / "TestSplit.txt").write_text("office"), r"TestSplit\.txt.*'office'"),
-    (lambda root: (root / "TestSplit.txt").write_text("sequence9"), r"TestSplit\.txt.*seq-09"),
-    (lambda root: (root / "TestSplit.txt").write_text("sequence1"), "seq-01 is in both"),
-    (lambda root: (root / "TestSplit.txt").write_bytes(b"\xff\xfe"), r"TestSplit\.txt: .*not text"),
-    (empty_splits, "are empty"),
-    (lambda root: shutil.rmtree(root / "seq-02"), "seq-02"),
-    (shutil.rmtree, "no such folder"),
-    (keep_only_poses, "seq-02: no images"),
-    (
-        lambda root: (root / "seq-02/frame-000002.pose.txt").unlink(),
-        r"seq-02/frame-000002\.pose\.txt: missing",
-    ),
-    (lambda root: break_pose(root, "1 2 3"), r"frame-000002\.pose\.txt: expected.*got 3 words"),
-    (lambda root: break_pose(root, "x " * 16), r"frame-000002\.pose\.txt: expected"),
-    (lambda root: break_pose(root, ""), r"frame-000002\.pose\.txt: expected"),
-    (lambda root: break_pose(root, ROTATION_OF_TWO), r"frame-000002\.pose\.txt: broken pose"),
-    (
-        lambda root: (root / "seq-02/frame-000000.color.png").write_bytes(b"no image"),
-        r"frame-000000\.color\.png: not a readable image",
-    ),
-    (
-        lambda root: (root / "seq-02/frame-000000.color.jpg").write_bytes(b""),
-        r"frame-000000\.color is there as \.png and as \.jpg",
-    ),
-    (
-        lambda root: (root / "camera-intrinsics.txt").write_text("525 525"),
-        r"camera-intrinsics\.txt: expected a 3x3",
-    ),
-    (
-        lambda root: (root / "camera-intrinsics.txt").write_text("0 0 0 0 0 0 0 0 1"),
-        r"camera-intrinsics\.txt: camera fx",
-    ),
+    ("TestSplit.txt", None, r"TestSplit\.txt: split file is missing"),
+    ("TestSplit.txt", b"office", r"TestSplit\.txt.*'office'"),
+    ("TestSplit.txt", b"sequence9", r"TestSplit\.txt.*seq-09"),
+    ("TestSplit.txt", b"sequence1", "seq-01 is in both"),
+    ("TestSplit.txt", b"\xff\xfe", r"TestSplit\.txt: .*not a text file"),
+    ("*Split.txt", b"\n", "are empty"),
+    ("seq-02/*.png", None, "seq-02: no images"),
+    (POSE, None, r"seq-02/frame-000002\.pose\.txt: .*is missing"),
+    (POSE, b"1 2 3", r"frame-000002\.pose\.txt: expected.*got 3 words"),
+    (POSE, b"x " * 16, r"frame-000002\.pose\.txt: expected"),
+    (POSE, b"", r"frame-000002\.pose\.txt: expected"),
+    (POSE, b"2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", r"frame-000002\.pose\.txt: broken pose"),
+    ("seq-02/frame-000000.color.png", b"no image", r"color\.png: not a readable image"),
+    ("seq-02/frame-000000.color.jpg", b"", r"frame-000000\.color is there as \.png and as \.jpg"),
+    ("camera-intrinsics.txt", b"525 525", r"camera-intrinsics\.txt: expected a 3x3"),
+    ("camera-intrinsics.txt", b"0 0 0 0 0 0 0 0 1", r"camera-intrinsics\.txt: camera fx"),
 ]
 
 
-@pytest.mark.parametrize(("damage", "message"), BREAKS, ids=[text for _, text in BREAKS])
-def test_broken_files_are_refused_in_one_line(kitchen: Path, damage, message: str) -> None:
-    damage(kitchen)
+@pytest.mark.parametrize(("file", "content", "message"), BREAKS)
+def test_broken_files_are_refused_in_one_line(
+    kitchen: Path, file: str, content: bytes | None, message: str
+) -> None:
+    for path in list(kitchen.glob(file)) or [kitchen / file]:
+        path.unlink() if content is None else path.write_bytes(content)
     with pytest.raises(InputError, match=message) as caught:
         load_recording(kitchen)
     assert "\n" not in str(caught.value)
+
+
+def test_missing_folders_are_refused(kitchen: Path) -> None:
+    for folder, message in ((kitchen / "seq-02", "seq-02"), (kitchen, "no such folder")):
+        shutil.rmtree(folder)
+        with pytest.raises(InputError, match=message):
+            load_recording(kitchen)
 
 
 def test_thousand_frames_load_within_a_second(kitchen: Path) -> None:

@@ -76,13 +76,13 @@ def test_suite_loads_scenes_and_names_missing_ones(apartment: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [
-        ("split.txt", None, r"split\.txt: missing"),
+        ("split.txt", None, r"split\.txt: .*is missing"),
         ("split.txt", "sequence0 frames=2", r"split\.txt: the first line holds no"),
         ("split.txt", "sequence0 [frames=9]", r"split\.txt: 9 test frames, but .* has 5 images"),
         ("info.txt", "m_colorWidth = 128", r"info\.txt: needs m_colorWidth"),
         ("info.txt", INFO.replace("116 0 65.5", "wide"), r"info\.txt: needs m_colorWidth"),
         ("data/frame-000002.pose.txt", "1 0 0", r"frame-000002\.pose\.txt: expected a 4x4"),
-        ("data/frame-000002.pose.txt", None, r"frame-000002\.pose\.txt: missing"),
+        ("data/frame-000002.pose.txt", None, r"frame-000002\.pose\.txt: .*is missing"),
         ("data/*.jpg", None, "no images"),
     ],
 )

@@ -195,9 +195,9 @@ def test_missing_and_ambiguous_files_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "empty"),
-        ("image,stamp_s\n", "no rows"),
-        ("1,2,3\n4,5,6\n", "names no columns"),
+        ("", "needs a line of column names"),
+        ("image,stamp_s\n", "then rows of a time"),
+        ("1,2,3\n4,5,6\n", "needs a line of column names"),
         ("image,stamp_s\na.png\n", "row 1 has 1 cells"),
         ("image,stamp_s\na.png,nan\n", "'nan' is not a number"),
         ("image,x\na.png,1\n", "needs the columns image and stamp_s"),

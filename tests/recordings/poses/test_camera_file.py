@@ -132,7 +132,7 @@ def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
 
 
 def test_missing_distortion_is_refused(tmp_path: Path) -> None:
-    text = CALIBRATION.replace("distortion_coefficients", "dist_coeff")
+    text = CALIBRATION.replace("distortion_coefficients", "lens")
     with pytest.raises(InputError, match="'distortion_coefficients' is missing"):
         read_camera(written(tmp_path, text))
     assert read_camera(written(tmp_path, text + "d: [0, 0, 0, 0]\n")).distortion == ()

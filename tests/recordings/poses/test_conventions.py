@@ -23,35 +23,17 @@ from evercal.recordings.poses.conventions import (
 Array = NDArray[np.float64]
 
 
-def rotation_about(axis: str, angle: float) -> Array:
-    """Elementary rotation about x, y or z."""
-    c, s = math.cos(angle), math.sin(angle)
-    return {
-        "x": np.array([[1, 0, 0], [0, c, -s], [0, s, c]]),
-        "y": np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]),
-        "z": np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]),
-    }[axis]
-
-
-def of_quaternion(w: float, x: float, y: float, z: float) -> Array:
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def of_vector(x: float, y: float, z: float) -> Array:
     return np.asarray(expm(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])), dtype=np.float64)
 
 
+def of_quaternion(w: float, x: float, y: float, z: float) -> Array:
+    return of_vector(*(2 * np.arccos(w) / math.sqrt(1 - w * w) * np.array([x, y, z])))
+
+
 def fixed_xyz(unit: float) -> Callable[..., Array]:
     return lambda a, b, c: (
-        rotation_about("z", c * unit)
-        @ rotation_about("y", b * unit)
-        @ rotation_about("x", a * unit)
+        of_vector(0, 0, c * unit) @ of_vector(0, b * unit, 0) @ of_vector(a * unit, 0, 0)
     )
 
 
@@ -62,18 +44,10 @@ ROTATIONS: dict[str, Callable[..., Array]] = {
     "abb": of_quaternion,
     "ur": of_vector,
     "rpy": fixed_xyz(1.0),
-    "kuka": lambda a, b, c: (
-        rotation_about("z", a * DEGREE)
-        @ rotation_about("y", b * DEGREE)
-        @ rotation_about("x", c * DEGREE)
-    ),
+    "kuka": lambda a, b, c: fixed_xyz(DEGREE)(c, b, a),
     "fanuc": fixed_xyz(DEGREE),
     "yaskawa": fixed_xyz(DEGREE),
-    "staubli": lambda a, b, c: (
-        rotation_about("x", a * DEGREE)
-        @ rotation_about("y", b * DEGREE)
-        @ rotation_about("z", c * DEGREE)
-    ),
+    "staubli": lambda a, b, c: fixed_xyz(DEGREE)(-a, -b, -c).T,
 }
 MILLIMETRES = {"abb", "kuka", "fanuc", "yaskawa", "staubli"}
 
@@ -141,17 +115,6 @@ def test_modifiers_change_unit_direction_and_axes(
     np.testing.assert_allclose(twin(name, expected_numbers), expected, atol=1e-12)
 
 
-def test_published_angles_are_reproduced() -> None:
-    """rpy (0.3, 0.4, 0.5) of URDF; the same rotation about moved axes has other angles."""
-    pose = poses_from_numbers([0, 0, 0, 0.3, 0.4, 0.5], CONVENTIONS["rpy"])
-    moved = numbers_from_poses(pose, pose_convention("staubli:rad"))
-    np.testing.assert_allclose(moved[3:], [0.092, 0.487, 0.416], atol=1e-3)
-    optical = numbers_from_poses(
-        SE3(np.array([0.5, -0.5, 0.5, -0.5]), np.zeros(3)), CONVENTIONS["rpy"]
-    )
-    np.testing.assert_allclose(optical[3:], [-math.pi / 2, 0, -math.pi / 2], atol=1e-12)
-
-
 @pytest.mark.parametrize("name", ["rpy", "kuka", "fanuc", "yaskawa", "staubli"])
 @pytest.mark.parametrize("middle", [90.0, -90.0, 90 - 1e-6, 90 - 1e-8])
 def test_gimbal_lock_keeps_the_rotation(name: str, middle: float) -> None:
@@ -187,11 +150,6 @@ def rows(name: str) -> Array:
     rng = np.random.default_rng(5)
     translation = rng.uniform(0.2, 0.8, (6, 3))
     return numbers_from_poses(SE3(rng.normal(size=(6, 4)), translation), pose_convention(name))
-
-
-@pytest.mark.parametrize("name", sorted(CONVENTIONS))
-def test_numbers_in_the_unit_of_their_convention_pass(name: str) -> None:
-    check_units(rows(name), CONVENTIONS[name])
 
 
 @pytest.mark.parametrize(

@@ -66,7 +66,7 @@ def test_planar_arm_agrees_with_its_closed_form(
 
 
 def test_any_two_links_can_be_chosen(model: RobotModel) -> None:
-    assert (model.base_link, model.end_link()) == ("base", "tip")
+    assert model.chosen_links(None, None) == ("base", "tip")
     assert model.joints_between("base", "tip") == ("shoulder", "elbow", "reach")
     assert model.joints_between("upper", "lower") == ("elbow",)
     assert model.joints_between("tip", "lower") == ("reach",)
@@ -98,7 +98,7 @@ def test_panda_agrees_with_its_published_parameters() -> None:
     file = next(f for f in files if str(f).endswith("panda_description/urdf/panda.urdf"))
     model = RobotModel(Path(file.locate()))
     with pytest.raises(InputError, match=r"has 3 ends; name the link with --gripper-frame"):
-        model.end_link()
+        model.chosen_links(None, None)
     joints = model.joints_between("panda_link0", "panda_link8")
     assert joints == tuple(f"panda_joint{i}" for i in range(1, 8))
     q = np.random.default_rng(1).uniform(-1.5, 0.0, (20, 7))
@@ -157,7 +157,7 @@ def test_json_and_csv_agree(tmp_path: Path, model: RobotModel) -> None:
         ("shoulder,elbow,reach\n90,20,0\n", "joint shoulder is at 90.0.*shoulder_deg"),
         ("shoulder,elbow,reach,elbow_deg\n0,1,0,90\n", "several columns are of joint elbow"),
         ("shoulder,elbow,reach\n0,x,0\n", "column 'elbow': 'x' is not a number"),
-        ("shoulder,elbow,reach\n", "no rows"),
+        ("shoulder,elbow,reach\n", "then rows of joint angles"),
     ],
 )
 def test_wrong_joint_tables_are_refused(
@@ -182,25 +182,22 @@ def test_wrong_json_is_refused(tmp_path: Path, model: RobotModel, data: str) -> 
         read_joint_poses(file, model)
 
 
-def test_angles_beyond_the_limits_are_noted(tmp_path: Path, model: RobotModel) -> None:
+@pytest.mark.parametrize(
+    ("rows", "note"),
+    [
+        ("3.5,9,0\n", "shoulder goes from 3.50 to 3.50, the URDF allows -3.00 to 3.00"),
+        ("0,-170,0\n0,170,0\n", "elbow goes from -170.00 to 170.00, more than two rotations"),
+        ("0,100,0\n0,103,0\n", None),
+    ],
+)
+def test_angles_beyond_the_limits_are_noted(
+    tmp_path: Path, model: RobotModel, rows: str, note: str | None
+) -> None:
     file = tmp_path / "joints.csv"
-    file.write_text("shoulder,elbow,reach\n3.5,9,0\n")
+    file.write_text("shoulder,elbow,reach\n" + rows)
     _, notes = read_joint_poses(file, model)
-    assert len(notes) == 2
-    assert "shoulder goes from 3.50 to 3.50, the URDF allows -3.00 to 3.00" in notes[1]
-
-
-def test_large_angles_without_limits_are_noted(tmp_path: Path) -> None:
-    (tmp_path / "a.urdf").write_text(
-        '<robot name="a"><link name="base"/><link name="tip"/>'
-        '<joint name="turn" type="continuous"><parent link="base"/><child link="tip"/>'
-        '<axis xyz="0 0 1"/></joint></robot>'
-    )
-    file = tmp_path / "joints.csv"
-    for values, count in (((-170, 170), 1), ((100.0, 103.0), 0)):
-        file.write_text("turn\n" + "".join(f"{value}\n" for value in values))
-        _, notes = read_joint_poses(file, RobotModel(tmp_path / "a.urdf"))
-        assert len(notes) == 1 + count
+    assert len(notes) == (1 if note is None else 2)
+    assert note is None or note in notes[1]
 
 
 def test_joints_are_not_interpolated_over_gaps() -> None:

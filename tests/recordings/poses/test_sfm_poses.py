@@ -77,5 +77,7 @@ def test_broken_files_are_refused(tmp_path: Path, line: str, message: str) -> No
     with pytest.raises(InputError, match=rf"heads_test\.txt: {message}"):
         with_sfm_poses(RECORDING, tmp_path, "heads")
     (tmp_path / "heads_test.txt").unlink()
-    with pytest.raises(InputError, match=r"heads_test\.txt: missing; get the folder pgt/sfm"):
+    with pytest.raises(
+        InputError, match=r"heads_test\.txt: pose file is missing; get the folder pgt/sfm"
+    ):
         with_sfm_poses(RECORDING, tmp_path, "heads")

@@ -11,11 +11,9 @@ other fields. Covariances are of (translation in the camera frame, metres; rotat
 board's axes, radians).
 """
 
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -23,7 +21,7 @@ from numpy.typing import NDArray
 
 from evercal.calibration.boards.corners import BoardPose, BoardView, board_pose, pixel_sigma
 from evercal.calibration.boards.detection import Board
-from evercal.errors import InputError
+from evercal.calibration.calibration import of_format, read_json
 from evercal.geometry import SE3, Camera
 from evercal.storage import write_json
 
@@ -38,11 +36,10 @@ class BoardImage:
 
     name: str
     """Path relative to the file of board poses, or a bare file name."""
-    view: BoardView | None
+    view: BoardView | None = None
     """Detected corners."""
-    camera_from_board: SE3 | None
-    """A single pose."""
-    covariance: Array | None
+    camera_from_board: SE3 | None = None
+    covariance: Array | None = None
     """(6, 6) covariance of the pose."""
     rms_px: float | None = None
     """Root mean square reprojection error of the corners."""
@@ -55,11 +52,9 @@ class BoardPoses:
     """Board poses of all images of one camera."""
 
     board: Board
-    """Board in the images."""
     camera: Camera
     """Intrinsics of all images."""
     images: tuple[BoardImage, ...]
-    """Images in the given order."""
     corner_sigma_px: float
     """Standard deviation of a corner coordinate."""
     camera_from: str = "file"
@@ -84,27 +79,18 @@ class BoardPoses:
 
     @classmethod
     def from_dict(cls, data: object) -> Self:
-        """Create board poses from the values of `to_dict`.
+        """Create board poses from the values of `to_dict`, or raise ValueError."""
+        return of_format(data, FORMAT, VERSION, cls._from_mapping)
 
-        Raises:
-            ValueError: The values have another format or version, or are broken.
-        """
-        if not isinstance(data, Mapping) or data.get("format") != FORMAT:
-            raise ValueError(f"not board poses: 'format' is not {FORMAT!r}")
-        if data.get("version") != VERSION:
-            raise ValueError(f"version {data.get('version')!r}; this evercal reads {VERSION}")
-        try:
-            return cls(
-                board=Board.from_dict(data["board"]),
-                camera=Camera.from_dict(data["camera"]),
-                images=tuple(_image_from_dict(image) for image in data["images"]),
-                corner_sigma_px=float(data["corner_sigma_px"]),
-                camera_from=str(data.get("camera_from", "file")),
-            )
-        except KeyError as error:
-            raise ValueError(f"{error} is missing") from None
-        except TypeError as error:
-            raise ValueError(f"an entry has the wrong kind of value ({error})") from None
+    @classmethod
+    def _from_mapping(cls, data: Mapping[str, Any]) -> Self:
+        return cls(
+            board=Board.from_dict(data["board"]),
+            camera=Camera.from_dict(data["camera"]),
+            images=tuple(_image_from_dict(image) for image in data["images"]),
+            corner_sigma_px=float(data["corner_sigma_px"]),
+            camera_from=str(data.get("camera_from", "file")),
+        )
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the file atomically."""
@@ -117,15 +103,7 @@ def read_board_poses(path: str | os.PathLike[str]) -> BoardPoses:
     Raises:
         InputError: The file is missing or does not hold board poses.
     """
-    path = Path(path)
-    try:
-        return BoardPoses.from_dict(json.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        raise InputError(f"{path}: file of camera poses is missing; check the path") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except ValueError as error:
-        raise InputError(f"{path}: {error}; give the JSON that evercal detect wrote") from None
+    return read_json(path, "file of camera poses", BoardPoses.from_dict)
 
 
 def board_poses(
@@ -139,31 +117,32 @@ def board_poses(
     Args:
         board: Board in the images.
         camera: Intrinsics of all images.
-        views: Corners of each image by its name, or the reason for a missing board.
-        camera_from: `file` or `board`.
+        views: Corners by image name, or the reason for a missing board.
+        camera_from: Source of the intrinsics, `file` or `board`.
     """
-    poses: dict[str, BoardPose] = {}
-    reasons = {name: view for name, view in views.items() if isinstance(view, str)}
-    for name, view in views.items():
-        if isinstance(view, BoardView):
-            try:
-                poses[name] = board_pose(view, camera)
-            except ValueError:
-                reasons[name] = "the detected corners fit no pose of the board"
-    sigma = pixel_sigma([*poses.values()]) if poses else 0.0
+    fits = {name: _fitted(view, camera) for name, view in views.items()}
+    poses = [fit for fit in fits.values() if isinstance(fit, BoardPose)]
+    sigma = pixel_sigma(poses) if poses else 0.0
     images = []
-    for name, view in views.items():
-        if name in reasons or isinstance(view, str):
-            images.append(BoardImage(name, None, None, None, None, reasons[name]))
+    for name, fit in fits.items():
+        view = views[name]
+        if isinstance(fit, str) or isinstance(view, str):
+            images.append(BoardImage(name, reason=str(fit)))
             continue
-        pose = poses[name]
-        covariance = sigma**2 * pose.unit_covariance
-        images.append(BoardImage(name, view, pose.camera_from_board, covariance, pose.rms_px))
+        covariance = sigma**2 * fit.unit_covariance
+        images.append(BoardImage(name, view, fit.camera_from_board, covariance, fit.rms_px))
     return BoardPoses(board, camera, tuple(images), sigma, camera_from)
 
 
+def _fitted(view: BoardView | str, camera: Camera) -> BoardPose | str:
+    try:
+        return view if isinstance(view, str) else board_pose(view, camera)
+    except ValueError:
+        return "the detected corners fit no pose of the board"
+
+
 def _image_to_dict(image: BoardImage) -> dict[str, Any]:
-    pose, view = image.camera_from_board, image.view
+    pose, view, covariance = image.camera_from_board, image.view, image.covariance
     return {
         "name": image.name,
         "reason": image.reason,
@@ -174,7 +153,7 @@ def _image_to_dict(image: BoardImage) -> dict[str, Any]:
             "translation_m": pose.translation_m.tolist(),
             "quaternion_wxyz": pose.rotation_wxyz.tolist(),
         },
-        "covariance": None if image.covariance is None else image.covariance.tolist(),
+        "covariance": None if covariance is None else covariance.tolist(),
         "points_m": None if view is None else view.points_m.tolist(),
         "pixels": None if view is None else view.pixels.tolist(),
     }
@@ -183,7 +162,7 @@ def _image_to_dict(image: BoardImage) -> dict[str, Any]:
 def _image_from_dict(data: Mapping[str, Any]) -> BoardImage:
     name, pose = str(data["name"]), data["camera_from_board"]
     if pose is None:
-        return BoardImage(name, None, None, None, None, str(data.get("reason", "no board")))
+        return BoardImage(name, reason=str(data.get("reason", "no board")))
     covariance = np.asarray(data["covariance"], dtype=np.float64)
     if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
         raise ValueError(f"'covariance' of {name} must be finite and 6x6, got {covariance.shape}")

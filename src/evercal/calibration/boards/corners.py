@@ -21,16 +21,12 @@ _LEAST_PX = 0.02
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """Corners of a board in one image.
-
-    Raises:
-        ValueError: There are fewer than four corners, or the shapes do not match.
-    """
+    """Four or more corners of a board in one image."""
 
     points_m: Array
-    """(k, 3) corners in the board frame, metres, k >= 4."""
+    """(k, 3) in the board frame, metres."""
     pixels: Array
-    """(k, 2) corners in the image, x then y."""
+    """(k, 2) x, y."""
 
     def __post_init__(self) -> None:
         points = np.asarray(self.points_m, dtype=np.float64)
@@ -49,14 +45,12 @@ class BoardPose:
     """Least-squares pose of the board in one image."""
 
     camera_from_board: SE3
-    """A single pose."""
     unit_covariance: Array
     """(6, 6) covariance for a corner noise of one pixel: (translation in the camera frame, metres;
     rotation about the board's axes, radians)."""
     squared_px: float
     """Sum of squared residuals of all coordinates."""
     corners: int
-    """Number of corners."""
 
     @property
     def rms_px(self) -> float:
@@ -65,34 +59,23 @@ class BoardPose:
 
 
 def board_pose(view: BoardView, camera: Camera, start: SE3 | None = None) -> BoardPose:
-    """Fit the pose of a board to its corners.
+    """Fit the pose of a board to its corners, from a start camera_from_board.
 
     A small or distant flat board has two similar poses; without a start, the better one is
     returned.
-
-    Args:
-        view: Corners.
-        camera: Intrinsics.
-        start: camera_from_board near the solution.
     """
     import cv2
 
-    matrix, distortion = camera.matrix(), np.array(camera.distortion)
     if start is None:
         starts = board_pose_candidates(view, camera)
         return min((board_pose(view, camera, s) for s in starts), key=lambda pose: pose.squared_px)
+    lens = camera.matrix(), np.array(camera.distortion)
     rotvec = Rotation.from_quat(start.rotation_wxyz, scalar_first=True).as_rotvec()
+    translation = start.translation_m.reshape(3, 1).copy()
     rotvec, translation = cv2.solvePnPRefineLM(
-        view.points_m,
-        view.pixels,
-        matrix,
-        distortion,
-        rotvec.reshape(3, 1).copy(),
-        start.translation_m.reshape(3, 1).copy(),
+        view.points_m, view.pixels, *lens, rotvec.reshape(3, 1).copy(), translation
     )
-    projected, slopes = cv2.projectPoints(view.points_m, rotvec, translation, matrix, distortion)[
-        :2
-    ]
+    projected, slopes, *_ = cv2.projectPoints(view.points_m, rotvec, translation, *lens)
     by_point = np.asarray(slopes[:, 3:6], dtype=np.float64).reshape(-1, 2, 3)
     rotation = Rotation.from_rotvec(np.ravel(rotvec))
     by_rotation = by_point @ (-rotation.as_matrix() @ cross_matrix(view.points_m))
@@ -110,13 +93,12 @@ def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:
     """Return the possible poses of the board: up to two for a flat board, mostly one otherwise."""
     import cv2
 
-    matrix, distortion = camera.matrix(), np.array(camera.distortion)
-    centered = view.points_m - view.points_m.mean(0)
-    thickness = np.linalg.svd(centered, compute_uv=False)
+    thickness = np.linalg.svd(view.points_m - view.points_m.mean(0), compute_uv=False)
     flat = thickness[2] < 1e-6 * thickness[0]
     flags = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
+    lens = camera.matrix(), np.array(camera.distortion)
     _, rotvecs, translations, _ = cv2.solvePnPGeneric(
-        view.points_m, view.pixels, matrix, distortion, flags=flags
+        view.points_m, view.pixels, *lens, flags=flags
     )
     poses = []
     for rotvec, translation in zip(rotvecs, translations, strict=True):

@@ -36,7 +36,6 @@ class Board:
     """
 
     kind: BoardKind
-    """`chessboard`, `charuco` or `apriltag`."""
     size_m: float
     """Side of a square, or of the black square of a tag, metres."""
     columns: int = 0
@@ -79,11 +78,7 @@ class Board:
 
     @classmethod
     def from_dict(cls, data: object) -> Self:
-        """Create a board from the values of `to_dict`.
-
-        Raises:
-            ValueError: The values describe no valid board.
-        """
+        """Create a board from the values of `to_dict`, or raise ValueError."""
         if not isinstance(data, dict):
             raise ValueError("'board' must be an object")
         try:
@@ -93,35 +88,24 @@ class Board:
 
 
 def find_board(image: Image, board: Board) -> BoardView | str:
-    """Detect the corners of a board in one image.
-
-    Args:
-        image: (H, W, 3) uint8 RGB.
-        board: Board to detect.
-
-    Returns:
-        The corners, or the reason why the board was not detected.
-    """
+    """Detect the corners of a board in an image (H, W, 3) uint8 RGB, or return a reason."""
     import cv2
 
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    if board.kind == "chessboard":
-        return _find_chessboard(grey, board)
-    if board.kind == "charuco":
-        return _find_charuco(grey, board)
-    return _find_tag(grey, board)
+    find = {"chessboard": _find_chessboard, "charuco": _find_charuco, "apriltag": _find_tag}
+    return find[board.kind](cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), board)
 
 
 def _find_chessboard(grey: NDArray, board: Board) -> BoardView | str:
     import cv2
 
     shape = (board.columns, board.rows)
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE
-    detected, pixels = cv2.findChessboardCornersSB(grey, shape, flags=flags)
-    if not detected:
-        flags |= cv2.CALIB_CB_EXHAUSTIVE
-        detected, pixels = cv2.findChessboardCornersSB(grey, shape, flags=flags)
-    if not detected:
+    for flags in (0, cv2.CALIB_CB_EXHAUSTIVE):
+        detected, pixels = cv2.findChessboardCornersSB(
+            grey, shape, flags=flags | cv2.CALIB_CB_NORMALIZE_IMAGE
+        )
+        if detected:
+            break
+    else:
         return (
             f"no chessboard with {board.columns}x{board.rows} inner corners; the whole board must"
             f" be visible, sharp and without glare"

@@ -1,7 +1,7 @@
 """Estimate intrinsics from views of a board, with a lens model that the views support."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,14 +16,10 @@ _FOCAL_SIGMA = 0.01
 """Maximum relative standard deviation of the focal length."""
 
 
-@dataclass(frozen=True)
-class Intrinsics:
-    """A camera and the residuals of the corners."""
+class Intrinsics(NamedTuple):
+    """A camera with the uncertainty of its focal length."""
 
     camera: Camera
-    """Intrinsics at the size of the images."""
-    rms_px: float
-    """Root mean square reprojection error."""
     focal_sigma_px: float
     """Standard deviation of the focal length, the larger of x and y."""
 
@@ -34,13 +30,8 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
     Models of 0, 1 (k1), 2 (k2), 4 (p1 p2) and 5 (k3) distortion coefficients are fitted.
     The Bayesian information criterion selects one, so that few views do not overfit.
 
-    Args:
-        views: Five or more tilted views of a flat board.
-        width: Image width, pixels.
-        height: Image height, pixels.
-
     Raises:
-        InputError: There are too few views, or they do not determine the focal length.
+        InputError: Fewer than five views, or they do not determine the focal length.
     """
     import cv2
 
@@ -79,7 +70,7 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
             sigma = float(np.sqrt(squared / max(count - 4 - extra - 6 * len(views), 1)))
             poses = list(zip(rotvecs, translations, strict=True))
             focal = sigma * _unit_focal_sigma(points, camera, extra, poses)
-            best = (criterion, Intrinsics(camera, float(rms), focal))
+            best = (criterion, Intrinsics(camera, focal))
     result = None if best is None else best[1]
     if result is None or not result.focal_sigma_px < _FOCAL_SIGMA * result.camera.fx:
         focal = ""

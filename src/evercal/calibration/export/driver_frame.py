@@ -17,10 +17,7 @@ import numpy as np
 
 from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
-from evercal.geometry import SE3, cross_matrix
-
-LINK_FROM_OPTICAL_WXYZ = (0.5, -0.5, 0.5, -0.5)
-"""Rotation between the axes of REP 103: z forward becomes x forward."""
+from evercal.geometry import SE3
 
 _Transforms = dict[tuple[str, str], SE3]
 """parent_from_child by (parent, child)."""
@@ -33,38 +30,14 @@ def standard_link_from_optical(offset_m: tuple[float, float, float] = (0.0, 0.0,
     Args:
         offset_m: Origin of the optical frame in the link: forward, left, up.
     """
-    return SE3(np.array(LINK_FROM_OPTICAL_WXYZ), np.array(offset_m))
+    return SE3(np.array([0.5, -0.5, 0.5, -0.5]), np.array(offset_m))
 
 
 def published_at(calibration: Calibration, link: str, link_from_optical: SE3) -> Calibration:
-    """Return the calibration of the driver's root frame.
-
-    Args:
-        calibration: Calibration of the optical frame.
-        link: Name of the driver's root frame.
-        link_from_optical: Pose of the optical frame in the root frame.
-
-    Returns:
-        Calibration with `link` as child frame, and with the covariance of the link's pose.
-
-    Raises:
-        InputError: `link` is the name of the parent frame.
-    """
-    if link == calibration.parent_frame:
-        raise InputError(f"driver's root frame and parent frame are both called {link!r}")
-    optical_from_link = link_from_optical.inverse()
-    parent_from_optical = calibration.parent_from_child
-    # d(t + R exp(w) a) = dt + R (w x a), and exp(w) R_a = R_a exp(R_a^T w).
-    lever = cross_matrix(optical_from_link.translation_m)
-    jacobian = np.eye(6)
-    jacobian[:3, 3:] = -parent_from_optical.rotation_matrix() @ lever
-    jacobian[3:, 3:] = optical_from_link.rotation_matrix().T
-    covariance = jacobian @ calibration.covariance @ jacobian.T
+    """Return the calibration of the driver's root frame `link`, with its covariance."""
+    pose = calibration.uncertain_pose @ link_from_optical.inverse()
     return replace(
-        calibration,
-        parent_from_child=parent_from_optical @ optical_from_link,
-        covariance=(covariance + covariance.T) / 2,
-        child_frame=link,
+        calibration, parent_from_child=pose.pose, covariance=pose.covariance, child_frame=link
     )
 
 
@@ -83,31 +56,33 @@ def read_link_from_optical(path: str | os.PathLike[str], link: str, optical: str
     """
     import yaml
 
-    path = Path(path)
-    try:
-        documents = [*yaml.safe_load_all(path.read_text(encoding="utf-8"))]
-    except FileNotFoundError:
-        raise InputError(f"{path}: file of transforms is missing; check the path") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except (UnicodeDecodeError, yaml.YAMLError):
-        raise InputError(f"{path}: neither YAML nor JSON; {_EXPECTED}") from None
     transforms: _Transforms = {}
     try:
-        for document in documents:
+        for document in yaml.safe_load_all(Path(path).read_text(encoding="utf-8")):
             transforms |= _transforms(document)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+    except (UnicodeDecodeError, yaml.YAMLError):
+        raise InputError(f"{path}: neither YAML nor JSON; {_EXPECTED}") from None
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: a transform is incomplete ({error}); {_EXPECTED}") from None
     if not transforms:
         raise InputError(f"{path}: contains no transform; {_EXPECTED}")
-    link_from_optical = _chain(transforms, link, optical)
-    if link_from_optical is None:
-        frames = ", ".join(sorted({frame for pair in transforms for frame in pair}))
+    transforms |= {(child, parent): pose.inverse() for (parent, child), pose in transforms.items()}
+    link_from = {link: SE3.identity()}
+    queue = [link]
+    for frame in queue:
+        for (parent, child), parent_from_child in transforms.items():
+            if parent == frame and child not in link_from:
+                link_from[child] = link_from[frame] @ parent_from_child
+                queue.append(child)
+    if optical not in link_from:
+        frames = ", ".join(sorted({parent for parent, _ in transforms}))
         raise InputError(
             f"{path}: no transform leads from {link!r} to {optical!r}; its frames are {frames}."
             f" Name the optical frame with --child and the driver's root frame with --via"
         )
-    return link_from_optical
+    return link_from[optical]
 
 
 def _transforms(data: Any) -> _Transforms:
@@ -130,16 +105,3 @@ def _transforms(data: Any) -> _Transforms:
         raise ValueError(f"quaternion {quaternion} is not of length 1")
     parent, child = (str(frame).lstrip("/") for frame in pair)
     return {(parent, child): SE3(np.array(quaternion), np.array(translation))}
-
-
-def _chain(transforms: _Transforms, start: str, end: str) -> SE3 | None:
-    """Return start_from_end along the transforms, each in either direction."""
-    inverses = {(child, parent): pose.inverse() for (parent, child), pose in transforms.items()}
-    start_from = {start: SE3.identity()}
-    queue = [start]
-    for frame in queue:
-        for (parent, child), parent_from_child in (transforms | inverses).items():
-            if parent == frame and child not in start_from:
-                start_from[child] = start_from[frame] @ parent_from_child
-                queue.append(child)
-    return start_from.get(end)

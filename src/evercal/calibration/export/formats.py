@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, Unpack
+from typing import Literal, TypeAlias, Unpack
 
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.export import image_poses, numbers, ros
@@ -20,58 +20,49 @@ Content: TypeAlias = str | bytes | dict[str, str]
 class Format:
     """One export format; every format takes fixed cameras and cameras on the arm."""
 
-    name: str
-    """Name for `--format`."""
     frame: Literal["tf", "optical", "any"]
     """Child frame. `tf`: a frame of the robot's tf tree. `optical`: only the camera's optical
     frame, so `via` is refused. `any`: plain numbers of either frame."""
-    suffix: str
-    """File suffix; empty for a folder."""
     write: Callable[[Export], Content]
     """Writer."""
     description: str
     """One line for `--format list`."""
 
 
-_ROWS: tuple[tuple[str, Literal["tf", "optical", "any"], str, Any, str], ...] = (
-    ("easy_handeye2", "tf", ".calib", ros.easy_handeye2, "for ~/.ros2/easy_handeye2/calibrations"),
-    ("easy_handeye", "tf", ".yaml", ros.easy_handeye, "easy_handeye of ROS 1, ~/.ros/easy_handeye"),
-    (
-        "moveit_samples",
+FORMATS = {
+    "easy_handeye2": Format("tf", ros.easy_handeye2, "for ~/.ros2/easy_handeye2/calibrations"),
+    "easy_handeye": Format("tf", ros.easy_handeye, "easy_handeye of ROS 1, ~/.ros/easy_handeye"),
+    "moveit_samples": Format(
         "optical",
-        ".yaml",
         image_poses.moveit_samples,
         "MoveIt Calibration's pose pairs (with --robot-poses and --target-poses)",
     ),
-    (
-        "static_transform_publisher",
-        "tf",
-        ".sh",
-        ros.publisher_command,
-        "shell command that publishes the transform in ROS 2",
+    "static_transform_publisher": Format(
+        "tf", ros.publisher_command, "shell command that publishes the transform in ROS 2"
     ),
-    ("launch_py", "tf", ".launch.py", ros.launch_py, "ROS 2 launch file with a tf publisher"),
-    ("ros1_launch", "tf", ".launch", ros.ros1_launch, "ROS 1 launch file, like MoveIt Calibration"),
-    ("transform_stamped", "tf", ".yaml", ros.transform_stamped, "geometry_msgs/TransformStamped"),
-    ("camera_info", "optical", ".yaml", ros.camera_info, "intrinsics for ROS"),
-    ("urdf", "tf", ".xml", ros.urdf, "fixed joint for a URDF, rpy about fixed axes"),
-    ("opencv", "optical", ".yml", numbers.opencv, "rvec, tvec (parent to camera), FileStorage"),
-    ("csv", "any", ".csv", numbers.csv, "4x4 matrix, metres, one matrix row per line"),
-    ("npy", "any", ".npy", numbers.npy, "4x4 matrix, metres, for numpy"),
-    ("json", "any", ".json", numbers.as_json, "matrix, quaternion w x y z, covariance, frames"),
-    ("tum", "optical", ".tum", image_poses.tum, "stamp, translation, quaternion x y z w"),
-    ("colmap", "optical", "", image_poses.colmap, "cameras.txt, images.txt, points3D.txt (folder)"),
-    ("nerfstudio", "optical", ".json", image_poses.nerfstudio, "transforms.json, OpenGL axes"),
-    ("zivid", "any", ".yaml", numbers.zivid, "4x4 matrix in millimetres for Zivid's SDK"),
-    ("ur", "any", ".txt", numbers.ur, "Universal Robots: p[x, y, z, rx, ry, rz]"),
-    ("kuka", "any", ".txt", numbers.kuka, "KUKA: {X, Y, Z, A, B, C}, mm and degrees"),
-    ("abb", "any", ".txt", numbers.abb, "ABB: [[x,y,z],[q1,q2,q3,q4]], mm"),
-    ("fanuc", "any", ".txt", numbers.fanuc, "FANUC: X Y Z W P R, mm and degrees"),
-    ("yaskawa", "any", ".txt", numbers.yaskawa, "Yaskawa: X Y Z Rx Ry Rz, mm and degrees"),
-    ("staubli", "any", ".txt", numbers.staubli, "Staubli: X Y Z RX RY RZ, mm and degrees"),
-    ("franka", "any", ".json", numbers.franka, "Franka: 16 numbers by column, metres"),
-)
-FORMATS = {row[0]: Format(*row) for row in _ROWS}
+    "launch_py": Format("tf", ros.launch_py, "ROS 2 launch file with a tf publisher"),
+    "ros1_launch": Format("tf", ros.ros1_launch, "ROS 1 launch file, like MoveIt Calibration"),
+    "transform_stamped": Format("tf", ros.transform_stamped, "geometry_msgs/TransformStamped"),
+    "camera_info": Format("optical", ros.camera_info, "intrinsics for ROS"),
+    "urdf": Format("tf", ros.urdf, "fixed joint for a URDF, rpy about fixed axes"),
+    "opencv": Format("optical", numbers.opencv, "rvec, tvec (parent to camera), FileStorage"),
+    "csv": Format("any", numbers.csv, "4x4 matrix, metres, one matrix row per line"),
+    "npy": Format("any", numbers.npy, "4x4 matrix, metres, for numpy"),
+    "json": Format("any", numbers.as_json, "matrix, quaternion w x y z, covariance, frames"),
+    "tum": Format("optical", image_poses.tum, "stamp, translation, quaternion x y z w"),
+    "colmap": Format(
+        "optical", image_poses.colmap, "cameras.txt, images.txt, points3D.txt (folder)"
+    ),
+    "nerfstudio": Format("optical", image_poses.nerfstudio, "transforms.json, OpenGL axes"),
+    "zivid": Format("any", numbers.zivid, "4x4 matrix in millimetres for Zivid's SDK"),
+    "ur": Format("any", numbers.ur, "Universal Robots: p[x, y, z, rx, ry, rz]"),
+    "kuka": Format("any", numbers.kuka, "KUKA: {X, Y, Z, A, B, C}, mm and degrees"),
+    "abb": Format("any", numbers.abb, "ABB: [[x,y,z],[q1,q2,q3,q4]], mm"),
+    "fanuc": Format("any", numbers.fanuc, "FANUC: X Y Z W P R, mm and degrees"),
+    "yaskawa": Format("any", numbers.yaskawa, "Yaskawa: X Y Z Rx Ry Rz, mm and degrees"),
+    "staubli": Format("any", numbers.staubli, "Staubli: X Y Z RX RY RZ, mm and degrees"),
+    "franka": Format("any", numbers.franka, "Franka: 16 numbers by column, metres"),
+}
 """All formats by name."""
 
 
@@ -119,25 +110,24 @@ def export_files(
     **options: Unpack[ExportOptions],
 ) -> Exported:
     """Export like `export_calibration`, and also return the written files."""
-    row = FORMATS.get(format.strip().lower().replace("-", "_"))
-    if row is None:
+    key = format.strip().lower().replace("-", "_")
+    if key not in FORMATS:
         raise InputError(f"export format {format!r} is not known; use one of {', '.join(FORMATS)}")
+    row = FORMATS[key]
     # easy_handeye2 looks up ~/cell.calib under the name cell.
     name = "evercal" if path is None else Path(path).name.split(".")[0] or "evercal"
     export = prepare_export(calibration, name, **options)
-    child = export.child
     if row.frame == "optical" and options.get("via") is not None:
-        raise InputError(f"{row.name} holds the pose of the camera, not of {child!r}; omit --via")
+        raise InputError(f"{key} holds the pose of the camera, not of {export.child!r}; omit --via")
     try:
         content = row.write(export)
     except InputError as error:
-        raise InputError(f"{row.name}: {error}") from None
+        raise InputError(f"{key}: {error}") from None
     text = content if isinstance(content, str) else ""
-    if path is None:
-        if not text:
-            raise InputError(f"{row.name} is not text and cannot be printed; give --out")
-        return Exported(row, export.calibration, text, ())
-    return Exported(row, export.calibration, text, _write(Path(path), content))
+    if path is None and not text:
+        raise InputError(f"{key} is not text and cannot be printed; give --out")
+    files = () if path is None else _write(Path(path), content)
+    return Exported(row, export.calibration, text, files)
 
 
 def _write(path: Path, content: Content) -> tuple[Path, ...]:

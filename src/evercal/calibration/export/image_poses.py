@@ -7,70 +7,50 @@ nerfstudio's data conventions, parser and `Cameras`.
 """
 
 import json
-from typing import NamedTuple
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
-from evercal.calibration.export.request import Export
+from evercal.calibration.export.request import Export, pose_numbers
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.recordings.poses.conventions import numbers_from_poses, pose_convention
 
 
-class _ImagePoses(NamedTuple):
-    """Camera poses of n images."""
-
-    names: tuple[str, ...]
-    stamps_s: NDArray[np.float64]
-    """(n,) seconds; 0, 1, 2, ... without time stamps."""
-    base_from_camera: SE3
-
-    def numbers(self, convention: str) -> list[list[float]]:
-        """Return the poses as numbers of a convention, without negative zeros."""
-        numbers = numbers_from_poses(self.base_from_camera, pose_convention(convention))
-        return (numbers + 0.0).tolist()
-
-
-def _image_poses(export: Export) -> _ImagePoses:
+def _image_poses(export: Export) -> tuple[tuple[str, ...], SE3]:
+    """Return the names of n images and base_from_camera (n,)."""
     robot = export.robot_poses
     if export.calibration.mount == "eye_to_hand":
         used = tuple(image.name for image in export.calibration.images if image.used)
         names = used or (f"{export.child.replace('/', '_')}.png",)
-        poses = SE3.stack([export.pose] * len(names))
-        return _ImagePoses(names, np.arange(len(names), dtype=np.float64), poses)
+        return names, SE3.stack([export.pose] * len(names))
     if robot is None:
         raise InputError(
             "the pose of a camera on the arm changes with each image;"
             " give the gripper's poses with --robot-poses"
         )
     names = robot.names or tuple(f"{i:06d}.png" for i in range(len(robot)))
-    stamps = np.arange(len(robot), dtype=np.float64) if robot.stamps_s is None else robot.stamps_s
-    return _ImagePoses(names, stamps, robot.poses @ export.pose)
+    return names, robot.poses @ export.pose
 
 
 def tum(export: Export) -> str:
     """Write lines of stamp, translation in metres, quaternion x y z w: base_from_camera."""
-    images = _image_poses(export)
-    lines = [
-        " ".join(map(repr, [stamp, *row]))
-        for stamp, row in zip(images.stamps_s.tolist(), images.numbers("xyzw"), strict=True)
-    ]
+    rows, robot = pose_numbers(_image_poses(export)[1]).tolist(), export.robot_poses
+    stamps = np.arange(len(rows), dtype=np.float64)
     if export.calibration.mount == "eye_to_hand":
-        lines = lines[:1]
+        stamps, rows = stamps[:1], rows[:1]
+    elif robot is not None and robot.stamps_s is not None:
+        stamps = robot.stamps_s
+    lines = [
+        " ".join(map(repr, [stamp, *row])) for stamp, row in zip(stamps.tolist(), rows, strict=True)
+    ]
     return "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines, ""])
 
 
 def colmap(export: Export) -> dict[str, str]:
-    """Write a sparse model without points: camera_from_base, quaternion w x y z.
-
-    Raises:
-        InputError: An image name contains white space, which COLMAP's text format cannot hold.
-    """
-    camera, images = export.camera, _image_poses(export)
-    lines = []
-    for i, (name, row) in enumerate(zip(images.names, images.numbers("wxyz:inverse"), strict=True)):
+    """Write a sparse model without points: camera_from_base, quaternion w x y z."""
+    camera, (names, poses) = export.camera, _image_poses(export)
+    lines, rows = [], pose_numbers(poses, "wxyz:inverse").tolist()
+    for i, (name, row) in enumerate(zip(names, rows, strict=True)):
         if len(name.split()) != 1:
             raise InputError(f"image name {name!r} contains a blank; rename the image")
         pose = " ".join(map(repr, [*row[3:], *row[:3]]))
@@ -90,12 +70,9 @@ def colmap(export: Export) -> dict[str, str]:
 
 
 def nerfstudio(export: Export) -> str:
-    """Write transforms.json: base_from_camera with camera axes x right, y up, z back.
-
-    Raises:
-        InputError: The distortion has terms that nerfstudio does not support.
-    """
-    camera, images = export.camera, _image_poses(export)
+    """Write transforms.json: base_from_camera with camera axes x right, y up, z back."""
+    camera, (names, poses) = export.camera, _image_poses(export)
+    matrices = pose_numbers(poses, "matrix:opengl").reshape(-1, 4, 4).tolist()
     k1, k2, p1, p2, k3, *rational = camera.coefficients
     if any(rational):
         # nerfstudio's k4 is the fourth coefficient of a polynomial, not OpenCV's k4.
@@ -105,27 +82,19 @@ def nerfstudio(export: Export) -> str:
         )
     record = {
         "camera_model": "OPENCV",
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx + 0.5,
-        "cy": camera.cy + 0.5,
+        **{"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy},
+        **{"cx": camera.cx + 0.5, "cy": camera.cy + 0.5},
         **{"k1": k1, "k2": k2, "k3": k3, "k4": 0.0, "p1": p1, "p2": p2},
         "frames": [
-            {"file_path": name, "transform_matrix": np.reshape(row, (4, 4)).tolist()}
-            for name, row in zip(images.names, images.numbers("matrix:opengl"), strict=True)
+            {"file_path": name, "transform_matrix": matrix}
+            for name, matrix in zip(names, matrices, strict=True)
         ],
     }
     return json.dumps(record, indent=1, allow_nan=False) + "\n"
 
 
 def moveit_samples(export: Export) -> str:
-    """Write the pose pairs that MoveIt Calibration solves: 4x4 matrices by row, metres.
-
-    Raises:
-        InputError: A pose has no partner.
-    """
+    """Write the pose pairs that MoveIt Calibration solves: 4x4 matrices by row, metres."""
     robot, target = export.robot_poses, export.target_poses
     if robot is None or target is None:
         raise InputError(

@@ -12,8 +12,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.export.request import Export
-from evercal.recordings.poses.conventions import numbers_from_poses, pose_convention
+from evercal.calibration.export.request import Export, pose_numbers
 
 
 def opencv(export: Export) -> str:
@@ -69,22 +68,21 @@ def as_json(export: Export) -> str:
 
 def zivid(export: Export) -> str:
     """Write the 4x4 matrix in millimetres as YAML."""
-    rows = numbers_from_poses(export.pose, pose_convention("matrix:mm")).reshape(4, 4) + 0.0
+    rows = pose_numbers(export.pose, "matrix:mm").reshape(4, 4)
     record = {"__version__": {"serializer": 1, "data": 1}, "FloatMatrix": {"Data": rows.tolist()}}
     return yaml.safe_dump(record, sort_keys=False, default_flow_style=None)
 
 
 def franka(export: Export) -> str:
     """Write 16 numbers column by column in metres, like libfranka's O_T_EE, as JSON."""
-    numbers = numbers_from_poses(export.pose, pose_convention("franka")) + 0.0
-    return json.dumps(numbers.tolist()) + "\n"
+    return json.dumps(pose_numbers(export.pose, "franka").tolist()) + "\n"
 
 
 def _controller(convention: str, text: str) -> Callable[[Export], str]:
     """Return a writer of a comment and one pose; `text` has a slot for each number."""
 
     def write(export: Export) -> str:
-        numbers = numbers_from_poses(export.pose, pose_convention(convention)).tolist()
+        numbers = pose_numbers(export.pose, convention).tolist()
         # Nine decimals and no exponents, which some controllers cannot parse.
         return text.format(*(f"{round(value, 9) + 0.0:.9f}" for value in numbers), c=export.comment)
 

@@ -3,8 +3,10 @@
 import os
 import re
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TypeAlias, TypedDict, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.export.driver_frame import (
@@ -14,6 +16,7 @@ from evercal.calibration.export.driver_frame import (
 )
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
+from evercal.recordings.poses.conventions import numbers_from_poses, pose_convention
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 
 PoseSource: TypeAlias = RobotPoses | str | os.PathLike[str] | None
@@ -101,47 +104,45 @@ def prepare_export(
     """
     parent = options.get("parent") or calibration.parent_frame
     child = options.get("child") or calibration.child_frame
-    if parent == child:
+    link, other = options.get("via"), options.get("robot_frame")
+    if parent in (child, link):
         raise InputError(f"parent and child frame are both called {parent!r}; rename one of them")
-    calibration = _at_driver_frame(
-        replace(calibration, parent_frame=parent, child_frame=child), options
-    )
-    other = options.get("robot_frame")
-    frames = {"parent": parent, "child": calibration.child_frame, "robot": other}
-    for role, frame in frames.items():
+    link_from_optical = _link_from_optical(child, options)
+    for role, frame in {"parent": parent, "child": link or child, "robot": other}.items():
         if frame is not None and not _FRAME.fullmatch(frame):
             raise InputError(
                 f"{role} frame {frame!r} is no name of a tf frame; use letters, digits, _ . - and"
                 f" inner /, such as 'camera_color_optical_frame' (rename with --parent or --child)"
             )
+    calibration = replace(calibration, parent_frame=parent, child_frame=child)
+    if link is not None:
+        calibration = published_at(calibration, link, link_from_optical)
     robot = _poses(options.get("robot_poses"), "robot", options.get("convention"))
     target = _poses(options.get("target_poses"), "target", None)
     return Export(calibration, name, other, robot, target)
 
 
-def _at_driver_frame(calibration: Calibration, options: ExportOptions) -> Calibration:
-    """Return the calibration of the driver's root frame if the options name one."""
+def pose_numbers(poses: SE3, convention: str = "xyzw") -> NDArray[np.float64]:
+    """Return (...) poses as numbers (..., k) of a convention, without negative zeros."""
+    return numbers_from_poses(poses, pose_convention(convention)) + 0.0
+
+
+def _link_from_optical(optical: str, options: ExportOptions) -> SE3:
     link, file, offset = (options.get(key) for key in ("via", "via_transform", "via_offset"))
-    sources = [file is not None, offset is not None, options.get("via_optical", False)]
-    if link is None:
-        if any(sources):
-            raise InputError("name the driver's root frame with --via, such as camera_link")
-        return calibration
-    if sum(sources) != 1:
+    sources = (file is not None) + (offset is not None) + options.get("via_optical", False)
+    if link is None and sources:
+        raise InputError("name the driver's root frame with --via, such as camera_link")
+    if link is not None and sources != 1:
         raise InputError(
             f"--via {link} needs the pose of the optical frame in it; give one of --via-transform"
             f" FILE, --via-offset X Y Z, or --via-optical if their origins are the same"
         )
-    if file is not None:
-        link_from_optical = read_link_from_optical(file, link, calibration.child_frame)
-    else:
-        link_from_optical = standard_link_from_optical(offset or (0.0, 0.0, 0.0))
-    return published_at(calibration, link, link_from_optical)
+    if link is not None and file is not None:
+        return read_link_from_optical(file, link, optical)
+    return standard_link_from_optical(offset or (0.0, 0.0, 0.0))
 
 
 def _poses(source: PoseSource, role: str, convention: str | None) -> RobotPoses | None:
     if source is None or isinstance(source, RobotPoses):
         return source
-    if not Path(source).is_file():
-        raise InputError(f"{source}: file of {role} poses is missing; check the path")
-    return read_robot_poses(source, convention)
+    return read_robot_poses(source, convention, what=f"file of {role} poses")

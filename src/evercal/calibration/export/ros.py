@@ -12,11 +12,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import yaml
 
-from evercal.calibration.export.request import Export
-from evercal.recordings.poses.conventions import CONVENTIONS, numbers_from_poses
-
-# evercal uses no marker, but the tools require a frame name.
-_MARKER_FRAME = "no_marker"
+from evercal.calibration.export.request import Export, pose_numbers
 
 
 def publisher_command(export: Export) -> str:
@@ -53,8 +49,7 @@ def generate_launch_description():
 
 def ros1_launch(export: Export) -> str:
     """Write a launch file for ROS 1 in the form of MoveIt Calibration."""
-    numbers = " ".join(map(repr, _numbers(export)))
-    arguments = quoteattr(f"{numbers} {export.parent} {export.child}")
+    arguments = quoteattr(" ".join([*_numbers(export), export.parent, export.child]))
     return f"""<launch>
   <!-- {_xml_comment(export)} x y z qx qy qz qw parent child -->
   <node pkg="tf2_ros" type="static_transform_publisher" name="{_node_name(export)}"
@@ -79,8 +74,8 @@ def urdf(export: Export) -> str:
     The angles rotate about fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll), in radians.
     """
     numbers = _numbers(export, "rpy")
-    xyz, rpy = (" ".join(map(repr, part)) for part in (numbers[:3], numbers[3:]))
-    name = re.sub(r"[^\w.-]", "_", f"{export.parent}_to_{export.child}")
+    xyz, rpy = " ".join(numbers[:3]), " ".join(numbers[3:])
+    name = _node_name(export, r"\w.-")
     return f"""<joint name={quoteattr(name)} type="fixed">
   <!-- {_xml_comment(export)} -->
   <parent link={quoteattr(export.parent)}/>
@@ -101,8 +96,9 @@ def easy_handeye2(export: Export) -> str:
         "move_group_namespace": "/",
         "move_group": "manipulator",
     }
-    calibration = {"parameters": parameters, "transform": _transform(export)}
-    return yaml.safe_dump(calibration, sort_keys=False)
+    return yaml.safe_dump(
+        {"parameters": parameters, "transform": _transform(export)}, sort_keys=False
+    )
 
 
 def easy_handeye(export: Export) -> str:
@@ -114,9 +110,8 @@ def easy_handeye(export: Export) -> str:
         "eye_on_hand": export.calibration.mount == "eye_in_hand",
         **_handeye_frames(export),
     }
-    transformation = dict(
-        zip(("x", "y", "z", "qx", "qy", "qz", "qw"), _numbers(export), strict=True)
-    )
+    names = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    transformation = dict(zip(names, pose_numbers(export.pose).tolist(), strict=True))
     calibration = {"parameters": parameters, "transformation": transformation}
     return yaml.safe_dump(calibration, sort_keys=False)
 
@@ -138,41 +133,36 @@ def camera_info(export: Export) -> str:
     return yaml.safe_dump(info, sort_keys=False, default_flow_style=None)
 
 
-def _numbers(export: Export, convention: str = "xyzw") -> list[float]:
-    """Return the pose as numbers, without negative zeros."""
-    return (numbers_from_poses(export.pose, CONVENTIONS[convention]) + 0.0).tolist()
+def _numbers(export: Export, convention: str = "xyzw") -> list[str]:
+    return [repr(number) for number in pose_numbers(export.pose, convention).tolist()]
 
 
 def _transform(export: Export) -> dict[str, dict[str, float]]:
     """Return the fields of geometry_msgs/Transform."""
-    numbers = _numbers(export)
-    return {
-        "translation": dict(zip("xyz", numbers[:3], strict=True)),
-        "rotation": dict(zip("xyzw", numbers[3:], strict=True)),
-    }
+    x, y, z, *rotation = pose_numbers(export.pose).tolist()
+    rotation = dict(zip("xyzw", rotation, strict=True))
+    return {"translation": {"x": x, "y": y, "z": z}, "rotation": rotation}
 
 
 def _flags(export: Export) -> dict[str, str]:
     names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
-    flags = dict(zip(names, map(repr, _numbers(export)), strict=True))
+    flags = dict(zip(names, _numbers(export), strict=True))
     return {**flags, "--frame-id": export.parent, "--child-frame-id": export.child}
 
 
 def _handeye_frames(export: Export) -> dict[str, str]:
     """Return the four frames of a hand-eye setup; the calibration itself names two of them."""
-    base, gripper = export.parent, export.robot_frame or "gripper"
-    if export.calibration.mount == "eye_in_hand":
-        base, gripper = export.robot_frame or "base", export.parent
+    in_hand, other = export.calibration.mount == "eye_in_hand", export.robot_frame
     return {
-        "robot_base_frame": base,
-        "robot_effector_frame": gripper,
+        "robot_base_frame": other or "base" if in_hand else export.parent,
+        "robot_effector_frame": export.parent if in_hand else other or "gripper",
         "tracking_base_frame": export.child,
-        "tracking_marker_frame": _MARKER_FRAME,
+        "tracking_marker_frame": "no_marker",  # the tools require a name
     }
 
 
-def _node_name(export: Export) -> str:
-    return re.sub(r"\W", "_", f"{export.parent}_to_{export.child}")
+def _node_name(export: Export, allowed: str = r"\w") -> str:
+    return re.sub(f"[^{allowed}]", "_", f"{export.parent}_to_{export.child}")
 
 
 def _xml_comment(export: Export) -> str:

@@ -1,5 +1,7 @@
 """Checks of a hand-eye fit: held-out poses, repeatability and plausibility."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,12 +27,7 @@ _FAR_M = 0.4
 def held_out_error(equation: PoseEquation, fit: HandEyeFit, noise: Array) -> dict[str, float]:
     """Compare each pose with the prediction from the other poses, by 5-fold cross-validation.
 
-    The error includes the noise of the held-out pose.
-
-    Args:
-        equation: Poses of the fit.
-        fit: Fit to check.
-        noise: (n, 6, 6) covariance of the residuals, `fit_weights`.
+    The error includes the noise of the held-out pose. `noise` are the `fit_weights`.
 
     Returns:
         `held_out_mm`, `held_out_deg` (medians) and `held_out_rms_mm`, `held_out_rms_deg` (root mean
@@ -49,21 +46,12 @@ def held_out_error(equation: PoseEquation, fit: HandEyeFit, noise: Array) -> dic
         lengths.append(np.linalg.norm(residual, axis=2))
     error = np.concatenate(lengths) * (1000.0, 180 / np.pi)
     rms, median = np.sqrt((error**2).mean(0)), np.median(error, 0)
-    return {
-        "held_out_mm": float(median[0]),
-        "held_out_deg": float(median[1]),
-        "held_out_rms_mm": float(rms[0]),
-        "held_out_rms_deg": float(rms[1]),
-    }
+    names = ("held_out_mm", "held_out_deg", "held_out_rms_mm", "held_out_rms_deg")
+    return dict(zip(names, (*median.tolist(), *rms.tolist()), strict=True))
 
 
 def repeatability(equation: PoseEquation, fit: HandEyeFit, noise: Array) -> dict[str, float]:
-    """Compare the calibrations from two halves of the poses.
-
-    Args:
-        equation: Sorted poses of the fit, so that both halves cover the same volume.
-        fit: Fit to check.
-        noise: (n, 6, 6) covariance of the residuals, `fit_weights`.
+    """Compare the calibrations from two halves of the sorted poses.
 
     Returns:
         `repeatability_mm` and `repeatability_deg`; empty for fewer than twelve poses.
@@ -84,12 +72,6 @@ def plausibility_warnings(
     equation: PoseEquation, fit: HandEyeFit, noise: Array, mount: Mount
 ) -> list[str]:
     """Return warnings about a fit that is consistent but implausible.
-
-    Args:
-        equation: Poses of the fit.
-        fit: Fit to check.
-        noise: (n, 6, 6) covariance of the residuals.
-        mount: Stated mount.
 
     Raises:
         InputError: Camera and robot clearly use different units of length.
@@ -118,7 +100,7 @@ def plausibility_warnings(
 
 def _scale_warnings(equation: PoseEquation, fit: HandEyeFit, noise: Array) -> list[str]:
     """Estimate the scale between camera and robot, which should be 1."""
-    free = equation.freed()
+    free = replace(equation, scale_known=False)
     at = refine(free, fit.at, noise, fit.inliers)
     selected = free[fit.inliers]
     jacobian = selected.jacobian(at, selected.residuals(at))

@@ -27,15 +27,7 @@ class RobotWorld(NamedTuple):
 
 
 def motions(fixed_from_parent: SE3, camera_from_board: SE3) -> tuple[SE3, SE3]:
-    """Compute the motions of parent and camera between all pairs i < j of n poses.
-
-    Args:
-        fixed_from_parent: (n,) poses of the frame that carries the camera.
-        camera_from_board: (n,) poses of the board, which is fixed in `fixed`.
-
-    Returns:
-        (n (n - 1) / 2,) `parent_i_from_parent_j` and `camera_i_from_camera_j`.
-    """
+    """Return `parent_i_from_parent_j` and `camera_i_from_camera_j` for all i < j of n poses."""
     i, j = np.triu_indices(len(fixed_from_parent), 1)
     a = fixed_from_parent[i].inverse() @ fixed_from_parent[j]
     b = camera_from_board[i] @ camera_from_board[j].inverse()
@@ -56,14 +48,7 @@ def park(a: SE3, b: SE3, scale_known: bool = True) -> tuple[SE3, float]:
 
     Returns:
         `parent_from_camera` and the scale, metres per unit of the translations of `b`.
-
-    Raises:
-        ValueError: There are fewer than two motions, or the counts differ.
     """
-    if len(a) < 2 or len(a) != len(b):
-        raise ValueError(
-            f"at least two motions of robot and camera are required, got {len(a)} and {len(b)}"
-        )
     rotation = Rotation.align_vectors(_sine_axes(a), _sine_axes(b))[0]
     rotated = rotation.apply(b.translation_m)
     system = a.rotation_matrix() - np.eye(3)
@@ -78,25 +63,12 @@ def park(a: SE3, b: SE3, scale_known: bool = True) -> tuple[SE3, float]:
 
 
 def shah(fixed_from_parent: SE3, camera_from_board: SE3, scale_known: bool = True) -> RobotWorld:
-    """Solve the robot-world equation, linearly in both rotations.
+    """Solve the robot-world equation of three or more poses, linearly in both rotations.
 
     M. Shah, Solving the robot-world/hand-eye calibration problem using the Kronecker product,
     2013. Rotations by 180 degrees need no special treatment.
-
-    Args:
-        fixed_from_parent: (n,), n >= 3.
-        camera_from_board: (n,).
-        scale_known: Whether the translations of `camera_from_board` are in metres.
-
-    Raises:
-        ValueError: There are fewer than three poses, or the counts differ.
     """
     n = len(fixed_from_parent)
-    if n < 3 or len(camera_from_board) != n:
-        raise ValueError(
-            f"Shah's method requires at least three poses of robot and camera, got {n} and"
-            f" {len(camera_from_board)}"
-        )
     robot, camera = fixed_from_parent.rotation_matrix(), camera_from_board.rotation_matrix()
     # vec(F X C) = (C' kron F) vec(X), with stacked columns.
     kronecker = np.einsum("nlk,nij->kilj", camera, robot).reshape(9, 9)

@@ -40,11 +40,7 @@ class _Boards(NamedTuple):
 
 
 def consensus_start(equation: PoseEquation) -> Unknowns:
-    """Return the hypothesis that agrees best with the better half of the poses.
-
-    Args:
-        equation: At least three poses with rotations about two axes.
-    """
+    """Return the hypothesis that agrees best with the better half of three or more poses."""
     n = len(equation)
     scored = equation[np.unique(np.linspace(0, n - 1, _SCORED).round().astype(int))]
     sampled, closed = _from_triples(equation, _triples(n)), _from_all_poses(scored)

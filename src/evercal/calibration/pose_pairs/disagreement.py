@@ -47,24 +47,16 @@ class _Reading(NamedTuple):
 
 
 class _Angles(NamedTuple):
-    """Rotation angles between all pairs of poses."""
+    """Rotation angles between all pairs of poses, radians."""
 
     mismatch: float
-    """Lower quartile of the differences between robot and camera, radians."""
+    """Lower quartile of the differences between robot and camera."""
     robot: Array
-    """(n (n - 1) / 2,) radians."""
     camera: Array
-    """(n (n - 1) / 2,) radians."""
 
 
 def require_agreement(pairs: PosePairs, mount: Mount, scale_known: bool, fit: Agreement) -> None:
     """Check that pose pairs agree, and diagnose them otherwise.
-
-    Args:
-        pairs: Fitted pairs.
-        mount: Stated mount.
-        scale_known: Whether the camera's translations are stated to be in metres.
-        fit: Residuals of the pairs.
 
     Raises:
         InputError: Another reading of the poses fits far better, or the residuals are too large.
@@ -192,11 +184,7 @@ def _angles(robot: SE3, camera: SE3) -> _Angles:
 
 
 def _require_unit(pairs: PosePairs, mount: Mount, fit: Agreement) -> None:
-    """Refuse camera lengths in another unit than the robot's.
-
-    Raises:
-        InputError: The pairs agree only after scaling of the camera's translations.
-    """
+    """Refuse camera lengths in another unit than the robot's."""
     free = agreement(pairs.equation(mount, False))
     if free.metres * _BETTER > fit.metres or free.radians > 1.5 * fit.radians + 1e-4:
         return

@@ -39,7 +39,6 @@ class HandEyeFit:
     """The refined estimate."""
 
     at: Unknowns
-    """Transforms, scale and time offset."""
     covariance: Array
     """(p, p) covariance of the unknowns, before multiplication by `factor`."""
     factor: float
@@ -51,7 +50,6 @@ class HandEyeFit:
     distance2: Array
     """(n,) squared Mahalanobis distance of each residual."""
     levels: NoiseLevels
-    """Estimated noise."""
     contributions: Array
     """(k, 6, 6) covariance of `parent_from_camera` due to each kind of noise."""
 
@@ -61,7 +59,6 @@ class Agreement:
     """A quick robust estimate and its residuals."""
 
     at: Unknowns
-    """Estimate from most poses."""
     metres: float
     """Standard deviation of the board position per axis."""
     radians: float
@@ -71,11 +68,7 @@ class Agreement:
 
 
 def agreement(equation: PoseEquation) -> Agreement:
-    """Estimate how well poses agree.
-
-    Args:
-        equation: At least four poses.
-    """
+    """Estimate how well four or more poses agree."""
     n, at = len(equation), consensus_start(equation)
     # Median length of a 3-D normal variable, corrected for the degrees of freedom of the fit.
     to_sigma = np.sqrt(n / max(n - 2.0, 1.0)) / np.sqrt(chi2.ppf(0.5, 3))
@@ -96,12 +89,7 @@ def agreement(equation: PoseEquation) -> Agreement:
 
 
 def robust_fit(equation: PoseEquation, start: Agreement) -> HandEyeFit:
-    """Refine an estimate and reject outliers.
-
-    Args:
-        equation: At least four sorted poses with rotations about two axes.
-        start: `agreement(equation)`.
-    """
+    """Refine the result of `agreement` for at least four sorted poses, and reject outliers."""
     at, inliers = start.at, start.inliers
     if inliers.sum() < MIN_POSES:  # outliers cannot be detected; all poses widen the covariance
         inliers = np.ones(len(equation), dtype=bool)
@@ -136,8 +124,8 @@ def refine(equation: PoseEquation, at: Unknowns, covariance: Array, use: Mask) -
     Args:
         equation: n poses.
         at: Start within a few degrees and centimetres.
-        covariance: (n, 6, 6) covariance of the residuals.
-        use: (n,) poses to use.
+        covariance: (n, 6, 6) of the residuals.
+        use: (n,).
     """
     selected, weight = equation[use], np.linalg.inv(covariance[use])
     for _ in range(30):
@@ -195,13 +183,12 @@ def _noise(equation: PoseEquation, at: Unknowns, levels: NoiseLevels) -> Array:
 
 
 def _converged(before: NoiseLevels | None, now: NoiseLevels) -> bool:
-    if before is None:
-        return False
-    return bool(np.abs(now.variance - before.variance).max() <= 0.05 * now.variance.max())
+    return before is not None and bool(
+        np.abs(now.variance - before.variance).max() <= 0.05 * now.variance.max()
+    )
 
 
 def _result(equation: PoseEquation, at: Unknowns, use: Mask, levels: NoiseLevels) -> HandEyeFit:
-    """Return the fit with its covariance."""
     noise = _noise(equation, at, levels)
     selected, residual = equation[use], equation.residuals(at)
     jacobian = selected.jacobian(at, residual[use])

@@ -41,9 +41,7 @@ class NoiseLevels:
     def covariances(self, directions: Mapping[str, Array], known: Array) -> Array:
         """Return the (n, 6, 6) covariance of the residuals.
 
-        Args:
-            directions: (n, 6, c) residuals due to unit errors, by kind.
-            known: (n, 6, 6) known covariance to add.
+        `directions` (n, 6, c) are residuals due to unit errors, `known` (n, 6, 6) is added.
         """
         columns = np.concatenate([directions[kind] for kind in self.kinds], 2)
         counts = [directions[kind].shape[2] for kind in self.kinds]
@@ -89,15 +87,11 @@ def estimate_levels(
 
 
 def working_noise(noise: Array, use: NDArray[np.bool_]) -> Array:
-    """Return the covariance for the weights of a fit: the estimate, made more even.
+    """Return the covariance (n, 6, 6) for the weights of a fit: the estimate, made more even.
 
     Estimated levels may assign almost no noise to some combination of translation and rotation, and
     the fit would then depend on it. A share of isotropic noise, equal for all poses, costs little
     accuracy if the levels are right and makes the fit robust if they are wrong.
-
-    Args:
-        noise: (n, 6, 6) estimated covariance.
-        use: (n,) poses to use.
     """
     mean = noise[use].mean(0)
     metres2, radians2 = np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3
@@ -173,7 +167,7 @@ def ellipsoid_factor(covariance: Array, slopes: Array, uncertainty: Array) -> fl
     factor, the chi-square quantile of 95 % has a coverage of 95 %.
 
     Args:
-        covariance: (d, d) covariance.
+        covariance: (d, d).
         slopes: (k, d, d) derivatives of the covariance by the variances of the noise.
         uncertainty: (k, k) covariance of the variances.
     """

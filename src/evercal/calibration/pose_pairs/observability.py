@@ -1,7 +1,6 @@
 """Check that pose pairs determine the calibration, before it is solved."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,29 +13,14 @@ from evercal.geometry import SE3, pose_distance
 Array = NDArray[np.floating]
 
 _FAR_M = 20.0
-_MIN_ROTATION_RAD, _MIN_SECOND_RAD = np.deg2rad(2.0), np.deg2rad(1.0)
+_MIN_ROTATION_DEG, _MIN_SECOND_DEG = 2.0, 1.0
 _MIN_TRANSLATION_M = 0.01
 _STILL_M, _STILL_RAD = 1e-3, np.deg2rad(0.1)
 _RECORD = "record 15 to 25 poses that differ by 20 to 60 deg about two axes and by 10 cm or more"
 
 
-class _Spread(NamedTuple):
-    """Rotations between poses."""
-
-    main_rad: float
-    """Root mean square angle about the main axis."""
-    second_rad: float
-    """Root mean square angle about the second axis."""
-    axis: Array
-    """(3,) main axis in the frame of a pose."""
-
-
 def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
     """Check that the pairs determine the calibration.
-
-    Args:
-        pairs: All pairs in the order of the recording.
-        scale_known: Whether the camera's translations are stated to be in metres.
 
     Raises:
         InputError: There are too few different poses, lengths are not in metres, robot or camera
@@ -72,40 +56,28 @@ def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
 
 
 def require_rotations(base_from_gripper: SE3) -> None:
-    """Check that the gripper rotated about two axes.
-
-    Args:
-        base_from_gripper: (n,) different poses.
-
-    Raises:
-        InputError: The gripper never rotated, or about one axis only.
-    """
-    spread = _rotation_spread(base_from_gripper)
-    main, second = np.rad2deg(spread.main_rad), np.rad2deg(spread.second_rad)
-    if spread.main_rad < _MIN_ROTATION_RAD:
+    """Refuse gripper poses (n,) without rotation, or with rotation about one axis only."""
+    rows = np.unique(np.linspace(0, len(base_from_gripper) - 1, 100).round().astype(int))
+    i, j = np.triu_indices(len(rows), 1)
+    motions = base_from_gripper[rows[i]].inverse() @ base_from_gripper[rows[j]]
+    rotations = 2.0 * motions.rotation_wxyz[:, 1:]
+    values, axes = np.linalg.eigh(rotations.T @ rotations / len(rotations))
+    # Root mean square angles about the main and the second axis.
+    main, second = np.rad2deg(np.sqrt(np.maximum(values[[2, 1]], 0)))
+    if main < _MIN_ROTATION_DEG:
         raise InputError(
             f"pure translation: the gripper never turned (by {main:.1f} deg rms), so the position"
             f" of the camera is not determined; turn the wrist by 20 to 60 deg between poses, about"
             f" two different axes"
         )
-    if spread.second_rad < _MIN_SECOND_RAD:
-        axis = " ".join(f"{value:+.2f}" for value in spread.axis)
+    if second < _MIN_SECOND_DEG:
+        axis = " ".join(f"{value:+.2f}" for value in axes[:, 2])
         raise InputError(
             f"parallel axes: the gripper turned about one axis only ({axis} in the gripper frame;"
             f" {main:.0f} deg rms about it, {second:.1f} deg about others), so the position of the"
             f" camera along it is not determined; record poses that also tilt the gripper by 20 deg"
             f" or more about another axis"
         )
-
-
-def _rotation_spread(poses: SE3) -> _Spread:
-    """Return the rotations between (n,) poses, n >= 2."""
-    selected = poses[np.unique(np.linspace(0, len(poses) - 1, 100).round().astype(int))]
-    i, j = np.triu_indices(len(selected), 1)
-    rotations = 2.0 * (selected[i].inverse() @ selected[j]).rotation_wxyz[:, 1:]
-    values, axes = np.linalg.eigh(rotations.T @ rotations / len(rotations))
-    main, second = np.sqrt(np.maximum(values[[2, 1]], 0))
-    return _Spread(float(main), float(second), axes[:, 2])
 
 
 def _require_metres(poses: SE3, names: Sequence[str], role: str) -> None:

@@ -30,9 +30,8 @@ class PairFiles:
     camera: Path
     """camera_from_board: the file of `evercal detect`, or a file like that of the robot."""
     robot_convention: str | None = None
-    """Pose convention of a robot file without a header."""
+    """Pose convention of a file without a header."""
     camera_convention: str | None = None
-    """Pose convention of a camera file without a header."""
     invert: Inverted | None = None
     """Files that hold inverted poses: gripper_from_base, board_from_camera."""
 
@@ -42,7 +41,6 @@ class _CameraPoses:
     """All images of a camera file."""
 
     names: tuple[str, ...] | None
-    """(n,) image names, if the file has them."""
     stamps_s: NDArray[np.float64] | None
     """(n,) times from the file or from the names."""
     poses: list[SE3 | None]
@@ -92,11 +90,7 @@ def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
 
 
 def read_streams(files: PairFiles) -> tuple[PoseTrack, CameraTrack]:
-    """Read robot and camera poses with times of separate clocks.
-
-    Raises:
-        InputError: A file is broken or has no times.
-    """
+    """Read robot and camera poses with times of separate clocks, or raise InputError."""
     robot, camera = _read_robot(files), _read_camera(files)
     if robot.stamps_s is None:
         raise InputError(f"{files.robot}: has no times; --time-offset takes a column stamp_s")

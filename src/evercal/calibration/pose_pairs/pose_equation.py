@@ -36,12 +36,12 @@ class Unknowns:
 
     @property
     def parent_from_camera(self) -> SE3:
-        """The calibration, a single transform."""
+        """The calibration."""
         return se3(self.rotations[0], self.translations[0])
 
     @property
     def fixed_from_board(self) -> SE3:
-        """Board pose in the fixed frame, a single transform."""
+        """Board pose in the fixed frame."""
         return se3(self.rotations[1], self.translations[1])
 
     def moved(self, step: Array, scale_known: bool) -> "Unknowns":
@@ -101,10 +101,6 @@ class PoseEquation:
         """Return the number of poses."""
         return len(self.robot_translation)
 
-    def freed(self) -> Self:
-        """Return the equation with an unknown scale."""
-        return replace(self, scale_known=False)
-
     @property
     def unknowns(self) -> int:
         """Number of unknowns: 12, then one for the scale and one for the time offset."""
@@ -123,12 +119,7 @@ class PoseEquation:
         return residual + at.offset_s * self.jacobian(at, residual)[:, :, -1]
 
     def jacobian(self, at: Unknowns, residual: Array) -> Array:
-        """Return the (n, 6, unknowns) derivatives of the residuals.
-
-        Args:
-            at: Point of linearization.
-            residual: (n, 6) `residuals(at)`.
-        """
+        """Return the (n, 6, unknowns) derivatives of the residuals (n, 6)."""
         robot = self.robot_rotation
         fixed_from_camera = robot @ at.rotations[0]
         board_in_camera = at.scale * self.camera_translation
@@ -142,9 +133,8 @@ class PoseEquation:
         if not self.scale_known:
             jacobian[:, :3, 12] = (fixed_from_camera @ board_in_camera[..., None])[..., 0]
         if self.velocity is not None:
-            lever = (fixed_from_camera @ board_in_camera[..., None])[
-                ..., 0
-            ] + robot @ at.translations[0]
+            lever = (fixed_from_camera @ board_in_camera[..., None])[..., 0]
+            lever = lever + robot @ at.translations[0]
             angular = self.velocity[:, 3:]
             jacobian[:, :3, -1] = self.velocity[:, :3] + np.cross(angular, lever)
             jacobian[:, 3:, -1] = (slope @ angular[..., None])[..., 0]
@@ -164,10 +154,7 @@ class PoseEquation:
         """Return the residuals due to unit errors of each kind of noise, (n, 6, c) by kind.
 
         A unit is one metre or one radian. A rotation about a distant point also moves the board.
-
-        Args:
-            at: Point of linearization.
-            plain: Omit the kinds that only many poses can separate from the others.
+        With `plain`, kinds that only many poses can separate from the others are omitted.
         """
         n = len(self)
         board, parent = at.translations[1], self.robot_translation

@@ -141,11 +141,7 @@ class PairSolution:
         return float(np.sqrt(self.fit.factor * self.fit.covariance[-1, -1]))
 
     def calibration(self, time_offset_s: float | None = None) -> Calibration:
-        """Return the calibration with its checks and verdict.
-
-        Args:
-            time_offset_s: Time offset to report instead of the offset of the fit.
-        """
+        """Return the calibration, with another time offset than that of the fit if given."""
         covariance = self.fit.factor * self.fit.covariance[:6, :6]
         calibration = Calibration(
             mount=self.mount,
@@ -161,7 +157,6 @@ class PairSolution:
         return replace(calibration, verdict=verdict(calibration))
 
     def _checks(self, time_offset_s: float | None) -> dict[str, Any]:
-        """Return the JSON values of `Calibration.checks`."""
         fit, noise = self.fit, fit_weights(self.equation, self.fit)
         used = fit.residual[fit.inliers].reshape(-1, 2, 3)
         rms = np.sqrt((used**2).sum(2).mean(0))
@@ -202,14 +197,13 @@ class PairSolution:
             row = row_of[i]
             lengths = np.linalg.norm(self.fit.residual[row].reshape(2, 3), axis=1)
             mm, deg = 1000 * float(lengths[0]), float(np.rad2deg(lengths[1]))
-            used, reason = bool(self.fit.inliers[row]), ""
-            if not used:
-                sigmas = float(np.sqrt(self.fit.distance2[row] / 6))
-                reason = (
-                    f"disagrees with the others by {mm:.1f} mm and {deg:.2f} deg, {sigmas:.1f}"
-                    f" times their noise"
-                )
-            uses.append(ImageUse(name, used, reason, mm, deg))
+            sigmas = float(np.sqrt(self.fit.distance2[row] / 6))
+            reason = (
+                f"disagrees with the others by {mm:.1f} mm and {deg:.2f} deg, {sigmas:.1f} times"
+                " their noise"
+            )
+            used = bool(self.fit.inliers[row])
+            uses.append(ImageUse(name, used, "" if used else reason, mm, deg))
         return tuple(uses)
 
     def _error_terms(self) -> tuple[ErrorTerm, ...]:
@@ -278,11 +272,7 @@ def _with_other_board_poses(
 
 
 def _require_determined(used: PosePairs, fit: HandEyeFit, equation: PoseEquation) -> None:
-    """Check that the inliers alone determine the calibration.
-
-    Raises:
-        InputError: They rotate about one axis only, or leave the scale or the position open.
-    """
+    """Check that the inliers alone determine the calibration."""
     require_rotations(used.base_from_gripper)
     least = least_sigma(equation, fit)
     if not equation.scale_known and not max(_log_scale_sigma(fit), least[12]) < _SCALE_SIGMA:
@@ -303,7 +293,6 @@ def _log_scale_sigma(fit: HandEyeFit) -> float:
 
 
 def _error_term(name: str, covariance: Array) -> ErrorTerm:
-    mm2, rad2 = np.trace(covariance[:3, :3]) / 3, np.trace(covariance[3:, 3:]) / 3
-    return ErrorTerm(
-        name, 1000 * float(np.sqrt(max(mm2, 0))), float(np.rad2deg(np.sqrt(max(rad2, 0))))
-    )
+    m2, rad2 = np.trace(covariance[:3, :3]) / 3, np.trace(covariance[3:, 3:]) / 3
+    metres, radians = np.sqrt(max(m2, 0)), np.sqrt(max(rad2, 0))
+    return ErrorTerm(name, 1000 * float(metres), float(np.rad2deg(radians)))

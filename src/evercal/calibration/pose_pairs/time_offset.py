@@ -31,11 +31,10 @@ class CameraTrack:
     """Board poses of images with time stamps."""
 
     names: tuple[str, ...]
-    """(n,) image names."""
     stamps_s: Array
     """(n,) seconds of the camera clock."""
     camera_from_board: SE3
-    """(n,) poses."""
+    """(n,)."""
     corners: BoardCorners | None = None
     """Corners of the images, in the same order."""
 
@@ -61,8 +60,8 @@ def solve_with_offset(
     Args:
         robot: base_from_gripper over time, dense enough for interpolation.
         camera: Board poses over time; some images must show the robot in motion.
-        mount: As for `solve`.
-        scale_known: As for `solve`.
+        mount: See `solve`.
+        scale_known: See `solve`.
         largest_s: Maximum offset.
 
     Returns:
@@ -94,14 +93,7 @@ def solve_with_offset(
 
 
 def interpolated_pairs(robot: PoseTrack, camera: CameraTrack) -> tuple[PosePairs, CameraTrack]:
-    """Interpolate the robot poses at the image times of one common clock.
-
-    Returns:
-        The pairs, and the images within the robot's track.
-
-    Raises:
-        InputError: All images are outside the robot's track.
-    """
+    """Interpolate robot poses at image times of the same clock; return the images inside, too."""
     pairs, overlapping = _pairs_at(robot, camera, 0.0)
     return replace(pairs, velocity=None), overlapping
 

@@ -18,15 +18,9 @@ def forgetting_curves(methods: Mapping[str, ArrayLike], scenes: Sequence[str]) -
         methods: By name (N, N) accuracies in per cent: row i after stage i, column j the scene
             learned in stage j. Entries above the diagonal are ignored.
         scenes: N names in order of learning.
-
-    Raises:
-        ValueError: A matrix is not (N, N).
     """
     matrices = {name: np.asarray(rows, dtype=np.float64) for name, rows in methods.items()}
     count = len(scenes)
-    for name, matrix in matrices.items():
-        if matrix.shape != (count, count):
-            raise ValueError(f"{name}: {count} scenes need ({count}, {count}), got {matrix.shape}")
     columns = min(4, count + 1)
     rows = -(-(count + 1) // columns)
     figure = new_figure(2.6 * columns + 0.4, 2.1 * rows + 0.7)
@@ -62,17 +56,12 @@ def scene_bars(methods: Mapping[str, ArrayLike], scenes: Sequence[str]) -> bytes
     Args:
         methods: By name (N,) accuracies in per cent.
         scenes: N names.
-
-    Raises:
-        ValueError: The number of accuracies differs from the number of scenes.
     """
     figure = new_figure(max(5.4, 1.6 + 0.22 * len(scenes) * (len(methods) + 1)), 3.2)
     panel = figure.subplots()
     width = 1.0 / (len(methods) + 1)
     for index, (name, values) in enumerate(methods.items()):
         heights = np.asarray(values, dtype=np.float64)
-        if heights.shape != (len(scenes),):
-            raise ValueError(f"{name}: {len(scenes)} scenes need as many numbers, got {heights}")
         left = np.arange(len(scenes)) + index * width
         colour = COLOURS[index % len(COLOURS)]
         hatch = ("", "//", "..", "xx")[index // len(COLOURS) % 4]

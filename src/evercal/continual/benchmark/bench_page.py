@@ -11,13 +11,15 @@ from evercal.continual.benchmark.bench_charts import (
     scene_bars,
 )
 from evercal.continual.benchmark.comparison import Run, TableRows, by_strategy
-from evercal.continual.benchmark.report_data import Report, Tables
+from evercal.continual.benchmark.report_data import TITLES, Report
 from evercal.reports.charts import error_curve
 from evercal.reports.page import Picture, Table, render
 
 
 def bench_page(
-    report: Report, tables: Tables, views: Mapping[str, Sequence[Picture]] | None = None
+    report: Report,
+    tables: Mapping[str, TableRows],
+    views: Mapping[str, Sequence[Picture]] | None = None,
 ) -> str:
     """Write the report.
 
@@ -43,11 +45,8 @@ def bench_page(
     return render(
         "benchmark.html",
         title="evercal bench",
-        tables={
-            name: _table(rows)
-            for name, rows in vars(tables).items()
-            if name != "compare_with" or report.compare_with
-        },
+        tables=dict.fromkeys(TITLES)
+        | {name: Table(rows[0], rows[1:]) for name, rows in tables.items()},
         scene_bars=Picture(scene_bars(ends, scenes), f"Final accuracy on each scene{caption}"),
         forgetting=_forgetting(runs),
         views=views or {},
@@ -106,7 +105,3 @@ def _keyframes(runs: Sequence[Run]) -> list[Picture]:
 
 def _label(names: Sequence[str]) -> str:
     return names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")
-
-
-def _table(rows: TableRows) -> Table | None:
-    return Table(rows[0], rows[1:]) if len(rows) > 1 else None

@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from evercal.continual.benchmark.published import LOOSE, PublishedScene
 from evercal.continual.benchmark.results import NETWORK, SceneResult
-from evercal.continual.benchmark.statistics import Interval, frame_pieces, paired_difference
+from evercal.continual.benchmark.statistics import Interval, frame_pieces, mean_interval
 from evercal.errors import InputError
 from evercal.evaluation.metrics import (
     COARSE,
@@ -272,23 +272,17 @@ def scene_rows(runs: Sequence[Run]) -> TableRows:
     """Tabulate the accuracy of each scene: just after learning it -> at the end."""
     import pandas
 
-    columns = ["strategy", "scene", "learned", "end"]
-    accuracies = [
+    cells = [
         (run.strategy, scene, run.matrix()[i, i], run.matrix()[-1, i])
         for run in runs
         for i, scene in enumerate(run.scenes)
     ]
-    frame = pandas.DataFrame(accuracies, columns=columns)
-    means = frame.pivot_table(index=columns[:2], aggfunc="mean", sort=False)
-    cells = {
-        key: f"{number(learned)} -> {number(end)}"
-        for key, learned, end in zip(means.index, means["learned"], means["end"], strict=True)
-    }
-    names = sorted(runs[0].scenes)
-    rows = [
-        [strategy, *(cells[strategy, name] for name in names)] for strategy in by_strategy(runs)
-    ]
-    return [["strategy", *names], *rows]
+    frame = pandas.DataFrame(cells, columns=["strategy", "scene", "learned", "end"])
+    means = frame.groupby(["strategy", "scene"], sort=False).mean()
+    ends = zip(means["learned"], means["end"], strict=True)
+    text = pandas.Series([f"{number(a)} -> {number(b)}" for a, b in ends], index=means.index)
+    by_scene = text.unstack(sort=False)[sorted(runs[0].scenes)].reset_index()
+    return [list(by_scene.columns), *by_scene.to_numpy().tolist()]
 
 
 def difference_rows(runs: Sequence[Run], reference: str) -> TableRows:
@@ -307,7 +301,7 @@ def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
     """Estimate the difference of final accuracies of two strategies, as shares in [-1, 1].
 
     Returns:
-        Mean and 95 % interval over runs of frames and seeds (`paired_difference`). None without a
+        Mean and 95 % interval over runs of frames and seeds (`mean_interval`). None without a
         common seed, or if a scene has a single test frame.
     """
     pairs = [(a, b) for a in ours for b in theirs if a.seed == b.seed]
@@ -317,11 +311,11 @@ def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
     pieces = [frame_pieces(pairs[0][0].end(name).frames) for name in names]
     if any(labels[-1] == 0 for labels in pieces):
         return None
-    first, second = (
-        [np.array([pair[which].end(name).correct() for pair in pairs], float) for name in names]
-        for which in (0, 1)
-    )
-    interval = paired_difference(first, second, pieces)
+    gains = [
+        np.array([a.end(name).correct().astype(float) - b.end(name).correct() for a, b in pairs])
+        for name in names
+    ]
+    interval = mean_interval(gains, pieces)
     return Interval(interval.mean, max(interval.low, -1.0), min(interval.high, 1.0))
 
 
@@ -332,9 +326,9 @@ def summary(runs: Sequence[Run]) -> dict[str, list[dict[str, object]]]:
             {
                 "seed": run.seed,
                 "scenes": list(run.scenes),
-                "accuracy_5cm_5deg": _plain(run.matrix()),
-                "accuracy_1cm_1deg": _plain(run.matrix(FINE)),
-                **{key: _plain(value) for key, value in asdict(run.scores()).items()},
+                "accuracy_5cm_5deg": _plain(run.matrix().round(3).tolist()),
+                "accuracy_1cm_1deg": _plain(run.matrix(FINE).round(3).tolist()),
+                **run.scores().to_dict(),
                 "memory_bytes": run.last[0].memory_bytes,
                 "head_bytes": run.last[0].head_bytes,
                 "seconds": run.seconds,
@@ -345,7 +339,5 @@ def summary(runs: Sequence[Run]) -> dict[str, list[dict[str, object]]]:
     }
 
 
-def _plain(value: object) -> object:
-    if isinstance(value, np.ndarray):
-        return [[None if math.isnan(v) else round(v, 3) for v in row] for row in value.tolist()]
-    return None if isinstance(value, float) and math.isnan(value) else value
+def _plain(matrix: list[list[float]]) -> list[list[float | None]]:
+    return [[None if math.isnan(value) else value for value in row] for row in matrix]

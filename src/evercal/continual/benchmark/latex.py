@@ -35,16 +35,13 @@ PUBLISHED: Mapping[str, Mapping[str, tuple[float, float]]] = {
 """Published final accuracy and TFR in per cent, by suite and strategy."""
 
 
-def paper_tables(runs: Sequence[Run], suite: str, ablation: TableRows) -> str:
-    """Format `paper_table` and, if its strategies were run, `ablation_table`."""
-    tables = [paper_table(runs, suite), ablation_table(ablation)]
-    return "\n\n".join(table for table in tables if table)
-
-
-def ablation_table(ablation: TableRows) -> str:
-    """Format the rows of `ablation_rows`; empty without rows."""
+def paper_tables(runs: Sequence[Run], suite: str, ablation: TableRows | None) -> str:
+    """Format `paper_table` and, if its strategies were run, the rows of `ablation_rows`."""
+    if ablation is None:
+        return paper_table(runs, suite)
     header, *rows = ablation
-    return _tabular(f"ll{'r' * (len(header) - 2)}", [header], [rows]) if rows else ""
+    table = _tabular(f"ll{'r' * (len(header) - 2)}", [header], [rows])
+    return f"{paper_table(runs, suite)}\n\n{table}"
 
 
 def paper_table(runs: Sequence[Run], suite: str) -> str:

@@ -1,7 +1,7 @@
 """The contents of a benchmark report: its runs and tables, shared by terminal, page and LaTeX."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -29,34 +29,6 @@ from evercal.storage.settings import read_settings
 PLOTTED = 7
 
 
-@dataclass(frozen=True)
-class Tables:
-    """Rows of each table, header first. A table without results is its header alone."""
-
-    methods: TableRows
-    thresholds: TableRows
-    scenes: TableRows
-    differences: TableRows
-    selectors: TableRows
-    ablation: TableRows
-    grid: TableRows
-    compare_with: TableRows
-
-    def non_empty(self) -> dict[str, TableRows]:
-        """Return the tables with results, by title."""
-        tables = {TITLES[part.name]: getattr(self, part.name) for part in fields(self)}
-        return {title: rows for title, rows in tables.items() if len(rows) > 1}
-
-    def as_text(self, style: Style) -> str:
-        """Format all tables, each below its title, with the definitions of the columns."""
-        title = "## {}" if style == "markdown" else "{}"
-        parts = [
-            f"{title.format(name)}\n\n{as_text(rows, style)}"
-            for name, rows in self.non_empty().items()
-        ]
-        return "\n\n".join([*parts, LEGEND])
-
-
 TITLES = {
     "methods": "Strategies, means over runs",
     "thresholds": "Final accuracy in per cent, by threshold",
@@ -67,7 +39,16 @@ TITLES = {
     "grid": "Final accuracy (TFR), by remembered frames and cost of replay",
     "compare_with": "The same scenes under other settings",
 }
-"""Titles of the fields of `Tables`."""
+"""Titles of the tables of a report, by name."""
+
+
+def tables_text(tables: Mapping[str, TableRows], style: Style) -> str:
+    """Format all tables, each below its title, with the definitions of the columns."""
+    title = "## {}" if style == "markdown" else "{}"
+    parts = [
+        f"{title.format(TITLES[name])}\n\n{as_text(rows, style)}" for name, rows in tables.items()
+    ]
+    return "\n\n".join([*parts, LEGEND])
 
 
 @dataclass(frozen=True)
@@ -92,18 +73,19 @@ class Report:
         )
         return [name for name, _ in groups[:PLOTTED]]
 
-    def tables(self) -> Tables:
-        """Compute all tables."""
-        return Tables(
-            methods=method_rows(self.runs),
-            thresholds=threshold_rows(self.runs),
-            scenes=scene_rows(self.runs),
-            differences=difference_rows(self.runs, self.reference),
-            selectors=selector_rows(self.runs),
-            ablation=ablation_rows(self.runs, self.suite),
-            grid=grid_rows(self.runs),
-            compare_with=method_rows(self.compare_with) if self.compare_with else [[]],
-        )
+    def tables(self) -> dict[str, TableRows]:
+        """Compute the tables that have results, by the names of `TITLES`; headers first."""
+        tables = {
+            "methods": method_rows(self.runs),
+            "thresholds": threshold_rows(self.runs),
+            "scenes": scene_rows(self.runs),
+            "differences": difference_rows(self.runs, self.reference),
+            "selectors": selector_rows(self.runs),
+            "ablation": ablation_rows(self.runs, self.suite),
+            "grid": grid_rows(self.runs),
+            "compare_with": method_rows(self.compare_with) if self.compare_with else [],
+        }
+        return {name: rows for name, rows in tables.items() if len(rows) > 1}
 
 
 def require_pandas() -> None:

@@ -71,76 +71,43 @@ def blocks(frames: int) -> Labels:
 
 
 def mean_interval(
-    values: ArrayLike | Sequence[ArrayLike], pieces: Sequence[ArrayLike] | None = None
+    scenes: Sequence[ArrayLike], pieces: Sequence[ArrayLike] | None = None
 ) -> Interval:
     """Estimate the mean over scenes of the mean over runs and frames, with its 95 % interval.
 
     Two variances add up: that of the pieces, which are the same for all runs, and that of the runs,
     which are the same for all scenes. Variance of one run on one piece counts in both, so intervals
     are slightly wide (Owen, The Pigeonhole Bootstrap, Ann. Appl. Stat. 2007). With a single run the
-    interval covers the choice of frames only. If all values are equal, its width is zero.
+    interval covers the choice of frames only.
 
     Args:
-        values: Typically per-frame correctness, frames in recorded order: an array (frames,) or
-            (runs, frames) for one scene, or a list of such arrays, one per scene.
+        scenes: Finite numbers of each scene, typically correctness: (runs, frames) in recorded
+            order, with equal runs in all scenes.
         pieces: Labels (frames,) of each scene from `frame_pieces`. Defaults to `blocks`.
 
     Raises:
-        ValueError: Shapes do not match, values are not finite, or a scene is a single piece.
+        ValueError: Shapes do not match, or a scene is a single piece.
     """
-    scenes = _scenes(values)
-    given = [blocks(rows.shape[1]) for rows in scenes] if pieces is None else pieces
-    labels = [np.asarray(piece) for piece in given]
-    shapes = [piece.shape for piece in labels]
-    if shapes != [rows.shape[1:] for rows in scenes]:
-        frames = [rows.shape[1] for rows in scenes]
-        raise ValueError(f"pieces have shapes {shapes}, expected (frames,) for frames {frames}")
-    for i, piece in enumerate(labels):
-        if len(np.unique(piece)) < 2:
-            raise ValueError(f"scene {i} is one piece of {len(piece)} frames; two are needed")
-    mean = float(np.mean([rows.mean() for rows in scenes]))
-    half = _half_width(scenes, labels)
-    return Interval(mean, mean - half, mean + half)
-
-
-def paired_difference(
-    a: ArrayLike | Sequence[ArrayLike],
-    b: ArrayLike | Sequence[ArrayLike],
-    pieces: Sequence[ArrayLike] | None = None,
-) -> Interval:
-    """Estimate how much better method `a` is than `b` on the same frames, with a 95 % interval.
-
-    Args:
-        a: Per-frame correctness, as for `mean_interval`.
-        b: The same scenes, runs and frames in the same order.
-        pieces: As for `mean_interval`.
-
-    Raises:
-        ValueError: As `mean_interval`, or `a` and `b` have different shapes.
-    """
-    first, second = _scenes(a), _scenes(b)
-    shapes = [rows.shape for rows in first], [rows.shape for rows in second]
-    if shapes[0] != shapes[1]:
-        raise ValueError(f"a and b must have the same scenes, runs and frames, got {shapes}")
-    return mean_interval([x - y for x, y in zip(first, second, strict=True)], pieces)
-
-
-def _half_width(scenes: Sequence[Array], labels: Sequence[Labels]) -> float:
     from scipy.stats import t
 
-    parts: list[tuple[float, float]] = []  # variance of the mean, degrees of freedom
-    for rows, piece in zip(scenes, labels, strict=True):
-        variance, freedom = _of_pieces(rows.mean(axis=0), piece)
-        parts.append((variance / len(scenes) ** 2, freedom))
-    runs = len(scenes[0])
+    values = [np.asarray(rows, dtype=np.float64) for rows in scenes]
+    labels = [blocks(rows.shape[1]) for rows in values] if pieces is None else pieces
+    mean = float(np.mean([rows.mean() for rows in values]))
+    of_runs = np.mean([rows.mean(axis=1) for rows in values], axis=0)
+    runs = len(of_runs)
+    parts = [
+        (variance / len(values) ** 2, freedom)
+        for rows, piece in zip(values, labels, strict=True)
+        for variance, freedom in [_of_pieces(rows.mean(axis=0), np.asarray(piece))]
+    ]
     if runs > 1:
-        means = np.mean([rows.mean(axis=1) for rows in scenes], axis=0)
-        parts.append((float(means.var(ddof=1)) / runs, runs - 1))
+        parts.append((float(of_runs.var(ddof=1)) / runs, runs - 1))
     total = sum(variance for variance, _ in parts)
     if total <= 1e-24:  # rounding, for values around one
-        return 0.0
+        return Interval(mean, mean, mean)
     freedom = total**2 / sum(variance**2 / freedom for variance, freedom in parts)
-    return float(t.ppf(0.975, freedom)) * total**0.5
+    half = float(t.ppf(0.975, freedom)) * total**0.5
+    return Interval(mean, mean - half, mean + half)
 
 
 def _of_pieces(values: Array, labels: Labels) -> tuple[float, float]:
@@ -150,6 +117,8 @@ def _of_pieces(values: Array, labels: Labels) -> tuple[float, float]:
     this. The degrees of freedom assume that the means of all pieces vary alike.
     """
     _, piece, counts = np.unique(labels, return_inverse=True, return_counts=True)
+    if len(counts) < 2:
+        raise ValueError(f"a scene is one piece of {len(values)} frames; two are needed")
     share = counts / len(values)
     residual = np.bincount(piece, values - values.mean()) / len(values)
     variance = float((residual**2 / (1 - share)).sum())
@@ -157,16 +126,3 @@ def _of_pieces(values: Array, labels: Labels) -> tuple[float, float]:
     products = np.eye(len(share)) - share[:, None] - share + (share**2).sum()
     matrix = weight[:, None] * products * weight
     return variance, float(np.trace(matrix) ** 2 / (matrix**2).sum())
-
-
-def _scenes(values: ArrayLike | Sequence[ArrayLike]) -> list[Array]:
-    """Convert to one checked float array (runs, frames) per scene."""
-    several = isinstance(values, (list, tuple)) and any(np.ndim(rows) for rows in values)
-    arrays = values if several else [values]
-    scenes = [np.atleast_2d(np.asarray(rows, dtype=np.float64)) for rows in arrays]  # pyright: ignore[reportGeneralTypeIssues]
-    shapes = [rows.shape for rows in scenes]
-    if any(len(shape) != 2 or 0 in shape for shape in shapes) or len({s[0] for s in shapes}) != 1:
-        raise ValueError(f"values are (runs, frames) with equal runs in all scenes, got {shapes}")
-    if not all(np.isfinite(rows).all() for rows in scenes):
-        raise ValueError("values must be finite, got inf or nan; give correctness, not errors")
-    return scenes

@@ -36,7 +36,7 @@ from evercal.features.device import device_of
 from evercal.localization.localizer import LearnedLocalizer, Localizer
 from evercal.localization.query import LocalizeOptions
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.selection import covering_radius, smallest_pair
+from evercal.mapping.selection import PoseSpace
 from evercal.recordings import Frame, Recording, stated_poses
 from evercal.recordings.held_out import split_held_out
 from evercal.storage import write_json
@@ -135,6 +135,7 @@ class _Run:
 
     def _remove(self) -> None:
         shutil.rmtree(self.store, ignore_errors=True)
+        self.store.with_name(f".{self.store.name}.lock").unlink(missing_ok=True)
         self._network_fits.unlink(missing_ok=True)
 
     def _learn(self, store: Path, scene: Recording, strategy: Strategy) -> None:
@@ -287,9 +288,12 @@ def _coverage(keyframes: Keyframes | None, scene: Recording) -> dict[str, object
     poses = stated_poses(split_held_out(scene.train).train)
     positions = keyframes.base_from_camera.translation_m
     distances = np.linalg.norm(poses.translation_m[:, None] - positions[None], axis=-1)
-    selection = poses.translation_m, poses.rotation_wxyz, distances.argmin(0)
+    selected = distances.argmin(0)
+    space = PoseSpace.of(poses.translation_m, poses.rotation_wxyz)
+    gaps = np.stack([space.distances(int(i)) for i in selected])
+    pairs = gaps[:, selected][np.triu_indices(len(selected), 1)]
     return {
         "keyframe_positions_m": tuple(tuple(round(float(v), 4) for v in p) for p in positions),
-        "covering_radius": covering_radius(*selection),
-        "min_spacing": smallest_pair(*selection),
+        "covering_radius": float(gaps.min(0).max()),
+        "min_spacing": float(pairs.min(initial=np.inf)),
     }

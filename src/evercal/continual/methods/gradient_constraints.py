@@ -6,7 +6,7 @@ of the weights is projected after the optimisers. To first order, a change u alt
 scene t by <g_t, u>, with g_t the gradient of that loss.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from evercal.continual.methods.method import FinishedScene, StageStart
 from evercal.continual.methods.penalties import Reprojection
-from evercal.continual.methods.replay import EpisodicMemory, MemoryHooks, by_scene
+from evercal.continual.methods.replay import EpisodicMemory, MemoryHooks
 from evercal.continual.networks.buffer import Rows, diffused
 from evercal.continual.networks.head import HeadOutput
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
@@ -38,22 +38,13 @@ class ConstrainedStep(EpisodicMemory):
         """Constrain the steps, from the second scene on."""
         return ConstraintHooks(self, start) if start.memories else TrainingHooks()
 
-    def edit(
-        self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
-    ) -> Tensor:
-        """Return an allowed change.
-
-        Args:
-            changes: (p,) change by the optimisers, all weights concatenated.
-            g: (t, p) gradients of the losses that `constrained` returns.
-            proposed: The step.
-            references: (t,) losses right after learning the scenes; NaN if unknown.
-        """
-        raise NotImplementedError
-
     def constrained(self, losses: list[Tensor]) -> list[Tensor]:
         """Compute the constrained losses from the losses of the remembered scenes."""
         return losses
+
+    def edit(self, changes: Tensor, g: Tensor) -> Tensor:
+        """Find the nearest change (p,) that raises no loss, given the gradients (t, p)."""
+        return nearest_change(changes, g, g.new_zeros(len(g)))
 
     def loss(self, output: HeadOutput, rows: Rows) -> Tensor:
         """Compute the mean loss of remembered rows with the fixed clamp."""
@@ -69,26 +60,25 @@ class ConstraintHooks(MemoryHooks):
     def __init__(self, method: ConstrainedStep, start: StageStart):
         super().__init__(start)
         self._rule = method
-        unknown = torch.tensor(torch.nan, device="cpu")
-        losses = [start.states[memory.scene].get("reference", unknown) for memory in self.memories]
-        self._references = torch.stack(losses)
 
     def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:
         """Compute the constrained losses."""
-        parts = by_scene(output, rows, self.memories)
-        return self._rule.constrained([self._rule.loss(o, r) for o, r in parts])
+        each = len(rows.scene) // len(self.memories)  # rows are ordered by scene
+        parts = [slice(i * each, (i + 1) * each) for i in range(len(self.memories))]
+        losses = [self._rule.loss(output.part(part), rows.part(part)) for part in parts]
+        return self._rule.constrained(losses)
 
     def edit_step(self, proposed: ProposedStep) -> None:
         """Project the step."""
-        names = list(proposed.changes)
-        g = torch.stack([_flat(constraint, names) for constraint in proposed.constraints])
-        references = self._references.to(g)
-        allowed = self._rule.edit(_flat(proposed.changes, names), g, proposed, references)
-        start = 0
-        for name in names:
-            like = proposed.changes[name]
-            proposed.changes[name] = allowed[start : start + like.numel()].view_as(like)
-            start += like.numel()
+        sizes = [change.numel() for change in proposed.changes.values()]
+        g = torch.stack([_flat(constraint) for constraint in proposed.constraints])
+        allowed = self.allowed(_flat(proposed.changes), g, proposed)
+        for name, part in zip(proposed.changes, allowed.split(sizes), strict=True):
+            proposed.changes[name] = part.view_as(proposed.changes[name])
+
+    def allowed(self, changes: Tensor, g: Tensor, proposed: ProposedStep) -> Tensor:
+        """Apply the method's rule to the change (p,)."""
+        return self._rule.edit(changes, g)
 
 
 @dataclass(frozen=True)
@@ -100,12 +90,6 @@ class AveragedGem(ConstrainedStep):
     def constrained(self, losses: list[Tensor]) -> list[Tensor]:
         """Return the mean loss."""
         return [torch.stack(losses).mean()]
-
-    def edit(
-        self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
-    ) -> Tensor:
-        """Remove the component that raises the mean loss."""
-        return nearest_change(changes, g, g.new_zeros(1))
 
 
 @dataclass(frozen=True)
@@ -121,12 +105,10 @@ class Gem(ConstrainedStep):
     margin: float = 1.0
     """Length added against every gradient g_t, as a share of the step's length."""
 
-    def edit(
-        self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
-    ) -> Tensor:
+    def edit(self, changes: Tensor, g: Tensor) -> Tensor:
         """Return the nearest change with <g_t, u> <= 0 for every scene, after the margin."""
-        pushed = changes - self.margin * changes.norm() * F.normalize(g, dim=1).sum(0)
-        return nearest_change(pushed, g, g.new_zeros(len(g)))
+        margin = self.margin * changes.norm() * F.normalize(g, dim=1).sum(0)
+        return super().edit(changes - margin, g)
 
 
 @dataclass(frozen=True)
@@ -162,10 +144,13 @@ class EpisodicConstraint(ConstrainedStep):
         """Constrain the steps after the warm-up, from the second scene on."""
         return _EpisodicHooks(self, start) if start.memories else TrainingHooks()
 
-    def edit(
+    def edit_step(
         self, changes: Tensor, g: Tensor, proposed: ProposedStep, references: Tensor
     ) -> Tensor:
-        """Return the nearest change with <g_t, u> <= -alpha eta h_t for every scene."""
+        """Return the nearest change with <g_t, u> <= -alpha eta h_t for every scene.
+
+        The (t,) references are losses right after learning the scenes; NaN if unknown.
+        """
         if proposed.step < self.warm_steps:
             return changes
         h = proposed.losses - (1 + self.slack) * references
@@ -191,21 +176,24 @@ class EpisodicConstraint(ConstrainedStep):
 class _EpisodicHooks(ConstraintHooks):
     def __init__(self, method: EpisodicConstraint, start: StageStart):
         super().__init__(method, start)
-        self._steps, self._warm, self._moving = 0, method.warm_steps, method.moving
+        self._method, self._steps = method, 0
+        references = [start.states[memory.scene]["reference"] for memory in self.memories]
+        self._references = torch.stack(references)
         if method.moving:
             self._references = torch.full_like(self._references, torch.nan)
 
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
         """Compute plain replay in the first steps, averaged over the scenes."""
-        if self._steps >= self._warm:
+        if self._steps >= self._method.warm_steps:
             return None
         return Reprojection()(output, None, rows, tau_px)
 
-    def edit_step(self, proposed: ProposedStep) -> None:
-        super().edit_step(proposed)
+    def allowed(self, changes: Tensor, g: Tensor, proposed: ProposedStep) -> Tensor:
+        change = self._method.edit_step(changes, g, proposed, self._references.to(g))
         self._steps = proposed.step + 1
-        if self._moving:
+        if self._method.moving:
             self._references = proposed.losses
+        return change
 
     def state(self) -> dict[str, Tensor]:
         return {"steps": torch.tensor(self._steps, device="cpu"), "references": self._references}
@@ -222,12 +210,10 @@ def nearest_change(changes: Tensor, g: Tensor, most: Tensor) -> Tensor:
     are first divided by the length of their gradient, which does not change the solution.
 
     Args:
-        changes: (p,).
-        g: (t, p).
+        changes: (p,) change of all weights.
+        g: (t, p) gradients.
         most: (t,) largest increase of each loss.
     """
-    if not len(g):
-        return changes
     size = g.norm(dim=1)
     some = size > 0  # no change affects a loss without a gradient
     g, most = g[some] / size[some, None], most.to(g)[some] / size[some]
@@ -244,6 +230,5 @@ def nearest_change(changes: Tensor, g: Tensor, most: Tensor) -> Tensor:
     return changes - torch.from_numpy(weights).to(g) @ g
 
 
-def _flat(named: Mapping[str, Tensor], names: Sequence[str]) -> Tensor:
-    """Concatenate tensors in the order of the names, (p,)."""
-    return torch.cat([named[name].flatten() for name in names])
+def _flat(named: Mapping[str, Tensor]) -> Tensor:
+    return torch.cat([value.flatten() for value in named.values()])

@@ -47,8 +47,9 @@ class _DistillationHooks(TrainingHooks):
         """Draw new rows once more, one part with the index of each earlier scene."""
         parts = []
         for scene in range(self._teacher.scenes):
-            size = len(fresh.scene), (self._each,)
-            drawn = torch.randint(*size, generator=generator, device="cpu")
+            drawn = torch.randint(
+                len(fresh.scene), (self._each,), generator=generator, device="cpu"
+            )
             part = fresh.part(drawn.to(fresh.scene.device))
             part.scene = torch.full_like(part.scene, scene)
             parts.append(part)

@@ -80,13 +80,8 @@ def interfered_views(
 ) -> Tensor:
     """Select the views of a remembered scene that a step on new rows harms most.
 
-    Args:
-        method: Numbers of views and rows.
-        head: Current head; not changed.
-        fresh: New rows.
-        memory: Rows of the remembered scene.
-        rate: Root mean square change of each parameter in the virtual step.
-        generator: Source of the random draws.
+    The head is not changed. `rate` is the root mean square change of each parameter in the virtual
+    step.
 
     Returns:
         (k,) numbers of the views.
@@ -114,7 +109,6 @@ def interfered_views(
 
 @torch.no_grad()
 def _losses(method: MaximallyInterferedRetrieval, head: Head, rows: Rows, views: int) -> Tensor:
-    """Compute the (views,) mean loss of each view's rows."""
     points = head(rows.features.float(), rows.scene, rows.descriptor).points
     loss, _ = fixed_clamp_loss(points, rows.target, method.clamp_px)
     return loss.view(views, -1).mean(1)

@@ -26,21 +26,21 @@ class Penalty:
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
     ) -> Tensor:
-        """Compute the loss in pixels.
+        """Compute the loss in pixels; `tau_px` is the soft clamp of new rows in this step."""
+        assert teacher is not None or not self.needs_teacher
+        return self._loss(student, teacher or student, rows, tau_px)
 
-        Args:
-            student: Output of the head.
-            teacher: Output of the head before the stage; None unless `needs_teacher`.
-            rows: The replayed rows.
-            tau_px: Soft clamp of the loss on new rows in this step, pixels.
-        """
+    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
         raise NotImplementedError
 
 
-def _distance_m(student: HeadOutput, teacher: HeadOutput | None) -> Tensor:
+def _distance_m(student: HeadOutput, teacher: HeadOutput) -> Tensor:
     """Compute the L1 distance (n,) between the points of both heads, metres."""
-    assert teacher is not None
     return (student.points - teacher.points.detach()).abs().sum(-1)
+
+
+def _reprojection(student: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
+    return reprojection_loss(student.points, rows.target, tau_px, LossOptions())[0].mean()
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,8 @@ class Reprojection(Penalty):
 
     needs_teacher: ClassVar[bool] = False
 
-    def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
-    ) -> Tensor:
-        """Compute the mean reprojection loss."""
-        cost, _ = reprojection_loss(student.points, rows.target, tau_px, LossOptions())
-        return cost.mean()
+    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
+        return _reprojection(student, rows, tau_px)
 
 
 @dataclass(frozen=True)
@@ -68,12 +64,9 @@ class OldOutput(Penalty):
     px_per_m: float = PX_PER_M
     """Weight of the distance, pixels per metre."""
 
-    def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
-    ) -> Tensor:
-        """Compute the mean of the sum."""
+    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
         distance = _distance_m(student, teacher).mean()
-        return Reprojection()(student, None, rows, tau_px) + self.px_per_m * distance
+        return _reprojection(student, rows, tau_px) + self.px_per_m * distance
 
 
 @dataclass(frozen=True)
@@ -87,17 +80,12 @@ class BoundedByTeacher(Penalty):
     px_per_m: float = PX_PER_M
     """Weight of the distance to the teacher's points, pixels per metre."""
 
-    def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
-    ) -> Tensor:
-        """Compute the mean of both terms, each with weight 1/2."""
-        assert teacher is not None
+    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
         _, error = fixed_clamp_loss(student.points, rows.target)
         _, bound = fixed_clamp_loss(teacher.points, rows.target)
         distance = _distance_m(student, teacher)
-        bounded = torch.where(error > bound, distance, torch.zeros_like(distance)).mean()
-        reprojection = Reprojection()(student, None, rows, tau_px)
-        return 0.5 * reprojection + 0.5 * self.px_per_m * bounded
+        bounded = torch.where(error > bound, distance, 0.0).mean()
+        return 0.5 * _reprojection(student, rows, tau_px) + 0.5 * self.px_per_m * bounded
 
 
 @dataclass(frozen=True)
@@ -112,16 +100,12 @@ class StoredOutput(Penalty):
     px_per_m: float = PX_PER_M
     """Weight of the distance to the stored points, pixels per metre."""
 
-    def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
-    ) -> Tensor:
-        """Compute the mean of both terms, each with weight 1/2."""
+    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
         assert rows.stored is not None, "the method stores points when a scene is finished"
         has_point = ~rows.stored[:, 0].isnan()
         distance = (student.points[has_point] - rows.stored[has_point]).abs().sum(-1)
         distance = distance.sum() / max(len(distance), 1)
-        reprojection = Reprojection()(student, None, rows, tau_px)
-        return 0.5 * reprojection + 0.5 * self.px_per_m * distance
+        return 0.5 * _reprojection(student, rows, tau_px) + 0.5 * self.px_per_m * distance
 
 
 @dataclass(frozen=True)
@@ -139,11 +123,7 @@ class Relations(Penalty):
     temperature: float = 0.2
     """Temperature of the softmax over cosines (no unit)."""
 
-    def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
-    ) -> Tensor:
-        """Compute the mean reprojection loss plus the divergence in nats."""
-        assert teacher is not None
+    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
         # Rows are ordered by scene, so an even spacing covers all scenes.
         count = len(student.hidden)
         few, device = min(count, self.related_rows), student.hidden.device
@@ -157,7 +137,7 @@ class Relations(Penalty):
 
         old, new = similarity(teacher.hidden.detach()), similarity(student.hidden)
         divergence = (old.exp() * (old - new)).sum(-1).mean()
-        return Reprojection()(student, None, rows, tau_px) + divergence
+        return _reprojection(student, rows, tau_px) + divergence
 
 
 @dataclass(frozen=True)
@@ -176,15 +156,11 @@ class AnchoredReprojection(Penalty):
     teacher_limit_px: float = 10.0
     """Reprojection error below which the teacher's point is used."""
 
-    def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
-    ) -> Tensor:
-        """Compute the mean of the sum."""
-        assert teacher is not None
+    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
         cost, _ = fixed_clamp_loss(student.points, rows.target, self.clamp_px)
         _, error = fixed_clamp_loss(teacher.points, rows.target, self.clamp_px)
         distance = _distance_m(student, teacher)
-        anchored = torch.where(error < self.teacher_limit_px, distance, torch.zeros_like(distance))
+        anchored = torch.where(error < self.teacher_limit_px, distance, 0.0)
         return cost.mean() + self.px_per_m * anchored.mean()
 
 
@@ -200,9 +176,5 @@ class Distillation(Penalty):
     scale: float = 1.0
     """Pixels per metre and per nat; the paper's value is 1."""
 
-    def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
-    ) -> Tensor:
-        """Compute the weighted sum of the three terms."""
-        assert teacher is not None
+    def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
         return self.scale * spdd_loss(student, teacher, self.options).total

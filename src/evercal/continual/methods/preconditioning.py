@@ -43,10 +43,9 @@ class _PreconditionedHooks(ReplayHooks):
         moments = input_moments(start.head, start.memories, start.seed)
         self._damping = {
             name: torch.linalg.inv(
-                torch.eye(len(moment), dtype=moment.dtype, device=moment.device)
-                + method.strength * moment
+                torch.eye(len(m), dtype=m.dtype, device=m.device) + method.strength * m
             ).float()
-            for name, moment in moments.items()
+            for name, m in moments.items()
         }
 
     def edit_step(self, proposed: ProposedStep) -> None:
@@ -84,16 +83,8 @@ def owned_rows(head: Head, memories: Sequence[FeatureBuffer]) -> dict[str, Tenso
     return owned
 
 
-def input_moments(
-    head: Head, memories: Sequence[FeatureBuffer], seed: int, rows: int = ROWS
-) -> dict[str, Tensor]:
+def input_moments(head: Head, memories: Sequence[FeatureBuffer], seed: int) -> dict[str, Tensor]:
     """Sum the second moments of each layer's inputs over scenes, with mean diagonal 1 per scene.
-
-    Args:
-        head: Head before the stage.
-        memories: Rows of remembered scenes, one buffer each.
-        seed: Seed of the drawn rows.
-        rows: Number of rows drawn from each scene.
 
     Returns:
         (inputs, inputs) double for every linear layer, by weight name.
@@ -113,7 +104,7 @@ def input_moments(
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for memory in memories:
-            drawn = memory.draw(rows, generator)
+            drawn = memory.draw(ROWS, generator)
             head(drawn.features.float(), drawn.scene, drawn.descriptor)
     for handle in handles:
         handle.remove()

@@ -41,7 +41,7 @@ class GradientProjectionMemory(Method):
         before = scene.earlier[-1] if scene.earlier else {}
         buffer = scene.rows()
         moments = input_moments(scene.head, [buffer], scene.number)
-        moments[OUTPUTS] = hidden_moment(scene.head, buffer)
+        moments[OUTPUTS] = _hidden_moment(scene.head, buffer)
         bases = {}
         for name, moment in moments.items():
             empty = moment.new_zeros(len(moment), 0)
@@ -65,7 +65,9 @@ class _ProjectedSteps(TrainingHooks):
             for name, basis in start.states[-1].items()
         }
         outputs = bases.pop(OUTPUTS)
-        shared = _shared_outputs(head)
+        shared = ["offset"] if head.options.offsets == "shared" else []
+        if head.options.condition == "descriptor":
+            shared = ["logit", "offset"]  # all scenes share all outputs
         self._bases: dict[str, Tensor] = bases | dict.fromkeys(shared, outputs)
         layers = [k.removesuffix("weight") + "bias" for k in bases]
         self._fixed = [*layers, *(f"{name}_bias" for name in shared)]
@@ -85,15 +87,8 @@ class _ProjectedSteps(TrainingHooks):
             changes[name] = changes[name] - (changes[name] @ basis) @ basis.T
 
 
-def _shared_outputs(head: Head) -> list[str]:
-    """Return the names of output parameters that all scenes share."""
-    if head.options.condition == "descriptor":
-        return ["logit", "offset"]
-    return ["offset"] if head.options.offsets == "shared" else []
-
-
 @torch.no_grad()
-def hidden_moment(head: Head, buffer: FeatureBuffer) -> Tensor:
+def _hidden_moment(head: Head, buffer: FeatureBuffer) -> Tensor:
     """Compute the (width, width) second moment of the last hidden layer over a scene, double."""
     rows = buffer.draw(ROWS, torch.Generator().manual_seed(buffer.scene))
     hidden = head.hidden(rows.features.float(), rows.scene, rows.descriptor).double()

@@ -3,7 +3,6 @@
 Most methods differ only in the selected frames and the loss of replayed rows; both are fields.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -14,7 +13,7 @@ from torch import Tensor
 from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.methods.method import FinishedScene, Method, StageStart
 from evercal.continual.methods.penalties import Penalty, Reprojection, StoredOutput
-from evercal.continual.networks.buffer import FeatureBuffer, Rows
+from evercal.continual.networks.buffer import Rows
 from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.selectors import SELECTORS
@@ -35,11 +34,7 @@ class EpisodicMemory(Method):
 
 
 class MemoryHooks(TrainingHooks):
-    """Draws the same number of rows from each remembered scene, at least one.
-
-    Args:
-        start: Start of the stage, with at least one memory.
-    """
+    """Draws the same number of rows from each remembered scene, at least one."""
 
     def __init__(self, start: StageStart):
         self.memories = start.memories
@@ -70,12 +65,7 @@ class Replay(EpisodicMemory):
 
 
 class ReplayHooks(MemoryHooks):
-    """Adds the penalty of the replayed rows.
-
-    Args:
-        method: Penalty and weight.
-        start: Start of the stage, with at least one memory.
-    """
+    """Adds the penalty of the replayed rows."""
 
     def __init__(self, method: Replay, start: StageStart):
         super().__init__(start)
@@ -96,15 +86,6 @@ def teacher_output(teacher: Head, rows: Rows) -> HeadOutput:
         return teacher(rows.features.float(), rows.scene, rows.descriptor)
 
 
-def by_scene(
-    output: HeadOutput, rows: Rows, memories: Sequence[FeatureBuffer]
-) -> list[tuple[HeadOutput, Rows]]:
-    """Split replayed rows by remembered scene; rows are ordered by scene."""
-    each = len(rows.scene) // len(memories)
-    slices = [slice(i * each, (i + 1) * each) for i in range(len(memories))]
-    return [(output.part(where), rows.part(where)) for where in slices]
-
-
 @dataclass(frozen=True)
 class DarkExperienceReplay(Replay):
     """DER++ for points (Buzzega et al., NeurIPS 2020): stores output points of the keyframes."""
@@ -116,7 +97,7 @@ class DarkExperienceReplay(Replay):
         """Replay with the stored points of plain views."""
         for memory in start.memories:
             state = start.states[memory.scene]
-            memory.stored = state["points"].float() + state["origin"]
+            memory.stored = (state["points"].float() + state["origin"]).to(memory.device)
         return super().begin(start)
 
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:

@@ -30,14 +30,11 @@ class SpddOptions:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name in ("prior_weight", "metric_weight", "output_weight"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"SpddOptions.{name} is {value}; give a finite number >= 0")
-        if not (math.isfinite(self.temperature) and self.temperature > 0):
-            raise ValueError(f"SpddOptions.temperature is {self.temperature}; give a number > 0")
-        if self.active_centres < 1:
-            raise ValueError(f"SpddOptions.active_centres is {self.active_centres}; give >= 1")
+        weights = self.prior_weight, self.metric_weight, self.output_weight
+        if not all(0 <= weight < math.inf for weight in weights):
+            raise ValueError(f"{self}: give weights that are finite and >= 0")
+        if not 0 < self.temperature < math.inf or self.active_centres < 1:
+            raise ValueError(f"{self}: give a temperature > 0 and active_centres >= 1")
 
 
 @dataclass(frozen=True)
@@ -69,17 +66,10 @@ def spdd_loss(student: HeadOutput, teacher: HeadOutput, options: SpddOptions) ->
     - output: ``|x_S - x_T|``.
 
     Centre k of the teacher is centre k of the student; new centres follow. A row without active
-    centres has no prior term, and no metric term with per-centre offsets. NaN propagates.
-
-    Args:
-        student: Output with gradients, K_student >= K_teacher centres.
-        teacher: Output for the same rows; detached here.
-        options: Weights, temperature and size of the active set.
-
-    Raises:
-        ValueError: The shapes are inconsistent.
+    centres has no prior term, and no metric term with per-centre offsets. NaN propagates. The
+    teacher is detached.
     """
-    shared = _check_shapes(student, teacher)
+    shared = student.offsets.shape[1] < student.logits.shape[1]
     rows, old = teacher.logits.shape
     teacher_logits = teacher.logits.detach()
     masked = torch.isneginf(teacher_logits) | torch.isneginf(student.logits.detach()[:, :old])
@@ -122,30 +112,6 @@ def _prior(
 
 
 def _log_softmax(logits: Tensor) -> Tensor:
-    """Compute a log-softmax over dim 1 that is finite for logits of -inf (probability 0)."""
-    # With -inf, the KL and its gradient would contain 0 * inf.
+    # Finite for a logit of -inf, where the KL and its gradient would contain 0 * inf.
     floor = torch.finfo(logits.dtype).min / 8
     return logits.masked_fill(torch.isneginf(logits), floor).log_softmax(dim=1)
-
-
-def _check_shapes(student: HeadOutput, teacher: HeadOutput) -> bool:
-    """Return whether offsets are shared; raise ValueError for inconsistent shapes."""
-    rows, old = teacher.logits.shape
-    total = student.logits.shape[1]
-    if student.logits.shape[0] != rows:
-        raise ValueError(f"student has {student.logits.shape[0]} rows, teacher {rows}; give equal")
-    if total < old:
-        raise ValueError(f"student has {total} centres, teacher {old}; centres are only added")
-    shapes = tuple(student.offsets.shape), tuple(teacher.offsets.shape)
-    per_centre = shapes == ((rows, total, 3), (rows, old, 3))
-    if not per_centre and shapes != ((rows, 1, 3), (rows, 1, 3)):
-        raise ValueError(
-            f"offsets have shapes {shapes[0]} (student) and {shapes[1]} (teacher); give both "
-            "(n, centres, 3) or both (n, 1, 3)"
-        )
-    if student.points.shape != (rows, 3) or teacher.points.shape != (rows, 3):
-        raise ValueError(
-            f"points have shapes {tuple(student.points.shape)} (student) and "
-            f"{tuple(teacher.points.shape)} (teacher); give ({rows}, 3)"
-        )
-    return not per_centre

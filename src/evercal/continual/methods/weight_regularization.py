@@ -62,36 +62,23 @@ class WeightRegularization(Method):
 class _TiedWeights(TrainingHooks):
     def __init__(self, method: WeightRegularization, start: StageStart):
         self.method, self._head = method, start.head
-        self._ties = [_ties(state, start.head) for state in method.needed(start.states)]
+        # Of each earlier scene, by parameter name: anchor and importance of the first rows.
+        named = list(start.head.named_parameters())
+        self._ties = [
+            {k: (s[f"anchor.{k}"].to(v), s[f"importance.{k}"].to(v)) for k, v in named}
+            for s in method.needed(start.states)
+        ]
 
     def regularizer(self) -> Tensor | None:
         if not self._ties:
             return None
-        return self.method.strength * tie_cost(self._head, self._ties)
-
-
-def tie_cost(head: Head, ties: Sequence[Mapping[str, tuple[Tensor, Tensor]]]) -> Tensor:
-    """Compute half the mean over weights of sum_s I_s (w - w_s)^2.
-
-    Args:
-        head: Current head.
-        ties: For each earlier scene, by parameter name: anchor and importance of the first rows.
-    """
-    cost = torch.zeros((), device=head.centres.device)
-    count = 0
-    for name, value in head.named_parameters():
-        count += value.numel()
-        for tie in ties:
-            anchor, importance = tie[name]
-            cost = cost + (importance * (value[: len(anchor)] - anchor).square()).sum()
-    return 0.5 / count * cost
-
-
-def _ties(state: MethodState, head: Head) -> dict[str, tuple[Tensor, Tensor]]:
-    return {
-        name: (state[f"anchor.{name}"].to(value), state[f"importance.{name}"].to(value))
-        for name, value in head.named_parameters()
-    }
+        cost = torch.zeros((), device=self._head.device)
+        for name, value in self._head.named_parameters():
+            for tie in self._ties:
+                anchor, importance = tie[name]
+                cost = cost + (importance * (value[: len(anchor)] - anchor).square()).sum()
+        count = sum(value.numel() for value in self._head.parameters())
+        return self.method.strength * (0.5 / count * cost)
 
 
 @dataclass(frozen=True)
@@ -204,9 +191,8 @@ class _PathIntegral(_TiedWeights):
         return {k: self._path[k].clamp(min=0) / (value + floor) for k, value in squared.items()}
 
     def state(self) -> dict[str, Tensor]:
-        return {f"path.{k}": v for k, v in self._path.items()} | {
-            f"first.{k}": v for k, v in self._first.items()
-        }
+        first = {f"first.{k}": v for k, v in self._first.items()}
+        return first | {f"path.{k}": v for k, v in self._path.items()}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
         for name in self._path:
@@ -222,18 +208,7 @@ def mean_over_images(
     value: Callable[[Rows], Tensor],
     size: Callable[[Tensor], Tensor],
 ) -> dict[str, Tensor]:
-    """Average a function of gradients over images.
-
-    Args:
-        head: Head with the parameters.
-        buffer: Rows of the images.
-        images: Number of images to draw.
-        value: Scalar of an image's rows that is differentiated.
-        size: Function of the gradient, such as its square.
-
-    Returns:
-        Means by parameter name.
-    """
+    """Average `size` of the gradients of `value` over some images, by parameter name."""
     generator = torch.Generator().manual_seed(buffer.scene)
     parameters = dict(head.named_parameters())
     total = {name: torch.zeros_like(p) for name, p in parameters.items()}

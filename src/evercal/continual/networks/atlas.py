@@ -49,10 +49,7 @@ class Atlas:
         self.cells: list[Cell] = []
 
     def place(self, positions_m: np.ndarray) -> Cell:
-        """Assign a cell to a new scene.
-
-        Args:
-            positions_m: (n, 3) camera positions in the scene's base frame.
+        """Assign a cell to a new scene with (n, 3) camera positions in its base frame.
 
         Raises:
             InputError: Layout `paper` has no cell left.
@@ -68,9 +65,7 @@ class Atlas:
             centre, side = paper_grid(self.expected)[len(self.cells)], MIN_CELL_M
         else:
             centre = next(c for c in spiral() if self._free(c, side))
-        x, y, z = (float(value) for value in centre)
-        ox, oy, oz = (float(value) for value in origin)
-        cell = Cell((x, y, z), side, (ox, oy, oz))
+        cell = Cell(_triple(centre), side, _triple(origin))
         self.cells.append(cell)
         return cell
 
@@ -89,11 +84,7 @@ class Atlas:
 
 
 def camera_clusters(positions_m: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Cluster camera positions (n, 3) by k-means.
-
-    Returns:
-        (k, 3) means. k is `count`, or the number of distinct positions if that is smaller.
-    """
+    """Return (k, 3) k-means of camera positions (n, 3); k is at most the distinct positions."""
     from scipy.cluster.vq import kmeans2
 
     if count == 1:
@@ -108,17 +99,18 @@ def combined_centres(
 ) -> tuple[tuple[float, float, float], ...]:
     """Compute the cluster centres of all scenes in the paper's layout.
 
-    As in GLACE, k-means runs on the camera positions of all scenes together.
-
-    Args:
-        positions_m: (n, 3) camera positions of each scene in its base frame.
-        count: Centres of all scenes together (K of the paper).
-        seed: Seed of the k-means.
+    As in GLACE, k-means runs on the camera positions of all scenes together. These are (n, 3) in
+    each scene's base frame; `count` is K of the paper.
     """
     atlas = Atlas("paper", len(positions_m))
     in_atlas = [atlas.place(scene).atlas_from_base.apply(scene) for scene in positions_m]
     means = camera_clusters(np.concatenate(in_atlas), count, seed)
-    return tuple((float(x), float(y), float(z)) for x, y, z in means)
+    return tuple(map(_triple, means))
+
+
+def _triple(point: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = point.tolist()
+    return x, y, z
 
 
 def spiral() -> Iterator[np.ndarray]:

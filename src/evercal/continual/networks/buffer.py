@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 
 import numpy as np
 import torch
@@ -39,26 +40,28 @@ class Rows:
     stored: Tensor | None = None
     """(n, 3) stored output points of an earlier head; NaN for rows without one."""
 
-    def _mapped(self, change: Callable[[Tensor], Tensor]) -> "Rows":
-        t = self.target
-        return Rows(
-            change(self.features),
-            change(self.scene),
-            change(self.descriptor),
-            Target(change(t.pixels), change(t.intrinsics), change(t.camera_from_atlas)),
-            change(self.index),
-            None if self.stored is None else change(self.stored),
-        )
-
     def part(self, where: slice | Tensor) -> "Rows":
         """Return the rows of a slice, or at indices (m,)."""
-        return self._mapped(lambda value: value[where])
+        return _combined([self], lambda values: values[0][where])
 
     def to(self, device: torch.device) -> "Rows":
         """Copy to a device; copies from pinned memory to a GPU are asynchronous."""
         if self.features.device == device:
             return self
-        return self._mapped(lambda v: v.to(device, non_blocking=device.type == "cuda"))
+        return _combined([self], lambda v: v[0].to(device, non_blocking=device.type == "cuda"))
+
+
+_TARGET = "target.pixels", "target.intrinsics", "target.camera_from_atlas"
+_tensors = attrgetter("features", "scene", "descriptor", "index", *_TARGET)
+
+
+def _combined(parts: Sequence[Rows], change: Callable[[list[Tensor]], Tensor]) -> Rows:
+    """Apply a function to each kind of tensor of some batches."""
+    columns = zip(*map(_tensors, parts), strict=True)
+    features, scene, descriptor, index, *target = (change(list(column)) for column in columns)
+    stored = [part.stored for part in parts if part.stored is not None]
+    points = change(stored) if stored else None
+    return Rows(features, scene, descriptor, Target(*target), index, points)
 
 
 class FeatureBuffer:
@@ -84,28 +87,20 @@ class FeatureBuffer:
         self.scene, self.atlas_from_base = scene, atlas_from_base
         self.correctable, self.device = correctable, torch.device(device)
         self.views = 0
-        self._stored: Tensor | None = None
+        self.stored: Tensor | None = None
+        """(m, 3) stored output points of the first m rows, on the buffer's device."""
         self._parts: list[dict[str, Tensor]] = []
         self._saved = 0  # leading parts that `take_new` has returned
         self._merged: dict[str, Tensor] | None = None
 
-    def add(
-        self, views: Sequence[View], features: Tensor, descriptors: Tensor, keep: Tensor
-    ) -> None:
-        """Append encoded views.
-
-        Args:
-            views: b views.
-            features: (b, channels, h, w), on any device.
-            descriptors: (b, width), on any device.
-            keep: (b, cells) bool, cells whose rows are added.
-        """
-        self.append(self.part(self.views, views, (features, descriptors), keep))
-
     def part(
         self, first: int, views: Sequence[View], encoded: tuple[Tensor, Tensor], keep: Tensor
     ) -> dict[str, Tensor]:
-        """Return the rows of views by name, on the CPU; `first` is the first view's number."""
+        """Return the rows of views by name, on the CPU; `first` is the first view's number.
+
+        `encoded` are features (b, channels, h, w) and descriptors (b, width) on any device. The
+        mask `keep` (b, cells) selects rows.
+        """
         features, descriptors = encoded
         rows = features.flatten(2).transpose(1, 2)
         poses = SE3.stack([self.atlas_from_base @ view.base_from_camera for view in views])
@@ -137,15 +132,6 @@ class FeatureBuffer:
         self._saved = len(self._parts)
 
     @property
-    def stored(self) -> Tensor | None:
-        """(m, 3) stored output points of the first m rows, on the buffer's device."""
-        return self._stored
-
-    @stored.setter
-    def stored(self, points: Tensor | None) -> None:
-        self._stored = None if points is None else points.to(self.device)
-
-    @property
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name, on the buffer's device, or on the CPU if the device has no room."""
         if self._merged is None:
@@ -162,12 +148,7 @@ class FeatureBuffer:
         return len(self.tensors["features"])
 
     def correct_lens(self, correction: Tensor) -> None:
-        """Undistort the pixels and correct the intrinsics.
-
-        Args:
-            correction: (5,) correction of the camera that took all frames; see
-                `reprojection_error`.
-        """
+        """Undistort the pixels and correct the intrinsics; see `reprojection_error`."""
         t, view = self.tensors, self.tensors["view"].long()
         focal, dx, dy, k1, k2 = correction.to(t["pixels"]).unbind()
         scale = t["intrinsics"][:, :2]
@@ -192,24 +173,19 @@ class FeatureBuffer:
         held = t["view"].device
         index = index.to(held)
         view = t["view"][index].long()
-        pinned = held != self.device
 
         def at(name: str, where: Tensor) -> Tensor:
-            return _pinned(t[name], where) if pinned else t[name][where]
+            return t[name][where] if held == self.device else _pinned(t[name], where)
 
         target = Target(at("pixels", index), at("intrinsics", view), at("camera_from_atlas", view))
         scene = torch.full((len(index),), self.scene, device=held)
         features, descriptors = at("features", index), at("descriptors", view)
         rows = Rows(features, scene, descriptors, target, index).to(self.device)
-        if self._stored is not None:
-            rows.stored = _points_at(self._stored, rows.index)
+        if self.stored is not None:
+            last = len(self.stored) - 1
+            points = self.stored[rows.index.clamp(max=last)].float()
+            rows.stored = torch.where((rows.index <= last)[:, None], points, torch.nan)
         return rows
-
-
-def _points_at(stored: Tensor, index: Tensor) -> Tensor:
-    """Return the (n, 3) points at `index` (n,), NaN beyond the last."""
-    points = stored[index.clamp(max=len(stored) - 1)].float()
-    return torch.where((index < len(stored))[:, None], points, torch.nan)
 
 
 def _merge(parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
@@ -246,38 +222,19 @@ def join(parts: Sequence[Rows]) -> Rows:
     if len(parts) == 1:
         return parts[0]
     if any(part.stored is not None for part in parts):
-        parts = [part if part.stored is not None else _without_stored(part) for part in parts]
-
-    def cat(get: Callable[[Rows], Tensor | None]) -> Tensor:
-        return torch.cat([value for value in map(get, parts) if value is not None])
-
-    return Rows(
-        cat(lambda part: part.features),
-        cat(lambda part: part.scene),
-        cat(lambda part: part.descriptor),
-        Target(
-            cat(lambda part: part.target.pixels),
-            cat(lambda part: part.target.intrinsics),
-            cat(lambda part: part.target.camera_from_atlas),
-        ),
-        cat(lambda part: part.index),
-        None if parts[0].stored is None else cat(lambda part: part.stored),
-    )
-
-
-def _without_stored(rows: Rows) -> Rows:
-    nan = torch.full((len(rows.scene), 3), torch.nan, device=rows.scene.device)
-    return replace(rows, stored=nan)
+        nan = torch.full((1, 3), torch.nan, device=parts[0].scene.device)
+        parts = [
+            replace(part, stored=nan.expand(len(part.scene), 3)) if part.stored is None else part
+            for part in parts
+        ]
+    return _combined(parts, torch.cat)
 
 
 def diffused(rows: Rows, deviation: float, generator: torch.Generator) -> Rows:
     """Add noise to the descriptors of rows (GLACE's feature diffusion).
 
-    Args:
-        rows: A batch.
-        deviation: Standard deviation of the noise per channel. Descriptors are normalised before
-            and after.
-        generator: Generator of the device of the rows.
+    `deviation` is that of the noise per channel. Descriptors are normalised before and after. The
+    generator is on the device of the rows.
     """
     noise = torch.randn(rows.descriptor.shape, generator=generator, device=generator.device)
     descriptor = F.normalize(rows.descriptor + deviation * noise.to(rows.descriptor), dim=-1)
@@ -341,15 +298,8 @@ def encode_frames(
 def encode_batches(frames: Sequence[Frame], plan: EncodePlan, done: int = 0) -> list[list[int]]:
     """Group consecutive views of equal size into batches for the encoder.
 
-    View n shows frame n mod len(frames) in pass n // len(frames).
-
-    Args:
-        frames: n frames.
-        plan: Number of passes and working size.
-        done: Number of views that are already encoded.
-
-    Returns:
-        Numbers of the views of each batch.
+    View n shows frame n mod len(frames) in pass n // len(frames). The first `done` views are
+    already encoded and left out.
     """
     batches: list[list[int]] = []
     last = None

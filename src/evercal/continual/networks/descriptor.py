@@ -22,12 +22,6 @@ class GlobalDescriptor(nn.Module):
 
     A small MLP lifts each cell's feature, several attention maps pool the result (like the soft
     assignment of NetVLAD, Arandjelovic et al., CVPR 2016), and a linear layer projects it.
-
-    Args:
-        inputs: Channels of the local features.
-        maps: Attention maps.
-        hidden: Channels pooled by each map.
-        width: Length of the descriptor.
     """
 
     def __init__(self, inputs: int, maps: int = 8, hidden: int = 64, width: int = 128):
@@ -52,10 +46,6 @@ class PooledDescriptor(nn.Module):
     """A descriptor without trained weights, for encoders that have no descriptor of their own.
 
     It projects the mean and standard deviation of the features by a fixed random matrix.
-
-    Args:
-        inputs: Channels of the local features.
-        width: Length of the descriptor.
     """
 
     projection: Tensor

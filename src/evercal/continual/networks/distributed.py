@@ -9,7 +9,7 @@ tensors. Tensors elsewhere are copied.
 """
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TypeVar
 
 import torch
@@ -34,9 +34,7 @@ def rank() -> int:
 def join_processes(device: str | torch.device = "auto") -> torch.device:
     """Join the process group that torchrun started; without torchrun, only select a device.
 
-    Args:
-        device: Device of the networks, see `device_of`. On CUDA each process of a machine uses the
-            device of its LOCAL_RANK.
+    On CUDA each process of a machine uses the device of its LOCAL_RANK.
 
     Returns:
         The device of this process.
@@ -67,72 +65,47 @@ def join_processes(device: str | torch.device = "auto") -> torch.device:
 @torch.no_grad()
 def average(tensors: Iterable[Tensor]) -> None:
     """Replace each tensor by its mean over the processes, in one exchange per type."""
-    count = processes()
-    if count == 1:
-        return
-    for group, flat in _flattened(tensors):
+
+    def mean(flat: Tensor) -> None:
         distributed.all_reduce(flat)
-        flat /= count
-        _copy_back(flat, group)
+        flat /= processes()
+
+    _exchange(tensors, mean)
 
 
 @torch.no_grad()
 def broadcast(tensors: Iterable[Tensor]) -> None:
-    """Replace each tensor by that of the first process, in one exchange per type.
+    """Replace each tensor by that of the first process, in one exchange per type."""
+    _exchange(tensors, lambda flat: distributed.broadcast(flat, 0))
 
-    Args:
-        tensors: Parameters and buffers, with the same order and shapes in every process.
-    """
+
+def _exchange(tensors: Iterable[Tensor], exchange: Callable[[Tensor], object]) -> None:
+    """Concatenate the tensors of each type, exchange them in place and copy them back."""
     if processes() == 1:
         return
-    for group, flat in _flattened(tensors):
-        distributed.broadcast(flat, 0)
-        _copy_back(flat, group)
-
-
-def _flattened(tensors: Iterable[Tensor]) -> list[tuple[list[Tensor], Tensor]]:
-    """Group tensors by type and concatenate each group on the device of the exchange."""
     by_type: dict[torch.dtype, list[Tensor]] = {}
     for tensor in tensors:
         by_type.setdefault(tensor.dtype, []).append(tensor)
-    device = _exchange_device()
-    return [
-        (group, torch.cat([tensor.detach().flatten() for tensor in group]).to(device))
-        for group in by_type.values()
-    ]
-
-
-def _copy_back(flat: Tensor, tensors: Sequence[Tensor]) -> None:
-    pieces = flat.split([tensor.numel() for tensor in tensors])
-    for tensor, piece in zip(tensors, pieces, strict=True):
-        tensor.detach().copy_(piece.view_as(tensor))
+    for group in by_type.values():
+        flat = torch.cat([tensor.detach().flatten() for tensor in group]).to(_exchange_device())
+        exchange(flat)
+        pieces = flat.split([tensor.numel() for tensor in group])
+        for tensor, piece in zip(group, pieces, strict=True):
+            tensor.detach().copy_(piece.view_as(tensor))
 
 
 def shared_out(work: Sequence[Work], number: int, count: int) -> list[Work | None]:
-    """Select the work of one process.
+    """Select the work of process `number` of `count`: one piece per round, None at the end.
 
     In round r, process k gets piece r count + k. All processes have the same number of rounds, so
     they can exchange results after each.
-
-    Args:
-        work: All pieces.
-        number: Number of the process.
-        count: Number of processes.
-
-    Returns:
-        One piece per round, or None when nothing is left.
     """
-    rounds = -(-len(work) // count)
-    indices = [r * count + number for r in range(rounds)]
-    return [work[index] if index < len(work) else None for index in indices]
+    padded = [*work, *[None] * (-len(work) % count)]
+    return padded[number::count]
 
 
 def gather(part: Mapping[str, Tensor] | None) -> list[dict[str, Tensor]]:
-    """Collect the tensors of all processes in the order of their numbers, without loss.
-
-    Args:
-        part: Named CPU tensors of this process, of any shape; None if it has no result.
-    """
+    """Collect the named CPU tensors of all processes in order, without loss."""
     if processes() == 1:
         return [] if part is None else [dict(part)]
     received: list[dict[str, Tensor] | None] = [None] * processes()

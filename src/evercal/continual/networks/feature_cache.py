@@ -12,30 +12,23 @@ import torch
 from torch import Tensor, nn
 
 
-def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int | None = None) -> None:
+def cache_features(encoder: nn.Module, folder: Path) -> None:
     """Make a frozen encoder read and write its features in a folder.
 
     Features get half precision, cached or not, so results do not depend on the cache. Unreadable
-    files are replaced. The folder may be deleted at any time.
-
-    Args:
-        encoder: Changed in place; its weights and class stay the same.
-        folder: One file per image; created if missing.
-        limit_bytes: Largest number of bytes to add. By default half of the disk space that is free
-            now stays free, even if other programs write to the disk. Writing also stops on a full
-            disk.
+    files are replaced. The folder may be deleted at any time. Half of the disk space that is free
+    now stays free, and writing stops on a full disk. The encoder is changed in place.
     """
     weights = hashlib.blake2b(digest_size=8)
     for value in encoder.state_dict().values():
         weights.update(value.detach().cpu().float().numpy().tobytes())
     folder = folder / weights.hexdigest()
     folder.mkdir(parents=True, exist_ok=True)
-    compute = encoder.forward
-    half = shutil.disk_usage(folder).free // 2
-    room, spare = (half, half) if limit_bytes is None else (limit_bytes, 0)
+    compute, writing = encoder.forward, True
+    spare = shutil.disk_usage(folder).free // 2
 
     def forward(grey: Tensor) -> Tensor:
-        nonlocal room
+        nonlocal writing
         names = [_name(image) for image in grey]
         features = [_read(folder / name) for name in names]
         missing = [i for i, value in enumerate(features) if value is None]
@@ -43,9 +36,8 @@ def cache_features(encoder: nn.Module, folder: Path, limit_bytes: int | None = N
             encoded = compute(grey[missing]).half().cpu()
             for i, value in zip(missing, encoded, strict=True):
                 features[i] = value
-                free = shutil.disk_usage(folder).free - spare
-                if min(room, free) > value.nbytes:
-                    room = room - value.nbytes if _written(folder / names[i], value) else 0
+                if writing and shutil.disk_usage(folder).free - spare > value.nbytes:
+                    writing = _written(folder / names[i], value)
         return torch.stack([value.float() for value in features if value is not None]).to(
             grey.device
         )
@@ -69,7 +61,6 @@ def _read(path: Path) -> Tensor | None:
 
 
 def _written(path: Path, features: Tensor) -> bool:
-    """Write features to a file; return whether that succeeded."""
     # Atomic but not synced, because features lost in a power failure are encoded again.
     temporary = path.with_name(f".{uuid.uuid4().hex[:8]}.tmp")
     try:

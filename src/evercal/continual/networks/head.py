@@ -67,8 +67,7 @@ class HeadOutput:
 
     def part(self, where: slice) -> "HeadOutput":
         """Return the rows of a slice."""
-        parts = (self.logits, self.offsets, self.points, self.hidden)
-        return HeadOutput(*(part[where] for part in parts))
+        return HeadOutput(*(value[where] for value in vars(self).values()))
 
 
 class Head(nn.Module):
@@ -148,9 +147,7 @@ class Head(nn.Module):
     @property
     def descriptor(self) -> int:
         """Channels of the global descriptor in the input; 0 with condition `code`."""
-        first = self.first[0]
-        assert isinstance(first, nn.Linear)
-        return first.in_features - self.features
+        return self.first[0].weight.shape[1] - self.features  # pyright: ignore
 
     @property
     def layers(self) -> int:
@@ -171,11 +168,8 @@ class Head(nn.Module):
         """Fit the input whitening, which later scenes keep.
 
         With the covariance C = V diag(s^2) V', an input becomes a (x - mean) V diag(s^-1/2) V'. The
-        factor a makes the variance over all rows and channels 1.
-
-        Args:
-            features: (n, features) rows of the first scene on any device. n must be well above the
-                number of channels.
+        factor a makes the variance over all rows and channels 1. The rows (n, features) are of the
+        first scene; n must be well above the number of channels.
         """
         features = features.double()
         mean = features.mean(0)
@@ -190,13 +184,10 @@ class Head(nn.Module):
         self.feature_map.copy_(mapping)
 
     def grow(self, centres: Tensor, seed: int) -> None:
-        """Add a scene; outputs for earlier scenes do not change.
+        """Add a scene with k >= 0 centres (k, 3) in the atlas, metres.
 
-        New rows are drawn on the CPU, so they are equal on every device.
-
-        Args:
-            centres: (k, 3) atlas coordinates of the new scene's centres, metres; k may be 0.
-            seed: Seed of the new rows.
+        Outputs for earlier scenes do not change. New rows are drawn on the CPU, so they are equal
+        on every device.
         """
         generator = torch.Generator().manual_seed(seed)
         width, count = self.options.width, len(centres)
@@ -218,15 +209,12 @@ class Head(nn.Module):
     def forward(
         self, features: Tensor, scene: Tensor | int, descriptor: Tensor | None
     ) -> HeadOutput:
-        """Predict the scene coordinates of feature rows.
+        """Predict the scene coordinates of feature rows, in fp32 also under autocast.
 
         Args:
             features: (n, features).
             scene: Index of the assumed scene, one for all rows or (n,) one per row.
             descriptor: (n, descriptor), or None with condition `code`.
-
-        Returns:
-            The output in fp32, also under autocast.
         """
         hidden = self.hidden(features, scene, descriptor)
         with torch.autocast(hidden.device.type, enabled=False):

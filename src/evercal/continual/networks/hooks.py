@@ -37,26 +37,16 @@ class TrainingHooks:
     def replayed(
         self, fresh: Rows, step: int, rate: float, generator: torch.Generator
     ) -> list[Rows]:
-        """Select remembered rows for a step.
+        """Select remembered rows for a step: the same number of parts of equal size every time.
 
-        Args:
-            fresh: Rows of the scene being learned.
-            step: Number of earlier steps.
-            rate: Learning rate of AdamW.
-            generator: Source of all random draws.
-
-        Returns:
-            Parts of equal size; every step has the same number of parts.
+        `fresh` are rows of the scene being learned, and `rate` is that of AdamW.
         """
         return []
 
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
-        """Compute the loss of replayed rows.
+        """Compute the loss of the parts of `replayed`, concatenated.
 
-        Args:
-            output: Output of the head.
-            rows: The parts of `replayed`, concatenated.
-            tau_px: Soft clamp of the loss on new rows in this step, pixels.
+        `tau_px` is the soft clamp of the loss on new rows in this step.
         """
         return None
 

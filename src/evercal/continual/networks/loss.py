@@ -117,8 +117,5 @@ def reprojection_loss(
 def fixed_clamp_loss(
     points: Tensor, target: Target, tau: float = FIXED_CLAMP_PX
 ) -> tuple[Tensor, Tensor]:
-    """Compute `reprojection_loss` with a fixed clamp.
-
-    Losses of different training steps are comparable only with the same clamp.
-    """
+    """Compute `reprojection_loss` with a fixed clamp, which makes different steps comparable."""
     return reprojection_loss(points, target, tau, LossOptions())

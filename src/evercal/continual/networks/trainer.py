@@ -83,15 +83,8 @@ class HeadTrainer:
     """Trains a head on feature rows; can stop after any step and resume from `state()`.
 
     The rows of a step depend only on the seed and the step number, so a resumed run draws the same
-    rows as an uninterrupted one.
-
-    Args:
-        head: Trained in place on its device, where the buffers must return their rows. All
-            processes start with the weights of the first.
-        buffers: Rows of the scenes being learned.
-        options: Training options.
-        seed: Random seed.
-        hooks: Hooks of a continual-learning method.
+    rows as an uninterrupted one. The head is trained in place on its device, where the buffers must
+    return their rows. All processes start with the weights of the first.
     """
 
     def __init__(
@@ -166,8 +159,7 @@ class HeadTrainer:
 
     def _fresh_costs(self, points: Tensor, rows: Rows, tau_px: float) -> tuple[Tensor, Tensor]:
         """Compute loss and error in pixels of the new rows."""
-        options = self.options
-        correction = None
+        options, correction = self.options, None
         if options.intrinsics_rate > 0 and tau_px < CORRECTION_FROM_PX:
             share = len(points) // len(self.buffers)
             correction = (self.correction * self._correctable).repeat_interleave(share, 0)
@@ -175,11 +167,9 @@ class HeadTrainer:
 
     def _gradients(self, loss: Tensor) -> dict[str, Tensor]:
         """Compute the gradient of a loss by parameter name, keeping the graph."""
-        named = dict(self.head.named_parameters())
-        gradients = torch.autograd.grad(
-            loss, list(named.values()), retain_graph=True, materialize_grads=True
-        )
-        return dict(zip(named, gradients, strict=True))
+        names, values = zip(*self.head.named_parameters(), strict=True)
+        gradients = torch.autograd.grad(loss, values, retain_graph=True, materialize_grads=True)
+        return dict(zip(names, gradients, strict=True))
 
     def _take_step(
         self, losses: Sequence[Tensor], constraints: list[dict[str, Tensor]], schedule: float
@@ -194,9 +184,8 @@ class HeadTrainer:
         if not before:
             return
         with torch.no_grad():
-            values = torch.zeros(0, device=self.head.device)
-            if losses:
-                values = torch.stack([loss.detach() for loss in losses])
+            empty = torch.zeros(0, device=self.head.device)
+            values = torch.stack([loss.detach() for loss in losses]) if losses else empty
             average([values])
             changes = {name: value - before[name] for name, value in named.items()}
             gradients = {
@@ -236,7 +225,6 @@ class HeadTrainer:
 
 
 def _without_prefix(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Select the tensors whose names start with a prefix, and remove the prefix."""
     return {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
 
 

@@ -4,7 +4,7 @@ import io
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import DataLoader, IterableDataset
 
-from evercal.continual.pretraining.furnished import FurnishedViews, cached_furnished_views
+from evercal.continual.pretraining.furnished import cached_furnished_views
 from evercal.continual.pretraining.pairs import (
     FIRST_ROOM_SEED,
     HEIGHT,
@@ -23,7 +23,6 @@ from evercal.continual.pretraining.pairs import (
     VALIDATION_ROOM_SEED,
     WIDTH,
     Pair,
-    RoomViews,
     Views,
     cell_pixels,
     homography_pair,
@@ -81,9 +80,9 @@ class PretrainOptions:
 class PretrainData:
     """Rendered training data."""
 
-    rooms: list[RoomViews]
+    rooms: Sequence[Views]
     pictures: list[np.ndarray]
-    furnished: list[FurnishedViews] = field(default_factory=list)
+    furnished: Sequence[Views] = ()
 
 
 class Batch(NamedTuple):
@@ -144,7 +143,7 @@ class PairStream(IterableDataset):
         for count, draw in (
             (o.room_pairs, lambda: self._parallax(self.data.rooms, rng)),
             (o.furnished_pairs, lambda: self._parallax(self.data.furnished, rng)),
-            (o.leaf_pairs, lambda: self._homography(rng)),
+            (o.leaf_pairs, lambda: homography_pair(self._picture(rng), rng)),
         ):
             goal = len(pairs) + count
             while len(pairs) < goal:
@@ -169,9 +168,8 @@ class PairStream(IterableDataset):
         first, second = anchor + rng.choice(PER_ANCHOR, 2, replace=False)
         return view_pair(views, int(first), int(second), rng)
 
-    def _homography(self, rng: np.random.Generator) -> Pair:
-        picture = self.data.pictures[rng.integers(len(self.data.pictures))]
-        return homography_pair(picture, rng)
+    def _picture(self, rng: np.random.Generator) -> np.ndarray:
+        return self.data.pictures[rng.integers(len(self.data.pictures))]
 
     def __iter__(self) -> Iterator[Batch]:
         import cv2
@@ -340,13 +338,10 @@ def _earlier(checkpoint: Path) -> dict[str, Tensor]:
 
 def _validation(data: PretrainData, folder: Path) -> dict[str, list[Batch]]:
     """Draw batches from held-out rooms, by kind of room."""
-    rooms = [room_views(VALIDATION_ROOM_SEED + i) for i in range(8)]
-    options = PretrainOptions(room_pairs=8, furnished_pairs=0, leaf_pairs=0)
-    stream = PairStream(PretrainData(rooms, []), options, 0)
-    batches = {"box rooms": [stream.draw(i) for i in range(6)]}
+    seeds = range(VALIDATION_ROOM_SEED, VALIDATION_ROOM_SEED + 8)
+    kinds: dict[str, Sequence[Views]] = {"box rooms": [room_views(seed) for seed in seeds]}
     if data.furnished:
-        furnished = [cached_furnished_views(VALIDATION_ROOM_SEED + i, folder) for i in range(8)]
-        options = PretrainOptions(room_pairs=0, furnished_pairs=8, leaf_pairs=0)
-        stream = PairStream(PretrainData([], [], furnished), options, 0)
-        batches["furnished rooms"] = [stream.draw(i) for i in range(6)]
-    return batches
+        kinds["furnished rooms"] = [cached_furnished_views(seed, folder) for seed in seeds]
+    options = PretrainOptions(room_pairs=8, furnished_pairs=0, leaf_pairs=0)
+    streams = {kind: PairStream(PretrainData(v, []), options, 0) for kind, v in kinds.items()}
+    return {kind: [stream.draw(i) for i in range(6)] for kind, stream in streams.items()}

@@ -55,11 +55,7 @@ def furnished_views(seed: int, anchors: int = 5) -> FurnishedViews:
     """Render a furnished room from `anchors * PER_ANCHOR` cameras.
 
     Cameras have random positions in free space, 0.7 to 3 m from a piece of furniture. The views of
-    an anchor differ by parallax, scale and roll.
-
-    Args:
-        seed: Seed of room, arm and cameras; FIRST_ROOM_SEED or later.
-        anchors: Number of observed parts of the room.
+    an anchor differ by parallax, scale and roll. Seeds start at FIRST_ROOM_SEED.
     """
     import cv2
 

@@ -47,12 +47,9 @@ def random_crop(maps: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def place_loss(a: Tensor, b: Tensor, rooms: Tensor) -> Tensor:
-    """Compute the symmetric InfoNCE loss, ignoring other places of the same room.
+    """Compute the symmetric InfoNCE loss, ignoring other places of the same room (n,).
 
-    Args:
-        a: (n, width) descriptors of n places.
-        b: (n, width) descriptors of other views of the same places.
-        rooms: (n,) room of each place.
+    `a` and `b` (n, width) are descriptors of two views of n places.
     """
     same_room = rooms[:, None] == rooms[None]
     same_room.fill_diagonal_(False)

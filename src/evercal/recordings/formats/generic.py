@@ -4,19 +4,21 @@ docs/formats.md lists the keys. `render` describes how a simulated scene was mad
 ignored.
 """
 
-import json
+import contextlib
 import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path, PureWindowsPath
-from types import TracebackType
 from typing import Any, Literal, Self
+
+import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, write_image
+from evercal.recordings.text_files import read_json
 from evercal.storage import write_json
 
 FILE = "scene.json"
@@ -43,8 +45,8 @@ def load(root: str | os.PathLike[str]) -> Recording:
     try:
         cameras = _cameras(data.get("cameras"))
         entries = data.get("frames")
-        if not isinstance(entries, list):
-            raise ValueError("'frames' is a list, got something else")
+        if not isinstance(entries, list) or not entries:
+            raise ValueError("'frames' is a list with at least one frame")
         frames: dict[str, list[Frame]] = {"train": [], "test": []}
         for i, entry in enumerate(entries):
             split, frame = _frame(root, i, entry, cameras)
@@ -55,8 +57,6 @@ def load(root: str | os.PathLike[str]) -> Recording:
         notes = data.get("notes", [])
         if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
             raise ValueError(f"'notes' is a list of sentences, got {notes!r}")
-        if not entries:
-            raise ValueError("no frames; a scene has at least one")
         every = frames["train"] + frames["test"]
         name, times = Counter(frame.name for frame in every).most_common(1)[0]
         if times > 1:
@@ -108,15 +108,8 @@ def write(
 class SceneWriter:
     """Write frames one by one; scene.json is written last, if the `with` block ends without error.
 
-    A folder without scene.json is therefore an interrupted recording, not a short scene.
-
-    Args:
-        root: Folder to write to; created if missing.
-        name: Name of the scene.
-        link: Create hard links to image files where the file system allows it.
-
-    Raises:
-        InputError: `root` already holds a scene.
+    A folder without scene.json is therefore an interrupted recording, not a short scene. Arguments
+    and errors are those of `write`.
     """
 
     def __init__(self, root: str | os.PathLike[str], name: str, link: bool = False) -> None:
@@ -139,12 +132,7 @@ class SceneWriter:
         """Return the writer; its folder exists already."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Write scene.json unless an error was raised."""
         if kind is None:
             self.close()
@@ -183,12 +171,12 @@ class SceneWriter:
             return relative
         stored = frame.image.file() if isinstance(frame.image, StoredImage) else None
         if stored is None:
-            image = frame.read_image()
-            self._put(f"{stem}.png", lambda path: write_image(path, image))
-            return f"{stem}.png"
-        ending, content = stored
-        self._put(f"{stem}{ending}", lambda path: path.write_bytes(content))
-        return f"{stem}{ending}"
+            ending, image = ".png", frame.read_image()
+            self._put(stem + ending, lambda path: write_image(path, image))
+        else:
+            ending, content = stored
+            self._put(stem + ending, lambda path: path.write_bytes(content))
+        return stem + ending
 
     def _copy(self, source: Path, relative: str) -> None:
         """Copy or link a file into the folder, unless it is that file already."""
@@ -197,9 +185,11 @@ class SceneWriter:
             return
 
         def write(path: Path) -> None:
-            # A link through a link would be broken once the folder moves.
-            if not (self._link and _linked(source.resolve(), path)):
-                shutil.copyfile(source, path)
+            if self._link:
+                with contextlib.suppress(OSError):  # not every file system has links
+                    # A link through a link would be broken once the folder moves.
+                    return path.hardlink_to(source.resolve())
+            shutil.copyfile(source, path)
 
         try:
             source.stat()
@@ -208,12 +198,7 @@ class SceneWriter:
         self._put(relative, write)
 
     def _put(self, relative: str, write: Callable[[Path], object]) -> None:
-        """Write a file under a temporary name and move it, so no hard link is written through.
-
-        Raises:
-            InputError: The file exists and is not from an interrupted recording, or it cannot be
-                written.
-        """
+        """Write a file under a temporary name and move it, so no hard link is written through."""
         target, marker = self._root / relative, self._root / _UNFINISHED
         if target.exists() and not self._resumed:
             marker.unlink(missing_ok=True)
@@ -252,15 +237,6 @@ class SceneWriter:
             raise InputError(f"{self._root / FILE}: cannot be written ({error.strerror})") from None
 
 
-def _linked(source: Path, target: Path) -> bool:
-    """Create a hard link; False if the file system does not allow it."""
-    try:
-        target.hardlink_to(source)
-    except OSError:
-        return False
-    return True
-
-
 def pose_to_dict(pose: SE3 | None) -> dict[str, object] | None:
     """Single transform as plain numbers, metres and wxyz; None stays None."""
     if pose is None:
@@ -276,22 +252,16 @@ def _pose_from_dict(data: object) -> SE3 | None:
         return None
     if not isinstance(data, Mapping):
         raise ValueError(f"is {{'translation_m', 'quaternion_wxyz'}} or null, got {data!r}")
-    translation = _numbers(data.get("translation_m"), 3, "translation_m")
-    quaternion = _numbers(data.get("quaternion_wxyz"), 4, "quaternion_wxyz")
-    length = sum(value * value for value in quaternion) ** 0.5
-    if not abs(length - 1.0) < 1e-2:
+    translation = np.array(_numbers(data.get("translation_m"), 3, "translation_m"))
+    quaternion = np.array(_numbers(data.get("quaternion_wxyz"), 4, "quaternion_wxyz"))
+    if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-2:
         raise ValueError(f"'quaternion_wxyz' has length 1, got {quaternion}")
-    return SE3(quaternion, translation)  # pyright: ignore[reportArgumentType]
+    return SE3(quaternion, translation)
 
 
 def _read(file: Path) -> dict[str, object]:
-    try:
-        data = json.loads(file.read_bytes())
-    except OSError:
-        raise InputError(f"{file}: missing; a scene folder of this format holds one") from None
-    except ValueError as error:
-        raise InputError(f"{file}: not valid JSON ({error}); convert the recording again") from None
-    if not isinstance(data, dict) or data.get("format") != _FORMAT:
+    data = read_json(file, "scene file", "convert the recording again")
+    if data.get("format") != _FORMAT:
         raise InputError(f"{file}: 'format' is not '{_FORMAT}'; this is another program's file")
     if data.get("version") != _VERSION:
         raise InputError(
@@ -302,12 +272,10 @@ def _read(file: Path) -> dict[str, object]:
 
 
 def _cameras(data: object) -> dict[str, Camera]:
-    if not isinstance(data, dict):
-        raise ValueError("'cameras' is an object of cameras, got something else")
+    if not isinstance(data, dict) or not all(isinstance(c, dict) for c in data.values()):
+        raise ValueError("'cameras' is an object of objects, got something else")
     cameras = {}
     for number, camera in data.items():
-        if not isinstance(camera, dict):
-            raise ValueError(f"camera {number!r} is an object, got {camera!r}")
         try:
             cameras[number] = Camera.from_dict(camera)
         except ValueError as error:
@@ -341,13 +309,9 @@ def _frame(
 
 
 def path_inside(path: object, what: str) -> str:
-    """Check that a path with forward slashes stays inside the folder of its file.
+    """Check that a path of a file with forward slashes stays inside the file's folder.
 
-    Symbolic links are followed: download caches keep files elsewhere.
-
-    Args:
-        path: Value from a file.
-        what: Name of the entry, for the message.
+    Symbolic links are followed: download caches keep files elsewhere. `what` names the entry.
 
     Raises:
         ValueError: The path is empty, absolute or contains "..".
@@ -361,9 +325,10 @@ def path_inside(path: object, what: str) -> str:
 
 
 def _numbers(value: object, count: int, name: str) -> list[float]:
-    plain = isinstance(value, list) and all(
-        isinstance(v, (int, float)) and not isinstance(v, bool) for v in value
-    )
-    if not isinstance(value, list) or not plain or len(value) != count:
+    if (
+        not isinstance(value, list)
+        or len(value) != count
+        or any(isinstance(v, bool) or not isinstance(v, (int, float)) for v in value)
+    ):
         raise ValueError(f"'{name}' is {count} numbers, got {value!r}")
     return [float(v) for v in value]

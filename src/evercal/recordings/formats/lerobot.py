@@ -11,11 +11,11 @@ file is required. Frames of all episodes are training frames with base_from_grip
 dataset must stay inside its folder.
 """
 
-import json
-from collections.abc import Mapping
+import functools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, decode_image, image_file
 from evercal.recordings.poses.camera_file import read_camera_of_size
 from evercal.recordings.read_options import ReadOptions
+from evercal.recordings.text_files import read_json
 
 USES = ("camera", "image_topic", "base_frame", "gripper_frame", "urdf", "pose_convention")
 INFO = Path("meta") / "info.json"
@@ -59,16 +60,14 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     height, width = shape[1:3] if shape[0] == 3 else shape[:2]  # some state channels first
     camera = read_camera_of_size(options.camera, (width, height), key)
     column = pose_feature(root, info, options)
-    table = _table(root, column)
-    poses, notes = feature_poses(root, info, column, table.values, options)
-    images = _images(root, info, key, table)
+    rows, values = _rows(root, column)
+    poses, notes = feature_poses(root, info, column, values, options)
+    images = _images(root, info, key, rows)
     frames = tuple(
-        Frame(f"episode_{episode:06d}/{number:06d}", image, camera, None, pose)
-        for episode, number, image, pose in zip(
-            table.episode, table.number, images, poses, strict=True
-        )
+        Frame(f"episode_{row.episode:06d}/{row.number:06d}", image, camera, None, pose)
+        for row, image, pose in zip(rows, images, poses, strict=True)
     )
-    here, total = len(set(table.episode.tolist())), int(info.get("total_episodes", 0))
+    here, total = len({row.episode for row in rows}), int(info.get("total_episodes", 0))
     if here < total:
         notes.append(f"{here} of {total} episodes are in the folder")
     frames[0].read_image()
@@ -77,8 +76,8 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
 
 def _info(root: Path) -> dict[str, Any]:
     file = root / INFO
+    info: dict[str, Any] = read_json(file, "LeRobot dataset")
     try:
-        info = json.loads(file.read_bytes())
         version = str(info["codebase_version"])
         if not version.startswith(("v2.", "v3.")):
             raise InputError(f"{file}: version {version}; this evercal reads v2 and v3")
@@ -88,8 +87,6 @@ def _info(root: Path) -> dict[str, Any]:
             if info.get(name) is not None:
                 path_inside(info[name], repr(name))
         return info
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror})") from None
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{file}: no LeRobot dataset ({type(error).__name__}: {error})") from None
 
@@ -104,46 +101,43 @@ def _camera_key(root: Path, info: Mapping[str, Any], wanted: str | None) -> str:
     raise InputError(f"{root}: {what}; name one with --image-topic: {', '.join(keys) or 'none'}")
 
 
-@dataclass(frozen=True, eq=False)
-class _Table:
-    """The rows of all episodes."""
+class _Row(NamedTuple):
+    """One image and its place in the tables."""
 
-    files: list[Path]
-    file: NDArray[np.int64]
-    """(n,) index of the row's file in `files`."""
-    row: NDArray[np.int64]
-    """(n,) index of the row in its file."""
-    episode: NDArray[np.int64]
-    number: NDArray[np.int64]
-    """(n,) index of the frame in its episode."""
-    seconds: NDArray[np.float64]
-    """(n,) time since the start of the episode."""
-    values: NDArray[np.float64]
-    """(n, k) numbers of the pose feature."""
+    episode: int
+    number: int
+    """Index of the frame in its episode."""
+    seconds: float
+    """Time since the start of the episode."""
+    file: Path
+    row: int
+    """Index of the row in `file`."""
 
 
-def _table(root: Path, column: str) -> _Table:
+def _rows(root: Path, column: str) -> tuple[list[_Row], NDArray[np.float64]]:
+    """The n rows of all episodes, and (n, k) numbers of the pose feature."""
     files = sorted((root / "data").glob("*/*.parquet"))
     if not files:
         raise InputError(
             f"{root / 'data'}: no parquet files; download the dataset's data folder too"
         )
-    parts: list[list[NDArray[Any]]] = []
-    for i, file in enumerate(files):
-        rows = _read_table(file, ["episode_index", "frame_index", "timestamp", column])
-        episode, number, seconds = (rows[name].to_numpy() for name in rows.column_names[:3])
+    rows: list[_Row] = []
+    parts = []
+    for file in files:
+        table = _read_table(file, ["episode_index", "frame_index", "timestamp", column])
+        *cells, poses = (table[name].to_pylist() for name in table.column_names)
+        for i, (episode, number, seconds) in enumerate(zip(*cells, strict=True)):
+            rows.append(_Row(episode, number, seconds, file, i))
         try:
-            values = np.array(rows[column].to_pylist(), dtype=np.float64)
+            values = np.array(poses, dtype=np.float64)
         except (TypeError, ValueError):
             values = np.empty(0)
         if values.ndim != 2 or not np.isfinite(values).all():
             raise InputError(f"{file}: {column} holds no rows of finite numbers")
-        where = np.full(len(values), i)
-        parts.append([where, np.arange(len(values)), episode, number, seconds, values])
-    where, row, episode, number, seconds, values = map(np.concatenate, zip(*parts, strict=True))
-    if not len(values):
+        parts.append(values)
+    if not rows:
         raise InputError(f"{root}: the dataset has no frames")
-    return _Table(files, where, row, episode, number, seconds.astype(np.float64), values)
+    return rows, np.concatenate(parts)
 
 
 def _parquet(path: Path) -> Any:
@@ -165,19 +159,19 @@ def _read_table(file: Path, columns: list[str]) -> Any:
         raise InputError(f"{file}: cannot be read: {text}") from None
 
 
-def _images(root: Path, info: Mapping[str, Any], key: str, table: _Table) -> list[StoredImage]:
-    rows = range(len(table.row))
+def _images(
+    root: Path, info: Mapping[str, Any], key: str, rows: Sequence[_Row]
+) -> list[StoredImage]:
     if info["features"][key]["dtype"] == "image":
-        tables = _Tables(root, key)
-        return [_Embedded(tables, table.files[table.file[i]], int(table.row[i])) for i in rows]
+        return [_Embedded(root, key, row.file, row.row) for row in rows]
     videos = Videos(float(info["fps"]))
-    starts = _video_starts(root, info, key, set(table.episode.tolist()))
+    starts = _video_starts(root, info, key, {row.episode for row in rows})
     images: list[StoredImage] = []
-    for episode, seconds in zip(table.episode.tolist(), table.seconds.tolist(), strict=True):
-        if episode not in starts:
-            raise InputError(f"{root / 'meta' / 'episodes'}: episode {episode} is not listed")
-        path, start = starts[episode]
-        images.append(VideoFrame(videos, path, start + seconds))
+    for row in rows:
+        if row.episode not in starts:
+            raise InputError(f"{root / 'meta' / 'episodes'}: episode {row.episode} is not listed")
+        path, start = starts[row.episode]
+        images.append(VideoFrame(videos, path, start + row.seconds))
     return images
 
 
@@ -210,54 +204,44 @@ def _video_path(root: Path, info: Mapping[str, Any], key: str, numbers: dict[str
         raise InputError(f"{root / INFO}: unusable 'video_path': {error}") from None
 
 
-class _Tables:
-    """Images in parquet files; the last row group is cached."""
-
-    def __init__(self, root: Path, key: str) -> None:
-        self._parquet, self._key, self._root = _parquet(root), key, root
-        self._last: tuple[Path, int, list[Any]] | None = None
-
-    def bytes(self, path: Path, row: int) -> bytes:
-        """Content of the image file in a row."""
-        file = self._parquet.ParquetFile(path)
-        try:
-            group, index = 0, row
-            while index >= file.metadata.row_group(group).num_rows:
-                index -= file.metadata.row_group(group).num_rows
-                group += 1
-            last = self._last
-            if last is None or last[:2] != (path, group):
-                rows = file.read_row_group(group, columns=[self._key])[self._key].to_pylist()
-                last = self._last = path, group, rows
-        finally:
-            file.close()
-        cell = last[2][index]
-        if cell["bytes"]:
-            return bytes(cell["bytes"])
-        where = f"{path}: row {row}: image {cell['path']!r}"
-        try:
-            return (self._root / path_inside(cell["path"], "the path")).read_bytes()
-        except ValueError as error:
-            raise InputError(f"{where}: {error}") from None
-        except OSError as error:
-            raise InputError(f"{where} cannot be read ({error.strerror})") from None
+@functools.lru_cache(maxsize=1)
+def _row_group(path: Path, group: int, key: str) -> list[Any]:
+    with _parquet(path).ParquetFile(path) as file:
+        return file.read_row_group(group, columns=[key])[key].to_pylist()
 
 
 @dataclass(frozen=True, eq=False)
 class _Embedded(StoredImage):
     """An image file in a cell of a table."""
 
-    tables: _Tables
+    root: Path
+    key: str
     path: Path
     row: int
 
     def read(self) -> NDArray[np.uint8]:
         """(H, W, 3) uint8 RGB."""
-        image = decode_image(np.frombuffer(self.tables.bytes(self.path, self.row), np.uint8))
+        image = decode_image(np.frombuffer(self._content(), np.uint8))
         if image is None:
             raise InputError(f"{self.path}: row {self.row} holds no image")
         return image
 
     def file(self) -> tuple[str, bytes] | None:
         """The PNG or JPEG file as it is stored."""
-        return image_file(self.tables.bytes(self.path, self.row))
+        return image_file(self._content())
+
+    def _content(self) -> bytes:
+        with _parquet(self.path).ParquetFile(self.path) as file:
+            groups = range(file.num_row_groups)
+            ends = np.cumsum([file.metadata.row_group(group).num_rows for group in groups])
+        group = int(np.searchsorted(ends, self.row, side="right"))
+        cell = _row_group(self.path, group, self.key)[self.row - int(ends[group])]
+        if cell["bytes"]:
+            return bytes(cell["bytes"])
+        where = f"{self.path}: row {self.row}: image {cell['path']!r}"
+        try:
+            return (self.root / path_inside(cell["path"], "the path")).read_bytes()
+        except ValueError as error:
+            raise InputError(f"{where}: {error}") from None
+        except OSError as error:
+            raise InputError(f"{where} cannot be read ({error.strerror})") from None

@@ -81,17 +81,7 @@ def feature_poses(
     values: NDArray[np.float64],
     options: ReadOptions,
 ) -> tuple[SE3, list[str]]:
-    """Convert the numbers of a feature to poses.
-
-    Args:
-        root: The dataset, for messages.
-        info: Content of info.json.
-        column: Name of the feature.
-        values: (n, k) numbers of the feature.
-        options: Convention, arm, frames and URDF.
-
-    Returns:
-        (n,) base_from_gripper, and notes.
+    """Convert the numbers (n, k) of a feature to (n,) base_from_gripper, with notes.
 
     Raises:
         InputError: The numbers are no poses, or several poses are possible.
@@ -135,21 +125,15 @@ def _joint_poses(
     if repeated:
         raise InputError(f"{root}: {_STATE}: {repeated[0]!r} names several numbers; rename them")
     model = RobotModel(options.urdf)
-    base, gripper = model.chosen_links(options.base_frame, options.gripper_frame)
     values = in_radians(model, names, stated, [options.pose_convention] * len(names))
     try:
-        poses = model.base_from_gripper(names, values, base, gripper)
+        return model.poses(names, values, options.base_frame, options.gripper_frame)
     except InputError as error:
         raise InputError(f"{root}: {_STATE}: {error} (or give --pose-convention deg)") from None
-    return poses, [model.note(base, gripper), *model.beyond_limits(names, values)]
 
 
 def _pose_columns(names: list[str], arm: str | None) -> tuple[PoseConvention, list[int]]:
-    """Convention of a feature's pose, and the columns of its numbers.
-
-    Raises:
-        ValueError: The names are those of several poses, and `arm` selects none of them.
-    """
+    """Convention of a feature's pose, and the columns of its numbers."""
     arms = _arms(names)
     chosen = [n if arm not in arms or n.rpartition(".")[0] == arm else "" for n in names]
     convention = _convention_of(chosen)

@@ -7,7 +7,6 @@ are set by the program that estimated the poses. Files in `val_filenames` and `t
 test frames. (Tancik et al., Nerfstudio, SIGGRAPH 2023; its documentation, Data conventions.)
 """
 
-import json
 import math
 import os
 from collections import Counter
@@ -22,6 +21,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, image_size
+from evercal.recordings.text_files import read_json
 
 FILE = "transforms.json"
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
@@ -50,13 +50,16 @@ def load(root: str | os.PathLike[str]) -> Recording:
     root = Path(root)
     file = root if root.is_file() else root / FILE
     root = file.parent
-    data = _read(file)
+    data = read_json(file, "nerfstudio file", "export it again")
     try:
         undo, scale = _applied(data)
         entries = data.get("frames")
         if not isinstance(entries, list) or not entries:
             raise ValueError("'frames' is a list with at least one frame")
-        data = {**_first_size(root, data, entries), **data}
+        first = entries[0]
+        if isinstance(first, dict) and "file_path" in first and not {"w", "h"} & {*data, *first}:
+            width, height = image_size(_image(root, str(first["file_path"])))
+            data |= {"w": width, "h": height}
         frames = [_frame(root, data, i, entry, undo, scale) for i, entry in enumerate(entries)]
         test = _test_images(root, data, {str(frame.image) for frame in frames})
     except (ValueError, OverflowError) as error:
@@ -71,30 +74,6 @@ def load(root: str | os.PathLike[str]) -> Recording:
         tuple(frame for frame in frames if frame.image in test),
         notes=(NOTE.format(file=FILE),),
     )
-
-
-def _read(file: Path) -> dict[str, object]:
-    try:
-        data = json.loads(file.read_bytes())
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror})") from None
-    except ValueError as error:
-        raise InputError(f"{file}: not valid JSON ({error}); export it again") from None
-    if not isinstance(data, dict):
-        raise InputError(f"{file}: no JSON object; expected an object with 'frames'")
-    return data
-
-
-def _first_size(root: Path, data: Mapping[str, object], entries: list[object]) -> dict[str, object]:
-    """Size of the first image as w and h, if neither the file nor its first frame states it."""
-    first = entries[0]
-    if not isinstance(first, dict) or {"w", "h"} & {*data, *first}:
-        return {}
-    name = first.get("file_path")
-    if not isinstance(name, str):
-        return {}
-    width, height = image_size(_image(root, name))
-    return {"w": width, "h": height}
 
 
 def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:

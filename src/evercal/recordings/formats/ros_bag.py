@@ -8,8 +8,9 @@ image stamps from /tf and /tf_static, or from /joint_states with a URDF. If the 
 frame of the images themselves, the poses are base_from_camera. Images stay in the bag until needed.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +18,19 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.recordings.formats.bags import images as ros_images
-from evercal.recordings.formats.bags.camera import bag_camera
-from evercal.recordings.formats.bags.file import COMPRESSED, IMAGE, BagFile, is_bag, stamp_ns
-from evercal.recordings.formats.bags.poses import ImagePoses, poses_at_images
+from evercal.recordings.formats.bags.file import (
+    CAMERA_INFO,
+    COMPRESSED,
+    IMAGE,
+    BagFile,
+    is_bag,
+    stamp_ns,
+)
+from evercal.recordings.formats.bags.poses import poses_at_images
 from evercal.recordings.formats.bags.tf_tree import plain_name
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, image_file
-from evercal.recordings.poses.camera_file import check_size, read_camera_of_size
+from evercal.recordings.poses.camera_file import camera_from_ros, check_size, read_camera_of_size
 from evercal.recordings.poses.pose_track import MAX_GAP_S
 from evercal.recordings.read_options import ReadOptions
 
@@ -49,18 +56,22 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     if options.camera is not None:
         camera = read_camera_of_size(options.camera, (width, height), topic)
     else:
-        info_topic, camera = bag_camera(bag, topic)
+        info_topic, camera = _bag_camera(bag, topic)
         check_size(f"{root}: {info_topic}", camera, (width, height), topic)
     stamps = np.array([shot.stamp_ns for shot in shots])
     poses = poses_at_images(bag, stamps, shots[0].frame_id, options)
-    frames = _frames(shots, camera, poses)
+    frames = []
+    for i in np.flatnonzero(poses.valid).tolist():
+        pose = poses.poses[i]
+        of_camera, of_gripper = (pose, None) if poses.of_camera else (None, pose)
+        frames.append(Frame(f"{i:06d}", shots[i].image, camera, of_camera, of_gripper))
     lost = len(shots) - len(frames)
     if lost:
         notes.append(
             f"{lost} of {len(shots)} images were taken outside the recorded poses or in a gap of"
             f" more than {MAX_GAP_S:g} s in which the gripper moved"
         )
-    return Recording(root.resolve().stem, frames, (), lost, notes=(*notes, *poses.notes))
+    return Recording(root.resolve().stem, tuple(frames), (), lost, notes=(*notes, *poses.notes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,14 +86,7 @@ class BagImage(StoredImage):
     """Number of earlier messages of the topic with the same time of recording."""
 
     def read(self) -> NDArray[np.uint8]:
-        """Decode the message.
-
-        Returns:
-            (H, W, 3) uint8 RGB.
-
-        Raises:
-            InputError: The message cannot be decoded.
-        """
+        """Decode the message, see `StoredImage.read`."""
         message = self.bag.message(self.topic, self.logged_ns, self.repeat)
         compressed = message.kind == COMPRESSED
         decode = ros_images.compressed_image_of if compressed else ros_images.image_of
@@ -99,8 +103,7 @@ class BagImage(StoredImage):
         return image_file(bytes(message.content.data))
 
 
-@dataclass(frozen=True, eq=False)
-class _Shot:
+class _Shot(NamedTuple):
     """One image with its time and camera frame."""
 
     image: BagImage
@@ -151,15 +154,48 @@ def _shots(bag: BagFile, topic: str) -> tuple[list[_Shot], list[str]]:
         shots.append(_Shot(image, stamp_ns(header.stamp), plain_name(header.frame_id)))
     notes = []
     if all(shot.stamp_ns == 0 for shot in shots):
-        shots = [replace(shot, stamp_ns=shot.image.logged_ns) for shot in shots]
+        shots = [shot._replace(stamp_ns=shot.image.logged_ns) for shot in shots]
         notes.append(f"images on {topic} carry no stamps; the times of recording were taken")
     return sorted(shots, key=lambda shot: shot.stamp_ns), notes
 
 
-def _frames(shots: list[_Shot], camera: Camera, poses: ImagePoses) -> tuple[Frame, ...]:
-    frames = []
-    for i in np.flatnonzero(poses.valid).tolist():
-        pose = poses.poses[i]
-        of_camera, of_gripper = (pose, None) if poses.of_camera else (None, pose)
-        frames.append(Frame(f"{i:06d}", shots[i].image, camera, of_camera, of_gripper))
-    return tuple(frames)
+def _bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
+    """Read the first camera_info beside an image topic, with its topic.
+
+    The topic of `/camera/image_raw/compressed` is `/camera/camera_info`. Rectified images
+    take P without distortion, others K and D.
+
+    Raises:
+        InputError: There is no camera_info, it is uncalibrated, or its model is not supported.
+    """
+    topics = bag.topics(CAMERA_INFO)
+    image = image_topic.removesuffix("/compressed")
+    beside = f"{image.rpartition('/')[0]}/camera_info"
+    if beside not in topics:
+        raise InputError(
+            f"{bag.path}: no camera_info for {image_topic} ({beside} is expected, there is"
+            f" {' and '.join(topics) or 'none'}); record it, or give the intrinsics with --camera"
+        )
+    message = next(bag.messages([beside])).content
+    try:
+        return beside, _camera(message, image.rpartition("/")[2].startswith("image_rect"))
+    except ValueError as error:
+        raise InputError(f"{bag.path}: {beside}: {error}") from None
+
+
+def _camera(message: Any, rectified: bool) -> Camera:
+    # ROS 1 writes K, D and P, ROS 2 k, d and p.
+    k, d, p = (
+        np.asarray(getattr(message, name, getattr(message, name.upper(), []))).reshape(-1).tolist()
+        for name in ("k", "d", "p")
+    )
+    if not any(k):
+        raise ValueError("K is all zeros: the camera is not calibrated; give --camera")
+    data = {"k": k, "d": d, "distortion_model": message.distortion_model}
+    if rectified:
+        if len(p) != 12 or not any(p):
+            raise ValueError("P is missing, which rectified images need; give --camera")
+        data = {"k": [*p[:3], *p[4:7], *p[8:11]], "d": [], "distortion_model": ""}
+    offsets = {name: int(getattr(message.roi, name)) for name in ("x_offset", "y_offset")}
+    size = {"width": int(message.width), "height": int(message.height)}
+    return camera_from_ros({**data, **size, "roi": offsets})

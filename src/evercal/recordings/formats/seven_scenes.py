@@ -18,14 +18,10 @@ from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.recordings.formats.frame_files import (
-    colour_images,
-    frame_name,
-    read_numbers,
-    tracked_frames,
-)
-from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.formats.frame_files import colour_images, read_numbers, tracked_frames
+from evercal.recordings.frame import Recording
 from evercal.recordings.images import image_size
+from evercal.recordings.text_files import read_text
 
 _SPLITS = ("TrainSplit.txt", "TestSplit.txt")
 _FOCAL_AT_640 = 525.0
@@ -45,8 +41,6 @@ def load(root: str | os.PathLike[str]) -> Recording:
         InputError: The folder, a split, a sequence, a pose or an image is missing or broken.
     """
     root = Path(root)
-    if not root.is_dir():
-        raise InputError(f"{root}: no such folder; give a folder with seq-XX folders in it")
     splits = [_sequences(root, name) for name in _SPLITS]
     shared = sorted({folder.name for folder in splits[0]} & {folder.name for folder in splits[1]})
     if shared:
@@ -57,7 +51,7 @@ def load(root: str | os.PathLike[str]) -> Recording:
     if not (images[0] or images[1]):
         raise InputError(f"{root}: {_SPLITS[0]} and {_SPLITS[1]} are empty; name a sequence in one")
     camera = _camera(root, (images[0] + images[1])[0])
-    train, test = (_frames(split, camera) for split in images)
+    train, test = (tracked_frames(split, camera, folders=True) for split in images)
     untracked = len(images[0]) + len(images[1]) - len(train) - len(test)
     return Recording(root.resolve().name, train, test, untracked)
 
@@ -65,17 +59,9 @@ def load(root: str | os.PathLike[str]) -> Recording:
 def _sequences(root: Path, split: str) -> list[Path]:
     """Folders named by a split file, in its order."""
     file = root / split
-    try:
-        lines = file.read_text().split("\n")
-    except OSError:
-        raise InputError(
-            f"{file}: split file is missing; write one with a line such as 'sequence1' for each"
-            f" seq-XX folder"
-        ) from None
-    except UnicodeDecodeError:
-        raise InputError(f"{file}: split file is not text; give lines like 'sequence1'") from None
+    text = read_text(file, "split file", "write lines like 'sequence1' for the seq-XX folders")
     folders = []
-    for line in filter(None, (line.strip() for line in lines)):
+    for line in filter(None, map(str.strip, text.splitlines())):
         match = re.fullmatch(r"(?:sequence|seq-?)?(\d+)", line, re.IGNORECASE)
         if match is None:
             raise InputError(f"{file}: cannot read line {line!r}; a line looks like 'sequence1'")
@@ -84,11 +70,6 @@ def _sequences(root: Path, split: str) -> list[Path]:
             raise InputError(f"{file}: line {line!r} names {folder.name}, which is not in {root}")
         folders.append(folder)
     return folders
-
-
-def _frames(images: list[Path], camera: Camera) -> tuple[Frame, ...]:
-    names = [f"{image.parent.name}/{frame_name(image.name)}" for image in images]
-    return tracked_frames(names, images, camera)
 
 
 def _camera(root: Path, image: Path) -> Camera:

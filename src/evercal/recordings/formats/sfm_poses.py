@@ -20,16 +20,14 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.frame import Recording
+from evercal.recordings.text_files import read_text
 
 
 def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:
-    """Replace poses and focal lengths of a recording.
+    """Replace poses and focal lengths of a recording and keep its split.
 
-    Args:
-        recording: Images with original poses; its split is kept.
-        folder: Folder of the pose files.
-        name: First part of the file names, such as chess or apt1_kitchen.
+    Files in `folder` begin with `name`, such as chess or apt1_kitchen.
 
     Raises:
         InputError: A file is missing or broken, or holds no frame of the recording.
@@ -38,21 +36,20 @@ def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:
     for split, frames in (("train", recording.train), ("test", recording.test)):
         file = folder / f"{name}_{split}.txt"
         poses = _read(file)
-        posed = tuple(_posed(f, *poses[_key(f.name)]) for f in frames if _key(f.name) in poses)
+        posed = []
+        for frame in (f for f in frames if _key(f.name) in poses):
+            pose, focal = poses[_key(frame.name)]
+            c = frame.camera
+            # The middle of the image, counted from the centre of the first pixel.
+            middle = (c.width - 1) / 2, (c.height - 1) / 2
+            camera = Camera(c.width, c.height, focal, focal, *middle, c.distortion)
+            posed.append(replace(frame, camera=camera, base_from_camera=pose))
         if frames and not posed:
             first = _key(frames[0].name)
             raise InputError(f"{file}: no frame of {recording.name} is in it, such as {first}")
-        splits.append(posed)
+        splits.append(tuple(posed))
         lost += len(frames) - len(posed)
     return replace(recording, train=splits[0], test=splits[1], untracked=recording.untracked + lost)
-
-
-def _posed(frame: Frame, base_from_camera: SE3, focal: float) -> Frame:
-    c = frame.camera
-    # The middle of the image, counted from the centre of the first pixel.
-    middle = (c.width - 1) / 2, (c.height - 1) / 2
-    camera = Camera(c.width, c.height, focal, focal, *middle, c.distortion)
-    return replace(frame, camera=camera, base_from_camera=base_from_camera)
 
 
 def _key(name: str) -> str:
@@ -62,13 +59,8 @@ def _key(name: str) -> str:
 
 def _read(file: Path) -> dict[str, tuple[SE3, float]]:
     """base_from_camera and focal length in pixels by frame."""
-    try:
-        lines = file.read_text().splitlines()
-    except (OSError, UnicodeDecodeError):
-        raise InputError(
-            f"{file}: missing; get the folder pgt/sfm of "
-            "https://github.com/tsattler/visloc_pseudo_gt_limitations"
-        ) from None
+    source = "https://github.com/tsattler/visloc_pseudo_gt_limitations"
+    lines = read_text(file, "pose file", f"get the folder pgt/sfm of {source}").splitlines()
     poses = {}
     for number, line in enumerate(filter(str.strip, lines), start=1):
         name, *words = line.split()

@@ -17,9 +17,10 @@ from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.recordings.formats.frame_files import colour_images, frame_name, tracked_frames
+from evercal.recordings.formats.frame_files import colour_images, tracked_frames
 from evercal.recordings.frame import Recording
 from evercal.recordings.images import image_size
+from evercal.recordings.text_files import read_text
 
 
 def detect(root: Path) -> bool:
@@ -37,17 +38,14 @@ def load(root: str | os.PathLike[str]) -> Recording:
     images = colour_images(root / "data")
     split = _test_count(root, len(images))
     camera = _camera(root, images[0])
-    train, test = (
-        tracked_frames([frame_name(image.name) for image in part], part, camera)
-        for part in (images[split:], images[:split])
-    )
+    train, test = (tracked_frames(part, camera) for part in (images[split:], images[:split]))
     return Recording(root.resolve().name, train, test, len(images) - len(train) - len(test))
 
 
 def _test_count(root: Path, frames: int) -> int:
     """Number of test frames, which come first."""
     file = root / "split.txt"
-    text = _text(file, "its first line is '... [frames=N]'")
+    text = read_text(file, "split file", "its first line is '... [frames=N]'")
     match = re.search(r"\[frames=(\d+)\]", text.split("\n")[0])
     if match is None:
         raise InputError(f"{file}: the first line holds no '[frames=N]'")
@@ -58,7 +56,7 @@ def _test_count(root: Path, frames: int) -> int:
 
 def _camera(root: Path, image: Path) -> Camera:
     file = root / "info.txt"
-    text = _text(file, "it holds m_calibrationColorIntrinsic")
+    text = read_text(file, "calibration", "it holds m_calibrationColorIntrinsic")
     values = dict(re.findall(r"^\s*(\w+)\s*=\s*(.+?)\s*$", text, re.MULTILINE))
     try:
         numbers = [float(word) for word in values["m_calibrationColorIntrinsic"].split()]
@@ -69,10 +67,3 @@ def _camera(root: Path, image: Path) -> Camera:
             f"{file}: needs m_colorWidth, m_colorHeight and m_calibrationColorIntrinsic ({error!r})"
         ) from None
     return camera.resized(*image_size(image))
-
-
-def _text(file: Path, contents: str) -> str:
-    try:
-        return file.read_text()
-    except (OSError, UnicodeDecodeError):
-        raise InputError(f"{file}: missing; {contents}") from None

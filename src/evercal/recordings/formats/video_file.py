@@ -1,7 +1,6 @@
 """Single frames of video files, decoded on demand by PyAV (extra `lerobot`)."""
 
 import threading
-import weakref
 from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,10 +61,7 @@ class _Open:
 
 
 class Videos:
-    """Cache of open videos of one frame rate; threads may share it.
-
-    Args:
-        fps: Frames per second of all videos.
+    """Cache of open videos with `fps` frames per second; threads may share it.
 
     Raises:
         InputError: The extra `lerobot` is not installed.
@@ -82,17 +78,9 @@ class Videos:
         self._half = 0.5 / fps
         self._open: OrderedDict[Path, _Open] = OrderedDict()
         self._lock = threading.Lock()
-        weakref.finalize(self, _close, self._open)
 
     def frame(self, path: Path, seconds: float) -> NDArray[np.uint8]:
-        """Decode the frame at a time.
-
-        Args:
-            path: Video file.
-            seconds: Time since the first frame.
-
-        Returns:
-            (H, W, 3) uint8 RGB.
+        """Decode the frame at a time in seconds since the first frame to (H, W, 3) uint8 RGB.
 
         Raises:
             InputError: The video is missing, cannot be decoded, or has no frame at this time.
@@ -117,9 +105,3 @@ class Videos:
             self._open[path] = _Open(path, self._av.open(str(path)))
         self._open.move_to_end(path)
         return self._open[path]
-
-
-def _close(videos: OrderedDict[Path, _Open]) -> None:
-    for video in videos.values():
-        video.container.close()
-    videos.clear()

@@ -5,17 +5,21 @@ The content decides the kind, not the file ending. Both ROS calibration files an
 all kinds, pixel (0, 0) is the centre of the top-left pixel, and images are upright.
 """
 
-import json
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from evercal.errors import InputError
 from evercal.geometry import Camera
+from evercal.recordings.poses.row_files import is_number
+from evercal.recordings.text_files import read_json, read_text
 
 _MODELS = ("plumb_bob", "rational_polynomial", "none", "")
 _LENGTHS = (0, 4, 5, 8)
-# Names of the fields in OpenCV's storage, in lower case without underscores.
+# Names of the fields in lower case without underscores.
 _ALIASES = {
     "camera_matrix": ("cameramatrix", "intrinsicmatrix", "k"),
     "distortion_coefficients": ("distortioncoefficients", "distcoeffs", "distcoeff", "d"),
@@ -27,43 +31,42 @@ _ALIASES = {
 def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> Camera:
     """Read the intrinsics of one camera.
 
-    Args:
-        path: The file.
-        size: (width, height) in pixels of the images. Required for a 3x3 matrix and for OpenCV's
-            storage without a size; otherwise the size in the file is used.
+    `size` is (width, height) in pixels of the images. A 3x3 matrix and OpenCV's storage without a
+    size need it; otherwise the size in the file is used.
 
     Raises:
         InputError: The file is missing, of an unknown kind, or holds no usable camera.
     """
+    import yaml
+
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{path}: camera file is missing; check the path") from None
-    except OSError as error:
-        raise InputError(f"{path}: camera file cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file; {_EXPECTED}") from None
+    text = read_text(path, "camera file")
     try:
         if text.lstrip().startswith("{"):
-            return Camera.from_dict(_json_object(text))
+            return Camera.from_dict(read_json(path, "camera file", _EXPECTED))
         if text.startswith("%YAML:") or "opencv-matrix" in text or "<opencv_storage" in text:
             return camera_from_ros(_stored_by_opencv(text, size))
-        numbers = _plain_numbers(text)
-        if numbers is not None:
-            return _from_matrix(numbers, size)
-        return camera_from_ros(_yaml_mapping(text))
+        words = re.sub(r"#.*|,", " ", text).split()
+        if all(map(is_number, words)):
+            if len(words) != 9:
+                raise ValueError(f"{len(words)} numbers, a 3x3 matrix has 9; {_EXPECTED}")
+            if size is None:
+                raise ValueError("a 3x3 matrix has no image size; give another kind of camera file")
+            return Camera.from_matrix(np.array(words, dtype=float).reshape(3, 3), *size)
+        # A printed message ends with '---', which opens a second, empty document.
+        data = next(yaml.safe_load_all(text), None)
+        if not isinstance(data, dict):
+            raise ValueError(f"no camera in it; {_EXPECTED}")
+        return camera_from_ros(data)
+    except yaml.YAMLError as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: not valid YAML ({reason}); {_EXPECTED}") from None
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: {error}") from None
 
 
 def read_camera_of_size(path: Path, size: tuple[int, int], images: str) -> Camera:
     """Read the intrinsics of images of one size.
-
-    Args:
-        path: The file.
-        size: (width, height) in pixels of the images.
-        images: Name of the images, for messages.
 
     Raises:
         InputError: As `read_camera`, or the camera has another size.
@@ -87,51 +90,14 @@ _EXPECTED = (
 )
 
 
-def _json_object(text: str) -> Mapping[str, object]:
-    try:
-        return json.loads(text)
-    except ValueError as error:
-        raise ValueError(f"not valid JSON ({error}); {_EXPECTED}") from None
-
-
-def _plain_numbers(text: str) -> list[float] | None:
-    """All words as numbers, without commas and comments; None if a word is not a number."""
-    lines = (line.split("#")[0].replace(",", " ") for line in text.splitlines())
-    try:
-        return [float(word) for line in lines for word in line.split()]
-    except ValueError:
-        return None
-
-
-def _from_matrix(numbers: list[float], size: tuple[int, int] | None) -> Camera:
-    if len(numbers) != 9:
-        raise ValueError(f"{len(numbers)} numbers, a 3x3 matrix has 9; {_EXPECTED}")
-    if size is None:
-        raise ValueError("a 3x3 matrix has no image size; give another kind of camera file")
-    return Camera.from_matrix([numbers[:3], numbers[3:6], numbers[6:]], *size)
-
-
-def _yaml_mapping(text: str) -> Mapping[str, object]:
-    import yaml
-
-    try:
-        # A printed message ends with '---', which opens a second, empty document.
-        data = next(yaml.safe_load_all(text), None)
-    except yaml.YAMLError as error:
-        raise ValueError(f"not valid YAML ({' '.join(str(error).split())}); {_EXPECTED}") from None
-    if not isinstance(data, dict):
-        raise ValueError(f"no camera in it; {_EXPECTED}")
-    return data
-
-
 def _stored_by_opencv(text: str, size: tuple[int, int] | None) -> dict[str, object]:
-    """Fields of a cv2.FileStorage under their names in ROS."""
+    """Values of a cv2.FileStorage."""
     import cv2
 
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         nodes = {key: storage.getNode(key) for key in storage.root().keys()}  # noqa: SIM118
-        values = {
+        values: dict[str, object] = {
             key: node.mat().ravel().tolist() if node.isMap() else node.real()
             for key, node in nodes.items()
             if node.isMap() or node.isInt() or node.isReal()
@@ -141,41 +107,38 @@ def _stored_by_opencv(text: str, size: tuple[int, int] | None) -> dict[str, obje
         raise ValueError(f"OpenCV cannot read its storage ({text}); {_EXPECTED}") from None
     if values.get("fisheye_model"):
         raise ValueError("fisheye_model is set; rectify the images or calibrate without it")
+    if size is not None and not {"image_width", "image_height"} & _fields(values).keys():
+        values |= {"image_width": size[0], "image_height": size[1]}
+    return values
+
+
+def _fields(data: Mapping[str, object]) -> dict[str, object]:
+    """Known fields under their names in a ROS calibration file."""
     fields: dict[str, object] = {}
     for name, aliases in _ALIASES.items():
-        keys = [key for key in values if key.lower().replace("_", "") in aliases]
+        keys = [key for key in data if str(key).lower().replace("_", "") in aliases]
         if len(keys) > 1:
             raise ValueError(f"{' and '.join(keys)} are the same; keep one of them")
         if keys:
-            fields[name] = values[keys[0]]
-    if "camera_matrix" not in fields:
-        raise ValueError(f"'camera_matrix' is missing, there is {', '.join(nodes) or 'nothing'}")
-    if size is not None and not {"image_width", "image_height"} & fields.keys():
-        fields |= {"image_width": size[0], "image_height": size[1]}
+            fields[name] = data[keys[0]]
     return fields
 
 
 def camera_from_ros(data: Mapping[str, object]) -> Camera:
-    """Build the camera of the raw image from the fields of a camera_info.
-
-    Args:
-        data: `width`, `height`, `k`, `d`, `distortion_model` and `roi` of a message, or the fields
-            of a calibration file.
+    """Build the camera of the raw image from the fields of a camera_info or a calibration file.
 
     Raises:
         ValueError: A field is missing or unusable, the distortion model is not supported, or the
             image is a region of interest.
     """
-    width = _first(data, "image_width", "width")
-    height = _first(data, "image_height", "height")
-    matrix = _list(_first(data, "camera_matrix", "K", "k"), "camera_matrix")
-    names = [name for name in ("distortion_coefficients", "D", "d") if name in data]
-    if not names:  # it may stand under another name
-        raise ValueError(
-            f"'distortion_coefficients' is missing, there is {', '.join(map(str, data))}; write"
-            f" four zeros if images have no lens distortion"
-        )
-    distortion = _list(data[names[0]], "distortion_coefficients")
+    fields = _fields(data)
+    for name in _ALIASES:
+        if name not in fields:
+            zeros = "; write four zeros if images have no lens distortion"
+            remedy = zeros if name == "distortion_coefficients" else f"; {_EXPECTED}"
+            names = ", ".join(map(str, data)) or "nothing"
+            raise ValueError(f"'{name}' is missing, there is {names}{remedy}")
+    matrix, distortion = (_list(fields[name], name) for name in [*_ALIASES][:2])
     model = data.get("distortion_model", "")
     if model not in _MODELS:
         raise ValueError(
@@ -190,20 +153,13 @@ def camera_from_ros(data: Mapping[str, object]) -> Camera:
     # Longer models add terms that are mostly zero and can then be dropped.
     while len(distortion) not in _LENGTHS and distortion[-1] == 0:
         distortion.pop()
-    sides = _list([width, height], "image size")
+    width, height = _list([fields["image_width"], fields["image_height"]], "image size")
     return Camera.from_matrix(
         [matrix[:3], matrix[3:6], matrix[6:]],
-        sides[0],  # pyright: ignore[reportArgumentType]  # checked when constructed
-        sides[1],  # pyright: ignore[reportArgumentType]
+        width,  # pyright: ignore[reportArgumentType]  # checked when constructed
+        height,  # pyright: ignore[reportArgumentType]
         tuple(distortion),
     )
-
-
-def _first(data: Mapping[str, object], *names: str) -> object:
-    for name in names:
-        if name in data:
-            return data[name]
-    raise ValueError(f"'{names[0]}' is missing; {_EXPECTED}")
 
 
 def _list(value: object, name: str) -> list[float]:

@@ -21,10 +21,8 @@ from evercal.geometry.se3 import SE3
 Array = NDArray[np.float64]
 Layout = Literal["wxyz", "xyzw", "rotation_vector", "euler", "rows", "columns"]
 
-_FAR_M = 10.0
-"""Largest distance of a gripper from its base, metres."""
-_NEAR_M = 0.01
-"""Smallest distance of a gripper from its base, metres, for at least one pose."""
+_FAR_M = 10.0  # largest distance of a gripper from its base, metres
+_NEAR_M = 0.01  # smallest distance of a gripper from its base, metres, for at least one pose
 _UNIT_TOLERANCE = 1e-2
 """Largest error of the length of a quaternion printed with three digits."""
 _RIGID_TOLERANCE = 1e-2
@@ -36,11 +34,9 @@ class PoseConvention:
     """How numbers represent a pose."""
 
     name: str
-    """Name with its modifiers, as the user gives it."""
     layout: Layout
     """Translation then this kind of rotation, or a matrix."""
     meaning: str
-    """Description in one line."""
     euler: str = ""
     """scipy's Euler axes: lower case about fixed axes, upper case about moving axes."""
     degrees: bool = False
@@ -48,7 +44,6 @@ class PoseConvention:
     metres_per_unit: float = 1.0
     """0.001 for millimetres."""
     inverse: bool = False
-    """Whether the numbers are the inverse of the pose."""
     opengl: bool = False
     """Whether the camera's axes are x right, y up, z back, else OpenCV's."""
     length_stated: bool = False
@@ -59,9 +54,7 @@ class PoseConvention:
     @property
     def count(self) -> int:
         """Number of numbers of a pose."""
-        if self.layout in ("rows", "columns"):
-            return 16
-        return 6 if self.has_angles else 7
+        return {"wxyz": 7, "xyzw": 7, "rows": 16, "columns": 16}.get(self.layout, 6)
 
     @property
     def has_angles(self) -> bool:
@@ -72,9 +65,7 @@ class PoseConvention:
 class ConventionError(ValueError):
     """A convention is missing, or does not fit the numbers.
 
-    Args:
-        problem: What is wrong.
-        remedy: Conventions to give instead.
+    `remedy` names the conventions to give instead.
     """
 
     def __init__(self, problem: str, remedy: str) -> None:
@@ -117,7 +108,6 @@ MODIFIERS: dict[str, dict[str, Any]] = {
     "inverse": {"inverse": True},
     "opengl": {"opengl": True},
 }
-"""Fields that each modifier sets."""
 KNOWN_CONVENTIONS = (
     f"{', '.join(CONVENTIONS)}, followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"
 )
@@ -150,14 +140,9 @@ def pose_convention(name: str) -> PoseConvention:
 
 
 def poses_from_numbers(numbers: ArrayLike, convention: PoseConvention) -> SE3:
-    """Convert numbers to poses.
+    """Convert numbers (..., `convention.count`) to poses (...).
 
-    Args:
-        numbers: (..., `convention.count`).
-        convention: Convention of the numbers.
-
-    Returns:
-        (...) transforms in metres with OpenCV's camera axes, not inverted.
+    Poses are in metres with OpenCV's camera axes, not inverted.
 
     Raises:
         ValueError: The count is wrong, a number is not finite, a quaternion is not of length one,
@@ -182,17 +167,10 @@ def poses_from_numbers(numbers: ArrayLike, convention: PoseConvention) -> SE3:
 
 
 def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
-    """Convert poses to numbers, the inverse of `poses_from_numbers`.
+    """Convert poses (...) to numbers (..., `convention.count`).
 
     Quaternions get w >= 0. If the middle angle of an Euler convention is within 1e-7 rad of gimbal
     lock, the third angle is 0 and the rotation is exact to 2e-7 rad (scipy).
-
-    Args:
-        poses: (...) transforms.
-        convention: Convention of the numbers.
-
-    Returns:
-        (..., `convention.count`).
     """
     poses = poses @ _OPENGL_FROM_OPENCV if convention.opengl else poses
     poses = poses.inverse() if convention.inverse else poses
@@ -216,11 +194,9 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
 
 
 def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
-    """Compare numbers with the units that a convention implies; units in its name are final.
+    """Compare numbers (n, `convention.count`) of one recording with the units of their convention.
 
-    Args:
-        numbers: (n, `convention.count`) of one recording.
-        convention: Convention of the numbers.
+    Units in its name are final.
 
     Raises:
         ConventionError: The numbers look like another unit.
@@ -228,7 +204,8 @@ def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
     """
     numbers = np.asarray(numbers, dtype=np.float64)
     if not convention.length_stated:
-        distance = np.linalg.norm(_translations(numbers, convention), axis=-1)
+        columns = {"rows": [3, 7, 11], "columns": [12, 13, 14]}.get(convention.layout, [0, 1, 2])
+        distance = np.linalg.norm(numbers[..., columns], axis=-1)
         _check_lengths(distance * convention.metres_per_unit, convention)
     if convention.has_angles and not convention.angle_stated:
         _check_angles(numbers[..., 3:], convention)
@@ -273,12 +250,6 @@ def _other_unit(
     words = [word for word in convention.name.split(":") if word not in units]
     likely, other = (":".join([*words, unit]) for unit in (likely, other))
     return ConventionError(problem, f"{likely} (or {other} if the unit is right as it is)")
-
-
-def _translations(numbers: Array, convention: PoseConvention) -> Array:
-    if convention.layout == "rows":
-        return numbers[..., [3, 7, 11]]
-    return numbers[..., 12:15] if convention.layout == "columns" else numbers[..., :3]
 
 
 def _rotations(numbers: Array, convention: PoseConvention) -> Rotation:

@@ -5,19 +5,19 @@ are radians, or degrees if a name ends in `_deg`, and metres for prismatic joint
 with images or times, or are in the order of the images.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.recordings.poses.kinematics import RobotModel
-from evercal.recordings.poses.labels import row_labels
 from evercal.recordings.poses.pose_track import MAX_GAP_S
 from evercal.recordings.poses.robot_poses import RobotPoses
-from evercal.recordings.poses.row_files import Rows, read_rows
+from evercal.recordings.poses.row_files import Rows, read_rows, row_labels
+from evercal.recordings.text_files import read_json
 
 _UNITS = ("deg", "rad", "m")
 _STILL_RAD = 0.001
@@ -31,34 +31,23 @@ def read_joint_poses(
     gripper: str | None = None,
     unit: str | None = None,
 ) -> tuple[RobotPoses, list[str]]:
-    """Read joint angles and compute gripper poses.
+    """Read joint angles and compute gripper poses, with notes.
 
-    Args:
-        path: A CSV or JSON file as above.
-        model: The arm.
-        base: Link. If omitted, the root of the URDF.
-        gripper: Link. If omitted, the only end of the URDF.
-        unit: "rad" or "deg" of angles whose column states no unit. If omitted, radians.
-
-    Returns:
-        Poses with names or times of the rows, and notes.
+    `unit` is "rad" or "deg" of angles whose column states no unit; radians if omitted. Links are
+    chosen by `RobotModel.chosen_links`.
 
     Raises:
-        InputError: The file cannot be read, a link or joint is missing, or angles look like
-            degrees.
+        InputError: The file is broken, a link or joint is missing, or angles look like degrees.
     """
     rows = read_joints(path)
     base, gripper = model.chosen_links(base, gripper)
-    needed = model.joints_between(base, gripper)
-    if not needed:
+    if not model.joints_between(base, gripper):
         raise InputError(f"{model.path}: no joint moves {gripper} against {base}; name other links")
     names, values = _plain_columns(path, rows, model, unit)
     try:
-        poses = model.base_from_gripper(names, values, base, gripper)
+        poses, notes = model.poses(names, values, base, gripper)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    columns = [names.index(name) for name in needed]
-    notes = [model.note(base, gripper), *model.beyond_limits(needed, values[:, columns])]
     return RobotPoses(rows.names, rows.stamps_s, poses), notes
 
 
@@ -84,13 +73,7 @@ def in_radians(
     values: NDArray[np.float64],
     units: Sequence[str | None],
 ) -> NDArray[np.float64]:
-    """Convert angles in degrees to radians and leave other values as they are.
-
-    Args:
-        model: The arm.
-        names: (k,) joints.
-        values: (n, k) stated values.
-        units: (k,) "deg", "rad", "m" or None.
+    """Convert angles in degrees to radians and leave other values (n, k) as they are.
 
     Raises:
         InputError: A unit is not known.
@@ -105,7 +88,7 @@ def in_radians(
 def interpolate(
     times_s: NDArray[np.float64], positions: NDArray[np.float64], stamps_s: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Interpolate the position of one joint.
+    """Interpolate the position of one joint at (m,) seconds.
 
     Args:
         times_s: (n,) times of the positions, in any order.
@@ -136,20 +119,14 @@ def read_joints(path: Path) -> Rows:
     """
     if path.suffix.lower() == ".csv":
         return read_rows(path, "joint angles")
+    data: dict[str, Any] = read_json(path, "file of joint angles", f"give {_JSON}")
     try:
-        data = json.loads(path.read_bytes())
         columns = tuple(str(name) for name in data["joint_names"])
         values = np.array(data["positions"], dtype=np.float64)
         lists = {key: value for key, value in data.items() if isinstance(value, list)}
         names, times = row_labels(lists, len(values), plural=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        if values.shape != (len(values), len(columns)) or not np.isfinite(values).all():
+            raise ValueError("'positions' are rows of finite numbers, one for each joint")
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: {type(error).__name__} {error}; give {_JSON}") from None
-    rows = len(values)
-    if values.shape != (rows, len(columns)) or not rows or not np.isfinite(values).all():
-        raise InputError(
-            f"{path}: 'positions' is a list of rows of {len(columns)} numbers, one for each of"
-            f" 'joint_names'"
-        )
     return Rows(names, times, columns, values)

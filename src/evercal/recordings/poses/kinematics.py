@@ -17,10 +17,7 @@ _LARGEST_RAD = 4 * np.pi
 
 
 class RobotModel:
-    """Links and joints of a URDF.
-
-    Args:
-        path: The URDF. Its meshes are not read.
+    """Links and joints of a URDF; its meshes are not read.
 
     Raises:
         InputError: The extra `urdf` is not installed, or the file is missing or no URDF.
@@ -62,26 +59,33 @@ class RobotModel:
         Raises:
             InputError: The gripper is omitted and the links have several ends.
         """
-        return base or self.base_link, gripper or self.end_link()
-
-    def end_link(self) -> str:
-        """The last link of an arm with a single end.
-
-        Raises:
-            InputError: The links have several ends, such as the fingers of a gripper.
-        """
         parents = {joint.parent for joint in self._joint_above.values()}
         ends = [link for link in self.links if link not in parents]
-        if len(ends) != 1:
+        if gripper is None and len(ends) != 1:
             raise InputError(
                 f"{self.path}: has {len(ends)} ends; name the link with --gripper-frame, one of"
                 f" {', '.join(self.links)}"
             )
-        return ends[0]
+        return base or self.base_link, gripper or ends[0]
 
-    def note(self, base: str, gripper: str) -> str:
-        """Sentence about the source of gripper poses."""
-        return f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
+    def poses(
+        self,
+        names: Sequence[str],
+        values: NDArray[np.float64],
+        base: str | None,
+        gripper: str | None,
+    ) -> tuple[SE3, list[str]]:
+        """Compute (n,) poses of the gripper, with notes about their source and joint limits.
+
+        Raises:
+            InputError: As `chosen_links` and `base_from_gripper`.
+        """
+        base, gripper = self.chosen_links(base, gripper)
+        poses = self.base_from_gripper(names, values, base, gripper)
+        note = f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
+        needed = self.joints_between(base, gripper)
+        columns = values[:, [list(names).index(name) for name in needed]]
+        return poses, [note, *self.beyond_limits(needed, columns)]
 
     def joints_between(self, base: str, gripper: str) -> tuple[str, ...]:
         """Moving joints between two links, from the base outwards.
@@ -102,16 +106,9 @@ class RobotModel:
     def base_from_gripper(
         self, names: Sequence[str], values: NDArray[np.float64], base: str, gripper: str
     ) -> SE3:
-        """Compute poses of one link in another.
+        """Compute (n,) poses of the link `gripper` in the link `base`.
 
-        Args:
-            names: (k,) joints, at least those of `joints_between`.
-            values: (n, k) radians, or metres for prismatic joints.
-            base: Link.
-            gripper: Link.
-
-        Returns:
-            (n,) base_from_gripper.
+        Values (n, k) of the k named joints are radians, or metres for prismatic joints.
 
         Raises:
             InputError: A joint has no values, or values are not in radians.
@@ -124,7 +121,13 @@ class RobotModel:
                 f" {', '.join(names) or 'none'}"
             )
         values = values[:, [list(names).index(name) for name in needed]]
-        self._refuse_degrees(needed, values)
+        for name, column in zip(needed, values.T, strict=True):
+            revolute = self._urdf.joint_map[name].type == "revolute"
+            if revolute and column.size and np.abs(column).max() > _LARGEST_RAD:
+                raise InputError(
+                    f"joint {name} is at {column[np.abs(column).argmax()]:.1f}, too far for"
+                    f" radians; if these are degrees, write the column as {name}_deg"
+                )
         matrices = np.empty((len(values), 4, 4))
         for row, matrix in zip(values, matrices, strict=True):
             self._urdf.update_cfg(dict(zip(needed, row.tolist(), strict=True)))
@@ -144,19 +147,16 @@ class RobotModel:
         notes = []
         for name, column in zip(names, values.T, strict=True):
             joint = self._urdf.joint_map.get(name)
-            if joint is None:
-                continue
+            limit = None if joint is None else joint.limit
             covered = f"joint {name} goes from {column.min():.2f} to {column.max():.2f}"
-            if joint.type == "continuous":
+            if joint is not None and joint.type == "continuous":
                 if np.ptp(column) > _LARGEST_RAD:
                     notes.append(
                         f"{covered}, more than two rotations in radians; are these degrees?"
                     )
+            elif limit is None or limit.lower is None or limit.upper is None:
                 continue
-            limit = joint.limit
-            if limit is None or limit.lower is None or limit.upper is None:
-                continue
-            if column.min() < limit.lower - 0.1 or column.max() > limit.upper + 0.1:
+            elif column.min() < limit.lower - 0.1 or column.max() > limit.upper + 0.1:
                 notes.append(
                     f"{covered}, the URDF allows {limit.lower:.2f} to {limit.upper:.2f}; are the"
                     f" joints in the right order and in radians?"
@@ -174,12 +174,3 @@ class RobotModel:
             joints.append(self._joint_above[link])
             link = joints[-1].parent
         return joints
-
-    def _refuse_degrees(self, names: Sequence[str], values: NDArray[np.float64]) -> None:
-        for name, column in zip(names, values.T, strict=True):
-            revolute = self._urdf.joint_map[name].type == "revolute"
-            if revolute and column.size and np.abs(column).max() > _LARGEST_RAD:
-                raise InputError(
-                    f"joint {name} is at {column[np.abs(column).argmax()]:.1f}, too far for"
-                    f" radians; if these are degrees, write the column as {name}_deg"
-                )

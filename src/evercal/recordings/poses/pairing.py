@@ -23,17 +23,11 @@ def pair_images(
     """Find the gripper pose of every image.
 
     Rows with names are paired with the images of these names. Rows with times are interpolated at
-    the image times, from a file or from the image names. Otherwise rows and images are paired in
-    order, and their numbers must be equal.
-
-    Args:
-        images: Image files in natural order.
-        rows: Content of the pose file.
-        stamps_s: Time of each image by its name, if a file states them.
-        file: The pose file, for messages.
+    the image times `stamps_s`, by name, or the times in the image names. Otherwise rows and images,
+    in natural order, are paired in order, and their numbers must be equal.
 
     Raises:
-        InputError: The images cannot be paired.
+        InputError: The images cannot be paired; messages name the pose file.
     """
     if rows.names is not None:
         return _by_name(images, rows.names, rows.poses, file)
@@ -59,15 +53,7 @@ def pair_images(
 
 
 def poses_of_images(file: Path, images: Sequence[Path], convention: str | None = None) -> SE3:
-    """Read the pose of every image from a pose file, for the commands with `--convention`.
-
-    Args:
-        file: As `read_robot_poses` takes it.
-        images: (n,) image files, in the order of the rows if neither names nor times pair them.
-        convention: Convention of the file. Required if the file does not define it.
-
-    Returns:
-        (n,) base_from_gripper.
+    """Read (n,) base_from_gripper of n images, for the commands with `--convention`.
 
     Raises:
         InputError: The images cannot be paired, or an image has no pose.

@@ -7,7 +7,7 @@ camera. Inverted poses rotate about other axes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,22 +18,14 @@ from evercal.recordings.frame import Frame
 
 Array = NDArray[np.float64]
 
-PAIRS = 16
-"""Number of image pairs that are compared."""
-LEAST_PAIRS = 6
-"""Matched pairs below which there is no verdict."""
-LEAST_DEG, BEST_DEG = 5.0, 12.0
-"""Smallest and best stated rotation between the images of a pair."""
-MOST_FRAMES_APART = 30
-"""Largest distance between the images of a pair, frames."""
-LEAST_MATCHES = 40
-"""Feature matches, and inliers of them, below which a pair is dropped."""
-LONG_SIDE = 640
-"""Longer side of the images that are matched, pixels."""
-AGREE_DEG = 2.0
-"""Difference up to which rotations agree."""
-STILL_DEG = 1.0
-"""Median measured rotation below which the images stand still."""
+PAIRS = 16  # number of image pairs that are compared
+LEAST_PAIRS = 6  # matched pairs below which there is no verdict
+LEAST_DEG, BEST_DEG = 5.0, 12.0  # smallest and best stated rotation between the images of a pair
+MOST_FRAMES_APART = 30  # largest distance between the images of a pair, frames
+LEAST_MATCHES = 40  # feature matches, and inliers of them, below which a pair is dropped
+LONG_SIDE = 640  # longer side of the images that are matched, pixels
+AGREE_DEG = 2.0  # difference up to which rotations agree
+STILL_DEG = 1.0  # median measured rotation below which the images stand still
 BETTER, CLOSE_DEG = 3.0, 0.5
 """Factor by which another reading of the poses must fit better to be named, and the margin within
 which further readings are named with it."""
@@ -43,30 +35,26 @@ GRIPPER_AGREE_DEG, GRIPPER_BETTER = 1.0, 2.0
 _GL = Rotation.from_euler("x", 180, degrees=True)
 
 
-@dataclass(frozen=True, eq=False)
-class PairRotations:
-    """Rotation of the second image of each pair in the frame of the first, as rotation vectors."""
+class PairRotations(NamedTuple):
+    """(n, 3) rotation vectors of the second image of each pair in the frame of the first."""
 
     measured: Array
-    """(n, 3) radians, from the images."""
+    """From the images, radians."""
     stated: Array
-    """(n, 3) radians, from the poses."""
+    """From the poses, radians."""
     inverse: Array
-    """(n, 3) radians, from the inverses of the poses."""
+    """From the inverses of the poses, radians."""
     swapped: Array
-    """(n, 3) radians, from the poses with quaternions in the other order."""
+    """From the poses with quaternions in the other order, radians."""
 
 
 def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> list[str]:
-    """Compare stated rotations with the images.
+    """Describe contradictions between stated rotations and the images, in sentences.
 
     Args:
         frames: (n,) frames in recorded order.
         poses: (n,) base_from_camera or base_from_gripper.
         of_camera: Whether the poses are base_from_camera.
-
-    Returns:
-        Sentences about contradictions.
 
     Raises:
         InputError: An image cannot be read.
@@ -79,19 +67,15 @@ def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> l
 
 def pair_rotations(frames: Sequence[Frame], poses: SE3) -> PairRotations | None:
     """Measure the rotation of some image pairs; None if too few pairs can be matched."""
-    pairs, measured = [], []
-    for first, second in _pairs(poses):
-        rotation = measured_rotation(frames[first], frames[second])
-        if rotation is not None:
-            pairs.append((first, second))
-            measured.append(rotation)
+    pairs = [(i, j, measured_rotation(frames[i], frames[j])) for i, j in _pairs(poses)]
+    pairs = [pair for pair in pairs if pair[2] is not None]
     if len(pairs) < LEAST_PAIRS:
         return None
-    first, second = np.array(pairs).T
+    first, second = np.array([pair[:2] for pair in pairs]).T
     stated = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
     swapped = Rotation.from_quat(poses.rotation_wxyz)
     return PairRotations(
-        measured=np.array(measured),
+        measured=np.array([pair[2] for pair in pairs]),
         stated=(stated[first].inv() * stated[second]).as_rotvec(),
         inverse=(stated[first] * stated[second].inv()).as_rotvec(),
         swapped=(swapped[first].inv() * swapped[second]).as_rotvec(),

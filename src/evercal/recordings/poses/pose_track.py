@@ -10,8 +10,7 @@ from evercal.geometry import SE3, pose_distance
 
 Array = NDArray[np.float64]
 
-MAX_GAP_S = 0.2
-"""Longest time between two poses over which a moving frame is interpolated, seconds."""
+MAX_GAP_S = 0.2  # longest time between two poses over which a moving frame is interpolated, seconds
 STILL_M, STILL_DEG = 0.001, 0.1
 """Motion below which a frame counts as standing still over a gap of any length."""
 
@@ -40,15 +39,11 @@ class PoseTrack:
         object.__setattr__(self, "poses", self.poses[order])
 
     def at(self, stamps_s: Array, max_gap_s: float = MAX_GAP_S) -> tuple[SE3, NDArray[np.bool_]]:
-        """Interpolate positions linearly and rotations along great circles.
-
-        Args:
-            stamps_s: (m,) seconds.
-            max_gap_s: Longest gap over which a moving frame is interpolated, seconds.
+        """Interpolate positions linearly and rotations along great circles at (m,) seconds.
 
         Returns:
-            (m,) poses and (m,) whether each is valid. Poses beyond the ends, which are those of
-            the ends, and in a longer gap over which the frame moved are not valid.
+            (m,) poses and (m,) whether each is valid. Poses are invalid beyond the ends, and in
+            a gap of more than `max_gap_s` seconds over which the frame moved.
         """
         stamps = np.asarray(stamps_s, dtype=np.float64)
         inside = np.clip(stamps, self.stamps_s[0], self.stamps_s[-1])

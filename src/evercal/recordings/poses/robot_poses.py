@@ -1,6 +1,6 @@
 """Pose files: a table (CSV, TUM), JSON or NPY, in a named convention.
 
-The header of a table names its columns (`pose_header`, `labels`). JSON is a list of objects with
+The header of a table names its columns (`pose_table`, `row_files`). JSON is a list of objects with
 `translation_m` and `quaternion_wxyz`, or `matrix`, or a list of lists of numbers; it may stand
 under `poses`. NPY is (n, 4, 4), or (n, k) numbers. A convention is required if the file does not
 define the meaning of its numbers. docs/formats.md has examples.
@@ -25,8 +25,9 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
     poses_from_numbers,
 )
-from evercal.recordings.poses.labels import number_array, row_labels
 from evercal.recordings.poses.pose_table import PoseTable, read_pose_table
+from evercal.recordings.poses.row_files import number_array, row_labels
+from evercal.recordings.text_files import read_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,30 +48,31 @@ class RobotPoses:
 
 def read_robot_poses(
     path: str | os.PathLike[str],
-    convention: str | PoseConvention | None = None,
+    convention: str | None = None,
     *,
     what: str = "file of robot poses",
     option: str | None = None,
 ) -> RobotPoses:
-    """Read a pose file.
+    """Read a pose file; `what` and the command line `option` of the convention are for messages.
 
     Args:
         path: A `.json` or `.npy` file; other endings are read as a table.
         convention: Convention of the numbers, such as `kuka`, `ur` or `matrix:mm`, or `tum` for
             xyzw after a stamp. Required if the file does not define it.
-        what: Kind of file, for messages.
-        option: Command line option of the convention, for messages.
+        what: Kind of file.
+        option: Option such as `--convention`.
 
     Raises:
-        InputError: The file is missing or broken, the convention is missing, or the numbers do not
-            fit it.
+        InputError: The file is missing or broken, or the numbers do not fit the convention.
     """
     path = Path(path)
     try:
         given = _convention(convention, path)
         if path.suffix.lower() == ".npy":
-            return _robot_poses(_npy_table(path, given))
-        text = path.read_text(encoding="utf-8-sig")
+            numbers = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
+            one_pose = numbers.shape == (4, 4)
+            return _robot_poses(_array_table(numbers[None] if one_pose else numbers, given))
+        text = read_text(path, what)
         if path.suffix.lower() == ".json":
             return _robot_poses(_json_table(json.loads(text), given))
         return _robot_poses(read_pose_table(text, given))
@@ -78,21 +80,15 @@ def read_robot_poses(
         raise InputError(f"{path}: {what} is missing; check the path") from None
     except OSError as error:
         raise InputError(f"{path}: {what} cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputError(
-            f"{path}: not a text file; give poses as a table, JSON, TUM lines or .npy"
-        ) from None
     except ConventionError as error:
         raise InputError(f"{path}: {error.naming(option)}") from None
-    except ValueError as error:  # also invalid JSON
+    except (ValueError, EOFError, TypeError) as error:  # also invalid JSON and arrays of text
         raise InputError(f"{path}: {error}") from None
 
 
-def _convention(given: str | PoseConvention | None, path: Path) -> PoseConvention | None:
+def _convention(given: str | None, path: Path) -> PoseConvention | None:
     if given is None:
         return pose_convention("xyzw") if path.suffix.lower() == ".tum" else None
-    if isinstance(given, PoseConvention):
-        return given
     base, colon, modifiers = given.strip().lower().partition(":")
     return pose_convention("xyzw" + colon + modifiers if base == "tum" else given)
 
@@ -109,14 +105,6 @@ def _robot_poses(table: PoseTable) -> RobotPoses:
     if table.stamps_s is not None and not np.isfinite(table.stamps_s).all():
         raise ValueError("a stamp is inf or nan; leave such rows out")
     return RobotPoses(table.names, table.stamps_s, poses)
-
-
-def _npy_table(path: Path, given: PoseConvention | None) -> PoseTable:
-    try:
-        numbers = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
-    except (EOFError, TypeError) as error:
-        raise ValueError(f"no array of numbers ({error})") from None
-    return _array_table(numbers[None] if numbers.shape == (4, 4) else numbers, given)
 
 
 def _array_table(numbers: NDArray[np.float64], given: PoseConvention | None) -> PoseTable:
@@ -143,15 +131,13 @@ def _json_table(data: object, given: PoseConvention | None) -> PoseTable:
             names=names if table.names is None else table.names,
             stamps_s=stamps if table.stamps_s is None else table.stamps_s,
         )
-    if isinstance(data, Mapping):
-        data = [data]
-    if not isinstance(data, list) or not data:
-        raise ValueError("JSON of poses is a list of objects, or of lists of numbers")
-    if all(isinstance(entry, list) for entry in data):
-        return _array_table(number_array(data, "a list of poses"), given)
-    if not all(isinstance(entry, Mapping) for entry in data):
-        raise ValueError("JSON of poses is a list of objects, or of lists of numbers, not of both")
-    return _object_table(data, given)
+    entries = [data] if isinstance(data, Mapping) else data
+    if isinstance(entries, list) and entries:
+        if all(isinstance(entry, list) for entry in entries):
+            return _array_table(number_array(entries, "a list of poses"), given)
+        if all(isinstance(entry, Mapping) for entry in entries):
+            return _object_table(entries, given)
+    raise ValueError("JSON of poses is a list of objects, or of lists of numbers, not of both")
 
 
 def _object_table(
@@ -168,19 +154,18 @@ def _object_table(
                 f"'translation_m' and 'quaternion_wxyz' contradict the convention"
                 f" {convention.name}; leave it out, or give wxyz:inverse"
             )
-        translation, quaternion = (
+        parts = [
             number_array([entry[key] for entry in entries], f"'{key}'")
             for key in ("translation_m", "quaternion_wxyz")
-        )
-        if (translation.shape[1:], quaternion.shape[1:]) != ((3,), (4,)):
+        ]
+        if [part.shape[1:] for part in parts] != [(3,), (4,)]:
             raise ValueError("'translation_m' has three numbers and 'quaternion_wxyz' four")
-        numbers = np.concatenate([translation, quaternion], axis=-1)
+        numbers = np.concatenate(parts, axis=-1)
     else:
         raise ValueError(
             "every pose has 'translation_m' and 'quaternion_wxyz', or every pose 'matrix'"
         )
-    keys = dict.fromkeys(key for entry in entries for key in entry)
-    columns = {key: [entry.get(key) for entry in entries] for key in keys}
+    columns = {key: [entry.get(key) for entry in entries] for entry in entries for key in entry}
     return PoseTable(numbers, convention, *row_labels(columns, len(entries)))
 
 

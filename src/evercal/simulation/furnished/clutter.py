@@ -138,10 +138,8 @@ class SmallObjects:
         green = m.stone(self.shop.name("leaf"), pick(self.rng, LEAVES), self.rng)
         leaves = []
         for i in range(int(self.rng.integers(9, 20))):
-            low, high = (0.16, 0.04, 0.8), (0.34, 0.08, 2.2)
-            length, width, droop = self.rng.uniform(low, high).tolist()
-            blade = leaf(length, width, droop)
-            blade = blade.rotated(about_y(float(self.rng.uniform(-0.7, 0.2))))
+            length, width, droop = self.rng.uniform((0.16, 0.04, 0.8), (0.34, 0.08, 2.2)).tolist()
+            blade = leaf(length, width, droop).rotated(about_y(float(self.rng.uniform(-0.7, 0.2))))
             leaves.append(blade.placed((0, 0, 0.12), 2.4 * i + float(self.rng.normal(0, 0.2))))
         parts = [(pot, self.glaze()), (Mesh.merged(leaves), green)]
         return Item("plant", [(mesh.scaled(scale), material) for mesh, material in parts])
@@ -153,8 +151,7 @@ class SmallObjects:
              (0.01, 0.2), (0.01, 0.26), (0, 0.26)], 28, 3,
         )  # fmt: skip
         shade = lathe(lampshade((0.12, 0.23), (0.105, 0.32), (0.075, 0.41)), 28, 1)
-        glow = m.plain("glow", (1.0, 0.82, 0.58), emission=2.2)
-        return Item("lamp", [(foot, self.glaze()), (shade, glow)])
+        return Item("lamp", [(foot, self.glaze()), (shade, m.GLOW)])
 
     def pot(self) -> Item:
         """A cooking pot with a lid and two handles."""
@@ -177,11 +174,11 @@ class SmallObjects:
             [(0, 0), (0.085, 0), (0.095, 0.02), (0.09, 0.09), (0.06, 0.14), (0.035, 0.155),
              (0.012, 0.165), (0.015, 0.18), (0, 0.185)], 32, 3,
         )  # fmt: skip
-        spout = tube(np.array([[0.07, 0, 0.07], [0.11, 0, 0.1], [0.14, 0, 0.15]]), 0.014)
+        spout = tube([(0.07, 0, 0.07), (0.11, 0, 0.1), (0.14, 0, 0.15)], 0.014)
         t = np.linspace(0.25, np.pi - 0.25, 10)
         arch = tube(np.stack([0.085 * np.cos(t), np.zeros(10), 0.12 + 0.11 * np.sin(t)], -1), 0.009)
-        shop = self.shop
-        return Item("kettle", [(body, self.glaze()), (spout, shop.steel), (arch, shop.dark)])
+        steel, dark = self.shop.steel, self.shop.dark
+        return Item("kettle", [(body, self.glaze()), (spout, steel), (arch, dark)])
 
     def toy_ball(self) -> Item:
         """A patterned ball."""

@@ -110,11 +110,12 @@ class FurnitureBuilder:
             (mattress, self.linen),
             (box(w + 0.04, 1.3, 0.14, 0.06, steps=4).shifted(0, -1.42, 0.42), self.cloths[0]),
         ]
-        for x in (-0.36, 0.36):
-            pillow = cushion(0.62, 0.42, 0.17).rotated(about_x(0.35), (x, -0.36, 0.52))
-            parts.append((pillow, self.cloths[1]))
-        small = cushion(0.4, 0.4, 0.16).rotated(about_x(0.9), (0.05, -0.55, 0.62))
-        parts.append((small, self.cloths[2]))
+        for size, angle, at, cloth in (
+            ((0.62, 0.42, 0.17), 0.35, (-0.36, -0.36, 0.52), 1),
+            ((0.62, 0.42, 0.17), 0.35, (0.36, -0.36, 0.52), 1),
+            ((0.4, 0.4, 0.16), 0.9, (0.05, -0.55, 0.62), 2),
+        ):
+            parts.append((cushion(*size).rotated(about_x(angle), at), self.cloths[cloth]))
         return Item("bed", parts)
 
     def wardrobe(self) -> Item:
@@ -124,9 +125,9 @@ class FurnitureBuilder:
         for i in range(3):
             x = (i - 1) * w / 3
             parts.append((box(w / 3 - 0.012, 0.022, h - 0.12, 0.008).shifted(x, -d, 0.06), paint))
-            handle = np.array([[x + 0.17, -d - 0.03, 0.95], [x + 0.17, -d - 0.045, 1.05],
-                               [x + 0.17, -d - 0.03, 1.15]])  # fmt: skip
-            parts.append((tube(handle, 0.009), self.steel))
+            side, front = x + 0.17, -d - 0.03
+            bar = [(side, front, 0.95), (side, -d - 0.045, 1.05), (side, front, 1.15)]
+            parts.append((tube(bar, 0.009), self.steel))
         return Item("wardrobe", parts, [(-0.65, 0.65, -0.5, -0.1, h)])
 
     def drawers(self) -> Item:
@@ -180,7 +181,7 @@ class FurnitureBuilder:
             for y in (-0.08, -0.42):
                 leg = [(0, 0), (0.012, 0), (0.02, 0.2), (0.017, 0.3), (0.021, 0.44), (0, 0.44)]
                 parts.append((lathe(leg, 12).shifted(x, y, 0), wood))
-            post = np.array([[x, -0.07, 0.46], [x * 1.03, -0.05, 0.65], [x * 1.05, 0.0, 0.9]])
+            post = [(x, -0.07, 0.46), (x * 1.03, -0.05, 0.65), (x * 1.05, 0.0, 0.9)]
             parts.append((tube(post, 0.014), wood))
         t = np.linspace(-1, 1, 9)
         for z in (0.62, 0.74, 0.86):
@@ -259,12 +260,13 @@ class FurnitureBuilder:
         for i in range(units):
             x = -w / 2 + (i + 0.5) * w / units
             if i == units - 1:  # the oven
-                parts.append((box(0.56, 0.03, 0.6, 0.01).shifted(x, -d + 0.02, 0.14), self.dark))
-                parts.append((_handle(x, 0.22, -d - 0.03, 0.66, 0.01), self.steel))
+                oven = box(0.56, 0.03, 0.6, 0.01).shifted(x, -d + 0.02, 0.14)
+                handle = _handle(x, 0.22, -d - 0.03, 0.66, 0.01)
                 knobs = [
                     cylinder(0.018, 0.025).rotated(about_x(np.pi / 2), (x + k, -d + 0.01, 0.8))
                     for k in (-0.2, -0.1, 0.1, 0.2)
                 ]
+                parts += [(oven, self.dark), (handle, self.steel)]
                 parts.append((Mesh.merged(knobs), self.steel))
             else:
                 door = box(w / units - 0.012, 0.022, h - 0.17, 0.007).shifted(x, -d + 0.03, 0.11)
@@ -294,9 +296,7 @@ class FurnitureBuilder:
         parts = [(box(0.62, 0.6, 1.8, 0.02).shifted(0, -0.3, 0), paint)]
         for z, h in ((0.05, 1.1), (1.17, 0.6)):
             parts.append((box(0.61, 0.06, h, 0.028, steps=4).shifted(0, -0.62, z), paint))
-            ends = np.array([[-0.25, -0.67, z + 0.1], [-0.25, -0.67, z + h - 0.1]])
-            middle = np.array([[-0.25, -0.69, z + h / 2]])
-            bar = np.concatenate([ends[:1], middle, ends[1:]])
+            bar = [(-0.25, -0.67, z + 0.1), (-0.25, -0.69, z + h / 2), (-0.25, -0.67, z + h - 0.1)]
             parts.append((tube(bar, 0.012), self.steel))
         for _ in range(4):
             x, z = self.rng.uniform(-0.15, 0.2), self.rng.uniform(0.7, 1.55)
@@ -306,18 +306,12 @@ class FurnitureBuilder:
 
     def floor_lamp(self) -> Item:
         """A floor lamp that is on."""
-        foot = lathe(
-            [(0, 0), (0.15, 0), (0.15, 0.015), (0.02, 0.035), (0.012, 0.1), (0.012, 1.4),
-             (0, 1.4)], 24, 2,
-        )  # fmt: skip
-        glow = m.plain("glow", (1.0, 0.82, 0.58), emission=2.2)
-        parts = [(foot.shifted(0, -0.2, 0), self.dark)]
+        profile = [(0, 0), (0.15, 0), (0.15, 0.015), (0.02, 0.035), (0.012, 0.1), (0.012, 1.4)]
+        foot = lathe([*profile, (0, 1.4)], 24, 2).shifted(0, -0.2, 0)
         shade = lathe(lampshade((0.19, 1.3), (0.17, 1.45), (0.13, 1.62)), 28, 1)
-        parts.append((shade.shifted(0, -0.2, 0), glow))
-        return Item("floor lamp", parts)
+        return Item("floor lamp", [(foot, self.dark), (shade.shifted(0, -0.2, 0), m.GLOW)])
 
 
 def _handle(x: float, half_width: float, y: float, z: float, radius: float) -> Mesh:
     """A horizontal bar that bends 1 cm outwards in the middle."""
-    bar = np.array([[x - half_width, y, z], [x, y - 0.01, z], [x + half_width, y, z]])
-    return tube(bar, radius)
+    return tube([(x - half_width, y, z), (x, y - 0.01, z), (x + half_width, y, z)], radius)

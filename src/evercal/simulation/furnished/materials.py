@@ -44,22 +44,16 @@ class Material:
         if self.texture.shape[:2] == (1, 1):
             colour: dict[str, Any] = {"type": "rgb", "value": linear(self.texture[0, 0]).tolist()}
         else:
-            colour = self._bitmap(mi)
-        if self.kind == "metal":
-            return {
-                "type": "roughconductor",
-                "material": "none",
-                "alpha": self.roughness,
-                "specular_reflectance": colour,
-            }
+            # Rows run downwards, v of our meshes runs upwards.
+            bitmap = mi.Bitmap(np.ascontiguousarray(self.texture[::-1]))
+            colour = {"type": "bitmap", "bitmap": bitmap, "wrap_mode": "repeat"}
+        if self.kind == "matt":
+            return {"type": "diffuse", "reflectance": colour}
         if self.kind == "coated":
-            return {
-                "type": "roughplastic",
-                "alpha": self.roughness,
-                "int_ior": 1.45,
-                "diffuse_reflectance": colour,
-            }
-        return {"type": "diffuse", "reflectance": colour}
+            plastic = {"type": "roughplastic", "int_ior": 1.45, "alpha": self.roughness}
+            return {**plastic, "diffuse_reflectance": colour}
+        metal = {"type": "roughconductor", "material": "none", "alpha": self.roughness}
+        return {**metal, "specular_reflectance": colour}
 
     def emitter(self, mi: Any) -> dict[str, Any] | None:
         """Mitsuba dictionary of the emission; None for surfaces that emit no light."""
@@ -70,15 +64,6 @@ class Material:
         weight = 0.12 if self.name == "glow" else 1.0
         radiance = {"type": "rgb", "value": value}
         return {"type": "area", "radiance": radiance, "sampling_weight": weight}
-
-    def _bitmap(self, mi: Any) -> dict[str, Any]:
-        # Rows run downwards, v of our meshes runs upwards.
-        return {
-            "type": "bitmap",
-            "bitmap": mi.Bitmap(np.ascontiguousarray(self.texture[::-1])),
-            "filter_type": "bilinear",
-            "wrap_mode": "repeat",
-        }
 
 
 def linear(srgb: np.ndarray) -> np.ndarray:
@@ -94,6 +79,10 @@ def plain(
     """A plain colour, sRGB in [0, 1]."""
     texel = np.round(np.clip(np.array(rgb), 0, 1) * 255).astype(np.uint8).reshape(1, 1, 3)
     return Material(name, texel, kind=kind, roughness=roughness, emission=emission)
+
+
+GLOW = plain("glow", (1.0, 0.82, 0.58), emission=2.2)
+"""The shade of a lamp that is on."""
 
 
 def wood(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
@@ -161,8 +150,8 @@ def fabric(name: str, rgb: tuple[float, float, float], rng: np.random.Generator)
     pattern = rng.integers(4)
     period = SIZE // int(rng.integers(2, 6))
     if pattern == 1:
-        picture[(u % period) < period * 0.3] *= 0
-        picture += ((u % period) < period * 0.3)[..., None] * other * value[..., None]
+        stripes = (u % period) < period * 0.3
+        picture = np.where(stripes[..., None], other * value[..., None], picture)
     elif pattern == 2:
         share = 0.5 * (((u % period) < period / 2) + 0.0 + ((v % period) < period / 2))
         picture = picture * (1 - share[..., None]) + share[..., None] * other * value[..., None]
@@ -178,13 +167,10 @@ def carpet(name: str, rgb: tuple[float, float, float], rng: np.random.Generator)
     half = 0.35 * half + 0.2 * half.mean(-1, keepdims=True) + 0.45 * np.array(rgb)
     picture = np.concatenate([half, half[:, ::-1]], 1)
     picture = np.concatenate([picture, picture[::-1]], 0)
+    edge = np.minimum(np.arange(SIZE), np.arange(SIZE)[::-1])
+    distance = np.minimum(edge[:, None], edge)
     for margin, colour in ((0, 0.6 * np.array(rgb)), (26, 0.4 + 0.6 * np.array(rgb))):
-        frame = np.ones((SIZE, SIZE), bool)
-        frame[margin + 22 : SIZE - margin - 22, margin + 22 : SIZE - margin - 22] = False
-        frame[:margin] = frame[:, :margin] = False
-        if margin:
-            frame[SIZE - margin :] = frame[:, SIZE - margin :] = False
-        picture[frame] = colour
+        picture[(distance >= margin) & (distance < margin + 22)] = colour
     picture *= (1 + 0.16 * rng.standard_normal((SIZE, SIZE)))[..., None]
     return Material(name, _bytes(picture))
 

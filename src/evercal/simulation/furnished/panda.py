@@ -50,7 +50,8 @@ class Panda:
 
     def base_from_flange(self, joints_rad: np.ndarray) -> SE3:
         """Pose of the flange for joint angles of shape (7,)."""
-        return self._link(joints_rad, FLANGE)
+        self._configure(joints_rad)
+        return SE3.from_matrix(self._urdf.get_transform(FLANGE, self._urdf.base_link))
 
     def meshes(self, joints_rad: np.ndarray) -> list[tuple[Mesh, Material]]:
         """Meshes of the arm for joint angles of shape (7,), one named mesh per colour."""
@@ -61,10 +62,6 @@ class Panda:
             rotated = mesh.rotated(matrix[:3, :3], matrix[:3, 3].tolist())
             groups.setdefault(material.name, (material, []))[1].append(rotated)
         return [(Mesh.merged(group), material) for material, group in groups.values()]
-
-    def _link(self, joints_rad: np.ndarray, link: str) -> SE3:
-        self._configure(joints_rad)
-        return SE3.from_matrix(self._urdf.get_transform(link, self._urdf.base_link))
 
     def _configure(self, joints_rad: np.ndarray) -> None:
         joints = np.asarray(joints_rad, float)
@@ -78,14 +75,12 @@ class Panda:
             shape = scene.geometry[scene.graph[node][1]]
             colour = np.asarray(shape.visual.material.main_color, float)[:3] / 255
             tone = "pale" if colour.min() > 0.85 else "black" if colour.max() < 0.4 else "mark"
-            uv = np.zeros((len(shape.vertices), 2))
-            mesh = Mesh(
+            vertices, normals = (
                 np.array(shape.vertices, float),
-                np.array(shape.faces),
                 np.array(shape.vertex_normals, float),
-                uv,
-                f"arm_{tone}",
             )
+            uv = np.zeros((len(vertices), 2))
+            mesh = Mesh(vertices, np.array(shape.faces), normals, uv, f"arm_{tone}")
             parts.append((node, mesh, _MATERIALS[tone]))
         return parts
 

@@ -6,6 +6,7 @@ Depth is exact: one ray passes through the centre of each pixel.
 
 import glob
 import os
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -94,32 +95,20 @@ def _llvm_libraries() -> list[str]:
     override = os.environ.get("DRJIT_LIBLLVM_PATH")
     if override:
         return [override]
-    patterns = (
-        "/usr/lib/*/libLLVM*.so*",
-        "/usr/lib/llvm-*/lib/libLLVM*.so*",
-        "/usr/lib64/libLLVM*",
-    )
-    paths = {os.path.realpath(path) for pattern in patterns for path in glob.glob(pattern)}
+    folders = ("/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/lib64/libLLVM*")
     versions = {}
-    for path in paths:
-        digits = "".join(c if c.isdigit() else " " for c in os.path.basename(path)).split()
-        if digits:
+    for path in {os.path.realpath(path) for folder in folders for path in glob.glob(folder)}:
+        if digits := re.search(r"\d+", os.path.basename(path)):
             versions.setdefault(int(digits[0]), path)
     # Older versions lack opaque pointers or abort on processors with AVX-512.
     return [versions[version] for version in sorted(versions, reverse=True) if version >= 16]
 
 
 def _works(variant: str, library: str | None) -> bool:
-    environment = dict(os.environ)
-    if library:
-        environment["DRJIT_LIBLLVM_PATH"] = library
+    environment = {**os.environ, **({"DRJIT_LIBLLVM_PATH": library} if library else {})}
+    command = [sys.executable, "-c", _PROBE, variant]
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", _PROBE, variant],
-            env=environment,
-            capture_output=True,
-            timeout=120,
-        )
+        done = subprocess.run(command, env=environment, capture_output=True, timeout=120)
     except subprocess.TimeoutExpired:
         return False
     return done.returncode == 0
@@ -128,24 +117,18 @@ def _works(variant: str, library: str | None) -> bool:
 class Renderer:
     """Renders a set of meshes from any pose.
 
-    Args:
-        meshes: Meshes in the base frame. Meshes of one material are merged for speed; a mesh with
-            a `name` stays separate and can be moved.
-        exposure: Factor on radiance before encoding.
-        max_depth: Longest light path in segments; 4 allows two bounces.
+    Meshes of one material are merged for speed; a mesh with a `name` stays separate and can be
+    moved. The exposure is a factor on radiance.
     """
 
-    def __init__(
-        self, meshes: list[tuple[Mesh, Material]], exposure: float = 2.0, max_depth: int = 4
-    ):
-        mi = mitsuba()
-        self._mi = mi
+    def __init__(self, meshes: list[tuple[Mesh, Material]], exposure: float = 2.0):
+        mi = self._mi = mitsuba()
         self._exposure = exposure
         self._sensors: dict[Camera, tuple[Any, Any]] = {}
         scene: dict[str, Any] = {
             "type": "scene",
-            # Russian roulette from the first bounce halves the time for little noise.
-            "integrator": {"type": "path", "max_depth": max_depth, "rr_depth": 1},
+            # Two bounces. Russian roulette from the first one halves the time for little noise.
+            "integrator": {"type": "path", "max_depth": 4, "rr_depth": 1},
         }
         groups: dict[tuple[str, str], tuple[Material, list[Mesh]]] = {}
         for mesh, material in meshes:
@@ -176,14 +159,8 @@ class Renderer:
     ) -> np.ndarray:
         """Render one image.
 
-        Args:
-            camera: Pinhole with square pixels and no distortion.
-            base_from_camera: Camera pose, shape (), or poses during the exposure, shape (n,).
-            options: Samples, exposure and noise.
-            seed: Seed of the noise. One variant gives the same pixels for the same seed.
-
-        Returns:
-            sRGB image, uint8, shape (H, W, 3).
+        A batch of poses (n,) base_from_camera is a motion during the exposure. One variant gives
+        the same pixels for the same seed. Returns sRGB (H, W, 3) uint8.
 
         Raises:
             ValueError: The camera has distortion, or fx and fy differ.
@@ -241,6 +218,8 @@ class Renderer:
             if any(camera.distortion) or abs(camera.fx - camera.fy) > 1e-6 * camera.fx:
                 raise ValueError(f"rendering needs a pinhole with fx = fy, got {camera}")
             width, height = camera.width, camera.height
+            film = {"type": "hdrfilm", "width": width, "height": height}
+            film |= {"rfilter": {"type": "box"}, "component_format": "float32"}
             sensor = self._mi.load_dict(
                 {
                     "type": "perspective",
@@ -250,13 +229,7 @@ class Renderer:
                     "far_clip": 1000.0,
                     "principal_point_offset_x": ((width - 1) / 2 - camera.cx) / width,
                     "principal_point_offset_y": ((height - 1) / 2 - camera.cy) / height,
-                    "film": {
-                        "type": "hdrfilm",
-                        "width": width,
-                        "height": height,
-                        "rfilter": {"type": "box"},
-                        "component_format": "float32",
-                    },
+                    "film": film,
                     "sampler": {"type": "multijitter", "sample_count": 16},
                 }
             )
@@ -265,15 +238,7 @@ class Renderer:
 
 
 def _denoised(light: np.ndarray, features: np.ndarray) -> np.ndarray:
-    """Remove sampling noise; textures and edges stay.
-
-    Args:
-        light: Radiance, shape (H, W, 3).
-        features: Albedo and normal of the first surface, shape (H, W, 6).
-
-    Returns:
-        Radiance, shape (H, W, 3).
-    """
+    """Radiance (H, W, 3) without noise; `features` are albedo and normal of the first surface."""
     import mitsuba_oidn as oidn  # pyright: ignore[reportMissingImports]
 
     albedo = np.ascontiguousarray(np.clip(features[..., :3], 0, 1))
@@ -300,14 +265,9 @@ def _mesh(mi: Any, mesh: Mesh, material: Material) -> Any:
     light = material.emitter(mi)
     if light is not None:
         properties["emitter"] = mi.load_dict(light)
-    result = mi.Mesh(
-        mesh.name or material.name,
-        len(mesh.vertices_m),
-        len(mesh.faces),
-        has_vertex_normals=True,
-        has_vertex_texcoords=True,
-        props=properties,
-    )
+    name, counts = mesh.name or material.name, (len(mesh.vertices_m), len(mesh.faces))
+    extras = {"has_vertex_normals": True, "has_vertex_texcoords": True}
+    result = mi.Mesh(name, *counts, **extras, props=properties)
     parameters = mi.traverse(result)
     for key, value, kind in (
         ("vertex_positions", mesh.vertices_m, np.float32),

@@ -125,10 +125,6 @@ class _Builder:
 def room(kind: str, seed: int) -> Room:
     """Compose a room. The same kind and seed give the same room.
 
-    Args:
-        kind: One of `KINDS`.
-        seed: A seed below 9000.
-
     Raises:
         ValueError: The kind is unknown or the seed is reserved.
     """
@@ -215,11 +211,7 @@ def _living(build: _Builder) -> None:
     build.try_wall(shop.floor_lamp, (0, 1, 2))
 
 
-KINDS: dict[str, Callable[[_Builder], None]] = {
-    "bedroom": _bedroom,
-    "kitchen": _kitchen,
-    "living": _living,
-}
+KINDS = {"bedroom": _bedroom, "kitchen": _kitchen, "living": _living}
 
 
 def _fill_up(build: _Builder) -> None:
@@ -235,20 +227,15 @@ def _fill_up(build: _Builder) -> None:
     for _ in range(9):
         build.try_wall(build.hangings.picture, (0, 1, 1, 2, 3), float(rng.uniform(1.25, 1.6)))
     for make in (t.plant, t.basket, t.toy_ball, t.basket, t.plant):
-        thing = _on_floor(make())
+        thing = make()
+        if thing.kind == "plant":  # larger than on tables
+            parts = [(mesh.scaled(2.6), material) for mesh, material in thing.parts]
+            thing = Item(thing.kind, parts)
         for _ in range(20):
             spot = rng.uniform((0.25, 0.25), build.size[:2] - 0.25)
-            wall_distance = np.minimum(spot, build.size[:2] - spot).min()
-            free = wall_distance < 0.9
-            if free and build.add(thing.placed(float(spot[0]), float(spot[1]), 0.0)):
+            by_wall = np.minimum(spot, build.size[:2] - spot).min() < 0.9
+            if by_wall and build.add(thing.placed(float(spot[0]), float(spot[1]), 0.0)):
                 break
-
-
-def _on_floor(item: Item) -> Item:
-    """The item in its size for the floor: plants are larger than on tables."""
-    if item.kind != "plant":
-        return item
-    return Item(item.kind, [(mesh.scaled(2.6), material) for mesh, material in item.parts])
 
 
 def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
@@ -276,9 +263,8 @@ def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
         slabs.append((box(x, 0.016, 0.08, 0.006).shifted(x / 2, py, 0), shop.white))
     for px in (0.008, x - 0.008):
         slabs.append((box(0.016, y, 0.08, 0.006).shifted(px, y / 2, 0), shop.white))
-    slabs += _window(build, 0, float(rng.uniform(0.45, 0.75)))
-    slabs += _window(build, 2, float(rng.uniform(0.2, 0.5)))
-    slabs += _window(build, 3, float(rng.uniform(0.3, 0.7)))
+    for wall, low, high in ((0, 0.45, 0.75), (2, 0.2, 0.5), (3, 0.3, 0.7)):
+        slabs += _window(build, wall, float(rng.uniform(low, high)))
     # A broad ceiling lamp keeps shadows soft and noise low.
     lamp = m.plain("lamp", (1.0, 0.95, 0.87), emission=5.0)
     slabs.append((cylinder(0.38, 0.05, 0.01, 48).shifted(0.55 * x, y / 2, z - 0.07), lamp))

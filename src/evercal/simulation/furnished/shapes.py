@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,13 +93,7 @@ def box(
 ) -> Mesh:
     """A bevelled box on z = 0, centred at x = y = 0.
 
-    Args:
-        x: Length in metres.
-        y: Depth in metres.
-        z: Height in metres.
-        bevel_m: Radius of the edges.
-        bottom: Include the underside.
-        steps: Segments per bevel.
+    Its sides are x, y and z metres, and its edges are rounded in `steps` segments.
     """
     half = np.array([x, y, z]) / 2
     radius = min(bevel_m, 0.499 * min(x, y, z))
@@ -109,14 +104,12 @@ def box(
             if axis == 2 and sign < 0 and not bottom:
                 continue
             ring = np.tan(np.linspace(0, np.pi / 4, steps + 1)) * radius
-            lines = []
-            for side in (a, b):
-                inner = half[side] - radius
-                # A flat face between its bevels is two triangles.
-                lines.append(np.concatenate([-inner - ring[::-1], inner + ring]))
-            p = np.zeros((len(lines[0]), len(lines[1]), 3))
+            # A flat face between its bevels is two triangles.
+            inner = half - radius
+            lines = [np.concatenate([-inner[i] - ring[::-1], inner[i] + ring]) for i in (a, b)]
+            p = np.empty((len(lines[0]), len(lines[1]), 3))
             p[..., axis] = sign * half[axis]
-            p[..., a], p[..., b] = lines[0][:, None], lines[1][None, :]
+            p[..., a], p[..., b] = np.meshgrid(*lines, indexing="ij")
             core = np.clip(p, -(half - radius), half - radius)
             normal = p - core
             normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -133,11 +126,9 @@ def box(
 def lathe(profile: Sequence[tuple[float, float]], segments: int = 28, smooth: int = 3) -> Mesh:
     """A body of revolution about z.
 
-    Args:
-        profile: (radius, height) pairs in metres, from the bottom of the outside over the rim to
-            the bottom of the inside. The outside is to the right of this direction.
-        segments: Number of segments around z.
-        smooth: Spline pieces per profile step; 1 keeps straight steps.
+    The profile holds (radius, height) pairs in metres, from the bottom of the outside over the rim
+    to the bottom of the inside. The outside is to the right of this direction. Each step is
+    `smooth` spline pieces; 1 keeps straight steps.
     """
     points = np.asarray(profile, float)
     if smooth > 1:
@@ -172,15 +163,8 @@ def _spline(points: np.ndarray, pieces: int) -> np.ndarray:
     parts = []
     for i in range(len(points) - 1):
         a, b, c, d = padded[i : i + 4]
-        parts.append(
-            0.5
-            * (
-                2 * b
-                + (c - a) * t
-                + (2 * a - 5 * b + 4 * c - d) * t**2
-                + (3 * b - a - 3 * c + d) * t**3
-            )
-        )
+        square, cube = 2 * a - 5 * b + 4 * c - d, 3 * b - a - 3 * c + d
+        parts.append(0.5 * (2 * b + (c - a) * t + square * t**2 + cube * t**3))
     return np.concatenate([*parts, points[-1:]])
 
 
@@ -204,7 +188,7 @@ def ball(radius: float, squash: float = 1.0, segments: int = 24) -> Mesh:
     return lathe(list(zip(radius * np.cos(angle), z, strict=True)), segments, smooth=1)
 
 
-def tube(path: np.ndarray, radius: float, segments: int = 10) -> Mesh:
+def tube(path: ArrayLike, radius: float, segments: int = 10) -> Mesh:
     """A round bar along a path (k, 3) in metres."""
     path = np.asarray(path, float)
     tangent = np.gradient(path, axis=0)
@@ -239,7 +223,7 @@ def cushion(x: float, y: float, z: float, cells: int = 12) -> Mesh:
 
 def _normals(points: np.ndarray) -> np.ndarray:
     """Upward unit normals of a height field (rows, columns, 3)."""
-    du, dv = np.gradient(points, axis=0), np.gradient(points, axis=1)
+    du, dv = np.gradient(points, axis=(0, 1))
     normal = np.cross(du, dv)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = np.where(length > 1e-12, normal / np.maximum(length, 1e-12), (0.0, 0.0, 1.0))
@@ -271,7 +255,7 @@ def drape(width: float, height: float, fold_m: float, folds: int, seed: int = 0)
     grid_x, grid_z = np.meshgrid(x, z, indexing="ij")
     swing = fold_m * np.sin(phase)[:, None] * (1 - 0.35 * (grid_z / height))
     p = np.stack([grid_x, -swing, grid_z], -1)
-    du, dv = np.gradient(p, axis=0), np.gradient(p, axis=1)
+    du, dv = np.gradient(p, axis=(0, 1))
     normal = np.cross(du, dv)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     return _both_sides(p, normal, np.stack([grid_x * 1.4, grid_z], -1))

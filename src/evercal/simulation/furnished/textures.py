@@ -16,13 +16,8 @@ _LETTERS = "ABCDEFGHJKLMNPRSTUVWXYZabcdefghkmnpqrstuvwxyz0123456789&%#?!"
 def one_over_f(size: int, exponent: float, rng: np.random.Generator) -> np.ndarray:
     """Noise whose amplitude falls with frequency as 1/f^exponent.
 
-    Args:
-        size: Side in pixels.
-        exponent: 1 resembles natural images, 0 is white noise.
-        rng: Random generator.
-
-    Returns:
-        Tiling noise of mean 0 and standard deviation 1, float32, shape (size, size).
+    An exponent of 1 resembles natural images, 0 is white noise. The noise tiles and has mean 0 and
+    standard deviation 1, float32, shape (size, size).
     """
     frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :])
     frequency[0, 0] = 1.0
@@ -104,14 +99,8 @@ def dead_leaves(
 ) -> np.ndarray:
     """Draw a dead-leaves picture.
 
-    Args:
-        height: Rows in pixels.
-        width: Columns in pixels.
-        rng: Random generator; the same state gives the same pixels.
-        leaves: Number of shapes, random if omitted. Few shapes give a calm picture.
-
-    Returns:
-        RGB picture, uint8, shape (height, width, 3).
+    Returns RGB, uint8, shape (height, width, 3). Few leaves give a calm picture; their number is
+    random if omitted.
     """
     tint = rng.uniform(0.2, 0.8, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(0.2, 0.8))
     picture = np.empty((height, width, 3), np.float32)

@@ -20,9 +20,8 @@ class WallObjects:
         parts = [(box(w, 0.32, 0.65, 0.006).shifted(0, -0.16, 0), shop.paint)]
         for x, knob in ((-w / 4, -0.06), (w / 4, 0.06)):
             parts.append((box(w / 2 - 0.01, 0.02, 0.63, 0.008).shifted(x, -0.33, 0.01), shop.paint))
-            parts.append(
-                (ball(0.014).rotated(about_x(np.pi / 2), (knob, -0.335, 0.08)), shop.steel)
-            )
+            handle = ball(0.014).rotated(about_x(np.pi / 2), (knob, -0.335, 0.08))
+            parts.append((handle, shop.steel))
         return Item("cupboard", parts)
 
     def wall_shelf(self) -> Item:
@@ -58,29 +57,21 @@ class WallObjects:
             [(r, 0), (r + 0.02, 0), (r + 0.02, 0.025), (r + 0.005, 0.035), (r - 0.005, 0.02)], 36, 2
         )
         up = about_x(np.pi / 2)
-        face = sheet((-r, 0, 0), (2 * r, 0, 0), (0, 2 * r, 0))
         angle = np.linspace(0, 2 * np.pi, 37)[:-1]
         points = np.stack([r * np.cos(angle), r * np.sin(angle), np.zeros(36)], -1)
         fan = np.stack([np.full(36, 36), np.arange(36), (np.arange(36) + 1) % 36], -1)
         uv = np.concatenate([0.5 + points[:, :2] / (2 * r), [[0.5, 0.5]]])
         points = np.concatenate([points, [[0, 0, 0]]])
-        face = Mesh(points, fan, np.tile([0.0, 0, 1], (37, 1)), uv)
-        parts = [
-            (rim.rotated(up, (0, 0, r)), shop.dark),
-            (face.rotated(up, (0, -0.012, r)), m.clock_face("clock")),
-        ]
-        return Item("clock", parts)
+        face = Mesh(points, fan, np.tile([0.0, 0, 1], (37, 1)), uv).rotated(up, (0, -0.012, r))
+        rim = rim.rotated(up, (0, 0, r))
+        return Item("clock", [(rim, shop.dark), (face, m.clock_face("clock"))])
 
     def curtains(self, w: float = 0.5) -> Item:
         """A curtain on a rod at a height of 2.2 m."""
         shop = self.shop
-        cloth = shop.cloths[1]
-        parts = [
-            (drape(w, 2.05, 0.035, 6, int(self.rng.integers(99))).shifted(0, -0.08, 0.12), cloth)
-        ]
-        rod = np.array([[-w / 2 - 0.1, -0.08, 2.19], [0, -0.08, 2.19], [w / 2 + 0.1, -0.08, 2.19]])
-        parts.append((tube(rod, 0.012), shop.dark))
-        return Item("curtain", parts)
+        curtain = drape(w, 2.05, 0.035, 6, int(self.rng.integers(99))).shifted(0, -0.08, 0.12)
+        rod = tube([(x, -0.08, 2.19) for x in (-w / 2 - 0.1, 0, w / 2 + 0.1)], 0.012)
+        return Item("curtain", [(curtain, shop.cloths[1]), (rod, shop.dark)])
 
     def door(self) -> Item:
         """A panelled door with a lever and a frame."""
@@ -91,8 +82,6 @@ class WallObjects:
         for x in (-0.48, 0.48):
             parts.append((box(0.09, 0.05, 2.08, 0.012).shifted(x, -0.025, 0), shop.white))
         parts.append((box(1.05, 0.05, 0.09, 0.012).shifted(0, -0.025, 2.0), shop.white))
-        lever = np.array(
-            [[0.36, -0.03, 1.0], [0.36, -0.08, 1.0], [0.33, -0.09, 1.0], [0.24, -0.09, 1.0]]
-        )
+        lever = [(0.36, -0.03, 1.0), (0.36, -0.08, 1.0), (0.33, -0.09, 1.0), (0.24, -0.09, 1.0)]
         parts.append((tube(lever, 0.011), shop.steel))
         return Item("door", parts)

@@ -20,9 +20,7 @@ class Message:
     """One message of a bag."""
 
     topic: str
-    """Topic name."""
     kind: str
-    """Type, such as sensor_msgs/msg/Image."""
     logged_ns: int
     """Time of recording, nanoseconds."""
     repeat: int
@@ -54,11 +52,15 @@ class BagFile:
             ) from None
         # Bags of ROS 2 before Iron lack type definitions; the types read here never changed.
         types = get_typestore(Stores.ROS2_HUMBLE)
+        parts = _parts(path)
+        kinds = {part.suffix for part in parts}
+        if len(kinds) > 1:
+            raise InputError(
+                f"{path}: holds bags of several kinds ({', '.join(kinds)}); name one file"
+            )
         try:
-            self._reader = AnyReader(_parts(path), default_typestore=types)
+            self._reader = AnyReader(parts, default_typestore=types)
             self._reader.open()
-        except InputError:
-            raise
         except Exception as error:  # damaged bags make rosbags raise many types
             raise InputError(f"{path}: rosbags cannot read it: {_reason(error)}") from None
         weakref.finalize(self, self._reader.close)
@@ -134,34 +136,18 @@ def stamp_ns(stamp: Any) -> int:
 
 def is_bag(path: Path) -> bool:
     """Whether a path looks like a bag or a folder of one."""
-    if path.is_file():
-        return path.suffix in _FILES
-    return _is_ros2_folder(path) or bool(_bags_in(path))
-
-
-def _is_ros2_folder(path: Path) -> bool:
-    metadata = path / "metadata.yaml"
-    try:
-        return b"rosbag2_bagfile_information" in metadata.read_bytes()[:1000]
-    except OSError:
-        return False
-
-
-def _bags_in(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    return sorted(p for p in folder.iterdir() if p.suffix in _FILES and p.is_file())
+    return bool(_parts(path))
 
 
 def _parts(path: Path) -> list[Path]:
-    """Paths to open: a ROS 2 folder as a whole, else its bag files, all of one kind."""
-    if path.is_file() or _is_ros2_folder(path):
+    """Paths to open: a bag file, a ROS 2 folder as a whole, or the bag files of a folder."""
+    if path.is_file():
+        return [path] if path.suffix in _FILES else []
+    metadata = path / "metadata.yaml"
+    if metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()[:1000]:
         return [path]
-    parts = _bags_in(path)
-    kinds = {part.suffix for part in parts}
-    if len(kinds) > 1:
-        raise InputError(f"{path}: holds bags of several kinds ({', '.join(kinds)}); name one file")
-    return parts
+    inside = sorted(path.iterdir()) if path.is_dir() else []
+    return [part for part in inside if part.suffix in _FILES and part.is_file()]
 
 
 def _reason(error: Exception) -> str:

@@ -46,10 +46,7 @@ def unsupported(encoding: str) -> str | None:
 
 
 def image_of(message: Any) -> NDArray[np.uint8]:
-    """Decode a sensor_msgs/Image.
-
-    Returns:
-        (H, W, 3) uint8 RGB, 16-bit values converted as by `as_rgb`.
+    """Decode a sensor_msgs/Image to (H, W, 3) uint8 RGB, 16-bit values converted as by `as_rgb`.
 
     Raises:
         ValueError: The encoding is not supported, or there is less data than the size needs.
@@ -78,10 +75,7 @@ def image_of(message: Any) -> NDArray[np.uint8]:
 
 
 def compressed_image_of(message: Any) -> NDArray[np.uint8]:
-    """Decode a sensor_msgs/CompressedImage with a PNG or JPEG.
-
-    Returns:
-        (H, W, 3) uint8 RGB.
+    """Decode a sensor_msgs/CompressedImage with a PNG or JPEG to (H, W, 3) uint8 RGB.
 
     Raises:
         ValueError: The image has another format, holds depth, or is broken.

@@ -1,8 +1,8 @@
 """Poses at the images of a bag, from tf or from joint states and a URDF."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,21 +31,13 @@ class ImagePoses:
     valid: NDArray[np.bool_]
     """(n,) whether each pose was recorded close enough to the image."""
     of_camera: bool
-    """Whether the poses are base_from_camera."""
     notes: list[str]
-    """Frames that were chosen."""
 
 
 def poses_at_images(
     bag: BagFile, stamps_ns: NDArray[np.int64], camera_frame: str, options: ReadOptions
 ) -> ImagePoses:
-    """Interpolate the pose of the gripper at every image.
-
-    Args:
-        bag: Open bag.
-        stamps_ns: (n,) times of the images.
-        camera_frame: Frame of the images.
-        options: Frames, topic and URDF.
+    """Interpolate the pose of the gripper at n images, taken at `stamps_ns` (n,) in `camera_frame`.
 
     Raises:
         InputError: There is no tf and there are no joint states, frames are missing or ambiguous,
@@ -130,7 +122,7 @@ def _frame(
 
 def _refuse_times(
     bag: BagFile, stamps: NDArray[np.float64], times: NDArray[np.float64], what: str
-) -> NoReturn:
+) -> None:
     """Raise for images that are all outside the recorded times."""
     covered = f"{times.min():.1f} to {times.max():.1f} s" if times.size else "no time"
     raise InputError(
@@ -164,13 +156,19 @@ def _from_joints(bag: BagFile, stamps_ns: NDArray[np.int64], options: ReadOption
     values, valid = np.empty((len(stamps), len(joints))), np.ones(len(stamps), dtype=bool)
     times = np.empty(0)
     for column, name in enumerate(joints):
-        times, positions = np.array(_joint_track(bag, name, tracks[name], options.pose_topic)).T
+        track = tracks[name]
+        if len(track) > 1 and options.pose_topic not in track:
+            raise InputError(
+                f"{bag.path}: joint {name} is on several topics, {', '.join(sorted(track))};"
+                f" choose one with --pose-topic"
+            )
+        topic = options.pose_topic if options.pose_topic in track else next(iter(track))
+        times, positions = np.array(track[topic]).T
         values[:, column], valid_here = interpolate(times, positions, stamps)
         valid &= valid_here
     if not valid.any():
         _refuse_times(bag, stamps, times, "the joint states")
-    poses = model.base_from_gripper(joints, values, base, gripper)
-    notes = [model.note(base, gripper), *model.beyond_limits(joints, values)]
+    poses, notes = model.poses(joints, values, base, gripper)
     return ImagePoses(poses, valid, False, notes)
 
 
@@ -178,24 +176,9 @@ def _joint_tracks(
     bag: BagFile, topics: Sequence[str], zero_ns: int
 ) -> dict[str, dict[str, list[tuple[float, float]]]]:
     """By joint and topic: pairs of seconds after `zero_ns` and position."""
-    tracks: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    tracks: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
     for message in bag.messages(topics):
-        stamp = stamp_ns(message.content.header.stamp) or message.logged_ns
+        stamp = ((stamp_ns(message.content.header.stamp) or message.logged_ns) - zero_ns) * 1e-9
         for name, position in zip(message.content.name, message.content.position, strict=False):
-            track = tracks.setdefault(name, {}).setdefault(message.topic, [])
-            track.append(((stamp - zero_ns) * 1e-9, float(position)))
+            tracks[name][message.topic].append((stamp, float(position)))
     return tracks
-
-
-def _joint_track(
-    bag: BagFile, joint: str, topics: dict[str, list[tuple[float, float]]], wanted: str | None
-) -> list[tuple[float, float]]:
-    """Positions of a joint on its only topic, or on the requested one."""
-    if wanted in topics:
-        return topics[wanted]
-    if len(topics) > 1:
-        raise InputError(
-            f"{bag.path}: joint {joint} is on several topics, {', '.join(sorted(topics))}; choose"
-            f" one with --pose-topic"
-        )
-    return next(iter(topics.values()))

@@ -1,6 +1,5 @@
 """The tree of transforms of ROS's /tf and /tf_static."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,11 +20,9 @@ class _Edge:
     quaternions: list[tuple[float, ...]] = field(default_factory=list)
     translations: list[tuple[float, ...]] = field(default_factory=list)
 
-    def equals(self, other: "_Edge") -> bool:
-        """Whether two static transforms are equal."""
-        return np.allclose(
-            self.translations[-1], other.translations[-1], atol=1e-6
-        ) and np.allclose(self.quaternions[-1], other.quaternions[-1], atol=1e-6)
+    def numbers(self) -> list[float]:
+        """The last transform."""
+        return [*self.translations[-1], *self.quaternions[-1]]
 
 
 class TfTree:
@@ -102,21 +99,27 @@ class TfTree:
     def a_from_b(
         self, a: str, b: str, stamps_s: NDArray[np.float64]
     ) -> tuple[SE3, NDArray[np.bool_]]:
-        """Interpolate poses of frame b in frame a.
+        """Interpolate (n,) poses of frame b in frame a, and whether each is valid.
 
-        Args:
-            a: Frame.
-            b: Frame.
-            stamps_s: (n,) seconds.
-
-        Returns:
-            (n,) a_from_b and (n,) whether each is valid, see `PoseTrack.at`.
+        Validity is that of `PoseTrack.at`.
 
         Raises:
             InputError: The frames are not connected, or the transforms between them are ambiguous.
         """
         up, down = self._chain(a), self._chain(b)
-        self._refuse_ambiguous(frame for frame in (*up, *down) if frame in self._edges)
+        for child in (frame for frame in (*up, *down) if frame in self._edges):
+            if self._conflicting(child):
+                raise InputError(
+                    f"{self._source}: tf {self._edge(child).parent} -> {child} is on several"
+                    f" topics, {', '.join(sorted(self._edges[child]))}; choose one with"
+                    f" --pose-topic"
+                )
+            if child in self._parents:
+                parents = ", ".join(sorted(self._parents[child]))
+                raise InputError(
+                    f"{self._source}: tf frame {child!r} has several parents, {parents}: two"
+                    f" programs publish it; record with one of them"
+                )
         if up[-1] != down[-1]:
             raise InputError(
                 f"{self._source}: tf has no chain between {a!r} and {b!r}: their roots are"
@@ -134,22 +137,6 @@ class TfTree:
             sides.append(ancestor_from_frame)
         return sides[0].inverse() @ sides[1], valid
 
-    def _refuse_ambiguous(self, frames: Iterable[str]) -> None:
-        """Raise for a frame with conflicting topics or several parents."""
-        for child in frames:
-            if self._conflicting(child):
-                raise InputError(
-                    f"{self._source}: tf {self._edge(child).parent} -> {child} is on several"
-                    f" topics, {', '.join(sorted(self._edges[child]))}; choose one with"
-                    f" --pose-topic"
-                )
-            if child in self._parents:
-                parents = ", ".join(sorted(self._parents[child]))
-                raise InputError(
-                    f"{self._source}: tf frame {child!r} has several parents, {parents}: two"
-                    f" programs publish it; record with one of them"
-                )
-
     def _edge(self, child: str) -> _Edge:
         """The transforms to use for a frame: the chosen topic, else a moving one."""
         topics = self._edges[child]
@@ -163,7 +150,8 @@ class TfTree:
             return False
         moving = sum(not other.static for other in edges)
         # Equal static transforms agree, and one moving topic takes precedence over static ones.
-        agree = moving == 1 or (not moving and all(edge.equals(other) for other in edges))
+        equal = all(np.allclose(edge.numbers(), e.numbers(), atol=1e-6) for e in edges)
+        agree = moving == 1 or (not moving and equal)
         return not agree or any(other.parent != edge.parent for other in edges)
 
     def _at(self, child: str, stamps_s: NDArray[np.float64]) -> tuple[SE3, NDArray[np.bool_]]:

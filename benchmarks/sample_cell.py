@@ -7,7 +7,7 @@
     DIR/bumped.jpg                     the fixed camera after a small bump
     DIR/truth.json                     true poses, noise and settings
 
-Render it with `python -m evercal.simulation.sample_cell DIR`.
+Render it with `python benchmarks/sample_cell.py DIR`.
 """
 
 import sys
@@ -46,8 +46,7 @@ _TRIPOD_TARGET_M = np.array([0.9, 0.1, 0.1])
 def render_sample_cell(out: Path) -> None:
     """Render the sample cell into a folder.
 
-    Args:
-        out: Folder to write. Existing files of the same names are replaced.
+    Existing files of the same names are replaced.
 
     Raises:
         InputError: The extra `sim` is not installed.
