@@ -23,8 +23,8 @@ from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.recordings.frame import Frame
 
 MAX_SUPPORT = 0.5
-"""Largest threshold. No wrong pose reached this support, in another room or in the right one with
-few keyframes (docs/experiments/map.md)."""
+"""Largest threshold. One wrong pose of those measured had more support: an image of another room
+with the same curtain (docs/experiments/map.md)."""
 MIN_SUPPORT = 0.14
 """Smallest threshold. Where stated poses fit the images badly, right poses have little support: the
 threshold is then half of the support of held-out frames, but at least this."""

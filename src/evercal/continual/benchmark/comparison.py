@@ -278,7 +278,8 @@ def scene_rows(runs: Sequence[Run]) -> TableRows:
         for i, scene in enumerate(run.scenes)
     ]
     frame = pandas.DataFrame(cells, columns=["strategy", "scene", "learned", "end"])
-    means = frame.groupby(["strategy", "scene"], sort=False).mean()
+    index = ["strategy", "scene"]
+    means = frame.pivot_table(index=index, values=["learned", "end"], sort=False)
     ends = zip(means["learned"], means["end"], strict=True)
     text = pandas.Series([f"{number(a)} -> {number(b)}" for a, b in ends], index=means.index)
     by_scene = text.unstack(sort=False)[sorted(runs[0].scenes)].reset_index()
