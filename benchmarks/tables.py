@@ -212,11 +212,11 @@ def _fixed(sources: Sequence[Published], _: str) -> str:
 
 
 POSE_ERRORS = {
-    "none": "as they are",
-    "noise": "every pose by 2 mm and 0.2 deg",
-    "offset": "all by one offset of 5.4 mm and 0.54 deg",
+    "none": "correct poses",
+    "noise": "noise of 2 mm and 0.2 deg",
+    "offset": "common offset of 5.4 mm and 0.54 deg",
     "focal": "focal length 1 % too long",
-    "gross": "every twentieth pose by 30 cm",
+    "gross": "every twentieth pose off by 30 cm",
 }
 
 
@@ -224,18 +224,18 @@ def _bad_poses(sources: Sequence[Published], _: str) -> str:
     """Tabulate `maps badposes`: the cost of wrong training poses, and what was estimated."""
     rows = _frame(sources[0])
     groups = _groups(rows.assign(kind=rows["scene"].str.split().str[0]), "kind")
-    table = [["bedroom, wrong training poses", "1 cm/1 deg", "median", "estimated"]]
+    table = [["bedroom, wrong training poses", "1 cm/1 deg", "median", "estimate"]]
     for kind, title in POSE_ERRORS.items():
         group = groups[kind]
         first = group.iloc[0]
         common = f"{first['common_error_mm']:.3f} mm, {first['common_error_deg']:.3f} deg"
         estimated = {
-            "none": f"nothing moved ({common})",
-            "noise": f"stated poses good to {_range(group, 'pose_sigma_mm', 1)} mm",
-            "offset": f"the offset, to {common}",
+            "none": f"common offset of {common}",
+            "noise": f"noise of {_range(group, 'pose_sigma_mm', 1)} mm",
+            "offset": f"offset, with an error of {common}",
             "focal": f"{first['focal_percent']:+.3f} % (true: -0.990 %)",
-            "gross": f"{group['named'].sum():.0f} of {group['planted'].sum():.0f} named,"
-            f" {group['named_wrongly'].sum():.0f} wrongly",
+            "gross": f"{group['named'].sum():.0f} of {group['planted'].sum():.0f} reported,"
+            f" {group['named_wrongly'].sum():.0f} false reports",
         }[kind]
         seeds = f" ({len(group)} seeds)" if len(group) > 1 else ""
         share = _share(_column(group, "1 cm/1 deg").mean())
