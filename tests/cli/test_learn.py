@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -84,8 +85,12 @@ def test_interrupt_leaves_no_map(rooms: Any, tmp_path: Path) -> None:
         assert process.stdout is not None
         assert process.stderr is not None
         assert process.stdout.readline().startswith("box-room-41: 24 training frames")
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=60) == 130
+        for _ in range(20):  # a signal that arrives inside a destructor is lost
+            process.send_signal(signal.SIGINT)
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(timeout=3)
+                break
+        assert process.returncode == 130
         messages = process.stderr.read()
     assert "stopped; the same command continues or starts again" in messages
     assert "Traceback" not in messages

@@ -12,7 +12,8 @@ import pytest
 
 from evercal.cli import main
 from evercal.recordings import generic
-from evercal.simulation.box_room import box_room_scene
+
+from ..box_world import box_room_scene
 
 
 @pytest.fixture(scope="module", autouse=True)

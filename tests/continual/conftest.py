@@ -120,22 +120,6 @@ def estimates(rooms: Rooms) -> Estimates:
 
 
 @pytest.fixture(scope="session")
-def arc_stage() -> StageOptions:
-    """Enough training for `arcs`."""
-    from evercal.continual.networks.buffer import EncodePlan
-    from evercal.continual.networks.head import HeadOptions
-    from evercal.continual.networks.trainer import FitOptions
-    from evercal.continual.stage import StageOptions
-    from evercal.features.views import ViewOptions
-
-    return StageOptions(
-        head=HeadOptions(width=64),
-        fit=FitOptions(iterations=600, batch=384, replay_batch=256, peak_rate=7e-3),
-        encode=EncodePlan(views_per_frame=2, view=ViewOptions(short_side=120)),
-    )
-
-
-@pytest.fixture(scope="session")
 def arc_scenes(
     arcs: tuple[Recording, Recording], arc_stage: StageOptions
 ) -> tuple[LearnedScenes, LearnedScenes]:

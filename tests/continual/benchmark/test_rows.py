@@ -119,7 +119,7 @@ BAD = [
     ),
     (
         {"name": "a", "of": "sars_spdd", "with": {"penalty": {"options": {"temperature": 0}}}},
-        "SpddOptions.temperature is 0.0",
+        "give a temperature > 0",
     ),
     ({"name": "a", "of": "evercal", "with": {"weight": 3}}, "evercal trains nothing"),
     ({"name": "a", "of": "er", "map": "yes"}, "map is 'yes'; give true or false"),
