@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from evercal.continual.learn_scene import NetworkLearnOptions, learn_networks
+from evercal.continual.learning.learn_scene import NetworkLearnOptions, learn_networks
 from evercal.continual.localizer import open_networks
 from evercal.continual.networks.descriptor import encode, load_descriptor
 from evercal.evaluation import evaluate, scores

@@ -7,13 +7,18 @@ from pathlib import Path
 
 from benchmarks.peak_memory import peak_gb
 from evercal.continual.benchmark.suites import load_suite
-from evercal.continual.learn import learn
+from evercal.continual.learning.learn import learn
+from evercal.continual.learning.presets import (
+    PAPER_SIM_STEPS,
+    on_paper_backbone,
+    preset,
+    short_side,
+)
+from evercal.continual.learning.stage import Encoding
 from evercal.continual.networks.atlas import combined_centres
 from evercal.continual.networks.descriptor import load_descriptor
 from evercal.continual.networks.trainer import Progress
-from evercal.continual.presets import PAPER_SIM_STEPS, on_paper_backbone, preset, short_side
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.stage import Encoding
 from evercal.continual.strategies import strategy_named
 from evercal.features.device import device_of
 from evercal.features.encoder import load_encoder

@@ -18,8 +18,8 @@ from evercal.continual.benchmark import results
 from evercal.continual.benchmark.bench import BenchOptions, run_bench
 from evercal.continual.benchmark.rows import read_rows, strategy_from_row
 from evercal.continual.benchmark.suites import load_suite, tuning_split
-from evercal.continual.presets import on_paper_backbone, preset
-from evercal.continual.stage import StageOptions
+from evercal.continual.learning.presets import on_paper_backbone, preset
+from evercal.continual.learning.stage import StageOptions
 from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
 from evercal.evaluation import recall_area

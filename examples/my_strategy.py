@@ -11,9 +11,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.methods.penalties import OldOutput
 from evercal.continual.methods.replay import Replay
+from evercal.continual.selection.frame_statistics import FrameStatistics
 from evercal.continual.strategies import Strategy
 from evercal.mapping.selection import select_farthest
 

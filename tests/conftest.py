@@ -22,7 +22,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 if TYPE_CHECKING:
     import torch
 
-    from evercal.continual.stage import StageOptions
+    from evercal.continual.learning.stage import StageOptions
     from evercal.mapping.build import BuiltMap
     from evercal.mapping.scene_map import MapContents
     from evercal.recordings.frame import Recording
@@ -157,10 +157,10 @@ def tree() -> Callable[[Path], dict[str, str]]:
 @pytest.fixture(scope="session")
 def quick() -> StageOptions:
     """A stage of eight steps for `rooms`."""
+    from evercal.continual.learning.stage import StageOptions
     from evercal.continual.networks.buffer import EncodePlan
     from evercal.continual.networks.head import HeadOptions
     from evercal.continual.networks.trainer import FitOptions
-    from evercal.continual.stage import StageOptions
     from evercal.features.views import ViewOptions
 
     return StageOptions(
@@ -174,10 +174,10 @@ def quick() -> StageOptions:
 @pytest.fixture(scope="session")
 def arc_stage() -> StageOptions:
     """Enough training for `arcs`."""
+    from evercal.continual.learning.stage import StageOptions
     from evercal.continual.networks.buffer import EncodePlan
     from evercal.continual.networks.head import HeadOptions
     from evercal.continual.networks.trainer import FitOptions
-    from evercal.continual.stage import StageOptions
     from evercal.features.views import ViewOptions
 
     return StageOptions(

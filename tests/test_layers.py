@@ -239,7 +239,7 @@ def test_planted_chains_are_found(tmp_path: Path) -> None:
     plant(
         tmp_path,
         {
-            "__init__.py": "from evercal.continual.learn import learn",
+            "__init__.py": "from evercal.continual.learning.learn import learn",
             "errors.py": "",
             "map.py": "from evercal.mapping.near import build",
             "features/__init__.py": "",
@@ -254,7 +254,7 @@ def test_planted_chains_are_found(tmp_path: Path) -> None:
             "simulation/__init__.py": "",
             "simulation/rooms.py": "",
             "continual/__init__.py": "",
-            "continual/learn.py": "",
+            "continual/learning/learn.py": "",
             "continual/networks/__init__.py": "",
             "continual/networks/loss.py": "",
         },

@@ -12,7 +12,7 @@ from evercal.continual.benchmark import results
 from evercal.continual.benchmark.bench import BenchOptions
 from evercal.continual.benchmark.results import SceneResult
 from evercal.continual.benchmark.rows import load_rows, strategy_from_row
-from evercal.continual.stage import StageOptions
+from evercal.continual.learning.stage import StageOptions
 from evercal.errors import InputError
 from evercal.recordings import Recording
 

@@ -101,7 +101,7 @@ def four_images(still_images: Path, tmp_path_factory: pytest.TempPathFactory) ->
 @pytest.fixture(scope="session")
 def network_store(tmp_path_factory: pytest.TempPathFactory, rooms: tuple[Path, Path]) -> Path:
     """A store of a network with 5 centres that was trained for four steps on `box-room-41`."""
-    from evercal.continual.presets import PRESETS
+    from evercal.continual.learning.presets import PRESETS
 
     demo, folder = PRESETS["demo"], tmp_path_factory.mktemp("stores") / "network.evercal"
     words = ["learn", str(folder), str(rooms[0]), "--strategy", "finetune", "--centres", "5"]

@@ -15,7 +15,7 @@ from evercal.continual.benchmark.results import RESULTS, STRATEGIES
 from evercal.recordings import generic
 
 if TYPE_CHECKING:
-    from evercal.continual.stage import StageOptions
+    from evercal.continual.learning.stage import StageOptions
     from evercal.recordings import Recording
 
 

@@ -20,7 +20,7 @@ from ..box_world import box_room_scene
 def tiny() -> Iterator[None]:
     """A preset of four steps, and negative images that need no rendering."""
     from evercal.continual import threshold
-    from evercal.continual.presets import PRESETS
+    from evercal.continual.learning.presets import PRESETS
 
     bench, rng = PRESETS["bench"], np.random.default_rng(0)
     stage = replace(

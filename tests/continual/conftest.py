@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
+    from evercal.continual.learning.stage import StageOptions
     from evercal.continual.scenes import LearnedScenes
-    from evercal.continual.stage import StageOptions
     from evercal.continual.store import NetworkStore
     from evercal.recordings.frame import Recording
 
@@ -40,7 +40,7 @@ def first_stages(
     empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions
 ) -> dict[str, LearnedScenes]:
     """Every strategy that learns scene by scene after the first room."""
-    from evercal.continual.learn import learn
+    from evercal.continual.learning.learn import learn
     from evercal.continual.strategies import STRATEGIES
 
     from .stages import outcome
@@ -57,7 +57,7 @@ def three_stages(
     first_stages: dict[str, LearnedScenes], rooms: Rooms, quick: StageOptions
 ) -> dict[str, list[LearnedScenes]]:
     """By strategy: what is learned after one, two and three rooms."""
-    from evercal.continual.learn import learn
+    from evercal.continual.learning.learn import learn
     from evercal.continual.strategies import STRATEGIES
 
     from .stages import outcome
@@ -124,7 +124,7 @@ def arc_scenes(
     arcs: tuple[Recording, Recording], arc_stage: StageOptions
 ) -> tuple[LearnedScenes, LearnedScenes]:
     """Networks after the first arc, and after both."""
-    from evercal.continual.learn import learn
+    from evercal.continual.learning.learn import learn
     from evercal.continual.networks.descriptor import load_descriptor
     from evercal.continual.scenes import LearnedScenes
     from evercal.continual.strategies import STRATEGIES

@@ -6,10 +6,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from evercal.continual.learn import learn
+from evercal.continual.learning.learn import learn
+from evercal.continual.learning.stage import Event, Stage, StageOptions
 from evercal.continual.networks.head import Head
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.stage import Event, Stage, StageOptions
 from evercal.continual.store import NetworkStore, Resume
 from evercal.continual.strategies import STRATEGIES
 from evercal.recordings.frame import Recording

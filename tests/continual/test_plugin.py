@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evercal.continual.learn import learn
+from evercal.continual.learning.learn import learn
+from evercal.continual.learning.stage import StageOptions
 from evercal.continual.methods.penalties import OldOutput
 from evercal.continual.plugin import load_plugin
-from evercal.continual.stage import StageOptions
 from evercal.continual.strategies import STRATEGIES, strategy_named
 from evercal.errors import InputError
 

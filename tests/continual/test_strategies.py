@@ -10,7 +10,7 @@ from evercal.continual.methods.method import described
 from evercal.continual.methods.penalties import Distillation
 from evercal.continual.methods.preconditioning import PreconditionedReplay
 from evercal.continual.methods.replay import Replay
-from evercal.continual.selectors import SELECTORS
+from evercal.continual.selection.selectors import SELECTORS
 from evercal.continual.strategies import STRATEGIES, Strategy, strategy_named
 from evercal.errors import InputError
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from evercal.continual.benchmark.bench import BenchOptions, Step
-    from evercal.continual.stage import StageOptions
+    from evercal.continual.learning.stage import StageOptions
     from evercal.continual.strategies import Strategy
     from evercal.recordings import Recording
 
@@ -89,9 +89,9 @@ class Bench:
         seeds = _numbers(self.seeds)
         from evercal.continual.benchmark.bench import BenchOptions
         from evercal.continual.benchmark.report_data import require_pandas
+        from evercal.continual.learning.presets import short_side
         from evercal.continual.networks.distributed import join_processes, rank, wait_for_all
         from evercal.continual.plugin import load_plugin
-        from evercal.continual.presets import short_side
 
         require_pandas()  # before hours of learning
         if self.plugin is not None:
@@ -162,7 +162,7 @@ class Bench:
         return load_suite(self.suite, self.data, _words(self.scenes), self.poses)
 
     def _stage(self, seed: int) -> "StageOptions":
-        from evercal.continual.presets import PAPER_SIM_STEPS, on_paper_backbone, preset
+        from evercal.continual.learning.presets import PAPER_SIM_STEPS, on_paper_backbone, preset
 
         try:
             stage = preset(self.preset, seed).with_memory(self.memory)

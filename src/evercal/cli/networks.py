@@ -67,7 +67,7 @@ def learn_into_networks(
         start: a line to print when learning begins.
         stream: where the line goes.
     """
-    from evercal.continual.learn_scene import NetworkLearnOptions, learn_networks
+    from evercal.continual.learning.learn_scene import NetworkLearnOptions, learn_networks
 
     given = request.options
     if given.centres is not None and given.centres < 1:
@@ -126,9 +126,9 @@ class Bars:
 
     def event(self, event: object) -> None:
         """Show an event of network training."""
-        from evercal.continual.learn_scene import MapProgress
+        from evercal.continual.learning.learn_scene import MapProgress
+        from evercal.continual.learning.stage import Encoding
         from evercal.continual.networks.trainer import Progress
-        from evercal.continual.stage import Encoding
 
         if isinstance(event, Progress):
             bar = self.step("training", event.step, event.total)

@@ -32,6 +32,7 @@ class Encoder(Protocol):
 
     def __call__(self, grey: Tensor) -> Tensor:
         """(b, 1, h, w) in [0, 1] -> (b, width, h // stride, w // stride)."""
+        ...
 
 
 class _ConvBlock(nn.Sequential):

@@ -38,18 +38,22 @@ class LearnedScene(Protocol):
     @property
     def name(self) -> str:
         """Name of the scene."""
+        ...
 
     @property
     def camera(self) -> Camera:
         """Intrinsics that its recording states."""
+        ...
 
     @property
     def adjusted_camera(self) -> Camera:
         """The same camera after learning."""
+        ...
 
     @property
     def frame(self) -> MapFrame:
         """Relation of its scene points to the base frame."""
+        ...
 
 
 class LearnedContents(Protocol):
@@ -58,10 +62,12 @@ class LearnedContents(Protocol):
     @property
     def short_side(self) -> int:
         """Shorter image side that the encoder works on, pixels."""
+        ...
 
     @property
     def scenes(self) -> Sequence[LearnedScene]:
         """In order of learning."""
+        ...
 
 
 class SceneLocalizer(Protocol):
@@ -70,9 +76,11 @@ class SceneLocalizer(Protocol):
     @property
     def scenes(self) -> tuple[str, ...]:
         """Names of the scenes, in order of learning."""
+        ...
 
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         """Estimate the camera pose of one image."""
+        ...
 
     def camera_for(self, stated: Camera) -> Camera | None:
         """The `camera` argument for an image with these stated intrinsics."""
@@ -84,6 +92,7 @@ class LearnedLocalizer(SceneLocalizer, Protocol):
     @property
     def contents(self) -> LearnedContents:
         """The scenes."""
+        ...
 
 
 class Localizer:

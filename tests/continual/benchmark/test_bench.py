@@ -24,8 +24,8 @@ from evercal.continual.benchmark.results import (
     read_strategies,
 )
 from evercal.continual.benchmark.suites import SUITES, load_suite, regions, tuning_split
+from evercal.continual.learning.presets import on_paper_backbone
 from evercal.continual.methods.replay import Replay
-from evercal.continual.presets import on_paper_backbone
 from evercal.continual.store import NetworkStore
 from evercal.continual.strategies import Strategy, strategy_named
 from evercal.errors import InputError
@@ -33,7 +33,7 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings import Frame, Recording
 
 if TYPE_CHECKING:
-    from evercal.continual.stage import StageOptions
+    from evercal.continual.learning.stage import StageOptions
 
 Arcs = tuple[Recording, Recording]
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)

@@ -21,7 +21,7 @@ from evercal.errors import InputError
 from evercal.recordings import Frame, Recording
 
 if TYPE_CHECKING:
-    from evercal.continual.stage import StageOptions
+    from evercal.continual.learning.stage import StageOptions
 
 
 @pytest.fixture

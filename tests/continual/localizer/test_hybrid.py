@@ -9,13 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.learn import learn
+from evercal.continual.learning.learn import learn
+from evercal.continual.learning.stage import StageOptions
 from evercal.continual.localizer import HybridLocalizer, NetworkLocalizer
 from evercal.continual.networks.atlas import Atlas
 from evercal.continual.networks.descriptor import load_descriptor
 from evercal.continual.networks.head import Head, HeadOptions, HeadOutput
 from evercal.continual.scenes import LearnedScenes, SceneRecord
-from evercal.continual.stage import StageOptions
 from evercal.continual.strategies import STRATEGIES
 from evercal.features.encoder import load_encoder
 from evercal.geometry import SE3, pose_distance

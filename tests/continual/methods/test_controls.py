@@ -16,8 +16,8 @@ from ..stages import outcome, second_stage, weights
 from .by_hand import stage_start, wave_head
 
 if TYPE_CHECKING:
+    from evercal.continual.learning.stage import StageOptions
     from evercal.continual.networks.head import Head
-    from evercal.continual.stage import StageOptions
 
     from ..stages import EmptyScenes, Rooms
 
@@ -46,7 +46,7 @@ def test_new_head_starts_from_the_shared_weights_of_the_last(
     quick: StageOptions,
 ) -> None:
     """Without training, the second head differs from the first only in the scene's parameters."""
-    from evercal.continual.learn import learn
+    from evercal.continual.learning.learn import learn
     from evercal.continual.strategies import STRATEGIES
 
     isolation = STRATEGIES["isolation"]

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.methods.method import FinishedScene, Method, MethodState
 from evercal.continual.networks.head import HeadOptions
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer
+from evercal.continual.selection.frame_statistics import FrameStatistics
 from evercal.continual.strategies import STRATEGIES
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from evercal.continual.learning.presets import PRESETS
 from evercal.continual.networks.head import Head, HeadOptions, fresh_head, homogeneous_scale
-from evercal.continual.presets import PRESETS
 from evercal.errors import InputError
 
 FEATURES, DESCRIPTOR, CENTRES = 7, 5, 3

@@ -7,7 +7,7 @@ import numpy as np
 from evercal.continual.benchmark.comparison import Run, TableRows, by_strategy, difference
 from evercal.continual.methods.method import described
 from evercal.continual.methods.replay import Replay
-from evercal.continual.selectors import SELECTORS
+from evercal.continual.selection.selectors import SELECTORS
 from evercal.continual.strategies import STRATEGIES
 
 ABLATIONS: dict[str, tuple[tuple[str, str], ...]] = {

@@ -24,9 +24,9 @@ import numpy as np
 from evercal.continual.benchmark import results
 from evercal.continual.benchmark.results import SceneResult
 from evercal.continual.benchmark.strategy_run import RunOptions, run_strategy
-from evercal.continual.learn_scene import OnEvent
+from evercal.continual.learning.learn_scene import OnEvent
+from evercal.continual.learning.stage import StageOptions
 from evercal.continual.networks.descriptor import DESCRIPTOR_FILE
-from evercal.continual.stage import StageOptions
 from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
 from evercal.features.encoder import ENCODER_FILE

@@ -20,7 +20,7 @@ from typing import Any
 
 from evercal.continual.methods import penalties
 from evercal.continual.methods.penalties import Penalty
-from evercal.continual.selectors import SELECTORS
+from evercal.continual.selection.selectors import SELECTORS
 from evercal.continual.strategies import Strategy, strategy_named
 from evercal.errors import InputError
 

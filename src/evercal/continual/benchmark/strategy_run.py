@@ -13,21 +13,26 @@ import numpy as np
 
 from evercal.continual.benchmark.results import NETWORK, UNALIGNED, SceneResult, scene_result
 from evercal.continual.benchmark.scene_views import keep_views
-from evercal.continual.finish_scene import Learned, correct_lens, finished_stage, memory_bytes
-from evercal.continual.learn_jointly import learn_jointly
-from evercal.continual.learn_scene import (
+from evercal.continual.learning.finish_scene import (
+    Learned,
+    correct_lens,
+    finished_stage,
+    memory_bytes,
+)
+from evercal.continual.learning.learn_jointly import learn_jointly
+from evercal.continual.learning.learn_scene import (
     NetworkLearnOptions,
     OnEvent,
     learn_networks,
     with_fitted_threshold,
 )
+from evercal.continual.learning.stage import Stage, StageOptions
+from evercal.continual.learning.stage_rows import encoded, scene_buffer, view_plan
 from evercal.continual.localizer import NetworkLocalizer, localizer_of
 from evercal.continual.networks.atlas import combined_centres
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.feature_cache import cache_features
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.stage import Stage, StageOptions
-from evercal.continual.stage_rows import encoded, scene_buffer, view_plan
 from evercal.continual.store import NetworkStore, head_bytes
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.continual.threshold import fit_threshold

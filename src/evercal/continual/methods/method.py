@@ -12,10 +12,10 @@ from typing import ClassVar
 import numpy as np
 from torch import Tensor
 
-from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
 from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
+from evercal.continual.selection.frame_statistics import FrameStatistics
 
 MethodState = Mapping[str, Tensor]
 """Named tensors that a method stores with a finished scene; they count as memory."""

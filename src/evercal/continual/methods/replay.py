@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.methods.method import FinishedScene, Method, StageStart
 from evercal.continual.methods.penalties import Penalty, Reprojection, StoredOutput
 from evercal.continual.networks.buffer import Rows
 from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
-from evercal.continual.selectors import SELECTORS
+from evercal.continual.selection.frame_statistics import FrameStatistics
+from evercal.continual.selection.selectors import SELECTORS
 from evercal.features.precision import autocast
 
 

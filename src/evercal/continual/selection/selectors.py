@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from evercal.continual.frame_statistics import FrameStatistics
-from evercal.continual.selection_by_features import (
+from evercal.continual.selection.frame_statistics import FrameStatistics
+from evercal.continual.selection.selection_by_features import (
     select_coverage,
     select_gradients,
     select_herding,

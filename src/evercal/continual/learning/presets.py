@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
+from evercal.continual.learning.stage import StageOptions
 from evercal.continual.networks.buffer import EncodePlan
 from evercal.continual.networks.head import HeadOptions
 from evercal.continual.networks.loss import LossOptions
 from evercal.continual.networks.trainer import FitOptions
-from evercal.continual.stage import StageOptions
 
 PRESETS: dict[str, StageOptions] = {
     # At most 240 s per scene on two cores.

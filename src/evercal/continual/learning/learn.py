@@ -6,13 +6,24 @@ from dataclasses import replace
 
 import torch
 
-from evercal.continual.finish_scene import Learned, correct_lens, finished_stage, trained_record
+from evercal.continual.learning.finish_scene import (
+    Learned,
+    correct_lens,
+    finished_stage,
+    trained_record,
+)
+from evercal.continual.learning.stage import Event, Stage, StageOptions
+from evercal.continual.learning.stage_head import head_for_scene, whiten
+from evercal.continual.learning.stage_rows import (
+    Pacer,
+    encoded,
+    remembered,
+    scene_buffer,
+    view_plan,
+)
 from evercal.continual.methods.method import StageStart
 from evercal.continual.networks.trainer import HeadTrainer
 from evercal.continual.scenes import LearnedScenes, SceneRecord
-from evercal.continual.stage import Event, Stage, StageOptions
-from evercal.continual.stage_head import head_for_scene, whiten
-from evercal.continual.stage_rows import Pacer, encoded, remembered, scene_buffer, view_plan
 from evercal.continual.store import Checkpoint, Resume
 from evercal.continual.strategies import Strategy
 from evercal.mapping.build import BuiltMap, OnProgress, build_map

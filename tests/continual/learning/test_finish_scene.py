@@ -12,18 +12,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.finish_scene import memory_bytes
-from evercal.continual.frame_statistics import FrameStatistics
-from evercal.continual.learn import learn
+from evercal.continual.learning.finish_scene import memory_bytes
+from evercal.continual.learning.learn import learn
+from evercal.continual.learning.stage import StageOptions
 from evercal.continual.methods.method import FinishedScene, Method, StageStart
 from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.stage import StageOptions
+from evercal.continual.selection.frame_statistics import FrameStatistics
 from evercal.continual.store import NetworkStore
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.recordings.frame import stated_poses
 
-from .stages import (
+from ..stages import (
     EmptyScenes,
     MakeStore,
     Rooms,

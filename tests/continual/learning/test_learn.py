@@ -12,7 +12,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.learn import adjusted_frames, build_scene_map, learn
+from evercal.continual.learning.learn import adjusted_frames, build_scene_map, learn
+from evercal.continual.learning.stage import Encoding, Stage, StageOptions
 from evercal.continual.localizer import NetworkLocalizer
 from evercal.continual.methods.penalties import Penalty
 from evercal.continual.methods.replay import Replay
@@ -21,7 +22,6 @@ from evercal.continual.networks.head import HeadOutput
 from evercal.continual.networks.loss import LossOptions, clamp_px
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.stage import Encoding, Stage, StageOptions
 from evercal.continual.store import Checkpoint
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.features.precision import autocast
@@ -29,7 +29,7 @@ from evercal.geometry import SE3, pose_distance
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.recordings.frame import Frame, Recording, stated_poses
 
-from .stages import EmptyScenes, Rooms, assert_same, finished, outcome, second_stage, weights
+from ..stages import EmptyScenes, Rooms, assert_same, finished, outcome, second_stage, weights
 
 NETWORK = STRATEGIES["evercal_network"]
 SCENE_BY_SCENE = [name for name, strategy in STRATEGIES.items() if not strategy.jointly]

@@ -10,14 +10,14 @@ import pytest
 import torch
 from safetensors.torch import load, save
 
-from evercal.continual import stage_rows
+from evercal.continual.learning import stage_rows
+from evercal.continual.learning.stage import Encoding, Event, StageOptions
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.stage import Encoding, Event, StageOptions
 from evercal.continual.store import Checkpoint, Resume
 from evercal.continual.strategies import STRATEGIES
 
-from .stages import Rooms, assert_same, outcome, second_stage, weights
+from ..stages import Rooms, assert_same, outcome, second_stage, weights
 
 TRAINED = [name for name, s in STRATEGIES.items() if s.method is not None and not s.jointly]
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from evercal.continual.frame_statistics import PARTS, FrameStatistics
-from evercal.continual.learn import learn
+from evercal.continual.learning.learn import learn
+from evercal.continual.learning.stage import StageOptions
 from evercal.continual.networks.buffer import FeatureBuffer, encode_frames
 from evercal.continual.networks.head import Head, HeadOptions
 from evercal.continual.networks.loss import LossOptions, reprojection_loss
-from evercal.continual.stage import StageOptions
+from evercal.continual.selection.frame_statistics import PARTS, FrameStatistics
 from evercal.continual.strategies import STRATEGIES
 from evercal.geometry import SE3
 
-from .stages import EmptyScenes, Rooms, outcome
+from ..stages import EmptyScenes, Rooms, outcome
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +49,8 @@ def test_neighbouring_frames_share_parts(
     captured: tuple[FrameStatistics, Head, FeatureBuffer], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     candidates, _, _ = captured
-    monkeypatch.setattr("evercal.continual.frame_statistics.RELIABLE_PX", 1e3)
-    monkeypatch.setattr("evercal.continual.frame_statistics.PARTS", 40)
+    monkeypatch.setattr("evercal.continual.selection.frame_statistics.RELIABLE_PX", 1e3)
+    monkeypatch.setattr("evercal.continual.selection.frame_statistics.PARTS", 40)
     parts = candidates.visible_parts()
     assert len(parts) == 30
     assert all((np.diff(actual) > 0).all() and actual.min() >= 0 for actual in parts)

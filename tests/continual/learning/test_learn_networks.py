@@ -15,18 +15,19 @@ import numpy as np
 import pytest
 import torch
 
-from evercal.continual import stage_rows, threshold
-from evercal.continual.learn_scene import MapProgress, NetworkLearnOptions, learn_networks
+from evercal.continual import threshold
+from evercal.continual.learning import stage_rows
+from evercal.continual.learning.learn_scene import MapProgress, NetworkLearnOptions, learn_networks
+from evercal.continual.learning.stage import Encoding, StageOptions
 from evercal.continual.localizer import HybridLocalizer, open_networks
 from evercal.continual.networks.trainer import Progress
-from evercal.continual.stage import Encoding, StageOptions
 from evercal.continual.store import Checkpoint, NetworkStore, head_bytes
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.map import LearnReport
 from evercal.recordings import generic
 
-from .stages import Rooms, Tree
+from ..stages import Rooms, Tree
 
 
 def noise(*_: object) -> list[np.ndarray]:
@@ -269,8 +270,8 @@ def test_other_stages_are_not_resumed(
 CHILD = """
 import pickle, sys, time
 from pathlib import Path
-from evercal.continual import stage_rows
-from evercal.continual.learn_scene import learn_networks
+from evercal.continual.learning import stage_rows
+from evercal.continual.learning.learn_scene import learn_networks
 from evercal.continual.networks.trainer import Progress
 from evercal.recordings import generic
 def wait(event):

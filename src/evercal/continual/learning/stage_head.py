@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from evercal.continual.learning.stage import StageOptions
 from evercal.continual.networks.atlas import camera_clusters
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.head import Head, fresh_head
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.stage import StageOptions
 
 WHITENING_ROWS = 20_000
 

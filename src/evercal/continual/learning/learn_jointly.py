@@ -4,14 +4,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
-from evercal.continual.finish_scene import Learned, finished_stage, trained_record
-from evercal.continual.learn import adjusted_frames, build_scene_map
+from evercal.continual.learning.finish_scene import Learned, finished_stage, trained_record
+from evercal.continual.learning.learn import adjusted_frames, build_scene_map
+from evercal.continual.learning.stage import Event, Stage, StageOptions
+from evercal.continual.learning.stage_head import head_for_all, whiten
+from evercal.continual.learning.stage_rows import encoded, scene_buffer, view_plan
 from evercal.continual.methods.method import Method
 from evercal.continual.networks.trainer import HeadTrainer
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.stage import Event, Stage, StageOptions
-from evercal.continual.stage_head import head_for_all, whiten
-from evercal.continual.stage_rows import encoded, scene_buffer, view_plan
 from evercal.continual.strategies import Strategy
 from evercal.recordings.frame import Recording, stated_poses
 

@@ -8,15 +8,15 @@ from itertools import groupby
 import pytest
 import torch
 
-from evercal.continual.learn_jointly import learn_jointly
+from evercal.continual.learning.learn_jointly import learn_jointly
+from evercal.continual.learning.stage import Encoding, Event, Stage, StageOptions
 from evercal.continual.networks.head import Head
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.stage import Encoding, Event, Stage, StageOptions
 from evercal.continual.strategies import STRATEGIES
 from evercal.recordings.frame import stated_poses
 
-from .stages import EmptyScenes, Rooms, finished, outcome, weights
+from ..stages import EmptyScenes, Rooms, finished, outcome, weights
 
 JOINT = STRATEGIES["joint"]
 

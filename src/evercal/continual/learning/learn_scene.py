@@ -10,13 +10,13 @@ from pathlib import Path
 from torch import nn
 
 from evercal.calibration.eye_in_hand import hand_eye_report, lacks_camera_poses, posed_by_gripper
-from evercal.continual.finish_scene import memory_bytes
-from evercal.continual.learn import learn
+from evercal.continual.learning.finish_scene import memory_bytes
+from evercal.continual.learning.learn import learn
+from evercal.continual.learning.presets import preset, short_side
+from evercal.continual.learning.stage import Encoding, Stage, StageOptions
 from evercal.continual.networks.feature_cache import cache_features
 from evercal.continual.networks.trainer import Progress
-from evercal.continual.presets import preset, short_side
 from evercal.continual.scenes import LearnedScenes, SceneRecord
-from evercal.continual.stage import Encoding, Stage, StageOptions
 from evercal.continual.store import Checkpoint, NetworkStore, Resume, head_bytes
 from evercal.continual.strategies import Strategy, strategy_named
 from evercal.continual.threshold import fit_threshold

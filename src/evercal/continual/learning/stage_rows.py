@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import torch
 
+from evercal.continual.learning.stage import Encoding, Event, StageOptions
 from evercal.continual.networks.atlas import Cell
 from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, encode_frames
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.stage import Encoding, Event, StageOptions
 from evercal.continual.store import Checkpoint, Resume
 from evercal.mapping.keyframes import Keyframes
 from evercal.recordings.frame import Frame

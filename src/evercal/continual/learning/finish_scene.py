@@ -4,7 +4,8 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from evercal.continual.frame_statistics import FrameStatistics
+from evercal.continual.learning.stage import Stage, StageOptions
+from evercal.continual.learning.stage_rows import keyframe_rows
 from evercal.continual.methods.method import FinishedScene, Method, MethodState
 from evercal.continual.networks.atlas import Cell
 from evercal.continual.networks.buffer import FeatureBuffer
@@ -17,8 +18,7 @@ from evercal.continual.scenes import (
     correction_between,
     prototypes,
 )
-from evercal.continual.stage import Stage, StageOptions
-from evercal.continual.stage_rows import keyframe_rows
+from evercal.continual.selection.frame_statistics import FrameStatistics
 from evercal.continual.strategies import Strategy
 from evercal.mapping.build import BuiltMap
 from evercal.mapping.keyframes import Keyframes, store_keyframes

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from evercal.continual.frame_statistics import FrameStatistics
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.head import Head, HeadOptions
-from evercal.continual.selectors import SELECTORS
+from evercal.continual.selection.frame_statistics import FrameStatistics
+from evercal.continual.selection.selectors import SELECTORS
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame
 

@@ -1,0 +1,1 @@
+"""Learning a scene with a network: stages, training rows, presets."""
