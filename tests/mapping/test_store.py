@@ -16,7 +16,7 @@ from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
 from evercal.features.vlad import vlad_for
 from evercal.geometry.se3 import SE3
-from evercal.mapping.map_frame import MapFrame, Similarity
+from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.mapping.store import MapStore
 from evercal.storage.manifest import MANIFEST, verify, write_manifest
@@ -196,3 +196,17 @@ def test_encoder_file_for_a_stored_map_is_refused(
     make(tmp_path, scenes[:1])
     with pytest.raises(InputError, match="keeps the encoder it was made with"):
         MapStore.open_or_create(tmp_path, Path("encoder.safetensors"))
+
+
+def test_update_removes_a_correction_that_no_longer_applies(
+    hall_map: MapContents, tmp_path: Path
+) -> None:
+    scene = hall_map.scenes[0]
+    poses = scene.keyframes.base_from_camera
+    correction = FrameCorrection(poses, np.full((len(poses), 6), 1e-3), (0.1, 0.2))
+    corrected = replace(scene, frame=replace(scene.frame, correction=correction))
+    store = MapStore.create(tmp_path / "map")
+    store.commit(corrected, {})
+    assert MapStore.open(tmp_path / "map").contents.scenes[0].frame.correction is not None
+    store.update(replace(scene, frame=replace(scene.frame, correction=None)))
+    assert MapStore.open(tmp_path / "map").contents.scenes[0].frame.correction is None

@@ -191,7 +191,11 @@ class NetworkStore(StageStore):
             write_report(folder, report)
 
         shared = len(scenes.heads) == 1
-        payload = {"strategy": scenes.strategy, "short_side": scenes.short_side}
+        payload = {
+            "kind": "networks",
+            "strategy": scenes.strategy,
+            "short_side": scenes.short_side,
+        }
         self.add(record.name, write, payload, lambda file: shared and file == HEAD)
         self.contents = scenes
         shutil.rmtree(self.root / LEARNING, ignore_errors=True)

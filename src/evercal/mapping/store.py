@@ -30,8 +30,8 @@ from evercal.storage.manifest import Manifest
 from evercal.storage.stages import StageStore, is_store, read_store, write_report
 from evercal.storage.tensors import load_tensors, save_tensors
 
-STRATEGY = "evercal"
-"""Name of the map among the strategies of `evercal learn`."""
+KIND, STRATEGY = "map", "evercal"
+"""Kind of store in its manifest, and its name among the strategies of `evercal learn`."""
 SCENE, KEYFRAMES, CORRECTION = "scene.json", "keyframes.safetensors", "correction.safetensors"
 
 _FIELDS = (
@@ -69,7 +69,7 @@ class MapStore(StageStore):
 
         def read(manifest: Manifest) -> Self:
             payload = manifest.payload
-            if payload.get("strategy") != STRATEGY:
+            if payload.get("kind") != KIND:
                 raise InputError(
                     f"store {root}: holds networks of strategy {payload.get('strategy')!r}, not a"
                     " map"
@@ -150,7 +150,7 @@ class MapStore(StageStore):
         self.contents.scenes[index] = scene
 
     def _payload(self) -> dict[str, object]:
-        return {"strategy": STRATEGY, "short_side": self.contents.short_side}
+        return {"kind": KIND, "strategy": STRATEGY, "short_side": self.contents.short_side}
 
 
 def is_free(root: Path) -> bool:
@@ -181,6 +181,7 @@ def write_scene(folder: Path, scene: SceneMap) -> None:
     values = {name: getattr(scene, name) for name in _FIELDS}
     content = {k: v.to_dict() if isinstance(v, Camera) else v for k, v in values.items()}
     write_json(folder / SCENE, {**content, "frame": frame_to_dict(scene.frame)})
+    (folder / CORRECTION).unlink(missing_ok=True)  # of the scene that is replaced
     if scene.frame.correction is not None:
         save_tensors(folder / CORRECTION, correction_tensors(scene.frame.correction))
 
