@@ -106,7 +106,7 @@ def test_foreign_folders_are_refused(tmp_path: Path, tree: Tree) -> None:
     [
         ({"schema": 1}, "schema 1 is of an earlier evercal; learn the scenes again into a new"),
         ({"schema": 99}, "schema 99 .*update evercal"),
-        ({"strategy": "sars"}, "holds networks of strategy 'sars'"),
+        ({"kind": "networks", "strategy": "sars"}, "holds networks of strategy 'sars'"),
         ({"networks": ["../secret.safetensors"]}, "network '../secret.safetensors' is not in"),
         ({"stages": ["../0001-alpha"]}, "stage '../0001-alpha' is not a stage's name"),
         ({"stages": ["/etc"]}, "stage '/etc' is not a stage's name"),
