@@ -1,7 +1,7 @@
 """Acceptance: which poses are answers, and how wide their covariance is.
 
-Everything about acceptance is in this file: the formula of the support, its constants, the fit of a
-scene's threshold and the decision.
+This file holds the formula of the support, its constants, the fit of a scene's threshold and the
+decision. `LocalizeOptions` says at which support further attempts are made.
 
 The support of a pose is
 

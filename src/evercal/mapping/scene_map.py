@@ -32,7 +32,7 @@ class SceneMap:
     min_support: float = 0.0
     """Poses with less support are rejected (`localization.acceptance`)."""
     covariance_scale: float = 1.0
-    """Factor on covariances, fitted with `min_support`."""
+    """Factor on covariances (`localization.acceptance.COVARIANCE_SCALE`)."""
 
     @property
     def landmarks(self) -> int:
