@@ -79,8 +79,13 @@ def test_calibration_has_the_estimated_transform_and_the_adjusted_camera(
 
 def test_interrupt_leaves_no_map(rooms: Any, tmp_path: Path) -> None:
     words = [sys.executable, "-m", "evercal", "learn", str(tmp_path / "s"), str(rooms[0])]
+
+    def interruptible() -> None:  # a shell's background jobs ignore SIGINT
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    pipe = subprocess.PIPE
     with subprocess.Popen(
-        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        words, stdout=pipe, stderr=pipe, text=True, preexec_fn=interruptible
     ) as process:
         assert process.stdout is not None
         assert process.stderr is not None
