@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import pytest
@@ -21,6 +23,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 if TYPE_CHECKING:
     import torch
+    from matplotlib.figure import Figure
 
     from evercal.continual.learning.stage import StageOptions
     from evercal.mapping.build import BuiltMap
@@ -185,3 +188,60 @@ def arc_stage() -> StageOptions:
         fit=FitOptions(iterations=600, batch=384, replay_batch=256, peak_rate=7e-3),
         encode=EncodePlan(views_per_frame=2, view=ViewOptions(short_side=120)),
     )
+
+
+@pytest.fixture
+def every_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[Path, Callable[[], object]], list[Path]]:
+    """Run something on a folder and copy the folder before each of its steps.
+
+    A step is a call that changes names on disk or syncs them. Files are linked, not copied: a
+    store never writes into a file that is in place.
+    """
+
+    def record(root: Path, action: Callable[[], object]) -> list[Path]:
+        snapshots: list[Path] = []
+        copying = [False]
+
+        def copy() -> None:
+            copying[0] = True
+            snapshots.append(tmp_path / "steps" / f"{len(snapshots):04d}" / "store")
+            if root.exists():
+                shutil.copytree(root, snapshots[-1], copy_function=os.link)
+            copying[0] = False
+
+        def watched(function: Callable[..., object]) -> Callable[..., object]:
+            def call(*args: object, **kwargs: object) -> object:
+                if not copying[0]:
+                    copy()
+                return function(*args, **kwargs)
+
+            return call
+
+        with monkeypatch.context() as patch:
+            for name in ("replace", "fsync", "unlink", "rmdir", "mkdir"):
+                patch.setattr(os, name, watched(getattr(os, name)))
+            action()
+        copy()
+        return snapshots
+
+    return record
+
+
+@pytest.fixture
+def figures_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[ModuleType], list[Figure]]:
+    """The figures that a module of charts makes with `new_figure`, in order."""
+
+    def watch(module: ModuleType) -> list[Figure]:
+        made: list[Figure] = []
+        original = module.new_figure
+
+        def keep(width: float, height: float) -> Figure:
+            made.append(original(width, height))
+            return made[-1]
+
+        monkeypatch.setattr(module, "new_figure", keep)
+        return made
+
+    return watch

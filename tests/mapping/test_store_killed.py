@@ -19,43 +19,6 @@ Contents = Callable[[MapContents], list[object]]
 Record = Callable[[Path, Callable[[], object]], list[Path]]
 
 
-@pytest.fixture
-def every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Record:
-    """Run something on a folder and copy the folder before each of its steps.
-
-    A step is a call that changes names on disk or syncs them. Files are linked, not copied: a
-    store never writes into a file that is in place.
-    """
-
-    def record(root: Path, action: Callable[[], object]) -> list[Path]:
-        snapshots: list[Path] = []
-        copying = [False]
-
-        def copy() -> None:
-            copying[0] = True
-            snapshots.append(tmp_path / "steps" / f"{len(snapshots):04d}" / "store")
-            if root.exists():
-                shutil.copytree(root, snapshots[-1], copy_function=os.link)
-            copying[0] = False
-
-        def watched(function: Callable[..., object]) -> Callable[..., object]:
-            def call(*args: object, **kwargs: object) -> object:
-                if not copying[0]:
-                    copy()
-                return function(*args, **kwargs)
-
-            return call
-
-        with monkeypatch.context() as patch:
-            for name in ("replace", "fsync", "unlink", "rmdir", "mkdir"):
-                patch.setattr(os, name, watched(getattr(os, name)))
-            action()
-        copy()
-        return snapshots
-
-    return record
-
-
 def test_store_survives_a_kill_while_a_scene_is_added(
     scenes: list[SceneMap],
     tmp_path: Path,

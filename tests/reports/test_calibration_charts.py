@@ -1,5 +1,8 @@
 """Charts of a calibration contain the given numbers."""
 
+from collections.abc import Callable
+from types import ModuleType
+
 import cv2
 import numpy as np
 import pytest
@@ -16,16 +19,8 @@ from evercal.reports.calibration_charts import (
 
 
 @pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    made: list[Figure] = []
-    original = calibration_charts.new_figure
-
-    def keep(width: float, height: float) -> Figure:
-        made.append(original(width, height))
-        return made[-1]
-
-    monkeypatch.setattr(calibration_charts, "new_figure", keep)
-    return made
+def figures(figures_of: Callable[[ModuleType], list[Figure]]) -> list[Figure]:
+    return figures_of(calibration_charts)
 
 
 def is_picture(data: bytes) -> bool:

@@ -3,6 +3,8 @@
 import math
 import subprocess
 import sys
+from collections.abc import Callable
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -14,17 +16,8 @@ from evercal.reports.charts import error_curve, error_histogram, trajectory
 
 
 @pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """The figures behind the PNG files."""
-    made: list[Figure] = []
-    original = charts.new_figure
-
-    def record(width: float, height: float) -> Figure:
-        made.append(original(width, height))
-        return made[-1]
-
-    monkeypatch.setattr(charts, "new_figure", record)
-    return made
+def figures(figures_of: Callable[[ModuleType], list[Figure]]) -> list[Figure]:
+    return figures_of(charts)
 
 
 def is_picture(data: bytes) -> bool:

@@ -118,45 +118,6 @@ def test_an_error_while_writing_leaves_the_store_unchanged(root: Path, tree: Tre
     }
 
 
-@pytest.fixture
-def every_step(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Callable[[Path, Callable[[], object]], list[Path]]:
-    """Run an action on a folder; return what a killed process leaves at each of its steps.
-
-    A step is a call that changes names on disk or syncs them. Snapshots link files instead of
-    copying them: a store never writes into a file that is in place.
-    """
-
-    def record(root: Path, action: Callable[[], object]) -> list[Path]:
-        snapshots: list[Path] = []
-        busy = [False]
-
-        def take() -> None:
-            busy[0] = True
-            snapshots.append(tmp_path / "steps" / f"{len(snapshots):04d}" / "store")
-            if root.exists():
-                shutil.copytree(root, snapshots[-1], copy_function=os.link)
-            busy[0] = False
-
-        def watched(function: Callable[..., object]) -> Callable[..., object]:
-            def call(*args: object, **kwargs: object) -> object:
-                if not busy[0]:
-                    take()
-                return function(*args, **kwargs)
-
-            return call
-
-        with monkeypatch.context() as patch:
-            for name in ("replace", "fsync", "unlink", "rmdir", "mkdir"):
-                patch.setattr(os, name, watched(getattr(os, name)))
-            action()
-        take()
-        return snapshots
-
-    return record
-
-
 @pytest.mark.parametrize("action", ["first", "add", "replace"])
 def test_writer_killed_at_any_step(
     action: str,

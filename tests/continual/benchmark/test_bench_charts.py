@@ -2,6 +2,8 @@
 
 import itertools
 import math
+from collections.abc import Callable
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -17,17 +19,8 @@ from evercal.continual.benchmark.bench_charts import (
 
 
 @pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """The figures behind the PNG files."""
-    made: list[Figure] = []
-    original = bench_charts.new_figure
-
-    def record(width: float, height: float) -> Figure:
-        made.append(original(width, height))
-        return made[-1]
-
-    monkeypatch.setattr(bench_charts, "new_figure", record)
-    return made
+def figures(figures_of: Callable[[ModuleType], list[Figure]]) -> list[Figure]:
+    return figures_of(bench_charts)
 
 
 def test_each_panel_starts_when_its_scene_is_learned(figures: list[Figure]) -> None:

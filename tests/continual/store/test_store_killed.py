@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
 import torch
 
 from evercal.continual.scenes import LearnedScenes
@@ -18,43 +16,6 @@ from ..stages import Estimates, MakeStore, Tree
 
 Stages = dict[str, list[LearnedScenes]]
 Record = Callable[[Path, Callable[[], object]], list[Path]]
-
-
-@pytest.fixture
-def every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Record:
-    """Run something on a folder and copy the folder before each of its steps.
-
-    A step is a call that changes names on disk or syncs them. Files are linked, not copied: a
-    store never writes into a file that is in place.
-    """
-
-    def record(root: Path, action: Callable[[], object]) -> list[Path]:
-        snapshots: list[Path] = []
-        copying = [False]
-
-        def copy() -> None:
-            copying[0] = True
-            snapshots.append(tmp_path / "steps" / f"{len(snapshots):04d}" / "store")
-            if root.exists():
-                shutil.copytree(root, snapshots[-1], copy_function=os.link)
-            copying[0] = False
-
-        def watched(function: Callable[..., object]) -> Callable[..., object]:
-            def call(*args: object, **kwargs: object) -> object:
-                if not copying[0]:
-                    copy()
-                return function(*args, **kwargs)
-
-            return call
-
-        with monkeypatch.context() as patch:
-            for name in ("replace", "fsync", "unlink", "rmdir", "mkdir"):
-                patch.setattr(os, name, watched(getattr(os, name)))
-            action()
-        copy()
-        return snapshots
-
-    return record
 
 
 def copied(snapshot: Path, to: Path) -> Path:
