@@ -260,7 +260,8 @@ def test_stores_of_networks_and_other_folders_are_refused(hall_only: Map, tmp_pa
     root = tmp_path / "networks"
     root.mkdir()
     manifest = Manifest.read(store.root)
-    payload = {**manifest.payload, "strategy": "evercal_network", "networks": [], "stages": []}
+    empty = {"networks": [], "stages": []}
+    payload = {**manifest.payload, "kind": "networks", "strategy": "evercal_network", **empty}
     write_manifest(root, payload, [])
     with pytest.raises(InputError, match=rf"{root}: holds networks of strategy 'evercal_network'"):
         Map.open(root, device="cpu")
