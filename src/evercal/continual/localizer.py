@@ -100,7 +100,7 @@ class NetworkLocalizer:
         features = encode_image(image, scenes.encoder, scenes.short_side)
         query = Query(image, features, self.options.patches_short_side)
         best: Hypothesis | None = None
-        for scene in self._candidates(query, cameras):
+        for scene in self._candidates(query):
             trial = self._hypothesis(query, scene, cameras)
             if best is None or _support(trial) > _support(best):
                 best = trial
@@ -121,9 +121,9 @@ class NetworkLocalizer:
         return len(heads) == 1 and heads[0].options.condition == "descriptor"
 
     @torch.inference_mode()
-    def _candidates(self, query: Query, cameras: list[Camera | None]) -> list[int]:
+    def _candidates(self, query: Query) -> list[int]:
         """Scenes to try, most similar prototype first."""
-        usable = [i for i, camera in enumerate(cameras) if camera is not None]
+        usable = list(range(len(self.contents.scenes)))
         if self._decides_scene:
             return usable[:1]
         descriptor = self.contents.descriptor(query.features[None])[0]
@@ -133,11 +133,10 @@ class NetworkLocalizer:
         return [i for i in usable if similarity[i] >= floor][: self.options.candidates]
 
     def _hypothesis(
-        self, query: Query, scene: int, cameras: list[Camera | None], moved: bool = False
+        self, query: Query, scene: int, cameras: Sequence[Camera], moved: bool = False
     ) -> Hypothesis:
         """A pose in one scene: predict, PnP."""
         camera = cameras[scene]
-        assert camera is not None, "only scenes whose camera fits are tried"
         small = camera.short_side_resized(self.contents.short_side)
         matches, patches = predicted_matches(self.contents, query, scene, small, 1)
         rough = solve_pnp(matches.pixels, matches.points_m, small, self.options.pnp)
@@ -146,8 +145,7 @@ class NetworkLocalizer:
         if self._decides_scene and not moved:
             other = self._scene_of(rough, scene)
             if other != scene:
-                other_camera = cameras[other]
-                if other_camera is not None and other_camera != camera:
+                if cameras[other] != camera:
                     # The pose lies in the cell of a scene with another camera: solve once more.
                     return self._hypothesis(query, other, cameras, moved=True)
                 return _moved(rough, matches, patches, self.contents.scenes, scene, other)
@@ -263,7 +261,11 @@ def _support(hypothesis: Hypothesis) -> float:
 def _from_pnp(rough: PnpResult, matches: Matches, patches: int, scene: int) -> Hypothesis:
     inliers = rough.inliers
     return Hypothesis(
-        scene, rough.pose, matches.pixels[inliers], matches.points_m[inliers], expected=patches
+        scene,
+        rough.pose,
+        pixels=matches.pixels[inliers],
+        points_m=matches.points_m[inliers],
+        expected=patches,
     )
 
 

@@ -141,6 +141,10 @@ class Camera:
             return self.resized(short_side, max(1, round(self.height * scale)))
         return self.resized(max(1, round(self.width * scale)), short_side)
 
+    def zoomed(self, factor: float) -> "Camera":
+        """The camera with its focal lengths multiplied by a factor."""
+        return replace(self, fx=factor * self.fx, fy=factor * self.fy)
+
     def project(self, points_camera: ArrayLike) -> Array:
         """Points in the camera frame to pixels.
 

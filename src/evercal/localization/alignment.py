@@ -2,19 +2,35 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.geometry import SE3, Camera
+from evercal.localization.intrinsics import Prior
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.pnp import PnpOptions, solve_pnp
-from evercal.localization.pose_refinement import refine_pose
+from evercal.localization.pose_refinement import (
+    INTRINSICS,
+    Observed,
+    RefinedPose,
+    changed_camera,
+    refine_pose,
+)
 from evercal.mapping.landmarks import project_surface
 from evercal.mapping.patches import Patches, align_patches, from_level, to_level, whitening
 
 Array = NDArray[np.floating]
+
+_STEPS = 10
+"""Gauss-Newton steps of pose and intrinsics, at most."""
+_MOST_AGAIN = 8
+"""Searches after a change of the intrinsics, at most."""
+_NOTICEABLE_PX = 0.2
+"""Landmarks are searched again if the intrinsics moved their projections by more than this."""
+_FAR_PX = 1.0
+"""They are searched in all rounds, coarse to fine, if it was more than this."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +80,8 @@ class AlignmentOptions:
 class Alignment:
     """A pose refined by landmarks, and its inliers."""
 
-    pose: UncertainPose
-    """map_from_camera."""
+    refined: RefinedPose
+    """map_from_camera and intrinsics."""
     pixels: Array
     """(n, 2) inliers, pixels of the image."""
     points_m: Array
@@ -76,24 +92,6 @@ class Alignment:
     """Landmarks whose patch was found near the expected position."""
     planned: int
     """Landmarks that the last round would search in an unobstructed image."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Matched:
-    """Landmarks matched in one round."""
-
-    expected: int
-    """Landmarks that were searched."""
-    pixels: Array
-    """(n, 2) of the image."""
-    ideal: Array
-    """(n, 2) the same in the ideal pinhole."""
-    distortion: Array | None
-    """(n, 2, 2) derivatives of `pixels` by `ideal`; None without distortion."""
-    points_m: Array
-    """(n, 3) in the map's frame."""
-    whitening: Array
-    """(n, 2, 2) of errors in the image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,104 +133,155 @@ def align_pose(
     keyframes: Sequence[AlignedLandmarks],
     start: SE3,
     options: AlignmentOptions,
+    prior: Prior,
+    change: Array | None = None,
 ) -> Alignment | None:
     """Refine a rough pose by the landmarks of keyframes.
 
-    The camera is that of the first level of the pyramid, and the start is map_from_camera, roughly.
+    The camera is that of the first level of the pyramid and the mean of the prior. The start is
+    map_from_camera, roughly, with a change (5,) of the intrinsics.
     Returns None if too few landmarks match.
     """
-    pose, refined, matched = start, None, None
-    target = _Target.of(keyframes)
-    for number, step in enumerate(options.rounds):
-        share = 1.0 if matched is None else len(matched.pixels) / matched.expected
-        more = min(max(1.0, options.enough_matched / max(share, 1e-3)), options.most_more)
-        wider = replace(step, landmarks=int(more * step.landmarks))
-        matched = _search(pyramid, camera, target, pose, wider, options)
-        if len(matched.pixels) < options.min_matches:
+    search = _Search(pyramid, _Target.of(keyframes), options)
+    pose, rounds = start, options.rounds
+    change = np.zeros(INTRINSICS) if change is None else change
+    found, again = None, 0
+    while True:
+        passed = search.rounds(rounds, camera, pose, change, prior, found)
+        if passed is None:
             return None
-        if number == 0:
-            # Many matches of the first round are wrong; RANSAC selects a consistent set.
-            loose = PnpOptions(threshold_px=4.0, max_iterations=200, min_iterations=20)
-            rough = solve_pnp(matched.ideal, matched.points_m, camera, loose)
-            if rough is None:
-                return None
-            pose = rough.pose.pose
-        refined = refine_pose(
-            matched.ideal,
-            matched.points_m,
-            matched.whitening,
-            camera,
-            pose,
-            step.steps,
-            matched.distortion,
-        )
-        pose = refined.pose.pose
-    assert refined is not None, "at least one round"
-    assert matched is not None, "at least one round"
+        pose, found = passed
+        refined = _self_calibrated(found.observed, camera, pose, change, prior)
+        moved = _moved_px(camera, change, refined.change)
+        if moved < _NOTICEABLE_PX:
+            break
+        if again == _MOST_AGAIN:
+            return None  # the intrinsics do not converge
+        pose, change, again = refined.pose.pose, refined.change, again + 1
+        rounds = options.rounds if moved > _FAR_PX else options.rounds[-1:]
     inliers = refined.residual_px < options.inlier_px
     if inliers.sum() < options.min_matches:
         return None
     return Alignment(
-        refined.pose,
-        matched.pixels[inliers],
-        matched.points_m[inliers],
-        matched.expected,
-        len(matched.pixels),
-        min(matched.expected, options.rounds[-1].landmarks),
+        refined,
+        found.observed.pixels[inliers],
+        found.observed.points_m[inliers],
+        found.expected,
+        len(found.observed.pixels),
+        min(found.expected, options.rounds[-1].landmarks),
     )
 
 
-def _search(
-    pyramid: Sequence[Array],
-    camera: Camera,
-    target: _Target,
-    pose: SE3,
-    step: AlignmentRound,
-    options: AlignmentOptions,
-) -> _Matched:
-    """Match the landmarks of all keyframes near their expected positions."""
-    inverse = pose.inverse()
-    rotation, shift = inverse.rotation_matrix(), inverse.translation_m
-    which, pixels, affines = project_surface(target.surface_m, rotation, shift, camera)
-    if len(which) > step.landmarks:
-        spread = np.linspace(0, len(which) - 1, step.landmarks).round().astype(int)
-        which, pixels, affines = which[spread], pixels[spread], affines[spread]
-    if not len(which):
-        empty = np.zeros((0, 2))
-        return _Matched(0, empty, empty, None, np.zeros((0, 3)), np.zeros((0, 2, 2)))
-    patches = target.patches(step.level, which)
-    at, correlation = align_patches(
-        patches, pyramid[step.level], to_level(pixels, step.level), affines, step.iterations
-    )
-    at = from_level(at.astype(np.float64), step.level)
-    good = correlation > options.min_correlation
-    good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
-    ideal, distortion = _undistorted(at, camera)
-    good &= np.isfinite(ideal).all(1)
-    if distortion is not None:
-        good &= np.isfinite(distortion).all((1, 2))
-        distortion = distortion[good]
-    spread = patches.inverse_hessian[good]
-    which, noise = which[good], options.noise * 2**step.level
-    points = target.surface_m[0, which]
-    error = _shift_px(points, target.depth_error_m[which], rotation, shift, camera)
-    if distortion is not None:
-        error = np.einsum("nij,nj->ni", distortion, error)
-    white = whitening(affines[good], spread, options.floor_px, noise, error)
-    return _Matched(len(good), at[good], ideal[good], distortion, points, white)
+def _self_calibrated(
+    observed: Observed, camera: Camera, pose: SE3, change: Array, prior: Prior
+) -> RefinedPose:
+    """Pose and intrinsics; the prior gives way where the image contradicts it."""
+    free = refine_pose(observed, camera, pose, _STEPS, prior.free(camera), change)
+    variances = prior.tested(camera, free.change, np.diag(free.change_covariance))
+    return refine_pose(observed, camera, free.pose.pose, _STEPS, variances, free.change)
+
+
+def _moved_px(camera: Camera, before: Array, after: Array) -> float:
+    """Motion of the image's edge by a change of the intrinsics, pixels."""
+    across = [np.linspace(0, side - 1, 5) for side in (camera.width, camera.height)]
+    plane = camera.pinhole.unproject(np.stack(np.meshgrid(*across), -1))
+    pixels = [changed_camera(camera, change).project(plane) for change in (before, after)]
+    return float(np.nanquantile(np.linalg.norm(pixels[1] - pixels[0], axis=-1), 0.75))
+
+
+def _consistent(observed: Observed, camera: Camera) -> SE3 | None:
+    loose = PnpOptions(threshold_px=4.0, max_iterations=200, min_iterations=20)
+    ideal = camera.pinhole.project(camera.unproject(observed.pixels))
+    valid = np.isfinite(ideal).all(1)
+    rough = solve_pnp(ideal[valid], observed.points_m[valid], camera, loose)
+    return None if rough is None else rough.pose.pose
+
+
+class _Found(NamedTuple):
+    """Landmarks matched in one round."""
+
+    expected: int
+    """Landmarks that were searched."""
+    observed: Observed
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Searches the landmarks of some keyframes in an image."""
+
+    pyramid: Sequence[Array]
+    target: _Target
+    options: AlignmentOptions
+
+    def rounds(
+        self,
+        rounds: Sequence[AlignmentRound],
+        camera: Camera,
+        pose: SE3,
+        change: Array,
+        prior: Prior,
+        found: _Found | None,
+    ) -> tuple[SE3, _Found] | None:
+        """Search coarse to fine and refine the pose after every round."""
+        now = changed_camera(camera, change)
+        for step in rounds:
+            found = self.run(step, now, pose, found)
+            if found is None:
+                return None
+            if step.level:
+                # Many matches of the first round are wrong; RANSAC selects a consistent set.
+                rough = _consistent(found.observed, now)
+                if rough is None:
+                    return None
+                pose = rough
+            pose = refine_pose(found.observed, now, pose, step.steps).pose.pose
+        assert found is not None, "at least one round"
+        return pose, found
+
+    def run(
+        self, step: AlignmentRound, camera: Camera, pose: SE3, before: _Found | None
+    ) -> _Found | None:
+        """Match landmarks near their expected positions; None for too few matches."""
+        share = 1.0 if before is None else len(before.observed.pixels) / before.expected
+        more = max(1.0, self.options.enough_matched / max(share, 1e-3))
+        count = int(min(more, self.options.most_more) * step.landmarks)
+        found = self._matched(replace(step, landmarks=count), camera, pose)
+        enough = found is not None and len(found.observed.pixels) >= self.options.min_matches
+        return found if enough else None
+
+    def _matched(self, step: AlignmentRound, camera: Camera, pose: SE3) -> _Found | None:
+        target, options, inverse = self.target, self.options, pose.inverse()
+        rotation, shift = inverse.rotation_matrix(), inverse.translation_m
+        which, pixels, affines = project_surface(target.surface_m, rotation, shift, camera)
+        if len(which) > step.landmarks:
+            spread = np.linspace(0, len(which) - 1, step.landmarks).round().astype(int)
+            which, pixels, affines = which[spread], pixels[spread], affines[spread]
+        if not len(which):
+            return None
+        patches = target.patches(step.level, which)
+        at, correlation = align_patches(
+            patches,
+            self.pyramid[step.level],
+            to_level(pixels, step.level),
+            affines,
+            step.iterations,
+        )
+        at = from_level(at.astype(np.float64), step.level)
+        good = correlation > options.min_correlation
+        good &= np.linalg.norm(at - pixels, axis=1) < step.reach_px
+        spread = patches.inverse_hessian[good]
+        which, noise = which[good], options.noise * 2**step.level
+        points = target.surface_m[0, which]
+        error = _shift_px(points, target.depth_error_m[which], rotation, shift, camera)
+        white = whitening(affines[good], spread, options.floor_px, noise, error)
+        return _Found(len(good), Observed(at[good], points, white))
 
 
 def _shift_px(points: Array, moves: Array, rotation: Array, shift: Array, camera: Camera) -> Array:
-    """(n, 2) displacement in the ideal pinhole of points (n, 3) that move by `moves` (n, 3)."""
+    """(n, 2) displacement in the image of points (n, 3) that move by `moves` (n, 3)."""
     local, move = points @ rotation.T + shift, moves @ rotation.T
-    plane = move[:, :2] - local[:, :2] * (move[:, 2:] / local[:, 2:])
-    return plane / local[:, 2:] * [camera.fx, camera.fy]
-
-
-def _undistorted(pixels: Array, camera: Camera) -> tuple[Array, Array | None]:
-    """(n, 2) pixels of the ideal pinhole, and (n, 2, 2) derivatives of image pixels by them."""
+    plane = local[:, :2] / local[:, 2:]
+    step = (move[:, :2] - plane * move[:, 2:]) / local[:, 2:]
     if not camera.distortion:
-        return pixels, None
-    plane, focal = camera.unproject(pixels)[:, :2], np.array([camera.fx, camera.fy])
-    by_plane, _ = camera.slopes(plane)
-    return plane * focal + [camera.cx, camera.cy], by_plane / focal
+        return step * [camera.fx, camera.fy]
+    return np.einsum("nij,nj->ni", camera.slopes(plane)[0], step)

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from evercal.geometry import SE3, UncertainPose
+from evercal.geometry import SE3, Camera, UncertainPose
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +33,8 @@ class PoseEstimate:
     """(n, 2) inliers in pixels of the image at working size, for overlays."""
     points_m: np.ndarray | None = None
     """(n, 3) their scene points in the base frame, metres."""
+    camera: Camera | None = None
+    """Intrinsics that the pose holds for, at the size of the image; None for networks."""
     support: float = 0.0
     """Support of the pose, see `localization.acceptance`."""
 

@@ -7,10 +7,12 @@ near a pose with little support, accept.
 import os
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from evercal.errors import InputError
@@ -22,14 +24,25 @@ from evercal.geometry import SE3, Camera, resize_pixels
 from evercal.localization.acceptance import accepted, rejection, support, widened
 from evercal.localization.alignment import align_pose
 from evercal.localization.estimate import PoseEstimate
+from evercal.localization.intrinsics import (
+    FOCAL_FACTORS,
+    OWN,
+    STATED,
+    UNKNOWN,
+    IntrinsicsPrior,
+    Prior,
+)
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.matching import Matcher
 from evercal.localization.pnp import PnpResult, solve_pnp
+from evercal.localization.pose_refinement import INTRINSICS, changed_camera
 from evercal.localization.query import Candidate, Hypothesis, LocalizeOptions, Matches, Query
 from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
 from evercal.recordings.images import as_rgb
+
+_ALONG_FOCAL = np.eye(INTRINSICS)[0]
 
 
 class LearnedScene(Protocol):
@@ -93,6 +106,30 @@ class LearnedLocalizer(SceneLocalizer, Protocol):
     def contents(self) -> LearnedContents:
         """The scenes."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class _Rough:
+    """A pose before alignment."""
+
+    matches: Matches
+    pnp: PnpResult
+    change: NDArray[np.floating]
+    """(5,) change of the intrinsics, see `changed_camera`."""
+
+    def as_answer(self, scene: int) -> Hypothesis:
+        """The PnP pose as the answer, for the ablation of alignment."""
+        count, inliers = len(self.matches.pixels), self.pnp.inliers
+        return Hypothesis(
+            scene,
+            self.pnp.pose,
+            None,
+            self.matches.pixels[inliers],
+            self.matches.points_m[inliers],
+            expected=count,
+            matched=int(inliers.sum()),
+            planned=count,
+        )
 
 
 class Localizer:
@@ -159,10 +196,15 @@ class Localizer:
         began = time.perf_counter()
         image, contents = as_rgb(image), self.contents
         cameras = camera_in_scenes(camera, image, contents.scenes)
-        features = encode_image(image, contents.encoder, contents.short_side)
-        query = Query(image, features, self.options.patches_short_side)
+        recorded = [scene.camera for scene in contents.scenes]
+        query = Query(
+            image,
+            encode_image(image, contents.encoder, contents.short_side),
+            self.options.patches_short_side,
+            tuple(prior_of(camera, image, stated) for stated in recorded),
+        )
         best = self._best_hypothesis(query, cameras)
-        return self._answer(best, 1000 * (time.perf_counter() - began))
+        return self._answer(query, best, 1000 * (time.perf_counter() - began))
 
     def localize_batch(
         self, images: Sequence[np.ndarray], cameras: Sequence[Camera | None]
@@ -173,72 +215,105 @@ class Localizer:
         pairs = list(zip(images, cameras, strict=True))
         return list(in_parallel(lambda pair: self.localize(*pair), pairs))
 
-    def _best_hypothesis(self, query: Query, cameras: list[Camera | None]) -> Hypothesis:
+    def _best_hypothesis(self, query: Query, cameras: Sequence[Camera]) -> Hypothesis:
         """The pose with the most support, from as few attempts as it takes."""
-        usable = [i for i, camera in enumerate(cameras) if camera is not None]
         best: Hypothesis | None = None
-        tried: set[tuple[int, int, bytes]] = set()
+        tried: set[tuple[int, int, bool, int, bytes]] = set()
         for number, attempt in enumerate(self.options.attempts):
-            for candidate in self._matcher.candidates(query, usable, attempt):
-                key = candidate.scene, candidate.match_stride, candidate.keyframes.tobytes()
-                if key in tried:
-                    continue  # in a small map a wider attempt often repeats the one before
-                tried.add(key)
-                camera = cameras[candidate.scene]
-                assert camera is not None, "candidates are usable scenes"
-                trial = self._guided(query, candidate, camera)
-                if best is None or support(trial) > support(best):
-                    best = trial
-                if self._accepted(trial, self.options.immediate):
-                    return trial
+            for turns in (2, 1, 3) if attempt.turned else (0,):
+                view = self._turned(query, turns)
+                for candidate in self._matcher.candidates(view, attempt):
+                    if candidate.key in tried:
+                        continue  # in a small map a wider attempt often repeats the one before
+                    tried.add(candidate.key)
+                    trial = self._guided(view, candidate, cameras[candidate.scene])
+                    if best is None or support(trial) > support(best):
+                        best = trial
+                    if self._accepted(trial, self.options.immediate):
+                        return trial
             # A pose that is barely accepted in the first attempt may be beaten in the second.
             if number and best is not None and self._accepted(best):
                 break
         assert best is not None, "at least one scene is tried"
         return best
 
+    def _turned(self, query: Query, turns: int) -> Query:
+        """The query with features of the image turned clockwise by quarter turns."""
+        if not turns:
+            return query
+        image = np.ascontiguousarray(np.rot90(query.image, -turns))
+        features = encode_image(image, self.contents.encoder, self.contents.short_side)
+        return replace(query, features=features, turns=turns)
+
     def _guided(self, query: Query, candidate: Candidate, camera: Camera) -> Hypothesis:
         """A pose in one scene; with little support it is matched again near itself."""
         best = self._hypothesis(query, candidate, camera)
-        dense = Candidate(candidate.scene, candidate.keyframes)
+        dense = replace(candidate, match_stride=1)
         while best.inliers and best.pose and support(best) < self.options.guided_below:
-            again = self._hypothesis(query, dense, camera, best.pose.pose)
+            again = self._hypothesis(query, dense, camera, best)
             if support(again) < self.options.guided_gain * support(best):
                 break
             best = again
         return best
 
     def _hypothesis(
-        self, query: Query, candidate: Candidate, camera: Camera, near: SE3 | None = None
+        self, query: Query, candidate: Candidate, camera: Camera, near: Hypothesis | None = None
     ) -> Hypothesis:
         """A pose in one scene: match, PnP, align."""
-        small = camera.short_side_resized(self.contents.short_side)
-        matches = self._matches(query, candidate, small, near)
-        rough = solve_pnp(matches.pixels, matches.points_m, small, self.options.pnp)
+        scene = self.contents.scenes[candidate.scene]
+        sigma = UNKNOWN if candidate.unknown_camera else query.priors[candidate.scene]
+        rough = self._rough(query, candidate, camera, sigma, near)
         if rough is None:
             return Hypothesis(candidate.scene)
         if not self.options.align:
-            return _from_pnp(candidate.scene, matches, rough)
+            return rough.as_answer(candidate.scene)
         height, width = query.grey.shape
         aligned = align_pose(
             query.pyramid,
             camera.resized(width, height),
             [self._bank.load(int(index)).landmarks for index in candidate.keyframes],
-            rough.pose.pose,
+            rough.pnp.pose.pose,
             self.options.alignment,
+            Prior(sigma, scene.covariance_scale),
+            rough.change,
         )
         if aligned is None:
-            return Hypothesis(candidate.scene, rough.pose)
+            return Hypothesis(candidate.scene, rough.pnp.pose)
         scale = self.contents.short_side / min(height, width)
         return Hypothesis(
             candidate.scene,
-            aligned.pose,
+            aligned.refined.pose,
+            aligned.refined,
             resize_pixels(aligned.pixels, scale),
             aligned.points_m,
             aligned.expected,
             aligned.matched,
             aligned.planned,
         )
+
+    def _rough(
+        self,
+        query: Query,
+        candidate: Candidate,
+        camera: Camera,
+        sigma: IntrinsicsPrior,
+        near: Hypothesis | None,
+    ) -> _Rough | None:
+        """Pose and focal length by PnP."""
+        refined = near.refined if near is not None else None
+        change: NDArray[np.floating] = refined.change if refined else np.zeros(INTRINSICS)
+        height, width = query.grey.shape
+        now = changed_camera(camera.resized(width, height), change)
+        small = now.short_side_resized(self.contents.short_side)
+        where = None if near is None or near.pose is None else near.pose.pose
+        matches = self._matches(query, candidate, small, where)
+        best: _Rough | None = None
+        for factor in FOCAL_FACTORS if sigma is UNKNOWN and near is None else (1.0,):
+            tried = small.zoomed(factor)
+            found = solve_pnp(matches.pixels, matches.points_m, tried, self.options.pnp)
+            if found and (best is None or found.inliers.sum() > best.pnp.inliers.sum()):
+                best = _Rough(matches, found, change + np.log(factor) * _ALONG_FOCAL)
+        return best
 
     def _matches(
         self, query: Query, candidate: Candidate, camera: Camera, near: SE3 | None
@@ -249,7 +324,7 @@ class Localizer:
     def _accepted(self, hypothesis: Hypothesis, times: float = 1.0) -> bool:
         return accepted(hypothesis, self.contents.scenes[hypothesis.scene], times)
 
-    def _answer(self, best: Hypothesis, milliseconds: float) -> PoseEstimate:
+    def _answer(self, query: Query, best: Hypothesis, milliseconds: float) -> PoseEstimate:
         scene = self.contents.scenes[best.scene]
         if best.pose is None or not self._accepted(best):
             failed = best.pose is None
@@ -277,6 +352,7 @@ class Localizer:
             milliseconds=milliseconds,
             pixels=best.pixels,
             points_m=scene.frame.points_to_base(best.points_m),
+            camera=best.refined and best.refined.camera.resized(*query.size),
             support=support(best),
         )
 
@@ -288,12 +364,11 @@ def own_or_stated(stated: Camera, recorded: Sequence[Camera]) -> Camera | None:
 
 def camera_in_scenes(
     camera: Camera | None, image: np.ndarray, scenes: Sequence[LearnedScene]
-) -> list[Camera | None]:
-    """Intrinsics of an image in each scene; None where the aspect ratio does not fit.
+) -> list[Camera]:
+    """Intrinsics of an image in each scene; a guess where none are given and no aspect ratio fits.
 
     Raises:
-        InputError: A camera with another aspect ratio than the image's, or no camera given and no
-            scene was recorded at this aspect ratio.
+        InputError: A camera with another aspect ratio than the image's.
     """
     height, width = image.shape[:2]
     if camera is not None:
@@ -303,18 +378,29 @@ def camera_in_scenes(
                 " give intrinsics of the same aspect ratio"
             )
         return [camera.resized(width, height)] * len(scenes)
-    own = [scene.adjusted_camera for scene in scenes]
-    cameras = [c.resized(width, height) if c.fits(width, height) else None for c in own]
-    if not any(cameras):
-        recorded = ", ".join(
-            f"{scene.name} {scene.adjusted_camera.width}x{scene.adjusted_camera.height}"
-            for scene in scenes
-        )
-        raise InputError(
-            f"image {width}x{height}: no scene was recorded at this aspect ratio ({recorded});"
-            " give the image's intrinsics with --camera"
-        )
-    return cameras
+    return [_own(scene.adjusted_camera, width, height) for scene in scenes]
+
+
+def _own(recorded: Camera, width: int, height: int) -> Camera:
+    """The camera of a recording for an image of another size."""
+    if recorded.fits(width, height):
+        return recorded.resized(width, height)
+    scale = max(width, height) / max(recorded.width, recorded.height)
+    middle = (width - 1) / 2, (height - 1) / 2
+    return Camera(width, height, scale * recorded.fx, scale * recorded.fy, *middle)
+
+
+def prior_of(camera: Camera | None, image: np.ndarray, recorded: Camera) -> IntrinsicsPrior:
+    """Prior of the intrinsics of an image: stated, the recording's, or unknown."""
+    if camera is not None:
+        return STATED
+    height, width = image.shape[:2]
+    if (width, height) == (recorded.width, recorded.height):
+        return OWN
+    larger, smaller = max(width, recorded.width), min(width, recorded.width)
+    whole = larger % smaller == 0 and recorded.width * height == recorded.height * width
+    # An image of half the size is probably resized; other sizes may be cropped.
+    return STATED if whole else UNKNOWN
 
 
 def encode_image(image: np.ndarray, encoder: Encoder, short_side: int) -> Tensor:
@@ -323,17 +409,3 @@ def encode_image(image: np.ndarray, encoder: Encoder, short_side: int) -> Tensor
     plain = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
     view = plain_view(image, plain, encoder.stride, ViewOptions(short_side=short_side))
     return encode_features([view], encoder)[0]
-
-
-def _from_pnp(scene: int, matches: Matches, rough: PnpResult) -> Hypothesis:
-    """The PnP pose as the answer, for the ablation of alignment."""
-    count, inliers = len(matches.pixels), int(rough.inliers.sum())
-    return Hypothesis(
-        scene,
-        rough.pose,
-        matches.pixels[rough.inliers],
-        matches.points_m[rough.inliers],
-        expected=count,
-        matched=inliers,
-        planned=count,
-    )

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
-from evercal.features.views import ideal_cell_pixels
+from evercal.features.views import cell_centres, ideal_cell_pixels
 from evercal.geometry import SE3, Camera
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.query import Attempt, Candidate, LocalizeOptions, Matches, Query
@@ -19,16 +19,15 @@ class Matcher:
         self._bank, self._options = bank, options
 
     @torch.inference_mode()
-    def candidates(self, query: Query, usable: list[int], attempt: Attempt) -> list[Candidate]:
+    def candidates(self, query: Query, attempt: Attempt) -> list[Candidate]:
         """Scenes to try, most likely first.
 
         The global descriptor ranks keyframes, and patches of the image vote among the first ones. A
         scene is tried with the keyframes that got most votes. If these are too few, its next
-        keyframes in the ranking are added. `usable` are indices of scenes whose camera fits the
-        image.
+        keyframes in the ranking are added.
         """
         features = query.features.flatten(1).T
-        ranked = self._bank.retrieve(features, usable)
+        ranked = self._bank.retrieve(features)
         proposed, rest = ranked[: attempt.retrieved], ranked[attempt.retrieved :]
         sample = features[:: self._options.retrieval_stride]
         best = []
@@ -48,7 +47,9 @@ class Matcher:
             voted = proposed[order[scene[order] == s]]
             others = rest[self._bank.scene[rest] == s]
             keyframes = np.concatenate([voted, others])[: self._options.keyframes]
-            candidates.append(Candidate(s, keyframes, attempt.match_stride))
+            candidates.append(
+                Candidate(s, keyframes, attempt.match_stride, attempt.unknown_camera, query.turns)
+            )
         return candidates
 
     @torch.inference_mode()
@@ -117,9 +118,27 @@ def strided_patches(
     """
     rows, columns = query.features.shape[1:]
     patches = np.arange(rows * columns).reshape(rows, columns)[::stride, ::stride].ravel()
-    pixels = ideal_cell_pixels(camera, encoder_stride).astype(np.float64)[patches]
+    pixels = cell_pixels(camera, encoder_stride, query.turns)[patches]
     valid = np.isfinite(pixels).all(1)
     return patches[valid], pixels[valid]
+
+
+def cell_pixels(camera: Camera, stride: int, turns: int) -> np.ndarray:
+    """(cells, 2) ideal pixels of the cells of an image that was encoded with quarter turns.
+
+    Cells are in the order of the turned image, pixels in the axes of the upright one.
+    """
+    if not turns:
+        return ideal_cell_pixels(camera, stride).astype(np.float64)
+    right, bottom = camera.width - 1, camera.height - 1
+    rows, columns = camera.height, camera.width
+    if turns % 2:
+        rows, columns = columns, rows
+    turned = cell_centres(rows, columns, stride)
+    x, y = turned[:, 0], turned[:, 1]
+    # Clockwise by one quarter, pixel (x, y) moves to (height - 1 - y, x).
+    back = {1: (y, bottom - x), 2: (right - x, bottom - y), 3: (right - y, x)}[turns]
+    return camera.pinhole.project(camera.unproject(np.stack(back, -1)))
 
 
 def _ordered(value: Tensor) -> np.ndarray:

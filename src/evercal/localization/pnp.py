@@ -74,7 +74,7 @@ def pose_covariance(
     """
     rotation = points_from_camera.rotation_matrix()
     position = points_from_camera.translation_m
-    residual, slope = linearise(pixels, points_m, rotation, position, camera)
+    residual, slope = linearise(pixels, points_m, rotation, position, camera.pinhole)
     rows = slope.transpose(1, 0, 2).reshape(6, -1)
     variance = float((residual**2).mean()) + 1e-6
     covariance = variance * np.linalg.pinv(rows @ rows.T, hermitian=True)

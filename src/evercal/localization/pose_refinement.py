@@ -1,6 +1,7 @@
-"""Robust Gauss-Newton refinement of a camera pose, with its covariance."""
+"""Robust Gauss-Newton refinement of a camera's pose and intrinsics, with their covariance."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import cv2
 import numpy as np
@@ -11,84 +12,155 @@ from evercal.geometry import SE3, Camera, UncertainPose
 
 Array = NDArray[np.floating]
 
+INTRINSICS = 5
+"""Parameters of a change of intrinsics: logarithm of the focal lengths, principal point in pixels,
+k1 and k2."""
 _SMALL = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
+class Observed:
+    """Landmarks observed in an image."""
+
+    pixels: Array
+    """(n, 2) of the image."""
+    points_m: Array
+    """(n, 3) in the map's frame."""
+    whitening: Array
+    """(n, 2, 2) that gives errors in the image unit variance."""
+
+    def take(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> Self:
+        """The observations of an index."""
+        return type(self)(self.pixels[index], self.points_m[index], self.whitening[index])
+
+
+@dataclass(frozen=True, eq=False)
 class RefinedPose:
-    """A pose and the residuals of its observations."""
+    """A pose, intrinsics and the residuals of the observations."""
 
     pose: UncertainPose
-    """points_from_camera."""
+    """points_from_camera; the uncertainty of the intrinsics is part of its covariance."""
     residual_px: Array
     """(n,) reprojection errors, pixels of the image."""
+    camera: Camera
+    """Refined intrinsics; the given ones without a prior."""
+    change: Array
+    """(5,) change of the intrinsics."""
+    change_covariance: Array
+    """(5, 5)."""
+    by_intrinsics: Array
+    """(6, 6) share of the pose's covariance that is due to the intrinsics."""
 
 
 def refine_pose(
-    pixels: Array,
-    points_m: Array,
-    whitening: Array,
+    observed: Observed,
     camera: Camera,
     start: SE3,
     iterations: int = 10,
-    distortion: Array | None = None,
+    variances: Array | None = None,
+    change: Array | None = None,
 ) -> RefinedPose:
     """Minimise whitened reprojection errors with Cauchy weights.
 
-    Pixels (n, 2) lie in the ideal pinhole, and the start is points_from_camera. The whitening (n,
-    2, 2) gives errors in the image unit variance. The distortion (n, 2, 2) holds derivatives of
-    image pixels by those of the ideal pinhole.
+    Args:
+        observed: landmarks in the image.
+        camera: intrinsics, the mean of their prior.
+        start: points_from_camera, roughly.
+        iterations: Gauss-Newton steps, at most.
+        variances: (5,) of the intrinsics about those of `camera`. None holds them fixed.
+        change: (5,) of the intrinsics to start from.
     """
-    whitening = whitening if distortion is None else whitening @ distortion
+    count = 6 if variances is None else 6 + INTRINSICS
+    moved: Array = np.zeros(INTRINSICS) if change is None else change
+    current = camera if variances is None else changed_camera(camera, moved)
     rotation, position = start.rotation_matrix(), start.translation_m
-    white = np.ascontiguousarray(whitening.transpose(1, 2, 0))
-    variance, information = 1.0, np.eye(6)
+    seen = observed.pixels, observed.points_m
+    white = np.ascontiguousarray(observed.whitening.transpose(1, 2, 0))
+    variance, information, data = 1.0, np.eye(count), np.eye(count)
     for _ in range(max(iterations, 1)):
-        raw, slope = linearise(pixels, points_m, rotation, position, camera)
+        raw, slope = linearise(*seen, rotation, position, current, variances is not None)
         residual = white[:, 0] * raw[0] + white[:, 1] * raw[1]
         slope = white[:, 0, None] * slope[0] + white[:, 1, None] * slope[1]
         squares = (residual**2).sum(0)
         # Robust scale: the median of a 2-D Gaussian's squared norm is 1.386 variances.
         variance = max(float(np.median(squares)) / 1.386, 0.05)
         root = 1 / np.sqrt(1 + squares / variance)
-        rows = (slope * root).transpose(1, 0, 2).reshape(6, -1)
-        information = rows @ rows.T + 1e-9 * np.eye(6)
-        step = -np.linalg.solve(information, rows @ (residual * root).ravel())
+        rows = (slope * root).transpose(1, 0, 2).reshape(count, -1)
+        data = rows @ rows.T + 1e-9 * np.eye(count)
+        gradient = rows @ (residual * root).ravel()
+        information = data
+        if variances is not None:
+            prior = np.r_[np.zeros(6), variance / variances]
+            information = data + np.diag(prior)
+            gradient[6:] += prior[6:] * moved
+        step = -np.linalg.solve(information, gradient)
         position = position + rotation @ step[:3]
-        rotation = rotation @ cv2.Rodrigues(step[3:])[0]
-        if np.abs(step).max() < _SMALL:
+        rotation = rotation @ cv2.Rodrigues(step[3:6])[0]
+        if variances is not None:
+            moved = moved + step[6:]
+            current = changed_camera(camera, moved)
+        if np.abs(step[:6]).max() < _SMALL:
             break
-    raw, _ = linearise(pixels, points_m, rotation, position, camera)
-    raw = raw if distortion is None else np.einsum("nij,jn->in", distortion, raw)
-    covariance = in_parent_axes(rotation, variance * np.linalg.inv(information))
+    raw, _ = linearise(*seen, rotation, position, current)
     quaternion = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
-    pose = UncertainPose(SE3(quaternion, position), np.asarray(covariance, np.float64))
-    return RefinedPose(pose, np.hypot(*raw))
+    covariance = variance * np.linalg.inv(information)
+    fixed = variance * np.linalg.inv(data[:6, :6])
+    own = np.asarray(in_parent_axes(rotation, covariance[:6, :6]), np.float64)
+    pose = UncertainPose(SE3(quaternion, position), own)
+    by_intrinsics = np.asarray(in_parent_axes(rotation, covariance[:6, :6] - fixed), np.float64)
+    return RefinedPose(pose, np.hypot(*raw), current, moved, covariance[6:, 6:], by_intrinsics)
+
+
+def changed_camera(camera: Camera, change: Array) -> Camera:
+    """A camera with changed intrinsics."""
+    factor, (k1, k2, *others) = float(np.exp(change[0])), camera.coefficients
+    return replace(
+        camera,
+        fx=factor * camera.fx,
+        fy=factor * camera.fy,
+        cx=camera.cx + float(change[1]),
+        cy=camera.cy + float(change[2]),
+        distortion=(k1 + float(change[3]), k2 + float(change[4]), *others),
+    )
 
 
 def linearise(
-    pixels: Array, points_m: Array, rotation: Array, position: Array, camera: Camera
+    pixels: Array,
+    points_m: Array,
+    rotation: Array,
+    position: Array,
+    camera: Camera,
+    intrinsics: bool = False,
 ) -> tuple[Array, Array]:
-    """Reprojection errors and their derivatives by the pose.
+    """Reprojection errors and their derivatives by the pose, and by intrinsics if wanted.
 
-    Pixels (n, 2) lie in the ideal pinhole; rotation and position are those of points_from_camera.
+    Pixels (n, 2) lie in the image; rotation and position are those of points_from_camera.
 
     Returns:
-        Residuals (2, n), and derivatives (2, 6, n) by a motion (translation, rotation) in the
-        camera frame.
+        Residuals (2, n) in pixels, and derivatives (2, 6 or 11, n) by a motion (translation,
+        rotation) in the camera frame and by a change of the intrinsics.
     """
     local = rotation.T @ (points_m - position).T
     inverse = 1 / np.maximum(local[2], 1e-3)
     x, y = local[0] * inverse, local[1] * inverse
-    fx, fy = camera.fx, camera.fy
-    residual = np.stack([x * fx + (camera.cx - pixels[:, 0]), y * fy + (camera.cy - pixels[:, 1])])
-    slope = np.empty((2, 6, len(x)))
+    slope = np.empty((2, 6 + INTRINSICS * intrinsics, len(x)))
     slope[0, 0], slope[0, 1], slope[0, 2] = -inverse, 0, x * inverse
     slope[0, 3], slope[0, 4], slope[0, 5] = x * y, -1 - x * x, y
     slope[1, 0], slope[1, 1], slope[1, 2] = 0, -inverse, y * inverse
     slope[1, 3], slope[1, 4], slope[1, 5] = 1 + y * y, -slope[0, 3], -x
-    slope *= np.array([fx, fy])[:, None, None]
-    return residual, slope
+    if not (camera.distortion or intrinsics):
+        focal = np.array([camera.fx, camera.fy])
+        projected = np.stack([x * camera.fx + camera.cx, y * camera.fy + camera.cy])
+        slope *= focal[:, None, None]
+        return projected - pixels.T, slope
+    plane = np.stack([x, y], -1)
+    by_plane, by_intrinsics = camera.slopes(plane)
+    slope[:, :6] = np.einsum("nij,jkn->ikn", by_plane, slope[:, :6])
+    if intrinsics:
+        slope[:, 6:] = by_intrinsics.transpose(1, 2, 0)
+    # The derivative by the logarithm of the focal length is the pixel beside the principal point.
+    projected = by_intrinsics[..., 0] + [camera.cx, camera.cy]
+    return (projected - pixels).T, slope
 
 
 def in_parent_axes(rotation: Array, covariance: Array) -> Array:

@@ -1,5 +1,6 @@
 """Options of localization, the prepared image, candidate scenes and pose hypotheses."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -10,7 +11,9 @@ from torch import Tensor
 from evercal.features.views import working_image
 from evercal.geometry import Camera, UncertainPose
 from evercal.localization.alignment import AlignmentOptions
+from evercal.localization.intrinsics import IntrinsicsPrior
 from evercal.localization.pnp import PnpOptions
+from evercal.localization.pose_refinement import RefinedPose
 from evercal.mapping.patches import image_pyramid
 
 
@@ -22,6 +25,10 @@ class Attempt:
     """Keyframes that the global descriptor proposes."""
     match_stride: int
     """Matches every n-th row and column of patches."""
+    unknown_camera: bool = False
+    """Estimate the intrinsics of an unknown camera."""
+    turned: bool = False
+    """Encode the image turned by 180, 90 and 270 degrees."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +37,13 @@ class LocalizeOptions:
 
     candidates: int = 3
     """Scenes that are tried per image, at most."""
-    attempts: tuple[Attempt, ...] = (Attempt(12, 2), Attempt(48, 1), Attempt(200, 1))
+    attempts: tuple[Attempt, ...] = (
+        Attempt(12, 2),
+        Attempt(48, 1),
+        Attempt(48, 1, unknown_camera=True),
+        Attempt(12, 2, turned=True),
+        Attempt(200, 1),
+    )
     """Attempts in order; the next one runs while no pose is accepted."""
     immediate: float = 2.0
     """A pose of the first attempt is final if its support is this many times the threshold.
@@ -70,6 +83,15 @@ class Query:
     """(channels, rows, columns) on the encoder's device."""
     short_side: int
     """Short side of `grey`, pixels, at most."""
+    priors: Sequence[IntrinsicsPrior] = ()
+    """Of the intrinsics in each scene."""
+    turns: int = 0
+    """Quarter turns clockwise of the image before it was encoded."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image, pixels."""
+        return self.image.shape[1], self.image.shape[0]
 
     @cached_property
     def grey(self) -> np.ndarray:
@@ -94,6 +116,16 @@ class Candidate:
     """Its keyframes in the bank, most similar first."""
     match_stride: int = 1
     """See `Attempt.match_stride`."""
+    unknown_camera: bool = False
+    """See `Attempt.unknown_camera`."""
+    turns: int = 0
+    """See `Query.turns`."""
+
+    @property
+    def key(self) -> tuple[int, int, bool, int, bytes]:
+        """The same for candidates that give the same pose."""
+        keyframes = self.keyframes.tobytes()
+        return self.scene, self.match_stride, self.unknown_camera, self.turns, keyframes
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +146,8 @@ class Hypothesis:
     """Index of the scene."""
     pose: UncertainPose | None = None
     """map_from_camera; None where PnP failed."""
+    refined: RefinedPose | None = None
+    """Pose and intrinsics at the size of `Query.grey`; None where alignment failed."""
     pixels: np.ndarray | None = None
     """(n, 2) inliers, pixels at the encoder's working size."""
     points_m: np.ndarray | None = None

@@ -1,0 +1,67 @@
+"""What is known of a camera's intrinsics before an image is located, and how far that is believed.
+
+A stated focal length is a prior and not a fact. The landmarks of an image measure the intrinsics
+together with the pose, to a thousandth. Where they contradict the prior, the prior gives way.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.geometry import Camera
+
+Array = NDArray[np.floating]
+
+DOUBT = 3.0
+"""Squared deviations from the prior, in standard deviations, from which it gives way."""
+
+
+@dataclass(frozen=True)
+class IntrinsicsPrior:
+    """Standard deviations of a camera's intrinsics about their stated values."""
+
+    focal: float
+    """Of both focal lengths, as a share."""
+    centre: float
+    """Of the principal point, as a share of the longer image side."""
+    k1: float
+    """Of the first radial distortion coefficient."""
+    k2: float
+    """Of the second one."""
+
+    def variances(self, camera: Camera) -> Array:
+        """(5,) variances of a change of intrinsics, see `pose_refinement.changed_camera`."""
+        centre = self.centre * max(camera.width, camera.height)
+        return np.square([self.focal, centre, centre, self.k1, self.k2])
+
+
+OWN = IntrinsicsPrior(focal=2e-4, centre=3e-4, k1=1e-3, k2=1e-3)
+"""The camera that recorded the scene: its error is in the landmarks, too, and cancels."""
+STATED = IntrinsicsPrior(focal=2e-3, centre=2e-3, k1=5e-3, k2=5e-3)
+"""Intrinsics that the user states."""
+UNKNOWN = IntrinsicsPrior(focal=0.3, centre=0.02, k1=0.1, k2=0.05)
+"""An uncropped image of any camera."""
+FREE = IntrinsicsPrior(focal=1.0, centre=0.3, k1=0.3, k2=0.3)
+"""Wide enough to test the other priors."""
+FOCAL_FACTORS = (0.7, 0.84, 1.0, 1.2, 1.44)
+"""Focal lengths that are tried where nothing is known, relative to a guess."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The prior of one image."""
+
+    sigma: IntrinsicsPrior = OWN
+    scale: float = 1.0
+    """Factor on the covariance of landmarks."""
+
+    def free(self, camera: Camera) -> Array:
+        """(5,) variances that hardly bind."""
+        return FREE.variances(camera) / self.scale
+
+    def tested(self, camera: Camera, change: Array, variance: Array) -> Array:
+        """(5,) variances: those of the prior, wider where an estimate contradicts it."""
+        tight = self.sigma.variances(camera)
+        excess = change**2 - DOUBT * (self.scale * variance + tight)
+        return (tight + np.maximum(excess, 0)) / self.scale
