@@ -28,7 +28,7 @@ Change = Callable[[Frame], Frame]
 def hypothesis(inliers: int, matched: int, expected: int) -> Hypothesis:
     points = np.zeros((inliers, 3))
     pose, planned = UncertainPose(SE3.identity(), np.eye(6)), min(expected, 900)
-    return Hypothesis(0, pose, points[:, :2], points, expected, matched, planned)
+    return Hypothesis(0, pose, None, points[:, :2], points, expected, matched, planned)
 
 
 def test_support_formula() -> None:

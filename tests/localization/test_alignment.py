@@ -14,12 +14,12 @@ from evercal.localization.alignment import (
     Alignment,
     AlignmentOptions,
     _shift_px,
-    _undistorted,
     align_pose,
 )
+from evercal.localization.intrinsics import Prior
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.localizer import Localizer
-from evercal.localization.pose_refinement import refine_pose
+from evercal.localization.pose_refinement import Observed, refine_pose
 from evercal.mapping.landmarks import Landmarks
 from evercal.mapping.patches import cut_patches, image_pyramid, to_level
 from evercal.mapping.scene_map import MapContents
@@ -64,8 +64,8 @@ def repeated(camera: Camera) -> tuple[Array, float]:
     white = np.tile(np.eye(2) / 0.2, (60, 1, 1))
     errors, claimed, residuals = [], [], []
     for _ in range(300):
-        ideal, distortion = _undistorted(pixels + rng.normal(0, 0.2, (60, 2)), camera)
-        refined = refine_pose(ideal, points, white, camera, POSE, distortion=distortion)
+        observed = Observed(pixels + rng.normal(0, 0.2, (60, 2)), points, white)
+        refined = refine_pose(observed, camera, POSE)
         errors.append((POSE.inverse() @ refined.pose.pose).log())
         claimed.append(refined.pose.covariance)
         residuals.append(np.median(refined.residual_px))
@@ -79,8 +79,6 @@ def test_errors_are_measured_in_the_image_with_any_distortion() -> None:
     plain, barrel = repeated(WIDE), repeated(BARREL)
     np.testing.assert_allclose(barrel[0], plain[0], rtol=0.1)
     assert barrel[1] == pytest.approx(plain[1], rel=0.02)
-    pixels = np.random.default_rng(0).uniform(0, 400, (9, 2))
-    assert _undistorted(pixels, WIDE) == (pixels, None)
 
 
 def test_distorted_image_is_located(hall: Recording, hall_map: MapContents) -> None:
@@ -122,7 +120,8 @@ def aligned(count: int, options: AlignmentOptions | None = None) -> Alignment | 
     image = texture()
     start = SE3.exp([0.01, -0.01, 0.005, 0.004, -0.003, 0.002])
     pyramid = image_pyramid(image, 2)
-    return align_pose(pyramid, CAMERA, [wall(image, count)], start, options or AlignmentOptions())
+    walls, options = [wall(image, count)], options or AlignmentOptions()
+    return align_pose(pyramid, CAMERA, walls, start, options, Prior())
 
 
 @pytest.mark.parametrize("count", [300, 900, 901, 1000, 1799, 3000])
@@ -132,7 +131,7 @@ def test_number_of_searched_landmarks_does_not_jump_at_the_limit(count: int) -> 
     assert alignment.expected == alignment.planned == min(count, 900)
     assert alignment.matched > 0.95 * alignment.expected
     assert len(alignment.pixels) == len(alignment.points_m) > 0.95 * alignment.matched
-    metres, radians = pose_distance(alignment.pose.pose, SE3.identity())
+    metres, radians = pose_distance(alignment.refined.pose.pose, SE3.identity())
     assert metres < 5e-4
     assert radians < 3e-4
 
@@ -142,7 +141,8 @@ def test_few_matches_widen_the_next_search() -> None:
     keyframe = wall(image, 3000)
     image[:, 90:] = 0
     start = SE3.exp([0.002, 0, 0, 0, 0, 0])
-    occluded = align_pose(image_pyramid(image, 2), CAMERA, [keyframe], start, AlignmentOptions())
+    pyramid, options = image_pyramid(image, 2), AlignmentOptions()
+    occluded = align_pose(pyramid, CAMERA, [keyframe], start, options, Prior())
     assert occluded is not None
     assert occluded.planned == 900
     assert 900 < occluded.expected <= 2700

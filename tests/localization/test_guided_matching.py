@@ -11,6 +11,7 @@ from evercal.features.encode import encode_features
 from evercal.features.views import ViewOptions, plain_view
 from evercal.geometry import SE3, UncertainPose, pose_distance
 from evercal.localization.acceptance import support
+from evercal.localization.intrinsics import OWN
 from evercal.localization.localizer import Localizer
 from evercal.localization.query import Candidate, Hypothesis, LocalizeOptions, Query
 from evercal.mapping.scene_map import MapContents
@@ -26,7 +27,7 @@ def with_support(value: float, x_m: float = 0.0) -> Hypothesis:
     pose = UncertainPose(SE3.exp([x_m, 0, 0, 0, 0, 0]), np.eye(6))
     # 9 of 9 matches are inliers, a share r of the landmarks: r^1.5 * sqrt(900) = value.
     expected = 9 / (value / 30) ** (2 / 3) if value else 0
-    return Hypothesis(0, pose, inliers[:, :2], inliers, expected, 9, 900)  # type: ignore[arg-type]
+    return Hypothesis(0, pose, None, inliers[:, :2], inliers, expected, 9, 900)  # type: ignore[arg-type]
 
 
 @dataclass
@@ -41,10 +42,11 @@ class Scripted(Localizer):
         self.options = LocalizeOptions()
 
     def _hypothesis(
-        self, query: object, candidate: Candidate, camera: object, near: SE3 | None = None
+        self, query: object, candidate: Candidate, camera: object, near: Hypothesis | None = None
     ) -> Hypothesis:
         if near is not None:
-            self.near.append(float(near.translation_m[0]))
+            assert near.pose is not None
+            self.near.append(float(near.pose.pose.translation_m[0]))
             self.strides.append(candidate.match_stride)
         number = len(self.near)
         return with_support(self.supports[min(number, len(self.supports) - 1)], float(number))
@@ -85,7 +87,7 @@ def frame(hall: Recording) -> Frame:
 def query(hall_map: MapContents, frame: Frame) -> Query:
     image, encoder = frame.read_image(), hall_map.encoder
     view = plain_view(image, frame.camera, encoder.stride, ViewOptions(short_side=240))
-    return Query(image, encode_features([view], encoder)[0], 480)
+    return Query(image, encode_features([view], encoder)[0], 480, [OWN])
 
 
 def truth_of(frame: Frame) -> SE3:
@@ -111,13 +113,17 @@ def test_matches_project_near_their_pixels(
     assert len(localizer._matches(query, KEYFRAMES, camera, behind).pixels) < 0.5 * len(near)
 
 
+def with_pose(pose: SE3) -> Hypothesis:
+    return Hypothesis(0, UncertainPose(pose, np.eye(6)))
+
+
 def test_a_pose_beside_the_true_one_converges(
     localizer: Localizer, query: Query, frame: Frame
 ) -> None:
     truth = truth_of(frame)
     beside = truth @ SE3.exp([0.1, 0.05, 0, 0, 0.03, 0])
     dense = replace(KEYFRAMES, match_stride=1)
-    hypothesis = localizer._hypothesis(query, dense, frame.camera, beside)
+    hypothesis = localizer._hypothesis(query, dense, frame.camera, with_pose(beside))
     assert hypothesis.pose is not None
     estimate = localizer.contents.scenes[0].frame.to_base(hypothesis.pose)
     assert pose_distance(estimate.pose, truth)[0] < 0.01 < pose_distance(beside, truth)[0]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.special import exp1
 
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.localization.pose_refinement import RefinedPose, linearise, refine_pose
+from evercal.localization.pose_refinement import Observed, RefinedPose, linearise, refine_pose
 
 Array = NDArray[np.floating]
 CAMERA = Camera(640, 480, 520.0, 500.0, 322.0, 238.0)
@@ -26,7 +26,7 @@ def project(points_m: Array) -> Array:
 
 
 def refined(pixels: Array, points_m: Array, white: Array) -> RefinedPose:
-    return refine_pose(pixels, points_m, white, CAMERA, NEAR)
+    return refine_pose(Observed(pixels, points_m, white), CAMERA, NEAR)
 
 
 def test_exact_pixels_give_the_exact_pose() -> None:

@@ -18,7 +18,7 @@ from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import (
     LearnedLocalizer,
     Localizer,
-    camera_in_scenes,
+    cameras_in_scenes,
     encode_image,
     own_or_stated,
 )
@@ -96,11 +96,11 @@ class NetworkLocalizer:
         """Estimate the camera pose of one image; see `Localizer.localize`."""
         began = time.perf_counter()
         image, scenes = as_rgb(image), self.contents
-        cameras = camera_in_scenes(camera, image, scenes.scenes)
+        cameras = _fitting_cameras(camera, image, scenes.scenes)
         features = encode_image(image, scenes.encoder, scenes.short_side)
         query = Query(image, features, self.options.patches_short_side)
         best: Hypothesis | None = None
-        for scene in self._candidates(query):
+        for scene in self._candidates(query, cameras):
             trial = self._hypothesis(query, scene, cameras)
             if best is None or _support(trial) > _support(best):
                 best = trial
@@ -121,9 +121,9 @@ class NetworkLocalizer:
         return len(heads) == 1 and heads[0].options.condition == "descriptor"
 
     @torch.inference_mode()
-    def _candidates(self, query: Query) -> list[int]:
+    def _candidates(self, query: Query, cameras: Sequence[Camera | None]) -> list[int]:
         """Scenes to try, most similar prototype first."""
-        usable = list(range(len(self.contents.scenes)))
+        usable = [i for i, camera in enumerate(cameras) if camera is not None]
         if self._decides_scene:
             return usable[:1]
         descriptor = self.contents.descriptor(query.features[None])[0]
@@ -133,10 +133,11 @@ class NetworkLocalizer:
         return [i for i in usable if similarity[i] >= floor][: self.options.candidates]
 
     def _hypothesis(
-        self, query: Query, scene: int, cameras: Sequence[Camera], moved: bool = False
+        self, query: Query, scene: int, cameras: Sequence[Camera | None], moved: bool = False
     ) -> Hypothesis:
         """A pose in one scene: predict, PnP."""
         camera = cameras[scene]
+        assert camera is not None, "only scenes whose camera fits are tried"
         small = camera.short_side_resized(self.contents.short_side)
         matches, patches = predicted_matches(self.contents, query, scene, small, 1)
         rough = solve_pnp(matches.pixels, matches.points_m, small, self.options.pnp)
@@ -145,7 +146,7 @@ class NetworkLocalizer:
         if self._decides_scene and not moved:
             other = self._scene_of(rough, scene)
             if other != scene:
-                if cameras[other] != camera:
+                if cameras[other] not in (None, camera):
                     # The pose lies in the cell of a scene with another camera: solve once more.
                     return self._hypothesis(query, other, cameras, moved=True)
                 return _moved(rough, matches, patches, self.contents.scenes, scene, other)
@@ -252,6 +253,37 @@ def predicted_matches(
     points = scenes.scenes[scene].cell.atlas_from_base.inverse().apply(points)[patches]
     valid = np.isfinite(points).all(1)
     return Matches(pixels[valid], points[valid]), len(patches)
+
+
+def _fitting_cameras(
+    camera: Camera | None, image: np.ndarray, scenes: Sequence[SceneRecord]
+) -> list[Camera | None]:
+    """Intrinsics of an image in each scene; None where the aspect ratio does not fit.
+
+    Networks do not estimate intrinsics, so that nothing is guessed.
+
+    Raises:
+        InputError: A camera with another aspect ratio than the image's, or no camera given and no
+            scene was recorded at this aspect ratio.
+    """
+    height, width = image.shape[:2]
+    recorded = [scene.adjusted_camera for scene in scenes]
+    if camera is None and not any(own.fits(width, height) for own in recorded):
+        sizes = ", ".join(
+            f"{scene.name} {own.width}x{own.height}"
+            for scene, own in zip(scenes, recorded, strict=True)
+        )
+        raise InputError(
+            f"image {width}x{height}: no scene was recorded at this aspect ratio ({sizes});"
+            " give the image's intrinsics with --camera"
+        )
+    asked = cameras_in_scenes(camera, image, scenes)
+    if camera is not None:
+        return list(asked)
+    return [
+        own if stated.fits(width, height) else None
+        for own, stated in zip(asked, recorded, strict=True)
+    ]
 
 
 def _support(hypothesis: Hypothesis) -> float:

@@ -195,7 +195,7 @@ class Localizer:
         """
         began = time.perf_counter()
         image, contents = as_rgb(image), self.contents
-        cameras = camera_in_scenes(camera, image, contents.scenes)
+        cameras = cameras_in_scenes(camera, image, contents.scenes)
         recorded = [scene.camera for scene in contents.scenes]
         query = Query(
             image,
@@ -362,7 +362,7 @@ def own_or_stated(stated: Camera, recorded: Sequence[Camera]) -> Camera | None:
     return None if stated in recorded else stated
 
 
-def camera_in_scenes(
+def cameras_in_scenes(
     camera: Camera | None, image: np.ndarray, scenes: Sequence[LearnedScene]
 ) -> list[Camera]:
     """Intrinsics of an image in each scene; a guess where none are given and no aspect ratio fits.
