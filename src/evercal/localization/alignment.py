@@ -7,8 +7,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.geometry import SE3, Camera
-from evercal.localization.intrinsics import Prior
+from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.localization.intrinsics import SHARED_PX, Prior
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import (
@@ -29,6 +29,8 @@ _MOST_AGAIN = 8
 """Searches after a change of the intrinsics, at most."""
 _NOTICEABLE_PX = 0.2
 """Landmarks are searched again if the intrinsics moved their projections by more than this."""
+_HOPELESS = 0.08
+"""They are not searched again if a smaller share of them are inliers."""
 _FAR_PX = 1.0
 """They are searched in all rounds, coarse to fine, if it was more than this."""
 
@@ -155,6 +157,8 @@ def align_pose(
         moved = _moved_px(camera, change, refined.change)
         if moved < _NOTICEABLE_PX:
             break
+        if (refined.residual_px < options.inlier_px).sum() < _HOPELESS * found.expected:
+            break  # other intrinsics do not make it the right place
         if again == _MOST_AGAIN:
             return None  # the intrinsics do not converge
         pose, change, again = refined.pose.pose, refined.change, again + 1
@@ -177,8 +181,18 @@ def _self_calibrated(
 ) -> RefinedPose:
     """Pose and intrinsics; the prior gives way where the image contradicts it."""
     free = refine_pose(observed, camera, pose, _STEPS, prior.free(camera), change)
+    # Errors that neighbouring landmarks share do not average out.
+    shared = 1 + (SHARED_PX**2 / free.variance) * float((observed.whitening**2).sum()) / 2
+    prior = replace(prior, scale=shared * prior.scale)
     variances = prior.tested(camera, free.change, np.diag(free.change_covariance))
-    return refine_pose(observed, camera, free.pose.pose, _STEPS, variances, free.change)
+    refined = refine_pose(observed, camera, free.pose.pose, _STEPS, variances, free.change)
+    wider = refined.pose.covariance + (shared - 1) * refined.by_intrinsics
+    return replace(
+        refined,
+        pose=UncertainPose(refined.pose.pose, wider),
+        by_intrinsics=shared * refined.by_intrinsics,
+        change_covariance=shared * refined.change_covariance,
+    )
 
 
 def _moved_px(camera: Camera, before: Array, after: Array) -> float:

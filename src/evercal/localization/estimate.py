@@ -9,6 +9,17 @@ from evercal.geometry import SE3, Camera, UncertainPose
 
 
 @dataclass(frozen=True, eq=False)
+class CovarianceTerm:
+    """The share of one cause in the covariance of a pose."""
+
+    name: Literal["view", "lens", "map", "base frame"]
+    """`view`: landmarks of this image. `lens`: its intrinsics. `map`: poses of keyframes.
+    `base frame`: a motion of the base frame that all answers share."""
+    covariance: np.ndarray
+    """(6, 6), see `PoseEstimate.covariance`."""
+
+
+@dataclass(frozen=True, eq=False)
 class PoseEstimate:
     """The answer for one image; failure is a value, not an exception."""
 
@@ -35,6 +46,8 @@ class PoseEstimate:
     """(n, 3) their scene points in the base frame, metres."""
     camera: Camera | None = None
     """Intrinsics that the pose holds for, at the size of the image; None for networks."""
+    terms: tuple[CovarianceTerm, ...] = ()
+    """Shares that sum to the covariance; empty for networks."""
     support: float = 0.0
     """Support of the pose, see `localization.acceptance`."""
 

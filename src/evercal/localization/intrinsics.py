@@ -13,6 +13,9 @@ from evercal.geometry import Camera
 
 Array = NDArray[np.floating]
 
+SHARED_PX = 0.02
+"""Errors that landmarks share, pixels: they bound how well many landmarks measure the intrinsics. A
+flat wall seen from the front would otherwise seem to measure the focal length."""
 DOUBT = 3.0
 """Squared deviations from the prior, in standard deviations, from which it gives way."""
 
@@ -40,8 +43,8 @@ OWN = IntrinsicsPrior(focal=2e-4, centre=3e-4, k1=1e-3, k2=1e-3)
 """The camera that recorded the scene: its error is in the landmarks, too, and cancels."""
 STATED = IntrinsicsPrior(focal=2e-3, centre=2e-3, k1=5e-3, k2=5e-3)
 """Intrinsics that the user states."""
-UNKNOWN = IntrinsicsPrior(focal=0.3, centre=0.02, k1=0.1, k2=0.05)
-"""An uncropped image of any camera."""
+UNKNOWN = IntrinsicsPrior(focal=0.3, centre=0.05, k1=0.1, k2=0.05)
+"""Any camera; the image may be cropped."""
 FREE = IntrinsicsPrior(focal=1.0, centre=0.3, k1=0.3, k2=0.3)
 """Wide enough to test the other priors."""
 FOCAL_FACTORS = (0.7, 0.84, 1.0, 1.2, 1.44)

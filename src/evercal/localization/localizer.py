@@ -21,7 +21,14 @@ from evercal.features.encode import encode_features
 from evercal.features.encoder import Encoder
 from evercal.features.views import ViewOptions, plain_view
 from evercal.geometry import SE3, Camera, resize_pixels
-from evercal.localization.acceptance import accepted, rejection, support, widened
+from evercal.localization.acceptance import (
+    USELESS_M,
+    accepted,
+    better,
+    in_base,
+    rejection,
+    support,
+)
 from evercal.localization.alignment import align_pose
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import (
@@ -36,7 +43,14 @@ from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.matching import Matcher
 from evercal.localization.pnp import PnpResult, solve_pnp
 from evercal.localization.pose_refinement import INTRINSICS, changed_camera
-from evercal.localization.query import Candidate, Hypothesis, LocalizeOptions, Matches, Query
+from evercal.localization.query import (
+    Attempt,
+    Candidate,
+    Hypothesis,
+    LocalizeOptions,
+    Matches,
+    Query,
+)
 from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
@@ -217,30 +231,52 @@ class Localizer:
 
     def _best_hypothesis(self, query: Query, cameras: Sequence[Camera]) -> Hypothesis:
         """The pose with the most support, from as few attempts as it takes."""
-        best: Hypothesis | None = None
-        tried: set[tuple[int, int, bool, int, bytes]] = set()
-        for number, attempt in enumerate(self.options.attempts):
-            for turns in (2, 1, 3) if attempt.turned else (0,):
-                view = self._turned(query, turns)
-                for candidate in self._matcher.candidates(view, attempt):
-                    if candidate.key in tried:
-                        continue  # in a small map a wider attempt often repeats the one before
-                    tried.add(candidate.key)
-                    trial = self._guided(view, candidate, cameras[candidate.scene])
-                    if best is None or support(trial) > support(best):
-                        best = trial
-                    if self._accepted(trial, self.options.immediate):
-                        return trial
-            # A pose that is barely accepted in the first attempt may be beaten in the second.
-            if number and best is not None and self._accepted(best):
+        first, other_camera = self.options.quick
+        best, view = self._tried(query, first, cameras), query
+        if self._accepted(best, self.options.immediate):
+            return best
+        for turns in (2, 1, 3):
+            turned = self._turned(query, turns)
+            trial = self._tried(turned, first, cameras)
+            if self._accepted(trial, self.options.immediate):
+                return trial
+            if better(trial, best):
+                best, view = trial, turned
+        if not self._accepted(best):
+            unknown = self._tried(view, other_camera, cameras)
+            best = unknown if better(unknown, best) else best
+            if best.pnp_inliers < self.options.promising_inliers:
+                return best
+        done: set[tuple[int, int, bool, bytes]] = set()
+        # A pose that is barely accepted in the first attempt may be beaten in the second.
+        for attempt in self.options.thorough:
+            trial = self._tried(view, attempt, cameras, done)
+            best = trial if support(trial) > support(best) else best
+            if self._accepted(best):
                 break
-        assert best is not None, "at least one scene is tried"
+        return best
+
+    def _tried(
+        self,
+        query: Query,
+        attempt: Attempt,
+        cameras: Sequence[Camera],
+        done: set[tuple[int, int, bool, bytes]] | None = None,
+    ) -> Hypothesis:
+        """The pose with the most support of one attempt; candidates that are `done` are skipped."""
+        done, best = set() if done is None else done, Hypothesis(0)
+        for candidate in self._matcher.candidates(query, attempt):
+            if candidate.key in done:
+                continue  # in a small map a wider attempt often repeats the one before
+            done.add(candidate.key)
+            trial = self._guided(query, candidate, cameras[candidate.scene])
+            best = trial if best.pose is None or better(trial, best) else best
+            if self._accepted(trial, self.options.immediate):
+                break
         return best
 
     def _turned(self, query: Query, turns: int) -> Query:
         """The query with features of the image turned clockwise by quarter turns."""
-        if not turns:
-            return query
         image = np.ascontiguousarray(np.rot90(query.image, -turns))
         features = encode_image(image, self.contents.encoder, self.contents.short_side)
         return replace(query, features=features, turns=turns)
@@ -267,6 +303,9 @@ class Localizer:
             return Hypothesis(candidate.scene)
         if not self.options.align:
             return rough.as_answer(candidate.scene)
+        inliers = int(rough.pnp.inliers.sum())
+        if near is None and inliers < self.options.aligned_inliers:
+            return Hypothesis(candidate.scene, rough.pnp.pose, pnp_inliers=inliers)
         height, width = query.grey.shape
         aligned = align_pose(
             query.pyramid,
@@ -278,7 +317,7 @@ class Localizer:
             rough.change,
         )
         if aligned is None:
-            return Hypothesis(candidate.scene, rough.pnp.pose)
+            return Hypothesis(candidate.scene, rough.pnp.pose, pnp_inliers=inliers)
         scale = self.contents.short_side / min(height, width)
         return Hypothesis(
             candidate.scene,
@@ -289,6 +328,7 @@ class Localizer:
             aligned.expected,
             aligned.matched,
             aligned.planned,
+            inliers,
         )
 
     def _rough(
@@ -328,31 +368,40 @@ class Localizer:
         scene = self.contents.scenes[best.scene]
         if best.pose is None or not self._accepted(best):
             failed = best.pose is None
-            return PoseEstimate(
+            return replace(
+                self._rejected(best, milliseconds),
                 status="failed" if failed else "unknown_scene",
                 reason="fewer than 6 inliers" if failed else rejection(best, scene),
-                scene=None,
-                base_from_camera=None,
-                covariance=None,
-                inliers=best.inliers,
-                inlier_ratio=best.inlier_ratio,
-                milliseconds=milliseconds,
-                support=support(best),
             )
-        estimate = scene.frame.to_base(widened(best, scene))
+        estimate, terms = in_base(best, scene)
+        if estimate.sigma_mm > 1000 * USELESS_M:
+            return replace(
+                self._rejected(best, milliseconds),
+                reason=f"its position is uncertain by {estimate.sigma_mm:.0f} mm per axis",
+            )
         assert best.points_m is not None, "accepted poses have inliers"
-        return PoseEstimate(
+        return replace(
+            self._rejected(best, milliseconds),
             status="ok",
-            reason="",
             scene=scene.name,
             base_from_camera=estimate.pose,
             covariance=estimate.covariance,
-            inliers=best.inliers,
-            inlier_ratio=best.inlier_ratio,
-            milliseconds=milliseconds,
+            terms=terms,
             pixels=best.pixels,
             points_m=scene.frame.points_to_base(best.points_m),
             camera=best.refined and best.refined.camera.resized(*query.size),
+        )
+
+    def _rejected(self, best: Hypothesis, milliseconds: float) -> PoseEstimate:
+        return PoseEstimate(
+            status="unknown_scene",
+            reason="",
+            scene=None,
+            base_from_camera=None,
+            covariance=None,
+            inliers=best.inliers,
+            inlier_ratio=best.inlier_ratio,
+            milliseconds=milliseconds,
             support=support(best),
         )
 

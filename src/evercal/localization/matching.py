@@ -47,9 +47,7 @@ class Matcher:
             voted = proposed[order[scene[order] == s]]
             others = rest[self._bank.scene[rest] == s]
             keyframes = np.concatenate([voted, others])[: self._options.keyframes]
-            candidates.append(
-                Candidate(s, keyframes, attempt.match_stride, attempt.unknown_camera, query.turns)
-            )
+            candidates.append(Candidate(s, keyframes, attempt.match_stride, attempt.unknown_camera))
         return candidates
 
     @torch.inference_mode()

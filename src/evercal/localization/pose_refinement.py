@@ -48,6 +48,8 @@ class RefinedPose:
     """(5,) change of the intrinsics."""
     change_covariance: Array
     """(5, 5)."""
+    variance: float
+    """Robust variance of the whitened errors."""
     by_intrinsics: Array
     """(6, 6) share of the pose's covariance that is due to the intrinsics."""
 
@@ -108,7 +110,9 @@ def refine_pose(
     own = np.asarray(in_parent_axes(rotation, covariance[:6, :6]), np.float64)
     pose = UncertainPose(SE3(quaternion, position), own)
     by_intrinsics = np.asarray(in_parent_axes(rotation, covariance[:6, :6] - fixed), np.float64)
-    return RefinedPose(pose, np.hypot(*raw), current, moved, covariance[6:, 6:], by_intrinsics)
+    return RefinedPose(
+        pose, np.hypot(*raw), current, moved, covariance[6:, 6:], variance, by_intrinsics
+    )
 
 
 def changed_camera(camera: Camera, change: Array) -> Camera:

@@ -27,8 +27,6 @@ class Attempt:
     """Matches every n-th row and column of patches."""
     unknown_camera: bool = False
     """Estimate the intrinsics of an unknown camera."""
-    turned: bool = False
-    """Encode the image turned by 180, 90 and 270 degrees."""
 
 
 @dataclass(frozen=True)
@@ -37,15 +35,19 @@ class LocalizeOptions:
 
     candidates: int = 3
     """Scenes that are tried per image, at most."""
-    attempts: tuple[Attempt, ...] = (
-        Attempt(12, 2),
+    quick: tuple[Attempt, Attempt] = (Attempt(12, 2), Attempt(12, 2, unknown_camera=True))
+    """The first attempt, and one for images that it does not locate, turned or not."""
+    thorough: tuple[Attempt, ...] = (
         Attempt(48, 1),
         Attempt(48, 1, unknown_camera=True),
-        Attempt(12, 2, turned=True),
         Attempt(200, 1),
     )
-    """Attempts in order; the next one runs while no pose is accepted."""
-    immediate: float = 2.0
+    """Attempts for images that are promising, until a pose is accepted."""
+    aligned_inliers: int = 12
+    """Poses with fewer PnP inliers are not aligned."""
+    promising_inliers: int = 16
+    """Images whose quick attempts end with fewer PnP inliers show no known place."""
+    immediate: float = 3.0
     """A pose of the first attempt is final if its support is this many times the threshold.
     Otherwise the second attempt runs and the pose with more support is taken."""
     guided_below: float = 1.5
@@ -118,14 +120,11 @@ class Candidate:
     """See `Attempt.match_stride`."""
     unknown_camera: bool = False
     """See `Attempt.unknown_camera`."""
-    turns: int = 0
-    """See `Query.turns`."""
 
     @property
-    def key(self) -> tuple[int, int, bool, int, bytes]:
+    def key(self) -> tuple[int, int, bool, bytes]:
         """The same for candidates that give the same pose."""
-        keyframes = self.keyframes.tobytes()
-        return self.scene, self.match_stride, self.unknown_camera, self.turns, keyframes
+        return self.scene, self.match_stride, self.unknown_camera, self.keyframes.tobytes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +157,9 @@ class Hypothesis:
     """Landmarks whose patch was found near the expected position."""
     planned: int = 0
     """Landmarks that an unobstructed image would have been searched for."""
+
+    pnp_inliers: int = 0
+    """Matches that agree with the pose before alignment."""
 
     @property
     def inliers(self) -> int:
