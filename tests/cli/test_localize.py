@@ -114,7 +114,7 @@ def test_camera_file_replaces_the_camera_of_the_scene(
 @pytest.mark.parametrize("as_json", [False, True])
 @pytest.mark.parametrize(
     "kind",
-    ["missing", "unreadable", "portrait", "none", "camera", "misfit", "overlay", "store", "empty"],
+    ["missing", "unreadable", "none", "camera", "misfit", "overlay", "store", "empty"],
 )
 def test_bad_input_is_one_line(
     run: Any,
@@ -128,13 +128,11 @@ def test_bad_input_is_one_line(
     image, broken = images / "1-hall.png", tmp_path / "broken.png"
     broken.write_bytes(b"\x89PNG broken")
     (tmp_path / "empty").mkdir()
-    write_image(tmp_path / "portrait.png", np.zeros((320, 240, 3), np.uint8))
     tall = Camera(240, 320, 250, 250, 119.5, 159.5)
     (tmp_path / "tall.json").write_text(json.dumps(tall.to_dict()))
     words: list[object] = {
         "missing": [hall_store, image, tmp_path / "nowhere.png"],
         "unreadable": [hall_store, image, broken],
-        "portrait": [hall_store, image, tmp_path / "portrait.png"],
         "none": [hall_store],
         "camera": [hall_store, image, "--camera", broken],
         "misfit": [hall_store, image, "--camera", tmp_path / "tall.json"],

@@ -257,6 +257,7 @@ def test_wrong_focal_length_is_corrected(
         assert estimate.camera is not None
         assert estimate.camera.fx == pytest.approx(frame.camera.fx, rel=0.01)
         assert estimate.uncertain_pose is not None
+        assert frame.base_from_camera is not None
         assert estimate.uncertain_pose.squared_mahalanobis(frame.base_from_camera) < 22.5
 
 
@@ -323,7 +324,8 @@ def test_terms_sum_to_the_covariance(localizer: Localizer, views: tuple[Frame, .
     own, stated = localizer.localize(image), localizer.localize(image, camera)
     for estimate in (own, stated):
         assert [term.name for term in estimate.terms] == ["view", "lens", "map", "base frame"]
-        total = sum(term.covariance for term in estimate.terms)
+        assert estimate.covariance is not None
+        total = np.sum([term.covariance for term in estimate.terms], 0)
         np.testing.assert_allclose(total, estimate.covariance, atol=1e-15)
         for term in estimate.terms:
             assert np.linalg.eigvalsh(term.covariance).min() > -1e-12

@@ -29,6 +29,7 @@ from evercal.calibration.located import (
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, axis_deviation, pose_distance
+from evercal.localization.localizer import cameras_in_scenes
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings import read_image
 from evercal.recordings.image_files import image_files
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
 
 Array = NDArray[np.float64]
+CONTRADICTED_PX = 1.0
+"""Stated intrinsics are replaced if the estimate moves rays by more than this, in pixels."""
 SPOT_M, SPOT_RAD = 0.1, np.deg2rad(10.0)
 """Views closer than this observe the same landmarks, so they share their errors."""
 
@@ -135,8 +138,10 @@ def calibrate(
         moved = in_gripper_frame(located, grippers)
     fused = fuse(moved)
     scene = scene_named(localizer, fused.scene)
-    camera = given.camera or scene.adjusted_camera
     height, width = given.images[0][1].shape[:2]
+    # The guess fits images of another aspect ratio, too.
+    stated = cameras_in_scenes(given.camera, given.images[0][1], [scene])[0]
+    camera = estimated_camera(fused.select(located), stated)
     if mount == "eye_to_hand":
         covariance, terms = _from_one_spot(moved, fused)
     else:
@@ -159,8 +164,38 @@ def calibrate(
         source=source,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-    sentences = [verdict(calibration), *_advice(calibration, fused)]
+    sentences = [
+        verdict(calibration),
+        *_lens_words(camera, stated),
+        *_advice(calibration, fused, camera != stated),
+    ]
     return replace(calibration, verdict=" ".join(sentences))
+
+
+def estimated_camera(used: Sequence[Located], stated: Camera) -> Camera:
+    """The stated intrinsics, or the median of the images' own if they contradict these."""
+    cameras = [item.estimate.camera for item in used if item.estimate.camera is not None]
+    if not cameras:
+        return stated
+    rows = [[c.fx, c.fy, c.cx, c.cy, *c.coefficients] for c in cameras]
+    fx, fy, cx, cy, *distortion = np.median(rows, axis=0).tolist()
+    median = Camera(stated.width, stated.height, fx, fy, cx, cy, tuple(distortion))
+    across = np.linspace(0, 1, 5)[:, None] * [stated.width - 1, stated.height - 1]
+    pixels = np.stack(np.meshgrid(*across.T), -1)
+    # Compare angles between rays: the principal point trades against the rotation.
+    shift = median.unproject(pixels) - stated.unproject(pixels)
+    off = np.nanmax(np.linalg.norm((shift - np.nanmean(shift, (0, 1)))[..., :2], axis=-1))
+    return median if stated.fx * off > CONTRADICTED_PX else stated
+
+
+def _lens_words(camera: Camera, stated: Camera) -> list[str]:
+    """Both focal lengths where the images contradict the stated intrinsics."""
+    if camera == stated:
+        return []
+    return [
+        f"The stated intrinsics (focal length {stated.fx:.1f} px) do not fit the images, which"
+        f" suggest {camera.fx:.1f} px: the estimated intrinsics were used."
+    ]
 
 
 def scene_named(localizer: "Localizer", name: str) -> SceneMap:
@@ -263,11 +298,11 @@ def _checks(moved: Sequence[Located], fused: Fused) -> Mapping[str, Any]:
     return checks
 
 
-def _advice(calibration: Calibration, fused: Fused) -> list[str]:
+def _advice(calibration: Calibration, fused: Fused, contradicted: bool) -> list[str]:
     """How to improve the result."""
     used, lost = int(fused.used.sum()), int((~fused.used).sum())
     advice = []
-    if calibration.source["intrinsics"] == "map":
+    if calibration.source["intrinsics"] == "map" and not contradicted:
         advice.append(
             f"The intrinsics are those of the camera that recorded {fused.scene}: give --camera if"
             " another camera took these images."
