@@ -96,9 +96,7 @@ def add_room(maps: MapContents, seed: int, count: int) -> None:
         images.append(jpeg(grey))
         poses.append(pose)
         depths.append(torch.full((len(features),), 1 / DEPTH_M).half())
-        landmarks.append(
-            Landmarks(pixels, np.full(n, 0.5), np.zeros((n, 2)), np.full(n, 0.01), np.full(n, 25.0))
-        )
+        landmarks.append(Landmarks(pixels, np.full(n, 0.5), np.zeros((n, 2)), np.full(n, 0.01)))
         descriptors.append(vlad(features))
     keyframes = Keyframes(
         tuple(images),

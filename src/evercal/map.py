@@ -166,6 +166,7 @@ class Map:
         from evercal.mapping.build import MapOptions, build_map
         from evercal.mapping.memory_budget import MemoryBudget
         from evercal.recordings import load_recording, posed_recording
+        from evercal.recordings.frame import MIN_GRIPPER_FRAMES, MIN_TRAIN_FRAMES
         from evercal.recordings.held_out import (
             lacks_camera_poses,
             named_recording,
@@ -178,15 +179,16 @@ class Map:
         loaded = recording if isinstance(recording, Recording) else load_recording(recording)
         loaded = named_recording(loaded, name, self.scenes)
         with self._store.writing():
-            contents, start = self._store.contents, None
+            contents, start, least = self._store.contents, None, MIN_TRAIN_FRAMES
             options = options or MapOptions()
             if lacks_camera_poses(loaded):
                 from evercal.calibration.eye_in_hand import posed_by_gripper
 
                 posed = posed_by_gripper(loaded, contents.encoder, on_progress)
                 loaded, start, options = posed.recording, posed.start, options.for_hand_eye()
+                least, budget = MIN_GRIPPER_FRAMES, replace(budget, least=MIN_GRIPPER_FRAMES)
             loaded = posed_recording(loaded)
-            require_frames(loaded)
+            require_frames(loaded, least)
             split = split_held_out(loaded.train)
             options = _sized(options, budget, contents.short_side)
             built = build_map(loaded.name, split.train, contents.encoder, options, on_progress)

@@ -65,6 +65,18 @@ def test_gripper_from_camera_within_its_covariance(
     assert report.warnings == ()
 
 
+def test_twelve_images_are_enough(hand: Recording, truth: SE3, tmp_path: Path) -> None:
+    arm = without_camera_poses(hand)
+    few = replace(arm, train=arm.train[:: len(arm.train) // 12][:12])
+    report = Map.open(tmp_path / "cell", device="cpu").learn(few)
+    assert (report.train_frames, report.held_out_frames) == (12, 0)
+    assert report.frames_kept >= 8
+    assert report.hand_eye is not None
+    estimate = report.hand_eye.gripper_from_camera
+    assert pose_distance(estimate.pose, truth)[0] < 0.01
+    assert estimate.squared_mahalanobis(truth) < 22.5  # 99.9 % of a chi-squared with 6 dof
+
+
 def test_report_becomes_a_calibration(learned: tuple[Path, LearnReport], hand: Recording) -> None:
     report = learned[1].hand_eye
     assert report is not None

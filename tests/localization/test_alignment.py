@@ -106,22 +106,12 @@ def wall(image: np.ndarray, count: int) -> AlignedLandmarks:
     """Landmarks on a wall two metres ahead of a keyframe at the origin."""
     rng = np.random.default_rng(1)
     pixels = rng.integers([20, 20], [300, 220], (count, 2)).astype(float)
-    flat = Landmarks(
-        pixels,
-        np.full(count, 0.5),
-        np.zeros((count, 2)),
-        np.full(count, 1e-3),
-        np.full(count, 25.0),
-    )
+    flat = Landmarks(pixels, np.full(count, 0.5), np.zeros((count, 2)), np.full(count, 1e-3))
     patches = [
         cut_patches(level, to_level(pixels, i)) for i, level in enumerate(image_pyramid(image, 2))
     ]
     return AlignedLandmarks(
-        flat.surface(CAMERA),
-        flat.sigma / flat.inverse_depth,
-        np.zeros(3),
-        tuple(patches),
-        flat.reach_px,
+        flat.surface(CAMERA), flat.sigma / flat.inverse_depth, np.zeros(3), tuple(patches)
     )
 
 

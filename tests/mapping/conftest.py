@@ -50,7 +50,6 @@ def scenes(rooms: tuple[Recording, ...]) -> list[SceneMap]:
                 inverse_depth=rng.uniform(0.1, 4, n).astype(np.float32).astype(float),
                 slope=rng.normal(0, 0.01, (n, 2)).astype(np.float32).astype(float),
                 sigma=rng.uniform(0.001, 0.1, n).astype(np.float32).astype(float),
-                reach_px=rng.integers(2, 26, n).astype(float),
             )
             for n in (7, 12)
         ]

@@ -164,6 +164,7 @@ def test_landmarks_are_tracked_again_after_noticeable_changes(
         sigma_rad=0.0,
         residual_px=0.1,
         common_covariance=zero[0],
+        common_systematic=zero[0],
         correction=zero[:, 0],
         weight=np.ones(10),
         covariance=zero,

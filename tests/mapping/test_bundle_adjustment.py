@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from evercal.errors import InputError
 from evercal.geometry.camera import Camera
@@ -180,6 +181,36 @@ def test_covariance_matches_errors_of_many_runs() -> None:
         claimed = np.mean([s[:, part] for s in spread])
         true = np.mean([np.square(e[:, part]) for e in deviations])
         assert 0.4 < claimed / true < 1.3
+
+
+def test_systematic_covariance_is_the_response_to_linear_errors() -> None:
+    made = world(noise_px=0.05)
+    options = BundleOptions(
+        common_stated=False, common_sigma_m=0.2, common_sigma_deg=10.0, least_sigma_m=1e-3,
+        least_sigma_deg=0.05,
+    )  # fmt: skip
+
+    def solved(stated: SE3) -> Adjustment:
+        cameras = [CAMERA] * len(stated)
+        return BundleAdjustment(stated, cameras, np.zeros((len(stated), 6)), options).solve(
+            made.tracks
+        )
+
+    rotations = Rotation.from_quat(made.truth.rotation_wxyz, scalar_first=True)
+    turns = (rotations.mean().inv() * rotations).as_rotvec()
+    linear = np.concatenate([turns, made.truth.translation_m], 1)
+    linear = (linear - linear.mean(0)) / linear.std(0)
+    exact = solved(made.truth)
+    change = np.zeros((6, 6))
+    for pattern in linear.T:
+        for axis, sigma in enumerate(np.repeat([exact.sigma_m, exact.sigma_rad], 3)):
+            error = np.zeros((len(linear), 6))
+            error[:, axis] = sigma * pattern
+            moved = solved(made.truth @ SE3.exp(error))
+            step = (exact.common.inverse() @ moved.common).log()
+            change += np.outer(step, step)
+    expected, estimated = np.sqrt(np.diag(change)), np.sqrt(np.diag(exact.common_systematic))
+    np.testing.assert_allclose(estimated, expected, rtol=0.4)
 
 
 def test_common_transform_is_estimated() -> None:

@@ -99,7 +99,6 @@ def mapped(frames: tuple[Frame, ...], counts: tuple[int, ...]) -> Keyframes:
             rng.uniform(0.1, 4, n).astype(np.float32).astype(float),
             rng.normal(0, 0.01, (n, 2)).astype(np.float32).astype(float),
             rng.uniform(0.001, 0.1, n).astype(np.float32).astype(float),
-            rng.integers(2, 26, n).astype(float),
         )
         for n in counts
     )
@@ -126,7 +125,7 @@ def test_landmarks_are_stored_exactly(
     assert torch.equal(torch.as_tensor(back.descriptors), keyframes.descriptors)
     # 16 bytes of floats and 4 of pixels a landmark.
     plain = replace(keyframes, landmarks=(), descriptors=None, inverse_depth=())
-    extra = 21 * sum(counts) + 8 * len(counts) + (2 * 48 + 8) * len(counts) + 32 * len(counts)
+    extra = 20 * sum(counts) + 8 * len(counts) + (2 * 48 + 8) * len(counts) + 32 * len(counts)
     assert keyframes.bytes == plain.bytes + extra
     empty = through_a_file(plain)
     assert (empty.landmarks, empty.descriptors, empty.inverse_depth) == ((), None, ())

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from evercal.geometry.camera import Camera
 from evercal.mapping.landmarks import (
     BORDER_PX,
-    UNIQUE_PX,
     Landmarks,
     detect,
     project_surface,
@@ -31,9 +30,7 @@ def on_a_plane(camera: Camera, normal: Array, pixels: Array) -> Landmarks:
     steps = np.array([[2.0, 0], [0, 2.0]])
     beside = [(inverse_depth(pixels + step) - inverse_depth(pixels)) / 2 for step in steps]
     n = len(pixels)
-    return Landmarks(
-        pixels, inverse_depth(pixels), np.stack(beside, -1), np.ones(n), np.full(n, UNIQUE_PX)
-    )
+    return Landmarks(pixels, inverse_depth(pixels), np.stack(beside, -1), np.ones(n))
 
 
 def spots() -> Array:
@@ -67,9 +64,7 @@ def test_patches_warp_like_a_slanted_plane(camera: Camera) -> None:
         centred = (projected(at + 0.01 * step) - projected(at - 0.01 * step)) / 0.02
         np.testing.assert_allclose(affines[:, :, column], centred, atol=0.03)
     # A plane parallel to the image has another warp.
-    flat = Landmarks(
-        marks.pixels, marks.inverse_depth, 0 * marks.slope, marks.sigma, marks.reach_px
-    )
+    flat = Landmarks(marks.pixels, marks.inverse_depth, 0 * marks.slope, marks.sigma)
     _, _, other = project_surface(flat.surface(camera), ROTATION, TRANSLATION, camera)
     assert np.abs(np.median(other, 0) - np.median(affines, 0)).max() > 0.03
 

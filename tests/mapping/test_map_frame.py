@@ -6,7 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
-from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity, fit_correction
+from evercal.mapping.map_frame import (
+    FrameCorrection,
+    MapFrame,
+    Similarity,
+    fit_correction,
+    shared_sigma,
+)
 
 CAMERA = Camera(320, 240, 300, 300, 159.5, 119.5)
 SIMILARITY = Similarity(SE3.exp([1.0, -2.0, 0.5, 0.3, -0.9, 0.4]), 0.37)
@@ -106,3 +112,21 @@ def test_noise_and_zero_corrections_are_not_fitted() -> None:
     noise = rng.normal(size=(200, 6)) * [0.002, 0.002, 0.002, 0.003, 0.003, 0.003]
     assert fit_correction(stated @ SE3.exp(noise), noise) is None
     assert fit_correction(stated, np.zeros((200, 6))) is None
+
+
+def test_errors_that_neighbours_share_widen_the_stated_frame() -> None:
+    rng = np.random.default_rng(0)
+    poses, independent = walk(200, rng), rng.normal(0, [0.004] * 3 + [0.003] * 3, (200, 6))
+    assert shared_sigma(poses, independent, None) == (0.0, 0.0)
+    drift = np.cumsum(independent, 0)
+    drift *= 0.004 / drift.std(0)
+    metres, radians = shared_sigma(poses, drift, None)
+    assert metres == pytest.approx(float(np.sqrt((drift[:, :3] ** 2).mean())))
+    assert radians > 0
+    assert shared_sigma(poses[:3], drift[:3], None) == (0.0, 0.0)
+
+
+def test_error_of_the_stated_frame_is_added() -> None:
+    exact = UncertainPose.exact(POSE)
+    wide = MapFrame(pose_sigma=(0.003, 0.0), frame_sigma=(0.004, 0.02)).to_base(exact)
+    np.testing.assert_allclose(np.diag(wide.covariance), [0.005**2] * 3 + [0.02**2] * 3)

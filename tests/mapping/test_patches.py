@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from evercal.mapping.patches import (
     SIDE,
+    Patches,
     align_down,
     align_patches,
     cut_patches,
@@ -214,3 +215,9 @@ def test_error_along_one_line_is_whitened() -> None:
         spread = affines[i] @ hessian[i] @ affines[i].T + 0.01 * np.eye(2)
         covariance = 0.64 * spread + np.outer(line[i], line[i])
         np.testing.assert_allclose(white @ covariance @ white.T, np.eye(2), atol=1e-9)
+
+
+def test_no_pixels_give_no_patches() -> None:
+    empty = cut_patches(np.zeros((40, 40), np.float32), np.zeros((0, 2)))
+    assert len(empty.intensity) == 0
+    assert Patches.joined([empty, empty]).intensity.shape == empty.intensity.shape

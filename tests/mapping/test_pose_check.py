@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from evercal.features.encoder import load_encoder
 from evercal.features.vlad import vlad_for
+from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.mapping.pose_check import (
+    _distinct,
     _segment_distance,
     contradicting_frames,
     depth_scale,
@@ -98,3 +101,12 @@ def test_distances_from_segments() -> None:
     start, end = np.array([[0.0, 0], [0, 0], [0, 0], [1, 1]]), np.array([[4.0, 0]] * 3 + [[1, 1]])
     points = np.array([[2.0, 3], [-3, 4], [7, -4], [4, 5]])
     np.testing.assert_allclose(_segment_distance(points, start, end), [3, 5, 5, 5], atol=1e-6)
+
+
+def test_cells_with_a_similar_cell_elsewhere_are_not_distinct() -> None:
+    camera = Camera(64, 8, 50, 50, 31.5, 3.5)
+    similar = torch.full((3, 8), 0.2)
+    similar[0, 1] = 0.9
+    similar[1, [1, 2]] = torch.tensor([0.9, 0.89])  # the neighbour shows the same place
+    similar[2, [1, 6]] = torch.tensor([0.9, 0.89])
+    assert _distinct(similar, torch.tensor([1, 1, 1]), camera, 8).tolist() == [True, True, False]

@@ -166,7 +166,7 @@ def solve_motions(base_from_gripper: SE3, motions: Sequence[PairMotion]) -> Hand
             " turning it, and check that the poses are in metres"
         )
     start = SE3(rotation.as_quat(canonical=True, scalar_first=True), translation)
-    used = [i for i in np.flatnonzero(agree) if motions[i].matches.size]
+    used = [i for i in np.flatnonzero(agree).tolist() if motions[i].matches.size]
     if used:
         start = _on_epipolar_lines(start, moved[used], [motions[i] for i in used])
     return HandEyeStart(start, int(agree.sum()), len(motions))

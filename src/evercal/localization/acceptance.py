@@ -87,15 +87,16 @@ def in_base(
         return replace(scene.frame, base_covariance=None, **frame).to_base(pose).covariance
 
     scale = np.trace(wide.covariance) / np.trace(hypothesis.refined.pose.covariance)
-    exact = (0.0, 0.0)
-    lens = moved(scale * hypothesis.refined.by_intrinsics, pose_sigma=exact)
-    view = moved(wide.covariance, pose_sigma=exact) - lens
-    poses = moved(np.zeros((6, 6)))
-    frame = estimate.covariance - view - lens - poses
+    exact, nothing = (0.0, 0.0), np.zeros((6, 6))
+    lens = moved(scale * hypothesis.refined.by_intrinsics, pose_sigma=exact, frame_sigma=exact)
+    view = moved(wide.covariance, pose_sigma=exact, frame_sigma=exact) - lens
+    poses, stated = moved(nothing, frame_sigma=exact), moved(nothing, pose_sigma=exact)
+    frame = estimate.covariance - view - lens - poses - stated
     return estimate, (
         CovarianceTerm("view", view),
         CovarianceTerm("lens", lens),
         CovarianceTerm("map", poses),
+        CovarianceTerm("stated poses", stated),
         CovarianceTerm("base frame", frame),
     )
 

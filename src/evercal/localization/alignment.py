@@ -68,8 +68,6 @@ class AlignmentOptions:
     """Largest factor on the number of landmarks."""
     min_correlation: float = 0.7
     """Smallest normalised cross-correlation of a match."""
-    min_clear: int = 60
-    """If fewer visible landmarks can be told from similar places, all are searched."""
     min_matches: int = 12
     """Fewer landmarks give no pose."""
     inlier_px: float = 1.0
@@ -107,8 +105,6 @@ class _Target:
     """(keyframes + 1,) the first landmark of each, and their number."""
     surface_m: Array
     """(3, n, 3), see `AlignedLandmarks`."""
-    reach_px: Array
-    """(n,) see `Landmarks`."""
     depth_error_m: Array
     """(n, 3) displacement of a landmark by one standard deviation of its depth."""
 
@@ -119,8 +115,7 @@ class _Target:
         counts = [surface.shape[1] for surface in surfaces]
         errors = [k.depth_noise[:, None] * (k.surface_m[0] - k.position_m) for k in keyframes]
         starts = np.cumsum([0, *counts])
-        reaches = np.concatenate([keyframe.reach_px for keyframe in keyframes])
-        return cls(keyframes, starts, np.concatenate(surfaces, 1), reaches, np.concatenate(errors))
+        return cls(keyframes, starts, np.concatenate(surfaces, 1), np.concatenate(errors))
 
     def patches(self, level: int, which: NDArray[np.int64]) -> Patches:
         """Templates of landmarks, indices in rising order."""
@@ -272,11 +267,6 @@ class _Search:
         target, options, inverse = self.target, self.options, pose.inverse()
         rotation, shift = inverse.rotation_matrix(), inverse.translation_m
         which, pixels, affines = project_surface(target.surface_m, rotation, shift, camera)
-        # Repeated texture is not searched from farther away than half its period.
-        size = np.sqrt(np.abs(np.linalg.det(affines)))
-        clear = np.flatnonzero(target.reach_px[which] * np.minimum(size, 1) >= step.reach_px)
-        if len(clear) >= options.min_clear:
-            which, pixels, affines = which[clear], pixels[clear], affines[clear]
         if len(which) > step.landmarks:
             spread = np.linspace(0, len(which) - 1, step.landmarks).round().astype(int)
             which, pixels, affines = which[spread], pixels[spread], affines[spread]

@@ -12,9 +12,10 @@ from evercal.geometry import SE3, Camera, UncertainPose
 class CovarianceTerm:
     """The share of one cause in the covariance of a pose."""
 
-    name: Literal["view", "lens", "map", "base frame"]
+    name: Literal["view", "lens", "map", "stated poses", "base frame"]
     """`view`: landmarks of this image. `lens`: its intrinsics. `map`: poses of keyframes.
-    `base frame`: a motion of the base frame that all answers share."""
+    `stated poses`: errors that neighbouring stated poses share. `base frame`: a motion of the base
+    frame that all answers share."""
     covariance: np.ndarray
     """(6, 6), see `PoseEstimate.covariance`."""
 

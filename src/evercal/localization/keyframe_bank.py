@@ -43,8 +43,6 @@ class AlignedLandmarks:
     """(3,) position of the keyframe's camera."""
     patches: tuple[Patches, ...]
     """Templates of the landmarks, one set for each pyramid level."""
-    reach_px: np.ndarray
-    """(n,) see `Landmarks`."""
 
 
 class LoadedKeyframe:
@@ -100,7 +98,6 @@ class LoadedKeyframe:
                 cut_patches(image, to_level(marks.pixels, level))
                 for level, image in enumerate(pyramid)
             ),
-            marks.reach_px,
         )
 
 

@@ -20,7 +20,7 @@ from evercal.geometry import SE3, Camera
 from evercal.geometry.uncertain_pose import frame_covariance
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment, BundleOptions
 from evercal.mapping.keyframes import Keyframes, jpeg
-from evercal.mapping.map_frame import MapFrame, fit_correction
+from evercal.mapping.map_frame import MapFrame, fit_correction, shared_sigma
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.pose_check import (
     contradicting_frames,
@@ -301,15 +301,18 @@ def _finish(
     if adjustment is not None:
         block = np.einsum("nii->ni", adjustment.covariance[numbers])
         common = adjustment.common
+        stated = adjustment.poses @ common.inverse()
+        correction = fit_correction(stated, adjustment.correction)
         frame = MapFrame(
             common=common,
-            correction=fit_correction(adjustment.poses @ common.inverse(), adjustment.correction),
+            correction=correction,
             pose_sigma=(float(np.sqrt(block[:, :3].mean())), float(np.sqrt(block[:, 3:].mean()))),
+            frame_sigma=shared_sigma(stated, adjustment.correction, correction),
         )
         if not options.bundle.common_stated:
             # The common transform is part of the answer and not an error to undo.
             covariance = np.asarray(adjustment.common_covariance, np.float64)
-            covariance = HAND_EYE_COVARIANCE_SCALE * covariance
+            covariance = HAND_EYE_COVARIANCE_SCALE * covariance + adjustment.common_systematic
             hand_eye = HandEyeCorrection(common, covariance)
             base = frame_covariance(frames.stated @ common, covariance)
             frame = replace(frame, common=SE3.identity(), base_covariance=base)

@@ -112,6 +112,8 @@ class Adjustment:
     """Median reprojection error, pixels."""
     common_covariance: Array
     """(6, 6) of the common transform, camera frame, metres and radians."""
+    common_systematic: Array
+    """(6, 6) of the same, due to errors of stated poses that vary linearly over the recording."""
     correction: Array
     """(n, 6) of each pose beside common transform and time shift, camera frame, metres and
     radians."""
@@ -372,11 +374,34 @@ class BundleAdjustment:
             sigma_rad=float(variances.sigma[3]),
             residual_px=float(np.median(np.linalg.norm(residual, axis=1))),
             common_covariance=root[n].T @ root[n],
+            common_systematic=self._systematic(estimate, variances),
             correction=self._deviation(parameters),
             weight=np.minimum(variances.weight, 1.0),
             covariance=np.stack([columns.T @ columns for columns in root[:n]]),
             inverse_depth=parameters.inverse_depth,
         )
+
+    def _systematic(self, estimate: Estimate, variances: Variances) -> Array:
+        """Covariance (6, 6) of the common transform due to systematic errors of stated poses.
+
+        The errors of a robot's joints vary slowly with the pose. They are modelled by errors that
+        are linear in the rotation and position of a frame, each as large as the estimated noise.
+        Residuals hardly show them, because the common transform and the depths follow.
+        """
+        n, stated = self.n, self.frames.stated
+        rotations = Rotation.from_quat(stated.rotation_wxyz, scalar_first=True)
+        turns = (rotations.mean().inv() * rotations).as_rotvec()
+        linear = np.concatenate([turns, stated.translation_m], axis=1)
+        linear = linear - linear.mean(0)
+        linear = linear / np.maximum(linear.std(0), 1e-9)
+        common = estimate.root[:, 6 * n : 6 * n + 6].T @ estimate.root
+        precision = variances.weight[:, None] / variances.sigma**2
+        # Response of the common transform to an error of each stated pose: (6, n, 6).
+        own = common[:, : 6 * n].reshape(6, n, 6) - common[:, None, 6 * n : 6 * n + 6]
+        drift = common[:, 6 * n + COMMON, None, None] * self.velocity
+        response = np.einsum("knj,nj,na->kaj", own - drift, precision, linear) * variances.sigma
+        rows = response.reshape(6, -1)
+        return rows @ rows.T
 
 
 def noise_of(linearised: Linearised) -> float:

@@ -108,6 +108,7 @@ class StatedFrames:
     """
 
     def __init__(self, stated: SE3, cameras: list[Camera]):
+        self.stated = stated
         self._rotation, self._position = stated.rotation_matrix(), stated.translation_m
         self._cameras = cameras
         self.same_camera = all(camera == cameras[0] for camera in cameras)

@@ -16,7 +16,7 @@ from torch import Tensor
 from evercal.features.views import working_image
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
-from evercal.mapping.landmarks import UNIQUE_PX, Landmarks
+from evercal.mapping.landmarks import Landmarks
 from evercal.recordings.frame import Frame
 
 JPEG_QUALITY = 95
@@ -25,9 +25,8 @@ _LANDMARK_FIELDS = {
     "inverse_depth": torch.float32,
     "slope": torch.float32,
     "sigma": torch.float32,
-    "reach_px": torch.uint8,
 }
-"""Fields of `Landmarks`, in order, and how they are stored: 21 bytes a landmark."""
+"""Fields of `Landmarks`, in order, and how they are stored: 20 bytes a landmark."""
 
 
 @dataclass(frozen=True)
@@ -141,8 +140,6 @@ class Keyframes:
 
 def _landmarks_of(tensors: dict[str, Tensor]) -> tuple[Landmarks, ...]:
     counts = tensors["landmark_counts"].tolist()
-    unique = torch.full((sum(counts),), UNIQUE_PX)  # maps of evercal 0.2 lack the reach
-    tensors = {"landmark_reach_px": unique, **tensors}
     columns = [
         [part.double().numpy() for part in tensors[f"landmark_{name}"].split(counts)]
         for name in _LANDMARK_FIELDS

@@ -7,22 +7,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.geometry.camera import Camera, resize_pixels
-from evercal.mapping.patches import RADIUS
+from evercal.geometry.camera import Camera
 
 Array = NDArray[np.floating]
 
 MIN_TEXTURE = 1e-4
 """Smallest minimum eigenvalue (cv2.cornerMinEigenVal, 5x5) of a landmark's pixel."""
-UNIQUE_PX = 25.0
-"""Reach of a landmark without a similar place nearby: the largest distance of any search."""
-MIN_SAME = 0.8
-"""Normalised cross-correlation of places that look the same."""
 BORDER_PX = 6
 """Landmarks and their projections lie at least this far inside the image."""
 NEAREST_M = 1e-3
 _TANGENT_PX = 2.0
-_WINDOW = int(UNIQUE_PX) + RADIUS
 _MIN_AREA, _MAX_AREA = 0.2, 5.0
 """Bounds of the area of a warped patch, relative to its keyframe."""
 
@@ -39,17 +33,15 @@ class Landmarks:
     """(n, 2) change of the inverse depth per pixel: the slant of the surface."""
     sigma: Array
     """(n,) standard deviation of the inverse depth, per metre."""
-    reach_px: Array
-    """(n,) half the distance to the nearest place in the keyframe's image that looks the same,
-    `UNIQUE_PX` where there is none. A search from farther away may find the wrong place."""
 
     def __len__(self) -> int:
         return len(self.pixels)
 
     def take(self, index: np.ndarray) -> "Landmarks":
         """The landmarks of an index."""
-        columns = self.pixels, self.inverse_depth, self.slope, self.sigma, self.reach_px
-        return Landmarks(*(column[index] for column in columns))
+        return Landmarks(
+            self.pixels[index], self.inverse_depth[index], self.slope[index], self.sigma[index]
+        )
 
     def surface(self, camera: Camera) -> Array:
         """(3, n, 3) points in the keyframe's camera frame, metres.
@@ -118,29 +110,6 @@ def detect(
                 pixels.append((columns[j] + u, rows[i] + v))
                 cells.append(i * grid[1] + j)
     return np.array(pixels, float).reshape(-1, 2), np.array(cells, np.int64)
-
-
-def reach(half: Array, pixels: Array) -> Array:
-    """Half the distances (n,) of pixels (n, 2) to the nearest place that looks the same.
-
-    The float image (h / 2, w / 2) is the second level of the pyramid, where searches begin. The
-    peak of a patch itself, as long as the edge that it lies on, is not another place.
-    """
-    reaches = np.full(len(pixels), UNIQUE_PX)
-    centres = np.rint(resize_pixels(pixels, 0.5)).astype(int)
-    for i, (u, v) in enumerate(centres.tolist()):
-        left, top = max(u - _WINDOW, 0), max(v - _WINDOW, 0)
-        window = half[top : v + _WINDOW + 1, left : u + _WINDOW + 1]
-        low, high = max(u - RADIUS, 0), max(v - RADIUS, 0)
-        patch = half[high : v + RADIUS + 1, low : u + RADIUS + 1]
-        same = cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED) > MIN_SAME
-        _, places = cv2.connectedComponents(same.astype(np.uint8), connectivity=8)
-        row, column = high - top, low - left
-        others = np.argwhere((places > 0) & (places != places[row, column])) - [row, column]
-        if len(others):
-            # Twice, for level 0, and half of the way.
-            reaches[i] = min(UNIQUE_PX, float(np.linalg.norm(others, axis=1).min()))
-    return reaches
 
 
 def slopes(inverse_depth: Array, grid: tuple[int, int], cell_px: float) -> Array:

@@ -79,6 +79,9 @@ class MapFrame:
     """Slowly varying corrections; None if neighbours do not predict them."""
     pose_sigma: tuple[float, float] = (0.0, 0.0)
     """Standard deviation of the adjusted poses per axis, metres and radians."""
+    frame_sigma: tuple[float, float] = (0.0, 0.0)
+    """Standard deviation of the stated frame about the map per axis, metres and radians: errors of
+    the stated poses that neighbouring frames share, see `shared_sigma`."""
     similarity: Similarity | None = None
     """From the frame of the recording to the base frame; None if both are the same."""
     base_covariance: Array | None = None
@@ -88,9 +91,11 @@ class MapFrame:
     def to_base(self, map_from_camera: UncertainPose) -> UncertainPose:
         """Transform a pose that was estimated from landmarks to the base frame.
 
-        The errors of the map's poses and of the base frame are added to the covariance.
+        The errors of the map's poses, of the stated frame and of the base frame are added to the
+        covariance.
         """
-        own = np.diag(np.repeat(np.square(self.pose_sigma), 3))
+        variance = np.square(self.pose_sigma) + np.square(self.frame_sigma)
+        own = np.diag(np.repeat(variance, 3))
         covariance = map_from_camera.covariance + own
         pose = self._undo(map_from_camera.pose)
         if self.similarity is not None:
@@ -148,15 +153,43 @@ def fit_correction(poses: SE3, correction: NDArray[np.floating]) -> FrameCorrect
     total = float(((correction / scale) ** 2).sum())
     for metres, degrees in RADII:
         radius = (metres, float(np.deg2rad(degrees)))
-        weight = np.stack([_closeness(poses, poses[i], radius) for i in range(len(poses))])
-        np.fill_diagonal(weight, 0)
-        predicted = weight @ correction / (weight.sum(1, keepdims=True) + SHRINKAGE)
-        explained = 1 - float((((correction - predicted) / scale) ** 2).sum()) / total
+        left = correction - _left_out(poses, correction, radius)
+        explained = 1 - float(((left / scale) ** 2).sum()) / total
         if explained > best[0]:
             best = (explained, radius)
     if best[0] <= MIN_EXPLAINED:
         return None
     return FrameCorrection(poses, correction, best[1])
+
+
+def shared_sigma(
+    poses: SE3, correction: NDArray[np.floating], fitted: FrameCorrection | None
+) -> tuple[float, float]:
+    """Standard deviation per axis of stated poses whose errors neighbouring frames share.
+
+    Poses and corrections (n, 6) are those of `fit_correction`, in recorded order; `fitted` is its
+    result. Independent errors of stated poses average out in a map and give 0: successive
+    corrections are uncorrelated to within three standard errors.
+    """
+    if len(correction) < 4:
+        return 0.0, 0.0
+    left = correction
+    if fitted is not None:
+        left = correction - _left_out(poses, correction, fitted.radius)
+    sigmas = []
+    for axes in (slice(0, 3), slice(3, 6)):
+        part, variance = left[:, axes], float((correction[:, axes] ** 2).mean())
+        shared = float((part[:-1] * part[1:]).mean())
+        error = float((part**2).mean()) / np.sqrt(part[1:].size)
+        sigmas.append(float(np.sqrt(variance)) if shared > 3 * error else 0.0)
+    return sigmas[0], sigmas[1]
+
+
+def _left_out(poses: SE3, correction: NDArray[np.floating], radius: tuple[float, float]) -> Array:
+    """(n, 6) corrections that the other frames predict."""
+    weight = np.stack([_closeness(poses, poses[i], radius) for i in range(len(poses))])
+    np.fill_diagonal(weight, 0)
+    return weight @ correction / (weight.sum(1, keepdims=True) + SHRINKAGE)
 
 
 def _closeness(poses: SE3, pose: SE3, radius: tuple[float, float]) -> Array:

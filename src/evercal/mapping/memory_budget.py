@@ -27,6 +27,8 @@ class MemoryBudget:
     """Keyframes as a share of the training frames."""
     bytes: int | None = None
     """Size of the keyframes instead, at most."""
+    least: int = 1
+    """Keyframes of a share, at least, as far as there are frames."""
     auto: bool = False
     """Keep the fewest keyframes that locate the recording's other frames well."""
 
@@ -57,7 +59,8 @@ class MemoryBudget:
         For a budget in bytes, as many as fit by the size of their images, from a sample.
         """
         if self.bytes is None:
-            return max(1, int(self.share * len(frames) + 1e-9))
+            least = min(self.least, len(frames))
+            return max(least, int(self.share * len(frames) + 1e-9))
         sample = frames[:: -(-len(frames) // _SAMPLED_FRAMES)]
         one = store_keyframes(sample, short_side).bytes / len(sample)
         return min(len(frames), max(1, int(self.bytes / one)))

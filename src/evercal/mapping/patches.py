@@ -84,10 +84,11 @@ def cut_patches(image: Array, pixels: Array) -> Patches:
     wide = wide.reshape(n, SIDE + 2, SIDE + 2)
     slope_u = (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2
     slope_v = (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2
-    patch = wide[:, 1:-1, 1:-1].reshape(n, -1)
+    patch = wide[:, 1:-1, 1:-1].reshape(n, SIDE * SIDE)
     patch = patch - patch.mean(1, keepdims=True)
     deviation = np.sqrt((patch * patch).mean(1, keepdims=True)) + _FLAT
-    gradient = np.stack([slope_u.reshape(n, -1), slope_v.reshape(n, -1)], -1) / deviation[..., None]
+    gradient = np.stack([slope_u.reshape(patch.shape), slope_v.reshape(patch.shape)], -1)
+    gradient /= deviation[..., None]
     hessian = gradient.transpose(0, 2, 1) @ gradient + _DAMPING * np.eye(2, dtype=np.float32)
     inverse = np.linalg.inv(hessian)
     descent = np.ascontiguousarray((gradient @ inverse).transpose(0, 2, 1))

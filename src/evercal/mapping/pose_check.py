@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from evercal.features.precision import fast_bfloat16
 from evercal.features.views import ideal_cell_pixels
@@ -34,6 +35,9 @@ MIN_SIMILARITY = 0.6
 """Smallest cosine of matched features."""
 MIN_MATCHES = 30
 """Pairs with fewer mutual matches are ignored."""
+RATIO, NEIGHBOURS = 0.9, 2.5
+"""A match is used if no cell beyond so many cells from it is nearly as similar: the distance of
+features is below this ratio (Lowe, IJCV 2004). Repeated texture would contradict right poses."""
 STRIDE = 3
 """Step between the cells of the first frame that are matched."""
 
@@ -109,12 +113,26 @@ def _matched(recording: PreparedFrames, i: int, j: int) -> MatchedPair:
     mutual = (back[best.indices] == rows) & (best.values > MIN_SIMILARITY)
     stride = recording.encoder.stride
     camera, other = recording.cell_camera(i), recording.cell_camera(j)
-    pixels = ideal_cell_pixels(camera, stride)[(rows[mutual] * STRIDE).numpy()]
+    rows = rows[mutual]
+    rows = rows[_distinct(similar[rows].float(), best.indices[rows], other, stride)]
+    pixels = ideal_cell_pixels(camera, stride)[(rows * STRIDE).numpy()]
     ray = camera.pinhole.unproject(pixels)
-    matched = ideal_cell_pixels(other, stride)[best.indices[mutual].numpy()].astype(np.float64)
+    matched = ideal_cell_pixels(other, stride)[best.indices[rows].numpy()].astype(np.float64)
     # Near the edge, the distortion can have no ray for a cell.
     valid = np.isfinite(ray).all(1) & np.isfinite(matched).all(1)
     return MatchedPair(i, j, ray[valid], matched[valid])
+
+
+def _distinct(similar: Tensor, best: Tensor, camera: Camera, stride: int) -> Tensor:
+    """(n,) matches without a similar cell elsewhere.
+
+    The similarities are (n, cells), and `best` (n,) are the matched cells of the camera's image.
+    """
+    centres = torch.tensor(ideal_cell_pixels(camera, stride), dtype=torch.float32)
+    apart = torch.cdist(centres[best], centres) > NEIGHBOURS * stride
+    second = similar.where(apart, -1.0).amax(1)
+    first = similar.gather(1, best[:, None])[:, 0]
+    return 1 - first < RATIO**2 * (1 - second)
 
 
 def _distance(recording: PreparedFrames, pair: MatchedPair) -> float:

@@ -208,6 +208,7 @@ def frame_to_dict(frame: MapFrame) -> dict[str, object]:
     return {
         "stated_camera_from_camera": frame.common.matrix().tolist(),
         "pose_sigma": list(frame.pose_sigma),
+        "frame_sigma": list(frame.frame_sigma),
         "base_from_map": None if similarity is None else similarity.base_from_map.matrix().tolist(),
         "scale": 1.0 if similarity is None else similarity.scale,
         "base_covariance": None if covariance is None else covariance.tolist(),
@@ -217,14 +218,15 @@ def frame_to_dict(frame: MapFrame) -> dict[str, object]:
 def frame_of(content: Mapping[str, object], correction: FrameCorrection | None) -> MapFrame:
     """The inverse of `frame_to_dict`."""
     base, covariance = content["base_from_map"], content["base_covariance"]
-    metres, radians = np.asarray(content["pose_sigma"], np.float64).tolist()
+    pose, shared = (np.asarray(content[key], np.float64) for key in ("pose_sigma", "frame_sigma"))
     similarity = None
     if base is not None:
         similarity = Similarity(SE3.from_matrix(np.asarray(base)), float(str(content["scale"])))
     return MapFrame(
         common=SE3.from_matrix(np.asarray(content["stated_camera_from_camera"])),
         correction=correction,
-        pose_sigma=(metres, radians),
+        pose_sigma=(float(pose[0]), float(pose[1])),
+        frame_sigma=(float(shared[0]), float(shared[1])),
         similarity=similarity,
         base_covariance=None if covariance is None else np.asarray(covariance, np.float64),
     )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.mapping.bundle_equations import BundleTracks
-from evercal.mapping.landmarks import UNIQUE_PX, Landmarks, detect, project_surface, reach, slopes
+from evercal.mapping.landmarks import Landmarks, detect, project_surface, slopes
 from evercal.mapping.patches import Patches, align_down, cut_patches, to_level, whitening
 from evercal.mapping.plane_sweep import (
     FAR_M,
@@ -52,8 +52,6 @@ LANDMARKS_PER_KEYFRAME = 200
 """Landmarks of a keyframe in bundle adjustment, at most."""
 BUNDLE_LANDMARKS = 6000
 """Landmarks of all keyframes in bundle adjustment, at most."""
-MIN_UNIQUE = 15
-"""Landmarks of a keyframe without repeated texture that bundle adjustment can do with."""
 MIN_SHARED = 0.15
 """Share of a keyframe's view that a frame tied to it must show."""
 FLOOR_PX = 0.1
@@ -116,9 +114,7 @@ def open_keyframe(recording: PreparedFrames, frame: int) -> KeyframeTracks:
     pyramid = recording.pyramid(frame)
     return KeyframeTracks(
         frame=frame,
-        landmarks=Landmarks(
-            pixels, inverse[cells], slant[cells], np.ones(len(cells)), reach(pyramid[1], pixels)
-        ),
+        landmarks=Landmarks(pixels, inverse[cells], slant[cells], np.ones(len(cells))),
         cell_inverse_depth=inverse,
         patches=tuple(
             cut_patches(pyramid[level], to_level(pixels, level)) for level in range(PYRAMID_LEVELS)
@@ -214,10 +210,6 @@ def _bundled(keyframe: KeyframeTracks, most: int) -> Index:
     which = np.flatnonzero(keyframe.confirmed)
     if len(which) < most // 2:
         which = np.arange(len(keyframe.landmarks))
-    # Poses may be off by more than a period of repeated texture.
-    unique = which[keyframe.landmarks.reach_px[which] >= UNIQUE_PX]
-    if len(unique) >= MIN_UNIQUE:
-        which = unique
     if len(which) > most:
         which = which[np.linspace(0, len(which) - 1, most).astype(int)]
     return which

@@ -12,6 +12,7 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.images import StoredImage, as_rgb, read_image
 
 MIN_TRAIN_FRAMES = 16  # posed training frames that a scene needs to be learned
+MIN_GRIPPER_FRAMES = 8  # the same for a camera on the gripper: a few views around one place
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,11 +16,14 @@ class HeldOutSplit:
 
     train: tuple[Frame, ...]
     held_out: tuple[Frame, ...]
-    """Frames that acceptance is fitted to: blocks of 4 in every 100, at least one block."""
+    """Frames that acceptance is fitted to: blocks of 4 in every 100, at least one block; none of a
+    recording with fewer than `MIN_TRAIN_FRAMES` frames."""
 
 
 def split_held_out(frames: Sequence[Frame]) -> HeldOutSplit:
     """Hold out blocks of training frames, in recorded order."""
+    if len(frames) < MIN_TRAIN_FRAMES:
+        return HeldOutSplit(tuple(frames), ())
     every = min(EVERY, len(frames))
     middle = every // 2
     held_out = [middle <= i % every < middle + BLOCK for i in range(len(frames))]
@@ -47,16 +50,16 @@ def named_recording(recording: Recording, name: str | None, taken: Iterable[str]
     return replace(recording, name=name)
 
 
-def require_frames(recording: Recording) -> None:
+def require_frames(recording: Recording, least: int = MIN_TRAIN_FRAMES) -> None:
     """Refuse a recording with too few training frames.
 
     Raises:
-        InputError: Fewer than `MIN_TRAIN_FRAMES`.
+        InputError: Fewer than `least`.
     """
-    if len(recording.train) < MIN_TRAIN_FRAMES:
+    if len(recording.train) < least:
         raise InputError(
             f"scene {recording.name!r}: {len(recording.train)} training frames are too few; give at"
-            f" least {MIN_TRAIN_FRAMES}"
+            f" least {least}"
         )
 
 
