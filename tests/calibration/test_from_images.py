@@ -12,6 +12,7 @@ import pytest
 from evercal.calibration.audit import audit
 from evercal.calibration.drift import check
 from evercal.calibration.from_images import Images, calibrate
+from evercal.calibration.from_images import _spots as spots_of
 from evercal.calibration.rig import rig_of
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
@@ -136,6 +137,21 @@ def test_camera_on_the_gripper(localizer: Localizer, hall: Recording) -> None:
     metres, _ = pose_distance(calibration.parent_from_child, gripper_from_camera)
     assert metres < 0.004
     assert metres < 4 * calibration.sigma_mm / 1000
+
+
+def test_fixed_camera_beside_a_moving_arm(localizer: Localizer, hall: Recording) -> None:
+    frame = hall.test[3]
+    images = [(str(i), frame.read_image()) for i in range(2)]
+    grippers = SE3.exp(np.random.default_rng(0).normal(0, 0.3, (2, 6)))
+    given = Images(images, frame.camera, grippers)
+    calibration = calibrate(localizer, given, "eye_to_hand")
+    assert calibration.parent_frame == "base"
+    assert pose_distance(calibration.parent_from_child, truth_of(frame))[0] < 0.004
+
+
+def test_spots_differ_in_position_or_rotation() -> None:
+    turned, away = SE3.exp([0, 0, 0, 0, 0, 0.5]), SE3.exp([0.5, 0, 0, 0, 0, 0])
+    assert spots_of([SE3.identity(), turned, away, SE3.identity()]).tolist() == [0, 1, 2, 0]
 
 
 def test_eye_in_hand_needs_a_pose_for_every_image(localizer: Localizer, hall: Recording) -> None:

@@ -25,8 +25,8 @@ class PoseEstimate:
     """The answer for one image; failure is a value, not an exception."""
 
     status: Literal["ok", "unknown_scene", "failed"]
-    """`unknown_scene`: a pose without enough support. `failed`: no pose, or a network's pose
-    outside the cell of its scene."""
+    """`unknown_scene`: a pose without enough support, or too uncertain to be useful. `failed`: no
+    pose, or a network's pose outside the cell of its scene."""
     reason: str
     """Why the status is not `ok`; empty otherwise."""
     scene: str | None
