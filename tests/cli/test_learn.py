@@ -90,10 +90,11 @@ def test_interrupt_leaves_no_map(rooms: Any, tmp_path: Path) -> None:
         assert process.stdout is not None
         assert process.stderr is not None
         assert process.stdout.readline().startswith("box-room-41: 24 training frames")
-        for _ in range(20):  # a signal that arrives inside a destructor is lost
+        # A signal inside a destructor is lost; a second one while Python ends kills the process.
+        for _ in range(5):
             process.send_signal(signal.SIGINT)
             with suppress(subprocess.TimeoutExpired):
-                process.wait(timeout=3)
+                process.wait(timeout=20)
                 break
         assert process.returncode == 130
         messages = process.stderr.read()
