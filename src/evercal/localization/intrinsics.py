@@ -45,6 +45,11 @@ STATED = IntrinsicsPrior(focal=2e-3, centre=2e-3, k1=5e-3, k2=5e-3)
 """Intrinsics that the user states."""
 UNKNOWN = IntrinsicsPrior(focal=0.3, centre=0.05, k1=0.1, k2=0.05)
 """Any camera; the image may be cropped."""
+TOLERATED = np.array([0.01, 0.01, 0.01])
+"""Changes of focal length and principal point, as shares of the focal length and of the longer
+side. Smaller ones of the recording's own camera are errors of the map and not of the camera: to
+follow them costs a third of the precision on a real recording with distortion
+(docs/experiments/intrinsics.md)."""
 FREE = IntrinsicsPrior(focal=1.0, centre=0.3, k1=0.3, k2=0.3)
 """Wide enough to test the other priors."""
 FOCAL_FACTORS = (0.7, 0.84, 1.0, 1.2, 1.44)
@@ -66,5 +71,8 @@ class Prior:
     def tested(self, camera: Camera, change: Array, variance: Array) -> Array:
         """(5,) variances: those of the prior, wider where an estimate contradicts it."""
         tight = self.sigma.variances(camera)
+        side = max(camera.width, camera.height)
+        if self.sigma is OWN and (np.abs(change[:3]) < TOLERATED * [1, side, side]).all():
+            return tight / self.scale
         excess = change**2 - DOUBT * (self.scale * variance + tight)
         return (tight + np.maximum(excess, 0)) / self.scale
