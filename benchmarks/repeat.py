@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from benchmarks.accuracy import Row
 from evercal.errors import InputError
+from evercal.evaluation.metrics import CHI2_6
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance_mm_deg
 from evercal.map import Map
 from evercal.recordings import Frame, Recording
@@ -70,12 +71,12 @@ def summary(mounts: list[Row], located: list[Row]) -> Row:
         "mounts": len(mounts),
         "refused": len(mounts) - len(found),
         "median mm": float(np.median([float(row["mm"]) for row in found] or [np.inf])),
-        "in ellipsoid": sum(float(row["squared"]) < 12.6 for row in found),
+        "in ellipsoid": sum(float(row["squared"]) < CHI2_6 for row in found),
         "images": len(located),
         "located": len(good),
         "median mm of images": float(np.median(errors)),
         "wrong": int(((errors > WRONG_MM) & (squares > WRONG_SIGMAS**2)).sum()),
-        "images in ellipsoid": float((squares < 12.6).mean()),
+        "images in ellipsoid": float((squares < CHI2_6).mean()),
     }
 
 
