@@ -196,7 +196,11 @@ class Map:
                 from evercal.localization.fewest_keyframes import fewest_keyframes
 
                 built = built.take(fewest_keyframes(contents, built, split.train, on_progress))
-            scene = fit_acceptance(contents.with_scene(built.scene), split.held_out)
+            scene = fit_acceptance(
+                contents.with_scene(built.scene),
+                built.corrected(split.held_out),
+                noise=built.independent_noise,
+            )
             report = LearnReport(
                 scene=scene.name,
                 seconds=time.perf_counter() - began,

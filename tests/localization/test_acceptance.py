@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from evercal.localization.acceptance import (
     MIN_SUPPORT,
     accepted,
     fit_acceptance,
+    scatter,
     support,
     widened,
 )
@@ -103,3 +104,30 @@ def test_only_the_given_scene_is_fitted(hall: Recording, hall_map: MapContents) 
     scene = fit_acceptance(both, hall.test[::20], index=0)
     assert scene.name == "hall"
     assert [other.min_support for other in both.scenes] == [hall_map.scenes[0].min_support, 0.3]
+
+
+def test_shared_errors_of_held_out_poses_widen_the_stated_frame(
+    hall: Recording, hall_map: MapContents
+) -> None:
+    def off(frames: Sequence[Frame], metres: float) -> list[Frame]:
+        shift = SE3.exp([metres, 0, 0, 0, 0, 0])
+        stated = [(frame, frame.base_from_camera) for frame in frames]
+        return [replace(f, base_from_camera=shift @ pose) for f, pose in stated if pose is not None]
+
+    held_out = hall.test[::10]
+    assert fit_acceptance(hall_map, held_out).frame.frame_sigma == (0.0, 0.0)
+    metres, radians = fit_acceptance(hall_map, off(held_out, 0.02)).frame.frame_sigma
+    assert 0.005 < metres < 0.015
+    assert radians == 0.0
+    # Independent noise of stated poses is no error of an answer.
+    noisy = fit_acceptance(hall_map, off(held_out, 0.02), noise=(0.02, 0.0))
+    assert noisy.frame.frame_sigma == (0.0, 0.0)
+
+
+def test_scatter_restores_the_distribution() -> None:
+    rng = np.random.default_rng(0)
+    covariances = np.stack([np.diag(rng.uniform(0.5, 2, 3)) for _ in range(2000)])
+    own = np.sqrt(np.einsum("nii->ni", covariances)) * rng.normal(size=(2000, 3))
+    errors = own + 3 * rng.normal(size=(2000, 3))
+    assert scatter(errors, covariances) == pytest.approx(3.0, rel=0.05)
+    assert scatter(0.9 * own, covariances) == 0.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,9 +13,10 @@ from evercal.features.vlad import vlad_for
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.mapping.pose_check import (
+    MatchedPair,
     _distinct,
     _segment_distance,
-    contradicting_frames,
+    check_poses,
     depth_scale,
     matched_pairs,
 )
@@ -39,7 +42,9 @@ def moved(recording: PreparedFrames, changes: dict[int, SE3]) -> PreparedFrames:
 
 def detected(recording: PreparedFrames) -> list[int]:
     pairs = matched_pairs(recording, vlad_for(recording.encoder))
-    return contradicting_frames(recording, pairs).tolist()
+    check = check_poses(recording, pairs)
+    assert len(check.untracked) == 0
+    return check.wrong.tolist()
 
 
 def test_right_poses_are_consistent(recording: PreparedFrames) -> None:
@@ -71,7 +76,7 @@ def test_depth_scale_is_that_of_the_recording(scale: float, recording: PreparedF
     scaled.adjust(SE3(poses.rotation_wxyz, scale * poses.translation_m), None)
     scaled.depth_scale = depth_scale(scaled, pairs)
     assert 0.3 * scale < scaled.depth_scale < 3 * scale
-    assert contradicting_frames(scaled, pairs).tolist() == []
+    assert check_poses(scaled, pairs).excluded.tolist() == []
 
 
 def test_small_pose_errors_are_accepted(recording: PreparedFrames) -> None:
@@ -110,3 +115,21 @@ def test_cells_with_a_similar_cell_elsewhere_are_not_distinct() -> None:
     similar[1, [1, 2]] = torch.tensor([0.9, 0.89])  # the neighbour shows the same place
     similar[2, [1, 6]] = torch.tensor([0.9, 0.89])
     assert _distinct(similar, torch.tensor([1, 1, 1]), camera, 8).tolist() == [True, True, False]
+
+
+def test_sift_clears_frames_that_the_encoder_suspects(
+    recording: PreparedFrames, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def suspicious(frames: PreparedFrames) -> list[MatchedPair]:
+        pairs = matched_pairs(frames, vlad_for(frames.encoder))
+        shift = np.array([60.0, 0.0])  # the encoder mistakes one square for another
+        return [
+            replace(p, pixels=p.pixels + shift) if 6 in (p.first, p.second) else p for p in pairs
+        ]
+
+    assert check_poses(recording, suspicious(recording)).excluded.tolist() == []
+    far = moved(recording, {6: SE3.exp(np.array([0, 0.3, 0, 0, 0, 0]))})
+    assert check_poses(far, suspicious(far)).wrong.tolist() == [6]
+    monkeypatch.setattr("evercal.mapping.pose_check.epipolar_pair", lambda *_: None)
+    check = check_poses(recording, suspicious(recording))
+    assert (check.wrong.tolist(), check.untracked.tolist()) == ([], [6])

@@ -26,9 +26,10 @@ from scipy.spatial.transform import Rotation
 from evercal.errors import InputError
 from evercal.features.encode import encode_features
 from evercal.features.encoder import Encoder
+from evercal.features.sift import epipolar_pair, sift_features
 from evercal.features.views import ViewOptions, plain_view, working_image
 from evercal.features.vlad import vlad_for
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3
 from evercal.mapping.build import OnProgress
 from evercal.mapping.selection import spread_poses
 from evercal.recordings.frame import Frame
@@ -38,10 +39,6 @@ Array = NDArray[np.float64]
 
 FRAMES, PARTNERS = 120, 6
 """Maximum number of frames, and number of most similar frames that each is matched to."""
-FEATURES, CONTRAST, RATIO = 1500, 0.01, 0.85
-"""SIFT features of an image, their contrast, and the ratio of distances in Lowe's test."""
-EPIPOLAR_PX, MIN_INLIERS = 1.0, 20
-"""Distance of a match from its epipolar line, and matches of a pair of frames."""
 ANGLE_DEG, ROTATION_DEG, DIRECTION_DEG = 3.0, 5.0, 10.0
 """Largest difference of the rotation angles, the rotations and the directions of a pair."""
 MATCHES_PER_PAIR = 150
@@ -266,70 +263,17 @@ def _pair_motions(
     pairs = sorted({(min(i, j), max(i, j)) for i, row in enumerate(nearest) for j in row})
     motions: list[PairMotion] = []
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        points = list(pool.map(lambda image: _sift(image), images))
-        jobs = pool.map(lambda pair: _motion(pair, points, cameras), pairs)
-        for done, motion in enumerate(jobs, start=1):
+        points = list(pool.map(sift_features, images))
+
+        def motion_of(pair: tuple[int, int]) -> PairMotion | None:
+            i, j = pair
+            found = epipolar_pair(points[i], points[j], cameras[i], cameras[j])
+            if found is None:
+                return None
+            some = found.rays[:, :: 1 + found.rays.shape[1] // MATCHES_PER_PAIR]
+            return PairMotion(i, j, found.rotation, found.direction, some, cameras[j].fx)
+
+        for done, motion in enumerate(pool.map(motion_of, pairs), start=1):
             motions += [motion] if motion is not None else []
             on_progress("matching", done, len(pairs))
     return motions
-
-
-def _sift(image: NDArray[np.uint8]) -> tuple[Array, NDArray[np.float32]]:
-    """Pixels (n, 2) and descriptors (n, 128) of unit length, RootSIFT (Arandjelovic, CVPR 2012)."""
-    import cv2
-
-    sift = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=CONTRAST)
-    points, descriptors = sift.detectAndCompute(image, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
-    if not points:
-        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
-    shares = descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
-    return np.array([point.pt for point in points]), np.sqrt(shares)
-
-
-def _ideal(camera: Camera) -> dict[str, object]:
-    """The camera without distortion and principal point, for PoseLib."""
-    return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [camera.fx, 0.0, 0.0]}
-
-
-def _motion(
-    pair: tuple[int, int],
-    features: list[tuple[Array, NDArray[np.float32]]],
-    cameras: list[Camera],
-) -> PairMotion | None:
-    import poselib
-
-    (pixels_a, a), (pixels_b, b) = (features[i] for i in pair)
-    if min(len(a), len(b)) < MIN_INLIERS:
-        return None
-    similar = a @ b.T
-    best = similar.argmax(1)
-    rows = np.arange(len(a))
-    top = similar[rows, best].copy()
-    mutual = similar.argmax(0)[best] == rows
-    similar[rows, best] = -1
-    second = similar.max(1)
-    distinct = np.maximum(2 - 2 * top, 0) < RATIO**2 * np.maximum(2 - 2 * second, 1e-9)
-    good = mutual & distinct
-    if good.sum() < MIN_INLIERS:
-        return None
-    # Undistorted here, so that PoseLib needs no camera model.
-    first, second = (cameras[i] for i in pair)
-    ideal_a = first.unproject(pixels_a[good])[:, :2] * first.fx
-    ideal_b = second.unproject(pixels_b[best[good]])[:, :2] * second.fx
-    valid = np.isfinite(ideal_a + ideal_b).all(1)
-    pose, info = poselib.estimate_relative_pose(
-        ideal_a[valid],
-        ideal_b[valid],
-        _ideal(first),
-        _ideal(second),
-        {"max_epipolar_error": EPIPOLAR_PX},
-        {},
-    )
-    if info["num_inliers"] < MIN_INLIERS:
-        return None
-    direction = np.asarray(pose.t) / max(float(np.linalg.norm(pose.t)), 1e-12)
-    inliers = np.flatnonzero(np.asarray(info["inliers"], bool))
-    inliers = inliers[:: 1 + len(inliers) // MATCHES_PER_PAIR]
-    plane = np.stack([ideal_a[valid][inliers] / first.fx, ideal_b[valid][inliers] / second.fx])
-    rays = np.concatenate([plane, np.ones((2, len(inliers), 1))], 2)
-    return PairMotion(*pair, Rotation.from_matrix(pose.R), direction, rays, second.fx)

@@ -127,13 +127,14 @@ def _adjusted_table(scenes: Sequence[dict[str, Any]]) -> str:
                 f"{adjusted['pose_sigma_mm']:.2f} mm, {adjusted['pose_sigma_deg']:.3f} deg",
                 f"{shift:.2f} mm, {rotation:.3f} deg",
                 f"{adjusted['focal_percent']:+.2f} %",
-                f"{len(adjusted['wrong_poses'])} left out",
+                str(len(adjusted["wrong_poses"])),
+                str(len(adjusted.get("untracked", ()))),
             ]
         )
     if not rows:
         return ""
     header = ["bundle adjustment", "median residual", "error of stated poses", "common transform"]
-    return "\n" + _table([*header, "focal length", "wrong poses"], rows)
+    return "\n" + _table([*header, "focal length", "wrong poses", "untracked"], rows)
 
 
 def _pixels(value: float | None) -> str:

@@ -223,6 +223,8 @@ def adjusted_lines(adjusted: "Adjusted") -> list[str]:
         lines.append(
             f"warning: poses that contradict the images, left out: {_few(adjusted.wrong_poses)}"
         )
+    if adjusted.untracked:
+        lines.append(f"untracked images, left out: {_few(adjusted.untracked)}")
     if adjusted.doubtful_poses:
         lines.append(f"warning: poses with large errors: {_few(adjusted.doubtful_poses)}")
     return lines

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evercal.geometry import SE3
 
-Status = Literal["ok", "unknown_scene", "failed"]
+Status = Literal["ok", "ambiguous", "unknown_scene", "failed"]
 
 COARSE = (0.05, math.radians(5.0))
 """5 cm and 5 deg, the threshold of the indoor benchmarks, in metres and radians."""
@@ -88,7 +88,7 @@ class SceneScores:
     wrong_scene: float
     """Per cent of frames with a pose in another scene."""
     unknown: float
-    """Per cent of frames with status `unknown_scene`."""
+    """Per cent of frames with status `unknown_scene` or `ambiguous`."""
     near_training_frame: float
     """Per cent of frames with a training frame within 5 cm and 5 deg."""
     inside_95: float = math.nan
@@ -263,7 +263,7 @@ def _scene_scores(rows: list[FrameResult]) -> SceneScores:
         median_translation_cm=100.0 * sorted(row.translation_error_m for row in rows)[middle],
         median_rotation_deg=math.degrees(sorted(row.rotation_error_rad for row in rows)[middle]),
         wrong_scene=_percent([row.wrong_scene for row in rows]),
-        unknown=_percent([row.status == "unknown_scene" for row in rows]),
+        unknown=_percent([row.status in ("unknown_scene", "ambiguous") for row in rows]),
         near_training_frame=_percent([row.near_training_frame for row in rows]),
         inside_95=share_inside([row.squared_mahalanobis for row in rows]),
     )

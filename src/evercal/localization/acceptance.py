@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from evercal.geometry import UncertainPose, pose_distance
+from evercal.geometry import SE3, UncertainPose, pose_distance
 from evercal.localization.estimate import CovarianceTerm
 from evercal.localization.query import Hypothesis
 from evercal.mapping.scene_map import MapContents, SceneMap
@@ -34,6 +34,8 @@ COVARIANCE_SCALE = 1.6
 training frames that are no keyframes (docs/experiments/map.md)."""
 USELESS_M = 0.05
 """Answers with a larger standard deviation of the position per axis are rejected."""
+APART_SIGMAS, APART_M, APART_RAD = 5.0, 0.01, np.deg2rad(1.0)
+"""Poses that differ by less are the same answer."""
 FULL_SUPPORT = 4.0
 """Poses with less support get a wider covariance (docs/experiments/map.md): few landmarks lie on
 few surfaces, so their errors are correlated."""
@@ -73,6 +75,14 @@ def widened(hypothesis: Hypothesis, scene: SceneMap) -> UncertainPose:
     return UncertainPose(hypothesis.pose.pose, scale * hypothesis.pose.covariance)
 
 
+def differ(hypothesis: Hypothesis, other: SE3, scene: SceneMap) -> bool:
+    """Whether another pose, map_from_camera, is outside the uncertainty of an accepted one."""
+    own = widened(hypothesis, scene)
+    metres, radians = pose_distance(own.pose, other)
+    far = metres > APART_M or radians > APART_RAD
+    return bool(far and own.squared_mahalanobis(other) > APART_SIGMAS**2)
+
+
 def in_base(
     hypothesis: Hypothesis, scene: SceneMap
 ) -> tuple[UncertainPose, tuple[CovarianceTerm, ...]]:
@@ -101,26 +111,77 @@ def in_base(
     )
 
 
-def fit_acceptance(contents: MapContents, held_out: Sequence[Frame], index: int = -1) -> SceneMap:
-    """Fit the threshold of a scene to frames that its map was not built from.
+def fit_acceptance(
+    contents: MapContents,
+    held_out: Sequence[Frame],
+    index: int = -1,
+    noise: tuple[float, float] = (0.0, 0.0),
+) -> SceneMap:
+    """Fit threshold and covariance of a scene to frames that its map was not built from.
 
     The scene is the newest by default. Its threshold is half of the 5 % quantile of the support of
-    well-located frames, between `MIN_SUPPORT` and `MAX_SUPPORT`.
+    well-located frames, between `MIN_SUPPORT` and `MAX_SUPPORT`. The scatter of the stated frame is
+    as large as the errors of these frames ask for. `noise` is the standard deviation of stated
+    poses per axis, metres and radians, that is independent from frame to frame: it averages out in
+    the map and is no error of an answer.
     """
     from evercal.geometry.near import NEAR_M, NEAR_RAD
     from evercal.localization.localizer import Localizer
 
     scenes = list(contents.scenes)
-    scenes[index] = replace(scenes[index], min_support=MIN_SUPPORT)
+    shared = scenes[index].frame.frame_sigma
+    bare = replace(scenes[index].frame, frame_sigma=(0.0, 0.0))
+    scenes[index] = replace(
+        scenes[index], frame=bare, min_support=MIN_SUPPORT, covariance_scale=COVARIANCE_SCALE
+    )
     localizer = Localizer(replace(contents, scenes=scenes))
-    supports = []
+    supports, errors, covariances = [], [], []
     for frame in held_out:
         estimate = localizer.localize(frame.read_image(), localizer.camera_for(frame.camera))
-        if estimate.base_from_camera is None or frame.base_from_camera is None:
+        pose, stated = estimate.uncertain_pose, frame.base_from_camera
+        if pose is None or stated is None:
             continue
-        metres, radians = pose_distance(estimate.base_from_camera, frame.base_from_camera)
+        metres, radians = pose_distance(pose.pose, stated)
         if metres < NEAR_M and radians < NEAR_RAD:
             supports.append(estimate.support)
+        turn = (pose.pose.inverse() @ stated).log()[3:]
+        errors.append(np.r_[stated.translation_m - pose.pose.translation_m, turn])
+        covariances.append(pose.covariance)
     low = float(np.quantile(supports, 0.05)) if supports else 2 * MAX_SUPPORT
     threshold = min(max(low / 2, MIN_SUPPORT), MAX_SUPPORT)
-    return replace(scenes[index], min_support=threshold, covariance_scale=COVARIANCE_SCALE)
+    sigma = shared
+    if errors:
+        off, spread = np.array(errors), np.array(covariances)
+        spread = spread + np.diag(np.repeat(np.square(noise), 3))
+        metres, radians = (
+            max(known, scatter(off[:, part], spread[:, part, part]))
+            for known, part in zip(shared, (slice(0, 3), slice(3, 6)), strict=True)
+        )
+        sigma = metres, radians
+    frame = replace(bare, frame_sigma=sigma)
+    return replace(scenes[index], frame=frame, min_support=threshold)
+
+
+def scatter(errors: np.ndarray, covariances: np.ndarray) -> float:
+    """Smallest standard deviation per axis that makes errors fit their covariances.
+
+    Errors are (n, 3), covariances (n, 3, 3). With the variance added to every axis, 90 % of the
+    squared Mahalanobis distances are below the 90 % quantile of their distribution. It is 0 where
+    they are without it.
+    """
+    from scipy.optimize import brentq
+    from scipy.stats import chi2
+
+    values, axes = np.linalg.eigh(covariances)
+    squares = np.einsum("nji,nj->ni", axes, errors) ** 2
+    limit = float(chi2.ppf(0.9, 3))
+
+    def excess(sigma: float) -> float:
+        distances = (squares / (values + sigma**2)).sum(1)
+        # Few frames: a quantile between two of them would follow the worst one.
+        return float(np.quantile(distances, 0.9, method="lower")) - limit
+
+    if excess(0.0) <= 0:
+        return 0.0
+    largest = 2 * float(np.sqrt(squares.sum(1).max()))
+    return float(brentq(excess, 0.0, largest))  # pyright: ignore[reportArgumentType]

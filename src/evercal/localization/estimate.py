@@ -24,9 +24,10 @@ class CovarianceTerm:
 class PoseEstimate:
     """The answer for one image; failure is a value, not an exception."""
 
-    status: Literal["ok", "unknown_scene", "failed"]
-    """`unknown_scene`: a pose without enough support, or too uncertain to be useful. `failed`: no
-    pose, or a network's pose outside the cell of its scene."""
+    status: Literal["ok", "ambiguous", "unknown_scene", "failed"]
+    """`ambiguous`: two poses explain the image, see `alternatives`. `unknown_scene`: a pose without
+    enough support, or too uncertain to be useful. `failed`: no pose, or a network's pose outside
+    the cell of its scene."""
     reason: str
     """Why the status is not `ok`; empty otherwise."""
     scene: str | None
@@ -49,6 +50,8 @@ class PoseEstimate:
     """Intrinsics that the pose holds for, at the size of the image; None for networks."""
     terms: tuple[CovarianceTerm, ...] = ()
     """Shares that sum to the covariance; empty for networks."""
+    alternatives: tuple[SE3, ...] = ()
+    """The poses base_from_camera of an ambiguous image, the one with the most support first."""
     support: float = 0.0
     """Support of the pose, see `localization.acceptance`."""
 

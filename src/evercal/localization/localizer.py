@@ -20,11 +20,18 @@ from evercal.features.device import device_of
 from evercal.features.encode import encode_features
 from evercal.features.encoder import Encoder
 from evercal.features.views import ViewOptions, plain_view
-from evercal.geometry import SE3, Camera, resize_pixels
+from evercal.geometry import (
+    SE3,
+    Camera,
+    UncertainPose,
+    pose_distance_mm_deg,
+    resize_pixels,
+)
 from evercal.localization.acceptance import (
     USELESS_M,
     accepted,
     better,
+    differ,
     in_base,
     rejection,
     support,
@@ -218,7 +225,8 @@ class Localizer:
             tuple(prior_of(camera, image, stated) for stated in recorded),
         )
         best = self._best_hypothesis(query, cameras)
-        return self._answer(query, best, 1000 * (time.perf_counter() - began))
+        rival = self._rival(query, best, cameras) if self._accepted(best) else None
+        return self._answer(query, best, rival, 1000 * (time.perf_counter() - began))
 
     def localize_batch(
         self, images: Sequence[np.ndarray], cameras: Sequence[Camera | None]
@@ -293,12 +301,17 @@ class Localizer:
         return best
 
     def _hypothesis(
-        self, query: Query, candidate: Candidate, camera: Camera, near: Hypothesis | None = None
+        self,
+        query: Query,
+        candidate: Candidate,
+        camera: Camera,
+        near: Hypothesis | None = None,
+        matches: Matches | None = None,
     ) -> Hypothesis:
-        """A pose in one scene: match, PnP, align."""
+        """A pose in one scene: match, PnP, align; `matches` are used instead of new ones."""
         scene = self.contents.scenes[candidate.scene]
         sigma = UNKNOWN if candidate.unknown_camera else query.priors[candidate.scene]
-        rough = self._rough(query, candidate, camera, sigma, near)
+        rough = self._rough(query, candidate, camera, sigma, near, matches)
         if rough is None:
             return Hypothesis(candidate.scene)
         if not self.options.align:
@@ -329,6 +342,8 @@ class Localizer:
             aligned.matched,
             aligned.planned,
             inliers,
+            candidate,
+            rough.matches,
         )
 
     def _rough(
@@ -338,6 +353,7 @@ class Localizer:
         camera: Camera,
         sigma: IntrinsicsPrior,
         near: Hypothesis | None,
+        matches: Matches | None = None,
     ) -> _Rough | None:
         """Pose and focal length by PnP."""
         refined = near.refined if near is not None else None
@@ -346,7 +362,7 @@ class Localizer:
         now = changed_camera(camera.resized(width, height), change)
         small = now.short_side_resized(self.contents.short_side)
         where = None if near is None or near.pose is None else near.pose.pose
-        matches = self._matches(query, candidate, small, where)
+        matches = matches or self._matches(query, candidate, small, where)
         best: _Rough | None = None
         for factor in FOCAL_FACTORS if sigma is UNKNOWN and near is None else (1.0,):
             tried = small.zoomed(factor)
@@ -361,10 +377,33 @@ class Localizer:
         """2D-3D matches in one scene, at the encoder's working size."""
         return self._matcher.matches(query, candidate, camera, near)
 
+    def _rival(self, query: Query, best: Hypothesis, cameras: Sequence[Camera]) -> SE3 | None:
+        """Another pose in the same scene, map_from_camera, that explains the image nearly as well.
+
+        Repeated texture matches in several places. The matches that an accepted pose leaves over
+        then agree on a second pose.
+        """
+        if best.pose is None or best.refined is None:
+            return None
+        assert best.candidate is not None and best.matches is not None, "the pose is aligned"
+        small = best.refined.camera.short_side_resized(self.contents.short_side)
+        rest = best.matches.beside(small, best.pose.pose, self.options.rival_px)
+        if len(rest.pixels) < self.options.aligned_inliers:
+            return None
+        camera = cameras[best.scene]
+        rival = self._hypothesis(query, best.candidate, camera, None, rest)
+        if rival.refined is None or rival.pose is None:
+            return None
+        enough = support(rival) >= self.options.rival_support * support(best)
+        scene = self.contents.scenes[best.scene]
+        return rival.pose.pose if enough and differ(best, rival.pose.pose, scene) else None
+
     def _accepted(self, hypothesis: Hypothesis, times: float = 1.0) -> bool:
         return accepted(hypothesis, self.contents.scenes[hypothesis.scene], times)
 
-    def _answer(self, query: Query, best: Hypothesis, milliseconds: float) -> PoseEstimate:
+    def _answer(
+        self, query: Query, best: Hypothesis, rival: SE3 | None, milliseconds: float
+    ) -> PoseEstimate:
         scene = self.contents.scenes[best.scene]
         if best.pose is None or not self._accepted(best):
             failed = best.pose is None
@@ -374,6 +413,16 @@ class Localizer:
                 reason="fewer than 6 inliers" if failed else rejection(best, scene),
             )
         estimate, terms = in_base(best, scene)
+        if rival is not None:
+            other = scene.frame.to_base(UncertainPose(rival, np.zeros((6, 6)))).pose
+            mm, deg = pose_distance_mm_deg(estimate.pose, other)
+            return replace(
+                self._rejected(best, milliseconds),
+                status="ambiguous",
+                reason=f"another pose, {mm:.0f} mm and {deg:.1f} deg away, explains it as well",
+                scene=scene.name,
+                alternatives=(estimate.pose, other),
+            )
         if estimate.sigma_mm > 1000 * USELESS_M:
             return replace(
                 self._rejected(best, milliseconds),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evercal.features.views import working_image
-from evercal.geometry import Camera, UncertainPose
+from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.localization.alignment import AlignmentOptions
 from evercal.localization.intrinsics import IntrinsicsPrior
 from evercal.localization.pnp import PnpOptions
@@ -55,6 +55,11 @@ class LocalizeOptions:
     beside the true pose: guided matching, PnP and alignment repeat while the support rises."""
     guided_gain: float = 1.1
     """Factor by which guided matching must raise the support to go on."""
+    rival_px: float = 16.0
+    """A second pose is sought among matches that the first one misses by more than this, pixels at
+    the encoder's working size."""
+    rival_support: float = 0.5
+    """An image with a second pose of this share of the first one's support is ambiguous."""
     guided_px: float = 32.0
     """Search radius of guided matching, pixels at the encoder's working size."""
     keyframes: int = 6
@@ -136,6 +141,16 @@ class Matches:
     points_m: np.ndarray
     """(m, 3) in the scene's frame."""
 
+    def beside(self, camera: Camera, pose: SE3, px: float) -> "Matches":
+        """Matches that lie farther than `px` from where a pose projects their points.
+
+        The camera is of the size of the matches' pixels, the pose map_from_camera.
+        """
+        projected = camera.pinhole.project(pose.inverse().apply(self.points_m))
+        off = np.linalg.norm(projected - self.pixels, axis=1)
+        rest = ~(off < px)  # points behind the camera have no projection
+        return Matches(self.pixels[rest], self.points_m[rest])
+
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
@@ -160,6 +175,10 @@ class Hypothesis:
 
     pnp_inliers: int = 0
     """Matches that agree with the pose before alignment."""
+    candidate: Candidate | None = None
+    """Keyframes that it was found with; None where alignment failed."""
+    matches: Matches | None = None
+    """All matches; None where alignment failed."""
 
     @property
     def inliers(self) -> int:

@@ -23,7 +23,7 @@ from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.map_frame import MapFrame, fit_correction, shared_sigma
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.pose_check import (
-    contradicting_frames,
+    check_poses,
     depth_scale,
     matched_pairs,
 )
@@ -105,6 +105,8 @@ class Adjusted:
     """Delay of the images after their stated poses."""
     wrong_poses: tuple[str, ...]
     """Frames whose stated pose contradicts the images; they are excluded."""
+    untracked: tuple[str, ...]
+    """Frames that could not be tracked in other images; they are excluded."""
     doubtful_poses: tuple[str, ...]
     """Frames whose stated pose has an unusually large error; they were given less weight."""
 
@@ -131,6 +133,27 @@ class BuiltMap:
     """Names of the frames that are keyframes."""
     hand_eye: HandEyeCorrection | None = None
     """Adjustment of `gripper_from_camera`; None where camera poses were stated."""
+
+    @property
+    def independent_noise(self) -> tuple[float, float]:
+        """Standard deviation of stated poses per axis that neighbouring frames do not share."""
+        stated = self.adjusted.pose_sigma_mm / 1000, np.deg2rad(self.adjusted.pose_sigma_deg)
+        metres, radians = (
+            0.0 if shared else float(sigma)
+            for sigma, shared in zip(stated, self.scene.frame.frame_sigma, strict=True)
+        )
+        return metres, radians
+
+    def corrected(self, frames: Sequence[Frame]) -> list[Frame]:
+        """Other frames of the recording, with the adjusted `gripper_from_camera`."""
+        if self.hand_eye is None:
+            return list(frames)
+        change = self.hand_eye.start_camera_from_camera
+        return [
+            replace(frame, base_from_camera=frame.base_from_camera @ change)
+            for frame in frames
+            if frame.base_from_camera is not None
+        ]
 
     def take(self, index: NDArray[np.int64]) -> "BuiltMap":
         """The same map with a subset of its keyframes."""
@@ -174,7 +197,9 @@ class _Prepared:
     keyframes: list[int]
     """Numbers of the keyframes."""
     wrong: tuple[str, ...]
-    """Names of the excluded frames."""
+    """Names of frames whose stated pose contradicts the images."""
+    untracked: tuple[str, ...]
+    """Names of frames that could not be tracked."""
 
 
 def _prepare(
@@ -190,16 +215,18 @@ def _prepare(
         on_progress("encoding", i + 1, len(prepared))
     pairs = matched_pairs(prepared, vlad_for(encoder, features))
     prepared.depth_scale = depth_scale(prepared, pairs)
-    bad = contradicting_frames(prepared, pairs)
-    wrong = tuple(prepared.frames[i].name for i in bad)
-    good = sorted(set(range(len(support))) - set(bad.tolist()))
-    if len(bad):
-        prepared = prepared.without(bad)
+    check = check_poses(prepared, pairs)
+    wrong, untracked = (
+        tuple(prepared.frames[i].name for i in part) for part in (check.wrong, check.untracked)
+    )
+    good = sorted(set(range(len(support))) - set(check.excluded.tolist()))
+    if len(check.excluded):
+        prepared = prepared.without(check.excluded)
     start = [new for new, old in enumerate(good) if support[old] in wanted]
     # Other frames replace excluded keyframes.
     positions, rotations = prepared.stated.translation_m, prepared.stated.rotation_wxyz
     keyframes = select_farthest(positions, rotations, len(wanted), start=start)
-    return _Prepared(prepared, keyframes.tolist(), wrong)
+    return _Prepared(prepared, keyframes.tolist(), wrong, untracked)
 
 
 def spread_frames(frames: Sequence[Frame], capacity: int) -> NDArray[np.int64]:
@@ -325,7 +352,7 @@ def _finish(
             frame=frame,
             train_frames=len(frames),
         ),
-        _adjusted(frames, adjustment, camera, prepared.wrong),
+        _adjusted(prepared, adjustment, camera),
         tuple(frames.frames[i].name for i in numbers),
         hand_eye,
     )
@@ -343,12 +370,11 @@ def _keyframes(frames: PreparedFrames, tracks: list[KeyframeTracks]) -> Keyframe
     )
 
 
-def _adjusted(
-    frames: PreparedFrames, adjustment: Adjustment | None, camera: Camera, wrong: tuple[str, ...]
-) -> Adjusted:
+def _adjusted(prepared: _Prepared, adjustment: Adjustment | None, camera: Camera) -> Adjusted:
+    frames, wrong, untracked = prepared.frames, prepared.wrong, prepared.untracked
     if adjustment is None:
         zero = (0.0, 0.0, 0.0)
-        return Adjusted(zero, zero, 0.0, None, 0.0, 0.0, 0.0, wrong, ())
+        return Adjusted(zero, zero, 0.0, None, 0.0, 0.0, 0.0, wrong, untracked, ())
     tangent = adjustment.common.log()
     shift, rotation = 1000 * tangent[:3], np.rad2deg(tangent[3:])
     doubtful = np.flatnonzero(adjustment.weight < 0.25)
@@ -361,5 +387,6 @@ def _adjusted(
         pose_sigma_deg=float(np.rad2deg(adjustment.sigma_rad)),
         time_shift_frames=adjustment.shift_frames,
         wrong_poses=wrong,
+        untracked=untracked,
         doubtful_poses=tuple(frames.frames[i].name for i in doubtful),
     )

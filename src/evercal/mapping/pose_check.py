@@ -3,8 +3,12 @@
 Similar frames show the same surfaces. A cell of one then matches a cell of the other that lies on
 the segment of its viewing ray between the nearest and the farthest depth. If most matches do not,
 one of the two poses is wrong: the one that contradicts most of its partners.
+
+The encoder mistakes one square of a chessboard for another, so this is only a suspicion. SIFT and
+an essential matrix decide: they confirm the pose, contradict it, or cannot track the frame.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evercal.features.precision import fast_bfloat16
+from evercal.features.sift import SiftFeatures, epipolar_pair, sift_features
 from evercal.features.views import ideal_cell_pixels
 from evercal.features.vlad import Vlad
 from evercal.geometry import Camera
@@ -31,6 +36,8 @@ PARTNERS = 5
 MAX_DISTANCE_PX = 6.0
 """Largest median distance of matches from their segments in a consistent pair, pixels
 at the encoder's working size."""
+MAX_SIFT_PX = 3.0
+"""The same for SIFT matches, which are more exact."""
 MIN_SIMILARITY = 0.6
 """Smallest cosine of matched features."""
 MIN_MATCHES = 30
@@ -55,6 +62,21 @@ class MatchedPair:
     """(n, 2) in the second, at working size."""
 
 
+@dataclass(frozen=True, eq=False)
+class PoseCheck:
+    """Frames that are not used."""
+
+    wrong: NDArray[np.int64]
+    """Their stated pose contradicts the images."""
+    untracked: NDArray[np.int64]
+    """Their images neither confirm nor contradict the stated pose."""
+
+    @property
+    def excluded(self) -> NDArray[np.int64]:
+        """All of them."""
+        return np.union1d(self.wrong, self.untracked)
+
+
 def matched_pairs(recording: PreparedFrames, vlad: Vlad) -> list[MatchedPair]:
     """Match every frame with the most similar ones."""
     count = len(recording)
@@ -66,11 +88,16 @@ def matched_pairs(recording: PreparedFrames, vlad: Vlad) -> list[MatchedPair]:
     return [pair for pair in matched if len(pair.ray) >= MIN_MATCHES]
 
 
-def contradicting_frames(recording: PreparedFrames, pairs: list[MatchedPair]) -> NDArray[np.int64]:
-    """Frames whose stated pose contradicts most of their partners."""
-    count = len(recording)
+def check_poses(recording: PreparedFrames, pairs: list[MatchedPair]) -> PoseCheck:
+    """Find frames whose stated pose contradicts most of their partners."""
+    count, sift = len(recording), _SiftCheck(recording)
+    partners: dict[int, set[int]] = {i: set() for i in range(count)}
+    for pair in pairs:
+        partners[pair.first].add(pair.second)
+        partners[pair.second].add(pair.first)
     rest = [(pair.first, pair.second, _distance(recording, pair)) for pair in pairs]
-    bad: list[int] = []
+    wrong: list[int] = []
+    untracked: list[int] = []
     while rest:
         against, total = np.zeros(count), np.zeros(count)
         for i, j, distance in rest:
@@ -81,9 +108,39 @@ def contradicting_frames(recording: PreparedFrames, pairs: list[MatchedPair]) ->
         worst = int(np.lexsort((against, share))[-1])
         if share[worst] <= 0.5:
             break
-        bad.append(worst)
         rest = [pair for pair in rest if worst not in pair[:2]]
-    return np.array(sorted(bad), np.int64)
+        agree, disagree = sift.votes(worst, sorted(partners[worst] - {*wrong, *untracked}))
+        if agree and agree >= disagree:
+            continue
+        (wrong if agree or disagree else untracked).append(worst)
+    return PoseCheck(np.array(sorted(wrong), np.int64), np.array(sorted(untracked), np.int64))
+
+
+class _SiftCheck:
+    """Compares stated poses with SIFT matches that one essential matrix explains."""
+
+    def __init__(self, recording: PreparedFrames):
+        self.recording = recording
+        self._features: dict[int, SiftFeatures] = {}
+
+    def votes(self, frame: int, partners: Sequence[int]) -> tuple[int, int]:
+        """Partners whose matches agree and disagree with the stated poses."""
+        pairs = [pair for pair in (self._pair(frame, j) for j in partners) if pair is not None]
+        agree = sum(_distance(self.recording, pair) <= MAX_SIFT_PX for pair in pairs)
+        return agree, len(pairs) - agree
+
+    def _pair(self, i: int, j: int) -> MatchedPair | None:
+        cameras = self.recording.cameras
+        found = epipolar_pair(self._of(i), self._of(j), cameras[i], cameras[j])
+        if found is None:
+            return None
+        pixels = self.recording.cell_camera(j).pinhole.project(found.rays[1])
+        return MatchedPair(i, j, found.rays[0], pixels)
+
+    def _of(self, frame: int) -> SiftFeatures:
+        if frame not in self._features:
+            self._features[frame] = sift_features(self.recording.grey[frame])
+        return self._features[frame]
 
 
 def depth_scale(recording: PreparedFrames, pairs: list[MatchedPair]) -> float:

@@ -97,7 +97,7 @@ def build_scene_map(
 def adjusted_frames(built: BuiltMap, frames: Sequence[Frame]) -> list[Frame]:
     """Frames with the poses and intrinsics of their map, so that a network learns the same points.
 
-    Frames whose pose contradicts the images are left out.
+    Frames that the map excludes are left out.
 
     Args:
         built: the map of the recording.
@@ -105,7 +105,8 @@ def adjusted_frames(built: BuiltMap, frames: Sequence[Frame]) -> list[Frame]:
     """
     scene, adjusted = built.scene, []
     for frame in frames:
-        if frame.name in built.adjusted.wrong_poses or frame.base_from_camera is None:
+        excluded = (*built.adjusted.wrong_poses, *built.adjusted.untracked)
+        if frame.name in excluded or frame.base_from_camera is None:
             continue
         camera = scene.adjusted_camera if frame.camera == scene.camera else frame.camera
         pose = scene.frame.from_base(frame.base_from_camera)

@@ -26,6 +26,7 @@ from evercal.features.weights_file import network_bytes
 from evercal.geometry import SE3
 from evercal.localization.acceptance import fit_acceptance
 from evercal.map import LearnReport
+from evercal.mapping.build import BuiltMap
 from evercal.recordings.frame import Frame, Recording, posed_recording
 from evercal.recordings.held_out import named_recording, require_frames, split_held_out
 from evercal.storage.stages import is_store
@@ -128,7 +129,9 @@ def learn_networks(
         except InputError:
             opened.abandon()  # bad input: nothing to resume
             raise
-        done.scenes.scenes[-1] = with_fitted_threshold(done.scenes, split.held_out)
+        done.scenes.scenes[-1] = with_fitted_threshold(
+            done.scenes, split.held_out, built=done.built
+        )
         record, keyframes = done.scenes.scenes[-1], done.scenes.keyframes[-1]
         report = LearnReport(
             scene=recording.name,
@@ -151,13 +154,19 @@ def learn_networks(
 
 
 def with_fitted_threshold(
-    scenes: LearnedScenes, held_out: Sequence[Frame], index: int = -1
+    scenes: LearnedScenes,
+    held_out: Sequence[Frame],
+    index: int = -1,
+    built: BuiltMap | None = None,
 ) -> SceneRecord:
     """A record with its threshold: of the map, if there is one, else of the network."""
     record = scenes.scenes[index]
     if record.map is None:
         return fit_threshold(scenes, held_out, index)
-    return replace(record, map=fit_acceptance(scenes.map_contents(), held_out, index))
+    noise = (0.0, 0.0)
+    if built is not None:
+        held_out, noise = built.corrected(held_out), built.independent_noise
+    return replace(record, map=fit_acceptance(scenes.map_contents(), held_out, index, noise))
 
 
 def run_stage(
