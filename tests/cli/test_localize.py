@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from evercal.recordings import Recording
 
 KEYS = {"path", "status", "reason", "scene", "base_from_camera", "covariance", "inliers"}
-KEYS |= {"inlier_ratio", "ms"}
+KEYS |= {"inlier_ratio", "ms", "error_terms"}
+CAUSES = ["view", "lens", "map", "stated poses", "base frame"]
 
 
 @pytest.fixture
@@ -46,9 +47,21 @@ def test_json_of_a_folder(run: Any, hall_store: Path, images: Path, hall: Record
     assert pose_distance(estimate, truth)[0] < 0.005
     assert np.shape(located["covariance"]) == (6, 6)
     assert located["inliers"] > 20
+    terms, variance = located["error_terms"], np.diag(located["covariance"])
+    assert [term["name"] for term in terms] == CAUSES
+    assert sum(term["share"] for term in terms) == pytest.approx(1)
+    for key, part, unit in (
+        ("translation_mm", variance[:3], 1e3),
+        ("rotation_deg", variance[3:], 180 / np.pi),
+    ):
+        assert sum(term[key] ** 2 for term in terms) == pytest.approx(unit**2 * part.mean())
+    total = sum(term["translation_mm"] ** 2 for term in terms)
+    for term in terms:
+        assert term["share"] == pytest.approx(term["translation_mm"] ** 2 / total)
     assert unknown["status"] in ("unknown_scene", "failed")
     assert unknown["reason"]
     assert unknown["base_from_camera"] is unknown["covariance"] is None
+    assert unknown["error_terms"] == []
     assert min(located["ms"], unknown["ms"]) > 0
     again = json.loads(run("localize", hall_store, images, "--json").out)["images"]
     for image in (*record["images"], *again):
@@ -68,7 +81,11 @@ def test_text_has_millimetres_and_the_next_command(
     assert lines[2].startswith("  translation")
     assert lines[2].endswith(f" m  sd {sd[0]:.2f} {sd[1]:.2f} {sd[2]:.2f} mm")
     assert lines[3].endswith(" deg")
-    assert lines[5] == str(files[1])
+    terms = sorted(located["error_terms"], key=lambda term: -term["share"])
+    shares = [f"{term['name']} {100 * term['share']:.0f} %" for term in terms]
+    shown = ", ".join(text for text in shares if not text.endswith(" 0 %"))
+    assert lines[4] == f"  budget       {shown} of the position's variance"
+    assert lines[6] == str(files[1])
     assert lines[-1] == f"next: evercal localize {hall_store} {files[0]} --overlay DIR"
 
 

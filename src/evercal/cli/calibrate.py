@@ -1,5 +1,6 @@
 """`evercal calibrate`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -13,7 +14,7 @@ from evercal.cli.stores import open_map
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.calibration.calibration import Calibration
+    from evercal.calibration.calibration import Calibration, ErrorTerm
     from evercal.calibration.from_images import Images
     from evercal.calibration.rig import Rig
     from evercal.localization.localizer import Localizer
@@ -133,10 +134,7 @@ def calibration_lines(calibration: "Calibration") -> list[str]:
         f"  uncertainty  {calibration.sigma_mm:.2f} mm, {calibration.sigma_deg:.3f} deg"
         " (standard deviation per axis)",
     ]
-    lines += [
-        f"    of it      {term.translation_mm:.2f} mm, {term.rotation_deg:.3f} deg: {term.name}"
-        for term in calibration.error_terms
-    ]
+    lines += _budget_lines(calibration.error_terms)
     if "repeatability_mm" in calibration.checks:
         checks = calibration.checks
         lines.append(
@@ -147,6 +145,18 @@ def calibration_lines(calibration: "Calibration") -> list[str]:
         lines.append(f"  images       {used} of {len(calibration.images)} used")
     lines += [f"    rejected   {i.name}: {i.reason}" for i in calibration.images if not i.used]
     return [*lines, f"  verdict      {calibration.verdict}"]
+
+
+def _budget_lines(terms: "Sequence[ErrorTerm]") -> list[str]:
+    """The terms of the uncertainty that count, each with its share."""
+    from evercal.calibration.calibration import position_shares
+
+    return [
+        f"    of it      {term.translation_mm:.2f} mm, {term.rotation_deg:.3f} deg:"
+        f" {term.name} ({100 * share:.0f} % of the position's variance)"
+        for term, share in zip(terms, position_shares(terms), strict=True)
+        if term.translation_mm >= 0.005 or term.rotation_deg >= 0.0005
+    ]
 
 
 def _rig_lines(rig: "Rig") -> list[str]:

@@ -16,6 +16,7 @@ from evercal.cli.stores import open_localizer
 if TYPE_CHECKING:
     import numpy as np
 
+    from evercal.calibration.calibration import ErrorTerm
     from evercal.geometry import Camera
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import LearnedLocalizer
@@ -130,10 +131,19 @@ def as_dict(answer: Answer) -> dict[str, object]:
         "scene": estimate.scene,
         "base_from_camera": pose,
         "covariance": covariance.tolist() if covariance is not None and usable else None,
+        "error_terms": [{**vars(term), "share": share} for term, share in budget_of(estimate)],
         "inliers": int(estimate.inliers),
         "inlier_ratio": float(estimate.inlier_ratio),
         "ms": answer.milliseconds,
     }
+
+
+def budget_of(estimate: "PoseEstimate") -> "list[tuple[ErrorTerm, float]]":
+    """The causes of an answer's covariance, each with its share of the position's variance."""
+    from evercal.calibration.calibration import ErrorTerm, position_shares
+
+    terms = [ErrorTerm.of(term.name, term.covariance) for term in estimate.terms]
+    return list(zip(terms, position_shares(terms), strict=True))
 
 
 def as_text(answer: Answer) -> str:
@@ -151,15 +161,22 @@ def as_text(answer: Answer) -> str:
         sd = estimate.covariance.diagonal().clip(0) ** 0.5
         spread = [_numbers(1000 * sd[:3], ".2f"), _numbers(sd[3:] * 180 / math.pi, ".3f")]
         spread = [f"  sd {spread[0]} mm", f"  sd {spread[1]} deg"]
-    return "\n".join(
-        [
-            str(answer.path),
-            f"  scene        {estimate.scene}",
-            f"  translation  {_numbers(pose.translation_m, '+.4f')} m{spread[0]}",
-            f"  quaternion   {_numbers(pose.rotation_wxyz, '+.4f')} wxyz{spread[1]}",
-            f"  inliers      {share}",
-        ]
-    )
+    lines = [
+        str(answer.path),
+        f"  scene        {estimate.scene}",
+        f"  translation  {_numbers(pose.translation_m, '+.4f')} m{spread[0]}",
+        f"  quaternion   {_numbers(pose.rotation_wxyz, '+.4f')} wxyz{spread[1]}",
+        f"  inliers      {share}",
+    ]
+    if budget := _budget_words(estimate):
+        lines.insert(-1, f"  budget       {budget} of the position's variance")
+    return "\n".join(lines)
+
+
+def _budget_words(estimate: "PoseEstimate") -> str:
+    """Shares of the causes, the largest first; empty without any."""
+    parts = sorted(budget_of(estimate), key=lambda part: -part[1])
+    return ", ".join(f"{t.name} {100 * share:.0f} %" for t, share in parts if share >= 0.005)
 
 
 def _numbers(values: "np.ndarray", form: str) -> str:
