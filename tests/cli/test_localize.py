@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
 from evercal.recordings import read_image, write_image
 
 if TYPE_CHECKING:
@@ -87,6 +87,32 @@ def test_text_has_millimetres_and_the_next_command(
     assert lines[4] == f"  budget       {shown} of the position's variance"
     assert lines[6] == str(files[1])
     assert lines[-1] == f"next: evercal localize {hall_store} {files[0]} --overlay DIR"
+
+
+def test_point_in_the_camera_frame_has_a_standard_deviation(
+    run: Any, hall_store: Path, images: Path
+) -> None:
+    point = [-0.2, 0.1, 1.5]
+    ran = run("localize", hall_store, images, "--at", "-0.2,0.1,1.5", "--json")
+    located, unknown = json.loads(ran.out)["images"]
+    pose = SE3.from_matrix(np.array(located["base_from_camera"]["matrix"]))
+    sigma = UncertainPose(pose, np.array(located["covariance"])).point_sigma_mm(point)
+    at = located["at"]
+    assert at["point_m"] == point
+    np.testing.assert_allclose(at["in_parent_m"], pose.apply(np.array(point)))
+    assert at["sigma_mm"] == pytest.approx(sigma)
+    assert unknown["at"] is None
+    text = run("localize", hall_store, images, "--at", "-0.2,0.1,1.5").out
+    assert f"sd {sigma:.2f} mm at (-0.2, 0.1, 1.5) m in the camera frame" in text
+
+
+@pytest.mark.parametrize("verb", ["localize", "calibrate", "report"])
+@pytest.mark.parametrize("text", ["0,1", "a,b,c", "0,0,nan", "0,0,1,2", ""])
+def test_other_points_are_refused_before_any_work(run: Any, verb: str, text: str) -> None:
+    words = ["nowhere.json"] if verb == "report" else ["nowhere.evercal", "nowhere.png"]
+    ran = run(verb, *words, f"--at={text}")
+    assert (ran.code, ran.out) == (2, "")
+    assert ran.err == [f"error: --at {text}: give x,y,z in metres such as 0,0.05,0.4"]
 
 
 def test_exit_code_is_1_without_any_pose(run: Any, hall_store: Path, images: Path) -> None:

@@ -11,13 +11,14 @@ from tyro.conf import Positional, arg
 from evercal.cli.console import print_json, print_next, progress_bar, require_folder
 from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for
+from evercal.cli.point_words import Point, point_dict, point_of, point_text
 from evercal.cli.stores import open_localizer
 
 if TYPE_CHECKING:
     import numpy as np
 
     from evercal.calibration.calibration import ErrorTerm
-    from evercal.geometry import Camera
+    from evercal.geometry import Camera, UncertainPose
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import LearnedLocalizer
 
@@ -40,6 +41,9 @@ class Localize:
     that recorded the scene."""
     overlay: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Output folder for copies of the images with their inliers."""
+    at: Annotated[str | None, arg(metavar="X,Y,Z", help_behavior_hint="")] = None
+    """A point in the camera frame (x right, y down, z forward; metres), such as an object that the
+    camera sees: print its standard deviation in the base frame."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
@@ -48,6 +52,7 @@ class Localize:
         """Locate every image; nothing is printed before all of them were read."""
         from evercal.recordings.image_files import image_files
 
+        point = point_of(self.at)
         files = image_files(self.images)
         camera = camera_for(self.camera, files)
         require_folder(self.overlay, "--overlay")
@@ -55,10 +60,10 @@ class Localize:
         answers = self._answers(localizer, files, camera)
         located = sum(answer.estimate.status == "ok" for answer in answers)
         if self.json:
-            print_json({"images": [as_dict(answer) for answer in answers]})
+            print_json({"images": [as_dict(answer, point) for answer in answers]})
         else:
             for answer in answers:
-                print(as_text(answer))
+                print(as_text(answer, point))
             self._next(files, located)
         return 0 if located else 1
 
@@ -113,29 +118,36 @@ def _overlay_name(files: list[Path], number: int) -> str:
     return f"{stems[number]}{again}-overlay.png"
 
 
-def as_dict(answer: Answer) -> dict[str, object]:
-    """One image's entry in the JSON output; null without a pose."""
-    import numpy as np
-
+def as_dict(answer: Answer, point: Point | None = None) -> dict[str, object]:
+    """One image's entry in the JSON output; null without a pose. `point` is that of --at."""
     from evercal.recordings.formats.generic import pose_to_dict
 
     estimate = answer.estimate
-    pose, covariance = pose_to_dict(estimate.base_from_camera), estimate.covariance
+    pose, uncertain = pose_to_dict(estimate.base_from_camera), _finite(estimate)
     if pose is not None and estimate.base_from_camera is not None:
         pose["matrix"] = estimate.base_from_camera.matrix().tolist()
-    usable = covariance is not None and bool(np.isfinite(covariance).all())
-    return {
+    entry = {
         "path": str(answer.path),
         "status": estimate.status,
         "reason": estimate.reason,
         "scene": estimate.scene,
         "base_from_camera": pose,
-        "covariance": covariance.tolist() if covariance is not None and usable else None,
+        "covariance": None if uncertain is None else uncertain.covariance.tolist(),
         "error_terms": [{**vars(term), "share": share} for term, share in budget_of(estimate)],
         "inliers": int(estimate.inliers),
         "inlier_ratio": float(estimate.inlier_ratio),
         "ms": answer.milliseconds,
     }
+    if point is not None:
+        entry["at"] = None if uncertain is None else point_dict(point, uncertain)
+    return entry
+
+
+def _finite(estimate: "PoseEstimate") -> "UncertainPose | None":
+    """The pose with its covariance; None without a usable one."""
+    uncertain = estimate.uncertain_pose
+    finite = uncertain is not None and all(map(math.isfinite, uncertain.covariance.flat))
+    return uncertain if finite else None
 
 
 def budget_of(estimate: "PoseEstimate") -> "list[tuple[ErrorTerm, float]]":
@@ -146,8 +158,8 @@ def budget_of(estimate: "PoseEstimate") -> "list[tuple[ErrorTerm, float]]":
     return list(zip(terms, position_shares(terms), strict=True))
 
 
-def as_text(answer: Answer) -> str:
-    """One image's block of text."""
+def as_text(answer: Answer, point: Point | None = None) -> str:
+    """One image's block of text. `point` is that of --at."""
     estimate = answer.estimate
     share = (
         f"{estimate.inliers} ({100 * estimate.inlier_ratio:.0f} %), {answer.milliseconds:.0f} ms"
@@ -170,6 +182,8 @@ def as_text(answer: Answer) -> str:
     ]
     if budget := _budget_words(estimate):
         lines.insert(-1, f"  budget       {budget} of the position's variance")
+    if point is not None and (uncertain := _finite(estimate)) is not None:
+        lines.insert(-1, f"  point        sd {point_text(point, uncertain)}")
     return "\n".join(lines)
 
 
