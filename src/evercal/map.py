@@ -197,6 +197,7 @@ class Map:
 
                 built = built.take(fewest_keyframes(contents, built, split.train, on_progress))
             scene = fit_acceptance(contents.with_scene(built.scene), split.held_out)
+            scene = replace(scene, metric=loaded.metric)
             report = LearnReport(
                 scene=scene.name,
                 seconds=time.perf_counter() - began,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from evercal.recordings import Recording
 
 KEYS = {"path", "status", "reason", "scene", "base_from_camera", "covariance", "inliers"}
-KEYS |= {"inlier_ratio", "ms", "error_terms"}
+KEYS |= {"inlier_ratio", "ms", "error_terms", "unit"}
 CAUSES = ["view", "lens", "map", "stated poses", "base frame"]
 
 
@@ -62,6 +62,7 @@ def test_json_of_a_folder(run: Any, hall_store: Path, images: Path, hall: Record
     assert unknown["reason"]
     assert unknown["base_from_camera"] is unknown["covariance"] is None
     assert unknown["error_terms"] == []
+    assert (located["unit"], unknown["unit"]) == ("metres", None)
     assert min(located["ms"], unknown["ms"]) > 0
     again = json.loads(run("localize", hall_store, images, "--json").out)["images"]
     for image in (*record["images"], *again):

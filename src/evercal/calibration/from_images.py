@@ -122,7 +122,8 @@ def calibrate(
         base_from_camera for eye_to_hand, gripper_from_camera for eye_in_hand.
 
     Raises:
-        InputError: No image was located, or eye_in_hand without gripper poses.
+        InputError: No image was located, eye_in_hand without gripper poses, or the scene's unit of
+            length is unknown.
     """
     grippers = given.base_from_gripper
     if grippers is not None and len(grippers) != len(given.images):
@@ -139,7 +140,7 @@ def calibrate(
     if mount == "eye_in_hand" and grippers is not None:
         moved = in_gripper_frame(located, grippers)
     fused = fuse(moved)
-    scene = scene_named(localizer, fused.scene)
+    scene = metric_scene(localizer, fused.scene)
     height, width = given.images[0][1].shape[:2]
     # The guess fits images of another aspect ratio, too.
     stated = cameras_in_scenes(given.camera, given.images[0][1], [scene])[0]
@@ -206,6 +207,18 @@ def scene_named(localizer: "Localizer", name: str) -> SceneMap:
         if scene.name == name:
             return scene
     raise InputError(f"scene {name!r}: the map has only {', '.join(localizer.scenes)}")
+
+
+def metric_scene(localizer: "Localizer", name: str) -> SceneMap:
+    """Return the map of a scene whose answers are in metres, or raise InputError."""
+    scene = scene_named(localizer, name)
+    if not scene.unit_known:
+        raise InputError(
+            f"scene {name}: the unit of length of its recording is unknown, so there are no"
+            " millimetres; run 'evercal align' first, with --robot-poses or with --points and"
+            " --picks"
+        )
+    return scene
 
 
 def map_digest(localizer: "Localizer", name: str) -> str:

@@ -80,11 +80,12 @@ class Localize:
             image = read_image(path)
             estimate = localizer.localize(image, camera)
             milliseconds = 1000 * (time.perf_counter() - began)
+            known = self._unit_known(localizer, estimate.scene)
             if self.overlay is not None and estimate.scene is not None:
                 intrinsics = camera or scene_camera(localizer, estimate.scene)
-                drawn = draw_estimate(image, estimate, intrinsics)
+                drawn = draw_estimate(image, estimate, intrinsics, legend=known)
                 write_image(self.overlay / _overlay_name(files, number), drawn)
-            return Answer(path, estimate, milliseconds)
+            return Answer(path, estimate, milliseconds, known)
 
         answers = []
         with progress_bar("localizing", len(files), "image") as bar:
@@ -92,6 +93,12 @@ class Localize:
                 answers.append(item)
                 bar.update()
         return answers
+
+    @staticmethod
+    def _unit_known(localizer: "LearnedLocalizer", name: str | None) -> bool:
+        """Whether answers in a scene are in metres; those of networks are taken to be."""
+        scenes = [scene for scene in localizer.contents.scenes if scene.name == name]
+        return all(getattr(scene, "unit_known", True) for scene in scenes)
 
     def _next(self, files: list[Path], located: int) -> None:
         if not located:
@@ -109,6 +116,8 @@ class Answer:
     path: Path
     estimate: "PoseEstimate"
     milliseconds: float
+    unit_known: bool = True
+    """Whether lengths are in metres; else their unit is unknown."""
 
 
 def _overlay_name(files: list[Path], number: int) -> str:
@@ -119,27 +128,35 @@ def _overlay_name(files: list[Path], number: int) -> str:
 
 
 def as_dict(answer: Answer, point: Point | None = None) -> dict[str, object]:
-    """One image's entry in the JSON output; null without a pose. `point` is that of --at."""
+    """One image's entry in the JSON output; null without a pose. `point` is that of --at.
+
+    Where the unit of length is unknown, lengths are in that unit and there are no millimetres.
+    """
     from evercal.recordings.formats.generic import pose_to_dict
 
     estimate = answer.estimate
     pose, uncertain = pose_to_dict(estimate.base_from_camera), _finite(estimate)
+    metric = uncertain if answer.unit_known else None
     if pose is not None and estimate.base_from_camera is not None:
         pose["matrix"] = estimate.base_from_camera.matrix().tolist()
+    terms = [{**vars(term), "share": share} for term, share in budget_of(estimate)]
+    if not answer.unit_known:
+        terms = [{**term, "translation_mm": None} for term in terms]
     entry = {
         "path": str(answer.path),
         "status": estimate.status,
         "reason": estimate.reason,
         "scene": estimate.scene,
+        "unit": None if pose is None else "metres" if answer.unit_known else "unknown",
         "base_from_camera": pose,
         "covariance": None if uncertain is None else uncertain.covariance.tolist(),
-        "error_terms": [{**vars(term), "share": share} for term, share in budget_of(estimate)],
+        "error_terms": terms,
         "inliers": int(estimate.inliers),
         "inlier_ratio": float(estimate.inlier_ratio),
         "ms": answer.milliseconds,
     }
     if point is not None:
-        entry["at"] = None if uncertain is None else point_dict(point, uncertain)
+        entry["at"] = None if metric is None else point_dict(point, metric)
     return entry
 
 
@@ -173,16 +190,18 @@ def as_text(answer: Answer, point: Point | None = None) -> str:
         sd = estimate.covariance.diagonal().clip(0) ** 0.5
         spread = [_numbers(1000 * sd[:3], ".2f"), _numbers(sd[3:] * 180 / math.pi, ".3f")]
         spread = [f"  sd {spread[0]} mm", f"  sd {spread[1]} deg"]
+    unit = f"m{spread[0]}" if answer.unit_known else "in an unknown unit: run 'evercal align' first"
     lines = [
         str(answer.path),
         f"  scene        {estimate.scene}",
-        f"  translation  {_numbers(pose.translation_m, '+.4f')} m{spread[0]}",
+        f"  translation  {_numbers(pose.translation_m, '+.4f')} {unit}",
         f"  quaternion   {_numbers(pose.rotation_wxyz, '+.4f')} wxyz{spread[1]}",
         f"  inliers      {share}",
     ]
     if budget := _budget_words(estimate):
         lines.insert(-1, f"  budget       {budget} of the position's variance")
-    if point is not None and (uncertain := _finite(estimate)) is not None:
+    uncertain = _finite(estimate)
+    if point is not None and uncertain is not None and answer.unit_known:
         lines.insert(-1, f"  point        sd {point_text(point, uncertain)}")
     return "\n".join(lines)
 
