@@ -201,6 +201,7 @@ class Map:
                 built.corrected(split.held_out),
                 noise=built.independent_noise,
             )
+            scene = replace(scene, metric=loaded.metric)
             report = LearnReport(
                 scene=scene.name,
                 seconds=time.perf_counter() - began,

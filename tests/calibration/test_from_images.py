@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from evercal.calibration.audit import audit
+from evercal.calibration.calibration import Calibration, ErrorTerm, Mount, largest_term
 from evercal.calibration.drift import check
 from evercal.calibration.from_images import Images, calibrate
+from evercal.calibration.from_images import _lens_advice as lens_advice
 from evercal.calibration.from_images import _spots as spots_of
 from evercal.calibration.rig import rig_of
 from evercal.errors import InputError
@@ -22,6 +24,7 @@ from evercal.recordings import write_image
 from evercal.recordings.formats import generic
 from evercal.recordings.frame import Frame, Recording
 
+CAUSES = ["view", "lens", "map", "stated poses", "base frame"]
 Draw = Callable[[Frame, int, int], list[tuple[str, np.ndarray]]]
 
 
@@ -73,6 +76,72 @@ def test_more_images_from_one_spot_hardly_reduce_the_uncertainty(
     assert many.sigma_mm > 0.7 * few.sigma_mm
 
 
+def rms_variances(calibration: Calibration) -> tuple[float, float]:
+    """Sums of the squared terms, millimetres and degrees."""
+    terms = calibration.error_terms
+    return sum(t.translation_mm**2 for t in terms), sum(t.rotation_deg**2 for t in terms)
+
+
+def test_terms_of_a_fixed_camera_are_its_images_causes(
+    localizer: Localizer, hall: Recording, noisy: Draw
+) -> None:
+    frame = hall.test[3]
+    images = noisy(frame, 4, 0)
+    calibration = calibrate(localizer, Images(images, frame.camera))
+    names = [term.name for term in calibration.error_terms]
+    assert names == [*CAUSES, "scatter of 4 images"]
+    assert rms_variances(calibration) == pytest.approx(
+        (calibration.sigma_mm**2, calibration.sigma_deg**2)
+    )
+    estimates = [localizer.localize(image, frame.camera) for _, image in images]
+    for number, term in enumerate(calibration.error_terms[:-1]):
+        own = [estimate.terms[number].covariance for estimate in estimates]
+        assert term == ErrorTerm.of(term.name, np.mean(own, axis=0))
+
+
+def test_terms_of_a_camera_on_the_gripper_contain_the_arm(
+    localizer: Localizer, hall: Recording
+) -> None:
+    frames, rng = hall.test[::3], np.random.default_rng(0)
+    noise = SE3.exp(
+        np.concatenate([rng.normal(0, 0.01, (len(frames), 3)), np.zeros((len(frames), 3))], 1)
+    )
+    grippers = SE3.stack([truth_of(f) for f in frames]) @ noise
+    images = [(f.name, f.read_image()) for f in frames]
+    calibration = calibrate(localizer, Images(images, frames[0].camera, grippers))
+    *own, arm = calibration.error_terms
+    assert [term.name for term in own] == CAUSES
+    assert arm.name.startswith("arm, and scatter among ")
+    assert rms_variances(calibration) == pytest.approx(
+        (calibration.sigma_mm**2, calibration.sigma_deg**2)
+    )
+    assert arm.translation_mm > 2 * max(term.translation_mm for term in own)
+
+
+@pytest.mark.parametrize(
+    ("mount", "intrinsics", "advice"),
+    [
+        ("eye_to_hand", "map", "give --camera with intrinsics from images of a board"),
+        ("eye_in_hand", "map", "('evercal detect'), or images from more spots."),
+        ("eye_to_hand", "given", "--camera counts as known to 0.2 % of the focal length"),
+        ("eye_in_hand", "given", "; images from more spots determine it better."),
+    ],
+)
+def test_advice_where_the_lens_is_the_largest_term(
+    mount: Mount, intrinsics: str, advice: str
+) -> None:
+    def words(lens_mm: float) -> str:
+        terms = (ErrorTerm("view", 1.0, 0.1), ErrorTerm("lens", lens_mm, 0.1))
+        calibration = Calibration(
+            mount, SE3.identity(), np.eye(6), error_terms=terms, source={"intrinsics": intrinsics}
+        )
+        return " ".join(lens_advice(calibration))
+
+    assert words(0.9) == ""
+    assert words(2.0).startswith("The lens is the largest term, 80 % of the position's variance: ")
+    assert advice in words(2.0)
+
+
 @pytest.fixture(scope="module")
 def adjusted(hall_map: MapContents) -> Localizer:
     """A map whose bundle adjustment changed the focal length by 3 %."""
@@ -92,7 +161,10 @@ def test_given_camera_is_used_and_saved(
     assert pose_distance(calibration.parent_from_child, truth_of(frame))[0] < 0.006
     assert calibration.camera == camera
     assert calibration.source["intrinsics"] == "given"
-    assert "--camera" not in calibration.verdict
+    assert "give --camera" not in calibration.verdict
+    lens = largest_term(calibration.error_terms)[0] == "lens"
+    assert lens == ("The lens is the largest term" in calibration.verdict)
+    assert lens  # where stated intrinsics are believed to 0.2 %
 
 
 def test_without_a_camera_that_of_the_map_is_saved(

@@ -58,10 +58,37 @@ def test_cameras_of_a_rig(
     assert ran.code == 0, ran.err
     assert json.loads(ran.out) == json.loads((tmp_path / "rig.json").read_text())
     left_from_right = truth_of(hall.test[3]).inverse() @ truth_of(hall.test[6])
-    text = run(*words, "--out", tmp_path / "rig.json").out
+    ran = run(*words, "--out", tmp_path / "rig.json", "--at", "0,0,1", "--json")
+    for camera in json.loads(ran.out)["cameras"].values():
+        assert camera["at"]["point_m"] == [0, 0, 1]
+        assert camera["at"]["sigma_mm"] > 0
+    text = run(*words, "--out", tmp_path / "rig.json", "--at", "0,0,1").out
+    assert text.count("mm at (0, 0, 1) m in the camera frame") == 2
     line = next(line for line in text.splitlines() if line.startswith("left_from_right: "))
     estimate = [float(word) for word in line.split()[1:4]]
     np.testing.assert_allclose(estimate, 1000 * left_from_right.translation_m, atol=6)
+
+
+def test_point_in_the_camera_frame_has_a_standard_deviation(
+    run: Any, hall_store: Path, four_images: Path, tmp_path: Path
+) -> None:
+    words = ("calibrate", hall_store, four_images, "--out", tmp_path / "c.json")
+    words = (*words, "--at", "0.1,0,1.5")
+    record = json.loads(run(*words, "--json").out)
+    own = read_calibration(tmp_path / "c.json")
+    sigma = own.uncertain_pose.point_sigma_mm([0.1, 0, 1.5])
+    at = own.parent_from_child.apply(np.array([0.1, 0, 1.5])).tolist()
+    expected = {"point_m": [0.1, 0, 1.5], "in_parent_m": at, "sigma_mm": pytest.approx(sigma)}
+    assert record.pop("at") == expected
+    assert record == json.loads((tmp_path / "c.json").read_text())
+    assert f"{sigma:.2f} mm at (0.1, 0, 1.5) m in the camera frame" in run(*words).out
+    page = ("report", tmp_path / "c.json", "--out", tmp_path / "r.html", "--at", "0.1,0,1.5")
+    assert json.loads(run(*page, "--json").out)["at"] == expected
+    assert (
+        "point (0.1, 0, 1.5) m of camera along the axes of base"
+        in (tmp_path / "r.html").read_text()
+    )
+    assert f"{sigma:.2f} mm at (0.1, 0, 1.5) m in the camera frame" in run(*page).out
 
 
 def test_audit_names_the_episode_with_a_wrong_pose(

@@ -9,14 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
 from evercal.recordings import read_image, write_image
 
 if TYPE_CHECKING:
     from evercal.recordings import Recording
 
 KEYS = {"path", "status", "reason", "scene", "base_from_camera", "covariance", "inliers"}
-KEYS |= {"inlier_ratio", "ms"}
+KEYS |= {"inlier_ratio", "ms", "error_terms", "unit"}
+CAUSES = ["view", "lens", "map", "stated poses", "base frame"]
 
 
 @pytest.fixture
@@ -46,9 +47,22 @@ def test_json_of_a_folder(run: Any, hall_store: Path, images: Path, hall: Record
     assert pose_distance(estimate, truth)[0] < 0.005
     assert np.shape(located["covariance"]) == (6, 6)
     assert located["inliers"] > 20
+    terms, variance = located["error_terms"], np.diag(located["covariance"])
+    assert [term["name"] for term in terms] == CAUSES
+    assert sum(term["share"] for term in terms) == pytest.approx(1)
+    for key, part, unit in (
+        ("translation_mm", variance[:3], 1e3),
+        ("rotation_deg", variance[3:], 180 / np.pi),
+    ):
+        assert sum(term[key] ** 2 for term in terms) == pytest.approx(unit**2 * part.mean())
+    total = sum(term["translation_mm"] ** 2 for term in terms)
+    for term in terms:
+        assert term["share"] == pytest.approx(term["translation_mm"] ** 2 / total)
     assert unknown["status"] in ("unknown_scene", "failed")
     assert unknown["reason"]
     assert unknown["base_from_camera"] is unknown["covariance"] is None
+    assert unknown["error_terms"] == []
+    assert (located["unit"], unknown["unit"]) == ("metres", None)
     assert min(located["ms"], unknown["ms"]) > 0
     again = json.loads(run("localize", hall_store, images, "--json").out)["images"]
     for image in (*record["images"], *again):
@@ -68,8 +82,38 @@ def test_text_has_millimetres_and_the_next_command(
     assert lines[2].startswith("  translation")
     assert lines[2].endswith(f" m  sd {sd[0]:.2f} {sd[1]:.2f} {sd[2]:.2f} mm")
     assert lines[3].endswith(" deg")
-    assert lines[5] == str(files[1])
+    terms = sorted(located["error_terms"], key=lambda term: -term["share"])
+    shares = [f"{term['name']} {100 * term['share']:.0f} %" for term in terms]
+    shown = ", ".join(text for text in shares if not text.endswith(" 0 %"))
+    assert lines[4] == f"  budget       {shown} of the position's variance"
+    assert lines[6] == str(files[1])
     assert lines[-1] == f"next: evercal localize {hall_store} {files[0]} --overlay DIR"
+
+
+def test_point_in_the_camera_frame_has_a_standard_deviation(
+    run: Any, hall_store: Path, images: Path
+) -> None:
+    point = [-0.2, 0.1, 1.5]
+    ran = run("localize", hall_store, images, "--at", "-0.2,0.1,1.5", "--json")
+    located, unknown = json.loads(ran.out)["images"]
+    pose = SE3.from_matrix(np.array(located["base_from_camera"]["matrix"]))
+    sigma = UncertainPose(pose, np.array(located["covariance"])).point_sigma_mm(point)
+    at = located["at"]
+    assert at["point_m"] == point
+    np.testing.assert_allclose(at["in_parent_m"], pose.apply(np.array(point)))
+    assert at["sigma_mm"] == pytest.approx(sigma)
+    assert unknown["at"] is None
+    text = run("localize", hall_store, images, "--at", "-0.2,0.1,1.5").out
+    assert f"sd {sigma:.2f} mm at (-0.2, 0.1, 1.5) m in the camera frame" in text
+
+
+@pytest.mark.parametrize("verb", ["localize", "calibrate", "report"])
+@pytest.mark.parametrize("text", ["0,1", "a,b,c", "0,0,nan", "0,0,1,2", ""])
+def test_other_points_are_refused_before_any_work(run: Any, verb: str, text: str) -> None:
+    words = ["nowhere.json"] if verb == "report" else ["nowhere.evercal", "nowhere.png"]
+    ran = run(verb, *words, f"--at={text}")
+    assert (ran.code, ran.out) == (2, "")
+    assert ran.err == [f"error: --at {text}: give x,y,z in metres such as 0,0.05,0.4"]
 
 
 def test_exit_code_is_1_without_any_pose(run: Any, hall_store: Path, images: Path) -> None:

@@ -81,6 +81,24 @@ def test_squared_mahalanobis_has_six_degrees_of_freedom() -> None:
     assert np.mean(squares) == pytest.approx(6, rel=0.06)
 
 
+@pytest.mark.parametrize("point", [(0.3, -0.2, 0.9), (0.0, 0.0, 0.0)])
+def test_point_moves_as_sampled_poses_move_it(point: tuple[float, float, float]) -> None:
+    a = UncertainPose(FIRST, covariance(13))
+    moved = sampled(a, 14).apply(np.array(point)) - FIRST.apply(np.array(point))
+    expected = moved.T @ moved / len(moved)
+    assert_same(a.point_covariance(point), expected)
+    assert a.point_sigma_mm(point) == pytest.approx(1000 * np.sqrt((moved**2).mean()), rel=0.02)
+
+
+def test_rotation_error_moves_a_point_ahead_across_and_not_along() -> None:
+    quarter = SE3.exp([0, 0, 0, 0, 0, np.pi / 2])
+    a = UncertainPose(quarter, np.diag([0, 0, 0, 4e-6, 0, 0]))
+    # 2 mrad about x move a point 0.5 m along z by 1 mm along -y of the child, x of the parent.
+    expected = np.diag([1e-6, 0, 0])
+    np.testing.assert_allclose(a.point_covariance([0.0, 0.0, 0.5]), expected, atol=1e-15)
+    assert a.point_sigma_mm([0.0, 0.0, 0.5]) == pytest.approx(1 / 3**0.5)
+
+
 def test_axis_deviation() -> None:
     assert axis_deviation(np.diag([1e-6, 4e-6, 4e-6, 1e-4, 1e-4, 1e-4])) == pytest.approx(
         (3**0.5, np.rad2deg(0.01))

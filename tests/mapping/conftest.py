@@ -77,6 +77,7 @@ def scenes(rooms: tuple[Recording, ...]) -> list[SceneMap]:
                 train_frames=30 + i,
                 min_support=0.1 * i,
                 covariance_scale=1.0 + i,
+                metric=i > 0,
             )
         )
     return made
@@ -112,7 +113,7 @@ def content() -> Contents:
         listed: list[object] = []
         for scene in contents.scenes:
             listed.append((scene.name, scene.camera, scene.adjusted_camera, scene.train_frames))
-            listed.append((scene.min_support, scene.covariance_scale))
+            listed.append((scene.min_support, scene.covariance_scale, scene.metric))
             listed.append(_rounded(frame_to_dict(scene.frame)))
             tensors = scene.keyframes.to_tensors()
             if scene.frame.correction is not None:

@@ -18,7 +18,7 @@ from evercal.features.vlad import vlad_for
 from evercal.geometry.se3 import SE3
 from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity
 from evercal.mapping.scene_map import MapContents, SceneMap
-from evercal.mapping.store import MapStore
+from evercal.mapping.store import MapStore, read_scene
 from evercal.storage.manifest import MANIFEST, verify, write_manifest
 
 Make = Callable[[Path, Sequence[SceneMap]], MapStore]
@@ -210,3 +210,15 @@ def test_update_removes_a_correction_that_no_longer_applies(
     assert MapStore.open(tmp_path / "map").contents.scenes[0].frame.correction is not None
     store.update(replace(scene, frame=replace(scene.frame, correction=None)))
     assert MapStore.open(tmp_path / "map").contents.scenes[0].frame.correction is None
+
+
+def test_scenes_that_state_no_unit_are_in_metres(
+    scenes: list[SceneMap], make: Make, tmp_path: Path
+) -> None:
+    store = make(tmp_path / "map", scenes[:1])
+    folder = store.folder(store.stages[0])
+    assert not read_scene(folder).metric
+    content = json.loads((folder / "scene.json").read_text())
+    del content["metric"]
+    (folder / "scene.json").write_text(json.dumps(content))
+    assert read_scene(folder).metric

@@ -15,7 +15,7 @@ from evercal.localization.estimate import PoseEstimate
 from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import write_image
-from evercal.reports.calibration_images import annotate_images, select_images
+from evercal.reports.calibration_images import annotate_images, exaggeration, select_images
 
 
 def pose(quaternion: ArrayLike, translation: ArrayLike) -> SE3:
@@ -58,8 +58,8 @@ class FixedLocalizer:
         assert camera is not None
         if self.pose is None:
             return PoseEstimate("failed", "too dark", None, None, None, 0, 0.0, 1.0)
-        points = BASE_FROM_CAMERA.apply([[0.1, 0.1, 1.0], [-0.2, 0.1, 1.0]])
-        pixels = camera.resized(80, 60).project([[0.1, 0.1, 1.0], [-0.2, 0.1, 1.0]])
+        points = BASE_FROM_CAMERA.apply([[0.1, 0.1, 1.0], [0.2, -0.1, 1.0]])
+        pixels = camera.resized(80, 60).project([[0.1, 0.1, 1.0], [0.2, -0.1, 1.0]])
         pixels[1, 0] += 3
         return PoseEstimate("ok", "", "room", self.pose, None, 2, 1.0, 1.0, pixels, points)
 
@@ -153,7 +153,35 @@ def test_residuals_refer_to_the_calibration_of_a_fixed_camera(
     localizer: Any = FixedLocalizer(BASE_FROM_CAMERA @ SE3.exp([0.05, 0, 0, 0, 0, 0]))
     [image] = annotate_images(own, select_images(own, tmp_path)[0], None, localizer).images
     assert image.landmarks == 2
-    assert image.summary == f"used; 2 landmarks, median residual {median_px:.2f} px"
+    words = f"used; 2 landmarks, median residual {median_px:.2f} px, lines "
+    assert image.summary.startswith(words)
+
+
+def test_lines_lead_from_the_detections_to_the_projections(tmp_path: Path) -> None:
+    write_images(tmp_path, "a.png")
+    own = calibration({"a.png": True})
+    localizer: Any = FixedLocalizer(BASE_FROM_CAMERA)
+    [image] = annotate_images(own, select_images(own, tmp_path)[0], None, localizer).images
+    assert image.summary.endswith("lines 1 times as long")
+    # The second landmark is seen 24 pixels of the page right of its projection.
+    [(x, y)] = CAMERA.resized(640, 480).project([[0.2, -0.1, 1.0]]).round().astype(int)
+    red, _, blue = image.image[y].astype(int).T
+    orange = np.flatnonzero(red - blue > 100)
+    assert orange.min() == pytest.approx(x, abs=2)
+    assert orange.max() == pytest.approx(x + 24 + 3, abs=2)  # with the radius of the yellow dot
+
+
+@pytest.mark.parametrize(
+    ("length", "times"), [(0.1, 100), (0.6, 20), (2.4, 10), (26.0, 1), (np.nan, 1)]
+)
+def test_lines_are_exaggerated_by_a_round_factor(length: float, times: int) -> None:
+    assert exaggeration(np.full((20, 2), length / 2**0.5)) == times
+
+
+def test_an_outlier_does_not_shorten_the_other_lines() -> None:
+    vectors = np.full((20, 2), 1.0)
+    vectors[0] = 500.0
+    assert exaggeration(vectors) == 10
 
 
 def test_reason_for_missing_landmarks_is_given(tmp_path: Path) -> None:

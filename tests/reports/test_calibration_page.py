@@ -98,6 +98,24 @@ def test_verdict_has_its_colour(mm: float, level: str, headline: str) -> None:
     assert reader.text("strong").startswith(headline)
 
 
+def test_point_of_the_camera_has_a_standard_deviation_along_each_axis() -> None:
+    page = calibration_page(
+        NamedCalibration("c.json", full()), AnnotatedImages(), None, None, (0, 0, 2)
+    )
+    [row] = [row for row in HtmlReader(page.html).rows if row[0].startswith("point ")]
+    assert row[0] == "point (0, 0, 2) m of camera_optical along the axes of panda_link0 (mm)"
+    # 2 m ahead, 0.01 mrad about the camera's x and y are 0.02 mm across.
+    across = [np.hypot(0.1, 0.02), np.hypot(0.2, 0.02), 0.3]
+    rms = np.sqrt(np.mean(np.square(across)))
+    assert row[1:] == [f"{value:.3f}" for value in (*across, rms)]
+    assert "point (" not in read(full())[1].html
+
+
+def test_causes_are_explained_where_images_were_located() -> None:
+    assert "lens: intrinsics" in read(full())[1].html
+    assert "lens: intrinsics" not in read(full(source={"command": "solve"}))[1].html
+
+
 def test_every_image_and_reason_is_listed() -> None:
     calibration = full()
     reader, _ = read(calibration)

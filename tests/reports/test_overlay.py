@@ -89,6 +89,13 @@ def test_encoded_images_read_back() -> None:
     assert np.abs(lossy[..., ::-1].astype(int) - flat).max() < 6
 
 
+def test_line_without_rims_has_its_colour_only() -> None:
+    line = [[10.0, 30.0], [30.0, 30.0]]
+    drawn = overlay_lines(GREY, [line], [(0, 0, 0)], width=1, rims=False)
+    assert drawn.max() == GREY.max()
+    assert overlay_lines(GREY, [line], [(0, 0, 0)], width=1).max() == 255
+
+
 def test_line_has_colour_rim_and_gaps() -> None:
     line = [[10, 30], [40, 30], [np.nan, 30], [60, 30], [70, 30]]
     drawn = overlay_lines(GREY, [line], [(200, 10, 20)], width=3)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.calibration import read_transform
+from evercal.calibration.from_images import metric_scene
 from evercal.calibration.located import Located, deviations, fuse, length_mm_deg, locate
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
@@ -67,7 +68,8 @@ def audit(
         on_episode: Called after each episode.
 
     Raises:
-        InputError: There is no episode, or an episode without a camera pose.
+        InputError: There is no episode, an episode without a camera pose, or the scene's unit of
+            length is unknown.
     """
     audited = []
     for episode in episode_folders(folder):
@@ -113,7 +115,9 @@ def _audited(
             reason = item.estimate.reason
     if not differences:
         return Episode(episode.name, "unknown", f"no image was located: {reason}")
-    off = deviations(SE3.stack([fuse(differences).pose]), SE3.identity())[0]
+    fused = fuse(differences)
+    metric_scene(localizer, fused.scene)
+    off = deviations(SE3.stack([fused.pose]), SE3.identity())[0]
     millimetres, degrees = length_mm_deg(off)
     wrong = millimetres > options.most_mm or degrees > options.most_deg
     reason = f"stated pose is {millimetres:.1f} mm and {degrees:.2f} deg from where it was found"

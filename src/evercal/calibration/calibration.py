@@ -13,7 +13,7 @@ repeat other values, for people and for programs that read one of them.
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar, get_args
@@ -52,6 +52,29 @@ class ErrorTerm:
     translation_mm: float
     rotation_deg: float
 
+    @classmethod
+    def of(cls, name: str, covariance: NDArray[np.floating]) -> Self:
+        """The term of a covariance (6, 6), metres and radians; rounding below zero counts as 0."""
+        variance = np.maximum(np.diag(covariance), 0.0)
+        return cls(name, *axis_deviation(np.diag(variance)))
+
+
+def position_shares(terms: Sequence[ErrorTerm]) -> list[float]:
+    """Share of each term in the variance of the position, 0 to 1; they sum to 1."""
+    variances = [term.translation_mm**2 for term in terms]
+    total = sum(variances)
+    return [variance / total if total > 0 else 0.0 for variance in variances]
+
+
+def largest_term(terms: Sequence[ErrorTerm]) -> tuple[str, float]:
+    """Name and share of the largest term of the position; an empty name without terms."""
+    shares = position_shares(terms)
+    return max(
+        zip((term.name for term in terms), shares, strict=True),
+        key=lambda pair: pair[1],
+        default=("", 0.0),
+    )
+
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
@@ -76,7 +99,7 @@ class Calibration:
     images: tuple[ImageUse, ...] = ()
     """All images in the given order."""
     error_terms: tuple[ErrorTerm, ...] = ()
-    """Parts of the covariance."""
+    """Parts of the covariance by cause; from images, those of `CovarianceTerm` and the scatter."""
     checks: Mapping[str, Any] = field(default_factory=dict)
     """Results of the checks, JSON values: `held_out_mm`, `repeatability_mm`, ..."""
     verdict: str = ""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, ImageUse
-from evercal.calibration.from_images import map_digest
+from evercal.calibration.from_images import map_digest, metric_scene
 from evercal.calibration.located import Fused, Located, deviations, fuse, length_mm_deg, locate
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, axis_deviation
@@ -72,7 +72,8 @@ def check(
         on_image: Called after each image.
 
     Raises:
-        InputError: No image was located, or the reference is a camera on the gripper.
+        InputError: No image was located, the reference is a camera on the gripper, or the scene's
+            unit of length is unknown.
     """
     located = locate(localizer, images, camera or reference.camera, on_image)
     return shift_between(reference, fuse(located), located, localizer)
@@ -95,7 +96,8 @@ def shift_between(
         confidence: Least confidence of a move.
 
     Raises:
-        InputError: The reference is a camera on the gripper.
+        InputError: The reference is a camera on the gripper, or the scene's unit of length is
+            unknown.
     """
     from scipy import stats
 
@@ -104,6 +106,7 @@ def shift_between(
             "the reference is a camera on the gripper, whose pose in the base changes with every"
             " move; give the calibration of a camera that stands still"
         )
+    metric_scene(localizer, fused.scene)
     same = reference.source.get("map") == map_digest(localizer, fused.scene)
     off = deviations(SE3.stack([fused.pose]), reference.parent_from_child)[0]
     count = int(fused.used.sum())

@@ -11,12 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.calibration import Calibration, ErrorTerm, Mount
+from evercal.calibration.calibration import Calibration, ErrorTerm, Mount, largest_term
 from evercal.calibration.located import (
     Fused,
     Located,
@@ -28,7 +28,9 @@ from evercal.calibration.located import (
 )
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, axis_deviation, pose_distance
+from evercal.geometry import SE3, Camera, pose_distance
+from evercal.localization.estimate import Cause
+from evercal.localization.intrinsics import STATED
 from evercal.localization.localizer import cameras_in_scenes
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings import read_image
@@ -120,7 +122,8 @@ def calibrate(
         base_from_camera for eye_to_hand, gripper_from_camera for eye_in_hand.
 
     Raises:
-        InputError: No image was located, or eye_in_hand without gripper poses.
+        InputError: No image was located, eye_in_hand without gripper poses, or the scene's unit of
+            length is unknown.
     """
     grippers = given.base_from_gripper
     if grippers is not None and len(grippers) != len(given.images):
@@ -137,7 +140,7 @@ def calibrate(
     if mount == "eye_in_hand" and grippers is not None:
         moved = in_gripper_frame(located, grippers)
     fused = fuse(moved)
-    scene = scene_named(localizer, fused.scene)
+    scene = metric_scene(localizer, fused.scene)
     height, width = given.images[0][1].shape[:2]
     # The guess fits images of another aspect ratio, too.
     stated = cameras_in_scenes(given.camera, given.images[0][1], [scene])[0]
@@ -206,6 +209,18 @@ def scene_named(localizer: "Localizer", name: str) -> SceneMap:
     raise InputError(f"scene {name!r}: the map has only {', '.join(localizer.scenes)}")
 
 
+def metric_scene(localizer: "Localizer", name: str) -> SceneMap:
+    """Return the map of a scene whose answers are in metres, or raise InputError."""
+    scene = scene_named(localizer, name)
+    if not scene.unit_known:
+        raise InputError(
+            f"scene {name}: the unit of length of its recording is unknown, so there are no"
+            " millimetres; run 'evercal align' first, with --robot-poses or with --points and"
+            " --picks"
+        )
+    return scene
+
+
 def map_digest(localizer: "Localizer", name: str) -> str:
     """Identify a scene's map and base frame: poses with the same digest share their errors."""
     scene = scene_named(localizer, name)
@@ -233,11 +248,8 @@ def _from_one_spot(located: Sequence[Located], fused: Fused) -> tuple[Array, tup
     used = fused.select(located)
     shared = np.mean([item.covariance for item in used], axis=0)
     own = fused.scatter / len(used)
-    terms = (
-        _term("landmarks and intrinsics, shared by all images from this spot", shared),
-        _term(f"scatter of {len(used)} images", own),
-    )
-    return shared + own, terms
+    name = f"scatter of {len(used)} images" if len(used) > 1 else "scatter (unknown from one image)"
+    return shared + own, (*_by_cause(used), ErrorTerm.of(name, own))
 
 
 def _from_many_spots(
@@ -260,11 +272,24 @@ def _from_many_spots(
     # Student factor of a covariance that was estimated from few spots.
     student = float((stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975)) ** 2)
     covariance = own * np.outer(scale, scale) * student
-    terms = (
-        _term(f"images from {count} spots", own),
-        _term("scatter among spots, with the errors of the robot's poses", scatter),
-    )
-    return covariance, terms
+    name = f"arm, and scatter among {count} spots"
+    return covariance, (*_by_cause(used, count), ErrorTerm.of(name, covariance - own))
+
+
+def _by_cause(used: Sequence[Located], spots: int = 1) -> tuple[ErrorTerm, ...]:
+    """The mean covariance of the images by cause, over the number of spots.
+
+    The moving axes of a gripper do not matter, since a term has one deviation for three axes.
+    """
+    total = {name: np.zeros((6, 6)) for name in get_args(Cause)}
+    for item in used:
+        terms = item.estimate.terms
+        if not terms and item.estimate.covariance is not None:
+            total["view"] += item.estimate.covariance
+        for term in terms:
+            total[term.name] += term.covariance
+    count = len(used) * spots
+    return tuple(ErrorTerm.of(name, covariance / count) for name, covariance in total.items())
 
 
 def _spots(poses: Sequence[SE3]) -> NDArray[np.int64]:
@@ -278,10 +303,6 @@ def _spots(poses: Sequence[SE3]) -> NDArray[np.int64]:
         if numbers[-1] == len(centres):
             centres.append(pose)
     return np.array(numbers)
-
-
-def _term(name: str, covariance: Array) -> ErrorTerm:
-    return ErrorTerm(name, *axis_deviation(covariance))
 
 
 def _checks(moved: Sequence[Located], fused: Fused) -> Mapping[str, Any]:
@@ -301,7 +322,8 @@ def _checks(moved: Sequence[Located], fused: Fused) -> Mapping[str, Any]:
 def _advice(calibration: Calibration, fused: Fused, contradicted: bool) -> list[str]:
     """How to improve the result."""
     used, lost = int(fused.used.sum()), int((~fused.used).sum())
-    advice = []
+    advice = _lens_advice(calibration)
+    near = largest_term(calibration.error_terms)[0] in ("view", "map")
     if calibration.source["intrinsics"] == "map" and not contradicted:
         advice.append(
             f"The intrinsics are those of the camera that recorded {fused.scene}: give --camera if"
@@ -317,6 +339,23 @@ def _advice(calibration: Calibration, fused: Fused, contradicted: bool) -> list[
     elif calibration.mount == "eye_to_hand" and used >= 5:
         advice.append(
             "More images from this spot will not help: the remaining error is common to all of"
-            " them. Keyframes nearer to the camera's view would."
+            " them." + (" Keyframes nearer to the camera's view would." if near else "")
         )
     return advice
+
+
+def _lens_advice(calibration: Calibration) -> list[str]:
+    """What to do where the intrinsics are the largest term of the position."""
+    name, share = largest_term(calibration.error_terms)
+    if name != "lens":
+        return []
+    moves = calibration.mount == "eye_in_hand"
+    advice = "give --camera with intrinsics from images of a board ('evercal detect')"
+    if moves:
+        advice += ", or images from more spots"
+    if calibration.source["intrinsics"] == "given":
+        known = f"--camera counts as known to {100 * STATED.focal:g} % of the focal length"
+        more = "images from more spots determine" if moves else "a view with more depth determines"
+        advice = f"{known}; {more} it better"
+    percent = f"{100 * share:.0f} %"
+    return [f"The lens is the largest term, {percent} of the position's variance: {advice}."]

@@ -25,7 +25,7 @@ class Align:
     Give images of a camera on the gripper with --robot-poses, or points that the tool has touched
     with --points and --picks. The error of the alignment is part of every later answer.
 
-    Example: evercal align cell.evercal cell wrist/ --robot-poses poses.csv --unknown-scale
+    Example: evercal align cell.evercal cell wrist/ --robot-poses poses.csv
     """
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
@@ -48,7 +48,8 @@ class Align:
     picks: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Points in images: lines of image, name, u, v in pixels; images relative to this file."""
     unknown_scale: bool = False
-    """Estimate the scale, for a scene that was not learned in metres."""
+    """Estimate the scale, for a scene that was not learned in metres. Default where the unit of
+    length of its recording is unknown."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
@@ -87,8 +88,14 @@ class Align:
             detected = read_board_poses(self.board_poses).detected
             by_name = {Path(image.name).name: image.camera_from_board for image in detected}
             boards = {str(f): pose for f in files if (pose := by_name.get(f.name)) is not None}
-        metric = not self.unknown_scale
+        metric = self._metric(localizer)
         return align_by_gripper(localizer, self.scene, images, poses, metric, boards)
+
+    def _metric(self, localizer: "Localizer") -> bool:
+        """Whether the scale is known."""
+        from evercal.calibration.from_images import scene_named
+
+        return scene_named(localizer, self.scene).metric and not self.unknown_scale
 
     def _by_points(self, localizer: "Localizer") -> "MapAlignment":
         from evercal.calibration.align import aligned_by_points
@@ -104,7 +111,8 @@ class Align:
             by_image.setdefault(image, {})[name] = pixel
         folder = self.picks.parent
         picks = [(name, read_image(folder / name), pixels) for name, pixels in by_image.items()]
-        return aligned_by_points(localizer, self.scene, points, picks, not self.unknown_scale)
+        metric = self._metric(localizer)
+        return aligned_by_points(localizer, self.scene, points, picks, metric)
 
     def _print(self, alignment: "MapAlignment") -> None:
         similarity, (mm, deg) = alignment.similarity, alignment.sigma

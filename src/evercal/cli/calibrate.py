@@ -1,5 +1,6 @@
 """`evercal calibrate`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -9,11 +10,12 @@ from tyro.conf import Positional, arg
 from evercal.cli.console import print_json, print_next, progress_bar, require_writable
 from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for, read_images
+from evercal.cli.point_words import Point, point_dict, point_of, point_text
 from evercal.cli.stores import open_map
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.calibration.calibration import Calibration
+    from evercal.calibration.calibration import Calibration, ErrorTerm
     from evercal.calibration.from_images import Images
     from evercal.calibration.rig import Rig
     from evercal.localization.localizer import Localizer
@@ -48,6 +50,9 @@ class Calibrate:
     """Intrinsics of these images. Default: those of the camera that recorded the scene."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("calibration.json")
     """Output file."""
+    at: Annotated[str | None, arg(metavar="X,Y,Z", help_behavior_hint="")] = None
+    """A point in the camera frame (x right, y down, z forward; metres), such as an object that the
+    camera sees: print its standard deviation in the base or gripper frame."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
@@ -55,20 +60,21 @@ class Calibrate:
     def run(self) -> int:
         """Calibrate, write the file and print the verdict."""
         require_writable(self.out, "--out")
+        point = point_of(self.at)
         named = {word.split("=", 1)[0]: Path(word.split("=", 1)[1]) for word in self._named()}
         from evercal.recordings.image_files import image_files
 
         if named:
-            return self._rig(open_map(self.store, self.device), named)
+            return self._rig(open_map(self.store, self.device), named, point)
         files = image_files([Path(word) for word in self.images])
         given = self._given(files)
         localizer = open_map(self.store, self.device)
         calibration = self._calibrated(localizer, given)
         calibration.write(self.out)
         if self.json:
-            print_json(calibration.to_dict())
+            print_json({**calibration.to_dict(), **_at_dict(calibration, point)})
         else:
-            for line in calibration_lines(calibration):
+            for line in calibration_lines(calibration, point):
                 print(line)
             print_next("evercal", "export", self.out, "--format", "easy_handeye2")
         from evercal.calibration.verdict import tier
@@ -103,7 +109,7 @@ class Calibrate:
             calibration = calibrate(localizer, given, self.mount, on_image=bar.update)
         return replace(calibration, source={**calibration.source, "store": str(self.store)})
 
-    def _rig(self, localizer: "Localizer", folders: dict[str, Path]) -> int:
+    def _rig(self, localizer: "Localizer", folders: dict[str, Path], point: Point | None) -> int:
         from evercal.calibration.rig import rig_of
         from evercal.recordings.image_files import image_files
 
@@ -113,15 +119,23 @@ class Calibrate:
         rig = rig_of(cameras)
         rig.write(self.out)
         if self.json:
-            print_json(rig.to_dict())
+            record = rig.to_dict()
+            for name, calibration in rig.cameras.items():
+                record["cameras"][name] |= _at_dict(calibration, point)
+            print_json(record)
         else:
-            for line in _rig_lines(rig):
+            for line in _rig_lines(rig, point):
                 print(line)
         return 0
 
 
-def calibration_lines(calibration: "Calibration") -> list[str]:
-    """A calibration in lines."""
+def _at_dict(calibration: "Calibration", point: Point | None) -> dict[str, object]:
+    """The entry of --at in the JSON output; empty without the option."""
+    return {} if point is None else {"at": point_dict(point, calibration.uncertain_pose)}
+
+
+def calibration_lines(calibration: "Calibration", point: Point | None = None) -> list[str]:
+    """A calibration in lines. `point` is that of --at."""
     used = sum(image.used for image in calibration.images)
     x, y, z = 1000 * calibration.parent_from_child.translation_m
     lines = [
@@ -133,10 +147,9 @@ def calibration_lines(calibration: "Calibration") -> list[str]:
         f"  uncertainty  {calibration.sigma_mm:.2f} mm, {calibration.sigma_deg:.3f} deg"
         " (standard deviation per axis)",
     ]
-    lines += [
-        f"    of it      {term.translation_mm:.2f} mm, {term.rotation_deg:.3f} deg: {term.name}"
-        for term in calibration.error_terms
-    ]
+    lines += _budget_lines(calibration.error_terms)
+    if point is not None:
+        lines.append(f"  point        {point_text(point, calibration.uncertain_pose)}")
     if "repeatability_mm" in calibration.checks:
         checks = calibration.checks
         lines.append(
@@ -149,10 +162,22 @@ def calibration_lines(calibration: "Calibration") -> list[str]:
     return [*lines, f"  verdict      {calibration.verdict}"]
 
 
-def _rig_lines(rig: "Rig") -> list[str]:
+def _budget_lines(terms: "Sequence[ErrorTerm]") -> list[str]:
+    """The terms of the uncertainty that count, each with its share."""
+    from evercal.calibration.calibration import position_shares
+
+    return [
+        f"    of it      {term.translation_mm:.2f} mm, {term.rotation_deg:.3f} deg:"
+        f" {term.name} ({100 * share:.0f} % of the position's variance)"
+        for term, share in zip(terms, position_shares(terms), strict=True)
+        if term.translation_mm >= 0.005 or term.rotation_deg >= 0.0005
+    ]
+
+
+def _rig_lines(rig: "Rig", point: Point | None) -> list[str]:
     lines = []
     for name, calibration in rig.cameras.items():
-        first, *rest = calibration_lines(calibration)
+        first, *rest = calibration_lines(calibration, point)
         lines += [f"{name}: {first}", *rest]
     for pair in rig.relative:
         pose = pair.first_from_second

@@ -95,6 +95,9 @@ class Learn:
         if self.calibration is not None:
             print(f"wrote {self.calibration}")
             print_next("evercal", "export", self.calibration, "--format", "easy_handeye2")
+        elif not recording.metric:
+            align = ("evercal", "align", self.store, report.scene)
+            print_next(*align, "IMAGE...", "--robot-poses", "FILE")
         elif recording.test:
             scene = str(self.scene) if self.name is None else f"{self.name}={self.scene}"
             print_next("evercal", "evaluate", self.store, scene)

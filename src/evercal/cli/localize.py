@@ -11,12 +11,14 @@ from tyro.conf import Positional, arg
 from evercal.cli.console import print_json, print_next, progress_bar, require_folder
 from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for
+from evercal.cli.point_words import Point, point_dict, point_of, point_text
 from evercal.cli.stores import open_localizer
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from evercal.geometry import Camera
+    from evercal.calibration.calibration import ErrorTerm
+    from evercal.geometry import Camera, UncertainPose
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import LearnedLocalizer
 
@@ -39,6 +41,9 @@ class Localize:
     that recorded the scene."""
     overlay: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Output folder for copies of the images with their inliers."""
+    at: Annotated[str | None, arg(metavar="X,Y,Z", help_behavior_hint="")] = None
+    """A point in the camera frame (x right, y down, z forward; metres), such as an object that the
+    camera sees: print its standard deviation in the base frame."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
@@ -47,6 +52,7 @@ class Localize:
         """Locate every image; nothing is printed before all of them were read."""
         from evercal.recordings.image_files import image_files
 
+        point = point_of(self.at)
         files = image_files(self.images)
         camera = camera_for(self.camera, files)
         require_folder(self.overlay, "--overlay")
@@ -54,10 +60,10 @@ class Localize:
         answers = self._answers(localizer, files, camera)
         located = sum(answer.estimate.status == "ok" for answer in answers)
         if self.json:
-            print_json({"images": [as_dict(answer) for answer in answers]})
+            print_json({"images": [as_dict(answer, point) for answer in answers]})
         else:
             for answer in answers:
-                print(as_text(answer))
+                print(as_text(answer, point))
             self._next(files, located)
         return 0 if located else 1
 
@@ -74,11 +80,12 @@ class Localize:
             image = read_image(path)
             estimate = localizer.localize(image, camera)
             milliseconds = 1000 * (time.perf_counter() - began)
+            known = self._unit_known(localizer, estimate.scene)
             if self.overlay is not None and estimate.scene is not None:
                 intrinsics = camera or scene_camera(localizer, estimate.scene)
-                drawn = draw_estimate(image, estimate, intrinsics)
+                drawn = draw_estimate(image, estimate, intrinsics, legend=known)
                 write_image(self.overlay / _overlay_name(files, number), drawn)
-            return Answer(path, estimate, milliseconds)
+            return Answer(path, estimate, milliseconds, known)
 
         answers = []
         with progress_bar("localizing", len(files), "image") as bar:
@@ -86,6 +93,12 @@ class Localize:
                 answers.append(item)
                 bar.update()
         return answers
+
+    @staticmethod
+    def _unit_known(localizer: "LearnedLocalizer", name: str | None) -> bool:
+        """Whether answers in a scene are in metres; those of networks are taken to be."""
+        scenes = [scene for scene in localizer.contents.scenes if scene.name == name]
+        return all(getattr(scene, "unit_known", True) for scene in scenes)
 
     def _next(self, files: list[Path], located: int) -> None:
         if not located:
@@ -103,6 +116,8 @@ class Answer:
     path: Path
     estimate: "PoseEstimate"
     milliseconds: float
+    unit_known: bool = True
+    """Whether lengths are in metres; else their unit is unknown."""
 
 
 def _overlay_name(files: list[Path], number: int) -> str:
@@ -112,32 +127,56 @@ def _overlay_name(files: list[Path], number: int) -> str:
     return f"{stems[number]}{again}-overlay.png"
 
 
-def as_dict(answer: Answer) -> dict[str, object]:
-    """One image's entry in the JSON output; null without a pose."""
-    import numpy as np
+def as_dict(answer: Answer, point: Point | None = None) -> dict[str, object]:
+    """One image's entry in the JSON output; null without a pose. `point` is that of --at.
 
+    Where the unit of length is unknown, lengths are in that unit and there are no millimetres.
+    """
     from evercal.recordings.formats.generic import pose_to_dict
 
     estimate = answer.estimate
-    pose, covariance = pose_to_dict(estimate.base_from_camera), estimate.covariance
+    pose, uncertain = pose_to_dict(estimate.base_from_camera), _finite(estimate)
+    metric = uncertain if answer.unit_known else None
     if pose is not None and estimate.base_from_camera is not None:
         pose["matrix"] = estimate.base_from_camera.matrix().tolist()
-    usable = covariance is not None and bool(np.isfinite(covariance).all())
-    return {
+    terms = [{**vars(term), "share": share} for term, share in budget_of(estimate)]
+    if not answer.unit_known:
+        terms = [{**term, "translation_mm": None} for term in terms]
+    entry = {
         "path": str(answer.path),
         "status": estimate.status,
         "reason": estimate.reason,
         "scene": estimate.scene,
+        "unit": None if pose is None else "metres" if answer.unit_known else "unknown",
         "base_from_camera": pose,
-        "covariance": covariance.tolist() if covariance is not None and usable else None,
+        "covariance": None if uncertain is None else uncertain.covariance.tolist(),
+        "error_terms": terms,
         "inliers": int(estimate.inliers),
         "inlier_ratio": float(estimate.inlier_ratio),
         "ms": answer.milliseconds,
     }
+    if point is not None:
+        entry["at"] = None if metric is None else point_dict(point, metric)
+    return entry
 
 
-def as_text(answer: Answer) -> str:
-    """One image's block of text."""
+def _finite(estimate: "PoseEstimate") -> "UncertainPose | None":
+    """The pose with its covariance; None without a usable one."""
+    uncertain = estimate.uncertain_pose
+    finite = uncertain is not None and all(map(math.isfinite, uncertain.covariance.flat))
+    return uncertain if finite else None
+
+
+def budget_of(estimate: "PoseEstimate") -> "list[tuple[ErrorTerm, float]]":
+    """The causes of an answer's covariance, each with its share of the position's variance."""
+    from evercal.calibration.calibration import ErrorTerm, position_shares
+
+    terms = [ErrorTerm.of(term.name, term.covariance) for term in estimate.terms]
+    return list(zip(terms, position_shares(terms), strict=True))
+
+
+def as_text(answer: Answer, point: Point | None = None) -> str:
+    """One image's block of text. `point` is that of --at."""
     estimate = answer.estimate
     share = (
         f"{estimate.inliers} ({100 * estimate.inlier_ratio:.0f} %), {answer.milliseconds:.0f} ms"
@@ -151,15 +190,26 @@ def as_text(answer: Answer) -> str:
         sd = estimate.covariance.diagonal().clip(0) ** 0.5
         spread = [_numbers(1000 * sd[:3], ".2f"), _numbers(sd[3:] * 180 / math.pi, ".3f")]
         spread = [f"  sd {spread[0]} mm", f"  sd {spread[1]} deg"]
-    return "\n".join(
-        [
-            str(answer.path),
-            f"  scene        {estimate.scene}",
-            f"  translation  {_numbers(pose.translation_m, '+.4f')} m{spread[0]}",
-            f"  quaternion   {_numbers(pose.rotation_wxyz, '+.4f')} wxyz{spread[1]}",
-            f"  inliers      {share}",
-        ]
-    )
+    unit = f"m{spread[0]}" if answer.unit_known else "in an unknown unit: run 'evercal align' first"
+    lines = [
+        str(answer.path),
+        f"  scene        {estimate.scene}",
+        f"  translation  {_numbers(pose.translation_m, '+.4f')} {unit}",
+        f"  quaternion   {_numbers(pose.rotation_wxyz, '+.4f')} wxyz{spread[1]}",
+        f"  inliers      {share}",
+    ]
+    if budget := _budget_words(estimate):
+        lines.insert(-1, f"  budget       {budget} of the position's variance")
+    uncertain = _finite(estimate)
+    if point is not None and uncertain is not None and answer.unit_known:
+        lines.insert(-1, f"  point        sd {point_text(point, uncertain)}")
+    return "\n".join(lines)
+
+
+def _budget_words(estimate: "PoseEstimate") -> str:
+    """Shares of the causes, the largest first; empty without any."""
+    parts = sorted(budget_of(estimate), key=lambda part: -part[1])
+    return ", ".join(f"{t.name} {100 * share:.0f} %" for t, share in parts if share >= 0.005)
 
 
 def _numbers(values: "np.ndarray", form: str) -> str:

@@ -34,6 +34,9 @@ class Reading:
     pose_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Format of the gripper poses, if the file's header does not state it; rad or deg for joint
     angles."""
+    metres: bool = False
+    """The poses of a COLMAP or nerfstudio recording are in metres. Default: their unit is unknown
+    until 'evercal align'."""
     every: Annotated[int, arg(metavar="N")] = 1
     """Use every N-th image."""
 
@@ -53,5 +56,6 @@ class Reading:
         words = []
         for field in fields(self):
             if (value := getattr(self, field.name)) != field.default:
-                words += ["--" + field.name.replace("_", "-"), str(value)]
+                words.append("--" + field.name.replace("_", "-"))
+                words += [] if value is True else [str(value)]
         return words

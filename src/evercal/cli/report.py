@@ -8,6 +8,7 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, progress_bar, require_writable
 from evercal.cli.device import Device
+from evercal.cli.point_words import point_dict, point_of, point_text
 from evercal.cli.stores import open_localizer
 
 if TYPE_CHECKING:
@@ -33,6 +34,9 @@ class Report:
     """Images of the camera, or a folder of them."""
     against: Annotated[Path | None, arg(metavar="OLD.json", help_behavior_hint="")] = None
     """Older calibration of the same camera, to compare with."""
+    at: Annotated[str | None, arg(metavar="X,Y,Z", help_behavior_hint="")] = None
+    """A point in the camera frame (x right, y down, z forward; metres), such as an object that the
+    camera sees: its standard deviation in the base or gripper frame is reported."""
     out: Annotated[Path, arg(metavar="FILE.html")] = Path("report.html")
     """The report, one file including its pictures."""
     device: Device = "auto"
@@ -42,6 +46,7 @@ class Report:
     def run(self) -> int:
         """Write the report."""
         require_writable(self.out, "--out")
+        point = point_of(self.at)
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.verdict import expected_error, tier, verdict
         from evercal.reports.calibration_page import NamedCalibration, calibration_page, difference
@@ -54,11 +59,12 @@ class Report:
         file = NamedCalibration(self.calibration.name, calibration)
         images = self._images(file, older)
         store = None if self.store is None else str(self.store)
-        page = calibration_page(file, images, store, older)
+        page = calibration_page(file, images, store, older, point)
         write_bytes(self.out, page.html.encode())
         text = calibration.verdict or verdict(calibration)
         if not self.json:
-            print("\n".join([text, *(f"  {sentence}" for sentence in page.missing)]))
+            words = [] if point is None else [point_text(point, calibration.uncertain_pose)]
+            print("\n".join([text, *(f"  {line}" for line in (*words, *page.missing))]))
             print(f"wrote {self.out}")
             print_next("evercal", "export", self.calibration, "--format", "easy_handeye2")
             return 0
@@ -77,6 +83,7 @@ class Report:
                 "pictures": [image.name for image in images.images],
                 "against": against,
                 "missing": list(page.missing),
+                **({} if point is None else {"at": point_dict(point, calibration.uncertain_pose)}),
             }
         )
         return 0

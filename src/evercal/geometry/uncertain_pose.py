@@ -91,6 +91,22 @@ class UncertainPose:
         # A pose from few points can have a singular covariance; its null space is left out.
         return float(error @ np.linalg.pinv(self.covariance) @ error)
 
+    def point_covariance(self, point_m: ArrayLike) -> Array:
+        """Covariance (3, 3) of a point (3,) in the parent frame, square metres.
+
+        The point is exact in the child frame, metres. With the error (dt, dr) of the pose it moves
+        by dt + R (dr x point): metres along the axes of the parent, `dr` in radians about those of
+        the child.
+        """
+        slope = np.zeros((3, 6))
+        slope[:, :3] = np.eye(3)
+        slope[:, 3:] = -self.pose.rotation_matrix() @ cross_matrix(point_m)
+        return slope @ self.covariance @ slope.T
+
+    def point_sigma_mm(self, point_m: ArrayLike) -> float:
+        """Standard deviation of a point per axis, millimetres, see `point_covariance`."""
+        return 1000 * float(np.sqrt(np.trace(self.point_covariance(point_m)) / 3))
+
     @property
     def sigma_mm(self) -> float:
         """Standard deviation of the translation per axis, millimetres."""

@@ -7,12 +7,14 @@ import numpy as np
 
 from evercal.geometry import SE3, Camera, UncertainPose
 
+Cause = Literal["view", "lens", "map", "stated poses", "base frame"]
+
 
 @dataclass(frozen=True, eq=False)
 class CovarianceTerm:
     """The share of one cause in the covariance of a pose."""
 
-    name: Literal["view", "lens", "map", "stated poses", "base frame"]
+    name: Cause
     """`view`: landmarks of this image. `lens`: its intrinsics. `map`: poses of keyframes.
     `stated poses`: errors that neighbouring stated poses share. `base frame`: a motion of the base
     frame that all answers share."""

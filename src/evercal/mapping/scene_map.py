@@ -33,6 +33,13 @@ class SceneMap:
     """Poses with less support are rejected (`localization.acceptance`)."""
     covariance_scale: float = 1.0
     """Factor on covariances (`localization.acceptance.COVARIANCE_SCALE`)."""
+    metric: bool = True
+    """Whether the recording was in metres; False where its unit of length is unknown."""
+
+    @property
+    def unit_known(self) -> bool:
+        """Whether answers are in metres: of the recording, or by alignment with the base frame."""
+        return self.metric or self.frame.similarity is not None
 
     @property
     def landmarks(self) -> int:

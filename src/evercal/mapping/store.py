@@ -36,6 +36,7 @@ SCENE, KEYFRAMES, CORRECTION = "scene.json", "keyframes.safetensors", "correctio
 
 _FIELDS = (
     "name", "camera", "adjusted_camera", "train_frames", "min_support", "covariance_scale",
+    "metric",
 )  # fmt: skip
 """Fields of `SceneMap` in scene.json, beside `frame`."""
 
@@ -188,7 +189,7 @@ def write_scene(folder: Path, scene: SceneMap) -> None:
 
 def read_scene(folder: Path) -> SceneMap:
     """Read a scene from its folder."""
-    content = json.loads((folder / SCENE).read_text())
+    content = {"metric": True, **json.loads((folder / SCENE).read_text())}
     correction = None
     if (folder / CORRECTION).exists():
         correction = correction_of(load_tensors(folder / CORRECTION))

@@ -80,6 +80,9 @@ class Recording:
     """Name of the base frame, if several scenes share it."""
     notes: tuple[str, ...] = ()
     """Choices and omissions of the reader, one sentence each."""
+    metric: bool = True
+    """Whether lengths are metres; False where their unit is unknown, as in structure from motion.
+    `base_from_camera` is then in that unit."""
 
 
 def posed_recording(recording: Recording) -> Recording:

@@ -24,6 +24,9 @@ class ReadOptions:
     pose_convention: str | None = None
     """Convention of a pose file, see `read_robot_poses`; rad or deg for joint angles. If omitted,
     the file defines it."""
+    metres: bool = False
+    """The lengths of a COLMAP or nerfstudio recording are metres. If omitted, their unit is
+    unknown."""
     every: int = 1
     """Take every N-th image; 1 for all."""
 

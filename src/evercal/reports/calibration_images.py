@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.calibration.from_images import map_digest
 from evercal.errors import InputError
+from evercal.geometry import resize_pixels
 from evercal.recordings.images import read_image
 from evercal.reports.frame_axes import (
     AxesInView,
@@ -19,7 +20,7 @@ from evercal.reports.frame_axes import (
     draw_axes,
     draw_directions,
 )
-from evercal.reports.overlay import overlay_points
+from evercal.reports.overlay import overlay_lines, overlay_points
 from evercal.reports.pictures import landmark_errors
 
 if TYPE_CHECKING:
@@ -33,6 +34,9 @@ _CLOSE_UP_PX = 480
 _ASPECT_TOLERANCE = 0.01
 _MAX_RESIDUAL_PX = 2.0
 """Upper end of the colour scale, pixels of the working image."""
+_VECTOR_PX = 25.0
+"""Length of long residual vectors as drawn, pixels of the page."""
+_VECTOR_COLOUR = (255, 140, 40)
 
 
 @dataclass(frozen=True)
@@ -201,13 +205,28 @@ def _with_landmarks(
     if errors is None:
         return large, estimate.reason or estimate.status.replace("_", " "), 0
     own = image.shape[0] / errors.height
-    pixels = (errors.pixels + 0.5) * (large.shape[0] / errors.height) - 0.5
+    enlarged = large.shape[0] / errors.height
+    pixels = resize_pixels(errors.pixels, enlarged)
     residuals = own * errors.errors_px
     limits = (0.0, _MAX_RESIDUAL_PX * own)
     drawn = overlay_points(large, pixels, residuals, 3.5, limits, "residual (px)")
+    vectors = enlarged * (errors.projected - errors.pixels)
+    times = exaggeration(vectors)
+    lines = np.stack([pixels, pixels + times * vectors], 1)
+    drawn = overlay_lines(drawn, list(lines), [_VECTOR_COLOUR] * len(lines), 1, rims=False)
     median = float(np.nanmedian(residuals)) if np.isfinite(residuals).any() else np.nan
-    summary = f"{len(residuals)} landmarks, median residual {median:.2f} px"
+    summary = (
+        f"{len(residuals)} landmarks, median residual {median:.2f} px, lines {times} times as long"
+    )
     return drawn, summary, len(residuals)
+
+
+def exaggeration(vectors: NDArray[np.float64]) -> int:
+    """Factor that makes residual vectors (n, 2) visible, the same for all: 1, 2, 5, 10, ..."""
+    lengths = np.linalg.norm(vectors, axis=1)
+    long = float(np.nanpercentile(lengths, 90)) if np.isfinite(lengths).any() else _VECTOR_PX
+    factors = [1, 2, 5, 10, 20, 50, 100]
+    return max([factor for factor in factors if factor * long <= _VECTOR_PX], default=1)
 
 
 def _use(use: ImageUse | None) -> str:

@@ -76,10 +76,12 @@ def calibration_page(
     images: AnnotatedImages,
     store: str | None = None,
     older: NamedCalibration | None = None,
+    point_m: tuple[float, float, float] | None = None,
 ) -> CalibrationPage:
     """Write the report of a calibration.
 
-    `store` is the path of the store whose landmarks are drawn.
+    `store` is the path of the store whose landmarks are drawn. `point_m` is a point in the camera
+    frame, metres, whose standard deviation is reported.
 
     Raises:
         InputError: A check of the calibration is not a number, or `older` has another mount.
@@ -106,6 +108,7 @@ def calibration_page(
         uncertain=_has_uncertainty(calibration),
         sigma_mm=1000 * sigma[:3],
         sigma_deg=np.rad2deg(sigma[3:]),
+        point=None if point_m is None else _point(calibration, point_m),
         older=older,
         difference=None if older is None else difference(calibration, older.calibration),
         pixel_shift=_pixel_shift(images),
@@ -130,6 +133,23 @@ def _level(calibration: Calibration) -> Literal["good", "fair", "bad", ""]:
         return ""
     best = tier(calibration)
     return "bad" if best is None else "fair" if best is TIERS[-1] else "good"
+
+
+class _Point(NamedTuple):
+    """A point in the camera frame and its error in the parent frame."""
+
+    name: str
+    sigma_mm: list[float]
+    """Along the axes of the parent."""
+    rms_mm: float
+
+
+def _point(calibration: Calibration, point_m: tuple[float, float, float]) -> _Point:
+    uncertain = calibration.uncertain_pose
+    variance = np.maximum(np.diag(uncertain.point_covariance(point_m)), 0.0)
+    name = ", ".join(f"{value:g}" for value in point_m)
+    sigma = (1000 * np.sqrt(variance)).tolist()
+    return _Point(f"({name}) m", sigma, uncertain.point_sigma_mm(point_m))
 
 
 def _pixel_shift(images: AnnotatedImages) -> float | None:

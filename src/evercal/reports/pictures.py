@@ -69,6 +69,8 @@ class LandmarkErrors:
 
     pixels: NDArray[np.float64]
     """(n, 2) detections in the working image."""
+    projected: NDArray[np.float64]
+    """(n, 2) projections of their scene points; NaN behind the camera."""
     errors_px: NDArray[np.float64]
     """(n,) pixels of the working image; NaN behind the camera."""
     height: int
@@ -95,8 +97,9 @@ def landmark_errors(
     short_side = localizer.contents.short_side
     working_camera = (camera or scene.adjusted_camera).short_side_resized(short_side)
     points = scene.frame.camera_among_points(pose).inverse().apply(estimate.points_m)
-    errors = np.linalg.norm(estimate.pixels - working_camera.project(points), axis=1)
-    return LandmarkErrors(estimate.pixels, errors, working_camera.height)
+    projected = working_camera.project(points)
+    errors = np.linalg.norm(estimate.pixels - projected, axis=1)
+    return LandmarkErrors(estimate.pixels, projected, errors, working_camera.height)
 
 
 def _scene(localizer: "LearnedLocalizer", name: str) -> "LearnedScene":

@@ -17,10 +17,13 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.recordings.formats.nerfstudio import NOTE
+from evercal.recordings.formats.nerfstudio import frame_note
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS
 from evercal.recordings.poses.row_files import natural_key
+from evercal.recordings.read_options import ReadOptions
+
+USES = ("metres",)
 
 _MODEL_FOLDERS = (".", "sparse", "colmap/sparse", "distorted/sparse")
 # Indices of fx, fy, cx, cy and OpenCV's distortion in COLMAP's parameters; None for 0.
@@ -39,17 +42,17 @@ def detect(root: Path) -> bool:
     return bool(_models(root))
 
 
-def load(root: str | os.PathLike[str]) -> Recording:
+def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Recording:
     """Read the largest model and check that its images exist; no image is opened.
 
     Raises:
         InputError: The extra `colmap` is not installed, the model is broken, its camera is not
             supported, or its images are missing.
     """
-    root = Path(root)
+    root, metric = Path(root), options is not None and options.metres
     models = _read_models(root)
     folder, model = max(models, key=lambda pair: pair[1].num_reg_images())
-    notes = [NOTE.format(file="COLMAP")]
+    notes = [frame_note("COLMAP", metric)]
     if len(models) > 1:
         sizes = ", ".join(f"{f.name}: {m.num_reg_images()}" for f, m in models)
         notes.append(f"took model {folder.name}, the one with the most images ({sizes})")
@@ -65,7 +68,8 @@ def load(root: str | os.PathLike[str]) -> Recording:
     )
     files = [p for p in images.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS]
     total = max(len(model.images), len(files) if images != root else 0)
-    return Recording(root.resolve().name, frames, (), total - len(frames), notes=tuple(notes))
+    name, lost = root.resolve().name, total - len(frames)
+    return Recording(name, frames, (), lost, notes=tuple(notes), metric=metric)
 
 
 def _models(root: Path) -> list[Path]:

@@ -54,6 +54,9 @@ def load(root: str | os.PathLike[str]) -> Recording:
         untracked = data.get("untracked", 0)
         if not isinstance(untracked, int):
             raise ValueError(f"'untracked' is a count, got {untracked!r}")
+        unit = data.get("unit", "metres")
+        if unit not in ("metres", "unknown"):
+            raise ValueError(f"'unit' is 'metres' or 'unknown', got {unit!r}")
         notes = data.get("notes", [])
         if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
             raise ValueError(f"'notes' is a list of sentences, got {notes!r}")
@@ -76,6 +79,7 @@ def load(root: str | os.PathLike[str]) -> Recording:
         tuple(frames["test"]),
         untracked,
         notes=tuple(notes),
+        metric=unit == "metres",
     )
 
 
@@ -99,6 +103,7 @@ def write(
     """
     with SceneWriter(root, recording.name, link) as writer:
         writer.untracked, writer.notes = recording.untracked, recording.notes
+        writer.metric = recording.metric
         for i, frame in enumerate((*recording.train, *recording.test)):
             writer.add(frame, "train" if i < len(recording.train) else "test")
             if on_frame is not None:
@@ -115,6 +120,7 @@ class SceneWriter:
     def __init__(self, root: str | os.PathLike[str], name: str, link: bool = False) -> None:
         self.untracked = 0
         self.notes: tuple[str, ...] = ()
+        self.metric = True
         self.render: dict[str, object] | None = None
         self._root = Path(root)
         self._name = name
@@ -226,6 +232,8 @@ class SceneWriter:
             "frames": list(self._entries.values()),
             "untracked": self.untracked,
         }
+        if not self.metric:
+            data["unit"] = "unknown"
         if self.notes:
             data["notes"] = list(self.notes)
         if self.render is not None:

@@ -21,6 +21,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, image_size
+from evercal.recordings.read_options import ReadOptions
 from evercal.recordings.text_files import read_json
 
 FILE = "transforms.json"
@@ -28,10 +29,20 @@ _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 # OpenGL axes (right, up, backward) from OpenCV axes (right, down, forward).
 _GL_FROM_CV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
 _TOLERANCE = 1e-2
-NOTE = (
-    "the base frame and the unit of length are those of {file}; if they are not metres in the"
-    " robot's base frame, run 'evercal align' after learning"
-)
+USES = ("metres",)
+
+
+def frame_note(file: str, metric: bool) -> str:
+    """What the recording leaves open: its base frame and, unless `metric`, its unit of length."""
+    if metric:
+        return (
+            f"the base frame is that of {file}; if it is not the robot's, run 'evercal align' after"
+            " learning"
+        )
+    return (
+        f"the base frame and the unit of length are those of {file}: run 'evercal align' after"
+        " learning, or give --metres if the poses are in metres"
+    )
 
 
 def detect(root: Path) -> bool:
@@ -39,7 +50,7 @@ def detect(root: Path) -> bool:
     return (root / FILE).is_file() or (root.name == FILE and root.is_file())
 
 
-def load(root: str | os.PathLike[str]) -> Recording:
+def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Recording:
     """Read the poses and the size of one image of every camera; no other image is opened.
 
     If the file states no image size, that of the first image is taken.
@@ -47,7 +58,7 @@ def load(root: str | os.PathLike[str]) -> Recording:
     Raises:
         InputError: The file or an image is missing, or the file breaks the format.
     """
-    root = Path(root)
+    root, metric = Path(root), options is not None and options.metres
     file = root if root.is_file() else root / FILE
     root = file.parent
     data = read_json(file, "nerfstudio file", "export it again")
@@ -72,7 +83,8 @@ def load(root: str | os.PathLike[str]) -> Recording:
         root.resolve().name,
         tuple(frame for frame in frames if frame.image not in test),
         tuple(frame for frame in frames if frame.image in test),
-        notes=(NOTE.format(file=FILE),),
+        notes=(frame_note(FILE, metric),),
+        metric=metric,
     )
 
 
