@@ -94,6 +94,8 @@ class Alignment:
     """Landmarks whose patch was found near the expected position."""
     planned: int
     """Landmarks that the last round would search in an unobstructed image."""
+    templates: Array
+    """(n, p) patches of the inliers in their keyframes, at half size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +119,10 @@ class _Target:
         starts = np.cumsum([0, *counts])
         return cls(keyframes, starts, np.concatenate(surfaces, 1), np.concatenate(errors))
 
+    def templates(self, which: NDArray[np.int64]) -> Array:
+        """Intensities (n, p) of landmarks at half size, indices in rising order."""
+        return self.patches(1, which).intensity
+
     def patches(self, level: int, which: NDArray[np.int64]) -> Patches:
         """Templates of landmarks, indices in rising order."""
         ends = np.searchsorted(which, self.starts)
@@ -137,15 +143,17 @@ def align_pose(
     options: AlignmentOptions,
     prior: Prior,
     change: Array | None = None,
+    coarse: bool = True,
 ) -> Alignment | None:
     """Refine a rough pose by the landmarks of keyframes.
 
     The camera is that of the first level of the pyramid and the mean of the prior. The start is
     map_from_camera, roughly, with a change (5,) of the intrinsics.
-    Returns None if too few landmarks match.
+    Returns None if too few landmarks match. A start that is known to some pixels needs no `coarse`
+    search.
     """
     search = _Search(pyramid, _Target.of(keyframes), options)
-    pose, rounds = start, options.rounds
+    pose, rounds = start, options.rounds if coarse else options.rounds[1:]
     change = np.zeros(INTRINSICS) if change is None else change
     found, again = None, 0
     while True:
@@ -163,6 +171,7 @@ def align_pose(
             return None  # the intrinsics do not converge
         pose, change, again = refined.pose.pose, refined.change, again + 1
         rounds = options.rounds if moved > _FAR_PX else options.rounds[-1:]
+    assert found.observed.landmark is not None, "landmarks of this search"
     inliers = refined.residual_px < options.inlier_px
     if inliers.sum() < options.min_matches:
         return None
@@ -173,6 +182,7 @@ def align_pose(
         found.expected,
         len(found.observed.pixels),
         min(found.expected, options.rounds[-1].landmarks),
+        search.target.templates(found.observed.landmark[inliers]),
     )
 
 
@@ -288,7 +298,7 @@ class _Search:
         points = target.surface_m[0, which]
         error = _shift_px(points, target.depth_error_m[which], rotation, shift, camera)
         white = whitening(affines[good], spread, options.floor_px, noise, error)
-        return _Found(len(good), Observed(at[good], points, white))
+        return _Found(len(good), Observed(at[good], points, white, which))
 
 
 def _shift_px(points: Array, moves: Array, rotation: Array, shift: Array, camera: Camera) -> Array:

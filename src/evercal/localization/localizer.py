@@ -6,7 +6,7 @@ near a pose with little support, accept.
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, Self
@@ -23,7 +23,6 @@ from evercal.features.views import ViewOptions, plain_view
 from evercal.geometry import (
     SE3,
     Camera,
-    UncertainPose,
     pose_distance_mm_deg,
     resize_pixels,
 )
@@ -58,6 +57,7 @@ from evercal.localization.query import (
     Matches,
     Query,
 )
+from evercal.localization.repetition import displaced, pattern_steps
 from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
@@ -225,7 +225,9 @@ class Localizer:
             tuple(prior_of(camera, image, stated) for stated in recorded),
         )
         best = self._best_hypothesis(query, cameras)
-        rival = self._rival(query, best, cameras) if self._accepted(best) else None
+        rival: Hypothesis | None = None
+        if self._accepted(best):
+            best, rival = self._settled(query, best, cameras)
         return self._answer(query, best, rival, 1000 * (time.perf_counter() - began))
 
     def localize_batch(
@@ -309,28 +311,44 @@ class Localizer:
         matches: Matches | None = None,
     ) -> Hypothesis:
         """A pose in one scene: match, PnP, align; `matches` are used instead of new ones."""
-        scene = self.contents.scenes[candidate.scene]
-        sigma = UNKNOWN if candidate.unknown_camera else query.priors[candidate.scene]
-        rough = self._rough(query, candidate, camera, sigma, near, matches)
+        rough = self._rough(query, candidate, camera, near, matches)
         if rough is None:
             return Hypothesis(candidate.scene)
         if not self.options.align:
             return rough.as_answer(candidate.scene)
         inliers = int(rough.pnp.inliers.sum())
+        pose = rough.pnp.pose
         if near is None and inliers < self.options.aligned_inliers:
-            return Hypothesis(candidate.scene, rough.pnp.pose, pnp_inliers=inliers)
+            return Hypothesis(candidate.scene, pose, pnp_inliers=inliers)
+        aligned = self._aligned(query, candidate, camera, pose.pose, rough.change)
+        if aligned is None:
+            return Hypothesis(candidate.scene, pose, pnp_inliers=inliers)
+        return replace(aligned, pnp_inliers=inliers, matches=rough.matches)
+
+    def _aligned(
+        self,
+        query: Query,
+        candidate: Candidate,
+        camera: Camera,
+        start: SE3,
+        change: NDArray[np.floating],
+        coarse: bool = True,
+    ) -> Hypothesis | None:
+        """A pose map_from_camera, refined by landmarks; see `align_pose`."""
         height, width = query.grey.shape
+        scene = self.contents.scenes[candidate.scene]
         aligned = align_pose(
             query.pyramid,
             camera.resized(width, height),
             [self._bank.load(int(index)).landmarks for index in candidate.keyframes],
-            rough.pnp.pose.pose,
+            start,
             self.options.alignment,
-            Prior(sigma, scene.covariance_scale),
-            rough.change,
+            Prior(self._prior(query, candidate), scene.covariance_scale),
+            change,
+            coarse,
         )
         if aligned is None:
-            return Hypothesis(candidate.scene, rough.pnp.pose, pnp_inliers=inliers)
+            return None
         scale = self.contents.short_side / min(height, width)
         return Hypothesis(
             candidate.scene,
@@ -341,17 +359,19 @@ class Localizer:
             aligned.expected,
             aligned.matched,
             aligned.planned,
-            inliers,
-            candidate,
-            rough.matches,
+            candidate=candidate,
+            templates=aligned.templates,
         )
+
+    @staticmethod
+    def _prior(query: Query, candidate: Candidate) -> IntrinsicsPrior:
+        return UNKNOWN if candidate.unknown_camera else query.priors[candidate.scene]
 
     def _rough(
         self,
         query: Query,
         candidate: Candidate,
         camera: Camera,
-        sigma: IntrinsicsPrior,
         near: Hypothesis | None,
         matches: Matches | None = None,
     ) -> _Rough | None:
@@ -362,6 +382,7 @@ class Localizer:
         now = changed_camera(camera.resized(width, height), change)
         small = now.short_side_resized(self.contents.short_side)
         where = None if near is None or near.pose is None else near.pose.pose
+        sigma = self._prior(query, candidate)
         matches = matches or self._matches(query, candidate, small, where)
         best: _Rough | None = None
         for factor in FOCAL_FACTORS if sigma is UNKNOWN and near is None else (1.0,):
@@ -377,32 +398,56 @@ class Localizer:
         """2D-3D matches in one scene, at the encoder's working size."""
         return self._matcher.matches(query, candidate, camera, near)
 
-    def _rival(self, query: Query, best: Hypothesis, cameras: Sequence[Camera]) -> SE3 | None:
-        """Another pose in the same scene, map_from_camera, that explains the image nearly as well.
+    def _settled(
+        self, query: Query, best: Hypothesis, cameras: Sequence[Camera]
+    ) -> tuple[Hypothesis, Hypothesis | None]:
+        """The pose with the most support among an accepted one and its rivals, and the runner-up.
 
-        Repeated texture matches in several places. The matches that an accepted pose leaves over
-        then agree on a second pose.
+        The runner-up is None unless it explains the image nearly as well as the best one.
         """
-        if best.pose is None or best.refined is None:
-            return None
-        assert best.candidate is not None and best.matches is not None, "the pose is aligned"
-        small = best.refined.camera.short_side_resized(self.contents.short_side)
-        rest = best.matches.beside(small, best.pose.pose, self.options.rival_px)
-        if len(rest.pixels) < self.options.aligned_inliers:
-            return None
-        camera = cameras[best.scene]
-        rival = self._hypothesis(query, best.candidate, camera, None, rest)
-        if rival.refined is None or rival.pose is None:
-            return None
-        enough = support(rival) >= self.options.rival_support * support(best)
-        scene = self.contents.scenes[best.scene]
-        return rival.pose.pose if enough and differ(best, rival.pose.pose, scene) else None
+        runner_up: Hypothesis | None = None
+        for _ in range(self.options.climbs):
+            scene = self.contents.scenes[best.scene]
+            rivals = [
+                rival
+                for rival in self._rivals(query, best, cameras[best.scene])
+                if rival.refined and rival.pose and differ(best, rival.pose.pose, scene)
+            ]
+            runner_up = max(rivals, key=support, default=None)
+            if runner_up is None or support(runner_up) <= support(best):
+                break
+            best, runner_up = runner_up, best
+        if runner_up is None or support(runner_up) < self.options.rival_support * support(best):
+            return best, None
+        return best, runner_up
+
+    def _rivals(self, query: Query, best: Hypothesis, camera: Camera) -> Iterator[Hypothesis]:
+        """Other poses in the same scene.
+
+        Repeated texture matches in several places. So the matches that a pose leaves over may agree
+        on another one, and the pose may have slipped by a step of the pattern.
+        """
+        if best.pose is None or best.refined is None or best.candidate is None:
+            return
+        pose, change = best.pose.pose, best.refined.change
+        if best.matches is not None:
+            small = best.refined.camera.short_side_resized(self.contents.short_side)
+            rest = best.matches.beside(small, pose, self.options.rival_px)
+            if len(rest.pixels) >= self.options.aligned_inliers:
+                yield self._hypothesis(query, best.candidate, camera, None, rest)
+        assert best.points_m is not None, "an aligned pose"
+        assert best.templates is not None, "an aligned pose"
+        for step in pattern_steps(best.points_m, best.templates, pose.translation_m):
+            start = displaced(pose, step)
+            rival = self._aligned(query, best.candidate, camera, start, change, coarse=False)
+            if rival is not None:
+                yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)
 
     def _accepted(self, hypothesis: Hypothesis, times: float = 1.0) -> bool:
         return accepted(hypothesis, self.contents.scenes[hypothesis.scene], times)
 
     def _answer(
-        self, query: Query, best: Hypothesis, rival: SE3 | None, milliseconds: float
+        self, query: Query, best: Hypothesis, rival: Hypothesis | None, milliseconds: float
     ) -> PoseEstimate:
         scene = self.contents.scenes[best.scene]
         if best.pose is None or not self._accepted(best):
@@ -413,8 +458,8 @@ class Localizer:
                 reason="fewer than 6 inliers" if failed else rejection(best, scene),
             )
         estimate, terms = in_base(best, scene)
-        if rival is not None:
-            other = scene.frame.to_base(UncertainPose(rival, np.zeros((6, 6)))).pose
+        if rival is not None and rival.pose is not None:
+            other = scene.frame.to_base(rival.pose).pose
             mm, deg = pose_distance_mm_deg(estimate.pose, other)
             return replace(
                 self._rejected(best, milliseconds),

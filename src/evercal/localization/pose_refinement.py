@@ -28,10 +28,13 @@ class Observed:
     """(n, 3) in the map's frame."""
     whitening: Array
     """(n, 2, 2) that gives errors in the image unit variance."""
+    landmark: NDArray[np.int64] | None = None
+    """(n,) numbers of the landmarks; None where nothing but the pose is wanted."""
 
     def take(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> Self:
         """The observations of an index."""
-        return type(self)(self.pixels[index], self.points_m[index], self.whitening[index])
+        number = None if self.landmark is None else self.landmark[index]
+        return type(self)(self.pixels[index], self.points_m[index], self.whitening[index], number)
 
 
 @dataclass(frozen=True, eq=False)

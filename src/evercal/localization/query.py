@@ -58,7 +58,9 @@ class LocalizeOptions:
     rival_px: float = 16.0
     """A second pose is sought among matches that the first one misses by more than this, pixels at
     the encoder's working size."""
-    rival_support: float = 0.5
+    climbs: int = 5
+    """A rival with more support replaces a pose so many times, at most."""
+    rival_support: float = 0.8
     """An image with a second pose of this share of the first one's support is ambiguous."""
     guided_px: float = 32.0
     """Search radius of guided matching, pixels at the encoder's working size."""
@@ -179,6 +181,8 @@ class Hypothesis:
     """Keyframes that it was found with; None where alignment failed."""
     matches: Matches | None = None
     """All matches; None where alignment failed."""
+    templates: np.ndarray | None = None
+    """(n, p) patches of the inliers, see `Alignment.templates`."""
 
     @property
     def inliers(self) -> int:

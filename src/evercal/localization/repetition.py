@@ -1,0 +1,72 @@
+"""Repeated texture: the steps by which a pose may have slipped.
+
+Landmarks that look alike lie one or several periods of a pattern apart. If many pairs share one
+displacement, the pose displaced by it matches these landmarks as well, and other landmarks decide.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.geometry import SE3
+
+Array = NDArray[np.floating]
+
+MOST_LANDMARKS, MOST_STEPS = 400, 8
+"""Landmarks that are compared, and steps that are returned, at most."""
+ALIKE = 0.85
+"""Smallest correlation of the patches of two landmarks that look alike."""
+TOLERANCE = 0.006
+"""Pairs share a displacement if it differs by less than this share of their distance from the
+camera."""
+LEAST_STEP = 0.015
+"""Smallest step, as a share of the distance from the camera: patches overlap below."""
+LEAST_PAIRS, LEAST_SHARE = 15, 0.05
+"""Pairs that share a displacement, and their number as a share of the landmarks."""
+
+
+def pattern_steps(points_m: Array, templates: Array, position_m: Array) -> Array:
+    """Displacements that many pairs of similar landmarks share, the most frequent first.
+
+    Args:
+        points_m: (n, 3) landmarks that agree with a pose.
+        templates: (n, p) their patches with zero mean and unit deviation.
+        position_m: (3,) position of the camera.
+
+    Returns:
+        (k, 3) metres; with every step, its opposite.
+    """
+    some = np.linspace(0, len(points_m) - 1, min(MOST_LANDMARKS, len(points_m))).astype(int)
+    points, patches = points_m[some], templates[some]
+    away = float(np.median(np.linalg.norm(points - position_m, axis=1)))
+    first, second = np.nonzero(patches @ patches.T > ALIKE * patches.shape[1])
+    moves = points[second] - points[first]
+    moves = moves[np.linalg.norm(moves, axis=1) > LEAST_STEP * away]
+    if not len(moves):
+        return np.zeros((0, 3))
+    least = max(LEAST_PAIRS, LEAST_SHARE * len(some))
+    return _shared(moves, TOLERANCE * away, least)
+
+
+def _shared(moves: Array, tolerance: float, least: float) -> Array:
+    """(k, 3) displacements within the tolerance of at least so many of `moves` (n, 3)."""
+    cells, of, counts = np.unique(
+        np.round(moves / tolerance).astype(int), axis=0, return_inverse=True, return_counts=True
+    )
+    sums = np.stack([np.bincount(of.ravel(), column) for column in moves.T], 1)
+    steps: list[Array] = []
+    for cell in np.argsort(-counts, kind="stable")[: 20 * MOST_STEPS]:
+        # A displacement near the border of a cell has neighbours in the next one.
+        near = (np.abs(cells - cells[cell]) <= 1).all(1)
+        if counts[near].sum() < least:
+            continue
+        step = sums[near].sum(0) / counts[near].sum()
+        if all(np.linalg.norm(step - other) > 3 * tolerance for other in steps):
+            steps.append(step)
+        if len(steps) == MOST_STEPS:
+            break
+    return np.array(steps).reshape(-1, 3)
+
+
+def displaced(pose: SE3, step_m: Array) -> SE3:
+    """The pose of a camera that is displaced by (3,) metres in the map's frame."""
+    return SE3(pose.rotation_wxyz, pose.translation_m + step_m)
