@@ -35,7 +35,8 @@ class Bench:
     """
 
     suite: Annotated[Positional[str], arg(metavar="SUITE")]
-    """One of sim-mini (packaged), sim, sim-7, sim-12, real2, i7s, i12s, custom, regions."""
+    """One of sim-mini (packaged), sim, sim-7, sim-12, sim-repeat, real2, i7s, i12s, custom,
+    regions."""
     recordings: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="")
     ] = ()

@@ -19,8 +19,11 @@ class Simulate:
     Example: evercal simulate sim-mini --out rooms/
     """
 
-    suite: Annotated[Positional[Literal["sim", "sim-7", "sim-12", "sim-mini"]], arg(name="SUITE")]
-    """Rooms to render: three (sim), seven, twelve, or the three packaged ones (sim-mini)."""
+    suite: Annotated[
+        Positional[Literal["sim", "sim-7", "sim-12", "sim-mini", "sim-repeat"]], arg(name="SUITE")
+    ]
+    """Rooms to render: three (sim), seven, twelve, the three packaged ones (sim-mini), or three
+    with repeated textures and objects (sim-repeat)."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Output folder. The same command continues an interrupted run."""
     frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None

@@ -68,12 +68,14 @@ def _numbered(count: int, first_seed: int) -> tuple[tuple[str, str, int], ...]:
 
 
 _THREE = (("bedroom", "bedroom", 101), ("kitchen", "kitchen", 102), ("living", "living", 103))
+_REPEATED = (("workshop", "workshop", 401), ("canteen", "canteen", 402), ("hall", "hall", 403))
 
 SUITES: dict[str, Suite] = {
     "sim": Suite(_THREE, 3300, (640, 480), 16),
     "sim-7": Suite(_numbered(7, 201), 1000, (320, 240), 16),
     "sim-12": Suite(_numbered(12, 301), 1000, (320, 240), 16),
     "sim-mini": Suite(_THREE, 130, (320, 240), 16, depth=False, jpeg_quality=85, changed=20),
+    "sim-repeat": Suite(_REPEATED, 130, (320, 240), 16, depth=False, jpeg_quality=85),
 }
 
 

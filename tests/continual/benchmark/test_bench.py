@@ -232,8 +232,8 @@ def test_suites_load_their_scenes_in_order() -> None:
     assert [scene.name for scene in load_suite("sim-mini")] == ["bedroom", "kitchen", "living"]
     some = load_suite("sim-mini", None, ["living", "bedroom"])
     assert [scene.name for scene in some] == ["bedroom", "living"]
-    sizes = [len(SUITES[name].scenes) for name in ("sim-7", "sim-12", "i7s", "i12s")]
-    assert sizes == [7, 12, 7, 12]
+    sizes = [len(SUITES[name].scenes) for name in ("sim-7", "sim-12", "sim-repeat", "i7s", "i12s")]
+    assert sizes == [7, 12, 3, 7, 12]
 
 
 @pytest.mark.parametrize(

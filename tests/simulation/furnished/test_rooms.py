@@ -76,6 +76,10 @@ def test_reserved_seeds_and_unknown_kinds_are_refused() -> None:
         room("living", rooms.RESERVED)
     with pytest.raises(ValueError, match="bedroom, kitchen, living"):
         room("garage", 1)
-    seeds = [seed for suite in ("sim", "sim-7", "sim-12") for *_, seed in SUITES[suite].rooms]
-    assert len(set(seeds)) == len(seeds) == 22
+    seeds = [
+        seed
+        for suite in ("sim", "sim-7", "sim-12", "sim-repeat")
+        for *_, seed in SUITES[suite].rooms
+    ]
+    assert len(set(seeds)) == len(seeds) == 25
     assert max(seeds) < rooms.RESERVED

@@ -54,6 +54,7 @@ SUITES: dict[str, Suite] = {
     "sim": _rendered("sim"),
     "sim-7": _rendered("sim-7"),
     "sim-12": _rendered("sim-12"),
+    "sim-repeat": _rendered("sim-repeat"),
     "real2": Suite(
         ("redkitchen", "fr1_rpy"),
         "7-Scenes (Shotton et al., CVPR 2013) and TUM RGB-D (Sturm et al., IROS 2012)",

@@ -15,6 +15,7 @@ from evercal.simulation.furnished.shapes import (
     lampshade,
     lathe,
     leaf,
+    sheet,
     tube,
 )
 
@@ -193,6 +194,14 @@ class SmallObjects:
             parts.append((block, self.glaze()))
             z += side
         return Item("blocks", parts)
+
+    def chessboard(self, square_m: float) -> Item:
+        """A printed board of 9 x 7 squares with a margin of one square, lying on its back."""
+        w, d = 11 * square_m, 9 * square_m
+        print_ = sheet((-w / 2, -d / 2, 0.005), (w, 0, 0), (0, d, 0))
+        board = box(w + 0.004, d + 0.004, 0.0048, 0.001)
+        parts = [(board, self.shop.white), (print_, m.chessboard("chessboard", 9, 7))]
+        return Item("chessboard", parts, curved=False)
 
     def basket(self) -> Item:
         """A woven basket with cloth in it."""

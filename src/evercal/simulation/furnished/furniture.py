@@ -238,6 +238,19 @@ class FurnitureBuilder:
                 tops.append((x + 0.02, x1, -0.25, -0.05, i * gap + 0.022))
         return Item("bookcase", parts, tops)
 
+    def rack(self) -> Item:
+        """An open steel rack with four boards."""
+        w, d, h, tops = 1.1, 0.4, 1.8, []
+        parts = [
+            (box(0.03, 0.03, h, 0.004).shifted(x, y, 0), self.steel)
+            for x in (-w / 2 + 0.02, w / 2 - 0.02)
+            for y in (-0.02, -d + 0.02)
+        ]
+        for z in (0.12, 0.55, 0.98, 1.41):
+            parts.append((box(w, d, 0.025, 0.005).shifted(0, -d / 2, z), self.woods[0]))
+            tops.append((-w / 2 + 0.05, w / 2 - 0.05, -d + 0.06, -0.06, z + 0.025))
+        return Item("rack", parts, tops)
+
     def book(self, thick: float, deep: float, tall: float) -> Mesh:
         """An upright book with its spine towards -y and a random cell of the `spines` texture."""
         mesh, cell = box(thick, deep, tall, 0.003, steps=1), self.rng.integers(m.BOOKS)

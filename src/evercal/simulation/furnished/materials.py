@@ -140,6 +140,24 @@ def tiles(
     return Material(name, _bytes(picture), tile_m, "coated", 0.12)
 
 
+def equal_tiles(
+    name: str,
+    rgb: tuple[float, float, float],
+    other: tuple[float, float, float],
+    tile_m: float,
+    rng: np.random.Generator,
+) -> Material:
+    """Identical glazed tiles with grout, two along `tile_m`, in two colours like a chessboard."""
+    side = SIZE // 2
+    value = 1 + 0.06 * _noise(1.6, rng)[:side, :side, None]
+    v, u = np.mgrid[0:side, 0:side] / side - 0.5
+    value[np.abs(np.abs(u) + np.abs(v) - 0.36) < 0.02] *= 0.6  # a rhombus
+    grout = np.minimum(u, v) < -0.48
+    a, b = (np.where(grout[..., None], 0.5, np.array(colour) * value) for colour in (rgb, other))
+    picture = np.concatenate([np.concatenate([a, b], 1), np.concatenate([b, a], 1)])
+    return Material(name, _bytes(picture), tile_m, "coated", 0.12)
+
+
 def fabric(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
     """Woven cloth with threads, shading and sometimes stripes, checks or dots."""
     v, u = np.mgrid[0:SIZE, 0:SIZE].astype(np.float32)
@@ -159,6 +177,14 @@ def fabric(name: str, rgb: tuple[float, float, float], rng: np.random.Generator)
         cells = np.hypot((u % period) / period - 0.5, (v % period) / period - 0.5) < 0.24
         picture = np.where(cells[..., None], other * value[..., None], picture)
     return Material(name, _bytes(picture), float(rng.uniform(0.4, 0.7)))
+
+
+def striped(
+    name: str, rgb: tuple[float, float, float], other: tuple[float, float, float], tile_m: float
+) -> Material:
+    """Plain cloth with equal stripes along v in two colours; one pair of stripes is `tile_m`."""
+    stripes = np.repeat(np.array([rgb, other]), SIZE // 2, axis=0)
+    return Material(name, np.tile(_bytes(stripes), (SIZE, 1, 1)), tile_m)
 
 
 def carpet(name: str, rgb: tuple[float, float, float], rng: np.random.Generator) -> Material:
@@ -267,6 +293,13 @@ def spines(name: str, rng: np.random.Generator) -> Material:
     picture = np.concatenate(cells, 1).astype(np.float32)
     picture *= (1 + 0.03 * rng.standard_normal(picture.shape[:2]))[..., None]
     return Material(name, np.clip(picture, 0, 255).astype(np.uint8), kind="coated", roughness=0.35)
+
+
+def chessboard(name: str, columns: int, rows: int) -> Material:
+    """A printed chessboard with a white margin of one square, black squares in its corners."""
+    squares = np.indices((rows, columns)).sum(0) % 2 * 225.0 + 15
+    picture = np.kron(np.pad(squares, 1, constant_values=240), np.ones((32, 32)))
+    return Material(name, np.repeat(picture[..., None], 3, -1).astype(np.uint8))
 
 
 def clock_face(name: str) -> Material:

@@ -1,10 +1,13 @@
-"""Rooms composed from a seed: bedroom, kitchen or living room, each with a table for the robot.
+"""Rooms composed from a seed, each with a table for the robot.
+
+`KINDS` are rooms of a home. `REPEATED` rooms consist mostly of identical copies: floor tiles,
+curtains, racks, tables, chairs.
 
 Base frame: origin at the centre of the robot's foot on the table top, x to the front, z up. A room
 is composed with one corner at the origin and shifted at the end.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +15,7 @@ import numpy as np
 from evercal.simulation.furnished import materials as m
 from evercal.simulation.furnished.clutter import SmallObjects
 from evercal.simulation.furnished.furniture import FurnitureBuilder, Item
-from evercal.simulation.furnished.shapes import Mesh, box, cylinder, lathe, sheet
+from evercal.simulation.furnished.shapes import Mesh, about_x, box, cylinder, lathe, sheet
 from evercal.simulation.furnished.wall_objects import WallObjects
 
 RESERVED = 9000
@@ -35,7 +38,7 @@ class Room:
     """A furnished room without the robot, in the base frame."""
 
     kind: str
-    """One of `KINDS`."""
+    """One of `KINDS` or `REPEATED`."""
     seed: int
     """Seed of the composition."""
     shell: list[tuple[Mesh, m.Material]]
@@ -128,8 +131,9 @@ def room(kind: str, seed: int) -> Room:
     Raises:
         ValueError: The kind is unknown or the seed is reserved.
     """
-    if kind not in KINDS:
-        raise ValueError(f"room kind is one of {', '.join(KINDS)}, got {kind!r}")
+    kinds = KINDS | REPEATED
+    if kind not in kinds:
+        raise ValueError(f"room kind is one of {', '.join(kinds)}, got {kind!r}")
     if not 0 <= seed < RESERVED:
         raise ValueError(
             f"room seeds are 0 to {RESERVED - 1}; higher ones are reserved, got {seed}"
@@ -137,9 +141,12 @@ def room(kind: str, seed: int) -> Room:
     build = _Builder(kind, seed)
     shell = _shell(build, kind)
     base = np.array([0.46 * build.size[0], build.size[1] / 2, 0.0])
-    base[2] = _robot_table(build, base)
-    KINDS[kind](build)
-    _fill_up(build)
+    base[2] = _robot_table(build, base, repeated=kind in REPEATED)
+    kinds[kind](build)
+    if kind in REPEATED:
+        _few_landmarks(build)
+    else:
+        _fill_up(build)
     for item in build.items[1:]:
         if item.tops:
             build.scatter(item, _small_things(build.trinkets, kind), 5)
@@ -156,7 +163,7 @@ def _small_things(t: SmallObjects, kind: str) -> list[Callable[[], Item]]:
     return [*both, t.lamp, t.toy_ball, t.blocks, t.radio, t.bowl, t.bottle]
 
 
-def _robot_table(build: _Builder, base: np.ndarray) -> float:
+def _robot_table(build: _Builder, base: np.ndarray, repeated: bool) -> float:
     """Add the robot's table with small objects around the work area, and return its height."""
     height = 0.74
     table = build.shop.table(1.5, 0.95, height).placed(base[0] + 0.3, base[1] + 0.475, 0.0)
@@ -165,9 +172,16 @@ def _robot_table(build: _Builder, base: np.ndarray) -> float:
     foot = np.array([[base[0] - 0.2, base[1] - 0.2, height], [base[0] + 0.2, base[1] + 0.2, 2.0]])
     build.blocked.append((None, foot))
     t = build.trinkets
+    if repeated:
+        x, y = (float(value) for value in base[:2])
+        build.add(t.chessboard(0.025).placed(x + 0.45, y, height + 0.001), 0.01, table)
+        jar = t.jar()
+        for side in (-0.4, 0.4):
+            for offset in np.linspace(-0.3, 0.9, 7):
+                build.add(jar.placed(x + offset, y + side, height + 0.001), 0.01, table)
     makes = [t.mug, t.blocks, t.carton, t.bowl, t.jar, t.books, t.bottle, t.plant, t.toy_ball]
     order = build.rng.permutation(len(makes))
-    for k in range(11):
+    for k in range(3 if repeated else 11):
         thing = makes[order[k % len(makes)]]()
         for _ in range(25):
             x = base[0] + build.rng.uniform(-0.35, 0.98)
@@ -214,6 +228,79 @@ def _living(build: _Builder) -> None:
 KINDS = {"bedroom": _bedroom, "kitchen": _kitchen, "living": _living}
 
 
+def _workshop(build: _Builder) -> None:
+    shop, t = build.shop, build.trinkets
+    crates = [[(mesh.scaled(1.5), mat) for mesh, mat in t.carton().parts] for _ in range(2)]
+    things = [Item("carton", crates[0]), t.jar(), Item("carton", crates[1]), t.bottle()]
+    _line_up(build, _stocked(shop.rack(), things), 1)
+    _in_rows(build, _stocked(shop.table(1.0, 0.6), things[:3]), 4, 2)
+    board = t.chessboard(0.07)
+    parts = [(mesh.rotated(about_x(np.pi / 2)), material) for mesh, material in board.parts]
+    build.try_wall(lambda: Item(board.kind, parts, curved=False), (0, 2), 1.5)
+
+
+def _canteen(build: _Builder) -> None:
+    shop, t = build.shop, build.trinkets
+    _line_up(build, build.hangings.cupboard(), 1, 1.45)
+    table, chair = shop.table(0.9, 0.65), shop.chair()
+    laid = _stocked(table, [t.plate(), t.mug(), t.bottle(), t.plate()])
+    for chair_y, yaw in ((0.25, 0.0), (-0.9, np.pi)):
+        laid.parts += chair.placed(0, chair_y, 0, yaw).parts
+    _in_rows(build, laid, 4, 3)
+
+
+def _hall(build: _Builder) -> None:
+    _line_up(build, build.hangings.striped_curtain(), 1)
+    _in_rows(build, build.shop.chair().placed(0, 0, 0, WALL_YAW_RAD[3]), 7, 6)
+
+
+REPEATED = {"workshop": _workshop, "canteen": _canteen, "hall": _hall}
+
+TILES = {
+    "workshop": ((0.55, 0.56, 0.56), (0.55, 0.56, 0.56), 0.6),
+    "canteen": ((0.72, 0.62, 0.5), (0.72, 0.62, 0.5), 0.4),
+    "hall": ((0.84, 0.82, 0.77), (0.16, 0.17, 0.2), 0.5),
+}
+"""Two colours of floor tiles and the size of two tiles in metres, by kind."""
+
+
+def _stocked(item: Item, things: Sequence[Item]) -> Item:
+    """The item with the same things in a row on each of its tops, as one object."""
+    parts = list(item.parts)
+    for x0, x1, y0, y1, z in item.tops:
+        for x, thing in zip(np.linspace(x0, x1, len(things) + 2)[1:-1], things, strict=True):
+            parts += thing.placed(x, (y0 + y1) / 2, z + 0.001).parts
+    return Item(item.kind, parts)
+
+
+def _line_up(build: _Builder, item: Item, wall: int, z: float = 0.0) -> None:
+    """Cover a wall with copies of an item, at equal distances."""
+    width = float(np.ptp(item.bounds_m()[:, 0]))
+    # `add` keeps 3 cm between items.
+    count = int(build.size[wall % 2] // (width + 0.06))
+    for at in np.linspace(0, 1, count):
+        build.along_wall(item, wall, float(at), z)
+
+
+def _in_rows(build: _Builder, item: Item, columns: int, rows: int) -> None:
+    """Stand copies of an item in a grid on the floor, wherever there is space."""
+    low, high = item.bounds_m()[:, :2]
+    first, last = 0.35 - low, build.size[:2] - 0.35 - high
+    for x in np.linspace(first[0], last[0], columns):
+        for y in np.linspace(first[1], last[1], rows):
+            build.add(item.placed(float(x), float(y), 0.0))
+
+
+def _few_landmarks(build: _Builder) -> None:
+    """Add a few things that occur once: a door, a clock, pictures and a wall shelf."""
+    hangings = build.hangings
+    build.try_wall(hangings.door, (3, 2))
+    build.try_wall(hangings.clock, (0, 1, 2), 1.85)
+    build.try_wall(hangings.wall_shelf, (0, 2), 1.4)
+    for _ in range(4):
+        build.try_wall(hangings.picture, (0, 1, 2, 3), float(build.rng.uniform(1.25, 1.6)))
+
+
 def _fill_up(build: _Builder) -> None:
     """Add what every room has: a door, furniture, wall objects and plants."""
     shop, t, rng = build.shop, build.trinkets, build.rng
@@ -239,7 +326,7 @@ def _fill_up(build: _Builder) -> None:
 
 
 def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
-    """Make walls, floor, ceiling, skirting, windows with curtains, a ceiling lamp and a carpet."""
+    """Make walls, floor, ceiling, skirting, windows with curtains, a ceiling lamp, a carpet."""
     x, y, z = (float(side) for side in build.size)
     rng, shop = build.rng, build.shop
     tone = WALLS[rng.integers(len(WALLS))]
@@ -248,6 +335,8 @@ def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
     if kind == "kitchen":
         floor = m.tiles("floor", (0.66, 0.62, 0.56), rng, 4, 1.3)
         accent = m.tiles("splash", WALLS[rng.integers(len(WALLS))], rng, 5, 0.75)
+    elif kind in REPEATED:
+        floor = m.equal_tiles("floor", *TILES[kind], rng)
     else:
         floor = m.boards("floor", FLOOR[rng.integers(len(FLOOR))], rng)
     ceiling = m.plaster("ceiling", (0.9, 0.9, 0.88), rng)
@@ -270,6 +359,8 @@ def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
     slabs.append((cylinder(0.38, 0.05, 0.01, 48).shifted(0.55 * x, y / 2, z - 0.07), lamp))
     rim = lathe([(0.38, 0), (0.4, 0), (0.4, 0.06), (0.38, 0.06)], 48, 1)
     slabs.append((rim.shifted(0.55 * x, y / 2, z - 0.06), shop.steel))
+    if kind in REPEATED:  # a carpet would hide the tiles
+        return slabs
     rug = m.carpet("carpet", tuple(rng.uniform(0.2, 0.6, 3).tolist()), rng)
     w, d = 0.62 * x, 0.55 * y
     mat = box(w, d, 0.012, 0.005, bottom=False).shifted(0.5 * x, y / 2, 0.0)

@@ -246,12 +246,16 @@ def _both_sides(points: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> Mesh
     return Mesh.merged([_grid(points + step, normals, uv), _grid(points - step, -normals, uv)])
 
 
-def drape(width: float, height: float, fold_m: float, folds: int, seed: int = 0) -> Mesh:
-    """A curtain around the plane y = 0 with folds along y, from z = height to 0."""
-    rng = np.random.default_rng(seed)
+def drape(width: float, height: float, fold_m: float, folds: int, seed: int | None = 0) -> Mesh:
+    """A curtain around the plane y = 0 with folds along y, from z = height to 0.
+
+    The folds differ in width; without a seed they are equal.
+    """
     x = np.linspace(-width / 2, width / 2, folds * 8 + 1)
     z = np.linspace(0, height, 9)
-    phase = 2 * np.pi * folds * (x / width) + 0.6 * np.sin(3 * x + rng.uniform(0, 6))
+    phase = 2 * np.pi * folds * (x / width)
+    if seed is not None:
+        phase += 0.6 * np.sin(3 * x + np.random.default_rng(seed).uniform(0, 6))
     grid_x, grid_z = np.meshgrid(x, z, indexing="ij")
     swing = fold_m * np.sin(phase)[:, None] * (1 - 0.35 * (grid_z / height))
     p = np.stack([grid_x, -swing, grid_z], -1)

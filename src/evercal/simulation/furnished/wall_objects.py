@@ -73,6 +73,14 @@ class WallObjects:
         rod = tube([(x, -0.08, 2.19) for x in (-w / 2 - 0.1, 0, w / 2 + 0.1)], 0.012)
         return Item("curtain", [(curtain, shop.cloths[1]), (rod, shop.dark)])
 
+    def striped_curtain(self) -> Item:
+        """A striped curtain with equal folds; hung side by side, it covers a wall."""
+        w, folds = 0.5, 6
+        cloth = m.striped("stripes", (0.5, 0.1, 0.12), (0.85, 0.8, 0.66), 1.4 * w / 2)
+        curtain = drape(w, 2.2, 0.035, folds, None).shifted(0, -0.06, 0.05)
+        rail = box(w, 0.04, 0.04, 0.008).shifted(0, -0.06, 2.25)
+        return Item("striped curtain", [(curtain, cloth), (rail, self.shop.dark)])
+
     def door(self) -> Item:
         """A panelled door with a lever and a frame."""
         shop = self.shop
