@@ -405,21 +405,36 @@ class Localizer:
 
         The runner-up is None unless it explains the image nearly as well as the best one.
         """
-        runner_up: Hypothesis | None = None
+        clear, runner_up, strong = self.options.clear_strength, None, 0.0
         for _ in range(self.options.climbs):
             scene = self.contents.scenes[best.scene]
             rivals = [
-                rival
+                (self._strength(rival, best), rival)
                 for rival in self._rivals(query, best, cameras[best.scene])
                 if rival.refined and rival.pose and differ(best, rival.pose.pose, scene)
             ]
-            runner_up = max(rivals, key=support, default=None)
-            if runner_up is None or support(runner_up) <= support(best):
+            strong, runner_up = max(rivals, key=lambda pair: pair[0], default=(0.0, None))
+            if runner_up is None or strong * clear <= 1:
                 break
-            best, runner_up = runner_up, best
-        if runner_up is None or support(runner_up) < self.options.rival_support * support(best):
-            return best, None
-        return best, runner_up
+            best, runner_up, strong = runner_up, best, 1 / strong
+        return best, runner_up if strong > clear else None
+
+    def _strength(self, rival: Hypothesis, best: Hypothesis) -> float:
+        """How well a rival explains the image, relative to another pose; both are aligned.
+
+        The ratio of their support times that of the matches within one cell. Landmarks tell a
+        square of a board from the next one, but alike racks only differ in their surroundings.
+        """
+        ratio = support(rival) / max(support(best), 1e-9)
+        if best.matches is None:
+            return ratio
+        agreeing = []
+        for pose in (rival.refined, best.refined):
+            assert pose is not None, "an aligned pose"
+            small = pose.camera.short_side_resized(self.contents.short_side)
+            rest = best.matches.beside(small, pose.pose.pose, self.contents.encoder.stride)
+            agreeing.append(len(best.matches.pixels) - len(rest.pixels))
+        return ratio * agreeing[0] / max(agreeing[1], 1)
 
     def _rivals(self, query: Query, best: Hypothesis, camera: Camera) -> Iterator[Hypothesis]:
         """Other poses in the same scene.
@@ -434,7 +449,8 @@ class Localizer:
             small = best.refined.camera.short_side_resized(self.contents.short_side)
             rest = best.matches.beside(small, pose, self.options.rival_px)
             if len(rest.pixels) >= self.options.aligned_inliers:
-                yield self._hypothesis(query, best.candidate, camera, None, rest)
+                left_over = self._hypothesis(query, best.candidate, camera, None, rest)
+                yield replace(left_over, matches=best.matches)
         assert best.points_m is not None, "an aligned pose"
         assert best.templates is not None, "an aligned pose"
         for step in pattern_steps(best.points_m, best.templates, pose.translation_m):

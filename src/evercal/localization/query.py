@@ -59,9 +59,10 @@ class LocalizeOptions:
     """A second pose is sought among matches that the first one misses by more than this, pixels at
     the encoder's working size."""
     climbs: int = 5
-    """A rival with more support replaces a pose so many times, at most."""
-    rival_support: float = 0.8
-    """An image with a second pose of this share of the first one's support is ambiguous."""
+    """A clearly stronger rival replaces a pose so many times, at most."""
+    clear_strength: float = 0.8
+    """A pose is clearly stronger than rivals with less than this strength. Otherwise the image is
+    ambiguous. The strength is the ratio of their support times that of the matches that agree."""
     guided_px: float = 32.0
     """Search radius of guided matching, pixels at the encoder's working size."""
     keyframes: int = 6
