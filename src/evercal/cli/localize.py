@@ -149,6 +149,7 @@ def as_dict(answer: Answer, point: Point | None = None) -> dict[str, object]:
         "scene": estimate.scene,
         "unit": None if pose is None else "metres" if answer.unit_known else "unknown",
         "base_from_camera": pose,
+        "alternatives": [pose_to_dict(other) for other in estimate.alternatives],
         "covariance": None if uncertain is None else uncertain.covariance.tolist(),
         "error_terms": terms,
         "inliers": int(estimate.inliers),

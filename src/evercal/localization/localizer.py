@@ -480,11 +480,11 @@ class Localizer:
             return replace(
                 self._rejected(best, milliseconds),
                 status="ambiguous",
-                reason=f"another pose, {mm:.0f} mm and {deg:.1f} deg away, explains it as well",
+                reason=_rival_reason(mm, deg, scene.unit_known),
                 scene=scene.name,
                 alternatives=(estimate.pose, other),
             )
-        if estimate.sigma_mm > 1000 * USELESS_M:
+        if scene.unit_known and estimate.sigma_mm > 1000 * USELESS_M:
             return replace(
                 self._rejected(best, milliseconds),
                 reason=f"its position is uncertain by {estimate.sigma_mm:.0f} mm per axis",
@@ -514,6 +514,11 @@ class Localizer:
             milliseconds=milliseconds,
             support=support(best),
         )
+
+
+def _rival_reason(mm: float, deg: float, unit_known: bool) -> str:
+    away = f"{mm:.0f} mm and {deg:.1f} deg away" if unit_known else f"{deg:.1f} deg away"
+    return f"another pose, {away}, explains it as well"
 
 
 def own_or_stated(stated: Camera, recorded: Sequence[Camera]) -> Camera | None:

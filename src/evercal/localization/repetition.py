@@ -35,6 +35,8 @@ def pattern_steps(points_m: Array, templates: Array, position_m: Array) -> Array
     Returns:
         (k, 3) metres; with every step, its opposite.
     """
+    if not len(points_m):
+        return np.zeros((0, 3))
     some = np.linspace(0, len(points_m) - 1, min(MOST_LANDMARKS, len(points_m))).astype(int)
     points, patches = points_m[some], templates[some]
     away = float(np.median(np.linalg.norm(points - position_m, axis=1)))
