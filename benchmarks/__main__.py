@@ -8,6 +8,7 @@ import tyro
 VERBS = {
     "maps": "accuracy of maps: degraded images, fixed cameras, wrong poses, sequences of scenes",
     "calibration": "cameras calibrated from images, compared with the simulator's truth",
+    "trust": "other lenses, few images, an inaccurate arm: errors and their stated deviations",
     "repeat": "a wrist camera before a chessboard, in three folds",
     "handeye": "pose pairs: errors, ellipsoids, outliers, scale, time",
     "many-keyframes": "localization among thousands of keyframes of other rooms",

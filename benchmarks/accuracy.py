@@ -1,6 +1,9 @@
-"""Rows of numbers from results of frames, shared by the measurements."""
+"""Rows of numbers from results of frames and poses, shared by the measurements."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,12 +16,18 @@ from evercal.evaluation.metrics import (
     correct,
     share_inside,
 )
+from evercal.geometry import SE3, UncertainPose, pose_distance_mm_deg
+from evercal.storage import write_bytes
 
 BOUNDS = {"5 cm/5 deg": COARSE, "2 cm/2 deg": MIDDLE, "1 cm/1 deg": FINE, "0.5 cm/0.5 deg": FINEST}
 """Thresholds in metres and radians, by the name of their column."""
 
 Row = dict[str, str | float]
 """A flat row of a measurement."""
+Rows = TypeVar("Rows", Row, list[Row])
+
+WRONG_MM, WRONG_SIGMAS = 10.0, 5.0
+"""A wrong answer is off by more than both: millimetres, and its own standard deviations."""
 
 
 def accuracy_row(name: str, results: Sequence[FrameResult]) -> Row:
@@ -47,3 +56,27 @@ def mean_row(name: str, rows: Sequence[Row]) -> Row:
 
     means = pandas.DataFrame(list(rows)).mean(numeric_only=True)
     return {"scene": name, **{str(key): float(value) for key, value in means.items()}}
+
+
+def pose_error(estimate: UncertainPose, truth: SE3) -> Row:
+    """Return the error of a pose, its standard deviation per axis, and its Mahalanobis distance."""
+    mm, deg = pose_distance_mm_deg(estimate.pose, truth)
+    return {
+        "mm": mm,
+        "deg": deg,
+        "sigma_mm": estimate.sigma_mm,
+        "sigma_deg": estimate.sigma_deg,
+        "squared_mahalanobis": estimate.squared_mahalanobis(truth),
+    }
+
+
+def wrong(mm: np.ndarray, squared_mahalanobis: np.ndarray) -> np.ndarray:
+    """Return which answers (n,) are wrong; NaN is not, infinity is."""
+    return (mm > WRONG_MM) & (squared_mahalanobis > WRONG_SIGMAS**2)
+
+
+def once(path: Path, measure: Callable[[], Rows]) -> Rows:
+    """Measure one or more rows and write them to a file, or read the file if it exists."""
+    if not path.exists():
+        write_bytes(path, json.dumps(measure(), indent=1).encode())
+    return json.loads(path.read_text())

@@ -1,9 +1,9 @@
 """Accuracy of cameras calibrated from images: on the arm, fixed, and after bumps."""
 
 import json
-import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -14,19 +14,21 @@ from tabulate import tabulate
 from tqdm import tqdm
 from tyro.conf import Positional
 
-from benchmarks.accuracy import Row
+from benchmarks.accuracy import Row, once, pose_error
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.drift import check
 from evercal.calibration.from_images import Images, calibrate
 from evercal.errors import InputError
 from evercal.evaluation.metrics import CHI2_6
-from evercal.geometry import SE3, UncertainPose, pose_distance
+from evercal.geometry import SE3
 from evercal.localization.localizer import Localizer
-from evercal.map import Map
+from evercal.map import LearnReport, Map
 from evercal.recordings import Recording, load_recording
-from evercal.recordings.samples import FOLDER
+from evercal.recordings.samples import FOLDER, ROOMS
 
 ROBOT_NOISE_M, ROBOT_NOISE_DEG = 2e-4, 0.02
+PACKAGED = tuple(FOLDER / name for name in ROOMS)
+"""Folders of the packaged rooms."""
 
 
 def run(
@@ -47,11 +49,11 @@ def run(
         store: Store with the rooms. Without it, they are learned.
     """
     out.mkdir(parents=True, exist_ok=True)
-    folders = rooms or tuple(FOLDER / name for name in ("bedroom", "kitchen", "living"))
+    folders = rooms or PACKAGED
     if what == "wrist":
         rows = wrist(folders, out, draws)
     else:
-        localizer = Localizer.open(store or _learned(folders, out / "rooms.evercal"))
+        localizer = Localizer.open(store or learned(folders, out / "rooms.evercal"))
         rows = (fixed if what == "fixed" else bumps)(folders, localizer, draws)
     (out / f"{what}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     print(tabulate(rows, headers="keys", floatfmt=".3f"))
@@ -65,10 +67,8 @@ def wrist(rooms: Sequence[Path], out: Path, draws: int) -> list[Row]:
         scene = load_recording(room)
         for draw in tqdm(range(draws), room.name, unit="draw"):
             path = out / f"wrist-{room.name}-{draw}.json"
-            if not path.exists():
-                store = path.with_suffix(".evercal")
-                path.write_text(json.dumps(_wrist_draw(scene, room, store, draw)))
-            rows.append(json.loads(path.read_text()))
+            measure = partial(_wrist_draw, scene, room, path.with_suffix(".evercal"), draw)
+            rows.append(once(path, measure))
     return rows
 
 
@@ -87,19 +87,23 @@ def as_wrist_recording(scene: Recording, draw: int) -> tuple[Recording, SE3]:
     return replace(scene, train=tuple(train), test=()), truth
 
 
+def learned_mount(recording: Recording, truth: SE3, store: Path) -> tuple[Row, LearnReport]:
+    """Learn a wrist recording and compare its `gripper_from_camera` with the true one."""
+    report = Map.open(store).learn(recording)
+    assert report.hand_eye is not None
+    return pose_error(report.hand_eye.gripper_from_camera, truth), report
+
+
 def _wrist_draw(scene: Recording, room: Path, store: Path, draw: int) -> Row:
     recording, truth = as_wrist_recording(scene, draw)
-    began = time.perf_counter()
-    report = Map.open(store).learn(recording)
-    seconds, result = time.perf_counter() - began, report.hand_eye
-    assert result is not None
-    row = _error(result.gripper_from_camera.pose, np.array(result.covariance), truth)
-    row |= {"start_mm": result.start_mm, "seconds": seconds}
+    row, report = learned_mount(recording, truth, store)
+    assert report.hand_eye is not None
+    row |= {"start_mm": report.hand_eye.start_mm, "seconds": report.seconds}
     folder = room / "calibration" / "fixed"
     if folder.is_dir():
-        images, true_camera = _images(folder)
+        images, true_camera = fixed_images(folder)
         calibration = calibrate(Localizer.open(store), images)
-        error = _error(calibration.parent_from_child, calibration.covariance, true_camera)
+        error = pose_error(calibration.uncertain_pose, true_camera)
         row |= {f"fixed_{key}": value for key, value in error.items()}
     return {"room": room.name, "draw": draw, **row}
 
@@ -109,12 +113,12 @@ def fixed(rooms: Sequence[Path], localizer: Localizer, draws: int) -> list[Row]:
     rows = []
     for room in tqdm(rooms, "rooms"):
         for recording in ("fixed", "bumped"):
-            images, truth = _images(room / "calibration" / recording)
+            images, truth = fixed_images(room / "calibration" / recording)
             rng, count = np.random.default_rng(0), len(images.images)
             five = [rng.choice(count, 5, replace=False).tolist() for _ in range(draws)]
             for some in (images, *(_take(images, chosen) for chosen in five)):
                 calibration = calibrate(localizer, some)
-                error = _error(calibration.parent_from_child, calibration.covariance, truth)
+                error = pose_error(calibration.uncertain_pose, truth)
                 camera: Row = {"room": room.name, "camera": recording, "images": len(some.images)}
                 rows.append(camera | error)
     return rows
@@ -129,7 +133,7 @@ def bumps(rooms: Sequence[Path], localizer: Localizer, draws: int) -> list[Row]:
     rows = []
     for room in tqdm(rooms, "rooms"):
         for recording in ("fixed", "bumped"):
-            images, _ = _images(room / "calibration" / recording)
+            images, _ = fixed_images(room / "calibration" / recording)
             rng = np.random.default_rng(1)
             for _ in range(draws):
                 order = rng.permutation(len(images.images)).tolist()
@@ -157,14 +161,16 @@ def _moved(reference: Calibration, rng: np.random.Generator) -> dict[str, Calibr
     return moved
 
 
-def _learned(rooms: Sequence[Path], store: Path) -> Path:
-    if not store.exists():
-        for room in tqdm(rooms, "learning"):
-            Map.open(store).learn(room)
+def learned(rooms: Sequence[Path], store: Path) -> Path:
+    """Learn the rooms that a store lacks, and return the store."""
+    cell = Map.open(store)
+    scenes = [load_recording(room) for room in rooms]
+    for scene in tqdm([scene for scene in scenes if scene.name not in cell.scenes], "learning"):
+        cell.learn(scene)
     return store
 
 
-def _images(folder: Path) -> tuple[Images, SE3]:
+def fixed_images(folder: Path) -> tuple[Images, SE3]:
     """Load the images of a fixed camera, and its true pose."""
     scene = load_recording(folder)
     truth = scene.test[0].base_from_camera
@@ -176,17 +182,6 @@ def _images(folder: Path) -> tuple[Images, SE3]:
 
 def _take(images: Images, chosen: Sequence[int]) -> Images:
     return replace(images, images=[images.images[i] for i in chosen])
-
-
-def _error(estimate: SE3, covariance: np.ndarray, truth: SE3) -> Row:
-    metres, radians = pose_distance(estimate, truth)
-    return {
-        "mm": 1000 * float(metres),
-        "deg": float(np.rad2deg(radians)),
-        "sigma_mm": 1000 * float(np.sqrt(np.trace(covariance[:3, :3]) / 3)),
-        "sigma_deg": float(np.rad2deg(np.sqrt(np.trace(covariance[3:, 3:]) / 3))),
-        "squared_mahalanobis": UncertainPose(estimate, covariance).squared_mahalanobis(truth),
-    }
 
 
 def summary(rows: Sequence[Row]) -> str:

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from tabulate import tabulate
 from tqdm import tqdm
 
-from benchmarks.accuracy import Row
+from benchmarks.accuracy import Row, pose_error, wrong
 from evercal.errors import InputError
 from evercal.evaluation.metrics import CHI2_6
-from evercal.geometry import SE3, Camera, UncertainPose, pose_distance_mm_deg
+from evercal.geometry import SE3, Camera
 from evercal.map import Map
 from evercal.recordings import Frame, Recording
 
@@ -24,8 +24,7 @@ SQUARES, SQUARE_M = (28, 17), 0.015
 BEHIND_M, NOISE_M, NOISE_DEG = 0.25, 2e-4, 0.02
 PIXELS_PER_M = 4000
 FOLDS = 3
-WRONG_MM, WRONG_SIGMAS = 10.0, 5.0
-NOTHING: Row = {"mm": np.nan, "deg": np.nan, "squared": np.nan}
+NOTHING: Row = {"mm": np.nan, "deg": np.nan, "squared_mahalanobis": np.nan}
 """Errors of a recording or an image that was refused."""
 
 
@@ -65,17 +64,17 @@ def summary(mounts: list[Row], located: list[Row]) -> Row:
     """Return one row for all recordings."""
     good = [row for row in located if np.isfinite(float(row["mm"]))]
     errors = np.array([float(row["mm"]) for row in good] or [np.inf])
-    squares = np.array([float(row["squared"]) for row in good] or [np.inf])
+    squares = np.array([float(row["squared_mahalanobis"]) for row in good] or [np.inf])
     found = [row for row in mounts if np.isfinite(float(row["mm"]))]
     return {
         "mounts": len(mounts),
         "refused": len(mounts) - len(found),
         "median mm": float(np.median([float(row["mm"]) for row in found] or [np.inf])),
-        "in ellipsoid": sum(float(row["squared"]) < CHI2_6 for row in found),
+        "in ellipsoid": sum(float(row["squared_mahalanobis"]) < CHI2_6 for row in found),
         "images": len(located),
         "located": len(good),
         "median mm of images": float(np.median(errors)),
-        "wrong": int(((errors > WRONG_MM) & (squares > WRONG_SIGMAS**2)).sum()),
+        "wrong": int(wrong(errors, squares).sum()),
         "images in ellipsoid": float((squares < CHI2_6).mean()),
     }
 
@@ -97,15 +96,9 @@ def _fold(recording: Recording, truth: SE3, fold: int, store: Path) -> tuple[Row
         assert pose is not None
         row = NOTHING | {"status": answer.status}
         if answer.uncertain_pose is not None:
-            row |= _error(answer.uncertain_pose, pose)
+            row |= pose_error(answer.uncertain_pose, pose)
         rows.append(row)
-    sigma = {"sigma_mm": estimate.sigma_mm, "warnings": len(report.hand_eye.warnings)}
-    return _error(estimate, truth) | sigma, rows
-
-
-def _error(estimate: UncertainPose, truth: SE3) -> Row:
-    mm, deg = pose_distance_mm_deg(estimate.pose, truth)
-    return {"mm": mm, "deg": deg, "squared": float(estimate.squared_mahalanobis(truth))}
+    return pose_error(estimate, truth) | {"warnings": len(report.hand_eye.warnings)}, rows
 
 
 def chessboard_recording(seed: int, images: int, curtain: float) -> tuple[Recording, SE3]:
