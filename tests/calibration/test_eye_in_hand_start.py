@@ -70,8 +70,8 @@ def test_inverted_poses_are_refused() -> None:
 
 
 def test_too_few_pairs_are_refused() -> None:
-    poses = grippers(4, 0)
-    with pytest.raises(InputError, match="only 6 pairs"):
+    poses = grippers(3, 0)
+    with pytest.raises(InputError, match="only 3 pairs"):
         solve_motions(poses, motions(poses, TRUTH))
 
 

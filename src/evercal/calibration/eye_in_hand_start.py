@@ -8,8 +8,7 @@ Martin, IEEE T-RA 1994). The length l of B's translation is unknown, so its tran
     (R_A - I) t_X + t_A = l R_X d,   so   [R_X d]x ((R_A - I) t_X + t_A) = 0,
 
 which is linear in t_X. Directions of short or planar motions are poor, so this translation can be
-off by centimetres. A last step minimises the distances of all matches from the epipolar lines that
-X and the gripper poses predict (Sampson; Hartley and Zisserman, Multiple View Geometry, 11.4.3).
+off by centimetres. Bundle adjustment converges from there.
 """
 
 from collections.abc import Sequence
@@ -20,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from evercal.errors import InputError
@@ -41,9 +39,7 @@ FRAMES, PARTNERS = 120, 6
 """Maximum number of frames, and number of most similar frames that each is matched to."""
 ANGLE_DEG, ROTATION_DEG, DIRECTION_DEG = 3.0, 5.0, 10.0
 """Largest difference of the rotation angles, the rotations and the directions of a pair."""
-MATCHES_PER_PAIR = 150
-"""Matches of a pair in the last step, at most."""
-LEAST_ROTATION_DEG, LEAST_PAIRS = 4.0, 12
+LEAST_ROTATION_DEG, LEAST_PAIRS = 4.0, 6
 """Standard deviation of the rotations about a second axis, and pairs that must agree."""
 
 
@@ -57,10 +53,6 @@ class PairMotion(NamedTuple):
     """second_camera_from_first_camera."""
     direction: Array
     """(3,) unit vector of its translation."""
-    matches: Array = np.zeros((2, 0, 3))
-    """(2, n, 3) rays of the inliers in both camera frames, at depth 1."""
-    focal_px: float = 1.0
-    """Focal length of the second camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,40 +155,7 @@ def solve_motions(base_from_gripper: SE3, motions: Sequence[PairMotion]) -> Hand
             " turning it, and check that the poses are in metres"
         )
     start = SE3(rotation.as_quat(canonical=True, scalar_first=True), translation)
-    used = [i for i in np.flatnonzero(agree).tolist() if motions[i].matches.size]
-    if used:
-        start = _on_epipolar_lines(start, moved[used], [motions[i] for i in used])
     return HandEyeStart(start, int(agree.sum()), len(motions))
-
-
-def _on_epipolar_lines(start: SE3, moved: SE3, motions: Sequence[PairMotion]) -> SE3:
-    """`gripper_from_camera` with the smallest distances of all matches from epipolar lines."""
-    counts = [motion.matches.shape[1] for motion in motions]
-    rows = np.repeat(np.arange(len(motions)), counts)
-    first, second = np.concatenate([motion.matches for motion in motions], 1)
-    focal = np.array([motion.focal_px for motion in motions])[rows]
-
-    def changed(tangent: Array) -> SE3:
-        turned = Rotation.from_quat(start.rotation_wxyz, scalar_first=True)
-        turned = turned * Rotation.from_rotvec(tangent[3:])
-        quaternion = turned.as_quat(canonical=True, scalar_first=True)
-        return SE3(quaternion, start.translation_m + tangent[:3])
-
-    def distances_px(tangent: Array) -> Array:
-        estimate = changed(tangent)
-        motion = estimate.inverse() @ moved @ estimate
-        length = np.linalg.norm(motion.translation_m, axis=1, keepdims=True)
-        direction = motion.translation_m / np.maximum(length, 1e-9)
-        # essential = [direction]x R: the cross product of the direction with every column of R.
-        columns = motion.rotation_matrix().transpose(0, 2, 1)
-        essential = np.cross(direction[:, None], columns).transpose(0, 2, 1)[rows]
-        line = np.einsum("nij,nj->ni", essential, first)
-        back = np.einsum("nji,nj->ni", essential, second)
-        slope = (line[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1)
-        return focal * (second * line).sum(1) / np.sqrt(np.maximum(slope, 1e-12))
-
-    fit = least_squares(distances_px, np.zeros(6), loss="cauchy", f_scale=0.5, x_scale="jac")
-    return changed(fit.x)
 
 
 def _refuse_disagreement(agree: NDArray[np.bool_]) -> None:
@@ -270,8 +229,7 @@ def _pair_motions(
             found = epipolar_pair(points[i], points[j], cameras[i], cameras[j])
             if found is None:
                 return None
-            some = found.rays[:, :: 1 + found.rays.shape[1] // MATCHES_PER_PAIR]
-            return PairMotion(i, j, found.rotation, found.direction, some, cameras[j].fx)
+            return PairMotion(i, j, found.rotation, found.direction)
 
         for done, motion in enumerate(pool.map(motion_of, pairs), start=1):
             motions += [motion] if motion is not None else []

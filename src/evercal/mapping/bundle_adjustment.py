@@ -385,15 +385,15 @@ class BundleAdjustment:
         """Covariance (6, 6) of the common transform due to systematic errors of stated poses.
 
         The errors of a robot's joints vary slowly with the pose. They are modelled by errors that
-        are linear in the rotation and position of a frame, each as large as the estimated noise.
-        Residuals hardly show them, because the common transform and the depths follow.
+        are linear in the rotation and position of a frame, together as large as the estimated
+        noise. Residuals hardly show them, because the common transform and the depths follow.
         """
         n, stated = self.n, self.frames.stated
         rotations = Rotation.from_quat(stated.rotation_wxyz, scalar_first=True)
         turns = (rotations.mean().inv() * rotations).as_rotvec()
         linear = np.concatenate([turns, stated.translation_m], axis=1)
         linear = linear - linear.mean(0)
-        linear = linear / np.maximum(linear.std(0), 1e-9)
+        linear = linear / np.maximum(linear.std(0), 1e-9) / np.sqrt(linear.shape[1])
         common = estimate.root[:, 6 * n : 6 * n + 6].T @ estimate.root
         precision = variances.weight[:, None] / variances.sigma**2
         # Response of the common transform to an error of each stated pose: (6, n, 6).
