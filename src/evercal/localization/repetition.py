@@ -13,6 +13,10 @@ Array = NDArray[np.floating]
 
 MOST_LANDMARKS, MOST_STEPS = 400, 8
 """Landmarks that are compared, and steps that are returned, at most."""
+MOST_COMPARED = 100
+"""Frequent displacements that are compared, at most."""
+FREQUENT = 0.4
+"""Steps are at least this frequent, relative to the most frequent one."""
 ALIKE = 0.85
 """Smallest correlation of the patches of two landmarks that look alike."""
 TOLERANCE = 0.006
@@ -25,7 +29,7 @@ LEAST_PAIRS, LEAST_SHARE = 15, 0.05
 
 
 def pattern_steps(points_m: Array, templates: Array, position_m: Array) -> Array:
-    """Displacements that many pairs of similar landmarks share, the most frequent first.
+    """Displacements that many pairs of similar landmarks share, the shortest first.
 
     Args:
         points_m: (n, 3) landmarks that agree with a pose.
@@ -55,18 +59,18 @@ def _shared(moves: Array, tolerance: float, least: float) -> Array:
         np.round(moves / tolerance).astype(int), axis=0, return_inverse=True, return_counts=True
     )
     sums = np.stack([np.bincount(of.ravel(), column) for column in moves.T], 1)
-    steps: list[Array] = []
-    for cell in np.argsort(-counts, kind="stable")[: 20 * MOST_STEPS]:
+    found: list[tuple[float, Array]] = []
+    for cell in np.argsort(-counts, kind="stable")[:MOST_COMPARED]:
         # A displacement near the border of a cell has neighbours in the next one.
         near = (np.abs(cells - cells[cell]) <= 1).all(1)
-        if counts[near].sum() < least:
-            continue
-        step = sums[near].sum(0) / counts[near].sum()
-        if all(np.linalg.norm(step - other) > 3 * tolerance for other in steps):
-            steps.append(step)
-        if len(steps) == MOST_STEPS:
-            break
-    return np.array(steps).reshape(-1, 3)
+        pairs = float(counts[near].sum())
+        step = sums[near].sum(0) / pairs
+        if pairs >= least and all(np.linalg.norm(step - s) > 3 * tolerance for _, s in found):
+            found.append((pairs, step))
+    # Multiples of a period are nearly as frequent; a pose that slipped by one takes several steps.
+    often = [step for pairs, step in found if pairs >= FREQUENT * found[0][0]]
+    often.sort(key=lambda step: float(np.linalg.norm(step)))
+    return np.array(often[:MOST_STEPS]).reshape(-1, 3)
 
 
 def displaced(pose: SE3, step_m: Array) -> SE3:
