@@ -41,6 +41,9 @@ ANGLE_DEG, ROTATION_DEG, DIRECTION_DEG = 3.0, 5.0, 10.0
 """Largest difference of the rotation angles, the rotations and the directions of a pair."""
 LEAST_ROTATION_DEG, LEAST_PAIRS = 4.0, 6
 """Standard deviation of the rotations about a second axis, and pairs that must agree."""
+LEAST_SHARE = 0.1
+"""Share of the pairs that must agree. Before a chessboard most pairs match the wrong squares, and
+these do not agree with each other."""
 
 
 class PairMotion(NamedTuple):
@@ -159,7 +162,7 @@ def solve_motions(base_from_gripper: SE3, motions: Sequence[PairMotion]) -> Hand
 
 
 def _refuse_disagreement(agree: NDArray[np.bool_]) -> None:
-    if agree.sum() < max(LEAST_PAIRS, 0.2 * len(agree)):
+    if agree.sum() < max(LEAST_PAIRS, LEAST_SHARE * len(agree)):
         raise InputError(
             f"the gripper's motion and the images agree in only {agree.sum()} of {len(agree)} pairs"
             " of frames: check that the poses belong to these images, that they are poses of the"
