@@ -199,6 +199,7 @@ class Map:
             scene = fit_acceptance(
                 contents.with_scene(built.scene),
                 built.corrected(split.held_out),
+                left_out=built.left_out(split.train),
                 noise=built.independent_noise,
             )
             scene = replace(scene, metric=loaded.metric)

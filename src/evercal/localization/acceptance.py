@@ -14,13 +14,15 @@ unobstructed image. A hand before the lens lowers the first factor alone.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from evercal.geometry import SE3, UncertainPose, pose_distance
+from evercal.geometry.near import NEAR_M, NEAR_RAD
 from evercal.localization.estimate import CovarianceTerm
 from evercal.localization.query import Hypothesis
-from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.mapping.scene_map import LeftOut, MapContents, SceneMap
 from evercal.recordings.frame import Frame
 
 MAX_SUPPORT = 0.5
@@ -115,51 +117,77 @@ def fit_acceptance(
     contents: MapContents,
     held_out: Sequence[Frame],
     index: int = -1,
+    left_out: Sequence[LeftOut] = (),
     noise: tuple[float, float] = (0.0, 0.0),
 ) -> SceneMap:
     """Fit threshold and covariance of a scene to frames that its map was not built from.
 
-    The scene is the newest by default. Its threshold is half of the 5 % quantile of the support of
-    well-located frames, between `MIN_SUPPORT` and `MAX_SUPPORT`. The scatter of the stated frame is
-    as large as the errors of these frames ask for. `noise` is the standard deviation of stated
-    poses per axis, metres and radians, that is independent from frame to frame: it averages out in
-    the map and is no error of an answer.
-    """
-    from evercal.geometry.near import NEAR_M, NEAR_RAD
-    from evercal.localization.localizer import Localizer
+    The threshold is half of the 5 % quantile of the support of well-located frames, between
+    `MIN_SUPPORT` and `MAX_SUPPORT`. The scatter of the stated frame is as large as the errors of
+    all given frames ask for.
 
+    Args:
+        contents: The map.
+        held_out: Frames that the map was not built from.
+        index: The scene; the newest by default.
+        left_out: Frames that are located without the keyframes near them.
+        noise: Standard deviation of stated poses per axis, metres and radians, that is independent
+            from frame to frame. It averages out in the map and is no error of an answer.
+    """
     scenes = list(contents.scenes)
     shared = scenes[index].frame.frame_sigma
     bare = replace(scenes[index].frame, frame_sigma=(0.0, 0.0))
-    scenes[index] = replace(
+    scene = replace(
         scenes[index], frame=bare, min_support=MIN_SUPPORT, covariance_scale=COVARIANCE_SCALE
     )
-    localizer = Localizer(replace(contents, scenes=scenes))
-    supports, errors, covariances = [], [], []
-    for frame in held_out:
-        estimate = localizer.localize(frame.read_image(), localizer.camera_for(frame.camera))
-        pose, stated = estimate.uncertain_pose, frame.base_from_camera
-        if pose is None or stated is None:
-            continue
-        metres, radians = pose_distance(pose.pose, stated)
-        if metres < NEAR_M and radians < NEAR_RAD:
-            supports.append(estimate.support)
-        turn = (pose.pose.inverse() @ stated).log()[3:]
-        errors.append(np.r_[stated.translation_m - pose.pose.translation_m, turn])
-        covariances.append(pose.covariance)
+    scenes[index] = scene
+    answers = _located(replace(contents, scenes=scenes), held_out)
+    supports = [answer.support for answer in answers if answer.near]
+    for part in left_out:
+        scenes[index] = replace(scene, keyframes=scene.keyframes.take(part.keyframes))
+        answers += _located(replace(contents, scenes=scenes), part.frames)
     low = float(np.quantile(supports, 0.05)) if supports else 2 * MAX_SUPPORT
     threshold = min(max(low / 2, MIN_SUPPORT), MAX_SUPPORT)
-    sigma = shared
-    if errors:
-        off, spread = np.array(errors), np.array(covariances)
+    if answers:
+        off = np.array([answer.off for answer in answers])
+        spread = np.array([answer.covariance for answer in answers])
         spread = spread + np.diag(np.repeat(np.square(noise), 3))
         metres, radians = (
             max(known, scatter(off[:, part], spread[:, part, part]))
             for known, part in zip(shared, (slice(0, 3), slice(3, 6)), strict=True)
         )
-        sigma = metres, radians
-    frame = replace(bare, frame_sigma=sigma)
-    return replace(scenes[index], frame=frame, min_support=threshold)
+        shared = metres, radians
+    return replace(scene, frame=replace(bare, frame_sigma=shared), min_support=threshold)
+
+
+class _Answer(NamedTuple):
+    """A located frame beside its stated pose."""
+
+    support: float
+    off: np.ndarray
+    """(6,) translation in the base frame, metres, and rotation about camera axes, radians."""
+    covariance: np.ndarray
+    """(6, 6)."""
+
+    @property
+    def near(self) -> bool:
+        """Whether the frame is well located."""
+        metres, radians = np.linalg.norm(self.off.reshape(2, 3), axis=1)
+        return bool(metres < NEAR_M and radians < NEAR_RAD)
+
+
+def _located(contents: MapContents, frames: Sequence[Frame]) -> list[_Answer]:
+    from evercal.localization.localizer import Localizer
+
+    localizer, answers = Localizer(contents), []
+    for frame in frames:
+        estimate = localizer.localize(frame.read_image(), localizer.camera_for(frame.camera))
+        pose, stated = estimate.uncertain_pose, frame.base_from_camera
+        if pose is not None and stated is not None:
+            turn = (pose.pose.inverse() @ stated).log()[3:]
+            off = np.r_[stated.translation_m - pose.pose.translation_m, turn]
+            answers.append(_Answer(estimate.support, off, pose.covariance))
+    return answers
 
 
 def scatter(errors: np.ndarray, covariances: np.ndarray) -> float:

@@ -28,7 +28,7 @@ from evercal.mapping.pose_check import (
     matched_pairs,
 )
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
-from evercal.mapping.scene_map import SceneMap
+from evercal.mapping.scene_map import LeftOut, SceneMap
 from evercal.mapping.selection import select_farthest, spread_poses
 from evercal.mapping.tracks import (
     KeyframeTracks,
@@ -45,6 +45,9 @@ HAND_EYE_COVARIANCE_SCALE = 2.5
 """Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated
 over many frames, which residuals do not show: the squared error in 30 trials was 1.8 times the
 formal one (docs/experiments/handeye.md)."""
+GAP, MOST_PARTS = 10, 12
+"""Frames without keyframes before and after a part that is left out, and number of parts at most.
+Frames between similar keyframes are located more exactly than new images are."""
 NOTICEABLE_RAD = 1e-4
 """Landmarks are tracked again if poses and intrinsics moved their projections by more than this:
 some hundredths of a pixel."""
@@ -154,6 +157,24 @@ class BuiltMap:
             for frame in frames
             if frame.base_from_camera is not None
         ]
+
+    def left_out(self, frames: Sequence[Frame]) -> list[LeftOut]:
+        """Parts of the recording, each with the keyframes that were recorded before and after it.
+
+        The frames are all that the map was built from, in recorded order. A recording that is too
+        short for it, or that states gripper poses, gives none.
+        """
+        if len(frames) < 3 * GAP or self.hand_eye is not None:
+            return []
+        order = {frame.name: i for i, frame in enumerate(frames)}
+        recorded = np.array([order[name] for name in self.keyframe_names])
+        count = min(MOST_PARTS, len(frames) // (2 * GAP))
+        parts = []
+        for middle in np.linspace(GAP, len(frames) - GAP - 1, count).astype(int).tolist():
+            others = np.flatnonzero(np.abs(recorded - middle) > GAP)
+            if len(others):
+                parts.append(LeftOut(tuple(frames[middle - 3 : middle + 4 : 2]), others))
+        return parts
 
     def take(self, index: NDArray[np.int64]) -> "BuiltMap":
         """The same map with a subset of its keyframes."""

@@ -1,9 +1,11 @@
 """`SceneMap`: the map of one scene as a robot keeps it, and the scenes of one map together."""
 
 from dataclasses import dataclass, field
-from typing import Self
+from typing import NamedTuple, Self
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from evercal.features.device import device_of_network
@@ -11,6 +13,7 @@ from evercal.features.encoder import Encoder
 from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import MapFrame
+from evercal.recordings.frame import Frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,3 +80,11 @@ class MapContents:
     def with_scene(self, scene: SceneMap) -> "MapContents":
         """The same map with one more scene."""
         return MapContents(self.encoder, self.short_side, [*self.scenes, scene])
+
+
+class LeftOut(NamedTuple):
+    """Frames that are located without the keyframes recorded near them."""
+
+    frames: tuple[Frame, ...]
+    keyframes: NDArray[np.int64]
+    """Indices of the other keyframes."""

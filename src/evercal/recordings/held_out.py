@@ -7,10 +7,7 @@ from dataclasses import dataclass, replace
 from evercal.errors import InputError
 from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording
 
-EVERY, SHORT_BLOCK, BLOCK = 100, 4, 16
-"""Frames are held out in blocks, one in every so many frames. A short block lies between similar
-frames and is located more exactly than new images are. Recordings of fewer than two blocks need
-their frames and give up short ones."""
+EVERY, BLOCK = 100, 4
 
 
 @dataclass(frozen=True)
@@ -19,8 +16,8 @@ class HeldOutSplit:
 
     train: tuple[Frame, ...]
     held_out: tuple[Frame, ...]
-    """Frames that acceptance and covariance are fitted to: at least one block, see `BLOCK`; none of
-    a recording with fewer than `MIN_TRAIN_FRAMES` frames."""
+    """Frames that acceptance is fitted to: blocks of 4 in every 100, at least one block; none of a
+    recording with fewer than `MIN_TRAIN_FRAMES` frames."""
 
 
 def split_held_out(frames: Sequence[Frame]) -> HeldOutSplit:
@@ -28,8 +25,8 @@ def split_held_out(frames: Sequence[Frame]) -> HeldOutSplit:
     if len(frames) < MIN_TRAIN_FRAMES:
         return HeldOutSplit(tuple(frames), ())
     every = min(EVERY, len(frames))
-    middle, block = every // 2, BLOCK if len(frames) >= 2 * EVERY else SHORT_BLOCK
-    held_out = [middle <= i % every < middle + block for i in range(len(frames))]
+    middle = every // 2
+    held_out = [middle <= i % every < middle + BLOCK for i in range(len(frames))]
     return HeldOutSplit(
         tuple(f for f, out in zip(frames, held_out, strict=True) if not out),
         tuple(f for f, out in zip(frames, held_out, strict=True) if out),

@@ -166,7 +166,7 @@ def with_fitted_threshold(
     noise = (0.0, 0.0)
     if built is not None:
         held_out, noise = built.corrected(held_out), built.independent_noise
-    return replace(record, map=fit_acceptance(scenes.map_contents(), held_out, index, noise))
+    return replace(record, map=fit_acceptance(scenes.map_contents(), held_out, index, noise=noise))
 
 
 def run_stage(
