@@ -20,7 +20,7 @@ from evercal.localization.acceptance import (
     widened,
 )
 from evercal.localization.query import Hypothesis
-from evercal.mapping.scene_map import MapContents
+from evercal.mapping.scene_map import LeftOut, MapContents
 from evercal.recordings.frame import Frame, Recording
 
 Change = Callable[[Frame], Frame]
@@ -131,3 +131,20 @@ def test_scatter_restores_the_distribution() -> None:
     errors = own + 3 * rng.normal(size=(2000, 3))
     assert scatter(errors, covariances) == pytest.approx(3.0, rel=0.05)
     assert scatter(0.9 * own, covariances) == 0.0
+
+
+def test_frames_far_from_keyframes_widen_the_stated_frame(
+    hall: Recording, hall_map: MapContents
+) -> None:
+    shift = SE3.exp([0.02, 0, 0, 0, 0, 0])
+    part = [
+        replace(frame, base_from_camera=shift @ frame.base_from_camera)
+        for frame in hall.test[:8]
+        if frame.base_from_camera is not None
+    ]
+    count = len(hall_map.scenes[0].keyframes)
+    left_out = [LeftOut(tuple(part), np.arange(count))]
+    scene = fit_acceptance(hall_map, (), left_out=left_out)
+    assert 0.005 < scene.frame.frame_sigma[0] < 0.015
+    assert len(scene.keyframes) == count
+    assert scene.min_support == MAX_SUPPORT

@@ -12,7 +12,14 @@ import pytest
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder, load_encoder
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
-from evercal.mapping.build import BuiltMap, MapOptions, _moved, build_map, spread_frames
+from evercal.mapping.build import (
+    BuiltMap,
+    HandEyeCorrection,
+    MapOptions,
+    _moved,
+    build_map,
+    spread_frames,
+)
 from evercal.mapping.bundle_adjustment import Adjustment
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.memory_budget import MemoryBudget
@@ -256,3 +263,23 @@ def test_spread_frames_fill_the_capacity(capacity: int, arcs: tuple[Recording, R
     selected = spread_frames(arcs[0].train, capacity).tolist()
     assert len(selected) == min(capacity, 24)
     assert selected == sorted(set(selected))
+
+
+def test_parts_are_left_out_with_the_keyframes_near_them(
+    hall: Recording, hall_built: BuiltMap
+) -> None:
+    # The hall has 30 frames: one part in its middle, or two.
+    frames = hall.train
+    built = replace(hall_built, keyframe_names=tuple(f.name for f in frames[::5][:7]))
+    parts = built.left_out(frames)
+    assert parts
+    numbers = {frame.name: i for i, frame in enumerate(frames)}
+    recorded = np.array([numbers[name] for name in built.keyframe_names])
+    for part in parts:
+        middle = np.mean([numbers[frame.name] for frame in part.frames])
+        away = np.abs(recorded - middle)
+        assert set(part.keyframes.tolist()) == set(np.flatnonzero(away > 10).tolist())
+        assert 0 < len(part.keyframes) < len(recorded)
+    assert built.left_out(frames[:29]) == []
+    moved = HandEyeCorrection(SE3.identity(), np.eye(6))
+    assert replace(built, hand_eye=moved).left_out(frames) == []

@@ -217,6 +217,14 @@ def adjusted_lines(adjusted: "Adjusted") -> list[str]:
         f" offset {shift:.1f} mm and {rotation:.2f} deg; focal length"
         f" {adjusted.focal_percent:+.2f} %"
     ]
+    from evercal.calibration.eye_in_hand import MOST_FOCAL_PERCENT
+
+    if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
+        lines.append(
+            "warning: images and stated poses ask for a focal length"
+            f" {adjusted.focal_percent:+.1f} % from the stated one; the intrinsics or the scale of"
+            " the poses are wrong"
+        )
     if abs(adjusted.time_shift_frames) > 0.02:
         lines.append(
             f"warning: the images lag their stated poses by {adjusted.time_shift_frames:+.2f} frame"
