@@ -187,7 +187,11 @@ def align_pose(
 
 
 def _self_calibrated(
-    observed: Observed, camera: Camera, pose: SE3, change: Array, prior: Prior
+    observed: Observed,
+    camera: Camera,
+    pose: SE3,
+    change: Array,
+    prior: Prior,
 ) -> RefinedPose:
     """Pose and intrinsics; the prior gives way where the image contradicts it."""
     free = refine_pose(observed, camera, pose, _STEPS, prior.free(camera), change)
@@ -196,12 +200,29 @@ def _self_calibrated(
     prior = replace(prior, scale=shared * prior.scale)
     variances = prior.tested(camera, free.change, np.diag(free.change_covariance))
     refined = refine_pose(observed, camera, free.pose.pose, _STEPS, variances, free.change)
+    if prior.sigma.gain > 1:
+        kept = refine_pose(observed, camera, pose, _STEPS, prior.tight(camera))
+        before, after = (np.median(each.residual_px) for each in (kept, refined))
+        if before < prior.sigma.gain * after:
+            refined = _doubted(kept, refined)
     wider = refined.pose.covariance + (shared - 1) * refined.by_intrinsics
     return replace(
         refined,
         pose=UncertainPose(refined.pose.pose, wider),
         by_intrinsics=shared * refined.by_intrinsics,
         change_covariance=shared * refined.change_covariance,
+    )
+
+
+def _doubted(kept: RefinedPose, other: RefinedPose) -> RefinedPose:
+    """A pose that is kept, with a covariance that reaches the pose for other intrinsics."""
+    turn = (kept.pose.pose.inverse() @ other.pose.pose).log()[3:]
+    off = np.r_[other.pose.pose.translation_m - kept.pose.pose.translation_m, turn]
+    doubt = np.outer(off, off)
+    return replace(
+        kept,
+        pose=UncertainPose(kept.pose.pose, kept.pose.covariance + doubt),
+        by_intrinsics=kept.by_intrinsics + doubt,
     )
 
 
