@@ -162,7 +162,7 @@ class Map:
             InputError: A recording that cannot be used, a name that is taken, or another process
                 is writing into the map.
         """
-        from evercal.localization.acceptance import fit_acceptance
+        from evercal.localization.fit_acceptance import fit_acceptance
         from evercal.mapping.build import MapOptions, build_map
         from evercal.mapping.memory_budget import MemoryBudget
         from evercal.recordings import load_recording, posed_recording

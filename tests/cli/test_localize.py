@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from evercal.recordings import Recording
 
 KEYS = {"path", "status", "reason", "scene", "base_from_camera", "covariance", "inliers"}
-KEYS |= {"inlier_ratio", "ms", "error_terms", "unit"}
+KEYS |= {"inlier_ratio", "ms", "error_terms", "unit", "alternatives"}
 CAUSES = ["view", "lens", "map", "stated poses", "base frame"]
 
 

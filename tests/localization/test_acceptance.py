@@ -14,11 +14,10 @@ from evercal.localization.acceptance import (
     MAX_SUPPORT,
     MIN_SUPPORT,
     accepted,
-    fit_acceptance,
-    scatter,
     support,
     widened,
 )
+from evercal.localization.fit_acceptance import fit_acceptance, scatter
 from evercal.localization.query import Hypothesis
 from evercal.mapping.scene_map import LeftOut, MapContents
 from evercal.recordings.frame import Frame, Recording

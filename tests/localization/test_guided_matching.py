@@ -42,7 +42,12 @@ class Scripted(Localizer):
         self.options = LocalizeOptions()
 
     def _hypothesis(
-        self, query: object, candidate: Candidate, camera: object, near: Hypothesis | None = None
+        self,
+        query: object,
+        candidate: Candidate,
+        camera: object,
+        near: Hypothesis | None = None,
+        matches: object = None,
     ) -> Hypothesis:
         if near is not None:
             assert near.pose is not None

@@ -1,7 +1,7 @@
 """`SceneMap`: the map of one scene as a robot keeps it, and the scenes of one map together."""
 
 from dataclasses import dataclass, field
-from typing import NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -13,7 +13,9 @@ from evercal.features.encoder import Encoder
 from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import MapFrame
-from evercal.recordings.frame import Frame
+
+if TYPE_CHECKING:
+    from evercal.recordings.frame import Frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +87,6 @@ class MapContents:
 class LeftOut(NamedTuple):
     """Frames that are located without the keyframes recorded near them."""
 
-    frames: tuple[Frame, ...]
+    frames: "tuple[Frame, ...]"
     keyframes: NDArray[np.int64]
     """Indices of the other keyframes."""

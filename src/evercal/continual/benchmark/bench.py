@@ -168,7 +168,7 @@ def _settings(scenes: Sequence[Recording], options: BenchOptions) -> dict[str, o
         **asdict(replace(stage, seed=0, encode=replace(stage.encode, seed=0))),
         "networks": [sha256_file(file)[:12] for file in (ENCODER_FILE, DESCRIPTOR_FILE)],
         "localize": asdict(LocalizeOptions()),
-        "acceptance": {k: v for k, v in vars(acceptance).items() if k.isupper()},
+        "acceptance": {k: v for k, v in vars(acceptance).items() if isinstance(v, float)},
         "order": options.order,
         "short_side": options.short_side,
         "scenes": [[scene.name, len(scene.train), len(scene.test)] for scene in scenes],

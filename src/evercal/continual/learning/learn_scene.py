@@ -24,7 +24,7 @@ from evercal.errors import InputError
 from evercal.features.device import device_of
 from evercal.features.weights_file import network_bytes
 from evercal.geometry import SE3
-from evercal.localization.acceptance import fit_acceptance
+from evercal.localization.fit_acceptance import fit_acceptance
 from evercal.map import LearnReport
 from evercal.mapping.build import BuiltMap
 from evercal.recordings.frame import Frame, Recording, posed_recording

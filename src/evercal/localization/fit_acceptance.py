@@ -1,0 +1,113 @@
+"""Threshold and covariance of a scene, fitted when it is learned."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from evercal.geometry.near import NEAR_M, NEAR_RAD
+from evercal.localization.acceptance import COVARIANCE_SCALE, MAX_SUPPORT, MIN_SUPPORT
+from evercal.localization.localizer import Localizer
+from evercal.mapping.scene_map import LeftOut, MapContents, SceneMap
+from evercal.recordings.frame import Frame
+
+
+def fit_acceptance(
+    contents: MapContents,
+    held_out: Sequence[Frame],
+    index: int = -1,
+    left_out: Sequence[LeftOut] = (),
+    noise: tuple[float, float] = (0.0, 0.0),
+) -> SceneMap:
+    """Fit threshold and covariance of a scene to frames that its map was not built from.
+
+    The threshold is half of the 5 % quantile of the support of well-located frames, between
+    `MIN_SUPPORT` and `MAX_SUPPORT`. The scatter of the stated frame is as large as the errors of
+    all given frames ask for.
+
+    Args:
+        contents: The map.
+        held_out: Frames that the map was not built from.
+        index: The scene; the newest by default.
+        left_out: Frames that are located without the keyframes near them.
+        noise: Standard deviation of stated poses per axis, metres and radians, that is independent
+            from frame to frame. It averages out in the map and is no error of an answer.
+    """
+    scenes = list(contents.scenes)
+    shared = scenes[index].frame.frame_sigma
+    bare = replace(scenes[index].frame, frame_sigma=(0.0, 0.0))
+    scene = replace(
+        scenes[index], frame=bare, min_support=MIN_SUPPORT, covariance_scale=COVARIANCE_SCALE
+    )
+    scenes[index] = scene
+    answers = _located(replace(contents, scenes=scenes), held_out)
+    supports = [answer.support for answer in answers if answer.near]
+    for part in left_out:
+        scenes[index] = replace(scene, keyframes=scene.keyframes.take(part.keyframes))
+        answers += _located(replace(contents, scenes=scenes), part.frames)
+    low = float(np.quantile(supports, 0.05)) if supports else 2 * MAX_SUPPORT
+    threshold = min(max(low / 2, MIN_SUPPORT), MAX_SUPPORT)
+    if answers:
+        off = np.array([answer.off for answer in answers])
+        spread = np.array([answer.covariance for answer in answers])
+        spread = spread + np.diag(np.repeat(np.square(noise), 3))
+        metres, radians = (
+            max(known, scatter(off[:, part], spread[:, part, part]))
+            for known, part in zip(shared, (slice(0, 3), slice(3, 6)), strict=True)
+        )
+        shared = metres, radians
+    return replace(scene, frame=replace(bare, frame_sigma=shared), min_support=threshold)
+
+
+class _Answer(NamedTuple):
+    """A located frame beside its stated pose."""
+
+    support: float
+    off: np.ndarray
+    """(6,) translation in the base frame, metres, and rotation about camera axes, radians."""
+    covariance: np.ndarray
+    """(6, 6)."""
+
+    @property
+    def near(self) -> bool:
+        """Whether the frame is well located."""
+        metres, radians = np.linalg.norm(self.off.reshape(2, 3), axis=1)
+        return bool(metres < NEAR_M and radians < NEAR_RAD)
+
+
+def _located(contents: MapContents, frames: Sequence[Frame]) -> list[_Answer]:
+    localizer, answers = Localizer(contents), []
+    for frame in frames:
+        estimate = localizer.localize(frame.read_image(), localizer.camera_for(frame.camera))
+        pose, stated = estimate.uncertain_pose, frame.base_from_camera
+        if pose is not None and stated is not None:
+            turn = (pose.pose.inverse() @ stated).log()[3:]
+            off = np.r_[stated.translation_m - pose.pose.translation_m, turn]
+            answers.append(_Answer(estimate.support, off, pose.covariance))
+    return answers
+
+
+def scatter(errors: np.ndarray, covariances: np.ndarray) -> float:
+    """Smallest standard deviation per axis that makes errors fit their covariances.
+
+    Errors are (n, 3), covariances (n, 3, 3). With the variance added to every axis, 90 % of the
+    squared Mahalanobis distances are below the 90 % quantile of their distribution. It is 0 where
+    they are without it.
+    """
+    from scipy.optimize import brentq
+    from scipy.stats import chi2
+
+    values, axes = np.linalg.eigh(covariances)
+    squares = np.einsum("nji,nj->ni", axes, errors) ** 2
+    limit = float(chi2.ppf(0.9, 3))
+
+    def excess(sigma: float) -> float:
+        distances = (squares / (values + sigma**2)).sum(1)
+        # Few frames: a quantile between two of them would follow the worst one.
+        return float(np.quantile(distances, 0.9, method="lower")) - limit
+
+    if excess(0.0) <= 0:
+        return 0.0
+    largest = 2 * float(np.sqrt(squares.sum(1).max()))
+    return float(brentq(excess, 0.0, largest))  # pyright: ignore[reportArgumentType]
