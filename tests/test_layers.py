@@ -36,7 +36,7 @@ FOR_ALL = ("errors",)
 FACES = ("__init__", "__main__")
 """Modules of the root that may import everything."""
 PRODUCT = ORDER[: ORDER.index("simulation")]
-MOST_LOCALIZING, MOST_LEARNING = 41, 61
+MOST_LOCALIZING, MOST_LEARNING = 42, 61
 """Modules of evercal that a program loads, at most."""
 
 

@@ -57,9 +57,16 @@ def sift_features(image: NDArray[np.uint8]) -> SiftFeatures:
 def epipolar_pair(
     a: SiftFeatures, b: SiftFeatures, first: Camera, second: Camera
 ) -> EpipolarPair | None:
-    """Match two images and estimate the camera's motion; None for too few inliers.
+    """Match two images and estimate the camera's motion.
 
-    The cameras are those of the images that the features are from.
+    Args:
+        a: Features of the first image.
+        b: Features of the second image.
+        first: Camera of the first image.
+        second: Camera of the second image.
+
+    Returns:
+        The motion, or None with fewer than `MIN_INLIERS` inliers.
     """
     import poselib
 

@@ -403,7 +403,7 @@ class Localizer:
     ) -> tuple[Hypothesis, Hypothesis | None]:
         """The pose with the most support among an accepted one and its rivals, and the runner-up.
 
-        The runner-up is None unless it explains the image nearly as well as the best one.
+        Without a runner-up that explains the image nearly as well, the second value is None.
         """
         clear, runner_up, strong = self.options.clear_strength, None, 0.0
         for _ in range(self.options.climbs):
@@ -422,8 +422,9 @@ class Localizer:
     def _strength(self, rival: Hypothesis, best: Hypothesis) -> float:
         """How well a rival explains the image, relative to another pose; both are aligned.
 
-        The ratio of their support times that of the matches within one cell. Landmarks tell a
-        square of a board from the next one, but alike racks only differ in their surroundings.
+        The ratio of their support times that of the matches within one cell. Landmarks
+        distinguish a square of a board from the next one. Racks of one kind differ only in their
+        surroundings.
         """
         ratio = support(rival) / max(support(best), 1e-9)
         if best.matches is None:
