@@ -43,8 +43,8 @@ class IntrinsicsPrior:
 
 OWN = IntrinsicsPrior(focal=2e-4, centre=3e-4, k1=1e-3, k2=1e-3, gain=1.1)
 """The camera that recorded the scene: its error is in the landmarks, too, and cancels. Where a map
-is inexact, every image fits slightly better with other intrinsics. To follow it without a clear gain
-costs precision on a real recording (docs/experiments/intrinsics.md)."""
+is inexact, every image fits slightly better with other intrinsics. To follow it without a clear
+gain costs precision on a real recording (docs/experiments/intrinsics.md)."""
 STATED = IntrinsicsPrior(focal=2e-3, centre=2e-3, k1=5e-3, k2=5e-3)
 """Intrinsics that the user states."""
 UNKNOWN = IntrinsicsPrior(focal=0.3, centre=0.05, k1=0.1, k2=0.05)
