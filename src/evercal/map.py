@@ -138,7 +138,7 @@ class Map:
         recording: PathLike | Recording,
         *,
         name: str | None = None,
-        memory: str | int = "10%",
+        memory: str | int | None = None,
         gripper_from_camera: SE3 | None = None,
         options: MapOptions | None = None,
         on_progress: OnProgress = lambda *_: None,
@@ -153,7 +153,8 @@ class Map:
                 read.
             name: of the scene. Default: the recording's name.
             memory: keyframes to keep: a share of the frames ("10%"), a size ("5MB"), or "auto" for
-                the fewest that locate the recording's other frames well.
+                the fewest that locate the recording's other frames well. Default: 10 %, at least
+                eight.
             gripper_from_camera: a rough one, such as from CAD, that the estimate is compared with.
             options: sizes and priors of the map; `memory` overrides theirs.
             on_progress: called with the current step, how much of it is done, and its total.

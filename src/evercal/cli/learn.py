@@ -39,9 +39,9 @@ class Learn:
     """Folder of the recording, or file of a bag."""
     name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Name of the scene. Default: the recording's own name."""
-    memory: Annotated[str, arg(metavar="SHARE|BYTES|auto")] = "10%"
+    memory: Annotated[str | None, arg(metavar="SHARE|BYTES|auto", help_behavior_hint="")] = None
     """Keyframes to keep: a share of the frames (10%), a size (5MB), or auto for the fewest that
-    locate the recording's other frames well."""
+    locate the recording's other frames well. Default: 10%, at least eight."""
     calibration: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Output file for the estimated gripper_from_camera, for 'evercal export'."""
     gripper_from_camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -121,7 +121,7 @@ class Learn:
             request = LearnRequest(
                 self.store,
                 strategy,
-                self.memory,
+                self.memory or "10%",
                 self.encoder,
                 self.device,
                 rough,
