@@ -193,6 +193,7 @@ class Map:
             split = split_held_out(loaded.train)
             options = _sized(options, budget, contents.short_side)
             built = build_map(loaded.name, split.train, contents.encoder, options, on_progress)
+            built = replace(built, scene=replace(built.scene, metric=loaded.metric))
             if budget.auto:
                 from evercal.localization.fewest_keyframes import fewest_keyframes
 
@@ -203,7 +204,6 @@ class Map:
                 left_out=built.left_out(split.train),
                 noise=built.independent_noise,
             )
-            scene = replace(scene, metric=loaded.metric)
             report = LearnReport(
                 scene=scene.name,
                 seconds=time.perf_counter() - began,

@@ -113,7 +113,9 @@ def test_shared_errors_of_held_out_poses_widen_the_stated_frame(
         stated = [(frame, frame.base_from_camera) for frame in frames]
         return [replace(f, base_from_camera=shift @ pose) for f, pose in stated if pose is not None]
 
-    held_out = hall.test[::10]
+    held_out = hall.test[::3]
+    few = fit_acceptance(hall_map, off(held_out[:7], 0.02))
+    assert few.frame.frame_sigma == (0.0, 0.0)
     assert fit_acceptance(hall_map, held_out).frame.frame_sigma == (0.0, 0.0)
     metres, radians = fit_acceptance(hall_map, off(held_out, 0.02)).frame.frame_sigma
     assert 0.005 < metres < 0.015
@@ -121,6 +123,9 @@ def test_shared_errors_of_held_out_poses_widen_the_stated_frame(
     # Independent noise of stated poses is no error of an answer.
     noisy = fit_acceptance(hall_map, off(held_out, 0.02), noise=(0.02, 0.0))
     assert noisy.frame.frame_sigma == (0.0, 0.0)
+    # A wrong pose is no scatter.
+    some = [*off(held_out[:2], 0.9), *held_out[2:]]
+    assert fit_acceptance(hall_map, some).frame.frame_sigma == (0.0, 0.0)
 
 
 def test_scatter_restores_the_distribution() -> None:

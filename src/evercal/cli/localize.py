@@ -142,12 +142,13 @@ def as_dict(answer: Answer, point: Point | None = None) -> dict[str, object]:
     terms = [{**vars(term), "share": share} for term, share in budget_of(estimate)]
     if not answer.unit_known:
         terms = [{**term, "translation_mm": None} for term in terms]
+    unit = "metres" if answer.unit_known else "unknown"
     entry = {
         "path": str(answer.path),
         "status": estimate.status,
         "reason": estimate.reason,
         "scene": estimate.scene,
-        "unit": None if pose is None else "metres" if answer.unit_known else "unknown",
+        "unit": unit if pose is not None or estimate.alternatives else None,
         "base_from_camera": pose,
         "alternatives": [pose_to_dict(other) for other in estimate.alternatives],
         "covariance": None if uncertain is None else uncertain.covariance.tolist(),

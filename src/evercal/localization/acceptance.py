@@ -77,7 +77,9 @@ def differ(hypothesis: Hypothesis, other: SE3, scene: SceneMap) -> bool:
     """Whether another pose, map_from_camera, is outside the uncertainty of an accepted one."""
     own = widened(hypothesis, scene)
     metres, radians = pose_distance(own.pose, other)
-    far = metres > APART_M or radians > APART_RAD
+    if scene.frame.similarity is not None:
+        metres = metres * scene.frame.similarity.scale
+    far = not scene.unit_known or metres > APART_M or radians > APART_RAD
     return bool(far and own.squared_mahalanobis(other) > APART_SIGMAS**2)
 
 

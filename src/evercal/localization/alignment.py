@@ -168,6 +168,8 @@ def align_pose(
         if (refined.residual_px < options.inlier_px).sum() < _HOPELESS * found.expected:
             break  # other intrinsics do not make it the right place
         if again == _MOST_AGAIN:
+            if prior.sigma.gain > 1:
+                break  # both are good, and it is undecided between them
             return None  # the intrinsics do not converge
         pose, change, again = refined.pose.pose, refined.change, again + 1
         rounds = options.rounds if moved > _FAR_PX else options.rounds[-1:]
@@ -200,30 +202,27 @@ def _self_calibrated(
     prior = replace(prior, scale=shared * prior.scale)
     variances = prior.tested(camera, free.change, np.diag(free.change_covariance))
     refined = refine_pose(observed, camera, free.pose.pose, _STEPS, variances, free.change)
+    doubt = np.zeros((6, 6))
     if prior.sigma.gain > 1:
         kept = refine_pose(observed, camera, pose, _STEPS, prior.tight(camera))
         before, after = (np.median(each.residual_px) for each in (kept, refined))
         if before < prior.sigma.gain * after:
-            refined = _doubted(kept, refined)
-    wider = refined.pose.covariance + (shared - 1) * refined.by_intrinsics
+            doubt = _apart(kept.pose.pose, refined.pose.pose)
+            refined = kept
+    wider = refined.pose.covariance + (shared - 1) * refined.by_intrinsics + doubt
     return replace(
         refined,
         pose=UncertainPose(refined.pose.pose, wider),
-        by_intrinsics=shared * refined.by_intrinsics,
+        by_intrinsics=shared * refined.by_intrinsics + doubt,
         change_covariance=shared * refined.change_covariance,
     )
 
 
-def _doubted(kept: RefinedPose, other: RefinedPose) -> RefinedPose:
-    """A pose that is kept, with a covariance that reaches the pose for other intrinsics."""
-    turn = (kept.pose.pose.inverse() @ other.pose.pose).log()[3:]
-    off = np.r_[other.pose.pose.translation_m - kept.pose.pose.translation_m, turn]
-    doubt = np.outer(off, off)
-    return replace(
-        kept,
-        pose=UncertainPose(kept.pose.pose, kept.pose.covariance + doubt),
-        by_intrinsics=kept.by_intrinsics + doubt,
-    )
+def _apart(kept: SE3, other: SE3) -> Array:
+    """(6, 6) covariance whose deviation reaches from one pose to that for other intrinsics."""
+    turn = (kept.inverse() @ other).log()[3:]
+    off = np.r_[other.translation_m - kept.translation_m, turn]
+    return np.outer(off, off)
 
 
 def _moved_px(camera: Camera, before: Array, after: Array) -> float:

@@ -53,7 +53,7 @@ class PoseEstimate:
     terms: tuple[CovarianceTerm, ...] = ()
     """Shares that sum to the covariance; empty for networks."""
     alternatives: tuple[SE3, ...] = ()
-    """The poses base_from_camera of an ambiguous image, the one with the most support first."""
+    """The poses base_from_camera of an ambiguous image, the stronger one first."""
     support: float = 0.0
     """Support of the pose, see `localization.acceptance`."""
 

@@ -12,6 +12,10 @@ from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_map import LeftOut, MapContents, SceneMap
 from evercal.recordings.frame import Frame
 
+LEAST_ANSWERS, WRONG_PLACE_M = 8, 0.5
+"""The scatter is fitted to so many answers, at least. Answers farther from their stated pose are
+wrong, or the pose is, and say nothing about its scatter."""
+
 
 def fit_acceptance(
     contents: MapContents,
@@ -41,14 +45,17 @@ def fit_acceptance(
         scenes[index], frame=bare, min_support=MIN_SUPPORT, covariance_scale=COVARIANCE_SCALE
     )
     scenes[index] = scene
-    answers = _located(replace(contents, scenes=scenes), held_out)
-    supports = [answer.support for answer in answers if answer.near]
-    for part in left_out:
-        scenes[index] = replace(scene, keyframes=scene.keyframes.take(part.keyframes))
-        answers += _located(replace(contents, scenes=scenes), part.frames)
+    answers = _located(replace(contents, scenes=scenes), held_out, scene.name)
+    supports = [answer.support for answer in answers if answer.near(scene.unit_known)]
     low = float(np.quantile(supports, 0.05)) if supports else 2 * MAX_SUPPORT
     threshold = min(max(low / 2, MIN_SUPPORT), MAX_SUPPORT)
-    if answers:
+    for part in left_out:
+        scenes[index] = replace(scene, keyframes=scene.keyframes.take(part.keyframes))
+        answers += _located(replace(contents, scenes=scenes), part.frames, scene.name)
+    answers = [answer for answer in answers if answer.support >= threshold]
+    if scene.unit_known:
+        answers = [answer for answer in answers if np.linalg.norm(answer.off[:3]) < WRONG_PLACE_M]
+    if len(answers) >= LEAST_ANSWERS:
         off = np.array([answer.off for answer in answers])
         spread = np.array([answer.covariance for answer in answers])
         spread = spread + np.diag(np.repeat(np.square(noise), 3))
@@ -69,19 +76,21 @@ class _Answer(NamedTuple):
     covariance: np.ndarray
     """(6, 6)."""
 
-    @property
-    def near(self) -> bool:
-        """Whether the frame is well located."""
+    def near(self, metric: bool) -> bool:
+        """Whether the frame is well located; by its rotation where the unit is unknown."""
         metres, radians = np.linalg.norm(self.off.reshape(2, 3), axis=1)
-        return bool(metres < NEAR_M and radians < NEAR_RAD)
+        return bool((metres < NEAR_M or not metric) and radians < NEAR_RAD)
 
 
-def _located(contents: MapContents, frames: Sequence[Frame]) -> list[_Answer]:
+def _located(contents: MapContents, frames: Sequence[Frame], scene: str) -> list[_Answer]:
+    """Answers in one scene, with finite covariances."""
     localizer, answers = Localizer(contents), []
     for frame in frames:
         estimate = localizer.localize(frame.read_image(), localizer.camera_for(frame.camera))
         pose, stated = estimate.uncertain_pose, frame.base_from_camera
-        if pose is not None and stated is not None:
+        if pose is None or stated is None or estimate.scene != scene:
+            continue
+        if np.isfinite(pose.covariance).all():
             turn = (pose.pose.inverse() @ stated).log()[3:]
             off = np.r_[stated.translation_m - pose.pose.translation_m, turn]
             answers.append(_Answer(estimate.support, off, pose.covariance))
@@ -99,6 +108,7 @@ def scatter(errors: np.ndarray, covariances: np.ndarray) -> float:
     from scipy.stats import chi2
 
     values, axes = np.linalg.eigh(covariances)
+    values = np.maximum(values, 1e-18)
     squares = np.einsum("nji,nj->ni", axes, errors) ** 2
     limit = float(chi2.ppf(0.9, 3))
 

@@ -299,7 +299,8 @@ class Localizer:
             again = self._hypothesis(query, dense, camera, best)
             if support(again) < self.options.guided_gain * support(best):
                 break
-            best = again
+            # Rivals are sought among all matches, and not only near this pose.
+            best = replace(again, matches=best.matches or again.matches)
         return best
 
     def _hypothesis(
@@ -401,7 +402,7 @@ class Localizer:
     def _settled(
         self, query: Query, best: Hypothesis, cameras: Sequence[Camera]
     ) -> tuple[Hypothesis, Hypothesis | None]:
-        """The pose with the most support among an accepted one and its rivals, and the runner-up.
+        """The strongest pose among an accepted one and its rivals, and the runner-up.
 
         Without a runner-up that explains the image nearly as well, the second value is None.
         """
@@ -411,7 +412,10 @@ class Localizer:
             rivals = [
                 (self._strength(rival, best), rival)
                 for rival in self._rivals(query, best, cameras[best.scene])
-                if rival.refined and rival.pose and differ(best, rival.pose.pose, scene)
+                if rival.refined
+                and rival.pose
+                and self._accepted(rival)
+                and differ(best, rival.pose.pose, scene)
             ]
             strong, runner_up = max(rivals, key=lambda pair: pair[0], default=(0.0, None))
             if runner_up is None or strong * clear <= 1:

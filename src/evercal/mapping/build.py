@@ -168,12 +168,14 @@ class BuiltMap:
             return []
         order = {frame.name: i for i, frame in enumerate(frames)}
         recorded = np.array([order[name] for name in self.keyframe_names])
+        excluded = {*self.adjusted.wrong_poses, *self.adjusted.untracked}
         count = min(MOST_PARTS, len(frames) // (2 * GAP))
         parts = []
         for middle in np.linspace(GAP, len(frames) - GAP - 1, count).astype(int).tolist():
             others = np.flatnonzero(np.abs(recorded - middle) > GAP)
-            if len(others):
-                parts.append(LeftOut(tuple(frames[middle - 3 : middle + 4 : 2]), others))
+            some = [f for f in frames[middle - 3 : middle + 4 : 2] if f.name not in excluded]
+            if len(others) and some:
+                parts.append(LeftOut(tuple(some), others))
         return parts
 
     def take(self, index: NDArray[np.int64]) -> "BuiltMap":
