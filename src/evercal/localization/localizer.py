@@ -406,22 +406,26 @@ class Localizer:
 
         Without a runner-up that explains the image nearly as well, the second value is None.
         """
-        clear, runner_up, strong = self.options.clear_strength, None, 0.0
+        seen, front, scene = [best], best, self.contents.scenes[best.scene]
         for _ in range(self.options.climbs):
-            scene = self.contents.scenes[best.scene]
             rivals = [
-                (self._strength(rival, best), rival)
-                for rival in self._rivals(query, best, cameras[best.scene])
-                if rival.refined
-                and rival.pose
-                and self._accepted(rival)
-                and differ(best, rival.pose.pose, scene)
+                rival
+                for rival in self._rivals(query, front, cameras[best.scene])
+                if rival.refined and rival.pose and self._accepted(rival)
             ]
-            strong, runner_up = max(rivals, key=lambda pair: pair[0], default=(0.0, None))
-            if runner_up is None or strong * clear <= 1:
+            seen += rivals
+            higher = max(rivals, key=support, default=front)
+            if support(higher) <= support(front):
                 break
-            best, runner_up, strong = runner_up, best, 1 / strong
-        return best, runner_up if strong > clear else None
+            front = higher  # several periods away, the way leads over poses of rising support
+        strongest = max(seen, key=lambda rival: self._strength(rival, best))
+        if self._strength(strongest, best) * self.options.clear_strength > 1:
+            best = strongest
+        others = [x for x in seen if x.pose and x is not best and differ(best, x.pose.pose, scene)]
+        runner_up = max(others, key=lambda rival: self._strength(rival, best), default=None)
+        if runner_up is None or self._strength(runner_up, best) <= self.options.clear_strength:
+            return best, None
+        return best, runner_up
 
     def _strength(self, rival: Hypothesis, best: Hypothesis) -> float:
         """How well a rival explains the image, relative to another pose; both are aligned.
@@ -435,7 +439,8 @@ class Localizer:
             return ratio
         agreeing = []
         for pose in (rival.refined, best.refined):
-            assert pose is not None, "an aligned pose"
+            if pose is None:  # without alignment there are no rivals
+                return ratio
             small = pose.camera.short_side_resized(self.contents.short_side)
             rest = best.matches.beside(small, pose.pose.pose, self.contents.encoder.stride)
             agreeing.append(len(best.matches.pixels) - len(rest.pixels))

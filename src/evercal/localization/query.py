@@ -59,7 +59,7 @@ class LocalizeOptions:
     """A second pose is sought among matches that the first one misses by more than this, pixels at
     the encoder's working size."""
     climbs: int = 5
-    """A clearly stronger rival replaces a pose so many times, at most."""
+    """Poses whose rivals are tried, at most."""
     clear_strength: float = 0.8
     """A pose is clearly stronger than rivals with less than this strength. Otherwise the image is
     ambiguous. The strength is the ratio of their support times that of the matches that agree."""
