@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from evercal.calibration.align_points import Picks, align_by_points
 from evercal.calibration.from_images import scene_named
 from evercal.calibration.located import locate
-from evercal.calibration.pose_pairs.disagreement import require_agreement
-from evercal.calibration.pose_pairs.hand_eye import HandEyeFit, agreement, robust_fit
-from evercal.calibration.pose_pairs.observability import require_observable
+from evercal.calibration.pose_pairs.fit import HandEyeFit
 from evercal.calibration.pose_pairs.pairs import PosePairs
+from evercal.calibration.pose_pairs.solve import solve_pairs
 from evercal.errors import InputError
 from evercal.geometry import SE3, axis_deviation, cross_matrix
 from evercal.mapping.map_frame import Similarity
@@ -119,12 +118,10 @@ def align_by_gripper(
     map_from_camera = SE3.stack([item.pose for item in located])
     names = tuple(item.name for item in located)
     pairs = PosePairs(names, base_from_gripper, map_from_camera.inverse())
-    require_observable(pairs, scale_known)
-    equation = pairs.equation("eye_in_hand", scale_known)
-    start = agreement(equation)
-    require_agreement(pairs, "eye_in_hand", scale_known, start)
-    fit = robust_fit(equation, start)
-    similarity = Similarity(fit.at.fixed_from_board, fit.at.scale)
+    solution = solve_pairs(pairs, "eye_in_hand", scale_known)
+    fit = solution.fit
+    scale = solution.scale * (1 + float(fit.at.extras[-1]) if not scale_known else 1.0)
+    similarity = Similarity(fit.at.fixed_from_board, scale)
     covariance, sigma = _frame_covariance(fit, similarity, map_from_camera, scale_known)
     rms = np.sqrt((fit.residual[fit.inliers].reshape(-1, 2, 3) ** 2).sum(2).mean(0))
     return MapAlignment(
@@ -143,7 +140,7 @@ def _frame_covariance(
 ) -> tuple[Array, tuple[float, float]]:
     """Covariance of the base frame as one motion of it, and sigmas in the middle of the cameras."""
     whole = fit.factor * fit.covariance
-    picked = np.arange(6, 12 if scale_known else 13)
+    picked = np.r_[6:12] if scale_known else np.r_[6:12, len(whole) - 1]
     own = whole[np.ix_(picked, picked)]
     rotation = similarity.base_from_map.rotation_matrix()
     centre = map_from_camera.translation_m.mean(0)

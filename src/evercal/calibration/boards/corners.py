@@ -51,6 +51,12 @@ class BoardPose:
     squared_px: float
     """Sum of squared residuals of all coordinates."""
     corners: int
+    lens_slope: Array
+    """(6, q) derivative of the pose by fx, fy, cx, cy and the distortion coefficients."""
+    lens_normal: Array
+    """(q, q) information on the intrinsics for a corner noise of one pixel, the pose unknown."""
+    lens_gradient: Array
+    """(q,) `lens_normal` times the change of the intrinsics that fits the corners best."""
 
     @property
     def rms_px(self) -> float:
@@ -69,24 +75,37 @@ def board_pose(view: BoardView, camera: Camera, start: SE3 | None = None) -> Boa
     if start is None:
         starts = board_pose_candidates(view, camera)
         return min((board_pose(view, camera, s) for s in starts), key=lambda pose: pose.squared_px)
-    lens = camera.matrix(), np.array(camera.distortion)
+    coefficients = np.zeros(max(len(camera.distortion), 5))
+    coefficients[: len(camera.distortion)] = camera.distortion
+    lens = camera.matrix(), coefficients
     rotvec = Rotation.from_quat(start.rotation_wxyz, scalar_first=True).as_rotvec()
     translation = start.translation_m.reshape(3, 1).copy()
     rotvec, translation = cv2.solvePnPRefineLM(
         view.points_m, view.pixels, *lens, rotvec.reshape(3, 1).copy(), translation
     )
     projected, slopes, *_ = cv2.projectPoints(view.points_m, rotvec, translation, *lens)
-    by_point = np.asarray(slopes[:, 3:6], dtype=np.float64).reshape(-1, 2, 3)
+    slopes = np.asarray(slopes, dtype=np.float64)
     rotation = Rotation.from_rotvec(np.ravel(rotvec))
+    by_point = slopes[:, 3:6].reshape(-1, 2, 3)
     by_rotation = by_point @ (-rotation.as_matrix() @ cross_matrix(view.points_m))
     jacobian = np.concatenate([by_point, by_rotation], 2).reshape(-1, 6)
-    squared = float(((projected.reshape(-1, 2) - view.pixels) ** 2).sum())
+    error = (view.pixels - projected.reshape(-1, 2)).ravel()
     normal = jacobian.T @ jacobian
     unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     covariance = np.outer(unit, unit) * np.linalg.pinv(normal * np.outer(unit, unit), 1e-12)
+    by_lens = slopes[:, 6 : 10 + max(len(camera.distortion), 5)]
+    lens_slope = -covariance @ (jacobian.T @ by_lens)
+    unexplained = by_lens + jacobian @ lens_slope
     quaternion = rotation.as_quat(canonical=True, scalar_first=True)
-    pose = SE3(quaternion, np.asarray(translation, dtype=np.float64).ravel())
-    return BoardPose(pose, (covariance + covariance.T) / 2, squared, len(view.points_m))
+    return BoardPose(
+        camera_from_board=SE3(quaternion, np.asarray(translation, dtype=np.float64).ravel()),
+        unit_covariance=(covariance + covariance.T) / 2,
+        squared_px=float((error**2).sum()),
+        corners=len(view.points_m),
+        lens_slope=lens_slope,
+        lens_normal=unexplained.T @ unexplained,
+        lens_gradient=unexplained.T @ error,
+    )
 
 
 def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:

@@ -1,15 +1,10 @@
-"""Checks of a hand-eye fit: held-out poses, repeatability and plausibility."""
-
-from dataclasses import replace
+"""Checks of a hand-eye fit: held-out poses, repeatability, and what the poses leave open."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.calibration import Mount
-from evercal.calibration.pose_pairs.hand_eye import HandEyeFit, refine
-from evercal.calibration.pose_pairs.noise_levels import normal_inverse
+from evercal.calibration.pose_pairs.fit import HandEyeFit, refine
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
-from evercal.errors import InputError
 from evercal.geometry import pose_distance_mm_deg
 
 Array = NDArray[np.floating]
@@ -17,17 +12,32 @@ Array = NDArray[np.floating]
 FOLDS = 5
 _MIN_HALVED = 12
 """Minimum number of poses to compare two halves."""
-_SCALE_SIGMAS = 6.0
-"""Significance of a scale error, standard deviations."""
-_SCALE_ERROR, _SCALE_WARNING = 0.02, 0.005
-"""Relative errors of the scale."""
-_FAR_M = 0.4
+_MAIN_SHARE = 0.5
+"""Share of the variance from which a cause is named."""
+_ELONGATED = 4.0
+"""Ratio of standard deviations from which a direction is named."""
+_SMALL_MM = 0.1
+"""Standard deviation below which nothing is left open."""
+_REMEDIES = {
+    "intrinsics": (
+        "the intrinsics, which trade against distance: tilt the board by 30 to 45 deg, vary the"
+        " distance by half, fill the corners of the image, or give a known lens with --camera"
+    ),
+    "shared depth": (
+        "a depth error that all images share: add poses that turn by 30 to 60 deg about two axes,"
+        " so that the same depth points in different directions"
+    ),
+    "size": (
+        "the size of the squares, which trades against distance: measure it over the whole board,"
+        " and move the gripper by 20 cm or more between poses"
+    ),
+}
 
 
-def held_out_error(equation: PoseEquation, fit: HandEyeFit, noise: Array) -> dict[str, float]:
+def held_out_error(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
     """Compare each pose with the prediction from the other poses, by 5-fold cross-validation.
 
-    The error includes the noise of the held-out pose. `noise` are the `fit_weights`.
+    The error includes the noise of the held-out pose.
 
     Returns:
         `held_out_mm`, `held_out_deg` (medians) and `held_out_rms_mm`, `held_out_rms_deg` (root mean
@@ -41,7 +51,7 @@ def held_out_error(equation: PoseEquation, fit: HandEyeFit, noise: Array) -> dic
         held_out = np.arange(len(rows)) % FOLDS == fold
         use = np.zeros(len(equation), dtype=bool)
         use[rows] = ~held_out
-        at = refine(equation, fit.at, noise, use)
+        at = refine(equation, fit.at, fit.weights, use)
         residual = equation[rows[held_out]].residuals(at).reshape(-1, 2, 3)
         lengths.append(np.linalg.norm(residual, axis=2))
     error = np.concatenate(lengths) * (1000.0, 180 / np.pi)
@@ -50,7 +60,7 @@ def held_out_error(equation: PoseEquation, fit: HandEyeFit, noise: Array) -> dic
     return dict(zip(names, (*median.tolist(), *rms.tolist()), strict=True))
 
 
-def repeatability(equation: PoseEquation, fit: HandEyeFit, noise: Array) -> dict[str, float]:
+def repeatability(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
     """Compare the calibrations from two halves of the sorted poses.
 
     Returns:
@@ -63,58 +73,30 @@ def repeatability(equation: PoseEquation, fit: HandEyeFit, noise: Array) -> dict
     for half in range(2):
         use = np.zeros(len(equation), dtype=bool)
         use[rows[half::2]] = True
-        halves.append(refine(equation, fit.at, noise, use).parent_from_camera)
+        halves.append(refine(equation, fit.at, fit.weights, use).parent_from_camera)
     millimetres, degrees = pose_distance_mm_deg(*halves)
     return {"repeatability_mm": millimetres, "repeatability_deg": degrees}
 
 
-def plausibility_warnings(
-    equation: PoseEquation, fit: HandEyeFit, noise: Array, mount: Mount
-) -> list[str]:
-    """Return warnings about a fit that is consistent but implausible.
-
-    Raises:
-        InputError: Camera and robot clearly use different units of length.
-    """
-    if not equation.scale_known:
+def left_open(fit: HandEyeFit, parent: str) -> list[str]:
+    """Return what the poses determine badly, and which poses to add; one sentence each."""
+    position = fit.factor * fit.covariance[:3, :3]
+    total, sentences = float(np.trace(position)), []
+    if 1000 * np.sqrt(total / 3) < _SMALL_MM:
         return []
-    warnings = _scale_warnings(equation, fit, noise)
-    if (equation.camera_translation[fit.inliers, 2] < 0).all():
-        warnings.append(
-            "the board is behind the camera in every image: check that the camera poses are"
-            " camera_from_board, with OpenCV's axes (z forward)"
+    for group, remedy in _REMEDIES.items():
+        share = fit.contributions.get(group)
+        if share is not None and np.trace(share[:3, :3]) > _MAIN_SHARE * np.trace(
+            fit.covariance[:3, :3]
+        ):
+            sentences.append(f"Most of the uncertainty is due to {remedy}.")
+    values, axes = np.linalg.eigh(position)
+    sigma = 1000 * np.sqrt(np.maximum(values, 0))
+    if sigma[2] > _ELONGATED * max(sigma[1], 1e-9):
+        axis = " ".join(f"{value:+.2f}" for value in axes[:, 2])
+        sentences.append(
+            f"Along one direction ({axis} in the {parent} frame) the position is known only to"
+            f" {sigma[2]:.2f} mm, along the others to {sigma[1]:.2f} mm: add poses that turn the"
+            f" gripper by 30 deg or more about axes perpendicular to it."
         )
-    camera, board = (float(np.linalg.norm(t)) for t in fit.at.translations)
-    if mount == "eye_in_hand" and camera > _FAR_M and camera > 2 * board:
-        warnings.append(
-            f"the camera is {camera:.2f} m from the gripper and the board {board:.2f} m from the"
-            f" base: if these should be swapped, both robot and camera poses are inverted"
-        )
-    if mount == "eye_to_hand" and board > _FAR_M and board > 2 * camera:
-        warnings.append(
-            f"the camera is {camera:.2f} m from the base and the board {board:.2f} m from the"
-            f" gripper: if these should be swapped, both robot and camera poses are inverted"
-        )
-    return warnings
-
-
-def _scale_warnings(equation: PoseEquation, fit: HandEyeFit, noise: Array) -> list[str]:
-    """Estimate the scale between camera and robot, which should be 1."""
-    free = replace(equation, scale_known=False)
-    at = refine(free, fit.at, noise, fit.inliers)
-    selected = free[fit.inliers]
-    jacobian = selected.jacobian(at, selected.residuals(at))
-    normal = (np.linalg.inv(noise[fit.inliers]) @ jacobian).reshape(-1, free.unknowns).T
-    normal = normal @ jacobian.reshape(-1, free.unknowns)
-    sigma = np.sqrt(normal_inverse(normal)[12, 12])
-    log_scale = np.log(at.scale)
-    if abs(log_scale) < _SCALE_SIGMAS * sigma or abs(log_scale) < _SCALE_WARNING:
-        return []
-    error = f"{100 * abs(1 / at.scale - 1):.1f} % too {'long' if log_scale < 0 else 'short'}"
-    advice = "check the size of the board's squares or of the tag, and the focal length"
-    if abs(log_scale) > _SCALE_ERROR:
-        raise InputError(
-            f"lengths from the camera are {error} compared with the robot; {advice};"
-            f" or estimate the scale with --scale unknown"
-        )
-    return [f"lengths from the camera are {error} compared with the robot; {advice}"]
+    return sentences

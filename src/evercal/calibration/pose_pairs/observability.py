@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.pose_pairs.hand_eye import MIN_POSES
+from evercal.calibration.pose_pairs.fit import MIN_POSES
 from evercal.calibration.pose_pairs.pairs import PosePairs, listed
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance

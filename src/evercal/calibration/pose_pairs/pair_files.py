@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from evercal.calibration.boards.board_poses import FORMAT, BoardPoses, read_board_poses
 from evercal.calibration.pose_pairs.pairs import PosePairs
-from evercal.calibration.pose_pairs.solve import BoardCorners
+from evercal.calibration.pose_pairs.measured import BoardCorners
 from evercal.calibration.pose_pairs.time_offset import CameraTrack, interpolated_pairs
 from evercal.errors import InputError
 from evercal.geometry import SE3
@@ -181,4 +181,5 @@ def _corners(board: BoardPoses | None, rows: list[int]) -> BoardCorners | None:
     if board is None:
         return None
     views = tuple(view for i in rows if (view := board.images[i].view) is not None)
-    return BoardCorners(board.camera, views, board.board.half_turn)
+    stated = board.camera_from == "file"
+    return BoardCorners(board.camera, views, board.board.half_turn, stated)

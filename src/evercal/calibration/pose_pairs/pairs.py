@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from evercal.calibration.calibration import Mount
-from evercal.calibration.pose_pairs.pose_equation import PoseEquation
+from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation
 from evercal.geometry import SE3, pose_distance
 
 Array = NDArray[np.floating]
@@ -17,6 +17,16 @@ Mask = NDArray[np.bool_]
 
 _SAME_ROBOT_M, _SAME_ROBOT_RAD = 1e-4, np.deg2rad(0.01)
 _SAME_CAMERA_M, _SAME_CAMERA_RAD = 5e-3, np.deg2rad(0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseNumbers:
+    """The numbers of a pose file, for messages about its convention."""
+
+    numbers: Array
+    """(n, k)."""
+    convention: str
+    """Name of the convention in which they were read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +49,10 @@ class PosePairs:
     velocity: Array | None = None
     """(n, 6) gripper velocity in the base frame, m/s and rad/s; required to estimate a time
     offset."""
+    robot_numbers: PoseNumbers | None = None
+    """Numbers of the robot's file."""
+    camera_numbers: PoseNumbers | None = None
+    """Numbers of the camera's file."""
 
     def __post_init__(self) -> None:
         counts = {len(self.names), len(self.base_from_gripper), len(self.camera_from_board)}
@@ -62,6 +76,8 @@ class PosePairs:
             camera_from_board=self.camera_from_board[rows],
             camera_covariance=None if covariance is None else covariance[rows],
             velocity=None if self.velocity is None else self.velocity[rows],
+            robot_numbers=_taken(self.robot_numbers, rows),
+            camera_numbers=_taken(self.camera_numbers, rows),
         )
 
     def order(self) -> NDArray[np.int64]:
@@ -69,6 +85,15 @@ class PosePairs:
         keys = [*self.base_from_gripper.translation_m.T, *self.camera_from_board.translation_m.T]
         keys += [*_canonical(self.base_from_gripper).T, *_canonical(self.camera_from_board).T]
         return np.lexsort(keys[::-1])
+
+    def distinct(
+        self, scale_known: bool = True
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return sorted indices of different pairs, and (n,) the first equal pair of every pair."""
+        order = self.order()
+        first = np.empty(len(self), dtype=np.int64)
+        first[order] = order[self[order].repeats(scale_known)]
+        return order[first[order] == order], first
 
     def repeats(self, scale_known: bool = True) -> NDArray[np.int64]:
         """Return (n,) the index of the first equal pair; the own index for a new pair.
@@ -93,7 +118,13 @@ class PosePairs:
             first = first[first]
         return first
 
-    def equation(self, mount: Mount, scale_known: bool = True) -> PoseEquation:
+    def scaled(self, scale: float) -> Self:
+        """Multiply the camera's lengths."""
+        camera = self.camera_from_board
+        moved = SE3(camera.rotation_wxyz, scale * camera.translation_m)
+        return replace(self, camera_from_board=moved)
+
+    def equation(self, mount: Mount, extras: Extras) -> PoseEquation:
         """Return the equation to solve.
 
         The board is fixed in the base for a camera on the arm, otherwise in the gripper.
@@ -109,10 +140,14 @@ class PosePairs:
             camera_rotation=self.camera_from_board.rotation_matrix(),
             camera_translation=self.camera_from_board.translation_m,
             camera_covariance=np.zeros((len(self), 6, 6)) if covariance is None else covariance,
-            scale_known=scale_known,
+            extras=extras,
             base_is_fixed=on_arm,
             velocity=velocity,
         )
+
+
+def _taken(given: PoseNumbers | None, rows: NDArray[np.int64]) -> PoseNumbers | None:
+    return None if given is None else replace(given, numbers=given.numbers[rows])
 
 
 def listed(names: Sequence[str], limit: int = 5) -> str:

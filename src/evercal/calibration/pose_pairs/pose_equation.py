@@ -1,10 +1,14 @@
-"""The hand-eye equation, its derivatives and its noise model.
+"""The hand-eye equation with all unknowns, its derivatives and its kinds of noise.
 
 For every pose, `fixed_from_parent @ parent_from_camera @ camera_from_board = fixed_from_board`.
 For a camera on the arm, `parent` is the gripper and `fixed` is the robot base. For a fixed camera
 with the board in the gripper, `parent` is the base and `fixed` is the gripper. The noise of a robot
 rotates its gripper about the origin of the gripper or of the base. These are the origins of
 `parent` and `fixed`, so one model serves both mounts.
+
+Further unknowns, the extras, change every camera pose: intrinsics, the size of a square, a depth
+error that all images share. Each has a prior. A prior is one more measurement: in the arrays of a
+`System` priors are further rows after those of the poses.
 
 Residuals are (translation, rotation vector) in the frame `fixed`, metres and radians.
 """
@@ -23,16 +27,14 @@ Array = NDArray[np.floating]
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """Unknowns of the equation: X = `parent_from_camera` and Z = `fixed_from_board`."""
+    """X = `parent_from_camera`, Z = `fixed_from_board`, and the extras."""
 
     rotations: Array
     """(2, 3, 3) of X and Z."""
     translations: Array
     """(2, 3) of X and Z, metres."""
-    scale: float = 1.0
-    """Metres per unit of the camera's translations."""
-    offset_s: float = 0.0
-    """Time to add to a camera stamp to get the robot's time, seconds."""
+    extras: Array
+    """(q,)."""
 
     @property
     def parent_from_camera(self) -> SE3:
@@ -44,27 +46,97 @@ class Unknowns:
         """Board pose in the fixed frame."""
         return se3(self.rotations[1], self.translations[1])
 
-    def moved(self, step: Array, scale_known: bool) -> "Unknowns":
-        """Return the unknowns after a (p,) step.
+    def moved(self, step: Array) -> "Unknowns":
+        """Return the unknowns after a (12 + q,) step: (translation, rotation) of X, of Z, extras.
 
-        The step holds translation and rotation of X, then of Z, then the logarithm of the scale and
-        the time offset if they are unknown. Translations change in the parent frame, rotations by a
-        factor on the right, as in `Calibration`.
+        Translations change in the parent frame, rotations by a factor on the right, as in
+        `Calibration`.
         """
         both = step[:12].reshape(2, 6)
-        rest = step[12:] if scale_known else step[13:]
-        growth = 1.0 if scale_known else float(np.exp(np.clip(step[12], -1, 1)))
-        return Unknowns(
-            self.rotations @ Rotation.from_rotvec(both[:, 3:]).as_matrix(),
-            self.translations + both[:, :3],
-            self.scale * growth,
-            self.offset_s + float(rest.sum()),
+        turned = self.rotations @ Rotation.from_rotvec(both[:, 3:]).as_matrix()
+        return Unknowns(turned, self.translations + both[:, :3], self.extras + step[12:])
+
+
+@dataclass(frozen=True, eq=False)
+class Extras:
+    """q further unknowns with a Gaussian prior; groups of them are independent."""
+
+    names: tuple[str, ...]
+    """(q,)."""
+    groups: tuple[str, ...]
+    """(q,) `intrinsics`, `depth`, `size` or `clock`."""
+    slopes: Array
+    """(n, 6, q) derivatives of `camera_from_board`: translation in the camera frame, rotation about
+    the board's axes; zero for a time offset, which moves the robot instead."""
+    information: Array
+    """(q, q) inverse covariance of the prior; zero for an unknown without prior."""
+    mean: Array
+    """(q,)."""
+
+    @classmethod
+    def nothing(cls, n: int) -> Self:
+        """No extras of n poses."""
+        return cls((), (), np.zeros((n, 6, 0)), np.zeros((0, 0)), np.zeros(0))
+
+    def with_one(self, name: str, slopes: Array, sigma: float) -> Self:
+        """Add an unknown with slopes (n, 6), mean 0 and a standard deviation, which may be inf."""
+        q = len(self.names)
+        information = np.zeros((q + 1, q + 1))
+        information[:q, :q] = self.information
+        information[q, q] = sigma**-2.0
+        return replace(
+            self,
+            names=(*self.names, name),
+            groups=(*self.groups, name),
+            slopes=np.concatenate([self.slopes, slopes[:, :, None]], 2),
+            information=information,
+            mean=np.append(self.mean, 0.0),
         )
+
+    def without_prior(self, name: str) -> Self:
+        """Free an unknown."""
+        information, k = self.information.copy(), self.names.index(name)
+        information[k], information[:, k] = 0.0, 0.0
+        return replace(self, information=information)
+
+    def __getitem__(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Self:
+        """Return the extras of a subset of the poses."""
+        return replace(self, slopes=self.slopes[rows])
+
+    def whitened(self) -> list[tuple[str, Array]]:
+        """Return the rows (k, q) of unit variance that make up the prior of each group."""
+        rows = []
+        for group in dict.fromkeys(self.groups):
+            own = np.flatnonzero([name == group for name in self.groups])
+            values, axes = np.linalg.eigh(self.information[np.ix_(own, own)])
+            kept = values > 1e-14 * max(values.max(), 1e-300)
+            whiten = np.zeros((int(kept.sum()), len(self.names)))
+            whiten[:, own] = np.sqrt(values[kept])[:, None] * axes[:, kept].T
+            rows.append((group, whiten))
+        return rows
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """The linear system at an estimate: n poses, then rows of priors, in blocks of six."""
+
+    residual: Array
+    """(n + b, 6)."""
+    jacobian: Array
+    """(n + b, 6, 12 + q)."""
+    known: Array
+    """(n + b, 6, 6) known covariance."""
+    directions: dict[str, Array]
+    """(n + b, 6, c) residuals due to unit errors of each kind of noise, by kind."""
+    poses: int
+    """n."""
+    priors: tuple[str, ...]
+    """(b,) group of the extras that each block of priors belongs to."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseEquation:
-    """The n poses of one recording as plain arrays, which every step uses."""
+    """The n poses of one recording as plain arrays."""
 
     robot_rotation: Array
     """(n, 3, 3) of `fixed_from_parent`."""
@@ -73,17 +145,16 @@ class PoseEquation:
     camera_rotation: Array
     """(n, 3, 3) of `camera_from_board`."""
     camera_translation: Array
-    """(n, 3) metres, or another unit if the scale is unknown."""
+    """(n, 3) metres."""
     camera_covariance: Array
     """(n, 6, 6) known covariance of `camera_from_board`: (translation in the camera frame, rotation
     about the board's axes); zero if it is unknown."""
-    scale_known: bool = True
-    """Whether the camera's translations are in metres."""
+    extras: Extras
     base_is_fixed: bool = True
     """Whether `fixed` is the robot base and `parent` the gripper, not the reverse."""
     velocity: Array | None = None
-    """(n, 6) velocity of the parent in the frame `fixed`, m/s and rad/s; required for a time
-    offset."""
+    """(n, 6) velocity of the parent in the frame `fixed`, m/s and rad/s; the last extra is then the
+    time to add to a camera stamp."""
 
     def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Self:
         """Return a subset of the poses."""
@@ -94,6 +165,7 @@ class PoseEquation:
             camera_rotation=self.camera_rotation[index],
             camera_translation=self.camera_translation[index],
             camera_covariance=self.camera_covariance[index],
+            extras=self.extras[index],
             velocity=None if self.velocity is None else self.velocity[index],
         )
 
@@ -103,77 +175,100 @@ class PoseEquation:
 
     @property
     def unknowns(self) -> int:
-        """Number of unknowns: 12, then one for the scale and one for the time offset."""
-        return 12 + (not self.scale_known) + (self.velocity is not None)
+        """Number of unknowns."""
+        return 12 + len(self.extras.names)
 
     def residuals(self, at: Unknowns) -> Array:
         """Return (n, 6) differences between the board pose by each image and the estimate."""
-        fixed_from_camera = self.robot_rotation @ at.rotations[0]
-        lever = (fixed_from_camera @ (at.scale * self.camera_translation[..., None]))[..., 0]
-        board = lever + self.robot_rotation @ at.translations[0] + self.robot_translation
-        difference = fixed_from_camera @ self.camera_rotation @ at.rotations[1].T
-        rotation = Rotation.from_matrix(difference, assume_valid=True).as_rotvec()
-        residual = np.concatenate([board - at.translations[1], rotation], 1)
-        if self.velocity is None or at.offset_s == 0.0:
-            return residual
-        return residual + at.offset_s * self.jacobian(at, residual)[:, :, -1]
+        return self._evaluated(at)[0]
 
-    def jacobian(self, at: Unknowns, residual: Array) -> Array:
-        """Return the (n, 6, unknowns) derivatives of the residuals (n, 6)."""
-        robot = self.robot_rotation
-        fixed_from_camera = robot @ at.rotations[0]
-        board_in_camera = at.scale * self.camera_translation
-        slope = _log_slope(residual[:, 3:])
-        jacobian = np.zeros((len(self), 6, self.unknowns))
-        jacobian[:, :3, 0:3] = robot
-        jacobian[:, :3, 3:6] = -fixed_from_camera @ cross_matrix(board_in_camera)
+    def _evaluated(self, at: Unknowns) -> tuple[Array, Array, Array, Array]:
+        """Return residuals, `fixed_from_camera`, and translation and rotation of the board."""
+        change = self.extras.slopes @ at.extras
+        board = self.camera_translation + change[:, :3]
+        turned = self.camera_rotation
+        if change[:, 3:].any():
+            turned = turned @ Rotation.from_rotvec(change[:, 3:]).as_matrix()
+        fixed_from_camera = self.robot_rotation @ at.rotations[0]
+        lever = (fixed_from_camera @ board[..., None])[..., 0]
+        lever = lever + self.robot_rotation @ at.translations[0]
+        difference = fixed_from_camera @ turned @ at.rotations[1].T
+        rotation = Rotation.from_matrix(difference, assume_valid=True).as_rotvec()
+        moved = lever + self.robot_translation - at.translations[1]
+        residual = np.concatenate([moved, rotation], 1)
+        if self.velocity is not None and at.extras[-1]:
+            residual = residual + at.extras[-1] * self._by_time(lever, rotation)
+        return residual, fixed_from_camera, board, turned
+
+    def _by_time(self, lever: Array, rotation: Array) -> Array:
+        assert self.velocity is not None
+        angular = self.velocity[:, 3:]
+        moved = self.velocity[:, :3] + np.cross(angular, lever)
+        return np.concatenate([moved, (_log_slope(rotation) @ angular[..., None])[..., 0]], 1)
+
+    def system(self, at: Unknowns) -> System:
+        """Linearize at an estimate."""
+        residual, fixed_from_camera, board, turned = self._evaluated(at)
+        n, slope = len(self), _log_slope(residual[:, 3:])
+        jacobian = np.zeros((n, 6, self.unknowns))
+        jacobian[:, :3, 0:3] = self.robot_rotation
+        jacobian[:, :3, 3:6] = -fixed_from_camera @ cross_matrix(board)
         jacobian[:, 3:, 3:6] = slope @ fixed_from_camera
         jacobian[:, :3, 6:9] = -np.eye(3)
         jacobian[:, 3:, 9:12] = -slope.transpose(0, 2, 1) @ at.rotations[1]
-        if not self.scale_known:
-            jacobian[:, :3, 12] = (fixed_from_camera @ board_in_camera[..., None])[..., 0]
+        by_camera = np.zeros((n, 6, 6))
+        by_camera[:, :3, :3], by_camera[:, 3:, 3:] = fixed_from_camera, fixed_from_camera @ turned
+        jacobian[:, :, 12:] = by_camera @ self.extras.slopes
         if self.velocity is not None:
-            lever = (fixed_from_camera @ board_in_camera[..., None])[..., 0]
-            lever = lever + robot @ at.translations[0]
-            angular = self.velocity[:, 3:]
-            jacobian[:, :3, -1] = self.velocity[:, :3] + np.cross(angular, lever)
-            jacobian[:, 3:, -1] = (slope @ angular[..., None])[..., 0]
-        return jacobian
+            lever = (fixed_from_camera @ board[..., None])[..., 0]
+            lever = lever + self.robot_rotation @ at.translations[0]
+            jacobian[:, :, -1] = self._by_time(lever, residual[:, 3:])
+        known = by_camera @ self.camera_covariance @ by_camera.transpose(0, 2, 1)
+        error, slopes, priors = self._priors(at)
+        blank = np.zeros((len(priors), 6, 3))
+        directions = {
+            kind: np.concatenate([columns, blank[:, :, : columns.shape[2]]])
+            for kind, columns in self._noise_directions(at).items()
+        }
+        return System(
+            np.concatenate([residual, error]),
+            np.concatenate([jacobian, slopes]),
+            np.concatenate([known, np.broadcast_to(np.eye(6), (len(priors), 6, 6))]),
+            directions,
+            n,
+            priors,
+        )
 
-    def known_noise(self, at: Unknowns) -> Array:
-        """Return the (n, 6, 6) covariance of the residuals due to `camera_covariance`."""
-        if not self.camera_covariance.any():
-            return self.camera_covariance
-        fixed_from_camera = self.robot_rotation @ at.rotations[0]
-        slope = np.zeros((len(self), 6, 6))
-        slope[:, :3, :3] = at.scale * fixed_from_camera
-        slope[:, 3:, 3:] = fixed_from_camera @ self.camera_rotation
-        return slope @ self.camera_covariance @ slope.transpose(0, 2, 1)
+    def _priors(self, at: Unknowns) -> tuple[Array, Array, tuple[str, ...]]:
+        """Return residuals (b, 6), derivatives (b, 6, 12 + q) and groups of the priors."""
+        change = at.extras - self.extras.mean
+        errors, slopes, groups = [np.zeros((0, 6))], [np.zeros((0, 6, self.unknowns))], []
+        for group, rows in self.extras.whitened():
+            blocks = -(-len(rows) // 6)
+            padded = np.zeros((6 * blocks, self.unknowns))
+            padded[: len(rows), 12:] = rows
+            errors.append((padded[:, 12:] @ change).reshape(-1, 6))
+            slopes.append(padded.reshape(-1, 6, self.unknowns))
+            groups += [group] * blocks
+        return np.concatenate(errors), np.concatenate(slopes), tuple(groups)
 
-    def noise_directions(self, at: Unknowns, plain: bool = False) -> dict[str, Array]:
-        """Return the residuals due to unit errors of each kind of noise, (n, 6, c) by kind.
+    def _noise_directions(self, at: Unknowns) -> dict[str, Array]:
+        """Return (n, 6, c) residuals due to unit errors of each kind, one metre or one radian.
 
-        A unit is one metre or one radian. A rotation about a distant point also moves the board.
-        With `plain`, kinds that only many poses can separate from the others are omitted.
+        A rotation about a distant point also moves the board.
         """
         n = len(self)
         board, parent = at.translations[1], self.robot_translation
-        camera = self.robot_rotation @ at.translations[0] + parent
-        gripper, base = (parent, np.zeros((n, 3)))[:: 1 if self.base_is_fixed else -1]
-        about = {"board": np.broadcast_to(board, (n, 3)), "camera": camera, "gripper": gripper}
-        if not plain:
-            about["base"] = base
-        kinds = {
-            f"rotation about {name}": _rotation_errors(board - point)
-            for name, point in about.items()
+        gripper = parent if self.base_is_fixed else np.zeros((n, 3))
+        ray = board - parent - self.robot_rotation @ at.translations[0]
+        depth = np.zeros((n, 6, 1))
+        depth[:, :3, 0] = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
+        return {
+            "translation": np.broadcast_to(np.eye(6, 3), (n, 6, 3)),
+            "depth": depth,
+            "rotation about board": _rotated(np.zeros((n, 3))),
+            "rotation about gripper": _rotated(board - gripper),
         }
-        kinds["translation"] = np.broadcast_to(np.eye(6, 3), (n, 6, 3))
-        if not plain:
-            ray = board - camera
-            depth = np.zeros((n, 6, 1))
-            depth[:, :3, 0] = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
-            kinds["depth"] = depth
-        return kinds
 
 
 def se3(rotation: Array, translation: Array) -> SE3:
@@ -194,6 +289,6 @@ def _log_slope(rotvec: Array) -> Array:
     return np.eye(3) - 0.5 * matrix + (1 / 12 + angle2 / 720 + angle2**2 / 30240) * square
 
 
-def _rotation_errors(lever: Array) -> Array:
+def _rotated(lever: Array) -> Array:
     """Return (n, 6, 3) residuals of unit rotations about points at a distance of `lever` (n, 3)."""
     return np.concatenate([-cross_matrix(lever), np.broadcast_to(np.eye(3), (len(lever), 3, 3))], 1)

@@ -7,54 +7,53 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.boards.corners import BoardPose, BoardView, board_pose, pixel_sigma
+from evercal.calibration.boards.corners import BoardView, board_pose
+from evercal.calibration.boards.lens import lens_vector, moved_camera
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, Mount
-from evercal.calibration.pose_pairs.checks import (
-    held_out_error,
-    plausibility_warnings,
-    repeatability,
-)
-from evercal.calibration.pose_pairs.disagreement import require_agreement
-from evercal.calibration.pose_pairs.hand_eye import (
+from evercal.calibration.pose_pairs.checks import held_out_error, left_open, repeatability
+from evercal.calibration.pose_pairs.fit import (
     Agreement,
     HandEyeFit,
     agreement,
-    fit_weights,
     least_sigma,
     robust_fit,
 )
+from evercal.calibration.pose_pairs.measured import BoardCorners as BoardCorners
+from evercal.calibration.pose_pairs.measured import Measured, measured
+from evercal.calibration.pose_pairs.mistakes import quick_fit, require_agreement
 from evercal.calibration.pose_pairs.observability import require_observable, require_rotations
 from evercal.calibration.pose_pairs.pairs import PosePairs
-from evercal.calibration.pose_pairs.pose_equation import PoseEquation
+from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation, Unknowns
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, cross_matrix
 
 Array = NDArray[np.floating]
 
+_SIZE_SIGMA = 0.003
+"""Relative standard deviation of a stated square size, and of a depth error of all images."""
+_SIZE_SIGMAS = 3.0
+"""Significance of a wrong size, standard deviations."""
 _SCALE_SIGMA = 0.1
-"""Maximum relative standard deviation of the scale."""
-_NOISE_NAMES = {
-    "translation": "translation of robot and camera poses",
-    "depth": "distance from camera to board",
+"""Maximum relative standard deviation of an unknown scale."""
+_MOST_LENSES = 8
+"""Number of times that the intrinsics are changed, at most."""
+_SAME_LENS = 0.01
+"""Squared Mahalanobis length of a change of the intrinsics that is not worth another round."""
+_LENS_WARNING = 3.0
+"""Deviation of stated intrinsics from the estimate that is reported, standard deviations."""
+_CAUSES = {
+    "translation": "position of robot and camera poses",
+    "depth": "distance from camera to board, image by image",
     "rotation about board": "rotation of the board in the image",
-    "rotation about camera": "direction from camera to board",
     "rotation about gripper": "rotation of the robot's gripper",
-    "rotation about base": "rotation of the robot about its base",
 }
-
-
-@dataclass(frozen=True, eq=False)
-class BoardCorners:
-    """Board corners of the images of pose pairs."""
-
-    camera: Camera
-    """Intrinsics of all images."""
-    views: tuple[BoardView, ...]
-    """One for each pair."""
-    half_turn: bool = False
-    """Whether the board looks the same after half a turn, so that its corners may be in reverse
-    order."""
+_EXTRA_CAUSES = {
+    "known": "corners of the board",
+    "intrinsics": "intrinsics",
+    "shared depth": "distance from camera to board, all images",
+    "size": "size of the squares, or scale",
+}
 
 
 def solve(
@@ -67,7 +66,12 @@ def solve(
 
     Both unknown transforms are estimated jointly: closed-form solutions of many subsets give a
     robust start, then every pose is weighted by the noise estimated from the pairs. With corners,
-    each image is weighted by the covariance of its board pose, and noise of the robot is added.
+    the intrinsics are estimated together with the transforms, and each image is weighted by what
+    its corners determine.
+
+    A stated size of the squares, the scale of the camera poses and a depth error that all images
+    share are unknowns with a prior of 0.3 %. A size that the robot's motions contradict is
+    reported and estimated.
 
     The covariance is enlarged for the uncertainty of the noise estimate, so that the usual
     chi-square quantiles hold (12.59 for 95 % in six dimensions).
@@ -84,38 +88,10 @@ def solve(
         `gripper_from_camera` or `base_from_camera`.
 
     Raises:
-        InputError: The poses do not determine the calibration or do not agree. The message states
-            the reason and a remedy.
+        InputError: The poses do not determine the calibration or do not agree, or look like another
+            convention. The message states the reason and a remedy.
     """
     return solve_pairs(pairs, mount, scale_known, corners).calibration()
-
-
-def solve_pairs(
-    pairs: PosePairs, mount: Mount, scale_known: bool, corners: BoardCorners | None
-) -> "PairSolution":
-    """Solve pose pairs like `solve`, and return the fit."""
-    measured: list[BoardPose] | None = None
-    if corners is not None:
-        pairs, measured = _with_corners(pairs, corners)
-    require_observable(pairs, scale_known)
-    order = pairs.order()
-    first = np.empty(len(pairs), dtype=np.int64)
-    first[order] = order[pairs[order].repeats(scale_known)]
-    rows = order[first[order] == order]
-    equation = pairs[rows].equation(mount, scale_known)
-    start = agreement(equation)
-    require_agreement(pairs[np.sort(rows)], mount, scale_known, start)
-    if corners is not None and measured is not None:
-        pairs, measured = _with_other_board_poses(pairs, corners, measured, rows, start, mount)
-        equation = pairs[rows].equation(mount, scale_known)
-        start = agreement(equation)
-    fit = robust_fit(equation, start)
-    _require_determined(pairs[rows[fit.inliers]], fit, equation)
-    sigma = None
-    if measured is not None:
-        sigma = pixel_sigma([measured[i] for i in rows[fit.inliers]])
-    camera = None if corners is None else corners.camera
-    return PairSolution(pairs, rows, first, equation, fit, mount, camera, sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,15 +106,29 @@ class PairSolution:
     equation: PoseEquation
     fit: HandEyeFit
     mount: Mount
-    camera: Camera | None
-    """Intrinsics, with corners."""
-    corner_sigma_px: float | None
-    """Standard deviation of a corner coordinate, with corners."""
+    scale: float
+    """Metres per unit of the camera's lengths."""
+    warnings: tuple[str, ...]
+    corners: BoardCorners | None = None
+    lens: Measured | None = None
 
     @property
-    def offset_sigma_s(self) -> float:
-        """Standard deviation of the time offset."""
-        return float(np.sqrt(self.fit.factor * self.fit.covariance[-1, -1]))
+    def parent(self) -> str:
+        """Frame that carries the camera."""
+        return "gripper" if self.mount == "eye_in_hand" else "base"
+
+    @property
+    def camera(self) -> Camera | None:
+        """Estimated intrinsics, with corners."""
+        if self.lens is None:
+            return None
+        change = self.fit.at.extras[_group(self.equation, "intrinsics")]
+        return moved_camera(self.lens.camera, change)
+
+    @property
+    def fixed_from_board(self) -> SE3:
+        """Estimated pose of the board."""
+        return self.fit.at.fixed_from_board @ _shift(_middle(self.corners)).inverse()
 
     def calibration(self, time_offset_s: float | None = None) -> Calibration:
         """Return the calibration, with another time offset than that of the fit if given."""
@@ -147,7 +137,7 @@ class PairSolution:
             mount=self.mount,
             parent_from_child=self.fit.at.parent_from_camera,
             covariance=(covariance + covariance.T) / 2,
-            parent_frame="gripper" if self.mount == "eye_in_hand" else "base",
+            parent_frame=self.parent,
             camera=self.camera,
             images=self._images(),
             error_terms=self._error_terms(),
@@ -157,33 +147,45 @@ class PairSolution:
         return replace(calibration, verdict=verdict(calibration))
 
     def _checks(self, time_offset_s: float | None) -> dict[str, Any]:
-        fit, noise = self.fit, fit_weights(self.equation, self.fit)
+        fit, extras = self.fit, self.equation.extras
         used = fit.residual[fit.inliers].reshape(-1, 2, 3)
         rms = np.sqrt((used**2).sum(2).mean(0))
-        board = fit.at.fixed_from_board
-        name = "base_from_board" if self.mount == "eye_in_hand" else "gripper_from_board"
+        board = self.fixed_from_board
+        distance = np.linalg.norm(self.equation.camera_translation[fit.inliers], axis=1)
+        fixed = "base" if self.mount == "eye_in_hand" else "gripper"
         checks: dict[str, Any] = {
             "poses_given": len(self.pairs),
             "poses_used": int(fit.inliers.sum()),
             "residual_mm": 1000 * float(rms[0]),
             "residual_deg": float(np.rad2deg(rms[1])),
-            **held_out_error(self.equation, fit, noise),
-            **repeatability(self.equation, fit, noise),
-            name: {
+            **held_out_error(self.equation, fit),
+            **repeatability(self.equation, fit),
+            "target_m": float(np.median(distance)),
+            f"{fixed}_from_board": {
                 "translation_m": board.translation_m.tolist(),
                 "quaternion_wxyz": board.rotation_wxyz.tolist(),
             },
-            "warnings": plausibility_warnings(self.equation, fit, noise, self.mount),
+            "leave_one_out_mm": self._by_name(1000 * np.linalg.norm(fit.moved[:, :3], axis=1)),
+            "information_percent": self._by_name(100 * fit.information),
+            "left_open": left_open(fit, self.parent),
+            "warnings": list(self.warnings),
         }
-        if self.equation.velocity is not None:
-            offset = fit.at.offset_s if time_offset_s is None else time_offset_s
-            checks |= {"time_offset_s": offset, "time_offset_sigma_s": self.offset_sigma_s}
-        if not self.equation.scale_known:
-            scale = fit.at.scale
-            checks |= {"scale": scale, "scale_sigma": scale * _log_scale_sigma(fit)}
-        if self.corner_sigma_px is not None:
-            checks["corner_sigma_px"] = self.corner_sigma_px
+        sigma = dict(zip(extras.names, fit.sigma[12:].tolist(), strict=True))
+        value = dict(zip(extras.names, fit.at.extras.tolist(), strict=True))
+        if "clock" in sigma:
+            offset = value["clock"] if time_offset_s is None else time_offset_s
+            checks |= {"time_offset_s": offset, "time_offset_sigma_s": sigma["clock"]}
+        checks |= {"scale": self.scale * (1 + value["size"]), "scale_sigma": sigma["size"]}
+        if self.lens is not None:
+            checks["corner_sigma_px"] = self.lens.sigma_px
+            lens = [name for name, g in zip(extras.names, extras.groups, strict=True)
+                    if g == "intrinsics"]  # fmt: skip
+            checks["camera_sigma"] = {name: sigma[name] for name in lens}
         return checks
+
+    def _by_name(self, values: Array) -> dict[str, float]:
+        named = zip(self.rows, self.fit.inliers, values.tolist(), strict=True)
+        return {self.pairs.names[i]: value for i, used, value in named if used}
 
     def _images(self) -> tuple[ImageUse, ...]:
         """Return the use of every pair in the given order."""
@@ -207,75 +209,202 @@ class PairSolution:
         return tuple(uses)
 
     def _error_terms(self) -> tuple[ErrorTerm, ...]:
-        fit = self.fit
-        covariance = fit.covariance[:6, :6]
-        terms = [
-            _error_term(_NOISE_NAMES[kind], fit.contributions[i])
-            for i, kind in enumerate(fit.levels.kinds)
-            if fit.levels.variance[i] > 0
-        ]
-        if self.pairs.camera_covariance is not None:
-            rest = covariance - fit.contributions.sum(0)
-            terms.append(_error_term("stated noise of the camera poses", rest))
-        few = _error_term("noise estimated from few poses", (fit.factor - 1) * covariance)
-        return (*terms, few)
+        fit, terms = self.fit, []
+        for name, cause in (_CAUSES | _EXTRA_CAUSES).items():
+            part = fit.contributions.get(name)
+            if part is not None and np.trace(part) > 1e-12 * np.trace(fit.covariance[:6, :6]):
+                terms.append(ErrorTerm.of(cause, part))
+        few = (fit.factor - 1) * fit.covariance[:6, :6]
+        return (*terms, ErrorTerm.of("noise estimated from few poses", few))
 
 
-def _with_corners(pairs: PosePairs, corners: BoardCorners) -> tuple[PosePairs, list[BoardPose]]:
-    """Replace the camera poses by poses fitted to the corners, with covariances."""
-    if len(corners.views) != len(pairs):
-        raise ValueError(f"{len(corners.views)} views of corners for {len(pairs)} pose pairs")
-    measured = [
-        board_pose(view, corners.camera, start)
-        for view, start in zip(corners.views, pairs.camera_from_board, strict=True)
-    ]
-    return _with_board_poses(pairs, measured), measured
-
-
-def _with_board_poses(pairs: PosePairs, measured: list[BoardPose]) -> PosePairs:
-    variance = pixel_sigma(measured) ** 2
-    return replace(
-        pairs,
-        camera_from_board=SE3.stack([pose.camera_from_board for pose in measured]),
-        camera_covariance=np.stack([variance * pose.unit_covariance for pose in measured]),
+def solve_pairs(
+    pairs: PosePairs,
+    mount: Mount,
+    scale_known: bool = True,
+    corners: BoardCorners | None = None,
+) -> PairSolution:
+    """Solve pose pairs like `solve`, and return the fit."""
+    require_observable(pairs, scale_known)
+    rows, first = pairs.distinct(scale_known)
+    start, scale = quick_fit(pairs[rows], mount, scale_known)
+    require_agreement(pairs[np.sort(rows)], mount, scale_known, start)
+    lens = None
+    if corners is not None:
+        lens = measured(corners, corners.camera, pairs.camera_from_board)
+        pairs = lens.applied_to(pairs)
+        start, scale = quick_fit(pairs[rows], mount, scale_known)
+        corrected = _other_board_poses(pairs, corners, lens, rows, start, mount, scale)
+        lens = measured(corners, corners.camera, corrected)
+    at = _in_the_middle(start.at, _middle(corners))
+    for _ in range(_MOST_LENSES):
+        equation, pairs = _equation(pairs, mount, scale, scale_known, corners, lens)
+        begin = agreement(equation[rows], _with_extras(at, equation))
+        fit = robust_fit(equation[rows], begin)
+        if corners is None or lens is None:
+            break
+        group = _group(equation, "intrinsics")
+        change, at = fit.at.extras[group], fit.at
+        if change @ equation.extras.information[np.ix_(group, group)] @ change < _SAME_LENS:
+            break
+        try:
+            camera = moved_camera(lens.camera, change)
+        except ValueError:
+            break
+        lens = measured(corners, camera, pairs.camera_from_board)
+    equation, warnings = equation[rows], []
+    if scale_known:
+        equation, fit, warnings = _with_tested_size(equation, fit, corners)
+    warnings += _lens_warnings(fit, equation, corners, lens)
+    _require_determined(pairs[rows[fit.inliers]], fit, equation, scale_known)
+    return PairSolution(
+        pairs, rows, first, equation, fit, mount, scale, tuple(warnings), corners, lens
     )
 
 
-def _with_other_board_poses(
+def _equation(
+    pairs: PosePairs,
+    mount: Mount,
+    scale: float,
+    scale_known: bool,
+    corners: BoardCorners | None,
+    lens: Measured | None,
+) -> tuple[PoseEquation, PosePairs]:
+    """Return the equation with all extras, about the middle of the board, and its pairs."""
+    if lens is not None:
+        pairs = lens.applied_to(pairs)
+    extras = Extras.nothing(len(pairs))
+    if corners is not None and lens is not None:
+        extras = lens.extras(corners.prior)
+    # The board's origin is a convention; noise about its middle is the same in any other.
+    middle = _middle(corners)
+    lever = np.broadcast_to(np.eye(6), (len(pairs), 6, 6)).copy()
+    lever[:, :3, 3:] = -pairs.camera_from_board.rotation_matrix() @ cross_matrix(middle)
+    lever[:, :3] *= scale
+    extras = replace(extras, slopes=lever @ extras.slopes)
+    about = replace(pairs, camera_from_board=pairs.camera_from_board @ _shift(middle)).scaled(scale)
+    if pairs.camera_covariance is not None:
+        spread = lever @ pairs.camera_covariance @ lever.transpose(0, 2, 1)
+        about = replace(about, camera_covariance=spread)
+    length = about.camera_from_board.translation_m
+    if lens is None and scale_known:
+        depth = np.pad(length[:, 2:], ((0, 0), (2, 3)))
+        extras = extras.with_one("shared depth", depth, _SIZE_SIGMA)
+    size = np.pad(length, ((0, 0), (0, 3)))
+    extras = extras.with_one("size", size, _SIZE_SIGMA if scale_known else np.inf)
+    if pairs.velocity is not None:
+        extras = extras.with_one("clock", np.zeros((len(pairs), 6)), np.inf)
+    return about.equation(mount, extras), pairs
+
+
+def _with_tested_size(
+    equation: PoseEquation, fit: HandEyeFit, corners: BoardCorners | None
+) -> tuple[PoseEquation, HandEyeFit, list[str]]:
+    """Free the size of the squares if the robot's motions contradict what was stated.
+
+    The noise is estimated again with the free size: a wrong size looks like noise otherwise.
+    """
+    free = replace(equation, extras=equation.extras.without_prior("size"))
+    freed = robust_fit(free, agreement(free, fit.at))
+    k = equation.extras.names.index("size")
+    off, sigma = float(freed.at.extras[k]), float(freed.sigma[12 + k])
+    if not (abs(off) > max(_SIZE_SIGMAS * sigma, _SIZE_SIGMA) and sigma < _SCALE_SIGMA):
+        return equation, fit, []
+    what = "lengths from the camera"
+    if corners is not None:
+        what = "the board"
+    warning = (
+        f"{what} must be {100 * off:+.2f} +- {100 * sigma:.2f} % larger to fit the robot's motions"
+        f" ({abs(off) / sigma:.0f} standard deviations): a square or tag of 24 mm would measure"
+        f" {24 * (1 + off):.2f} mm; check its size and the focal length. The calibration uses the"
+        f" estimated size"
+    )
+    return free, freed, [warning]
+
+
+def _lens_warnings(
+    fit: HandEyeFit, equation: PoseEquation, corners: BoardCorners | None, lens: Measured | None
+) -> list[str]:
+    """Compare a stated focal length with the estimate."""
+    if corners is None or lens is None or not corners.stated:
+        return []
+    stated = corners.prior
+    change = fit.at.extras[_group(equation, "intrinsics")][0]
+    now = lens_vector(lens.camera)[0] + change
+    sigma = stated.information[0, 0] ** -0.5
+    if abs(now - stated.mean[0]) < _LENS_WARNING * sigma:
+        return []
+    return [
+        f"the stated focal length is {stated.mean[0]:.1f} px, corners and motions give {now:.1f}"
+        f" px: check --camera, or omit it"
+    ]
+
+
+def _middle(corners: BoardCorners | None) -> Array:
+    """(3,) middle of the board's corners, metres; the origin without corners."""
+    if corners is None:
+        return np.zeros(3)
+    return np.mean([view.points_m.mean(0) for view in corners.views], 0)
+
+
+def _shift(point: Array) -> SE3:
+    return SE3(np.array([1.0, 0.0, 0.0, 0.0]), point)
+
+
+def _in_the_middle(at: Unknowns, middle: Array) -> Unknowns:
+    """Return the unknowns with the board's origin moved to a point (3,) of the board."""
+    moved = at.translations.copy()
+    moved[1] += at.rotations[1] @ middle
+    return replace(at, translations=moved)
+
+
+def _with_extras(at: Unknowns, equation: PoseEquation) -> Unknowns:
+    return replace(at, extras=np.zeros(len(equation.extras.names)))
+
+
+def _group(equation: PoseEquation, name: str) -> NDArray[np.int64]:
+    return np.flatnonzero([group == name for group in equation.extras.groups])
+
+
+def _other_board_poses(
     pairs: PosePairs,
     corners: BoardCorners,
-    measured: list[BoardPose],
+    lens: Measured,
     rows: NDArray[np.int64],
     start: Agreement,
     mount: Mount,
-) -> tuple[PosePairs, list[BoardPose]]:
+    scale: float,
+) -> SE3:
     """Fit the board pose of each outlier again, starting from the pose that the others predict.
 
     A flat board has two similar poses, and the corners of a symmetric board may be in reverse
     order.
     """
-    at, corrected = start.at, list(measured)
+    at, poses = start.at, list(pairs.camera_from_board)
     robot = pairs[rows].base_from_gripper
     robot = robot if mount == "eye_in_hand" else robot.inverse()
     predicted = (robot @ at.parent_from_camera).inverse() @ at.fixed_from_board
+    predicted = SE3(predicted.rotation_wxyz, predicted.translation_m / scale)
     for row in np.flatnonzero(~start.inliers):
         i = int(rows[row])
-        view, old = corners.views[i], measured[i]
+        view, old = corners.views[i], lens.poses[i]
         views = [view]
         if corners.half_turn:
             views.append(BoardView(view.points_m, view.pixels[::-1]))
         for candidate in views:
-            pose = board_pose(candidate, corners.camera, predicted[row])
+            pose = board_pose(candidate, lens.camera, predicted[row])
             if pose.squared_px < 4 * old.squared_px + 0.1 * old.corners:
-                corrected[i] = pose
-    return _with_board_poses(pairs, corrected), corrected
+                poses[i] = pose.camera_from_board
+    return SE3.stack(poses)
 
 
-def _require_determined(used: PosePairs, fit: HandEyeFit, equation: PoseEquation) -> None:
+def _require_determined(
+    used: PosePairs, fit: HandEyeFit, equation: PoseEquation, scale_known: bool
+) -> None:
     """Check that the inliers alone determine the calibration."""
     require_rotations(used.base_from_gripper)
-    least = least_sigma(equation, fit)
-    if not equation.scale_known and not max(_log_scale_sigma(fit), least[12]) < _SCALE_SIGMA:
+    least, size = least_sigma(equation, fit), 12 + equation.extras.names.index("size")
+    if not scale_known and not max(float(fit.sigma[size]), least[size]) < _SCALE_SIGMA:
         raise InputError(
             "pure rotation: the poses turn about one point and leave the camera's scale open; also"
             " move the gripper by 10 cm or more between poses"
@@ -286,13 +415,3 @@ def _require_determined(used: PosePairs, fit: HandEyeFit, equation: PoseEquation
             "the poses leave the position of the camera open by more than a metre; record 15 to 25"
             " poses that turn by 20 to 60 deg about two axes"
         )
-
-
-def _log_scale_sigma(fit: HandEyeFit) -> float:
-    return float(np.sqrt(fit.factor * fit.covariance[12, 12]))
-
-
-def _error_term(name: str, covariance: Array) -> ErrorTerm:
-    m2, rad2 = np.trace(covariance[:3, :3]) / 3, np.trace(covariance[3:, 3:]) / 3
-    metres, radians = np.sqrt(max(m2, 0)), np.sqrt(max(rad2, 0))
-    return ErrorTerm(name, 1000 * float(metres), float(np.rad2deg(radians)))

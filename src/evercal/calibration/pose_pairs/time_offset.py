@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, Mount
 from evercal.calibration.pose_pairs.pairs import PosePairs
-from evercal.calibration.pose_pairs.solve import BoardCorners, solve_pairs
+from evercal.calibration.pose_pairs.measured import BoardCorners
+from evercal.calibration.pose_pairs.solve import solve_pairs
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import PoseTrack
@@ -77,12 +78,12 @@ def solve_with_offset(
     for _ in range(6):
         pairs, overlapping = _pairs_at(robot, camera, offset)
         solution = solve_pairs(pairs, mount, scale_known, overlapping.corners)
-        correction = solution.fit.at.offset_s
+        correction = float(solution.fit.at.extras[-1])
         if abs(correction) < 1e-4:
             break
         offset += float(np.clip(correction, -largest_s, largest_s))
     assert solution is not None
-    sigma = solution.offset_sigma_s
+    sigma = float(solution.fit.sigma[-1])
     if not sigma < _MAX_SIGMA_S or abs(correction) > 0.02:
         raise InputError(
             f"the time offset is not determined (standard deviation {1000 * sigma:.0f} ms): too few"

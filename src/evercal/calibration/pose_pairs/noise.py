@@ -6,14 +6,17 @@ their expectations. See H. Patterson and R. Thompson, Recovery of inter-block in
 C. R. Rao, Estimation of variance and covariance components, 1971.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.stats import chi2, f
+
+if TYPE_CHECKING:
+    from evercal.calibration.pose_pairs.pose_equation import System
 
 Array = NDArray[np.floating]
 
@@ -38,38 +41,31 @@ class NoiseLevels:
     uncertainty: Array
     """(k, k) covariance of `variance`; zero for kinds that are absent."""
 
-    def covariances(self, directions: Mapping[str, Array], known: Array) -> Array:
-        """Return the (n, 6, 6) covariance of the residuals.
-
-        `directions` (n, 6, c) are residuals due to unit errors, `known` (n, 6, 6) is added.
-        """
-        columns = np.concatenate([directions[kind] for kind in self.kinds], 2)
-        counts = [directions[kind].shape[2] for kind in self.kinds]
+    def covariances(self, system: "System") -> Array:
+        """Return the (n, 6, 6) covariance of the residuals of a system."""
+        columns = np.concatenate([system.directions[kind] for kind in self.kinds], 2)
+        counts = [system.directions[kind].shape[2] for kind in self.kinds]
         sized = columns * np.repeat(self.variance, counts)
-        return known + _FLOOR + sized @ columns.transpose(0, 2, 1)
+        return system.known + _FLOOR + sized @ columns.transpose(0, 2, 1)
 
 
 def estimate_levels(
-    residual: Array,
-    jacobian: Array,
-    directions: Mapping[str, Array],
-    known: Array,
-    start: NoiseLevels | None = None,
+    system: "System", kinds: tuple[str, ...], start: NoiseLevels | None = None
 ) -> NoiseLevels:
     """Estimate the noise levels by restricted maximum likelihood.
 
     Args:
-        residual: (n, 6) residuals of a fit.
-        jacobian: (n, 6, p) derivatives by its unknowns.
-        directions: (n, 6, c) residuals due to unit errors (1 m or 1 rad), by kind.
-        known: (n, 6, 6) covariance of known noise.
+        system: Linear system at the estimate.
+        kinds: Kinds of noise of the poses.
         start: Levels of a similar fit.
     """
-    rows = np.unique(np.linspace(0, len(residual) - 1, MAX_POSES).round().astype(int))
-    residual, jacobian, known = residual[rows], jacobian[rows], known[rows]
-    directions = {kind: columns[rows] for kind, columns in directions.items()}
-    problem = _Problem(residual, _basis(jacobian), tuple(directions.values()), known)
-    variance = problem.first_guess() if start is None else start.variance
+    chosen = np.linspace(0, system.poses - 1, MAX_POSES).round().astype(int)
+    rows = np.r_[np.unique(chosen), system.poses : len(system.residual)]
+    directions = tuple(system.directions[kind][rows] for kind in kinds)
+    basis = _basis(system.jacobian[rows])
+    problem = _Problem(system.residual[rows], basis, directions, system.known[rows])
+    poses = system.residual[: system.poses]
+    variance = _first_guess(poses, kinds) if start is None else start.variance
     forms = problem.at(variance)
     for _ in range(_ROUNDS):
         proposed = _solve_nonnegative(forms.gram, forms.values)
@@ -83,7 +79,7 @@ def estimate_levels(
             proposed = (proposed + variance) / 2
             trial = problem.at(proposed)
         variance, forms = proposed, trial
-    return NoiseLevels(tuple(directions), variance, _level_uncertainty(forms.gram, variance))
+    return NoiseLevels(kinds, variance, _level_uncertainty(forms.gram, variance))
 
 
 def working_noise(noise: Array, use: NDArray[np.bool_]) -> Array:
@@ -124,47 +120,20 @@ class Gain:
         gain = normal_inverse(normal) @ weighted.transpose(0, 2, 1)
         return cls(gain, (gain @ noise @ gain.transpose(0, 2, 1)).sum(0))
 
-    def slopes(self, directions: Mapping[str, Array]) -> Array:
+    def slopes(self, directions: Sequence[Array]) -> Array:
         """Return the (k, p, p) derivatives of the covariance by the variances of the noise."""
-        moves = [self.gain @ columns for columns in directions.values()]
+        moves = [self.gain @ columns for columns in directions]
         return np.stack([(move @ move.transpose(0, 2, 1)).sum(0) for move in moves])
-
-
-def loss_by_weights(
-    jacobian: Array, noise: Array, directions: Mapping[str, Array], uncertainty: Array
-) -> Array:
-    """Return the (p, p) covariance due to weights that were estimated from the same residuals.
-
-    M. Kenward and J. Roger, Small sample inference for fixed effects from restricted maximum
-    likelihood, 1997.
-
-    Args:
-        jacobian: (n, 6, p).
-        noise: (n, 6, 6) covariance of the residuals.
-        directions: (n, 6, c) residuals due to unit errors, by kind.
-        uncertainty: (k, k) covariance of the variances.
-    """
-    best = Gain.of(jacobian, noise, noise)
-    inverse = np.linalg.inv(noise)
-    # (k, n, p, 6): response of the unknowns to noise of each kind in each residual.
-    parts = directions.values()
-    response = np.stack([best.gain @ part @ part.transpose(0, 2, 1) for part in parts])
-    whitened = response @ inverse
-    products = np.einsum("knpi,lnqi->klpq", whitened, response, optimize=True)
-    slopes = best.slopes(directions)
-    precision = normal_inverse(best.covariance)
-    products -= np.einsum("kpq,qr,lrs->klps", slopes, precision, slopes, optimize=True)
-    loss = 2 * np.einsum("kl,klpq->pq", uncertainty, products)
-    return (loss + loss.T) / 2
 
 
 def ellipsoid_factor(covariance: Array, slopes: Array, uncertainty: Array) -> float:
     """Return the factor that corrects a covariance for estimated noise levels.
 
-    Squared distances by an estimated covariance follow an F distribution rather than chi-square.
-    Its degrees of freedom follow from the uncertainty of the variance along each axis (A. Fai and
-    P. Cornelius, Approximate F-tests of multiple degree of freedom hypotheses, 1996). With this
-    factor, the chi-square quantile of 95 % has a coverage of 95 %.
+    Squared distances by an estimated covariance follow an F distribution rather than chi-square. A
+    variance with nu degrees of freedom has a relative variance of 2 / nu (F. Satterthwaite, An
+    approximate distribution of estimates of variance components, 1946); the axis with the fewest
+    degrees of freedom decides. With this factor, the chi-square quantile of 95 % has a coverage of
+    95 %.
 
     Args:
         covariance: (d, d).
@@ -172,14 +141,12 @@ def ellipsoid_factor(covariance: Array, slopes: Array, uncertainty: Array) -> fl
         uncertainty: (k, k) covariance of the variances.
     """
     d = len(covariance)
-    variances, axes = np.linalg.eigh(covariance)
-    gradient = np.einsum("dm,kde,em->mk", axes, slopes, axes)
-    spread = np.einsum("mk,kl,ml->m", gradient, uncertainty, gradient)
-    freedom = np.minimum(2 * variances**2 / np.maximum(spread, 1e-300), 1e6)
-    expected = float(np.sum(np.where(freedom > 2, freedom / np.maximum(freedom - 2, 1e-9), 0.0)))
-    freedom_all = 2 * expected / (expected - d) if expected > d else 2.0
-    freedom_all = float(np.clip(freedom_all, 2.0, 1e6))
-    return max(1.0, float(d * f.ppf(_COVERAGE, d, freedom_all) / chi2.ppf(_COVERAGE, d)))
+    values, axes = np.linalg.eigh(covariance)
+    whiten = axes / np.sqrt(np.maximum(values, 1e-300))
+    gradient = np.einsum("dm,kde,em->mk", whiten, slopes, whiten)
+    relative = np.einsum("mk,kl,ml->m", gradient, uncertainty, gradient).max()
+    freedom = float(np.clip(2 / max(relative, 1e-300), 2.5, 1e6))
+    return max(1.0, float(d * f.ppf(_COVERAGE, d, freedom) / chi2.ppf(_COVERAGE, d)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,12 +179,6 @@ class _Problem:
         """(k,) squared residual due to a unit of variance, metres and radians together."""
         return np.array([(part**2).sum() / len(part) for part in self.directions])
 
-    def first_guess(self) -> Array:
-        """Return variances that explain equal shares of the residuals."""
-        metres2, radians2 = (np.mean(part**2) for part in np.split(self.residual, 2, 1))
-        rotations = [bool(part[:, 3:].any()) for part in self.directions]
-        return np.where(rotations, radians2, metres2) / max(len(rotations) / 2, 1) + 1e-18
-
     def at(self, variance: Array) -> _Forms:
         """Return the forms with weights of these variances."""
         m = len(self.residual)
@@ -243,6 +204,13 @@ class _Problem:
         likelihood = -np.linalg.slogdet(covariance)[1].sum() - np.linalg.slogdet(normal)[1]
         likelihood -= error @ self.residual.ravel()
         return _Forms(gram[:-1, :-1], values[:-1] - gram[:-1, -1], float(likelihood))
+
+
+def _first_guess(residual: Array, kinds: tuple[str, ...]) -> Array:
+    """Return variances that explain equal shares of the residuals."""
+    metres2, radians2 = (np.mean(part**2) for part in np.split(residual, 2, 1))
+    rotations = [kind.startswith("rotation") for kind in kinds]
+    return np.where(rotations, radians2, metres2) / max(len(kinds) / 2, 1) + 1e-18
 
 
 def _basis(jacobian: Array) -> Array:

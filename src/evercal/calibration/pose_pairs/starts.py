@@ -1,4 +1,9 @@
-"""A start that is robust to outliers: the best of many solutions from three poses each.
+"""A start that is robust to outliers: the best of many closed-form solutions.
+
+Each solves A X = X B for the motions A of the parent and B of the camera among three poses, and one
+among all poses. F. Park and B. Martin, Robot sensor calibration: solving AX = XB on the Euclidean
+group, 1994. The axes are weighted by the sine of the angle instead of the angle: the logarithm of a
+rotation by 180 degrees has no sign, and motions near 180 degrees would have the largest weight.
 
 The samples use a fixed seed, so sorted poses give the same start every time.
 """
@@ -9,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.calibration.pose_pairs.closed_form import motions, park, shah
-from evercal.calibration.pose_pairs.pose_equation import PoseEquation, Unknowns, se3
+from evercal.calibration.pose_pairs.pose_equation import PoseEquation, Unknowns
 
 Array = NDArray[np.floating]
 
@@ -19,6 +23,14 @@ SAMPLES = 150
 _SCORED = 60
 """Maximum number of poses that score a sample."""
 _FLOOR = 1e-9
+
+
+class Start(NamedTuple):
+    """The best closed-form solution."""
+
+    at: Unknowns
+    scale: float
+    """Metres per unit of the camera's translations."""
 
 
 class _Hypotheses(NamedTuple):
@@ -39,20 +51,27 @@ class _Boards(NamedTuple):
     translations: Array
 
 
-def consensus_start(equation: PoseEquation) -> Unknowns:
-    """Return the hypothesis that agrees best with the better half of three or more poses."""
+def consensus_start(equation: PoseEquation, scale_known: bool = True) -> Start:
+    """Return the hypothesis that agrees best with the better half of three or more poses.
+
+    With `scale_known`, the camera's translations are in metres.
+    """
     n = len(equation)
     scored = equation[np.unique(np.linspace(0, n - 1, _SCORED).round().astype(int))]
-    sampled, closed = _from_triples(equation, _triples(n)), _from_all_poses(scored)
-    hypotheses = _Hypotheses(*(np.concatenate(pair) for pair in zip(sampled, closed, strict=True)))
+    i, j = np.triu_indices(len(scored), 1)
+    triples = _triples(n)
+    sampled = solve_motions(equation, triples[:, [0, 0, 1]], triples[:, [1, 2, 2]], scale_known)
+    whole = solve_motions(scored, i[None], j[None], scale_known)
+    hypotheses = _Hypotheses(*(np.concatenate(pair) for pair in zip(sampled, whole, strict=True)))
     cost, mean = _spread(_boards(scored, hypotheses))
     cost[~(hypotheses.scales > 0)] = np.inf
     best = int(np.argmin(cost))
-    return Unknowns(
+    at = Unknowns(
         np.stack([hypotheses.rotations[best], mean.rotations[best]]),
         np.stack([hypotheses.translations[best], mean.translations[best]]),
-        float(hypotheses.scales[best]),
+        np.zeros(len(equation.extras.names)),
     )
+    return Start(at, float(hypotheses.scales[best]))
 
 
 def _triples(n: int) -> NDArray[np.int64]:
@@ -63,26 +82,14 @@ def _triples(n: int) -> NDArray[np.int64]:
     return np.argsort(rng.random((SAMPLES, n)), 1)[:, :3]
 
 
-def _from_all_poses(equation: PoseEquation) -> _Hypotheses:
-    """Solve with all poses by Park and by Shah, the best start without outliers."""
-    robot = se3(equation.robot_rotation, equation.robot_translation)
-    camera = se3(equation.camera_rotation, equation.camera_translation)
-    world = shah(robot, camera, equation.scale_known)
-    by_motions, scale = park(*motions(robot, camera), equation.scale_known)
-    poses = (by_motions, world.parent_from_camera)
-    return _Hypotheses(
-        np.stack([pose.rotation_matrix() for pose in poses]),
-        np.stack([pose.translation_m for pose in poses]),
-        np.array([scale, world.scale]),
-    )
-
-
-def _from_triples(equation: PoseEquation, triples: NDArray[np.int64]) -> _Hypotheses:
-    """Solve each triple of poses by Park's method."""
-    h = len(triples)
-    first, second = triples[:, [0, 0, 1]], triples[:, [1, 2, 2]]
+def solve_motions(
+    equation: PoseEquation,
+    first: NDArray[np.int64],
+    second: NDArray[np.int64],
+    scale_known: bool = True,
+) -> _Hypotheses:
+    """Solve A X = X B for h sets of m motions between the poses `first` and `second`, (h, m)."""
     robot, camera = equation.robot_rotation, equation.camera_rotation
-    # (h, 3) motions A of the robot and B of the camera within each triple.
     inverse = robot[first].transpose(0, 1, 3, 2)
     rotation_a = inverse @ robot[second]
     rotation_b = camera[first] @ camera[second].transpose(0, 1, 3, 2)
@@ -93,17 +100,17 @@ def _from_triples(equation: PoseEquation, triples: NDArray[np.int64]) -> _Hypoth
     rotations = _nearest(_sine_axes(rotation_a).transpose(0, 2, 1) @ _sine_axes(rotation_b))
     system, right_side = rotation_a - np.eye(3), -translation_a
     rotated = translation_b @ rotations.transpose(0, 2, 1)
-    if equation.scale_known:
+    if scale_known:
         right_side = right_side + rotated
     else:
         system = np.concatenate([system, -rotated[..., None]], -1)
-    unknowns = system.shape[-1]
-    system, right_side = system.reshape(h, 9, unknowns), right_side.reshape(h, 9, 1)
+    h, unknowns = len(system), system.shape[-1]
+    system, right_side = system.reshape(h, -1, unknowns), right_side.reshape(h, -1, 1)
     normal = system.transpose(0, 2, 1) @ system
     ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12
     projected = system.transpose(0, 2, 1) @ right_side
     solution = np.linalg.solve(normal + ridge * np.eye(unknowns), projected)[..., 0]
-    scales = np.ones(h) if equation.scale_known else solution[:, 3]
+    scales = np.ones(h) if scale_known else solution[:, 3]
     return _Hypotheses(rotations, solution[:, :3], scales)
 
 

@@ -1,0 +1,73 @@
+"""Pose pairs whose camera poses were measured by the corners of a board.
+
+The corners of all images determine the pose of the board in each image up to the intrinsics, which
+all images share. Eliminating the poses from the normal equations leaves what the corners say about
+the intrinsics (the Schur complement of bundle adjustment), and the derivative of each pose by them.
+The hand-eye equation with the intrinsics as extras is then the full reprojection problem.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.calibration.boards.corners import BoardPose, BoardView, board_pose, pixel_sigma
+from evercal.calibration.boards.lens import LENS, LensPrior, lens_estimate
+from evercal.calibration.pose_pairs.pairs import PosePairs
+from evercal.calibration.pose_pairs.pose_equation import Extras
+from evercal.geometry import SE3, Camera
+
+Array = NDArray[np.floating]
+
+@dataclass(frozen=True, eq=False)
+class BoardCorners:
+    """Board corners of the images of pose pairs."""
+
+    camera: Camera
+    """Intrinsics of all images."""
+    views: tuple[BoardView, ...]
+    """One for each pair."""
+    half_turn: bool = False
+    """Whether the board looks the same after half a turn, so that its corners may be in reverse
+    order."""
+    stated: bool = False
+    """Whether the intrinsics are stated, for example by the maker; else they were estimated from
+    these corners."""
+
+    @property
+    def prior(self) -> LensPrior:
+        """Knowledge of the intrinsics without the corners."""
+        return (LensPrior.stated if self.stated else LensPrior.usual)(self.camera)
+
+
+class Measured(NamedTuple):
+    """Board poses by corners at one estimate of the intrinsics."""
+
+    camera: Camera
+    poses: list[BoardPose]
+    sigma_px: float
+    """Standard deviation of a corner coordinate."""
+
+    def applied_to(self, pairs: PosePairs) -> PosePairs:
+        """Return the pairs with these camera poses and their covariances."""
+        variance = self.sigma_px**2
+        return replace(
+            pairs,
+            camera_from_board=SE3.stack([pose.camera_from_board for pose in self.poses]),
+            camera_covariance=np.stack([variance * pose.unit_covariance for pose in self.poses]),
+        )
+
+    def extras(self, prior: LensPrior) -> Extras:
+        """Return the intrinsics as unknowns; the corners are part of their prior."""
+        best = lens_estimate(self.poses, self.sigma_px, self.camera, prior)
+        slopes = np.stack([pose.lens_slope for pose in self.poses])
+        names = LENS[: len(best.change)]
+        groups = ("intrinsics",) * len(names)
+        return Extras(names, groups, slopes, best.information, best.change)
+
+
+def measured(corners: BoardCorners, camera: Camera, starts: SE3) -> Measured:
+    """Fit the pose of the board in every image from (n,) starts."""
+    poses = [board_pose(v, camera, s) for v, s in zip(corners.views, starts, strict=True)]
+    return Measured(camera, poses, pixel_sigma(poses))

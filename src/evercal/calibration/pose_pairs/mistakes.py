@@ -1,0 +1,344 @@
+"""Mistakes in the input, found by evidence: which other reading of the poses fits them?
+
+A camera fixed to the gripper rotates by the same angle as the gripper. Poses that violate this were
+mostly read in a wrong convention: inverted, transposed, another order of angles, shifted by a row,
+another unit. Each of these readings is tested, and one that makes the pairs agree is reported.
+
+Other mistakes leave the pairs in perfect agreement: exchanged files, both files inverted, camera
+axes of OpenGL. Geometry gives them away: a camera sees its board near its optical axis, and what a
+gripper carries is near the gripper.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.calibration.calibration import Mount
+from evercal.calibration.pose_pairs.fit import MIN_POSES, Agreement, agreement
+from evercal.calibration.pose_pairs.pairs import PoseNumbers, PosePairs
+from evercal.calibration.pose_pairs.pose_equation import Extras
+from evercal.calibration.pose_pairs.starts import consensus_start
+from evercal.errors import InputError
+from evercal.geometry import SE3
+from evercal.recordings.poses.conventions import (
+    CONVENTIONS,
+    numbers_from_poses,
+    pose_convention,
+    poses_from_numbers,
+)
+
+Array = NDArray[np.floating]
+
+SUSPECT_M, SUSPECT_RAD = 0.01, np.deg2rad(1.0)
+"""Residuals above which other readings are tested."""
+HOPELESS_M, HOPELESS_RAD = 0.05, np.deg2rad(3.0)
+"""Residuals above which the pairs are refused."""
+_BETTER = 3.0
+"""Factor by which another reading must reduce the residuals of translation or rotation."""
+_SPOILT = 1.2
+"""Largest factor by which it may enlarge the others."""
+_NEAR_M, _FAR_M, _SPREAD = 0.1, 0.7, 0.8
+"""Usual distances of a camera or board from the gripper that carries it, and from the base; standard
+deviation of their logarithms."""
+_FIELD_RAD, _ANYWHERE = np.deg2rad(22.0), 0.03
+"""Usual angle between board and optical axis; share of images with any angle."""
+_IMAGES = 4.0
+"""Number of independent images: all look in similar directions."""
+_CLEARLY = 4.0
+"""Logarithm of the likelihood ratio at which another reading is more plausible."""
+_FITTED = 30
+"""Number of rotation readings to fit, sorted by their agreement of angles."""
+_FLIP = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
+_CAUSES = (
+    "check that each row belongs to its image, that the robot stood still, which frames the poses"
+    " connect, their Euler or quaternion order, and that the camera was fixed firmly"
+)
+
+
+class _Reading(NamedTuple):
+    """The pairs in another convention."""
+
+    message: str
+    """The mistake and its correction."""
+    pairs: PosePairs
+    mount: Mount
+
+
+def quick_fit(pairs: PosePairs, mount: Mount, scale_known: bool) -> tuple[Agreement, float]:
+    """Return a robust estimate of X and Z alone, and the scale."""
+    blank = Extras.nothing(len(pairs))
+    start = consensus_start(pairs.equation(mount, blank), scale_known)
+    equation = pairs.scaled(start.scale).equation(mount, blank)
+    return agreement(equation, start.at), start.scale
+
+
+def require_agreement(pairs: PosePairs, mount: Mount, scale_known: bool, fit: Agreement) -> None:
+    """Check that pose pairs agree, and diagnose them otherwise.
+
+    Raises:
+        InputError: Another reading of the poses fits far better or is far more plausible, or the
+            residuals are too large.
+    """
+    suspect = fit.metres > SUSPECT_M or fit.radians > SUSPECT_RAD or fit.inliers.mean() < 0.6
+    readings = [_Reading(*other, mount) for other in _other_conventions(pairs, suspect)]
+    if suspect:
+        readings = [*_readings(pairs, mount), *readings]
+    best, found = fit, []
+    for reading in readings:
+        other, _ = quick_fit(reading.pairs, reading.mount, scale_known)
+        if _clearly_better(other, fit):
+            found.append((other, reading))
+            best = min(best, other, key=_cost)
+    # Inverted robot poses, inverted camera poses and the other mount obey the same equation.
+    found = [(other, reading) for other, reading in found if _cost(other) < 3 * _cost(best)]
+    if found:
+        fit_of, likely = max(found, key=lambda pair: _plausibility(pair[1], pair[0]))
+        raise InputError(
+            f"{likely.message}; corrected, the poses agree to {_size(fit_of)}, as given to"
+            f" {_size(fit)}"
+        )
+    if not suspect:
+        _require_plausible(pairs, mount, fit)
+        return
+    if scale_known:
+        _require_unit(pairs, mount, fit)
+    enough = fit.inliers.mean() >= 0.5
+    if not (fit.metres < HOPELESS_M and fit.radians < HOPELESS_RAD and enough):
+        raise InputError(f"{_mismatch(pairs)}; they agree only to {_size(fit)}; {_CAUSES}")
+
+
+def _require_plausible(pairs: PosePairs, mount: Mount, fit: Agreement) -> None:
+    """Refuse pairs that agree, but whose geometry fits another reading far better.
+
+    Each other reading has the solution X and Z of the given one, exchanged or inverted.
+    """
+    x, z = fit.at.parent_from_camera, fit.at.fixed_from_board
+    camera = pairs.camera_from_board
+    given = _likelihood(mount, x, z, camera)
+    swapped = (z.inverse(), x.inverse())[:: 1 if mount == "eye_in_hand" else -1]
+    others = (
+        (
+            "the files look exchanged: the camera poses look like gripper poses; exchange"
+            " --robot-poses and --camera-poses",
+            _likelihood(mount, *swapped, pairs.base_from_gripper),
+        ),
+        (
+            "robot and camera poses look inverted (gripper_from_base and board_from_camera):"
+            " invert both (--invert both)",
+            _likelihood(mount, z, x, camera.inverse()),
+        ),
+        (
+            "the board is behind the camera, as if the camera poses had OpenGL's axes (y up, z"
+            " back): append :opengl to --camera-convention, or convert the poses to OpenCV's axes"
+            " (y down, z forward)",
+            _likelihood(mount, x @ _FLIP, z, _FLIP @ camera),
+        ),
+    )
+    message, best = max(others, key=lambda pair: pair[1])
+    if best > given + _CLEARLY:
+        raise InputError(message)
+    if (camera.translation_m[:, 2] < 0).all():
+        raise InputError(
+            "the board is behind the camera in every image: the camera poses are"
+            " camera_from_board, with OpenCV's axes (z forward); see --camera-convention"
+        )
+
+
+def _clearly_better(other: Agreement, fit: Agreement) -> bool:
+    """Whether a reading improves translation or rotation by far, and spoils neither."""
+    metres = max(other.metres, 1e-7) / max(fit.metres, 1e-7)
+    radians = max(other.radians, 1e-7) / max(fit.radians, 1e-7)
+    return min(metres, radians) * _BETTER < 1 and max(metres, radians) < _SPOILT
+
+
+def _plausibility(reading: _Reading, fit: Agreement) -> float:
+    camera = reading.pairs.camera_from_board
+    return _likelihood(reading.mount, fit.at.parent_from_camera, fit.at.fixed_from_board, camera)
+
+
+def _likelihood(mount: Mount, x: SE3, z: SE3, camera_from_board: SE3) -> float:
+    """Return how usual a geometry is, the logarithm of a probability density."""
+    usual = (_NEAR_M, _FAR_M) if mount == "eye_in_hand" else (_FAR_M, _NEAR_M)
+    lengths = np.array([np.linalg.norm(x.translation_m), np.linalg.norm(z.translation_m)])
+    ratio = np.log(np.maximum(lengths, 0.03) / usual) / _SPREAD
+    board = camera_from_board.translation_m
+    angle = np.arccos(np.clip(board[:, 2] / np.linalg.norm(board, axis=1).clip(1e-9), -1, 1))
+    bell = np.exp(-0.5 * (angle / _FIELD_RAD) ** 2) / (_FIELD_RAD * np.sqrt(np.pi / 2))
+    seen = np.log((1 - _ANYWHERE) * bell + _ANYWHERE / np.pi)
+    return float(_IMAGES * seen.mean() - 0.5 * (ratio**2).sum())
+
+
+def _readings(pairs: PosePairs, mount: Mount) -> Iterator[_Reading]:
+    """Yield other readings of the pairs."""
+    robot, camera = pairs.base_from_gripper, pairs.camera_from_board
+    other: Mount = "eye_to_hand" if mount == "eye_in_hand" else "eye_in_hand"
+    yield _Reading(
+        "the robot poses look inverted (gripper_from_base): invert them (--invert robot), or, if"
+        f" they are base_from_gripper, use --mount {other}",
+        replace(pairs, base_from_gripper=robot.inverse()),
+        mount,
+    )
+    yield _Reading(
+        "the camera poses look inverted (board_from_camera): invert them (--invert camera), or, if"
+        f" they are camera_from_board, use --mount {other}",
+        replace(pairs, camera_from_board=camera.inverse()),
+        mount,
+    )
+    yield _Reading(
+        f"the mount looks wrong: use --mount {other}, or, if it is {mount}, invert the robot poses"
+        " (--invert robot)",
+        pairs,
+        other,
+    )
+    for name, part, poses in (
+        ("robot", "base_from_gripper", robot),
+        ("camera", "camera_from_board", camera),
+    ):
+        conjugate = poses.rotation_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
+        yield _Reading(
+            f"the rotations of the {name} poses look transposed (their translations do not): swap"
+            f" rows and columns of the matrices, or the sign of the quaternions' x y z",
+            replace(pairs, **{part: SE3(conjugate, poses.translation_m)}),
+            mount,
+        )
+    for shift, late in ((1, "robot"), (-1, "camera")):
+        rows = np.arange(len(pairs))[max(shift, 0) : len(pairs) + min(shift, 0)]
+        shifted = replace(pairs[rows], camera_from_board=camera[rows - shift])
+        if len(shifted) >= MIN_POSES:
+            yield _Reading(
+                f"rows and images are shifted by one: the {late} poses have an extra pose at the"
+                f" beginning; pair each row with its own image",
+                shifted,
+                mount,
+            )
+
+
+def _other_conventions(pairs: PosePairs, every: bool) -> Iterator[tuple[str, PosePairs]]:
+    """Yield the pairs with the numbers of one file in another convention, the best first.
+
+    Unless `every` is set, the angles of robot and camera must agree far better. An exchanged order
+    of quaternions keeps all angles.
+    """
+    robot, camera = pairs.base_from_gripper, pairs.camera_from_board
+    limit = mismatch_rad(robot, camera) / _BETTER
+    found: list[tuple[float, int, str, PosePairs]] = []
+    for name, part in {"robot": "base_from_gripper", "camera": "camera_from_board"}.items():
+        poses, other = (robot, camera) if name == "robot" else (camera, robot)
+        for used, numbers in _numbers(poses, getattr(pairs, f"{name}_numbers")):
+            for meant, corrected in _reread(used, numbers):
+                mismatch = mismatch_rad(corrected, other)
+                if mismatch > limit and not every:
+                    continue
+                message = (
+                    f"the {name} poses look read as {used}, but written as {' or '.join(meant)}"
+                    f" ({pose_convention(meant[0]).meaning}); give --{name}-convention {meant[0]}"
+                )
+                changed = replace(pairs, **{part: corrected})
+                found.append((round(np.rad2deg(mismatch), 1), len(found), message, changed))
+    found.sort(key=lambda entry: entry[:2])
+    yield from ((message, changed) for _, _, message, changed in found[:_FITTED])
+
+
+def _numbers(poses: SE3, given: PoseNumbers | None) -> Iterator[tuple[str, Array]]:
+    """Yield the convention and the numbers of a file, or the likely ones of bare poses."""
+    if given is not None:
+        yield given.convention, given.numbers
+        return
+    for name in ("wxyz", "xyzw", "rpy", "ur", "staubli", "kuka"):
+        used = f"{name}:m" if name in ("staubli", "kuka") else name
+        yield used, numbers_from_poses(poses, pose_convention(used))
+
+
+def _reread(used: str, numbers: Array) -> list[tuple[list[str], SE3]]:
+    """Return the poses by each other convention of the same count and unit of length, with the
+    shortest names of that convention."""
+    convention, found = pose_convention(used), dict[bytes, tuple[list[str], SE3]]()
+    kept = [word for word in ("inverse", "opengl") if f":{word}" in used]
+    length = "m" if convention.metres_per_unit == 1.0 else "mm"
+    for name, other in CONVENTIONS.items():
+        if other.count != convention.count:
+            continue
+        for angle in ("rad", "deg") if other.has_angles else ("",):
+            units = [
+                unit
+                for unit in (length, angle)
+                if unit and _units(f"{name}:{unit}") != _units(name)
+            ]
+            meant = ":".join([name, *units, *kept])
+            try:
+                corrected = poses_from_numbers(numbers, pose_convention(meant))
+            except ValueError:  # no rotations in that convention
+                continue
+            key = np.abs(corrected.rotation_wxyz).round(6).tobytes()
+            found.setdefault(key, ([], corrected))[0].append(meant)
+    for names, _ in found.values():
+        fewest = min(name.count(":") for name in names)
+        names[:] = [name for name in names if name.count(":") == fewest]
+    return list(found.values())
+
+
+def _units(name: str) -> tuple[float, bool]:
+    convention = pose_convention(name)
+    return convention.metres_per_unit, convention.degrees
+
+
+def mismatch_rad(robot: SE3, camera: SE3) -> float:
+    """Return the lower quartile of the differences between angles of robot and camera."""
+    first, second = (_angles(poses) for poses in (robot, camera))
+    return float(np.quantile(np.abs(first - second), 0.25))
+
+
+def _angles(poses: SE3) -> Array:
+    """Return the rotation angles between all pairs of poses, radians."""
+    i, j = np.triu_indices(len(poses), 1)
+    q = poses.rotation_wxyz
+    return 2 * np.arccos(np.minimum(np.abs((q[i] * q[j]).sum(1)), 1.0))
+
+
+def _require_unit(pairs: PosePairs, mount: Mount, fit: Agreement) -> None:
+    """Refuse camera lengths in another unit than the robot's."""
+    free, scale = quick_fit(pairs, mount, False)
+    if free.metres * _BETTER > fit.metres or free.radians > 1.5 * fit.radians + 1e-4:
+        return
+    units = {0.001: "millimetres", 0.01: "centimetres", 0.0254: "inches"}
+    for unit, name in units.items():
+        if abs(np.log(scale / unit)) < 0.1:
+            raise InputError(
+                f"the camera poses look like {name}, the robot's like metres; convert them, or"
+                f" state the unit with --camera-convention"
+            )
+        if abs(np.log(scale * unit)) < 0.1:
+            raise InputError(
+                f"the robot poses look like {name}, the camera's like metres; convert them, or"
+                f" state the unit with --robot-convention"
+            )
+    raise InputError(
+        f"the camera's lengths fit the robot's only if multiplied by {scale:.4g}; check the board's"
+        f" square or tag size and both units, or estimate the scale with --scale unknown"
+    )
+
+
+def _mismatch(pairs: PosePairs) -> str:
+    robot, camera = _angles(pairs.base_from_gripper), _angles(pairs.camera_from_board)
+    differences = np.abs(robot - camera)
+    if np.quantile(differences, 0.25) < np.deg2rad(2.0):
+        return "rotations of robot and camera agree, but no mount of the camera fits their poses"
+    i, j = np.triu_indices(len(pairs), 1)
+    typical = int(np.argsort(differences)[len(differences) // 2])
+    return (
+        f"robot and camera agree in no rotation: from {pairs.names[i[typical]]} to"
+        f" {pairs.names[j[typical]]} the robot turned by {np.rad2deg(robot[typical]):.1f}"
+        f" deg, the camera by {np.rad2deg(camera[typical]):.1f} deg; most pairs differ"
+        f" by as much"
+    )
+
+
+def _cost(fit: Agreement) -> float:
+    return max(fit.metres, 1e-9) * max(fit.radians, 1e-9)
+
+
+def _size(fit: Agreement) -> str:
+    return f"{1000 * fit.metres:.1f} mm and {np.rad2deg(fit.radians):.2f} deg"
