@@ -11,11 +11,10 @@ from tqdm import tqdm
 from tyro.conf import arg
 
 from evercal.calibration.calibration import Mount
-from evercal.calibration.pose_pairs.closed_form import motions, park, shah
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve
 from evercal.evaluation.metrics import share_inside
-from evercal.geometry import SE3, pose_distance
+from evercal.geometry import SE3
 
 
 @dataclass(frozen=True)
@@ -143,24 +142,6 @@ def trials(setting: Setting, count: int, first_seed: int = 0) -> dict[str, float
     }
 
 
-def closed_forms(setting: Setting, count: int) -> dict[str, tuple[float, float]]:
-    """Return median errors (mm, deg) of the closed-form methods, without outlier rejection."""
-    errors: dict[str, list[tuple[float, float]]] = {"Park": [], "Shah": []}
-    for seed in range(count):
-        drawn = recording(setting, seed)
-        robot = drawn.pairs.base_from_gripper
-        fixed_from_parent = robot if setting.mount == "eye_in_hand" else robot.inverse()
-        a, b = motions(fixed_from_parent, drawn.pairs.camera_from_board)
-        estimates = {
-            "Park": park(a, b)[0],
-            "Shah": shah(fixed_from_parent, drawn.pairs.camera_from_board).parent_from_camera,
-        }
-        for name, estimate in estimates.items():
-            metres, radians = pose_distance(estimate, drawn.parent_from_camera)
-            errors[name].append((1000 * float(metres), float(np.rad2deg(radians))))
-    return {name: tuple(np.median(rows, 0).tolist()) for name, rows in errors.items()}
-
-
 def run(count: Annotated[int, arg(name="trials")] = 1000, thorough: bool = False) -> None:
     """Solve simulated pose pairs: errors, 95 % ellipsoids, outliers, scale, time.
 
@@ -181,7 +162,6 @@ def run(count: Annotated[int, arg(name="trials")] = 1000, thorough: bool = False
         settings += [replace(s, noisy=who, at="far") for s in some for who in ("camera", "robot")]
     rows = []
     for setting in tqdm(settings, unit="setting"):
-        classical = closed_forms(setting, min(count, 200)) if setting.scale is None else {}
         row = {
             "mount": setting.mount,
             "path": setting.path,
@@ -190,7 +170,6 @@ def run(count: Annotated[int, arg(name="trials")] = 1000, thorough: bool = False
             "scale": "unknown" if setting.scale else "known",
             **trials(setting, count),
         }
-        row |= {f"{name} mm": mm for name, (mm, _) in classical.items()}
         rows.append(row)
     print(f"{count} trials each, {settings[0].poses} poses, 2 mm and 0.2 deg per axis")
     print(tabulate(rows, headers="keys", floatfmt=".3g", tablefmt="github", missingval=""))

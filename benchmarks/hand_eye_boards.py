@@ -5,19 +5,13 @@ heavy-tailed noise, the arm has noise of its own. Every solver gets the same cor
 calibrated from them first, as most people do.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from evercal.geometry import SE3 as _SE3
-
-
-def pose(r, t):
-    return _SE3(r.as_quat(scalar_first=True), t)
-
+from benchmarks.hand_eye import pose
 from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.calibration import Mount
 from evercal.geometry import SE3, Camera
