@@ -118,7 +118,7 @@ def align_by_gripper(
     map_from_camera = SE3.stack([item.pose for item in located])
     names = tuple(item.name for item in located)
     pairs = PosePairs(names, base_from_gripper, map_from_camera.inverse())
-    solution = solve_pairs(pairs, "eye_in_hand", scale_known)
+    solution = solve_pairs(pairs, "eye_in_hand", scale_known, of_board=False)
     fit = solution.fit
     scale = solution.scale * (1 + float(fit.at.extras[-1]) if not scale_known else 1.0)
     similarity = Similarity(fit.at.fixed_from_board, scale)

@@ -49,6 +49,11 @@ _IMAGES = 4.0
 """Number of independent images: all look in similar directions."""
 _CLEARLY = 4.0
 """Logarithm of the likelihood ratio at which another reading is more plausible."""
+_MOST, _SOME = 0.9, 0.5
+"""Share of images that show the board ahead of the camera, if the reading is right; below the second
+one a reading is suspect."""
+_LONG_M = 0.4
+"""Distance of a camera or board from its gripper above which a reading is suspect."""
 _FITTED = 30
 """Number of rotation readings to fit, sorted by their agreement of angles."""
 _FLIP = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
@@ -75,8 +80,12 @@ def quick_fit(pairs: PosePairs, mount: Mount, scale_known: bool) -> tuple[Agreem
     return agreement(equation, start.at), start.scale
 
 
-def require_agreement(pairs: PosePairs, mount: Mount, scale_known: bool, fit: Agreement) -> None:
+def require_agreement(
+    pairs: PosePairs, mount: Mount, scale_known: bool, fit: Agreement, of_board: bool = True
+) -> None:
     """Check that pose pairs agree, and diagnose them otherwise.
+
+    Camera poses `of_board` must see it; those in a map may see anything.
 
     Raises:
         InputError: Another reading of the poses fits far better or is far more plausible, or the
@@ -101,7 +110,8 @@ def require_agreement(pairs: PosePairs, mount: Mount, scale_known: bool, fit: Ag
             f" {_size(fit)}"
         )
     if not suspect:
-        _require_plausible(pairs, mount, fit)
+        if of_board:
+            _require_plausible(pairs, mount, fit)
         return
     if scale_known:
         _require_unit(pairs, mount, fit)
@@ -124,27 +134,39 @@ def _require_plausible(pairs: PosePairs, mount: Mount, fit: Agreement) -> None:
             "the files look exchanged: the camera poses look like gripper poses; exchange"
             " --robot-poses and --camera-poses",
             _likelihood(mount, *swapped, pairs.base_from_gripper),
+            pairs.base_from_gripper,
         ),
         (
             "robot and camera poses look inverted (gripper_from_base and board_from_camera):"
             " invert both (--invert both)",
             _likelihood(mount, z, x, camera.inverse()),
+            camera.inverse(),
         ),
         (
             "the board is behind the camera, as if the camera poses had OpenGL's axes (y up, z"
             " back): append :opengl to --camera-convention, or convert the poses to OpenCV's axes"
             " (y down, z forward)",
             _likelihood(mount, x @ _FLIP, z, _FLIP @ camera),
+            _FLIP @ camera,
         ),
     )
-    message, best = max(others, key=lambda pair: pair[1])
-    if best > given + _CLEARLY:
+    message, best, seen = max(others, key=lambda other: other[1])
+    ahead = _ahead(camera)
+    carried = x if mount == "eye_in_hand" else z
+    odd = ahead < _SOME or np.linalg.norm(carried.translation_m) > _LONG_M
+    if odd and best > given + _CLEARLY and _ahead(seen) > _MOST:
         raise InputError(message)
-    if (camera.translation_m[:, 2] < 0).all():
+    if (camera.translation_m[:, 2] < 0).mean() > _MOST:
         raise InputError(
-            "the board is behind the camera in every image: the camera poses are"
-            " camera_from_board, with OpenCV's axes (z forward); see --camera-convention"
+            "the board is behind the camera: camera poses are camera_from_board, with OpenCV's axes"
+            " (z forward); see --camera-convention and --invert"
         )
+
+
+def _ahead(camera_from_board: SE3) -> float:
+    """Return the share of boards that a camera may see, within 60 degrees of its optical axis."""
+    board = camera_from_board.translation_m
+    return float((board[:, 2] > 0.5 * np.linalg.norm(board, axis=1)).mean())
 
 
 def _clearly_better(other: Agreement, fit: Agreement) -> bool:

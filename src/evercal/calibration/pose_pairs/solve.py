@@ -223,12 +223,16 @@ def solve_pairs(
     mount: Mount,
     scale_known: bool = True,
     corners: BoardCorners | None = None,
+    of_board: bool = True,
 ) -> PairSolution:
-    """Solve pose pairs like `solve`, and return the fit."""
+    """Solve pose pairs like `solve`, and return the fit.
+
+    Poses in a map, not `of_board`, may have any direction.
+    """
     require_observable(pairs, scale_known)
     rows, first = pairs.distinct(scale_known)
     start, scale = quick_fit(pairs[rows], mount, scale_known)
-    require_agreement(pairs[np.sort(rows)], mount, scale_known, start)
+    require_agreement(pairs[np.sort(rows)], mount, scale_known, start, of_board)
     lens = None
     if corners is not None:
         lens = measured(corners, corners.camera, pairs.camera_from_board)
