@@ -77,7 +77,7 @@ names = st.sampled_from(sorted(CONVENTIONS))
 def test_read_poses_agree_with_their_numbers(name: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     convention = CONVENTIONS[name]
-    rotation = rng.normal(size=convention.count - 3)
+    rotation = rng.normal(size=convention.counts[-1] - 3)
     if convention.has_angles:
         rotation *= 90 if convention.degrees else 1.5
     else:
@@ -134,8 +134,8 @@ def test_quaternions_are_written_with_positive_w() -> None:
     ("name", "message"),
     [
         ("euler", "is not known; use one of wxyz, xyzw"),
-        ("kuka:cm", "modifier 'cm' is not known"),
-        ("wxyz:deg", "has no angles"),
+        ("kuka:cm", "'cm' is not one of m, mm, rad, deg, inv"),
+        ("wxyz:deg", "'deg' is not one of m, mm, inverse, opengl"),
         ("kuka:m:mm", "repeats a modifier"),
         ("kuka:deg:rad", "repeats a modifier"),
         ("matrix:inverse:inverse", "repeats a modifier"),

@@ -33,8 +33,7 @@ class PoseConvention:
     name: str
     """Name with modifiers."""
     layout: str
-    """After the translation `wxyz`, `xyzw`, `vector` or scipy's Euler axes, else `rows` or
-    `columns` of a matrix."""
+    """`wxyz`, `xyzw`, `vector` or Euler axes of scipy after a position, else `rows`, `columns`."""
     meaning: str
     metres_per_unit: float = 1.0
     """0.001 for millimetres."""
@@ -61,18 +60,13 @@ class PoseConvention:
         """Possible lengths of a pose; matrices may lack the row 0 0 0 1."""
         return (12, 16) if self.is_matrix else (6,) if self.has_angles else (7,)
 
-    @property
-    def count(self) -> int:
-        """Length of a pose written by `numbers_from_poses`."""
-        return self.counts[-1]
-
     def has(self, *modifiers: str) -> bool:
         """Whether the name has one of these modifiers."""
         return not set(modifiers).isdisjoint(self.name.split(":")[1:])
 
 
 class ConventionError(ValueError):
-    """A convention is missing or does not fit the numbers; `remedy` names those to give instead."""
+    """A convention is missing or does not fit the numbers; `remedy` names others."""
 
     def __init__(self, problem: str, remedy: str) -> None:
         self.problem, self.remedy = problem, remedy
@@ -101,17 +95,14 @@ CONVENTIONS = {
     )
 }
 """All conventions by name, without modifiers."""
-UNITS: dict[str, dict[str, Any]] = {
-    "m": {"metres_per_unit": 1.0},
-    "mm": {"metres_per_unit": 0.001},
-    "rad": {"degrees": False},
-    "deg": {"degrees": True},
-}
-"""Modifiers that change a unit; `inverse` and `opengl` are the others."""
 KNOWN_CONVENTIONS = (
     f"{', '.join(CONVENTIONS)}, followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"
 )
-"""All names and modifiers, for messages."""
+UNITS: dict[str, dict[str, Any]] = {
+    "m": {"metres_per_unit": 1.0}, "mm": {"metres_per_unit": 0.001},
+    "rad": {"degrees": False}, "deg": {"degrees": True},
+}  # fmt: skip
+"""What a unit changes of a convention."""
 
 
 def pose_convention(name: str) -> PoseConvention:
@@ -124,20 +115,15 @@ def pose_convention(name: str) -> PoseConvention:
     if base not in CONVENTIONS:
         raise ValueError(f"pose convention {name!r} is not known; use one of {KNOWN_CONVENTIONS}")
     convention = replace(CONVENTIONS[base], name=":".join([base, *modifiers]))
-    kinds: set[str] = set()
+    kinds = [("m", "mm"), ("rad", "deg"), ("inverse",), ("opengl",)]
+    kinds = kinds if convention.has_angles else [kinds[0], *kinds[2:]]
     for modifier in modifiers:
-        if modifier not in (*UNITS, "inverse", "opengl"):
-            known = ", ".join([*UNITS, "inverse", "opengl"])
-            problem = f"modifier {modifier!r} is not known; use one of {known}"
-        elif modifier in ("rad", "deg") and not convention.has_angles:
-            problem = f"it has no angles; leave :{modifier} out"
-        elif kinds & {kind := next(iter(UNITS.get(modifier, {modifier: True})))}:
-            problem = f":{modifier} repeats a modifier; give each kind once"
-        else:
-            kinds.add(kind)
-            convention = replace(convention, **UNITS.get(modifier, {}))
-            continue
-        raise ValueError(f"pose convention {name!r}: {problem}")
+        if not any(modifier in kind for kind in kinds):
+            known = ", ".join(word for kind in kinds for word in kind)
+            raise ValueError(f"pose convention {name!r}: {modifier!r} is not one of {known}")
+        convention = replace(convention, **UNITS.get(modifier, {}))
+    if any(sum(word in kind for word in modifiers) > 1 for kind in kinds):
+        raise ValueError(f"pose convention {name!r} repeats a modifier; give each kind once")
     return convention
 
 
@@ -173,7 +159,7 @@ def poses_from_numbers(
 
 
 def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
-    """Convert poses (...) to numbers (..., `convention.count`).
+    """Convert poses (...) to numbers (..., k), k the largest of `convention.counts`.
 
     Quaternions get w >= 0. If the middle angle of an Euler convention is within 1e-7 rad of gimbal
     lock, the third angle is 0 and the rotation is exact to 2e-7 rad (scipy).
@@ -205,13 +191,13 @@ def matrix_convention(numbers: Array) -> PoseConvention:
     """
     orders = [CONVENTIONS[name] for name in ("matrix", "franka")]
     rigid = [order for order in orders if _rigid(_matrices(numbers, order.layout)).all()]
-    if len(rigid) != 1:
-        raise ConventionError(
-            f"rows of {numbers.shape[-1]} numbers are rigid transforms in"
-            f" {'both orders' if rigid else 'no order'}",
-            "matrix (row after row) or franka (column after column)",
-        )
-    return rigid[0]
+    if len(rigid) == 1:
+        return rigid[0]
+    which = "both orders" if rigid else "no order"
+    raise ConventionError(
+        f"rows of {numbers.shape[-1]} numbers are rigid transforms in {which}",
+        "matrix (row after row) or franka (column after column)",
+    )
 
 
 def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
@@ -227,10 +213,17 @@ def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
     if not convention.has("m", "mm"):
         matrix = convention.is_matrix
         at = _matrices(numbers, convention.layout)[..., 3] if matrix else numbers
-        distance = np.linalg.norm(at[..., :3], axis=-1)
-        _check_lengths(distance * convention.metres_per_unit, convention)
+        _check_lengths(
+            np.linalg.norm(at[..., :3], axis=-1) * convention.metres_per_unit, convention
+        )
     if convention.has_angles and not convention.has("rad", "deg"):
-        _check_angles(numbers[..., 3:], convention)
+        angles = np.abs(numbers[..., 3:])
+        angles = np.linalg.norm(angles, axis=-1) if convention.layout == "vector" else angles
+        largest = float(angles.max(initial=0.0))
+        degrees = largest > 2 * np.pi + 1e-6
+        if largest > 0 and degrees != convention.degrees:
+            problem = f"angles up to {largest:.4g} look like"
+            raise _other_unit("deg" if degrees else "rad", problem, convention)
 
 
 def _check_lengths(metres: Array, convention: PoseConvention) -> None:
@@ -245,29 +238,19 @@ def _check_lengths(metres: Array, convention: PoseConvention) -> None:
             f" {metres[odd][0]:.3g} m; millimetres and metres may be mixed: write all in one unit"
         )
     if far.any():
-        raise _looks_like("mm", f"positions up to {metres.max():.4g} m from the base", convention)
+        problem = f"positions up to {metres.max():.4g} m from the base look like"
+        raise _other_unit("mm", problem, convention)
     if near.any() and near.all():
-        problem = f"positions within {1000 * metres.max():.2g} mm of the base"
-        raise _looks_like("m", problem, convention)
+        problem = f"positions within {1000 * metres.max():.2g} mm of the base look like"
+        raise _other_unit("m", problem, convention)
 
 
-def _check_angles(angles: Array, convention: PoseConvention) -> None:
-    if convention.layout == "vector":
-        angles = np.linalg.norm(angles, axis=-1)
-    largest = float(np.abs(angles).max(initial=0.0))
-    degrees = largest > 2 * np.pi + 1e-6
-    if largest > 0 and degrees != convention.degrees:
-        unit = "deg" if degrees else "rad"
-        raise _looks_like(unit, f"angles up to {largest:.4g}", convention)
-
-
-def _looks_like(unit: str, problem: str, convention: PoseConvention) -> ConventionError:
-    names = {"m": "metres", "mm": "millimetres", "rad": "radians", "deg": "degrees"}
-    units = ("m", "mm") if unit in ("m", "mm") else ("rad", "deg")
-    base = ":".join(word for word in convention.name.split(":") if word not in units)
-    other = units[1 - units.index(unit)]
+def _other_unit(unit: str, problem: str, convention: PoseConvention) -> ConventionError:
+    name = {"m": "metres", "mm": "millimetres", "rad": "radians", "deg": "degrees"}[unit]
+    other = {"m": "mm", "mm": "m", "rad": "deg", "deg": "rad"}[unit]
+    base = ":".join(word for word in convention.name.split(":") if word not in (unit, other))
     remedy = f"{base}:{unit} (or {base}:{other} if the unit is right as it is)"
-    return ConventionError(f"{problem} look like {names[unit]}", remedy)
+    return ConventionError(f"{problem} {name}", remedy)
 
 
 def _rotations(numbers: Array, convention: PoseConvention) -> Rotation:
@@ -302,14 +285,13 @@ def _rigid(matrices: Array) -> NDArray[np.bool_]:
 
 def _from_matrices(numbers: Array, convention: PoseConvention) -> SE3:
     matrices = _matrices(numbers, convention.layout)
-    orders = [("rows", "row after row", "matrix"), ("columns", "column after column", "franka")]
-    (_, stated, _), (layout, written, other) = orders[:: 1 if convention.layout == "rows" else -1]
+    other = CONVENTIONS["franka" if convention.layout == "rows" else "matrix"]
+    stated, written = "row after row", "column after column"
+    stated, written = (stated, written) if other.base == "franka" else (written, stated)
     broken = ~_rigid(matrices)
-    if broken.any() and _rigid(_matrices(numbers, layout)).all():
-        raise ConventionError(
-            f"the matrices are no rigid transforms {stated}, they are written {written}",
-            ":".join([other, *convention.name.split(":")[1:]]),
-        )
+    if broken.any() and _rigid(_matrices(numbers, other.layout)).all():
+        problem = f"the matrices are no rigid transforms {stated}, they are written {written}"
+        raise ConventionError(problem, ":".join([other.name, *convention.name.split(":")[1:]]))
     _refuse(
         broken,
         f"the matrix {stated} is no rigid transform: its last row is not 0 0 0 1, or its left 3x3"
