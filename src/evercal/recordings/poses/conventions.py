@@ -113,7 +113,8 @@ def pose_convention(name: str) -> PoseConvention:
     """
     base, *modifiers = name.strip().lower().split(":")
     if base not in CONVENTIONS:
-        raise ValueError(f"pose convention {name!r} is not known; use one of {KNOWN_CONVENTIONS}")
+        problem = f"pose convention {name!r} is not known"
+        raise ConventionError(problem, f"NAME, one of {KNOWN_CONVENTIONS}")
     convention = replace(CONVENTIONS[base], name=":".join([base, *modifiers]))
     kinds = [("m", "mm"), ("rad", "deg"), ("inverse",), ("opengl",)]
     kinds = kinds if convention.has_angles else [kinds[0], *kinds[2:]]

@@ -44,15 +44,16 @@ class PoseTable(NamedTuple):
     names: Names = None
     stamps_s: Array | None = None
     fixed: bool = False
-    """Whether keys of the file state all of the convention."""
+    """Whether keys of the file state the poses themselves."""
 
 
 class Columns(NamedTuple):
     """Columns that belong together."""
 
-    prefixes: Sequence[str]
+    prefixes: str
+    """Words before the end of a name, between commas."""
     ends: Sequence[str]
-    """Rest of the name of each column; after tvec_ and rvec_ also its index."""
+    """End of the name of each column; after tvec_ and rvec_ also its index."""
     conventions: Sequence[str] = ()
     """Conventions that the columns of a rotation may hold."""
     ask: str = ""
@@ -61,43 +62,34 @@ class Columns(NamedTuple):
 
 _GRID = [f"{row}{column}" for row in range(4) for column in range(4)]
 HEADERS = {
-    "position": Columns(("", "t", "t_", "p", "pos_", "position_", "translation_", "tvec_"), "xyz"),
+    "position": Columns(",t,t_,p,pos_,position_,translation_,tvec_", "xyz"),
     "quaternion": Columns(
-        ("q", "q_", "quat_", "quaternion_", "orientation_", "rotation_"),
-        "wxyz",
-        ("wxyz", "xyzw", "tum", "abb"),
+        "q,q_,quat_,quaternion_,orientation_,rotation_", "wxyz", ("wxyz", "xyzw", "tum", "abb")
     ),
-    "rotation vector": Columns(("rotvec_", "rvec_", "rotation_vector_"), "xyz", ("ur",)),
-    "matrix": Columns(("m",), _GRID, ("matrix", "franka")),
-    "3x4 matrix": Columns(("m",), _GRID[:12], ("matrix", "franka")),
-    "W P R": Columns(("",), "wpr", ("fanuc",)),
+    "rotation vector": Columns("rotvec_,rvec_,rotation_vector_", "xyz", ("ur",)),
+    "matrix": Columns("m", _GRID, ("matrix", "franka")),
+    "3x4 matrix": Columns("m", _GRID[:12], ("matrix", "franka")),
+    "W P R": Columns("", "wpr", ("fanuc",)),
     "angles": Columns(
-        ("r", "r_", "rot_", "rotation_"),
-        "xyz",
-        ("ur", "yaskawa", "staubli", "fanuc", "rpy"),
+        "r,r_,rot_,rotation_", "xyz", ("ur", "yaskawa", "staubli", "fanuc", "rpy"),
         "ur (rotation vector), yaskawa, staubli, fanuc or rpy",
     ),
     "roll pitch yaw": Columns(
-        ("",),
-        ("roll", "pitch", "yaw"),
-        ("rpy", "yaskawa", "staubli", "fanuc", "kuka"),
+        "", ("roll", "pitch", "yaw"), ("rpy", "yaskawa", "staubli", "fanuc", "kuka"),
         "rpy:rad or rpy:deg",
     ),
-    "A B C": Columns(("",), "abc", ("kuka",), "kuka"),
-    "q1 to q4": Columns(("q",), "1234", ("abb", "wxyz", "xyzw", "tum"), "abb, wxyz or xyzw"),
-}
-"""Columns of a position and of rotations; those that define a rotation come first."""
+    "A B C": Columns("", "abc", ("kuka",), "kuka"),
+    "q1 to q4": Columns("q", "1234", ("abb", "wxyz", "xyzw", "tum"), "abb, wxyz or xyzw"),
+}  # fmt: skip
+"""Columns of a position and of rotations; definite rotations come first."""
 _AXES = {"quaternion": "wxyz", "angles": "xyz", "roll pitch yaw": "xyz"}
 """Columns that conventions order by axis; rx and roll rotate about x."""
 _BRACKETS = re.compile(r'(?:([^\s\[\](){}=,;:"]+)[\s=,;:"]+)?(p?\[|\{)([^\[\]{}]*)[\]}]')
 _NOTATIONS = {"[": "", "p[": "x,y,z,rotvec_x,rotvec_y,rotvec_z", "{": "X,Y,Z,A,B,C"}
 
 
-class _Header(NamedTuple):
-    groups: dict[str, list[int]]
-    """Columns by key of `HEADERS`."""
-    units: dict[str, str]
-    """`m` or `mm` of the position, `rad` or `deg` of angles, if the header states them."""
+_Groups = dict[str, tuple[list[int], str | None]]
+"""Columns and their unit, if stated, by key of `HEADERS`."""
 
 
 def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
@@ -114,11 +106,11 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
     plain, given = _without_brackets(plain, given)
     cells = table_cells(plain)
     words, rows = cells[0].tolist(), cells[1:]
-    if _header(words) is None:
+    if not _is_header(words):
         words, rows = table_cells([c.lstrip("# ") for c in comments[-1:]]).ravel().tolist(), cells
     if not len(rows):
         raise ValueError("no line of numbers in it")
-    if len(words) == rows.shape[1] and _header(words) is not None:
+    if len(words) == rows.shape[1] and _is_header(words):
         return named_numbers(words, rows, given)
     texts = [i for i, cell in enumerate(rows[0].tolist()) if not is_number(cell)]
     numbers = cell_numbers(np.delete(rows, texts[:1], axis=1))
@@ -140,24 +132,26 @@ def named_numbers(
         ValueError: The names are ambiguous or contradict the given convention, or a cell is no
             number.
     """
-    header = _header(words) or _Header({}, {})
+    groups = _groups(words)
     names, stamps, others = row_labels(words, rows.T.tolist(), len(rows))
-    convention = given or pose_convention(_defined(header, words))
-    for key, columns in header.groups.items():
+    convention = given or pose_convention(_defined(groups, words))
+    columns = others if groups.keys() <= {"position"} else []
+    position, length = groups.get("position", ([], None))
+    for key, (rotation, unit) in groups.items():
+        if convention.base not in HEADERS[key].conventions or columns:
+            continue
         if convention.layout == "columns":
-            columns = np.reshape(columns, (-1, 4)).T.ravel().tolist()
+            rotation = np.reshape(rotation, (-1, 4)).T.ravel().tolist()
         elif key in _AXES and convention.layout != "vector":
-            columns = [columns[_AXES[key].find(axis)] for axis in convention.layout.lower()]
-        if not convention.is_matrix:
-            columns = [*header.groups.get("position", ()), *columns]
-        if convention.base in HEADERS[key].conventions and len(columns) in convention.counts:
-            for part, final in (("position", ("m", "mm")), (key, ("rad", "deg"))):
-                if part in header.units and not convention.has(*final):
-                    convention = replace(convention, **UNITS[header.units[part]])
-            chosen = cell_numbers(rows[:, columns], [words[column] for column in columns])
-            return PoseTable(chosen, convention, names, stamps)
-    if header.groups.keys() <= {"position"} and len(others) in convention.counts:
-        return PoseTable(cell_numbers(rows[:, others]), convention, names, stamps)
+            rotation = [rotation[_AXES[key].index(axis)] for axis in convention.layout.lower()]
+        columns = rotation if convention.is_matrix else position + rotation
+        if length is not None and not convention.has("m", "mm"):
+            convention = replace(convention, **UNITS[length])
+        if unit is not None and not convention.has("rad", "deg"):
+            convention = replace(convention, **UNITS[unit])
+    if len(columns) in convention.counts:
+        numbers = cell_numbers(rows[:, columns], [words[column] for column in columns])
+        return PoseTable(numbers, convention, names, stamps)
     raise ConventionError(
         f"the columns {', '.join(words)} are none of {convention.name} ({convention.meaning})",
         "of the columns, or leave it out if their names define it",
@@ -202,10 +196,13 @@ def plain_numbers(numbers: Array, given: PoseConvention | None, names: Names = N
 def _without_brackets(
     lines: list[str], given: PoseConvention | None
 ) -> tuple[list[str], PoseConvention | None]:
-    """Lines of a table with a line for each bracket, and the convention that a notation defines."""
+    """Lines of a table, one for each bracket, and the convention that a notation defines."""
     found: list[list[str]] = []
     kinds: set[str] = set()
-    for word, bracket, inside in _BRACKETS.findall("\n".join(lines)):
+    text = "\n".join(lines)
+    if "[" not in text and "{" not in text:
+        return lines, given
+    for word, bracket, inside in _BRACKETS.findall(text):
         values = dict(re.findall(r"\b([XYZABC])\s+([^\s,]+)", inside))
         numbers = [values.get(key, "") for key in "XYZABC"]
         numbers = numbers if bracket == "{" else inside.replace(",", " ").split()
@@ -223,52 +220,54 @@ def _without_brackets(
     return ([label + header, *rows] if header else rows or lines), given
 
 
-def _header(words: Sequence[str]) -> _Header | None:
-    """Interpret the cells of a first line, or return None if they are numbers.
+def _is_header(words: Sequence[str]) -> bool:
+    """Whether the cells of a line are names of columns, of which some may be numbers."""
+    numbers = [is_number(word) for word in words]
+    return not all(numbers) and (not any(numbers) or bool(_groups(words)))
+
+
+def _groups(words: Sequence[str]) -> _Groups:
+    """Columns of a header that belong together.
 
     Raises:
         ValueError: The columns of a group differ in unit, or a column is ambiguous.
     """
-    names = [name_and_unit(word) for word in words]
-    header, used = _Header({}, {}), set[int]()
-    for key, group in HEADERS.items():
+    names, units = zip(*map(name_and_unit, words), strict=True)
+    groups: _Groups = {}
+    for key, (prefixes, ends, *_) in HEADERS.items():
         found: list[list[int]] = []
-        for k, end in enumerate(group.ends):
-            some = {prefix + end for prefix in group.prefixes}
-            some |= {f"{prefix}{k}" for prefix in group.prefixes if prefix.endswith("vec_")}
-            found.append([column for column, (name, _) in enumerate(names) if name in some])
+        for k, end in enumerate(ends):
+            some = {prefix + end for prefix in prefixes.split(",")}
+            some |= {f"{prefix}{k}" for prefix in prefixes.split(",") if "vec_" in prefix}
+            found.append([column for column, name in enumerate(names) if name in some])
         columns = [candidates[0] for candidates in found if candidates]
         # rotation_x belongs to a quaternion if there is a rotation_w.
-        if not all(found) or used & {*columns}:
+        if not all(found) or any({*columns} & {*used} for used, _ in groups.values()):
             continue
         for repeated in (candidates for candidates in found if len(candidates) > 1):
             which = " and ".join(words[column] for column in repeated)
             raise ValueError(f"the columns {which} may both be the {key}'s; keep those of the pose")
-        used |= {*columns}
-        units = {names[column][1] for column in columns}
-        if len(units) > 1:
+        unit = units[columns[0]]
+        if any(units[column] != unit for column in columns):
             raise ValueError(f"the columns {', '.join(words[c] for c in columns)} differ in unit")
-        header.groups[key] = columns
-        if (unit := units.pop()) in (("m", "mm") if key == "position" else ("rad", "deg")):
-            header.units[key] = str(unit)
-    numbers = [is_number(word) for word in words]
-    return None if all(numbers) or (not header.groups and any(numbers)) else header
+        stated = unit in (("m", "mm") if key == "position" else ("rad", "deg"))
+        groups[key] = columns, unit if stated else None
+    return groups
 
 
-def _defined(header: _Header, words: Sequence[str]) -> str:
+def _defined(groups: _Groups, words: Sequence[str]) -> str:
     """Name of the only convention that the columns define."""
-    rotations = [key for key in header.groups if key != "position"]
-    stated = header.units.keys() & {"roll pitch yaw"}
-    sure = [key for key in rotations if not HEADERS[key].ask or key in stated]
+    rotations = [key for key in groups if key != "position"]
+    sure = [k for k in rotations if not HEADERS[k].ask or (k == "roll pitch yaw" and groups[k][1])]
     conventions = [HEADERS[key].conventions[0] for key in sure]
-    if len(sure) == 1 and ("position" in header.groups or conventions == ["matrix"]):
+    if len(sure) == 1 and ("position" in groups or conventions == ["matrix"]):
         return conventions[0]
     if sure[1:]:
         raise ConventionError(f"the header names {' and '.join(sure)}", " or ".join(conventions))
     if rotations and not sure:
-        columns = ", ".join(words[column] for column in header.groups[rotations[0]])
-        ask = HEADERS[rotations[0]].ask
-        raise ConventionError(f"columns {columns} do not define a rotation", ask)
+        columns = ", ".join(words[column] for column in groups[rotations[0]][0])
+        problem = f"columns {columns} do not define a rotation"
+        raise ConventionError(problem, HEADERS[rotations[0]].ask)
     raise ConventionError(
         f"the columns {', '.join(words)} name no known pose (such as x y z qw qx qy qz)",
         f"NAME, one of {KNOWN_CONVENTIONS}",

@@ -10,7 +10,8 @@ import json
 import os
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,7 @@ class RobotPoses:
     numbers: NDArray[np.float64] | None = None
     """(n, k) numbers of the file, to be read by `poses_from_numbers`."""
     convention: PoseConvention | None = None
-    """Convention of the numbers. None, also of the numbers, if the file's keys state all of it."""
+    """Convention of the numbers. Both are None if keys of the file state the poses themselves."""
 
     def __len__(self) -> int:
         """Number of poses."""
@@ -95,7 +96,16 @@ def read_robot_poses(
             table = _data_table(json.loads(read_text(path, what)), given)
         else:
             table = read_pose_table(read_text(path, what), given)
-        return _robot_poses(table, camera_from)
+        poses = poses_from_numbers(table.numbers, table.convention, camera_from)
+        check_units(table.numbers, table.convention)
+        names = table.names or ()
+        repeated = [name for i, name in enumerate(names) if name in names[:i]]
+        if repeated:
+            raise ValueError(f"the name {repeated[0]!r} comes twice; names are unique")
+        read = RobotPoses(table.names, table.stamps_s, poses)
+        if table.fixed:
+            return read
+        return replace(read, numbers=table.numbers, convention=table.convention)
     except FileNotFoundError:
         raise InputError(f"{path}: {what} is missing; check the path") from None
     except OSError as error:
@@ -104,18 +114,6 @@ def read_robot_poses(
         raise InputError(f"{path}: {error.naming(option)}") from None
     except (ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: {error}") from None  # also invalid JSON and arrays of text
-
-
-def _robot_poses(table: PoseTable, camera_from: bool) -> RobotPoses:
-    numbers, convention, names, stamps, fixed = table
-    if not len(numbers):
-        raise ValueError("no pose in it")
-    poses = poses_from_numbers(numbers, convention, camera_from)
-    check_units(numbers, convention)
-    repeated = [name for i, name in enumerate(names or ()) if name in (names or ())[:i]]
-    if repeated:
-        raise ValueError(f"the name {repeated[0]!r} comes twice; names are unique")
-    return RobotPoses(names, stamps, poses, *((None, None) if fixed else (numbers, convention)))
 
 
 def _data_table(data: Any, given: PoseConvention | None) -> PoseTable:
@@ -146,7 +144,7 @@ def _data_table(data: Any, given: PoseConvention | None) -> PoseTable:
 def _labelled(
     table: PoseTable, columns: Mapping[str, Sequence[object]], plural: bool = False
 ) -> PoseTable:
-    """The table with names and times from lists by key, where it has none."""
+    """Add names and times from lists by key to a table without them."""
     names, stamps, _ = row_labels([*columns], [*columns.values()], len(table.numbers), plural)
     stamps = stamps if table.stamps_s is None else table.stamps_s
     return table._replace(names=table.names or names, stamps_s=stamps)
@@ -168,19 +166,15 @@ def _flat(entry: Mapping[str, Any]) -> dict[str, object]:
 
 def _pose_key(data: Mapping[str, Any]) -> str:
     """The only key of poses."""
-    keys = [key for key in data if key in _KEYS] or [k for k, v in data.items() if _has_shape(v)]
+    keys = [key for key in data if key in _KEYS]
+    for key in () if keys else data:
+        with suppress(ValueError):  # ragged
+            shape = np.shape(data[key])
+            table = len(shape) == 2 and shape[1] in _WIDTHS
+            keys += [key] if table or shape[-2:] in ((4, 4), (3, 4)) else []
     if len(keys) != 1:
         raise ValueError(
             f"{' and '.join(keys) or 'none'} of its keys ({', '.join(data)}) may hold the poses;"
             f" call the right one 'poses'"
         )
     return keys[0]
-
-
-def _has_shape(values: Any) -> bool:
-    """Whether lists have the shape of matrices or of rows of poses."""
-    try:
-        shape = np.shape(values)
-    except ValueError:
-        return False
-    return shape[-2:] in ((4, 4), (3, 4)) or (len(shape) == 2 and shape[1] in _WIDTHS)

@@ -81,19 +81,21 @@ def table_cells(lines: Sequence[str]) -> NDArray[np.str_]:
     """
     import pandas as pd
 
-    lines = [line.strip(" \r\n") for line in lines if line.strip()]
-    separator = next((s for s in (";", ",", "\t") if lines and s in lines[0]), r"\s+")
-    text, options = io.StringIO("\n".join(lines)), {"header": None, "keep_default_na": False}
+    first = next((line for line in lines if line.strip()), "")
+    separator = next((s for s in (";", ",", "\t") if s in first), " ")
+    # Empty cells at the end of a line are missing cells.
+    text = io.StringIO("\n".join(line.lstrip(" ").rstrip(f" \r\n{separator}") for line in lines))
+    sep = r"\s+" if separator == " " else separator
+    options = {"header": None, "keep_default_na": False, "skipinitialspace": True}
     try:
-        table = pd.read_csv(text, sep=separator, dtype=str, skipinitialspace=True, **options)
+        table = pd.read_csv(text, sep=sep, dtype=str, **options)
     except pd.errors.EmptyDataError:
         return np.empty((0, 0), dtype=np.str_)
     except pd.errors.ParserError as error:
         raise ValueError(f"no table: {str(error).strip().rpartition('error: ')[2]}") from None
     if separator == ";":
         table = table.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
-    cells = np.char.strip(table.to_numpy(dtype=np.str_))
-    return cells[:, :-1] if (cells[:, -1] == "").all() else cells  # a separator ends each line
+    return np.char.strip(table.to_numpy(dtype=np.str_))
 
 
 def cell_numbers(cells: NDArray[np.str_], words: Sequence[str] = ()) -> Array:
