@@ -203,7 +203,7 @@ def _matrix(fields: Mapping[str, Any], data: Mapping[str, Any]) -> np.ndarray:
 
 
 def _distortion(fields: Mapping[str, Any], data: Mapping[str, Any], ros: bool) -> list[float]:
-    """Distortion coefficients; none in files that have no such field, unless they are of ROS."""
+    """Distortion coefficients, empty if a file has no such field; ROS files must have it."""
     name = "distortion_coefficients"
     if name in fields:
         numbers = _numbers(fields[name], name)

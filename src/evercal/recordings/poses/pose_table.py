@@ -162,7 +162,7 @@ def plain_numbers(numbers: Array, given: PoseConvention | None, names: Names = N
     """Matrices (n, 4, 4) or (n, 3, 4), or numbers (n, k) or with stamps (n, 1 + k).
 
     Raises:
-        ValueError: They do not fit the convention, or none is given and they do not define it.
+        ValueError: The numbers do not fit the convention, or a convention is required.
     """
     if numbers.ndim != 2:
         given = given or pose_convention("matrix")
@@ -221,7 +221,7 @@ def _without_brackets(
 
 
 def _is_header(words: Sequence[str]) -> bool:
-    """Whether the cells of a line are names of columns, of which some may be numbers."""
+    """Whether a line names columns; some names may be numbers."""
     numbers = [is_number(word) for word in words]
     return not all(numbers) and (not any(numbers) or bool(_groups(words)))
 

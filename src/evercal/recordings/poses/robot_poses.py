@@ -57,7 +57,7 @@ class RobotPoses:
     numbers: NDArray[np.float64] | None = None
     """(n, k) numbers of the file, to be read by `poses_from_numbers`."""
     convention: PoseConvention | None = None
-    """Convention of the numbers. Both are None if keys of the file state the poses themselves."""
+    """Convention of the numbers; numbers and convention are None for JSON's quaternion_wxyz."""
 
     def __len__(self) -> int:
         """Number of poses."""

@@ -124,7 +124,9 @@ def name_and_unit(cell: str) -> tuple[str, str | None]:
 def row_labels(
     words: Sequence[str], columns: Sequence[Sequence[object]], count: int, plural: bool = False
 ) -> tuple[tuple[str, ...] | None, Array | None, list[int]]:
-    """Image names and seconds of `count` rows, or None, and indices of the other columns.
+    """Image names, seconds and indices of the other columns of `count` rows.
+
+    Names and seconds are None if there is no such column.
 
     Raises:
         ValueError: A column is incomplete, a time is no number, or the columns are ambiguous.
