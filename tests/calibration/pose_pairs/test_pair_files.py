@@ -7,6 +7,7 @@ import pytest
 
 from evercal.calibration.pose_pairs.pair_files import PairFiles, read_pairs
 from evercal.errors import InputError
+from evercal.geometry import SE3, pose_distance
 
 
 def write(file: Path, names: list[str]) -> Path:
@@ -40,3 +41,20 @@ def test_messages_name_the_file_and_its_option(tmp_path: Path, role: str) -> Non
     broken.unlink()
     with pytest.raises(InputError, match=f"file of {role} poses is missing; check --{role}-poses"):
         read_pairs(PairFiles(robot, camera))
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_opengl_flips_the_side_of_the_camera(tmp_path: Path, inverted: bool) -> None:
+    rng = np.random.default_rng(2)
+    camera_from_board = SE3(rng.normal(size=(3, 4)), rng.uniform(0.2, 0.8, (3, 3)))
+    stated = np.diag([1.0, -1.0, -1.0, 1.0]) @ camera_from_board.matrix()
+    np.save(tmp_path / "camera.npy", np.linalg.inv(stated) if inverted else stated)
+    robot = write(tmp_path / "robot.csv", ["1", "2", "3"])
+    files = PairFiles(
+        robot,
+        tmp_path / "camera.npy",
+        camera_convention="matrix:opengl",
+        invert="camera" if inverted else None,
+    )
+    pairs, _ = read_pairs(files)
+    assert np.max(pose_distance(pairs.camera_from_board, camera_from_board)) < 1e-12

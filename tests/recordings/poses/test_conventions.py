@@ -41,6 +41,7 @@ DEGREE = math.pi / 180
 ROTATIONS: dict[str, Callable[..., Array]] = {
     "wxyz": of_quaternion,
     "xyzw": lambda x, y, z, w: of_quaternion(w, x, y, z),
+    "tum": lambda x, y, z, w: of_quaternion(w, x, y, z),
     "abb": of_quaternion,
     "ur": of_vector,
     "rpy": fixed_xyz(1.0),
@@ -76,7 +77,7 @@ names = st.sampled_from(sorted(CONVENTIONS))
 def test_read_poses_agree_with_their_numbers(name: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     convention = CONVENTIONS[name]
-    rotation = rng.normal(size=convention.count - 3)
+    rotation = rng.normal(size=convention.counts[-1] - 3)
     if convention.has_angles:
         rotation *= 90 if convention.degrees else 1.5
     else:
@@ -132,9 +133,9 @@ def test_quaternions_are_written_with_positive_w() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("euler", "is not known; use one of wxyz, xyzw"),
-        ("kuka:cm", "modifier 'cm' is not known"),
-        ("wxyz:deg", "has no angles"),
+        ("euler", "is not known; give the convention NAME, one of wxyz"),
+        ("kuka:cm", "'cm' is not one of m, mm, rad, deg, inv"),
+        ("wxyz:deg", "'deg' is not one of m, mm, inverse, opengl"),
         ("kuka:m:mm", "repeats a modifier"),
         ("kuka:deg:rad", "repeats a modifier"),
         ("matrix:inverse:inverse", "repeats a modifier"),
@@ -158,10 +159,10 @@ def rows(name: str) -> Array:
         ("wxyz:mm", "wxyz", "look like millimetres; give --robot-convention wxyz:mm"),
         ("matrix:mm", "matrix", "look like millimetres; give --robot-convention matrix:mm"),
         ("franka:mm", "franka:inverse", "give --robot-convention franka:inverse:mm"),
-        ("kuka:m", "kuka", "looks like metres; give --robot-convention kuka:m"),
-        ("rpy:deg", "rpy", "looks like degrees; give --robot-convention rpy:deg"),
-        ("ur:deg", "ur", "looks like degrees; give --robot-convention ur:deg"),
-        ("fanuc:rad", "fanuc", "looks like radians; give --robot-convention fanuc:rad"),
+        ("kuka:m", "kuka", "look like metres; give --robot-convention kuka:m"),
+        ("rpy:deg", "rpy", "look like degrees; give --robot-convention rpy:deg"),
+        ("ur:deg", "ur", "look like degrees; give --robot-convention ur:deg"),
+        ("fanuc:rad", "fanuc", "look like radians; give --robot-convention fanuc:rad"),
     ],
 )
 def test_other_units_are_refused_unless_stated(written: str, read: str, remedy: str) -> None:

@@ -95,10 +95,11 @@ def feature_poses(
     try:
         if options.pose_convention is not None:
             convention = pose_convention(options.pose_convention)
-            numbers = values[:, : convention.count]
-            if convention.count < count:
-                used = f" ({', '.join(names[: convention.count])})" if names else ""
-                notes = [f"the first {convention.count} of its {count} numbers were taken{used}"]
+            taken = convention.counts[-1]
+            numbers = values[:, :taken]
+            if taken < count:
+                used = f" ({', '.join(names[:taken])})" if names else ""
+                notes = [f"the first {taken} of its {count} numbers were taken{used}"]
         elif len(names) != count:
             raise ValueError(f"has {count} numbers and {len(names)} names")
         else:
