@@ -20,6 +20,7 @@ from evercal.geometry import SE3, Camera
 
 Array = NDArray[np.floating]
 
+
 @dataclass(frozen=True, eq=False)
 class BoardCorners:
     """Board corners of the images of pose pairs."""

@@ -56,6 +56,7 @@ _LONG_M = 0.4
 """Distance of a camera or board from its gripper above which a reading is suspect."""
 _FITTED = 30
 """Number of rotation readings to fit, sorted by their agreement of angles."""
+_LENGTHS = {1.0: "m", 0.001: "mm"}
 _FLIP = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
 _CAUSES = (
     "check that each row belongs to its image, that the robot stood still, which frames the poses"
@@ -249,13 +250,13 @@ def _other_conventions(pairs: PosePairs, every: bool) -> Iterator[tuple[str, Pos
     found: list[tuple[float, int, str, PosePairs]] = []
     for name, part in {"robot": "base_from_gripper", "camera": "camera_from_board"}.items():
         poses, other = (robot, camera) if name == "robot" else (camera, robot)
-        for used, numbers in _numbers(poses, getattr(pairs, f"{name}_numbers")):
-            for meant, corrected in _reread(used, numbers):
+        for given in _numbers(poses, getattr(pairs, f"{name}_numbers")):
+            for meant, corrected in _reread(given):
                 mismatch = mismatch_rad(corrected, other)
                 if mismatch > limit and not every:
                     continue
                 message = (
-                    f"the {name} poses look read as {used}, but written as {' or '.join(meant)}"
+                    f"the {name} poses look read as {given.convention.name}, but written as {' or '.join(meant)}"
                     f" ({pose_convention(meant[0]).meaning}); give --{name}-convention {meant[0]}"
                 )
                 changed = replace(pairs, **{part: corrected})
@@ -264,34 +265,34 @@ def _other_conventions(pairs: PosePairs, every: bool) -> Iterator[tuple[str, Pos
     yield from ((message, changed) for _, _, message, changed in found[:_FITTED])
 
 
-def _numbers(poses: SE3, given: PoseNumbers | None) -> Iterator[tuple[str, Array]]:
-    """Yield the convention and the numbers of a file, or the likely ones of bare poses."""
+def _numbers(poses: SE3, given: PoseNumbers | None) -> Iterator[PoseNumbers]:
+    """Yield the numbers of a file, or of bare poses in the likely conventions."""
     if given is not None:
-        yield given.convention, given.numbers
+        yield given
         return
-    for name in ("wxyz", "xyzw", "rpy", "ur", "staubli", "kuka"):
-        used = f"{name}:m" if name in ("staubli", "kuka") else name
-        yield used, numbers_from_poses(poses, pose_convention(used))
+    for name in ("wxyz", "xyzw", "rpy", "ur", "staubli:m", "kuka:m"):
+        used = pose_convention(name)
+        yield PoseNumbers(numbers_from_poses(poses, used), used)
 
 
-def _reread(used: str, numbers: Array) -> list[tuple[list[str], SE3]]:
+def _reread(given: PoseNumbers) -> list[tuple[list[str], SE3]]:
     """Return the poses by each other convention of the same count and unit of length, with the
-    shortest names of that convention."""
-    convention, found = pose_convention(used), dict[bytes, tuple[list[str], SE3]]()
-    kept = [word for word in ("inverse", "opengl") if f":{word}" in used]
-    length = "m" if convention.metres_per_unit == 1.0 else "mm"
+    shortest names of that convention.
+    """
+    found: dict[bytes, tuple[list[str], SE3]] = {}
+    used = given.convention
+    kept = [word for word in ("inverse", "opengl") if used.has(word)]
     for name, other in CONVENTIONS.items():
-        if other.count != convention.count:
+        if given.numbers.shape[1] not in other.counts or name == "tum":
             continue
-        for angle in ("rad", "deg") if other.has_angles else ("",):
-            units = [
-                unit
-                for unit in (length, angle)
-                if unit and _units(f"{name}:{unit}") != _units(name)
-            ]
-            meant = ":".join([name, *units, *kept])
+        length = (
+            "" if other.metres_per_unit == used.metres_per_unit else _LENGTHS[used.metres_per_unit]
+        )
+        for angle in ("", "deg" if not other.degrees else "rad") if other.has_angles else ("",):
+            meant = ":".join(filter(None, (name, length, angle, *kept)))
             try:
-                corrected = poses_from_numbers(numbers, pose_convention(meant))
+                convention = pose_convention(meant)
+                corrected = poses_from_numbers(given.numbers, convention, given.camera_from)
             except ValueError:  # no rotations in that convention
                 continue
             key = np.abs(corrected.rotation_wxyz).round(6).tobytes()
@@ -300,11 +301,6 @@ def _reread(used: str, numbers: Array) -> list[tuple[list[str], SE3]]:
         fewest = min(name.count(":") for name in names)
         names[:] = [name for name in names if name.count(":") == fewest]
     return list(found.values())
-
-
-def _units(name: str) -> tuple[float, bool]:
-    convention = pose_convention(name)
-    return convention.metres_per_unit, convention.degrees
 
 
 def mismatch_rad(robot: SE3, camera: SE3) -> float:

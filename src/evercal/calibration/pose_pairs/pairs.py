@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation
 from evercal.geometry import SE3, pose_distance
+from evercal.recordings.poses.conventions import PoseConvention
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -25,8 +26,10 @@ class PoseNumbers:
 
     numbers: Array
     """(n, k)."""
-    convention: str
-    """Name of the convention in which they were read."""
+    convention: PoseConvention
+    """Convention in which they were read."""
+    camera_from: bool = False
+    """Whether the camera's frame is the first of the pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +89,7 @@ class PosePairs:
         keys += [*_canonical(self.base_from_gripper).T, *_canonical(self.camera_from_board).T]
         return np.lexsort(keys[::-1])
 
-    def distinct(
-        self, scale_known: bool = True
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def distinct(self, scale_known: bool = True) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return sorted indices of different pairs, and (n,) the first equal pair of every pair."""
         order = self.order()
         first = np.empty(len(self), dtype=np.int64)

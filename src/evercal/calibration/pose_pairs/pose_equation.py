@@ -153,8 +153,8 @@ class PoseEquation:
     base_is_fixed: bool = True
     """Whether `fixed` is the robot base and `parent` the gripper, not the reverse."""
     velocity: Array | None = None
-    """(n, 6) velocity of the parent in the frame `fixed`, m/s and rad/s; the last extra is then the
-    time to add to a camera stamp."""
+    """(n, 6) velocity of the parent in the frame `fixed`, m/s and rad/s; required for the extra
+    `clock`, which is the last: the time to add to a camera stamp."""
 
     def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Self:
         """Return a subset of the poses."""
@@ -178,6 +178,11 @@ class PoseEquation:
         """Number of unknowns."""
         return 12 + len(self.extras.names)
 
+    @property
+    def _is_timed(self) -> bool:
+        """Whether the last extra is a time offset."""
+        return "clock" in self.extras.groups
+
     def residuals(self, at: Unknowns) -> Array:
         """Return (n, 6) differences between the board pose by each image and the estimate."""
         return self._evaluated(at)[0]
@@ -196,7 +201,7 @@ class PoseEquation:
         rotation = Rotation.from_matrix(difference, assume_valid=True).as_rotvec()
         moved = lever + self.robot_translation - at.translations[1]
         residual = np.concatenate([moved, rotation], 1)
-        if self.velocity is not None and at.extras[-1]:
+        if self._is_timed and at.extras[-1]:
             residual = residual + at.extras[-1] * self._by_time(lever, rotation)
         return residual, fixed_from_camera, board, turned
 
@@ -219,7 +224,7 @@ class PoseEquation:
         by_camera = np.zeros((n, 6, 6))
         by_camera[:, :3, :3], by_camera[:, 3:, 3:] = fixed_from_camera, fixed_from_camera @ turned
         jacobian[:, :, 12:] = by_camera @ self.extras.slopes
-        if self.velocity is not None:
+        if self._is_timed:
             lever = (fixed_from_camera @ board[..., None])[..., 0]
             lever = lever + self.robot_rotation @ at.translations[0]
             jacobian[:, :, -1] = self._by_time(lever, residual[:, 3:])

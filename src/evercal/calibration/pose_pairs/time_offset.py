@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.calibration import Calibration, Mount
-from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.measured import BoardCorners
+from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve_pairs
 from evercal.errors import InputError
 from evercal.geometry import SE3
