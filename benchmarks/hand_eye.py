@@ -72,7 +72,7 @@ def recording(setting: Setting, seed: int) -> SimulatedPairs:
     camera_in, board_in = (pose(Rotation.random(rng=rng), shift) for shift in shifts)
     fixed_from_parent = robot if on_arm else robot.inverse()
     camera = camera_in.inverse() @ fixed_from_parent.inverse() @ board_in
-    if setting.path == "table":  # the camera looks at the board
+    if setting.path == "table" or not on_arm:  # the camera looks at the board
         middle = camera.translation_m.mean(0)
         turn = pose(Rotation.align_vectors([[0, 0, 1]], [middle])[0], np.zeros(3))
         camera, camera_in = turn @ camera, camera_in @ turn.inverse()

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.stats import chi2, f
-
 from evercal.calibration.pose_pairs.noise_levels import (
     Gain,
     NoiseLevels,
@@ -11,6 +9,7 @@ from evercal.calibration.pose_pairs.noise_levels import (
     estimate_levels,
     working_noise,
 )
+from scipy.stats import chi2, f
 
 
 def mean_of(n: int) -> np.ndarray:

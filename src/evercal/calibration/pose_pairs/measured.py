@@ -35,6 +35,8 @@ class BoardCorners:
     stated: bool = False
     """Whether the intrinsics are stated, for example by the maker; else they were estimated from
     these corners."""
+    size_m: float | None = None
+    """Stated side of a square, or of a tag, for messages."""
 
     @property
     def prior(self) -> LensPrior:

@@ -36,22 +36,25 @@ SUSPECT_M, SUSPECT_RAD = 0.01, np.deg2rad(1.0)
 """Residuals above which other readings are tested."""
 HOPELESS_M, HOPELESS_RAD = 0.05, np.deg2rad(3.0)
 """Residuals above which the pairs are refused."""
+_EXACT = 1e-5
+"""Residual, metres or radians, that is not improved."""
 _BETTER = 3.0
 """Factor by which another reading must reduce the residuals of translation or rotation."""
 _SPOILT = 1.2
 """Largest factor by which it may enlarge the others."""
 _NEAR_M, _FAR_M, _SPREAD = 0.1, 0.7, 0.8
-"""Usual distances of a camera or board from the gripper that carries it, and from the base; standard
-deviation of their logarithms."""
+"""Usual distances of a camera or board from the gripper that carries it, and from the base;
+standard deviation of their logarithms."""
 _FIELD_RAD, _ANYWHERE = np.deg2rad(22.0), 0.03
 """Usual angle between board and optical axis; share of images with any angle."""
 _IMAGES = 4.0
 """Number of independent images: all look in similar directions."""
 _CLEARLY = 4.0
 """Logarithm of the likelihood ratio at which another reading is more plausible."""
-_MOST, _SOME = 0.9, 0.5
-"""Share of images that show the board ahead of the camera, if the reading is right; below the second
-one a reading is suspect."""
+_MOST = 0.9
+"""Share of images that show the board ahead of the camera, if a reading is right."""
+_COHERENT = 0.8
+"""Length of the mean of directions above which they are similar in all images."""
 _LONG_M = 0.4
 """Distance of a camera or board from its gripper above which a reading is suspect."""
 _FITTED = 30
@@ -152,12 +155,14 @@ def _require_plausible(pairs: PosePairs, mount: Mount, fit: Agreement) -> None:
         ),
     )
     message, best, seen = max(others, key=lambda other: other[1])
-    ahead = _ahead(camera)
+    rays = camera.translation_m / np.linalg.norm(camera.translation_m, axis=1)[:, None].clip(1e-9)
+    behind = (rays[:, 2] < 0).mean() > _MOST
+    beside = _ahead(camera) < 1 - _MOST / 2 and np.linalg.norm(rays.mean(0)) > _COHERENT
     carried = x if mount == "eye_in_hand" else z
-    odd = ahead < _SOME or np.linalg.norm(carried.translation_m) > _LONG_M
+    odd = behind or beside or np.linalg.norm(carried.translation_m) > _LONG_M
     if odd and best > given + _CLEARLY and _ahead(seen) > _MOST:
         raise InputError(message)
-    if (camera.translation_m[:, 2] < 0).mean() > _MOST:
+    if behind:
         raise InputError(
             "the board is behind the camera: camera poses are camera_from_board, with OpenCV's axes"
             " (z forward); see --camera-convention and --invert"
@@ -172,8 +177,8 @@ def _ahead(camera_from_board: SE3) -> float:
 
 def _clearly_better(other: Agreement, fit: Agreement) -> bool:
     """Whether a reading improves translation or rotation by far, and spoils neither."""
-    metres = max(other.metres, 1e-7) / max(fit.metres, 1e-7)
-    radians = max(other.radians, 1e-7) / max(fit.radians, 1e-7)
+    metres = max(other.metres, _EXACT) / max(fit.metres, _EXACT)
+    radians = max(other.radians, _EXACT) / max(fit.radians, _EXACT)
     return min(metres, radians) * _BETTER < 1 and max(metres, radians) < _SPOILT
 
 
@@ -256,8 +261,9 @@ def _other_conventions(pairs: PosePairs, every: bool) -> Iterator[tuple[str, Pos
                 if mismatch > limit and not every:
                     continue
                 message = (
-                    f"the {name} poses look read as {given.convention.name}, but written as {' or '.join(meant)}"
-                    f" ({pose_convention(meant[0]).meaning}); give --{name}-convention {meant[0]}"
+                    f"the {name} poses look written as {' or '.join(meant)} and read as"
+                    f" {given.convention.name}; give --{name}-convention {meant[0]}"
+                    f" ({CONVENTIONS[pose_convention(meant[0]).base].meaning})"
                 )
                 changed = replace(pairs, **{part: corrected})
                 found.append((round(np.rad2deg(mismatch), 1), len(found), message, changed))
@@ -276,8 +282,9 @@ def _numbers(poses: SE3, given: PoseNumbers | None) -> Iterator[PoseNumbers]:
 
 
 def _reread(given: PoseNumbers) -> list[tuple[list[str], SE3]]:
-    """Return the poses by each other convention of the same count and unit of length, with the
-    shortest names of that convention.
+    """Return the poses by other conventions of the same count and unit of length, and their names.
+
+    Of several names of one convention the shortest are given.
     """
     found: dict[bytes, tuple[list[str], SE3]] = {}
     used = given.convention

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from evercal.calibration.boards.board_poses import FORMAT, BoardPoses, read_board_poses
 from evercal.calibration.pose_pairs.measured import BoardCorners
-from evercal.calibration.pose_pairs.pairs import PosePairs
+from evercal.calibration.pose_pairs.pairs import PoseNumbers, PosePairs
 from evercal.calibration.pose_pairs.time_offset import CameraTrack, interpolated_pairs
 from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.recordings.poses.conventions import PoseConvention
 from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, times_in_names, without_ending
@@ -47,6 +48,11 @@ class _CameraPoses:
     """(n,) poses, or None if the image shows no board."""
     board: BoardPoses | None
     """The file of `evercal detect`."""
+    numbers: NDArray[np.float64] | None = None
+    """(n, k) numbers of a table."""
+    convention: PoseConvention | None = None
+    camera_from: bool = True
+    """Whether the camera's frame is the first of a pose of the table."""
 
     def rows(self) -> tuple[str, ...]:
         """Return the image names, or the row numbers of a file without names."""
@@ -85,6 +91,8 @@ def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
         tuple(names[i] for i in paired),
         robot.poses[np.array([rows[i] for i in paired], dtype=np.int64)],
         SE3.stack([pose for i in paired if (pose := camera.poses[i]) is not None]),
+        robot_numbers=_numbers(robot.numbers, robot.convention, [rows[i] or 0 for i in paired]),
+        camera_numbers=_numbers(camera.numbers, camera.convention, paired, camera.camera_from),
     )
     return pairs, _corners(camera.board, paired)
 
@@ -105,8 +113,29 @@ def read_streams(files: PairFiles) -> tuple[PoseTrack, CameraTrack]:
 def _read_robot(files: PairFiles) -> RobotPoses:
     robot = _read_poses(files.robot, "robot", files.robot_convention)
     if files.invert in ("robot", "both"):
-        robot = replace(robot, poses=robot.poses.inverse())
+        convention = _inverted(robot.convention)
+        robot = replace(robot, poses=robot.poses.inverse(), convention=convention)
     return robot
+
+
+def _inverted(convention: PoseConvention | None) -> PoseConvention | None:
+    """Return the convention of the same numbers that states the inverse."""
+    if convention is None:
+        return None
+    words = convention.name.split(":")
+    words = [w for w in words if w != "inverse"] if "inverse" in words else [*words, "inverse"]
+    return replace(convention, name=":".join(words))
+
+
+def _numbers(
+    numbers: NDArray[np.float64] | None,
+    convention: PoseConvention | None,
+    rows: list[int],
+    camera_from: bool = False,
+) -> PoseNumbers | None:
+    if numbers is None or convention is None:
+        return None
+    return PoseNumbers(numbers[rows], convention, camera_from)
 
 
 def _read_camera(files: PairFiles) -> _CameraPoses:
@@ -124,10 +153,14 @@ def _read_camera(files: PairFiles) -> _CameraPoses:
         stamps = table.stamps_s
         if stamps is None and table.names is not None:
             stamps = times_in_names(table.names)
-        camera = _CameraPoses(table.names, stamps, list(table.poses), None)
+        poses, numbers = list(table.poses), table.numbers
+        camera = _CameraPoses(
+            table.names, stamps, poses, None, numbers, table.convention, camera_from
+        )
     if files.invert not in ("camera", "both"):
         return camera
-    return replace(camera, poses=[p if p is None else p.inverse() for p in camera.poses])
+    inverse = [p if p is None else p.inverse() for p in camera.poses]
+    return replace(camera, poses=inverse, convention=_inverted(camera.convention), camera_from=True)
 
 
 def _read_poses(
@@ -191,4 +224,5 @@ def _corners(board: BoardPoses | None, rows: list[int]) -> BoardCorners | None:
         return None
     views = tuple(view for i in rows if (view := board.images[i].view) is not None)
     stated = board.camera_from == "file"
-    return BoardCorners(board.camera, views, board.board.half_turn, stated)
+    printed = board.board
+    return BoardCorners(board.camera, views, printed.half_turn, stated, printed.size_m)

@@ -238,8 +238,10 @@ def solve_pairs(
         lens = measured(corners, corners.camera, pairs.camera_from_board)
         pairs = lens.applied_to(pairs)
         start, scale = quick_fit(pairs[rows], mount, scale_known)
-        corrected = _other_board_poses(pairs, corners, lens, rows, start, mount, scale)
-        lens = measured(corners, corners.camera, corrected)
+        robot = pairs[rows].base_from_gripper
+        predicted = _predicted(robot if mount == "eye_in_hand" else robot.inverse(), start, scale)
+        corners, poses = _other_board_poses(corners, lens, rows, ~start.inliers, predicted)
+        lens = measured(corners, corners.camera, poses)
     at = _in_the_middle(start.at, _middle(corners))
     for _ in range(_MOST_LENSES):
         equation, pairs = _equation(pairs, mount, scale, scale_known, corners, lens)
@@ -314,14 +316,15 @@ def _with_tested_size(
     off, sigma = float(freed.at.extras[k]), float(freed.sigma[12 + k])
     if not (abs(off) > max(_SIZE_SIGMAS * sigma, _SIZE_SIGMA) and sigma < _SCALE_SIGMA):
         return equation, fit, []
-    what = "lengths from the camera"
-    if corners is not None:
-        what = "the board"
+    stated = None if corners is None else corners.size_m
+    size = f"a square or tag of 24 mm would measure {24 * (1 + off):.2f} mm"
+    if stated is not None:
+        size = f"its side measures {1000 * stated * (1 + off):.2f} mm, not {1000 * stated:.2f} mm"
     warning = (
-        f"{what} must be {100 * off:+.2f} +- {100 * sigma:.2f} % larger to fit the robot's motions"
-        f" ({abs(off) / sigma:.0f} standard deviations): a square or tag of 24 mm would measure"
-        f" {24 * (1 + off):.2f} mm; check its size and the focal length. The calibration uses the"
-        f" estimated size"
+        f"the board is {100 * abs(off):.2f} +- {100 * sigma:.2f} %"
+        f" {'larger' if off > 0 else 'smaller'} than stated, by the robot's motions"
+        f" ({abs(off) / sigma:.0f} standard deviations): {size}; check its size and the focal"
+        f" length. The calibration uses the estimated size"
     )
     return free, freed, [warning]
 
@@ -370,36 +373,37 @@ def _group(equation: PoseEquation, name: str) -> NDArray[np.int64]:
     return np.flatnonzero([group == name for group in equation.extras.groups])
 
 
+def _predicted(fixed_from_parent: SE3, start: Agreement, scale: float) -> SE3:
+    """Return camera_from_board by the other poses, in the camera's unit of length."""
+    at = start.at
+    poses = (fixed_from_parent @ at.parent_from_camera).inverse() @ at.fixed_from_board
+    return SE3(poses.rotation_wxyz, poses.translation_m / scale)
+
+
 def _other_board_poses(
-    pairs: PosePairs,
     corners: BoardCorners,
     lens: Measured,
     rows: NDArray[np.int64],
-    start: Agreement,
-    mount: Mount,
-    scale: float,
-) -> SE3:
-    """Fit the board pose of each outlier again, starting from the pose that the others predict.
+    outliers: NDArray[np.bool_],
+    predicted: SE3,
+) -> tuple[BoardCorners, SE3]:
+    """Fit the board pose of each outlier again, starting from the predicted pose.
 
     A flat board has two similar poses, and the corners of a symmetric board may be in reverse
     order.
     """
-    at, poses = start.at, list(pairs.camera_from_board)
-    robot = pairs[rows].base_from_gripper
-    robot = robot if mount == "eye_in_hand" else robot.inverse()
-    predicted = (robot @ at.parent_from_camera).inverse() @ at.fixed_from_board
-    predicted = SE3(predicted.rotation_wxyz, predicted.translation_m / scale)
-    for row in np.flatnonzero(~start.inliers):
+    views, poses = list(corners.views), [pose.camera_from_board for pose in lens.poses]
+    for row in np.flatnonzero(outliers):
         i = int(rows[row])
         view, old = corners.views[i], lens.poses[i]
-        views = [view]
+        candidates = [view]
         if corners.half_turn:
-            views.append(BoardView(view.points_m, view.pixels[::-1]))
-        for candidate in views:
+            candidates.append(BoardView(view.points_m, view.pixels[::-1]))
+        for candidate in candidates:
             pose = board_pose(candidate, lens.camera, predicted[row])
             if pose.squared_px < 4 * old.squared_px + 0.1 * old.corners:
-                poses[i] = pose.camera_from_board
-    return SE3.stack(poses)
+                views[i], poses[i] = candidate, pose.camera_from_board
+    return replace(corners, views=tuple(views)), SE3.stack(poses)
 
 
 def _require_determined(
