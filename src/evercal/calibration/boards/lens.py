@@ -20,6 +20,8 @@ LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _USUAL_CENTRE, _USUAL_ASPECT = 0.1, 0.02
 """Standard deviations of the principal point from the middle of the image, in widths, and of the
 ratio of both focal lengths from one."""
+_ROUGH_FOCAL = 0.5
+"""Relative standard deviation of a rough focal length."""
 _USUAL_DISTORTION = (0.3, 0.5, 2e-3, 2e-3, 0.5, 0.1, 0.1, 0.1)
 _STATED = 0.005
 """Standard deviation of a stated focal length and principal point, relative to the focal length."""
@@ -44,11 +46,12 @@ class LensPrior(NamedTuple):
     def usual(cls, camera: Camera) -> "LensPrior":
         """Prior of an unknown lens; `camera` gives image size and a rough focal length."""
         mean = np.zeros(len(lens_vector(camera)))
+        mean[:2] = camera.fx
         mean[2:4] = (camera.width - 1) / 2, (camera.height - 1) / 2
         sigma = np.r_[np.full(4, _USUAL_CENTRE * camera.width), _USUAL_DISTORTION][: len(mean)]
         information = np.diag(sigma**-2.0)
         aspect = np.array([[1.0, -1.0], [-1.0, 1.0]]) / (_USUAL_ASPECT * camera.fx) ** 2
-        information[:2, :2] = aspect
+        information[:2, :2] = aspect + np.eye(2) / (_ROUGH_FOCAL * camera.fx) ** 2
         return cls(mean, information)
 
 

@@ -224,6 +224,7 @@ class PoseEquation:
         by_camera = np.zeros((n, 6, 6))
         by_camera[:, :3, :3], by_camera[:, 3:, 3:] = fixed_from_camera, fixed_from_camera @ turned
         jacobian[:, :, 12:] = by_camera @ self.extras.slopes
+        jacobian[:, 3:, 12:] = slope @ jacobian[:, 3:, 12:]
         if self._is_timed:
             lever = (fixed_from_camera @ board[..., None])[..., 0]
             lever = lever + self.robot_rotation @ at.translations[0]

@@ -242,23 +242,9 @@ def solve_pairs(
         predicted = _predicted(robot if mount == "eye_in_hand" else robot.inverse(), start, scale)
         corners, poses = _other_board_poses(corners, lens, rows, ~start.inliers, predicted)
         lens = measured(corners, corners.camera, poses)
-    at = _in_the_middle(start.at, _middle(corners))
-    for _ in range(_MOST_LENSES):
-        equation, pairs = _equation(pairs, mount, scale, scale_known, corners, lens)
-        begin = agreement(equation[rows], _with_extras(at, equation))
-        fit = robust_fit(equation[rows], begin)
-        if corners is None or lens is None:
-            break
-        group = _group(equation, "intrinsics")
-        change, at = fit.at.extras[group], fit.at
-        if change @ equation.extras.information[np.ix_(group, group)] @ change < _SAME_LENS:
-            break
-        try:
-            camera = moved_camera(lens.camera, change)
-        except ValueError:
-            break
-        lens = measured(corners, camera, pairs.camera_from_board)
-    equation, warnings = equation[rows], []
+    problem = _Problem(mount, scale, scale_known, corners)
+    equation, fit, lens = problem.fitted(pairs, rows, start.at, lens)
+    warnings: list[str] = []
     if scale_known:
         equation, fit, warnings = _with_tested_size(equation, fit, corners)
     warnings += _lens_warnings(fit, equation, corners, lens)
@@ -268,39 +254,68 @@ def solve_pairs(
     )
 
 
-def _equation(
-    pairs: PosePairs,
-    mount: Mount,
-    scale: float,
-    scale_known: bool,
-    corners: BoardCorners | None,
-    lens: Measured | None,
-) -> tuple[PoseEquation, PosePairs]:
-    """Return the equation with all extras, about the middle of the board, and its pairs."""
-    if lens is not None:
-        pairs = lens.applied_to(pairs)
-    extras = Extras.nothing(len(pairs))
-    if corners is not None and lens is not None:
-        extras = lens.extras(corners.prior)
-    # The board's origin is a convention; noise about its middle is the same in any other.
-    middle = _middle(corners)
-    lever = np.broadcast_to(np.eye(6), (len(pairs), 6, 6)).copy()
-    lever[:, :3, 3:] = -pairs.camera_from_board.rotation_matrix() @ cross_matrix(middle)
-    lever[:, :3] *= scale
-    extras = replace(extras, slopes=lever @ extras.slopes)
-    about = replace(pairs, camera_from_board=pairs.camera_from_board @ _shift(middle)).scaled(scale)
-    if pairs.camera_covariance is not None:
-        spread = lever @ pairs.camera_covariance @ lever.transpose(0, 2, 1)
-        about = replace(about, camera_covariance=spread)
-    length = about.camera_from_board.translation_m
-    if lens is None and scale_known:
-        depth = np.pad(length[:, 2:], ((0, 0), (2, 3)))
-        extras = extras.with_one("shared depth", depth, _SIZE_SIGMA)
-    size = np.pad(length, ((0, 0), (0, 3)))
-    extras = extras.with_one("size", size, _SIZE_SIGMA if scale_known else np.inf)
-    if pairs.velocity is not None:
-        extras = extras.with_one("clock", np.zeros((len(pairs), 6)), np.inf)
-    return about.equation(mount, extras), pairs
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What is known of the pairs besides their poses."""
+
+    mount: Mount
+    scale: float
+    """Metres per unit of the camera's lengths, roughly if it is unknown."""
+    scale_known: bool
+    corners: BoardCorners | None
+
+    def fitted(
+        self, pairs: PosePairs, rows: NDArray[np.int64], start: Unknowns, lens: Measured | None
+    ) -> tuple[PoseEquation, HandEyeFit, Measured | None]:
+        """Fit all unknowns; with corners, until the intrinsics no longer change."""
+        at = _in_the_middle(start, _middle(self.corners))
+        for _ in range(_MOST_LENSES):
+            equation = self.equation(pairs, lens)[rows]
+            at = replace(at, extras=np.zeros(len(equation.extras.names)))
+            fit = robust_fit(equation, agreement(equation, at))
+            if self.corners is None or lens is None:
+                return equation, fit, None
+            group, at = _group(equation, "intrinsics"), fit.at
+            change = at.extras[group]
+            information = equation.extras.information[np.ix_(group, group)]
+            if change @ information @ change < _SAME_LENS:
+                return equation, fit, lens
+            try:
+                camera = moved_camera(lens.camera, change)
+            except ValueError:
+                break
+            poses = SE3.stack([pose.camera_from_board for pose in lens.poses])
+            lens = measured(self.corners, camera, poses)
+        raise InputError(
+            "the corners and the robot's motions leave the intrinsics open; tilt the board by 20 to"
+            " 45 deg in several directions, or give --camera to evercal detect"
+        )
+
+    def equation(self, pairs: PosePairs, lens: Measured | None) -> PoseEquation:
+        """Return the equation with all extras, about the middle of the board."""
+        extras = Extras.nothing(len(pairs))
+        if self.corners is not None and lens is not None:
+            pairs, extras = lens.applied_to(pairs), lens.extras(self.corners.prior)
+        # The board's origin is a convention; noise about its middle is the same in any other.
+        middle = _middle(self.corners)
+        lever = np.broadcast_to(np.eye(6), (len(pairs), 6, 6)).copy()
+        lever[:, :3, 3:] = -pairs.camera_from_board.rotation_matrix() @ cross_matrix(middle)
+        lever[:, :3] *= self.scale
+        extras = replace(extras, slopes=lever @ extras.slopes)
+        about = pairs.camera_from_board @ _shift(middle)
+        moved = replace(pairs, camera_from_board=about).scaled(self.scale)
+        if pairs.camera_covariance is not None:
+            spread = lever @ pairs.camera_covariance @ lever.transpose(0, 2, 1)
+            moved = replace(moved, camera_covariance=spread)
+        length = moved.camera_from_board.translation_m
+        if lens is None and self.scale_known:
+            depth = np.pad(length[:, 2:], ((0, 0), (2, 3)))
+            extras = extras.with_one("shared depth", depth, _SIZE_SIGMA)
+        size = np.pad(length, ((0, 0), (0, 3)))
+        extras = extras.with_one("size", size, _SIZE_SIGMA if self.scale_known else np.inf)
+        if pairs.velocity is not None:
+            extras = extras.with_one("clock", np.zeros((len(pairs), 6)), np.inf)
+        return moved.equation(self.mount, extras)
 
 
 def _with_tested_size(
@@ -347,14 +362,14 @@ def _lens_warnings(
     ]
 
 
-def _middle(corners: BoardCorners | None) -> Array:
+def _middle(corners: BoardCorners | None) -> NDArray[np.float64]:
     """(3,) middle of the board's corners, metres; the origin without corners."""
     if corners is None:
         return np.zeros(3)
     return np.mean([view.points_m.mean(0) for view in corners.views], 0)
 
 
-def _shift(point: Array) -> SE3:
+def _shift(point: NDArray[np.float64]) -> SE3:
     return SE3(np.array([1.0, 0.0, 0.0, 0.0]), point)
 
 
@@ -363,10 +378,6 @@ def _in_the_middle(at: Unknowns, middle: Array) -> Unknowns:
     moved = at.translations.copy()
     moved[1] += at.rotations[1] @ middle
     return replace(at, translations=moved)
-
-
-def _with_extras(at: Unknowns, equation: PoseEquation) -> Unknowns:
-    return replace(at, extras=np.zeros(len(equation.extras.names)))
 
 
 def _group(equation: PoseEquation, name: str) -> NDArray[np.int64]:

@@ -100,17 +100,18 @@ def solve_motions(
     rotations = _nearest(_sine_axes(rotation_a).transpose(0, 2, 1) @ _sine_axes(rotation_b))
     system, right_side = rotation_a - np.eye(3), -translation_a
     rotated = translation_b @ rotations.transpose(0, 2, 1)
+    unit = np.sqrt((translation_b**2).mean((1, 2), keepdims=True)) + 1e-300
     if scale_known:
         right_side = right_side + rotated
     else:
-        system = np.concatenate([system, -rotated[..., None]], -1)
+        system = np.concatenate([system, -(rotated / unit)[..., None]], -1)
     h, unknowns = len(system), system.shape[-1]
     system, right_side = system.reshape(h, -1, unknowns), right_side.reshape(h, -1, 1)
     normal = system.transpose(0, 2, 1) @ system
     ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12
     projected = system.transpose(0, 2, 1) @ right_side
     solution = np.linalg.solve(normal + ridge * np.eye(unknowns), projected)[..., 0]
-    scales = np.ones(h) if scale_known else solution[:, 3]
+    scales = np.ones(h) if scale_known else solution[:, 3] / unit[:, 0, 0]
     return _Hypotheses(rotations, solution[:, :3], scales)
 
 

@@ -2,14 +2,16 @@
 
 import numpy as np
 import pytest
-from evercal.calibration.pose_pairs.noise_levels import (
+from scipy.stats import chi2, f
+
+from evercal.calibration.pose_pairs.noise import (
     Gain,
     NoiseLevels,
     ellipsoid_factor,
     estimate_levels,
     working_noise,
 )
-from scipy.stats import chi2, f
+from evercal.calibration.pose_pairs.pose_equation import System
 
 
 def mean_of(n: int) -> np.ndarray:
@@ -17,12 +19,21 @@ def mean_of(n: int) -> np.ndarray:
     return np.broadcast_to(np.eye(6), (n, 6, 6))
 
 
+def system(
+    residual: np.ndarray, directions: dict[str, np.ndarray], known: np.ndarray | None = None
+) -> System:
+    """Return the system of a mean of n residuals (n, 6)."""
+    n = len(residual)
+    known = np.zeros((n, 6, 6)) if known is None else known
+    return System(residual, mean_of(n), known, directions, n, ())
+
+
 def test_one_kind_equals_the_sample_variance() -> None:
     rng = np.random.default_rng(0)
     values = rng.normal(0, 0.003, (20, 6))
     residual = values - values.mean(0)
     directions = {"all": mean_of(20)}
-    levels = estimate_levels(residual, mean_of(20), directions, np.zeros((20, 6, 6)))
+    levels = estimate_levels(system(residual, directions), ("all",))
     # Each mean takes one degree of freedom.
     assert levels.variance[0] == pytest.approx(values.var(0, ddof=1).mean(), rel=1e-3)
     # The relative deviation of a variance with nu degrees of freedom is sqrt(2 / nu).
@@ -42,7 +53,7 @@ def test_kinds_are_separated_and_absent_kinds_are_zero() -> None:
     values += 5e-3 * (rotation @ rng.normal(size=(n, 3, 1)))[..., 0]
     directions = {"shift": shift, "rotation": rotation, "lever": lever}
     residual = values - values.mean(0)
-    levels = estimate_levels(residual, mean_of(n), directions, np.zeros((n, 6, 6)))
+    levels = estimate_levels(system(residual, directions), tuple(directions))
     sigma = np.sqrt(levels.variance)
     assert sigma[0] == pytest.approx(2e-3, rel=0.15)
     assert sigma[1] == pytest.approx(5e-3, rel=0.15)
@@ -54,9 +65,10 @@ def test_known_noise_is_subtracted() -> None:
     n = 50
     known = np.broadcast_to(9e-6 * np.eye(6), (n, 6, 6))
     values = rng.normal(0, 5e-3, (n, 6))  # total variance 25e-6
-    levels = estimate_levels(values - values.mean(0), mean_of(n), {"rest": mean_of(n)}, known)
+    measured = system(values - values.mean(0), {"rest": mean_of(n)}, known)
+    levels = estimate_levels(measured, ("rest",))
     assert levels.variance[0] == pytest.approx(16e-6, rel=0.3)
-    total = levels.covariances({"rest": mean_of(n)}, known)
+    total = levels.covariances(measured)
     assert np.trace(total[0]) / 6 == pytest.approx(values.var(0, ddof=1).mean(), rel=1e-2)
 
 
@@ -106,5 +118,5 @@ def test_working_noise_is_more_even() -> None:
 
 def test_zero_levels_give_a_positive_covariance() -> None:
     levels = NoiseLevels(("a",), np.zeros(1), np.zeros((1, 1)))
-    covariance = levels.covariances({"a": mean_of(3)}, np.zeros((3, 6, 6)))
+    covariance = levels.covariances(system(np.zeros((3, 6)), {"a": mean_of(3)}))
     assert (np.linalg.eigvalsh(covariance) > 0).all()
