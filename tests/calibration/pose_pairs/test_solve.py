@@ -230,7 +230,8 @@ def solve_real(name: str, mount: Mount, board: Board, camera: Camera | None) -> 
     poses = board_poses(board, camera, detected)
     boards = SE3.stack([i.camera_from_board for i in poses.images if i.camera_from_board])
     pairs = PosePairs(tuple(images), robot, boards)
-    calibration = solve(pairs, mount, corners=BoardCorners(camera, views)).parent_from_child
+    corners = BoardCorners(camera, views, stated=camera == FRANKA)
+    calibration = solve(pairs, mount, corners=corners).parent_from_child
     fixed_from_parent = robot if mount == "eye_in_hand" else robot.inverse()
     return calibration, fixed_from_parent @ calibration @ boards
 

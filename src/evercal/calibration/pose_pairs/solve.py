@@ -34,6 +34,9 @@ _SIZE_SIGMA = 0.003
 """Relative standard deviation of a stated square size, and of a depth error of all images."""
 _SIZE_SIGMAS = 3.0
 """Significance of a wrong size, standard deviations."""
+_LARGE_SIZE, _MUCH_BETTER = 0.1, 3.0
+"""An error of the size above the first number is believed only if the residuals fall by the second
+factor."""
 _SCALE_SIGMA = 0.1
 """Maximum relative standard deviation of an unknown scale."""
 _MOST_LENSES = 8
@@ -329,8 +332,20 @@ def _with_tested_size(
     freed = robust_fit(free, agreement(free, fit.at))
     k = equation.extras.names.index("size")
     off, sigma = float(freed.at.extras[k]), float(freed.sigma[12 + k])
-    if not (abs(off) > max(_SIZE_SIGMAS * sigma, _SIZE_SIGMA) and sigma < _SCALE_SIGMA):
+    # Errors of an arm are similar in similar poses. Together as large as the noise, they could move
+    # the size by more than independent noise does.
+    noise = sum(np.trace(freed.contributions[kind][:3, :3]) for kind in freed.levels.kinds)
+    share = float(noise / np.trace(freed.covariance[:3, :3]))
+    sigma *= float(np.sqrt(1 + share * freed.inliers.sum()))
+    if abs(off) < max(_SIZE_SIGMAS * sigma, _SIZE_SIGMA):
         return equation, fit, []
+    better = _misfit(fit) / _misfit(freed)
+    if abs(off) > _LARGE_SIZE and better < _MUCH_BETTER:
+        return equation, fit, [
+            f"a board {100 * abs(off):.0f} % {'larger' if off > 0 else 'smaller'} than stated would"
+            f" fit the robot's motions better, but not well: check its size, the robot poses and"
+            f" the intrinsics"
+        ]
     stated = None if corners is None else corners.size_m
     size = f"a square or tag of 24 mm would measure {24 * (1 + off):.2f} mm"
     if stated is not None:
@@ -342,6 +357,11 @@ def _with_tested_size(
         f" length. The calibration uses the estimated size"
     )
     return free, freed, [warning]
+
+
+def _misfit(fit: HandEyeFit) -> float:
+    """Root mean square residual of the translations, metres."""
+    return float(np.sqrt((fit.residual[fit.inliers, :3] ** 2).mean()))
 
 
 def _lens_warnings(
