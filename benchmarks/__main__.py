@@ -11,6 +11,7 @@ VERBS = {
     "trust": "other lenses, few images, an inaccurate arm: errors and their stated deviations",
     "repeat": "a wrist camera before a chessboard, in three folds",
     "handeye": "pose pairs: errors, ellipsoids, outliers, scale, time",
+    "handeye-boards": "boards through a lens found from the same images, beside other solvers",
     "many-keyframes": "localization among thousands of keyframes of other rooms",
     "peers": "SIFT and XFeat on the same frames",
     "tune": "the setting of every continual method, on held-out training frames",
@@ -22,7 +23,12 @@ VERBS = {
     "tables": "generate the tables of the docs from results/",
     "gate": "check accuracy, speed and size against the committed baseline",
 }
-MODULES = {"handeye": "hand_eye", "many-keyframes": "many_keyframes", "tune": "tuning"}
+MODULES = {
+    "handeye": "hand_eye",
+    "handeye-boards": "hand_eye_boards",
+    "many-keyframes": "many_keyframes",
+    "tune": "tuning",
+}
 """Modules whose names differ from their verbs."""
 
 

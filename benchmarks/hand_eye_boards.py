@@ -5,18 +5,32 @@ heavy-tailed noise, the arm has noise of its own. Every solver gets the same cor
 calibrated from them first, as most people do.
 """
 
-from dataclasses import dataclass, field
+import json
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from tabulate import tabulate
+from tqdm import tqdm
+from tyro.conf import arg
 
-from benchmarks.hand_eye import pose
-from evercal.calibration.boards.corners import BoardView
+from benchmarks.hand_eye import pose, rotations
+from evercal.calibration.boards.corners import BoardView, board_pose
+from evercal.calibration.boards.intrinsics import calibrate_camera
+from evercal.calibration.boards.lens import lens_vector, moved_camera
 from evercal.calibration.calibration import Mount
-from evercal.geometry import SE3, Camera
+from evercal.calibration.pose_pairs.measured import BoardCorners
+from evercal.calibration.pose_pairs.pairs import PosePairs
+from evercal.calibration.pose_pairs.solve import solve
+from evercal.evaluation.metrics import share_inside
+from evercal.geometry import SE3, Camera, pose_distance
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 LENS = (-0.26, 0.11, 0.0004, -0.0003, -0.03)
 """Distortion k1 k2 p1 p2 k3 of the true lens: 20 pixels in the corners of the image."""
 
@@ -69,8 +83,8 @@ class BoardRecording:
 def board_points(setting: BoardSetting, stated: bool = True) -> Array:
     """Return corners (k, 3) with the stated or the true size of a square."""
     size = setting.square_m * (1 + setting.square_error if stated else 1)
-    grid = np.stack(np.meshgrid(np.arange(setting.columns), np.arange(setting.rows)), -1)
-    return np.pad(size * grid.reshape(-1, 2).astype(float), ((0, 0), (0, 1)))
+    x, y = np.meshgrid(np.arange(float(setting.columns)), np.arange(float(setting.rows)))
+    return size * np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
 
 
 def project(points: Array, camera_from_board: SE3, camera: Camera) -> Array:
@@ -86,69 +100,220 @@ def project(points: Array, camera_from_board: SE3, camera: Camera) -> Array:
 def record(setting: BoardSetting, seed: int) -> BoardRecording:
     """Draw one recording."""
     rng = np.random.default_rng(seed)
-    focal = rng.uniform(560, 680)
-    wobble = 1 + rng.uniform(-0.1, 0.1)
-    lens = tuple(wobble * k for k in LENS)
-    camera = Camera(640, 480, focal, focal * rng.uniform(0.998, 1.002), *rng.normal(0, 8, 2)
-                    + np.array([319.5, 239.5]), lens)  # fmt: skip
-    on_arm = setting.mount == "eye_in_hand"
-    near = pose(Rotation.random(rng=rng), rng.uniform(-0.12, 0.12, 3))
-    if on_arm:
-        far = pose(Rotation.from_rotvec(rng.normal(0, 0.3, 3)), np.array([0.5, 0.1, 0.02]))
-        parent_from_camera, fixed_from_board = near, far
-    else:
-        look = Rotation.from_euler("x", np.pi / 2 + 0.6) * Rotation.from_rotvec(
-            rng.normal(0, 0.2, 3)
-        )
-        parent_from_camera, fixed_from_board = pose(look, np.array([1.1, 0.2, 0.7])), near
-    points = board_points(setting, stated=False)
-    middle = points.mean(0)
-    poses = []
-    while len(poses) < setting.views:
-        limit = np.deg2rad(setting.tilt_deg)
-        axis = rng.normal(size=3) * (1, 1, 1.0)
-        turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(0, 1.5) * limit)
-        distance = rng.uniform(0.3, 0.55)
-        aim = np.array([*rng.uniform(-0.28, 0.28, 2) * distance, distance])
-        trial = pose(turn, aim - turn.apply(middle))
-        pixels = project(points, trial, camera)
-        inside = (pixels > 8) & (pixels < np.array([632, 472]))
-        if inside.all() and abs(turn.as_matrix()[2, 2]) > 0.35:
-            poses.append(trial)
-    camera_from_board = SE3.stack(poses)
+    camera = _camera(rng)
+    parent_from_camera, fixed_from_board = _places(setting.mount, rng)
+    camera_from_board = _board_poses(setting, camera, rng)
     fixed_from_parent = (
         fixed_from_board @ camera_from_board.inverse() @ parent_from_camera.inverse()
     )
-    robot = fixed_from_parent if on_arm else fixed_from_parent.inverse()
+    robot = fixed_from_parent if setting.mount == "eye_in_hand" else fixed_from_parent.inverse()
 
     def noise(*shape: int) -> Array:
         if setting.tails:
             return rng.standard_t(setting.tails, shape)
         return rng.normal(size=shape)
 
+    true, stated = board_points(setting, stated=False), board_points(setting)
     views = tuple(
-        BoardView(
-            board_points(setting),
-            project(points, p, camera) + setting.noise_px * noise(len(points), 2),
-        )
+        BoardView(stated, project(true, p, camera) + setting.noise_px * noise(len(true), 2))
         for p in camera_from_board
     )
     n = setting.views
-    robot = pose(
-        Rotation.from_quat(robot.rotation_wxyz, scalar_first=True)
-        * Rotation.from_rotvec(np.deg2rad(setting.arm_deg) * noise(n, 3)),
-        robot.translation_m + 1e-3 * setting.arm_mm * noise(n, 3),
-    )
+    turned = rotations(robot) * Rotation.from_rotvec(np.deg2rad(setting.arm_deg) * noise(n, 3))
+    robot = pose(turned, robot.translation_m + 1e-3 * setting.arm_mm * noise(n, 3))
     spoiled = np.sort(rng.choice(n, setting.outliers, replace=False))
     quaternion, translation = robot.rotation_wxyz.copy(), robot.translation_m.copy()
     for i in spoiled:
         axis, direction = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
-        turned = Rotation.from_quat(quaternion[i], scalar_first=True) * Rotation.from_rotvec(
-            np.deg2rad(20) * axis
-        )
-        quaternion[i] = turned.as_quat(scalar_first=True)
+        other = rotations(robot[i]) * Rotation.from_rotvec(np.deg2rad(20) * axis)
+        quaternion[i] = other.as_quat(scalar_first=True)
         translation[i] += 0.05 * direction
     return BoardRecording(
-        setting, views, SE3(quaternion, translation), parent_from_camera, fixed_from_board,
-        camera, camera_from_board, tuple(int(i) for i in spoiled),
-    )  # fmt: skip
+        setting=setting,
+        views=views,
+        base_from_gripper=SE3(quaternion, translation),
+        parent_from_camera=parent_from_camera,
+        fixed_from_board=fixed_from_board,
+        camera=camera,
+        camera_from_board=camera_from_board,
+        spoiled=tuple(int(i) for i in spoiled),
+    )
+
+
+def _camera(rng: np.random.Generator) -> Camera:
+    focal, wobble = rng.uniform(560, 680), 1 + rng.uniform(-0.1, 0.1)
+    ratio, (dx, dy) = rng.uniform(0.998, 1.002), rng.normal(0, 8, 2)
+    lens = tuple(wobble * k for k in LENS)
+    return Camera(640, 480, focal, focal * ratio, 319.5 + dx, 239.5 + dy, lens)
+
+
+def _places(mount: Mount, rng: np.random.Generator) -> tuple[SE3, SE3]:
+    """Return parent_from_camera and fixed_from_board."""
+    near = pose(Rotation.random(rng=rng), rng.uniform(-0.12, 0.12, 3))
+    if mount == "eye_in_hand":
+        return near, pose(Rotation.from_rotvec(rng.normal(0, 0.3, 3)), np.array([0.5, 0.1, 0.02]))
+    look = Rotation.from_euler("x", np.pi / 2 + 0.6) * Rotation.from_rotvec(rng.normal(0, 0.2, 3))
+    return pose(look, np.array([1.1, 0.2, 0.7])), near
+
+
+def _board_poses(setting: BoardSetting, camera: Camera, rng: np.random.Generator) -> SE3:
+    """Return (n,) camera_from_board that show the whole board."""
+    points, poses = board_points(setting, stated=False), []
+    while len(poses) < setting.views:
+        axis = rng.normal(size=3)
+        angle = rng.uniform(0, 1.5) * np.deg2rad(setting.tilt_deg)
+        turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * angle)
+        distance = rng.uniform(0.3, 0.55)
+        aim = np.array([*rng.uniform(-0.28, 0.28, 2) * distance, distance])
+        trial = pose(turn, aim - turn.apply(points.mean(0)))
+        pixels = project(points, trial, camera)
+        inside = (pixels > 8) & (pixels < np.array([632, 472]))
+        if inside.all() and abs(turn.as_matrix()[2, 2]) > 0.35:
+            poses.append(trial)
+    return SE3.stack(poses)
+
+
+def pose_pairs(recording: BoardRecording, seed: int) -> PosePairs:
+    """Return pairs of poses without corners: lateral, depth and rotation noise of each image."""
+    setting, rng, n = recording.setting, np.random.default_rng(10000 + seed), len(recording.views)
+    board = recording.camera_from_board
+    noise = rng.standard_t(setting.tails, (n, 7)) if setting.tails else rng.normal(size=(n, 7))
+    moved = board.translation_m + 3e-4 * noise[:, :3]
+    moved = moved * (1 + max(setting.depth_noise, 0.003) * noise[:, 3:4])
+    moved[:, 2] *= 1 + setting.depth_error
+    turned = rotations(board) * Rotation.from_rotvec(np.deg2rad(0.15) * noise[:, 4:])
+    names = tuple(f"row {i + 1}" for i in range(n))
+    scale = 1 + setting.square_error
+    return PosePairs(names, recording.base_from_gripper, pose(turned, scale * moved))
+
+
+def corner_pairs(recording: BoardRecording) -> tuple[PosePairs, BoardCorners]:
+    """Return pairs with corners, the lens calibrated from the same corners."""
+    camera = calibrate_camera(recording.views, 640, 480).camera
+    board = [board_pose(view, camera).camera_from_board for view in recording.views]
+    names = tuple(f"{i}.png" for i in range(len(board)))
+    pairs = PosePairs(names, recording.base_from_gripper, SE3.stack(board))
+    size = recording.setting.square_m * (1 + recording.setting.square_error)
+    return pairs, BoardCorners(camera, recording.views, size_m=size)
+
+
+def opencv_solvers(pairs: PosePairs, mount: Mount) -> dict[str, SE3]:
+    """Return parent_from_camera by each solver of OpenCV; empty where OpenCV has none (5.0)."""
+    import cv2
+
+    found: dict[str, SE3] = {}
+    robot = pairs.base_from_gripper if mount == "eye_in_hand" else pairs.base_from_gripper.inverse()
+    arrays = [list(part) for p in (robot, pairs.camera_from_board)
+              for part in (p.rotation_matrix(), p.translation_m)]  # fmt: skip
+    solve_hand_eye = getattr(cv2, "calibrateHandEye", None)
+    if solve_hand_eye is None:
+        return found
+    for name in ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS"):
+        rotation, shift = solve_hand_eye(*arrays, method=getattr(cv2, f"CALIB_HAND_EYE_{name}"))
+        if np.isfinite(rotation).all() and abs(np.linalg.det(rotation) - 1) < 1e-3:
+            found[name.title()] = pose(Rotation.from_matrix(rotation), np.ravel(shift))
+    return found
+
+
+def reprojection(
+    recording: BoardRecording, pairs: PosePairs, corners: BoardCorners, start: SE3
+) -> SE3:
+    """Return parent_from_camera that minimizes all reprojection errors over X, Z and the lens.
+
+    The arm is taken for exact, as in textbook bundle adjustment; soft L1 loss.
+    """
+    robot = recording.base_from_gripper
+    robot = robot if recording.setting.mount == "eye_in_hand" else robot.inverse()
+    board = (robot @ start @ pairs.camera_from_board)[0]
+    points, pixels = recording.views[0].points_m, np.stack([v.pixels for v in recording.views])
+    lens = lens_vector(corners.camera)
+    scale = np.maximum(np.abs(lens), 0.1)
+
+    def residual(step: Array) -> Array:
+        x, z = start @ SE3.exp(step[:6]), board @ SE3.exp(step[6:12])
+        camera = moved_camera(corners.camera, step[12:] * scale)
+        seen = (robot @ x).inverse() @ z
+        return (np.stack([project(points, p, camera) for p in seen]) - pixels).ravel()
+
+    step = least_squares(residual, np.zeros(12 + len(lens)), loss="soft_l1", f_scale=0.3).x
+    return start @ SE3.exp(step[:6])
+
+
+CORNER = BoardSetting()
+POSES = BoardSetting(views=25)
+CONDITIONS: dict[str, tuple[BoardSetting, bool]] = {
+    "corners, clean": (CORNER, True),
+    "corners, fixed camera": (replace(CORNER, mount="eye_to_hand"), True),
+    "corners, 3 outliers": (replace(CORNER, outliers=3), True),
+    "corners, 6 views": (replace(CORNER, views=6), True),
+    "corners, 10 deg": (replace(CORNER, tilt_deg=10), True),
+    "corners, heavy tails": (replace(CORNER, tails=3.0), True),
+    "corners, arm 0.5 mm 0.1 deg": (replace(CORNER, arm_mm=0.5, arm_deg=0.1), True),
+    "corners, square 1 % wrong": (replace(CORNER, square_error=0.01), True),
+    "corners, square 5 % wrong": (replace(CORNER, square_error=0.05), True),
+    "poses, clean": (POSES, False),
+    "poses, fixed camera": (replace(POSES, mount="eye_to_hand"), False),
+    "poses, 3 outliers": (replace(POSES, outliers=3), False),
+    "poses, 6 views": (replace(POSES, views=6), False),
+    "poses, 10 deg": (replace(POSES, tilt_deg=10), False),
+    "poses, heavy tails": (replace(POSES, tails=3.0), False),
+    "poses, depth noise 2 %": (replace(POSES, depth_noise=0.02), False),
+    "poses, shared depth 0.3 %": (replace(POSES, depth_error=0.003), False),
+    "poses, arm 0.5 mm 0.3 deg": (replace(POSES, arm_mm=0.5, arm_deg=0.3), False),
+}
+"""Setting and whether corners are given."""
+
+
+def measure(name: str, count: int, references: int) -> dict[str, object]:
+    """Solve many recordings of one condition; the first `references` also by other solvers."""
+    setting, with_corners = CONDITIONS[name]
+    squared, flagged, ms = [], [], []
+    mm: dict[str, list[float]] = {"evercal": []}
+    for seed in range(count):
+        drawn = record(setting, seed)
+        pairs, corners = corner_pairs(drawn) if with_corners else (pose_pairs(drawn, seed), None)
+        began = time.process_time()
+        result = solve(pairs, setting.mount, corners=corners)
+        ms.append(1000 * (time.process_time() - began))
+        truth = drawn.parent_from_camera
+        squared.append(result.uncertain_pose.squared_mahalanobis(truth))
+        flagged.append(any("than stated" in text for text in result.checks["warnings"]))
+        estimates = {"evercal": result.parent_from_child}
+        if seed < references:
+            others = opencv_solvers(pairs, setting.mount)
+            estimates |= others
+            if corners is not None:
+                start = result.parent_from_child
+                estimates["reprojection"] = reprojection(drawn, pairs, corners, start)
+        for solver, estimate in estimates.items():
+            mm.setdefault(solver, []).append(1000 * float(pose_distance(estimate, truth)[0]))
+    row: dict[str, object] = {"condition": name, "trials": count}
+    row |= {
+        "median_mm": float(np.median(mm["evercal"])),
+        "p95_mm": float(np.quantile(mm["evercal"], 0.95)),
+    }
+    row |= {"inside_95": share_inside(squared), "size_flagged": 100 * float(np.mean(flagged))}
+    row |= {"ms": float(np.median(ms))}
+    rest = {name: float(np.median(values)) for name, values in mm.items() if name != "evercal"}
+    return row | {f"{name}_mm": value for name, value in rest.items()}
+
+
+def run(
+    count: Annotated[int, arg(name="trials")] = 300,
+    references: int = 30,
+    out: Path = Path("runs/handeye-boards.json"),
+) -> None:
+    """Simulated boards through a distorted lens that is found from the same images.
+
+    Args:
+        count: Trials of each condition.
+        references: Trials that are also solved by OpenCV's solvers (OpenCV 4) and by a full
+            reprojection fit; their medians are over these trials.
+        out: File of the rows.
+    """
+    rows: list[dict[str, object]] = []
+    out.parent.mkdir(parents=True, exist_ok=True)
+    for name in tqdm(CONDITIONS, unit="condition"):
+        rows.append(measure(name, count, references))
+        out.write_text(json.dumps({"settings": {"trials": count}, "rows": rows}, indent=1))
+    print(tabulate(rows, headers="keys", floatfmt=".3g", tablefmt="github", missingval=""))

@@ -2,7 +2,10 @@
 
 from typing import NamedTuple
 
+import numpy as np
+
 from evercal.calibration.calibration import Calibration
+from evercal.geometry import cross_matrix
 
 
 class Tier(NamedTuple):
@@ -22,66 +25,54 @@ TIERS = (
 
 
 def tier(calibration: Calibration) -> Tier | None:
-    """Return the most demanding use that a calibration serves.
-
-    Its uncertainty and the errors of its checks decide: a small uncertainty beside a large error
-    means that the model of rigid motion does not hold.
-    """
+    """Return the most demanding use that a calibration serves, by its own error."""
     mm, deg = expected_error(calibration)
     return next((t for t in TIERS if mm < t.mm and deg < t.deg), None)
 
 
 def expected_error(calibration: Calibration) -> tuple[float, float]:
-    """Return millimetres and degrees: the largest of the uncertainty and the errors of the checks.
+    """Return the root mean square error in space, millimetres and degrees.
 
-    Two halves of the data differ by twice the error of their mean.
+    The position counts where the camera works: at the distance of its target along the optical
+    axis (`target_m` of the checks), or at the camera if that is larger. Two halves of the data
+    differ by twice the error of their mean. The noise of a single view is no error of the
+    calibration; it is part of the covariance as far as it does not average out.
     """
-    mm, deg = _sigma_in_space(calibration)
-    for check, share in (("held_out", 1.0), ("repeatability", 0.5)):
-        mm = max(mm, share * float(calibration.checks.get(f"{check}_mm") or 0.0))
-        deg = max(deg, share * float(calibration.checks.get(f"{check}_deg") or 0.0))
-    return mm, deg
+    target = float(calibration.checks.get("target_m") or 0.0)
+    rotation = calibration.parent_from_child.rotation_matrix()
+    slope = np.concatenate([np.eye(3), -rotation @ cross_matrix([0.0, 0.0, target])], 1)
+    at_target = float(np.sqrt(np.trace(slope @ calibration.covariance @ slope.T)))
+    halves = [float(calibration.checks.get(f"repeatability_{u}") or 0.0) / 2 for u in ("mm", "deg")]
+    mm = max(3**0.5 * calibration.sigma_mm, 1000 * at_target, halves[0])
+    return mm, max(3**0.5 * calibration.sigma_deg, halves[1])
 
 
 def verdict(calibration: Calibration) -> str:
     """Return one to three sentences: possible uses, the reason, and advice."""
-    use, sigma, checks = tier(calibration), _sigma_in_space(calibration), calibration.checks
+    use, (mm, deg) = tier(calibration), expected_error(calibration)
+    checks = calibration.checks
     first = f"Unusable: even tabletop tasks ask for {TIERS[-1].mm:g} mm and {TIERS[-1].deg:g} deg."
     if use is not None:
         first = f"Good for {use.name} (within {use.mm:g} mm and {use.deg:g} deg)."
-    first = f"{first} Expected error {_length(sigma[0])} and {sigma[1]:.2f} deg"
+    first = f"{first} Expected error {_length(mm)} and {deg:.2f} deg"
+    if checks.get("target_m"):
+        first += f", {checks['target_m']:.2f} m from the camera"
     if "held_out_mm" not in checks or "held_out_deg" not in checks:
         return f"{first}."
-    held_out = float(checks["held_out_mm"]), float(checks["held_out_deg"])
-    return (
-        f"{first}; the median error on held-out poses is {_length(held_out[0])} and"
-        f" {held_out[1]:.2f} deg. {_advice(use, sigma, held_out)}"
+    held_out = (
+        f"{_length(float(checks['held_out_mm']))} and {float(checks['held_out_deg']):.2f} deg"
     )
+    return f"{first}; single held-out poses differ by {held_out} (median). {_advice(use)}"
 
 
-def _advice(use: Tier | None, sigma: tuple[float, float], held_out: tuple[float, float]) -> str:
+def _advice(use: Tier | None) -> str:
     if use is TIERS[0]:
         return "Check it on the robot before use: touch a point that the camera sees."
     wanted = TIERS[-1] if use is None else TIERS[TIERS.index(use) - 1]
-    sigma_lacks = sigma[0] >= wanted.mm or sigma[1] >= wanted.deg
-    held_out_lacks = held_out[0] >= wanted.mm or held_out[1] >= wanted.deg
-    if sigma_lacks and not held_out_lacks:
-        return f"More poses, tilted more about two axes, bring it nearer to {wanted.name}."
-    if sigma_lacks:
-        return (
-            f"For {wanted.name} single poses are too far off: let the robot stand still at each,"
-            f" use a larger or nearer board, check intrinsics, then record more poses."
-        )
     return (
-        f"More images will not help for {wanted.name}: each pose of robot or camera is off by about"
-        f" that much; let the robot stand still at each, use a larger or nearer board, check"
-        f" intrinsics and the arm's own calibration."
+        f"For {wanted.name}: more poses, tilted more about two axes; let the robot stand still at"
+        f" each; use a larger or nearer board."
     )
-
-
-def _sigma_in_space(calibration: Calibration) -> tuple[float, float]:
-    """Root mean square error in space, millimetres and degrees."""
-    return 3**0.5 * calibration.sigma_mm, 3**0.5 * calibration.sigma_deg
 
 
 def _length(mm: float) -> str:

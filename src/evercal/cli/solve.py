@@ -109,8 +109,17 @@ def _check_lines(calibration: "Calibration") -> list[str]:
         lines.append(f"  corners      {checks['corner_sigma_px']:.2f} px (standard deviation)")
     if "scale" in checks:
         scale, sigma = checks["scale"], checks["scale_sigma"]
-        lines.append(f"  scale        {scale:.6g} +- {sigma:.2g} metres per unit of the camera")
+        lines.append(
+            f"  scale        {scale:.6g} +- {sigma:.2g} (size of the board, or metres per unit)"
+        )
+    if calibration.camera is not None and "camera_sigma" in checks:
+        camera, focal = calibration.camera, checks["camera_sigma"]["fx"]
+        lines.append(
+            f"  intrinsics   fx {camera.fx:.2f}, fy {camera.fy:.2f} +- {focal:.2f} px, cx"
+            f" {camera.cx:.2f}, cy {camera.cy:.2f} +- {checks['camera_sigma']['cx']:.2f} px"
+        )
     if "time_offset_s" in checks:
         offset, sigma = 1000 * checks["time_offset_s"], 1000 * checks["time_offset_sigma_s"]
         lines.append(f"  clocks       robot time = camera time {offset:+.1f} +- {sigma:.1f} ms")
+    lines += [f"  left open    {sentence}" for sentence in checks.get("left_open", ())]
     return [*lines, *(f"warning: {warning}" for warning in checks.get("warnings", ()))]

@@ -132,12 +132,12 @@ def _require_plausible(pairs: PosePairs, mount: Mount, fit: Agreement) -> None:
     x, z = fit.at.parent_from_camera, fit.at.fixed_from_board
     camera = pairs.camera_from_board
     given = _likelihood(mount, x, z, camera)
-    swapped = (z.inverse(), x.inverse())[:: 1 if mount == "eye_in_hand" else -1]
+    first, second = (z, x) if mount == "eye_in_hand" else (x, z)
     others = (
         (
             "the files look exchanged: the camera poses look like gripper poses; exchange"
             " --robot-poses and --camera-poses",
-            _likelihood(mount, *swapped, pairs.base_from_gripper),
+            _likelihood(mount, first.inverse(), second.inverse(), pairs.base_from_gripper),
             pairs.base_from_gripper,
         ),
         (

@@ -153,7 +153,8 @@ def _read_camera(files: PairFiles) -> _CameraPoses:
         stamps = table.stamps_s
         if stamps is None and table.names is not None:
             stamps = times_in_names(table.names)
-        poses, numbers = list(table.poses), table.numbers
+        poses: list[SE3 | None] = [*table.poses]
+        numbers = table.numbers
         camera = _CameraPoses(
             table.names, stamps, poses, None, numbers, table.convention, camera_from
         )

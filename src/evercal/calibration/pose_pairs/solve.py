@@ -217,8 +217,8 @@ class PairSolution:
             part = fit.contributions.get(name)
             if part is not None and np.trace(part) > 1e-12 * np.trace(fit.covariance[:6, :6]):
                 terms.append(ErrorTerm.of(cause, part))
-        few = (fit.factor - 1) * fit.covariance[:6, :6]
-        return (*terms, ErrorTerm.of("noise estimated from few poses", few))
+        rest = fit.factor * fit.covariance[:6, :6] - sum(fit.contributions.values())
+        return (*terms, ErrorTerm.of("few poses, and errors alike in similar poses", rest))
 
 
 def solve_pairs(
@@ -250,6 +250,8 @@ def solve_pairs(
     warnings: list[str] = []
     if scale_known:
         equation, fit, warnings = _with_tested_size(equation, fit, corners)
+    else:
+        fit = _widened(equation, fit)
     warnings += _lens_warnings(fit, equation, corners, lens)
     _require_determined(pairs[rows[fit.inliers]], fit, equation, scale_known)
     return PairSolution(
@@ -332,31 +334,46 @@ def _with_tested_size(
     freed = robust_fit(free, agreement(free, fit.at))
     k = equation.extras.names.index("size")
     off, sigma = float(freed.at.extras[k]), float(freed.sigma[12 + k])
-    # Errors of an arm are similar in similar poses. Together as large as the noise, they could move
-    # the size by more than independent noise does.
-    noise = sum(np.trace(freed.contributions[kind][:3, :3]) for kind in freed.levels.kinds)
-    share = float(noise / np.trace(freed.covariance[:3, :3]))
-    sigma *= float(np.sqrt(1 + share * freed.inliers.sum()))
+    sigma *= float(np.sqrt(1 + _alike(freed)))
     if abs(off) < max(_SIZE_SIGMAS * sigma, _SIZE_SIGMA):
         return equation, fit, []
     better = _misfit(fit) / _misfit(freed)
+    larger = "larger" if off > 0 else "smaller"
     if abs(off) > _LARGE_SIZE and better < _MUCH_BETTER:
-        return equation, fit, [
-            f"a board {100 * abs(off):.0f} % {'larger' if off > 0 else 'smaller'} than stated would"
-            f" fit the robot's motions better, but not well: check its size, the robot poses and"
-            f" the intrinsics"
-        ]
+        warning = (
+            f"a board {100 * abs(off):.0f} % {larger} than stated would fit the robot's motions"
+            f" better, but not well: check its size, the robot poses and the intrinsics"
+        )
+        return equation, fit, [warning]
     stated = None if corners is None else corners.size_m
     size = f"a square or tag of 24 mm would measure {24 * (1 + off):.2f} mm"
     if stated is not None:
         size = f"its side measures {1000 * stated * (1 + off):.2f} mm, not {1000 * stated:.2f} mm"
     warning = (
-        f"the board is {100 * abs(off):.2f} +- {100 * sigma:.2f} %"
-        f" {'larger' if off > 0 else 'smaller'} than stated, by the robot's motions"
+        f"the board is {100 * abs(off):.2f} +- {100 * sigma:.2f} % {larger} than stated, by the"
+        f" robot's motions"
         f" ({abs(off) / sigma:.0f} standard deviations): {size}; check its size and the focal"
         f" length. The calibration uses the estimated size"
     )
     return free, freed, [warning]
+
+
+def _alike(fit: HandEyeFit) -> float:
+    """Return by how much errors that are alike in similar poses enlarge the variance of the size.
+
+    Errors of an arm depend on its pose. Together as large as the noise, they may move the size by
+    as much as all poses together, where independent noise averages out.
+    """
+    noise = sum(np.trace(fit.contributions[kind][:3, :3]) for kind in fit.levels.kinds)
+    return float(noise / np.trace(fit.covariance[:3, :3]) * fit.inliers.sum())
+
+
+def _widened(equation: PoseEquation, fit: HandEyeFit) -> HandEyeFit:
+    """Add what errors of an arm that are alike in similar poses do through an unknown size."""
+    k = 12 + equation.extras.names.index("size")
+    column = fit.covariance[:, k]
+    added = _alike(fit) * np.outer(column, column) / max(fit.covariance[k, k], 1e-300)
+    return replace(fit, covariance=fit.covariance + added)
 
 
 def _misfit(fit: HandEyeFit) -> float:
