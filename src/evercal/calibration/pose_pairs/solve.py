@@ -30,7 +30,7 @@ from evercal.geometry import SE3, Camera, cross_matrix
 
 Array = NDArray[np.floating]
 
-_SIZE_SIGMA = 0.003
+_SIZE_SIGMA = 0.002
 """Relative standard deviation of a stated square size, and of a depth error of all images."""
 _SIZE_SIGMAS = 3.0
 """Significance of a wrong size, standard deviations."""
@@ -73,7 +73,7 @@ def solve(
     its corners determine.
 
     A stated size of the squares, the scale of the camera poses and a depth error that all images
-    share are unknowns with a prior of 0.3 %. A size that the robot's motions contradict is
+    share are unknowns with a prior of 0.2 %. A size that the robot's motions contradict is
     reported and estimated.
 
     The covariance is enlarged for the uncertainty of the noise estimate, so that the usual
