@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from evercal.cli import bench as verb
-from evercal.continual.benchmark import report_data
 from evercal.continual.benchmark.results import RESULTS, STRATEGIES
 from evercal.recordings import generic
 
@@ -89,16 +88,6 @@ def test_folder_without_results_is_refused(run: Any, tmp_path: Path) -> None:
     ran = run("bench-report", tmp_path)
     assert ran.code == 2
     assert "no results here" in ran.err[0]
-
-
-def test_missing_pandas_is_refused_before_any_work(
-    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(report_data, "find_spec", lambda name: None)
-    ran = run("bench", "sim-mini", "--out", tmp_path / "out")
-    assert ran.code == 2
-    assert "pip install 'evercal[bench]'" in ran.err[0]
-    assert not (tmp_path / "out").exists()
 
 
 def test_held_out_frames_are_training_frames(

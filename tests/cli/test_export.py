@@ -131,7 +131,7 @@ def test_a_camera_on_the_arm_gets_a_pose_per_robot_pose(
     assert run(*words, "--robot-poses", gripper, "--convention", "xyzw:mm").code == 0
     assert len(read_robot_poses(tmp_path / "c.tum")) == 2
     refused = run(*words, "--robot-poses", gripper, "--convention", "xyzw")
-    assert "look like millimetres; give the convention xyzw:mm" in refused.err[0]
+    assert "look like millimetres; give --convention xyzw:mm" in refused.err[0]
 
 
 @pytest.mark.parametrize(

@@ -34,10 +34,21 @@ RECORDINGS = {
     "house": (["images/0001.jpg"], 1, 0),
 }
 SINGLE_FILES = {
-    "joints.csv", "joints.json", "camera.json", "camera.txt", "camera_info.yaml",
-    "camera_opencv.yaml", "poses.csv", "kuka.txt", "poses.tum", "poses.json", "points.csv",
-    "picks.csv", "base_from_camera.txt", "pusht/meta/info.json",
+    "joints.csv", "joints.json", "camera.txt", "touched.csv", "picks.csv", "base_from_camera.txt",
+    "pusht/meta/info.json",
 }  # fmt: skip
+CAMERAS = {
+    "camera.json", "camera_info.yaml", "camera_opencv.yaml", "camera_opencv.json",
+    "camera_realsense.json",
+}  # fmt: skip
+POSE_FILES = {
+    "poses.csv": None, "kuka.txt": "kuka", "poses.tum": None, "kitti.txt": None,
+    "matrices.txt": None, "ur.script": None, "frames.dat": None, "poses.json": None,
+    "arrays.json": None,
+}  # fmt: skip
+"""Examples with their conventions."""
+NAMED = ("poses.csv", "kuka.txt", "ur.script", "frames.dat", "poses.json", "arrays.json")
+TIMED = ("poses.csv", "poses.tum", "poses.json")
 
 
 @pytest.fixture
@@ -52,9 +63,9 @@ def page(tmp_path: Path) -> Path:
 
 def test_every_example_is_read_here() -> None:
     assert PAGE.read_text().count("```") == 2 * len(EXAMPLES)
-    folders = {name.split("/")[0] for name in EXAMPLES if name not in SINGLE_FILES}
-    assert folders == set(RECORDINGS)
-    assert set(EXAMPLES) >= SINGLE_FILES
+    files = SINGLE_FILES | CAMERAS | POSE_FILES.keys()
+    assert {name.split("/")[0] for name in EXAMPLES if name not in files} == set(RECORDINGS)
+    assert set(EXAMPLES) >= files
 
 
 def recording(page: Path, name: str) -> Recording:
@@ -91,24 +102,21 @@ def assert_poses(read: Recording) -> None:
         assert max(pose_distance(frame.base_from_gripper, expected)) < 1e-4
 
 
-@pytest.mark.parametrize("name", ["camera.json", "camera_info.yaml", "camera_opencv.yaml"])
+@pytest.mark.parametrize("name", sorted(CAMERAS))
 def test_camera_files(page: Path, name: str) -> None:
     assert read_camera(page / name) == CAMERA
     expected = Camera(640, 480, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
     assert read_camera(page / "camera.txt", (640, 480)) == expected
 
 
-@pytest.mark.parametrize(
-    ("name", "convention"),
-    [("poses.csv", None), ("kuka.txt", "kuka"), ("poses.tum", None), ("poses.json", None)],
-)
-def test_pose_tables(page: Path, name: str, convention: str | None) -> None:
+@pytest.mark.parametrize(("name", "convention"), POSE_FILES.items())
+def test_pose_files(page: Path, name: str, convention: str | None) -> None:
     read = read_robot_poses(page / name, convention)
     metres, radians = pose_distance(read.poses, POSES)
     assert metres.max() < 1e-9
     assert radians.max() < 2e-3
-    assert name == "poses.tum" or read.names == ("image-1.png", "image-2.png")
-    assert name == "kuka.txt" or (read.stamps_s is not None and read.stamps_s[1] == 10.1)
+    assert read.names == (("image-1.png", "image-2.png") if name in NAMED else None)
+    assert name not in TIMED or (read.stamps_s is not None and read.stamps_s[1] == 10.1)
 
 
 def test_joint_tables(page: Path) -> None:
@@ -126,7 +134,7 @@ def test_lerobot_description(page: Path) -> None:
 
 
 def test_touched_points(page: Path) -> None:
-    points = read_points(page / "points.csv", 1, 3, "name, x, y, z")
+    points = read_points(page / "touched.csv", 1, 3, "name, x, y, z")
     assert [names for names, _ in points] == [("corner",), ("screw",), ("edge",)]
     picks = read_points(page / "picks.csv", 2, 2, "image, name, u, v")
     assert picks[0][0] == ("images/a.jpg", "corner")

@@ -89,12 +89,10 @@ class Bench:
         """Run what is missing and print the tables."""
         seeds = _numbers(self.seeds)
         from evercal.continual.benchmark.bench import BenchOptions
-        from evercal.continual.benchmark.report_data import require_pandas
         from evercal.continual.learning.presets import short_side
         from evercal.continual.networks.distributed import join_processes, rank, wait_for_all
         from evercal.continual.plugin import load_plugin
 
-        require_pandas()  # before hours of learning
         if self.plugin is not None:
             load_plugin(self.plugin)
         # Workers of a cluster have GPUs of their own.

@@ -38,7 +38,7 @@ class Calibrate:
     """Image files or folders of them, all of one camera; or NAME=FOLDER for each camera of a
     rig."""
     robot_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """base_from_gripper of every image: a pose table, JSON or NPY."""
+    """base_from_gripper of every image: a pose table, JSON, NPY or NPZ."""
     convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Format of the robot poses, if the file does not state it."""
     mount: Annotated[Literal["eye_to_hand", "eye_in_hand"] | None, arg(help_behavior_hint="")] = (

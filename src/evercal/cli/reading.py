@@ -18,8 +18,8 @@ class Reading:
     """Format of the recording: generic, 7scenes, 12scenes, nerfstudio, colmap, wrist, lerobot or
     rosbag. Default: recognised from its files."""
     camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Intrinsics of all images, if the recording has none: 3x3 matrix as text, JSON, ROS
-    camera_info YAML or OpenCV's storage."""
+    """Intrinsics of all images, if the recording has none: 3x3 matrix as text, JSON, YAML,
+    NPZ, ROS camera_info or OpenCV's storage."""
     image_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="")] = None
     """Images of a bag or a LeRobot dataset; required if there are several topics."""
     pose_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="")] = None

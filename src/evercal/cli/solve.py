@@ -24,9 +24,9 @@ class Solve:
     """
 
     robot_poses: Annotated[Path, arg(metavar="FILE")]
-    """base_from_gripper of every image: CSV, JSON, NPY or TUM."""
+    """base_from_gripper of every image: a pose table, JSON, NPY or NPZ."""
     camera_poses: Annotated[Path, arg(metavar="FILE")]
-    """camera_from_board of every image: from 'evercal detect', or CSV, JSON, NPY, TUM."""
+    """camera_from_board of every image: from 'evercal detect', or like --robot-poses."""
     mount: Literal["eye_in_hand", "eye_to_hand"]
     """eye_in_hand: camera on the gripper. eye_to_hand: fixed camera, board in the gripper."""
     scale: Literal["known", "unknown"] = "known"

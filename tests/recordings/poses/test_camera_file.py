@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -179,8 +180,9 @@ def test_ros_numbers_in_any_notation_are_exact(
         ("hello world", "no camera in it"),
         ("a: [1", "not valid YAML"),
         ("{'single': 'quotes'}", "not valid JSON"),
-        ('{"width": 640}', "height"),
-        ('{"width": 1e999}', "height"),
+        ('{"width": 640}', "'camera_matrix' is missing, there is width"),
+        ('{"fx": 1, "fy": 1, "cx": 1, "cy": 1, "width": 640}', "'image_height' is missing"),
+        ('{"fx": 1, "cx": 1, "cy": 1}', "camera 'fy' is missing"),
         (CALIBRATION.replace("image_width", "breadth"), "'image_width' is missing"),
         (CALIBRATION.replace("640", "wide"), "image size"),
         (CALIBRATION.replace("640", "0"), "width"),
@@ -220,3 +222,65 @@ def test_yaml_cannot_run_code(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not valid YAML"):
         read_camera(written(tmp_path, text))
     assert not bait.exists()
+
+
+K, D = CAMERA.matrix().tolist(), list(CAMERA.distortion)
+FLAT = [value for row in K for value in row]
+SIZE = {"image_width": 640, "image_height": 480}
+REALSENSE = {"fx": 525.25, "fy": 526.5, "ppx": 319.5, "ppy": 239.25, "width": 640, "height": 480}
+FIELDS = [
+    {"camera_matrix": K, "dist_coeffs": [D], **SIZE},
+    {"camera_matrix": FLAT, "dist_coeff": D, "image_size": [640, 480]},
+    {"camera_matrix": {"rows": 3, "cols": 3, "data": FLAT}, "dist": D, "resolution": [640, 480]},
+    {"K": K, "D": D, "img_size": {"width": 640, "height": 480}},
+    {"mtx": K, "dist": [[d] for d in D]},
+    {"K": K, "distortion": D, "width": 640, "height": 480},
+    {"intrinsic_matrix": CAMERA.matrix().T.ravel().tolist(), "distortion_coefficients": D},
+    {**REALSENSE, "coeffs": D, "model": "distortion.brown_conrady"},
+    {**CAMERA.to_dict(), "k1": 0.5},
+    {"fx": 525.25, "fy": 526.5, "cx": 319.5, "cy": 239.25,
+     **dict(zip(("k1", "k2", "p1", "p2", "k3"), D, strict=True))},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("fields", FIELDS)
+def test_fields_of_json_yaml_and_npz_give_the_same_camera(
+    tmp_path: Path, fields: dict[str, object]
+) -> None:
+    assert read_camera(written(tmp_path, json.dumps(fields)), (640, 480)) == CAMERA
+    assert read_camera(written(tmp_path, yaml.safe_dump(fields)), (640, 480)) == CAMERA
+    if not any(isinstance(value, (dict, str)) for value in fields.values()):
+        np.savez(tmp_path / "c.npz", **fields)  # pyright: ignore[reportArgumentType]
+        assert read_camera(tmp_path / "c.npz", (640, 480)) == CAMERA
+
+
+def test_files_with_a_matrix_alone_have_no_distortion(tmp_path: Path) -> None:
+    ideal = CAMERA.pinhole
+    for text in (json.dumps({"camera_matrix": K}), json.dumps(K), str(CAMERA.matrix())):
+        assert read_camera(written(tmp_path, text), (640, 480)) == ideal
+    assert read_camera(stored(tmp_path, dist_coeffs=np.zeros(5))) == ideal
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"K": K, "D": D}, "'image_width' is missing, so it has no image size"),
+        ({"K": K, "D": D, "width": 640}, "'image_height' is missing"),
+        ({"K": K, "distortion_parameters": D, **SIZE}, "there is distortion_parameters"),
+        ({"K": K, "dist": D, "d": D, **SIZE}, "dist and d are the same; keep one"),
+        ({"K": K, "image_size": [480, 640, 3]}, "image size is width and height"),
+        ({**REALSENSE, "coeffs": D, "model": "inverse_brown_conrady"}, "is not supported"),
+        ({**REALSENSE, "coeffs": [0] * 5, "model": "kannala_brandt4"}, "is not supported"),
+        ({"K": K[:2], **SIZE}, "camera_matrix has 9 numbers, got 6"),
+    ],
+)
+def test_unclear_fields_are_refused(
+    tmp_path: Path, fields: dict[str, object], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        read_camera(written(tmp_path, json.dumps(fields)))
+
+
+def test_realsense_without_distortion_is_read(tmp_path: Path) -> None:
+    fields = {**REALSENSE, "coeffs": [0.0] * 5, "model": "Inverse Brown Conrady"}
+    assert read_camera(written(tmp_path, json.dumps(fields))) == CAMERA.pinhole

@@ -41,6 +41,7 @@ DEGREE = math.pi / 180
 ROTATIONS: dict[str, Callable[..., Array]] = {
     "wxyz": of_quaternion,
     "xyzw": lambda x, y, z, w: of_quaternion(w, x, y, z),
+    "tum": lambda x, y, z, w: of_quaternion(w, x, y, z),
     "abb": of_quaternion,
     "ur": of_vector,
     "rpy": fixed_xyz(1.0),
@@ -158,10 +159,10 @@ def rows(name: str) -> Array:
         ("wxyz:mm", "wxyz", "look like millimetres; give --robot-convention wxyz:mm"),
         ("matrix:mm", "matrix", "look like millimetres; give --robot-convention matrix:mm"),
         ("franka:mm", "franka:inverse", "give --robot-convention franka:inverse:mm"),
-        ("kuka:m", "kuka", "looks like metres; give --robot-convention kuka:m"),
-        ("rpy:deg", "rpy", "looks like degrees; give --robot-convention rpy:deg"),
-        ("ur:deg", "ur", "looks like degrees; give --robot-convention ur:deg"),
-        ("fanuc:rad", "fanuc", "looks like radians; give --robot-convention fanuc:rad"),
+        ("kuka:m", "kuka", "look like metres; give --robot-convention kuka:m"),
+        ("rpy:deg", "rpy", "look like degrees; give --robot-convention rpy:deg"),
+        ("ur:deg", "ur", "look like degrees; give --robot-convention ur:deg"),
+        ("fanuc:rad", "fanuc", "look like radians; give --robot-convention fanuc:rad"),
     ],
 )
 def test_other_units_are_refused_unless_stated(written: str, read: str, remedy: str) -> None:

@@ -145,4 +145,5 @@ def _link_from_optical(optical: str, options: ExportOptions) -> SE3:
 def _poses(source: PoseSource, role: str, convention: str | None) -> RobotPoses | None:
     if source is None or isinstance(source, RobotPoses):
         return source
-    return read_robot_poses(source, convention, what=f"file of {role} poses")
+    option = "--convention" if role == "robot" else None
+    return read_robot_poses(source, convention, what=f"file of {role} poses", option=option)

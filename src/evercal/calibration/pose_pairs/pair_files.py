@@ -26,7 +26,7 @@ class PairFiles:
     """Files of pose pairs and their conventions."""
 
     robot: Path
-    """base_from_gripper: CSV, JSON, NPY or TUM."""
+    """base_from_gripper: a table, JSON, NPY, NPZ or TUM."""
     camera: Path
     """camera_from_board: the file of `evercal detect`, or a file like that of the robot."""
     robot_convention: str | None = None
@@ -118,7 +118,9 @@ def _read_camera(files: PairFiles) -> _CameraPoses:
         board = replace(board, images=tuple(images))
         camera = _CameraPoses(names, times_in_names(names), poses, board)
     else:
-        table = _read_poses(files.camera, "camera", files.camera_convention)
+        # Inverted, the file states board_from_camera.
+        camera_from = files.invert not in ("camera", "both")
+        table = _read_poses(files.camera, "camera", files.camera_convention, camera_from)
         stamps = table.stamps_s
         if stamps is None and table.names is not None:
             stamps = times_in_names(table.names)
@@ -128,12 +130,19 @@ def _read_camera(files: PairFiles) -> _CameraPoses:
     return replace(camera, poses=[p if p is None else p.inverse() for p in camera.poses])
 
 
-def _read_poses(path: Path, role: str, convention: str | None) -> RobotPoses:
+def _read_poses(
+    path: Path, role: str, convention: str | None, camera_from: bool = False
+) -> RobotPoses:
     """Read a table of poses; messages name its role and its own option."""
     if not path.exists():
         raise InputError(f"{path}: file of {role} poses is missing; check --{role}-poses")
-    what = f"file of {role} poses"
-    return read_robot_poses(path, convention, what=what, option=f"--{role}-convention")
+    return read_robot_poses(
+        path,
+        convention,
+        what=f"file of {role} poses",
+        option=f"--{role}-convention",
+        camera_from=camera_from,
+    )
 
 
 def _is_board_file(path: Path) -> bool:

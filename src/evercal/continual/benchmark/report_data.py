@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -88,16 +87,6 @@ class Report:
         return {name: rows for name, rows in tables.items() if len(rows) > 1}
 
 
-def require_pandas() -> None:
-    """Check that tables can be computed.
-
-    Raises:
-        InputError: pandas is not installed.
-    """
-    if find_spec("pandas") is None:
-        raise InputError("tables of a benchmark need pandas: pip install 'evercal[bench]'")
-
-
 def read_report(folder: Path, reference: str, compare_with: Sequence[Path] = ()) -> Report:
     """Read results.
 
@@ -107,9 +96,8 @@ def read_report(folder: Path, reference: str, compare_with: Sequence[Path] = ())
         compare_with: Other folders with results of the same scenes.
 
     Raises:
-        InputError: A folder has no results, or results of other scenes, or pandas is missing.
+        InputError: A folder has no results, or results of other scenes.
     """
-    require_pandas()
     runs, settings = _results(folder)
     others = []
     for other in compare_with:

@@ -30,7 +30,7 @@ from evercal.recordings.formats.bags.poses import poses_at_images
 from evercal.recordings.formats.bags.tf_tree import plain_name
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, image_file
-from evercal.recordings.poses.camera_file import camera_from_ros, check_size, read_camera_of_size
+from evercal.recordings.poses.camera_file import camera_from_fields, check_size, read_camera_of_size
 from evercal.recordings.poses.pose_track import MAX_GAP_S
 from evercal.recordings.read_options import ReadOptions
 
@@ -198,4 +198,4 @@ def _camera(message: Any, rectified: bool) -> Camera:
         data = {"k": [*p[:3], *p[4:7], *p[8:11]], "d": [], "distortion_model": ""}
     offsets = {name: int(getattr(message.roi, name)) for name in ("x_offset", "y_offset")}
     size = {"width": int(message.width), "height": int(message.height)}
-    return camera_from_ros({**data, **size, "roi": offsets})
+    return camera_from_fields({**data, **size, "roi": offsets})

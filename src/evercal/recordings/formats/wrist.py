@@ -1,8 +1,9 @@
 """A plain folder: images, and the gripper pose at each, see docs/formats.md.
 
-Poses are in base_from_gripper.csv, .json, .npy, .tum or .txt, or in joints.csv or joints.json with
-a URDF. Rows are paired with images by name, by time or in order. Images with a pose become training
-frames with base_from_gripper; gripper_from_camera is unknown. All images come from one camera.
+Poses are in base_from_gripper.csv, .json, .npy, .npz, .tum or .txt, or in joints.csv or joints.json
+with a URDF. Rows are paired with images by name, by time or in order. Images with a pose become
+training frames with base_from_gripper; gripper_from_camera is unknown. All images come from one
+camera.
 """
 
 import os
@@ -21,12 +22,14 @@ from evercal.recordings.poses.row_files import natural_key, read_rows
 from evercal.recordings.read_options import ReadOptions, flag
 
 USES = ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention")
-_POSES = tuple(f"base_from_gripper.{ending}" for ending in ("csv", "json", "npy", "tum", "txt"))
+_POSES = tuple(
+    f"base_from_gripper.{ending}" for ending in ("csv", "json", "npy", "npz", "tum", "txt")
+)
 _JOINTS = ("joints.csv", "joints.json")
 _CAMERAS = tuple(
     f"{stem}.{ending}"
     for stem in ("camera", "camera_info")
-    for ending in ("json", "yaml", "yml", "xml", "txt")
+    for ending in ("json", "yaml", "yml", "xml", "npz", "txt")
 )
 _FOLDERS = (".", "images", "rgb")
 
@@ -107,8 +110,8 @@ def _camera(root: Path, file: Path | None, image: Path) -> Camera:
             files = f"{' and '.join(names)} in it" if names else "no camera file in it"
             raise InputError(
                 f"{root}: {files}; name the file of the intrinsics with --camera (3x3 matrix, JSON,"
-                f" camera_info YAML or OpenCV's storage), or put it there as camera.json,"
-                f" .yaml, .xml or .txt"
+                f" YAML, NPZ or OpenCV's storage), or put it there as camera.json, .yaml, .xml,"
+                f" .npz or .txt"
             )
         file = root / names[0]
     return read_camera_of_size(file, image_size(image), image.name)

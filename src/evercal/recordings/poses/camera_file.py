@@ -1,67 +1,71 @@
-"""Camera files: 3x3 matrix as text, evercal's JSON, ROS camera_info, OpenCV's FileStorage.
+"""Camera files: a 3x3 matrix, JSON, YAML, NPZ, ROS camera_info, OpenCV's FileStorage.
 
-The content decides the kind, not the file ending. Both ROS calibration files and printed messages
-(`ros2 topic echo --once .../camera_info`) are read, with the matrix K and D of the raw image. In
-all kinds, pixel (0, 0) is the centre of the top-left pixel, and images are upright.
+The content decides the kind, not the file ending. Fields of JSON, YAML and NPZ have the names of
+OpenCV (`camera_matrix`, `dist_coeffs`), of ROS (`K`, `D`), of RealSense (`fx`, `ppx`, `coeffs`) or
+of evercal's own JSON. Of ROS, both calibration files and printed messages (`ros2 topic echo --once
+.../camera_info`) are read, with the matrix K and D of the raw image. In all kinds, pixel (0, 0) is
+the centre of the top-left pixel, and images are upright.
 """
 
+import json
 import os
 import re
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.recordings.poses.row_files import is_number
-from evercal.recordings.text_files import read_json, read_text
+from evercal.recordings.poses.row_files import arrays_as_lists, is_number
+from evercal.recordings.text_files import read_text
 
-_MODELS = ("plumb_bob", "rational_polynomial", "none", "")
+_MODELS = (
+    "plumbbob", "rationalpolynomial", "brownconrady", "radtan", "opencv", "pinhole", "none", "",
+)  # fmt: skip
+_MODEL_KEYS = ("distortionmodel", "model", "cameramodel")
 _LENGTHS = (0, 4, 5, 8)
 # Names of the fields in lower case without underscores.
 _ALIASES = {
-    "camera_matrix": ("cameramatrix", "intrinsicmatrix", "k"),
-    "distortion_coefficients": ("distortioncoefficients", "distcoeffs", "distcoeff", "d"),
-    "image_width": ("imagewidth", "width"),
-    "image_height": ("imageheight", "height"),
-}
+    "camera_matrix": ("cameramatrix", "intrinsicmatrix", "intrinsics", "k", "mtx"),
+    "distortion_coefficients": (
+        "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "distortion",
+        "dist", "coeffs", "d",
+    ),
+    "image_width": ("imagewidth", "width", "w"),
+    "image_height": ("imageheight", "height", "h"),
+    "image_size": ("imagesize", "imgsize", "resolution", "size"),
+    "fx": ("fx",),
+    "fy": ("fy",),
+    "cx": ("cx", "ppx"),
+    "cy": ("cy", "ppy"),
+}  # fmt: skip
+_ROS = ("distortionmodel", "rectificationmatrix", "projectionmatrix", "header", "roi", "p", "r")
+_EXPECTED = (
+    "give a 3x3 matrix as text, JSON, YAML or NPZ with camera_matrix and dist_coeffs, a ROS"
+    " camera_info or OpenCV's storage"
+)
 
 
 def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> Camera:
     """Read the intrinsics of one camera.
 
-    `size` is (width, height) in pixels of the images. A 3x3 matrix and OpenCV's storage without a
-    size need it; otherwise the size in the file is used.
+    `size` is (width, height) in pixels of the images. Files without a size need it; otherwise the
+    size in the file is used.
 
     Raises:
         InputError: The file is missing, of an unknown kind, or holds no usable camera.
     """
-    import yaml
-
     path = Path(path)
-    text = read_text(path, "camera file")
     try:
-        if text.lstrip().startswith("{"):
-            return Camera.from_dict(read_json(path, "camera file", _EXPECTED))
-        if text.startswith("%YAML:") or "opencv-matrix" in text or "<opencv_storage" in text:
-            return camera_from_ros(_stored_by_opencv(text, size))
-        words = re.sub(r"#.*|,", " ", text).split()
-        if all(map(is_number, words)):
-            if len(words) != 9:
-                raise ValueError(f"{len(words)} numbers, a 3x3 matrix has 9; {_EXPECTED}")
-            if size is None:
-                raise ValueError("a 3x3 matrix has no image size; give another kind of camera file")
-            return Camera.from_matrix(np.array(words, dtype=float).reshape(3, 3), *size)
-        # A printed message ends with '---', which opens a second, empty document.
-        data = next(yaml.safe_load_all(text), None)
-        if not isinstance(data, dict):
-            raise ValueError(f"no camera in it; {_EXPECTED}")
-        return camera_from_ros(data)
-    except yaml.YAMLError as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not valid YAML ({reason}); {_EXPECTED}") from None
-    except (ValueError, OverflowError) as error:
+        return camera_from_fields(_fields_of(path), size)
+    except FileNotFoundError:
+        raise InputError(f"{path}: camera file is missing; check the path") from None
+    except OSError as error:
+        raise InputError(f"{path}: camera file cannot be read ({error.strerror})") from None
+    except (ValueError, OverflowError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: {error}") from None
 
 
@@ -85,19 +89,72 @@ def check_size(source: str, camera: Camera, size: tuple[int, int], images: str) 
         )
 
 
-_EXPECTED = (
-    "give a 3x3 matrix as text, evercal's camera JSON, a ROS camera_info YAML or OpenCV's storage"
-)
+def camera_from_fields(data: Mapping[str, Any], size: tuple[int, int] | None = None) -> Camera:
+    """Build a camera from the fields of a file, or of a ROS message.
+
+    `size` is (width, height) in pixels of the images, if the fields may lack it.
+
+    Raises:
+        ValueError: A field is missing or unusable, the distortion model is not supported, or the
+            image is a region of interest.
+    """
+    fields = _fields(data)
+    ros = not {_plain(key) for key in data}.isdisjoint(_ROS)
+    roi = data.get("roi")
+    if isinstance(roi, dict) and any(roi.get(key) for key in ("x_offset", "y_offset")):
+        raise ValueError(f"the image is a cut-out (roi {roi}); give the whole image's camera_info")
+    matrix = _matrix(fields, data)
+    width, height = _size(fields, data, None if ros else size)
+    distortion = _distortion(fields, data, ros)
+    for model in (str(data[key]) for key in data if _plain(key) in _MODEL_KEYS):
+        # RealSense prints distortion.inverse_brown_conrady, mostly with zeros.
+        known = _plain(model.rpartition(".")[2].replace(" ", "")) in _MODELS
+        if not known and (any(distortion) or "conrady" not in model.lower()):
+            raise ValueError(
+                f"distortion_model {model!r} is not supported; rectify the images or calibrate with"
+                f" plumb_bob or rational_polynomial"
+            )
+    return Camera.from_matrix(matrix, width, height, tuple(distortion))
 
 
-def _stored_by_opencv(text: str, size: tuple[int, int] | None) -> dict[str, object]:
+def _fields_of(path: Path) -> Mapping[str, Any]:
+    """Fields of a file, not yet interpreted."""
+    import yaml
+
+    with path.open("rb") as file:
+        zipped = file.read(2) == b"PK"
+    if zipped:
+        return arrays_as_lists(path)
+    text = read_text(path, "camera file")
+    try:
+        if text.startswith("%YAML:") or "opencv-matrix" in text or "<opencv_storage" in text:
+            return _stored_by_opencv(text)
+        words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
+        if all(map(is_number, words)):
+            if len(words) != 9:
+                raise ValueError(f"{len(words)} numbers, a 3x3 matrix has 9; {_EXPECTED}")
+            return {"camera_matrix": [float(word) for word in words]}
+        if text.lstrip().startswith("{"):
+            return json.loads(text)
+        # A printed message ends with '---', which opens a second, empty document.
+        data = next(yaml.safe_load_all(text), None)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"not valid JSON ({error}); {_EXPECTED}") from None
+    except yaml.YAMLError as error:
+        raise ValueError(f"not valid YAML ({' '.join(str(error).split())}); {_EXPECTED}") from None
+    if not isinstance(data, dict):
+        raise ValueError(f"no camera in it; {_EXPECTED}")
+    return data
+
+
+def _stored_by_opencv(text: str) -> dict[str, Any]:
     """Values of a cv2.FileStorage."""
     import cv2
 
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         nodes = {key: storage.getNode(key) for key in storage.root().keys()}  # noqa: SIM118
-        values: dict[str, object] = {
+        values: dict[str, Any] = {
             key: node.mat().ravel().tolist() if node.isMap() else node.real()
             for key, node in nodes.items()
             if node.isMap() or node.isInt() or node.isReal()
@@ -107,16 +164,18 @@ def _stored_by_opencv(text: str, size: tuple[int, int] | None) -> dict[str, obje
         raise ValueError(f"OpenCV cannot read its storage ({text}); {_EXPECTED}") from None
     if values.get("fisheye_model"):
         raise ValueError("fisheye_model is set; rectify the images or calibrate without it")
-    if size is not None and not {"image_width", "image_height"} & _fields(values).keys():
-        values |= {"image_width": size[0], "image_height": size[1]}
     return values
 
 
-def _fields(data: Mapping[str, object]) -> dict[str, object]:
-    """Known fields under their names in a ROS calibration file."""
-    fields: dict[str, object] = {}
+def _plain(key: object) -> str:
+    return str(key).lower().replace("_", "")
+
+
+def _fields(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Known fields by key of `_ALIASES`."""
+    fields: dict[str, Any] = {}
     for name, aliases in _ALIASES.items():
-        keys = [key for key in data if str(key).lower().replace("_", "") in aliases]
+        keys = [key for key in data if _plain(key) in aliases]
         if len(keys) > 1:
             raise ValueError(f"{' and '.join(keys)} are the same; keep one of them")
         if keys:
@@ -124,51 +183,76 @@ def _fields(data: Mapping[str, object]) -> dict[str, object]:
     return fields
 
 
-def camera_from_ros(data: Mapping[str, object]) -> Camera:
-    """Build the camera of the raw image from the fields of a camera_info or a calibration file.
+def _matrix(fields: Mapping[str, Any], data: Mapping[str, Any]) -> np.ndarray:
+    """(3, 3) intrinsic matrix."""
+    if "camera_matrix" in fields:
+        numbers = _numbers(fields["camera_matrix"], "camera_matrix")
+        if len(numbers) != 9:
+            raise ValueError(f"camera_matrix has 9 numbers, got {len(numbers)}")
+        matrix = np.reshape(numbers, (3, 3))
+        # Open3D writes it column after column.
+        return matrix.T if not matrix[:2, 2].any() and matrix[2, :2].any() else matrix
+    names = ("fx", "fy", "cx", "cy")
+    missing = [name for name in names if name not in fields]
+    if missing:
+        what = f"camera {missing[0]!r}" if len(missing) < 4 else "'camera_matrix'"
+        found = ", ".join(map(str, data)) or "nothing"
+        raise ValueError(f"{what} is missing, there is {found}; {_EXPECTED}")
+    fx, fy, cx, cy = (_numbers([fields[name]], name)[0] for name in names)
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
-    Raises:
-        ValueError: A field is missing or unusable, the distortion model is not supported, or the
-            image is a region of interest.
-    """
-    fields = _fields(data)
-    for name in _ALIASES:
-        if name not in fields:
-            zeros = "; write four zeros if images have no lens distortion"
-            remedy = zeros if name == "distortion_coefficients" else f"; {_EXPECTED}"
-            names = ", ".join(map(str, data)) or "nothing"
-            raise ValueError(f"'{name}' is missing, there is {names}{remedy}")
-    matrix, distortion = (_list(fields[name], name) for name in [*_ALIASES][:2])
-    model = data.get("distortion_model", "")
-    if model not in _MODELS:
-        raise ValueError(
-            f"distortion_model {model!r} is not supported; rectify the images or calibrate with"
-            f" plumb_bob or rational_polynomial"
-        )
-    if len(matrix) != 9:
-        raise ValueError(f"camera_matrix has 9 numbers, got {len(matrix)}")
-    roi = data.get("roi")
-    if isinstance(roi, dict) and any(roi.get(key) for key in ("x_offset", "y_offset")):
-        raise ValueError(f"the image is a cut-out (roi {roi}); give the whole image's camera_info")
+
+def _distortion(fields: Mapping[str, Any], data: Mapping[str, Any], ros: bool) -> list[float]:
+    """Distortion coefficients; none in files that have no such field, unless they are of ROS."""
+    name = "distortion_coefficients"
+    if name in fields:
+        numbers = _numbers(fields[name], name)
+    elif "k1" in data:
+        names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        numbers = _numbers([data.get(key, 0.0) for key in names], "k1")
+        numbers = numbers if any(numbers[5:]) else numbers[:5]
+    else:
+        other = [key for key in data if "dist" in _plain(key) and _plain(key) not in _MODEL_KEYS]
+        if ros or other:
+            raise ValueError(
+                f"{name!r} is missing, there is {', '.join(other or data)}; write four zeros if"
+                f" images have no lens distortion"
+            )
+        numbers = []
     # Longer models add terms that are mostly zero and can then be dropped.
-    while len(distortion) not in _LENGTHS and distortion[-1] == 0:
-        distortion.pop()
-    width, height = _list([fields["image_width"], fields["image_height"]], "image size")
-    return Camera.from_matrix(
-        [matrix[:3], matrix[3:6], matrix[6:]],
-        width,  # pyright: ignore[reportArgumentType]  # checked when constructed
-        height,  # pyright: ignore[reportArgumentType]
-        tuple(distortion),
-    )
+    while len(numbers) not in _LENGTHS and numbers[-1] == 0:
+        numbers.pop()
+    return numbers
 
 
-def _list(value: object, name: str) -> list[float]:
-    """Numbers from a list or from OpenCV's {rows, cols, data}."""
+def _size(
+    fields: Mapping[str, Any], data: Mapping[str, Any], size: tuple[int, int] | None
+) -> tuple[Any, Any]:
+    """Width and height in pixels, checked when the camera is constructed."""
+    names = ("image_width", "image_height")
+    stated: Any = [fields[name] for name in names if name in fields]
+    if len(stated) < 2:
+        stated = fields.get("image_size", None if stated else size)
+    if isinstance(stated, Mapping):
+        return _size(_fields(stated), stated, None)
+    if stated is None:
+        missing = next(name for name in names if name not in fields)
+        raise ValueError(
+            f"{missing!r} is missing, so it has no image size, there is {', '.join(data)}"
+        )
+    numbers = _numbers(list(stated), "image size")
+    if len(numbers) != 2:
+        raise ValueError(f"image size is width and height in pixels, got {stated}")
+    return numbers[0], numbers[1]
+
+
+def _numbers(value: Any, name: str) -> list[float]:
+    """Numbers from a list, nested or not, or from OpenCV's {rows, cols, data}."""
     value = value.get("data") if isinstance(value, dict) else value
     try:
         if not isinstance(value, list) or any(isinstance(v, bool) for v in value):
             raise TypeError
         # YAML 1.1 reads 1e-05, as written by ROS, as a word.
-        return [float(v) for v in value]
+        return np.array(value, dtype=np.float64).ravel().tolist()
     except (TypeError, ValueError):
         raise ValueError(f"'{name}' is a list of numbers, got {value!r}") from None

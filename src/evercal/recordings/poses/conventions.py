@@ -1,16 +1,16 @@
 """Named conventions for poses as numbers, as robots and programs write them.
 
-A convention defines order, units and rotation of the numbers; the table is in docs/formats.md. Its
-name may be followed by modifiers: `kuka:m` (KUKA's angles, but metres), `matrix:inverse` (the file
-holds gripper_from_base), `matrix:opengl` (camera axes x right, y up, z back). Units in the name are
-final. Units that a convention only implies are checked against the numbers by `check_units`.
+A convention defines order, units and rotation of the numbers. Its name may be followed by
+modifiers: `kuka:m` (KUKA's angles, but metres), `matrix:inverse` (gripper_from_base),
+`matrix:opengl` (camera axes x right, y up, z back). Units in the name are final, units that a
+convention only implies are checked against the numbers. docs/formats.md has the same tables.
 
 The conventions were checked against Roboception's documentation of pose formats (ABB, FANUC, KUKA,
 Yaskawa), Universal Robots' script manual, RoboDK's converters (Staubli) and libfranka's reference.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,14 +19,11 @@ from scipy.spatial.transform import Rotation
 from evercal.geometry.se3 import SE3
 
 Array = NDArray[np.float64]
-Layout = Literal["wxyz", "xyzw", "rotation_vector", "euler", "rows", "columns"]
 
 _FAR_M = 10.0  # largest distance of a gripper from its base, metres
 _NEAR_M = 0.01  # smallest distance of a gripper from its base, metres, for at least one pose
-_UNIT_TOLERANCE = 1e-2
-"""Largest error of the length of a quaternion printed with three digits."""
-_RIGID_TOLERANCE = 1e-2
-"""Largest error of R^T R of a rotation matrix printed with three digits."""
+_TOLERANCE = 1e-2  # error of a quaternion's length, or of R^T R, if printed with three digits
+_OPENGL_FROM_OPENCV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))  # its own inverse
 
 
 @dataclass(frozen=True)
@@ -34,80 +31,83 @@ class PoseConvention:
     """How numbers represent a pose."""
 
     name: str
-    layout: Layout
-    """Translation then this kind of rotation, or a matrix."""
+    """Name with modifiers."""
+    layout: str
+    """After the translation `wxyz`, `xyzw`, `vector` or scipy's Euler axes, else `rows` or
+    `columns` of a matrix."""
     meaning: str
-    euler: str = ""
-    """scipy's Euler axes: lower case about fixed axes, upper case about moving axes."""
-    degrees: bool = False
-    """Whether angles are in degrees, else radians."""
     metres_per_unit: float = 1.0
     """0.001 for millimetres."""
-    inverse: bool = False
-    opengl: bool = False
-    """Whether the camera's axes are x right, y up, z back, else OpenCV's."""
-    length_stated: bool = False
-    """Whether the name has the unit of length."""
-    angle_stated: bool = False
-    """Whether the name has the unit of angles."""
+    degrees: bool = False
+    """Whether angles are in degrees, else radians."""
 
     @property
-    def count(self) -> int:
-        """Number of numbers of a pose."""
-        return {"wxyz": 7, "xyzw": 7, "rows": 16, "columns": 16}.get(self.layout, 6)
+    def base(self) -> str:
+        """Name without modifiers."""
+        return self.name.split(":")[0]
+
+    @property
+    def is_matrix(self) -> bool:
+        """Whether the numbers are a matrix."""
+        return self.layout in ("rows", "columns")
 
     @property
     def has_angles(self) -> bool:
         """Whether some numbers are in radians or degrees."""
-        return self.layout in ("rotation_vector", "euler")
+        return not self.is_matrix and self.layout not in ("wxyz", "xyzw")
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Possible lengths of a pose; matrices may lack the row 0 0 0 1."""
+        return (12, 16) if self.is_matrix else (6,) if self.has_angles else (7,)
+
+    @property
+    def count(self) -> int:
+        """Length of a pose written by `numbers_from_poses`."""
+        return self.counts[-1]
+
+    def has(self, *modifiers: str) -> bool:
+        """Whether the name has one of these modifiers."""
+        return not set(modifiers).isdisjoint(self.name.split(":")[1:])
 
 
 class ConventionError(ValueError):
-    """A convention is missing, or does not fit the numbers.
-
-    `remedy` names the conventions to give instead.
-    """
+    """A convention is missing or does not fit the numbers; `remedy` names those to give instead."""
 
     def __init__(self, problem: str, remedy: str) -> None:
-        super().__init__(f"{problem}; give the convention {remedy}")
         self.problem, self.remedy = problem, remedy
+        super().__init__(self.naming(None))
 
     def naming(self, option: str | None) -> str:
         """Message that names the command line option of the convention, if there is one."""
         return f"{self.problem}; give {option or 'the convention'} {self.remedy}"
 
 
-_MM: dict[str, Any] = {"metres_per_unit": 0.001}
-_MM_DEG: dict[str, Any] = {"metres_per_unit": 0.001, "degrees": True}
 CONVENTIONS = {
     convention.name: convention
     for convention in (
         PoseConvention("wxyz", "wxyz", "x y z qw qx qy qz, metres"),
-        PoseConvention("xyzw", "xyzw", "x y z qx qy qz qw, metres, as ROS and TUM"),
-        PoseConvention("abb", "wxyz", "X Y Z q1 q2 q3 q4, millimetres, q1 is w", **_MM),
-        PoseConvention("ur", "rotation_vector", "x y z rx ry rz, metres, rotation vector"),
-        PoseConvention("rpy", "euler", "x y z roll pitch yaw, metres, radians, as URDF", "xyz"),
-        PoseConvention("kuka", "euler", "X Y Z A B C, mm, degrees, A about z", "ZYX", **_MM_DEG),
-        PoseConvention("fanuc", "euler", "X Y Z W P R, mm, degrees, W about x", "xyz", **_MM_DEG),
-        PoseConvention(
-            "yaskawa", "euler", "X Y Z Rx Ry Rz, mm, degrees, fixed axes", "xyz", **_MM_DEG
-        ),
-        PoseConvention(
-            "staubli", "euler", "X Y Z RX RY RZ, mm, degrees, moving axes", "XYZ", **_MM_DEG
-        ),
-        PoseConvention("matrix", "rows", "4x4 matrix row after row, metres"),
-        PoseConvention("franka", "columns", "4x4 matrix column after column, metres (O_T_EE)"),
+        PoseConvention("xyzw", "xyzw", "x y z qx qy qz qw, metres, as ROS"),
+        PoseConvention("tum", "xyzw", "stamp, then x y z qx qy qz qw, metres"),
+        PoseConvention("abb", "wxyz", "X Y Z q1 q2 q3 q4, millimetres, q1 is w", 0.001),
+        PoseConvention("ur", "vector", "x y z rx ry rz, metres, rotation vector"),
+        PoseConvention("rpy", "xyz", "x y z roll pitch yaw, metres, radians, as URDF"),
+        PoseConvention("kuka", "ZYX", "X Y Z A B C, mm, degrees, A about z", 0.001, True),
+        PoseConvention("fanuc", "xyz", "X Y Z W P R, mm, degrees, W about x", 0.001, True),
+        PoseConvention("yaskawa", "xyz", "X Y Z Rx Ry Rz, mm, degrees, fixed axes", 0.001, True),
+        PoseConvention("staubli", "XYZ", "X Y Z RX RY RZ, mm, degrees, moving axes", 0.001, True),
+        PoseConvention("matrix", "rows", "4x4 or 3x4 matrix row after row, metres"),
+        PoseConvention("franka", "columns", "matrix column after column, metres (O_T_EE)"),
     )
 }
 """All conventions by name, without modifiers."""
-MODIFIERS: dict[str, dict[str, Any]] = {
-    "m": {"metres_per_unit": 1.0, "length_stated": True},
-    "mm": {"metres_per_unit": 0.001, "length_stated": True},
-    "rad": {"degrees": False, "angle_stated": True},
-    "deg": {"degrees": True, "angle_stated": True},
-    "inverse": {"inverse": True},
-    "opengl": {"opengl": True},
+UNITS: dict[str, dict[str, Any]] = {
+    "m": {"metres_per_unit": 1.0},
+    "mm": {"metres_per_unit": 0.001},
+    "rad": {"degrees": False},
+    "deg": {"degrees": True},
 }
+"""Modifiers that change a unit; `inverse` and `opengl` are the others."""
 KNOWN_CONVENTIONS = (
     f"{', '.join(CONVENTIONS)}, followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"
 )
@@ -124,25 +124,30 @@ def pose_convention(name: str) -> PoseConvention:
     if base not in CONVENTIONS:
         raise ValueError(f"pose convention {name!r} is not known; use one of {KNOWN_CONVENTIONS}")
     convention = replace(CONVENTIONS[base], name=":".join([base, *modifiers]))
+    kinds: set[str] = set()
     for modifier in modifiers:
-        if modifier not in MODIFIERS:
-            raise ValueError(
-                f"pose convention {name!r}: modifier {modifier!r} is not known;"
-                f" use one of {', '.join(MODIFIERS)}"
-            )
-        if modifier in ("rad", "deg") and not convention.has_angles:
-            raise ValueError(f"pose convention {name!r}: it has no angles; leave :{modifier} out")
-        convention = replace(convention, **MODIFIERS[modifier])
-    kinds = [modifier.replace("mm", "m").replace("deg", "rad") for modifier in modifiers]
-    if len(set(kinds)) < len(kinds):
-        raise ValueError(f"pose convention {name!r} repeats a modifier; give each kind once")
+        if modifier not in (*UNITS, "inverse", "opengl"):
+            known = ", ".join([*UNITS, "inverse", "opengl"])
+            problem = f"modifier {modifier!r} is not known; use one of {known}"
+        elif modifier in ("rad", "deg") and not convention.has_angles:
+            problem = f"it has no angles; leave :{modifier} out"
+        elif kinds & {kind := next(iter(UNITS.get(modifier, {modifier: True})))}:
+            problem = f":{modifier} repeats a modifier; give each kind once"
+        else:
+            kinds.add(kind)
+            convention = replace(convention, **UNITS.get(modifier, {}))
+            continue
+        raise ValueError(f"pose convention {name!r}: {problem}")
     return convention
 
 
-def poses_from_numbers(numbers: ArrayLike, convention: PoseConvention) -> SE3:
-    """Convert numbers (..., `convention.count`) to poses (...).
+def poses_from_numbers(
+    numbers: ArrayLike, convention: PoseConvention, camera_from: bool = False
+) -> SE3:
+    """Convert numbers (..., k), k of `convention.counts`, to poses (...).
 
-    Poses are in metres with OpenCV's camera axes, not inverted.
+    Poses are in metres with OpenCV's camera axes, not inverted. The camera's frame is the second of
+    the pose, or the first with `camera_from` (camera_from_board); only `:opengl` depends on it.
 
     Raises:
         ValueError: The count is wrong, a number is not finite, a quaternion is not of length one,
@@ -150,20 +155,21 @@ def poses_from_numbers(numbers: ArrayLike, convention: PoseConvention) -> SE3:
         ConventionError: The matrices are transposed.
     """
     numbers = np.asarray(numbers, dtype=np.float64)
-    if numbers.shape[-1:] != (convention.count,):
+    if not numbers.ndim or numbers.shape[-1] not in convention.counts:
         raise ValueError(
-            f"a pose as {convention.name!r} has {convention.count} numbers"
+            f"a pose as {convention.name!r} has {' or '.join(map(str, convention.counts))} numbers"
             f" ({convention.meaning}), got {numbers.shape[-1] if numbers.ndim else 1}"
         )
     _refuse(~np.isfinite(numbers).all(-1), "a number is inf or nan; leave untracked poses out")
-    if convention.layout in ("rows", "columns"):
-        poses = _from_matrices(numbers.reshape(*numbers.shape[:-1], 4, 4), convention)
+    if convention.is_matrix:
+        poses = _from_matrices(numbers, convention)
     else:
-        rotation = _rotations(numbers[..., 3:], convention)
-        quaternion = rotation.as_quat(canonical=True, scalar_first=True)
+        quaternion = _rotations(numbers[..., 3:], convention).as_quat(scalar_first=True)
         poses = SE3(quaternion, numbers[..., :3] * convention.metres_per_unit)
-    poses = poses.inverse() if convention.inverse else poses
-    return poses @ _OPENGL_FROM_OPENCV if convention.opengl else poses
+    poses = poses.inverse() if convention.has("inverse") else poses
+    if not convention.has("opengl"):
+        return poses
+    return _OPENGL_FROM_OPENCV @ poses if camera_from else poses @ _OPENGL_FROM_OPENCV
 
 
 def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
@@ -172,29 +178,44 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
     Quaternions get w >= 0. If the middle angle of an Euler convention is within 1e-7 rad of gimbal
     lock, the third angle is 0 and the rotation is exact to 2e-7 rad (scipy).
     """
-    poses = poses @ _OPENGL_FROM_OPENCV if convention.opengl else poses
-    poses = poses.inverse() if convention.inverse else poses
+    poses = poses @ _OPENGL_FROM_OPENCV if convention.has("opengl") else poses
+    poses = poses.inverse() if convention.has("inverse") else poses
     translation = poses.translation_m / convention.metres_per_unit
-    if convention.layout in ("rows", "columns"):
+    layout, degrees = convention.layout, convention.degrees
+    if convention.is_matrix:
         matrix = poses.matrix()
         matrix[..., :3, 3] = translation
-        if convention.layout == "columns":
-            matrix = np.swapaxes(matrix, -1, -2)
+        matrix = matrix if layout == "rows" else np.swapaxes(matrix, -1, -2)
         return matrix.reshape(*poses.shape, 16)
     rotation = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
-    if convention.layout == "euler":
-        numbers = rotation.as_euler(
-            convention.euler, degrees=convention.degrees, suppress_warnings=True
-        )
-    elif convention.layout == "rotation_vector":
-        numbers = rotation.as_rotvec(degrees=convention.degrees)
+    if layout == "vector":
+        numbers = rotation.as_rotvec(degrees=degrees)
+    elif convention.has_angles:
+        numbers = rotation.as_euler(layout, degrees=degrees, suppress_warnings=True)
     else:
-        numbers = rotation.as_quat(canonical=True, scalar_first=convention.layout == "wxyz")
+        numbers = rotation.as_quat(canonical=True, scalar_first=layout == "wxyz")
     return np.concatenate([translation, numbers], axis=-1)
 
 
+def matrix_convention(numbers: Array) -> PoseConvention:
+    """`matrix` or `franka`, whichever makes rigid transforms of (n, 12 or 16) numbers.
+
+    Raises:
+        ConventionError: Both orders do, or neither.
+    """
+    orders = [CONVENTIONS[name] for name in ("matrix", "franka")]
+    rigid = [order for order in orders if _rigid(_matrices(numbers, order.layout)).all()]
+    if len(rigid) != 1:
+        raise ConventionError(
+            f"rows of {numbers.shape[-1]} numbers are rigid transforms in"
+            f" {'both orders' if rigid else 'no order'}",
+            "matrix (row after row) or franka (column after column)",
+        )
+    return rigid[0]
+
+
 def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
-    """Compare numbers (n, `convention.count`) of one recording with the units of their convention.
+    """Compare numbers (n, k) of one recording with the units of their convention.
 
     Units in its name are final.
 
@@ -203,11 +224,12 @@ def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
         ValueError: The numbers mix two units of length.
     """
     numbers = np.asarray(numbers, dtype=np.float64)
-    if not convention.length_stated:
-        columns = {"rows": [3, 7, 11], "columns": [12, 13, 14]}.get(convention.layout, [0, 1, 2])
-        distance = np.linalg.norm(numbers[..., columns], axis=-1)
+    if not convention.has("m", "mm"):
+        matrix = convention.is_matrix
+        at = _matrices(numbers, convention.layout)[..., 3] if matrix else numbers
+        distance = np.linalg.norm(at[..., :3], axis=-1)
         _check_lengths(distance * convention.metres_per_unit, convention)
-    if convention.has_angles and not convention.angle_stated:
+    if convention.has_angles and not convention.has("rad", "deg"):
         _check_angles(numbers[..., 3:], convention)
 
 
@@ -220,92 +242,86 @@ def _check_lengths(metres: Array, convention: PoseConvention) -> None:
         poses = ", ".join(str(i + 1) for i in np.flatnonzero(odd)[:5])
         raise ValueError(
             f"positions are {np.median(usual):.3g} m from the base, but those of poses {poses} are"
-            f" {metres[odd][0]:.3g} m; millimetres and metres may be mixed: write all of them in"
-            f" one unit"
+            f" {metres[odd][0]:.3g} m; millimetres and metres may be mixed: write all in one unit"
         )
     if far.any():
-        problem = f"positions up to {metres.max():.4g} m from the base look like millimetres"
-        raise _other_unit(convention, problem, "mm", "m")
+        raise _looks_like("mm", f"positions up to {metres.max():.4g} m from the base", convention)
     if near.any() and near.all():
-        problem = f"all positions are within {1000 * metres.max():.2g} mm of the base"
-        raise _other_unit(convention, f"{problem}, which looks like metres", "m", "mm")
+        problem = f"positions within {1000 * metres.max():.2g} mm of the base"
+        raise _looks_like("m", problem, convention)
 
 
 def _check_angles(angles: Array, convention: PoseConvention) -> None:
-    if convention.layout == "rotation_vector":
+    if convention.layout == "vector":
         angles = np.linalg.norm(angles, axis=-1)
-    largest, full = float(np.abs(angles).max(initial=0.0)), 2.0 * np.pi
-    if not convention.degrees and largest > full + 1e-6:
-        problem = f"an angle of {largest:.4g} is more than a full rotation in radians"
-        raise _other_unit(convention, f"{problem}, so it looks like degrees", "deg", "rad")
-    if convention.degrees and 0 < largest <= full:
-        problem = f"no angle is larger than {largest:.3g}"
-        raise _other_unit(convention, f"{problem}, which looks like radians", "rad", "deg")
+    largest = float(np.abs(angles).max(initial=0.0))
+    degrees = largest > 2 * np.pi + 1e-6
+    if largest > 0 and degrees != convention.degrees:
+        unit = "deg" if degrees else "rad"
+        raise _looks_like(unit, f"angles up to {largest:.4g}", convention)
 
 
-def _other_unit(
-    convention: PoseConvention, problem: str, likely: str, other: str
-) -> ConventionError:
-    units = ("m", "mm") if likely in ("m", "mm") else ("rad", "deg")
-    words = [word for word in convention.name.split(":") if word not in units]
-    likely, other = (":".join([*words, unit]) for unit in (likely, other))
-    return ConventionError(problem, f"{likely} (or {other} if the unit is right as it is)")
+def _looks_like(unit: str, problem: str, convention: PoseConvention) -> ConventionError:
+    names = {"m": "metres", "mm": "millimetres", "rad": "radians", "deg": "degrees"}
+    units = ("m", "mm") if unit in ("m", "mm") else ("rad", "deg")
+    base = ":".join(word for word in convention.name.split(":") if word not in units)
+    other = units[1 - units.index(unit)]
+    remedy = f"{base}:{unit} (or {base}:{other} if the unit is right as it is)"
+    return ConventionError(f"{problem} look like {names[unit]}", remedy)
 
 
 def _rotations(numbers: Array, convention: PoseConvention) -> Rotation:
-    if convention.layout == "euler":
-        return Rotation.from_euler(convention.euler, numbers, degrees=convention.degrees)
-    if convention.layout == "rotation_vector":
+    if convention.layout == "vector":
         return Rotation.from_rotvec(numbers, degrees=convention.degrees)
+    if convention.has_angles:
+        return Rotation.from_euler(convention.layout, numbers, degrees=convention.degrees)
     length = np.linalg.norm(numbers, axis=-1)
     _refuse(
-        np.abs(length - 1.0) > _UNIT_TOLERANCE,
+        np.abs(length - 1.0) > _TOLERANCE,
         f"the quaternion is not of length 1 (shortest {length.min(initial=1.0):.4g}, longest"
         f" {length.max(initial=1.0):.4g}); check which columns hold it",
     )
     return Rotation.from_quat(numbers, scalar_first=convention.layout == "wxyz")
 
 
-def _from_matrices(matrices: Array, convention: PoseConvention) -> SE3:
-    if convention.layout == "columns":
-        matrices = np.swapaxes(matrices, -1, -2)
-    last = np.array([0.0, 0.0, 0.0, 1.0])
-    rows_fit = np.abs(matrices[..., 3, :] - last).max(-1) < 1e-6
-    columns_fit = np.abs(matrices[..., :, 3] - last).max(-1) < 1e-6
-    if (~rows_fit & columns_fit).any():
-        orders = ("row after row", "matrix"), ("column after column", "franka")
-        stated, other = orders if convention.layout == "rows" else orders[::-1]
-        pose = _first(~rows_fit & columns_fit)
-        raise ConventionError(
-            f"{pose}: read {stated[0]}, the last column is 0 0 0 1 and the last row holds the"
-            f" translation, so it was written {other[0]}",
-            ":".join([other[1], *convention.name.split(":")[1:]]),
-        )
-    _refuse(~rows_fit, "the last row of the matrix is not 0 0 0 1, so it is no rigid transform")
-    block = matrices[..., :3, :3]
+def _matrices(numbers: Array, layout: str) -> Array:
+    """Numbers (..., 12 or 16) as matrices (..., 3 or 4, 4)."""
+    height = numbers.shape[-1] // 4
+    if layout == "rows":
+        return numbers.reshape(*numbers.shape[:-1], height, 4)
+    return np.swapaxes(numbers.reshape(*numbers.shape[:-1], 4, height), -1, -2)
+
+
+def _rigid(matrices: Array) -> NDArray[np.bool_]:
+    """(...) whether matrices (..., 3 or 4, 4) are rigid transforms."""
+    block, last = matrices[..., :3, :3], matrices[..., 3:, :]
     drift = np.abs(np.swapaxes(block, -1, -2) @ block - np.eye(3)).max((-1, -2), initial=0.0)
+    homogeneous = np.abs(last - (0.0, 0.0, 0.0, 1.0)).max((-1, -2), initial=0.0) < 1e-6
+    return (drift < _TOLERANCE) & (np.linalg.det(block) > 0) & homogeneous
+
+
+def _from_matrices(numbers: Array, convention: PoseConvention) -> SE3:
+    matrices = _matrices(numbers, convention.layout)
+    orders = [("rows", "row after row", "matrix"), ("columns", "column after column", "franka")]
+    (_, stated, _), (layout, written, other) = orders[:: 1 if convention.layout == "rows" else -1]
+    broken = ~_rigid(matrices)
+    if broken.any() and _rigid(_matrices(numbers, layout)).all():
+        raise ConventionError(
+            f"the matrices are no rigid transforms {stated}, they are written {written}",
+            ":".join([other, *convention.name.split(":")[1:]]),
+        )
     _refuse(
-        (drift > _RIGID_TOLERANCE) | (np.linalg.det(block) < 0),
-        f"the left 3x3 block of the matrix is no rotation (R^T R is off by up to"
-        f" {drift.max(initial=0.0):.3g}, a reflection has determinant -1); it may hold a scale",
+        broken,
+        f"the matrix {stated} is no rigid transform: its last row is not 0 0 0 1, or its left 3x3"
+        f" block is no rotation but holds a scale or a reflection",
     )
-    scaled = matrices.copy()
-    scaled[..., :3, 3] *= convention.metres_per_unit
-    return SE3.from_matrix(scaled, _RIGID_TOLERANCE)
+    poses = SE3.from_matrix(matrices, _TOLERANCE)
+    return SE3(poses.rotation_wxyz, poses.translation_m * convention.metres_per_unit)
 
 
 def _refuse(broken: ArrayLike, reason: str) -> None:
     """Raise for the first broken pose."""
-    if np.any(broken):
-        raise ValueError(f"{_first(broken)}: {reason}")
-
-
-def _first(broken: ArrayLike) -> str:
-    """Number of the first broken pose from 1, and how many more there are."""
-    indices = np.flatnonzero(np.atleast_1d(broken))
-    more = f" (and {len(indices) - 1} more)" if len(indices) > 1 else ""
-    return f"pose {indices[0] + 1}{more}"
-
-
-_OPENGL_FROM_OPENCV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
-"""Half a rotation about x; its own inverse."""
+    indices = np.flatnonzero(broken)
+    if len(indices):
+        more = f" (and {len(indices) - 1} more)" if len(indices) > 1 else ""
+        raise ValueError(f"pose {indices[0] + 1}{more}: {reason}")

@@ -124,7 +124,7 @@ def read_joints(path: Path) -> Rows:
         columns = tuple(str(name) for name in data["joint_names"])
         values = np.array(data["positions"], dtype=np.float64)
         lists = {key: value for key, value in data.items() if isinstance(value, list)}
-        names, times = row_labels(lists, len(values), plural=True)
+        names, times, _ = row_labels([*lists], [*lists.values()], len(values), plural=True)
         if values.shape != (len(values), len(columns)) or not np.isfinite(values).all():
             raise ValueError("'positions' are rows of finite numbers, one for each joint")
     except (KeyError, TypeError, ValueError) as error:

@@ -1,16 +1,18 @@
-"""Pose files: a table (CSV, TUM), JSON or NPY, in a named convention.
+"""Pose files: a table (CSV, TUM, text), JSON, NPY or NPZ, in a named convention.
 
-The header of a table names its columns (`pose_table`, `row_files`). JSON is a list of objects with
-`translation_m` and `quaternion_wxyz`, or `matrix`, or a list of lists of numbers; it may stand
-under `poses`. NPY is (n, 4, 4), or (n, k) numbers. A convention is required if the file does not
+JSON is a list of objects with `translation_m` and `quaternion_wxyz`, with `matrix`, or with numbers
+named like the columns of a table. It may also be a list of lists of numbers, as NPY and NPZ. Poses
+and lists of names or times may stand under keys. A convention is required if the file does not
 define the meaning of its numbers. docs/formats.md has examples.
 """
 
 import json
 import os
+import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,16 +20,27 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.conventions import (
-    KNOWN_CONVENTIONS,
     ConventionError,
     PoseConvention,
     check_units,
     pose_convention,
     poses_from_numbers,
 )
-from evercal.recordings.poses.pose_table import PoseTable, read_pose_table
-from evercal.recordings.poses.row_files import number_array, row_labels
+from evercal.recordings.poses.pose_table import (
+    PoseTable,
+    named_numbers,
+    plain_numbers,
+    read_pose_table,
+)
+from evercal.recordings.poses.row_files import arrays_as_lists, number_array, row_labels
 from evercal.recordings.text_files import read_text
+
+_KEYS = ("poses", "base_from_gripper", "camera_from_board", "T", "transforms", "matrices")
+"""Keys of poses in JSON and NPZ."""
+_WIDTHS = (6, 7, 8, 12, 13, 16, 17)
+"""Numbers of a pose, possibly after a stamp."""
+_LISTS = {"translation_m": ("x_m", "y_m", "z_m"), "quaternion_wxyz": ("qw", "qx", "qy", "qz")}
+"""Columns of lists in JSON."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +53,10 @@ class RobotPoses:
     """(n,) seconds, if the file has any."""
     poses: SE3
     """(n,) base_from_gripper, or the transforms that the file holds instead."""
+    numbers: NDArray[np.float64] | None = None
+    """(n, k) numbers of the file, to be read by `poses_from_numbers`."""
+    convention: PoseConvention | None = None
+    """Convention of the numbers. None, also of the numbers, if the file's keys state all of it."""
 
     def __len__(self) -> int:
         """Number of poses."""
@@ -52,130 +69,118 @@ def read_robot_poses(
     *,
     what: str = "file of robot poses",
     option: str | None = None,
+    camera_from: bool = False,
 ) -> RobotPoses:
-    """Read a pose file; `what` and the command line `option` of the convention are for messages.
+    """Read a pose file.
 
     Args:
-        path: A `.json` or `.npy` file; other endings are read as a table.
-        convention: Convention of the numbers, such as `kuka`, `ur` or `matrix:mm`, or `tum` for
-            xyzw after a stamp. Required if the file does not define it.
-        what: Kind of file.
-        option: Option such as `--convention`.
+        path: A `.json`, `.npy` or `.npz` file; other endings are read as a table.
+        convention: Convention of the numbers, such as `kuka`, `ur` or `matrix:mm`. Required if the
+            file does not define it.
+        what: Kind of file, for messages.
+        option: Option of the convention, such as `--convention`, for messages.
+        camera_from: Whether the file states camera_from_something, for `:opengl`.
 
     Raises:
         InputError: The file is missing or broken, or the numbers do not fit the convention.
     """
     path = Path(path)
+    ending = path.suffix.lower()
     try:
-        given = _convention(convention, path)
-        if path.suffix.lower() == ".npy":
-            numbers = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
-            one_pose = numbers.shape == (4, 4)
-            return _robot_poses(_array_table(numbers[None] if one_pose else numbers, given))
-        text = read_text(path, what)
-        if path.suffix.lower() == ".json":
-            return _robot_poses(_json_table(json.loads(text), given))
-        return _robot_poses(read_pose_table(text, given))
+        name = "tum" if convention is None and ending == ".tum" else convention
+        given = None if name is None else pose_convention(name)
+        if ending in (".npy", ".npz"):
+            table = _data_table(arrays_as_lists(path), given)
+        elif ending == ".json":
+            table = _data_table(json.loads(read_text(path, what)), given)
+        else:
+            table = read_pose_table(read_text(path, what), given)
+        return _robot_poses(table, camera_from)
     except FileNotFoundError:
         raise InputError(f"{path}: {what} is missing; check the path") from None
     except OSError as error:
         raise InputError(f"{path}: {what} cannot be read ({error.strerror})") from None
     except ConventionError as error:
         raise InputError(f"{path}: {error.naming(option)}") from None
-    except (ValueError, EOFError, TypeError) as error:  # also invalid JSON and arrays of text
-        raise InputError(f"{path}: {error}") from None
+    except (ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: {error}") from None  # also invalid JSON and arrays of text
 
 
-def _convention(given: str | None, path: Path) -> PoseConvention | None:
-    if given is None:
-        return pose_convention("xyzw") if path.suffix.lower() == ".tum" else None
-    base, colon, modifiers = given.strip().lower().partition(":")
-    return pose_convention("xyzw" + colon + modifiers if base == "tum" else given)
-
-
-def _robot_poses(table: PoseTable) -> RobotPoses:
-    if not len(table.numbers):
+def _robot_poses(table: PoseTable, camera_from: bool) -> RobotPoses:
+    numbers, convention, names, stamps, fixed = table
+    if not len(numbers):
         raise ValueError("no pose in it")
-    poses = poses_from_numbers(table.numbers, table.convention)
-    check_units(table.numbers, table.convention)
-    if table.names is not None:
-        repeated = [name for i, name in enumerate(table.names) if name in table.names[:i]]
-        if repeated:
-            raise ValueError(f"the name {repeated[0]!r} comes twice; names are unique")
-    if table.stamps_s is not None and not np.isfinite(table.stamps_s).all():
-        raise ValueError("a stamp is inf or nan; leave such rows out")
-    return RobotPoses(table.names, table.stamps_s, poses)
+    poses = poses_from_numbers(numbers, convention, camera_from)
+    check_units(numbers, convention)
+    repeated = [name for i, name in enumerate(names or ()) if name in (names or ())[:i]]
+    if repeated:
+        raise ValueError(f"the name {repeated[0]!r} comes twice; names are unique")
+    return RobotPoses(names, stamps, poses, *((None, None) if fixed else (numbers, convention)))
 
 
-def _array_table(numbers: NDArray[np.float64], given: PoseConvention | None) -> PoseTable:
-    if numbers.ndim == 3:
-        convention = given or pose_convention("matrix")
-        return PoseTable(_matrices(numbers, convention), convention)
-    if numbers.ndim != 2:
-        raise ValueError(f"poses are (n, 4, 4) or (n, k) numbers, got shape {numbers.shape}")
-    if given is None:
-        raise ConventionError(
-            f"{numbers.shape[1]} numbers do not define a pose",
-            f"NAME, one of {KNOWN_CONVENTIONS}",
-        )
-    return PoseTable(numbers, given)
-
-
-def _json_table(data: object, given: PoseConvention | None) -> PoseTable:
-    if isinstance(data, Mapping) and "poses" in data:
-        table = _json_table(data["poses"], given)
-        lists = {k: v for k, v in data.items() if k != "poses" and isinstance(v, list)}
-        names, stamps = row_labels(lists, len(table.numbers), plural=True)
-        return replace(
-            table,
-            names=names if table.names is None else table.names,
-            stamps_s=stamps if table.stamps_s is None else table.stamps_s,
-        )
-    entries = [data] if isinstance(data, Mapping) else data
-    if isinstance(entries, list) and entries:
-        if all(isinstance(entry, list) for entry in entries):
-            return _array_table(number_array(entries, "a list of poses"), given)
-        if all(isinstance(entry, Mapping) for entry in entries):
-            return _object_table(entries, given)
-    raise ValueError("JSON of poses is a list of objects, or of lists of numbers, not of both")
-
-
-def _object_table(
-    entries: Sequence[Mapping[str, object]], given: PoseConvention | None
-) -> PoseTable:
+def _data_table(data: Any, given: PoseConvention | None) -> PoseTable:
+    """Poses in lists and mappings, as in JSON."""
+    if isinstance(data, Mapping) and not {"matrix", "translation_m"} & data.keys():
+        key = _pose_key(data)
+        table = _data_table(data[key], given)
+        columns = {k: v for k, v in data.items() if k != key and isinstance(v, list)}
+        return _labelled(table, columns, plural=True)
+    entries = data if isinstance(data, list) else [data]
+    if entries and all(isinstance(entry, list) for entry in entries):
+        numbers = number_array(entries, "a list of poses")
+        single = numbers.shape in ((4, 4), (3, 4))
+        return plain_numbers(numbers[None] if single else numbers, given)
+    if not entries or not all(isinstance(entry, Mapping) for entry in entries):
+        raise ValueError("poses are a list of objects, or of lists of numbers, not of both")
+    keys = dict.fromkeys(key for entry in entries for key in entry)
+    columns = {key: [entry.get(key) for entry in entries] for key in keys}
     if all("matrix" in entry for entry in entries):
-        convention = given or pose_convention("matrix")
-        matrices = number_array([entry["matrix"] for entry in entries], "'matrix'")
-        numbers = matrices if matrices.ndim == 2 else _matrices(matrices, convention)
-    elif all({"translation_m", "quaternion_wxyz"} <= entry.keys() for entry in entries):
-        convention = given or pose_convention("wxyz")
-        if convention.layout != "wxyz":
-            raise ValueError(
-                f"'translation_m' and 'quaternion_wxyz' contradict the convention"
-                f" {convention.name}; leave it out, or give wxyz:inverse"
-            )
-        parts = [
-            number_array([entry[key] for entry in entries], f"'{key}'")
-            for key in ("translation_m", "quaternion_wxyz")
-        ]
-        if [part.shape[1:] for part in parts] != [(3,), (4,)]:
-            raise ValueError("'translation_m' has three numbers and 'quaternion_wxyz' four")
-        numbers = np.concatenate(parts, axis=-1)
-    else:
-        raise ValueError(
-            "every pose has 'translation_m' and 'quaternion_wxyz', or every pose 'matrix'"
-        )
-    columns = {key: [entry.get(key) for entry in entries] for entry in entries for key in entry}
-    return PoseTable(numbers, convention, *row_labels(columns, len(entries)))
+        return _labelled(_data_table(columns["matrix"], given), columns)
+    rows = [_flat(entry) for entry in entries]
+    words = [*rows[0]]
+    cells = np.array([[str(row.get(word)) for word in words] for row in rows])
+    table = named_numbers(words, cells, given)
+    return _labelled(table, columns)._replace(fixed="quaternion_wxyz" in columns)
 
 
-def _matrices(matrices: NDArray[np.float64], convention: PoseConvention) -> NDArray[np.float64]:
-    """(n, 4, 4) as (n, 16), refused in other conventions."""
-    if matrices.shape[1:] != (4, 4):
-        raise ValueError(f"a matrix is 4x4, got {' x '.join(map(str, matrices.shape[1:]))}")
-    if convention.layout not in ("rows", "columns"):
+def _labelled(
+    table: PoseTable, columns: Mapping[str, Sequence[object]], plural: bool = False
+) -> PoseTable:
+    """The table with names and times from lists by key, where it has none."""
+    names, stamps, _ = row_labels([*columns], [*columns.values()], len(table.numbers), plural)
+    stamps = stamps if table.stamps_s is None else table.stamps_s
+    return table._replace(names=table.names or names, stamps_s=stamps)
+
+
+def _flat(entry: Mapping[str, Any]) -> dict[str, object]:
+    """Values of an object by the name of a column."""
+    cells: dict[str, object] = {}
+    for key, value in entry.items():
+        if isinstance(value, list):
+            value = dict(zip(_LISTS.get(key, range(len(value))), value, strict=False))
+            cells |= value if key in _LISTS else {f"{key}_{i}": v for i, v in value.items()}
+        elif isinstance(value, Mapping):
+            cells |= _flat({f"{key}_{inner}": v for inner, v in value.items()})
+        else:
+            cells[key] = value
+    return cells
+
+
+def _pose_key(data: Mapping[str, Any]) -> str:
+    """The only key of poses."""
+    keys = [key for key in data if key in _KEYS] or [k for k, v in data.items() if _has_shape(v)]
+    if len(keys) != 1:
         raise ValueError(
-            f"it holds 4x4 matrices, and the convention {convention.name} means"
-            f" {convention.meaning}; give matrix or franka, or leave it out"
+            f"{' and '.join(keys) or 'none'} of its keys ({', '.join(data)}) may hold the poses;"
+            f" call the right one 'poses'"
         )
-    return matrices.reshape(-1, 16)
+    return keys[0]
+
+
+def _has_shape(values: Any) -> bool:
+    """Whether lists have the shape of matrices or of rows of poses."""
+    try:
+        shape = np.shape(values)
+    except ValueError:
+        return False
+    return shape[-2:] in ((4, 4), (3, 4)) or (len(shape) == 2 and shape[1] in _WIDTHS)

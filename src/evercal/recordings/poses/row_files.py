@@ -1,4 +1,4 @@
-"""Files with one row for each image or time: labels of the rows, and CSV files with a header.
+"""Files with one row for each image or time: cells of a table, and labels of its rows.
 
 Labels are columns of a table, or keys of JSON, that hold image names and times. Names are
 case-insensitive, and times may have a unit (`stamp_ns`, `time [ms]`). If there are several
@@ -6,11 +6,13 @@ candidates, the first of the list is used. A column with nothing but names of im
 any name. In JSON lists beside the poses, names are in the plural: `images`, `stamps_s`.
 """
 
-import csv
+import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePath
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,8 @@ from evercal.errors import InputError
 from evercal.recordings.images import IMAGE_ENDINGS
 from evercal.recordings.text_files import read_text
 
+Array = NDArray[np.float64]
+
 _NAMES = (
     "image", "image_name", "image_file", "image_path", "img", "file", "filename", "file_name",
     "file_path", "filepath", "path", "name", "frame",
@@ -26,36 +30,84 @@ _NAMES = (
 _STAMPS = ("stamp", "timestamp", "time_stamp", "time", "t")
 _UNIT = re.compile(r"[\s_]*[\s_\[(](mm|m|degrees|deg|radians|rad|ns|us|ms|s)[\])]?$|\s*\[\s*\]$")
 _SHORT = {"degrees": "deg", "radians": "rad"}
-_PER_SECOND = {"ms": 1e3, "us": 1e6, "ns": 1e9}
-_LATEST_S = 1e11  # the year 5138: a larger stamp is not in seconds
+_PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+_EARLIEST_S, _LATEST_S = 1e9, 4e9  # 2001 and 2096 in seconds since 1970
+_DECIMAL_COMMA = r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$"
 
 
-@dataclass(frozen=True)
-class Labels:
-    """Positions of the labels in a list of columns or keys."""
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """A table of numbers with one row for each image or time."""
 
-    name: int | None
-    stamp: int | None
-    unit: str | None
-    """`s`, `ms`, `us` or `ns` of the times, if stated."""
-    all: frozenset[int]
-    """All columns or keys with the name of a label."""
+    names: tuple[str, ...] | None
+    """(n,) image names, if there is such a column."""
+    stamps_s: Array | None
+    """(n,) seconds, if there is such a column."""
+    columns: tuple[str, ...]
+    """Names of the other columns."""
+    values: Array
+    """(n, columns) numbers."""
 
 
-def find_labels(words: Sequence[str], plural: bool = False) -> Labels:
-    """Find labels among names of columns, or among plural keys of JSON lists."""
-    positions: dict[str, int] = {}
-    for i, word in enumerate(words):
-        name, _ = name_and_unit(word)
-        if not plural or name.endswith("s"):
-            positions.setdefault(name[:-1] if plural else name, i)
-    stamp = next((positions[n] for n in _STAMPS if n in positions), None)
-    return Labels(
-        name=next((positions[n] for n in _NAMES if n in positions), None),
-        stamp=stamp,
-        unit=None if stamp is None else name_and_unit(words[stamp])[1],
-        all=frozenset(i for n, i in positions.items() if n in _NAMES + _STAMPS),
+def read_rows(path: Path, contents: str) -> Rows:
+    """Read a table whose first line names the columns; `contents` describes it in messages.
+
+    Raises:
+        InputError: The file is missing, lacks a header or rows, or holds a cell that is not a
+            finite number.
+    """
+    text = read_text(path, f"file with {contents}")
+    try:
+        cells = table_cells([line for line in text.splitlines() if line[:1] != "#"])
+        if len(cells) < 2 or all(map(is_number, cells[0])):
+            raise ValueError(f"needs a line of column names, then rows of {contents}")
+        header, rows = cells[0].tolist(), cells[1:]
+        names, stamps, others = row_labels(header, rows.T.tolist(), len(rows))
+        columns = tuple(header[i] for i in others)
+        values = cell_numbers(rows[:, others], columns)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    return Rows(names, stamps, columns, values)
+
+
+def table_cells(lines: Sequence[str]) -> NDArray[np.str_]:
+    """(n, k) cells of lines of text; missing cells at the end of a line are empty.
+
+    Semicolons, commas, tabs or blanks of the first line separate them. If it is semicolons, the
+    comma may be a decimal point.
+
+    Raises:
+        ValueError: A line has more cells than the first.
+    """
+    import pandas as pd
+
+    lines = [line.strip(" \r\n") for line in lines if line.strip()]
+    separator = next((s for s in (";", ",", "\t") if lines and s in lines[0]), r"\s+")
+    text, options = io.StringIO("\n".join(lines)), {"header": None, "keep_default_na": False}
+    try:
+        table = pd.read_csv(text, sep=separator, dtype=str, skipinitialspace=True, **options)
+    except pd.errors.EmptyDataError:
+        return np.empty((0, 0), dtype=np.str_)
+    except pd.errors.ParserError as error:
+        raise ValueError(f"no table: {str(error).strip().rpartition('error: ')[2]}") from None
+    if separator == ";":
+        table = table.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
+    cells = np.char.strip(table.to_numpy(dtype=np.str_))
+    return cells[:, :-1] if (cells[:, -1] == "").all() else cells  # a separator ends each line
+
+
+def cell_numbers(cells: NDArray[np.str_], words: Sequence[str] = ()) -> Array:
+    """Convert cells (n, k) to finite numbers; ValueError names the first other cell."""
+    with suppress(ValueError):
+        if np.isfinite(numbers := cells.astype(np.float64)).all():
+            return numbers
+    (row, column), cell = next(
+        (at, str(cell))
+        for at, cell in np.ndenumerate(cells)
+        if not is_number(cell) or not np.isfinite(float(cell))
     )
+    name = repr(words[column]) if words else column + 1
+    raise ValueError(f"row {row + 1}, column {name}: {cell!r} is not a finite number")
 
 
 def name_and_unit(cell: str) -> tuple[str, str | None]:
@@ -67,67 +119,76 @@ def name_and_unit(cell: str) -> tuple[str, str | None]:
     return re.sub(r"[\s.]+", "_", name), _SHORT.get(unit or "", unit)
 
 
-def _image_column(columns: Mapping[str, Sequence[object]]) -> str | None:
-    """Name of the only column with nothing but names of image files, if there is one."""
-    names = [
-        name
-        for name, cells in columns.items()
-        if cells and all(str(cell).lower().endswith(IMAGE_ENDINGS) for cell in cells)
-    ]
-    if len(names) > 1:
-        raise ValueError(f"{' and '.join(names)} name image files; call the right one 'image'")
-    return names[0] if names else None
-
-
 def row_labels(
-    columns: Mapping[str, Sequence[object]], count: int, plural: bool = False
-) -> tuple[tuple[str, ...] | None, NDArray[np.float64] | None]:
-    """Image names and seconds of `count` rows, each None if there is no such column.
+    words: Sequence[str], columns: Sequence[Sequence[object]], count: int, plural: bool = False
+) -> tuple[tuple[str, ...] | None, Array | None, list[int]]:
+    """Image names and seconds of `count` rows, or None, and indices of the other columns.
 
     Raises:
         ValueError: A column is incomplete, a time is no number, or the columns are ambiguous.
     """
-    keys = [*columns]
-    labels = find_labels(keys, plural)
-    name, stamp = (None if i is None else keys[i] for i in (labels.name, labels.stamp))
-    name = name or _image_column(columns)
-    for key in filter(None, (name, stamp)):
-        if len(columns[key]) != count:
-            raise ValueError(f"{key!r} holds {len(columns[key])} entries for {count} poses")
-        if None in columns[key]:
-            raise ValueError(f"some poses have {key!r}, others lack it; give it to all poses")
-    seconds = None
-    if stamp is not None:
-        seconds = in_unit(number_array(columns[stamp], f"{stamp!r}"), labels.unit)
-    return None if name is None else tuple(map(str, columns[name])), seconds
+    plain = [name_and_unit(word)[0] for word in words]
+    plain = [name[:-1] if name.endswith("s") else "" for name in plain] if plural else plain
+    name, stamp = (next((plain.index(w) for w in k if w in plain), None) for k in (_NAMES, _STAMPS))
+    if name is None:
+        ends = [
+            [str(cell).lower().endswith(IMAGE_ENDINGS) for cell in column] for column in columns
+        ]
+        files = [i for i, images in enumerate(ends) if images and all(images)]
+        if len(files) > 1:
+            found = " and ".join(words[i] for i in files)
+            raise ValueError(f"{found} name image files; call the right one 'image'")
+        name = files[0] if files else None
+    for i in (i for i in (name, stamp) if i is not None):
+        if len(columns[i]) != count:
+            raise ValueError(f"{words[i]!r} holds {len(columns[i])} entries for {count} poses")
+        if None in columns[i]:
+            raise ValueError(f"some poses have {words[i]!r}, others lack it; give it to all poses")
+    others = [i for i, word in enumerate(plain) if word not in _NAMES + _STAMPS and i != name]
+    names = None if name is None else tuple(map(str, columns[name]))
+    if stamp is None:
+        return names, None, others
+    times = number_array(columns[stamp], f"{words[stamp]!r}")
+    return names, in_unit(times, name_and_unit(words[stamp])[1]), others
 
 
-def number_array(values: object, what: str) -> NDArray[np.float64]:
-    """Convert nested lists to an array.
-
-    Raises:
-        ValueError: The lists are ragged or hold something other than numbers.
-    """
+def number_array(values: object, what: str) -> Array:
+    """Convert nested lists to an array; ValueError if they are ragged or hold other things."""
     try:
         return np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
         raise ValueError(f"{what} is made of numbers and has the same shape everywhere") from None
 
 
-def in_unit(stamps: NDArray[np.float64], unit: str | None) -> NDArray[np.float64]:
-    """Convert stamps (n,) to seconds from `s`, `ms`, `us` or `ns`; seconds if omitted.
+def arrays_as_lists(path: Path) -> Any:
+    """An array of NPY as lists, or the arrays of NPZ by name; ValueError or BadZipFile."""
+    with path.open("rb") as file:
+        loaded = np.load(file, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return loaded.tolist()
+        return {key: loaded[key].tolist() for key in loaded.files}
+
+
+def in_unit(stamps: Array, unit: str | None = None) -> Array:
+    """Convert stamps (n,) to seconds from `s`, `ms`, `us` or `ns`, by their size if omitted.
+
+    Times since 1970 are about 1.7e9 s, and a thousand, a million or a billion times as large in
+    milli-, micro- or nanoseconds. Smaller numbers are seconds.
 
     Raises:
-        ValueError: The unit is omitted, and the numbers are too large for seconds.
+        ValueError: The numbers are too large for seconds.
     """
-    if unit in _PER_SECOND:
-        return stamps / _PER_SECOND[unit]
-    if stamps.ndim != 1 or np.abs(stamps).max(initial=0.0) > _LATEST_S:
+    middle = float(np.median(stamps)) if stamps.size else 0.0
+    sizes = {"ns": 1e17, "us": 1e14, "ms": 1e11}
+    likely = next((name for name, size in sizes.items() if middle > size), "s")
+    if not np.isfinite(stamps).all():
+        raise ValueError("a stamp is inf or nan; leave such rows out")
+    if stamps.ndim != 1 or (unit == "s" and likely != "s"):
         raise ValueError(
-            f"a stamp of {np.abs(stamps).max(initial=0.0):.4g} is not in seconds; call the column"
-            f" stamp_ns, stamp_us or stamp_ms"
+            f"a stamp of {middle:.4g} is not in seconds; call the column stamp_ns, stamp_us or"
+            f" stamp_ms"
         )
-    return stamps
+    return stamps / _PER_SECOND[unit if unit in _PER_SECOND else likely]
 
 
 def is_number(cell: str) -> bool:
@@ -139,79 +200,7 @@ def is_number(cell: str) -> bool:
     return True
 
 
-_EARLIEST_S, _LATEST_S = 1e9, 4e9
-"""The years 2001 and 2096 in seconds since 1970, the range of plausible times of recordings."""
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """A table of numbers with one row for each image or time."""
-
-    names: tuple[str, ...] | None
-    """(n,) image names, if there is such a column."""
-    stamps_s: NDArray[np.float64] | None
-    """(n,) seconds, if there is such a column."""
-    columns: tuple[str, ...]
-    """Names of the other columns."""
-    values: NDArray[np.float64]
-    """(n, columns) numbers."""
-
-
-def read_rows(path: Path, contents: str) -> Rows:
-    """Read a CSV file whose first line names the columns; `contents` describes it in messages.
-
-    Raises:
-        InputError: The file is missing, lacks a header or rows, or holds a cell that is not a
-            finite number.
-    """
-    text = read_text(path, f"file with {contents}")
-    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    separator = ";" if lines and ";" in lines[0] else ","
-    cells = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator)]
-    if len(cells) < 2 or all(map(is_number, cells[0])):
-        raise InputError(f"{path}: needs a line of column names, then rows of {contents}")
-    header, *rows = cells
-    labels = find_labels(header)
-    others = [i for i in range(len(header)) if i not in labels.all]
-    numbers = [*others] if labels.stamp is None else [*others, labels.stamp]
-    values = np.empty((len(rows), len(numbers)))
-    for i, row in enumerate(rows):
-        if len(row) != len(header):
-            raise InputError(
-                f"{path}: row {i + 1} has {len(row)} cells, the header has {len(header)}"
-            )
-        for j, column in enumerate(numbers):
-            values[i, j] = float(row[column]) if is_number(row[column]) else np.nan
-            if not np.isfinite(values[i, j]):
-                raise InputError(
-                    f"{path}: row {i + 1}, column {header[column]!r}: {row[column]!r} is not a"
-                    f" number"
-                )
-    stamps = None
-    if labels.stamp is not None:
-        try:
-            stamps = (
-                in_unit(values[:, -1], labels.unit) if labels.unit else in_seconds(values[:, -1])
-            )
-        except ValueError as error:
-            raise InputError(f"{path}: {error}") from None
-    names = None if labels.name is None else tuple(row[labels.name] for row in rows)
-    return Rows(names, stamps, tuple(header[i] for i in others), values[:, : len(others)])
-
-
-def in_seconds(stamps: NDArray[np.float64] | Sequence[float]) -> NDArray[np.float64]:
-    """Convert times to seconds, with a unit inferred from their size.
-
-    Times since 1970 are about 1.7e9 s, and a thousand, a million or a billion times as large in
-    milli-, micro- or nanoseconds. Smaller numbers are seconds.
-    """
-    stamps = np.asarray(stamps, dtype=np.float64)
-    middle = float(np.median(stamps)) if stamps.size else 0.0
-    unit = next((u for size, u in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)) if middle > size), 1.0)
-    return stamps * unit
-
-
-def times_in_names(names: Sequence[str]) -> NDArray[np.float64] | None:
+def times_in_names(names: Sequence[str]) -> Array | None:
     """(n,) seconds if the image names are times, else None.
 
     Times have a decimal point, or are whole milli-, micro- or nanoseconds since 1970. Frame numbers
@@ -220,7 +209,7 @@ def times_in_names(names: Sequence[str]) -> NDArray[np.float64] | None:
     stems = [without_ending(name) for name in names]
     if not stems or not all(re.fullmatch(r"\d+(\.\d+)?", stem) for stem in stems):
         return None
-    times = in_seconds([float(stem) for stem in stems])
+    times = in_unit(np.array(stems, dtype=np.float64))
     since_1970 = ((times > _EARLIEST_S) & (times < _LATEST_S)).all()
     return times if since_1970 or any("." in stem for stem in stems) else None
 
