@@ -27,6 +27,7 @@ from evercal.calibration.calibration import Mount
 from evercal.calibration.pose_pairs.measured import BoardCorners
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve
+from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside
 from evercal.geometry import SE3, Camera, pose_distance
 
@@ -267,13 +268,17 @@ CONDITIONS: dict[str, tuple[BoardSetting, bool]] = {
 def measure(name: str, count: int, references: int) -> dict[str, object]:
     """Solve many recordings of one condition; the first `references` also by other solvers."""
     setting, with_corners = CONDITIONS[name]
-    squared, flagged, ms = [], [], []
+    squared, flagged, ms, refused = [], [], [], 0
     mm: dict[str, list[float]] = {"evercal": []}
     for seed in range(count):
         drawn = record(setting, seed)
         pairs, corners = corner_pairs(drawn) if with_corners else (pose_pairs(drawn, seed), None)
         began = time.process_time()
-        result = solve(pairs, setting.mount, corners=corners)
+        try:
+            result = solve(pairs, setting.mount, corners=corners)
+        except InputError:
+            refused += 1
+            continue
         ms.append(1000 * (time.process_time() - began))
         truth = drawn.parent_from_camera
         squared.append(result.uncertain_pose.squared_mahalanobis(truth))
@@ -287,7 +292,7 @@ def measure(name: str, count: int, references: int) -> dict[str, object]:
                 estimates["reprojection"] = reprojection(drawn, pairs, corners, start)
         for solver, estimate in estimates.items():
             mm.setdefault(solver, []).append(1000 * float(pose_distance(estimate, truth)[0]))
-    row: dict[str, object] = {"condition": name, "trials": count}
+    row: dict[str, object] = {"condition": name, "trials": count, "refused": refused}
     row |= {
         "median_mm": float(np.median(mm["evercal"])),
         "p95_mm": float(np.quantile(mm["evercal"], 0.95)),

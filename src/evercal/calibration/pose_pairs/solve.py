@@ -274,7 +274,7 @@ class _Problem:
     ) -> tuple[PoseEquation, HandEyeFit, Measured | None]:
         """Fit all unknowns; with corners, until the intrinsics no longer change."""
         at = _in_the_middle(start, _middle(self.corners))
-        for _ in range(_MOST_LENSES):
+        for turn in range(_MOST_LENSES):
             equation = self.equation(pairs, lens)[rows]
             at = replace(at, extras=np.zeros(len(equation.extras.names)))
             fit = robust_fit(equation, agreement(equation, at))
@@ -283,7 +283,9 @@ class _Problem:
             group, at = _group(equation, "intrinsics"), fit.at
             change = at.extras[group]
             information = equation.extras.information[np.ix_(group, group)]
-            if change @ information @ change < _SAME_LENS:
+            # A pose at the threshold of rejection may alternate for ever, and the lens with it.
+            least = len(change) if turn == _MOST_LENSES - 1 else _SAME_LENS
+            if change @ information @ change < least:
                 return equation, fit, lens
             try:
                 camera = moved_camera(lens.camera, change)
