@@ -11,6 +11,7 @@ VERBS = {
     "trust": "other lenses, few images, an inaccurate arm: errors and their stated deviations",
     "repeat": "a wrist camera before a chessboard, in three folds",
     "handeye": "pose pairs: errors, ellipsoids, outliers, scale, time",
+    "boards": "detection of rendered boards, beside the finders of OpenCV",
     "handeye-boards": "boards through a lens found from the same images, beside other solvers",
     "many-keyframes": "localization among thousands of keyframes of other rooms",
     "peers": "SIFT and XFeat on the same frames",

@@ -29,10 +29,12 @@ class Detect:
     Example: evercal detect images/ --board chessboard --size 9x6 --square-mm 25
     """
 
-    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
-    """Image files of one camera, or a folder of them."""
     board: Literal["chessboard", "charuco", "apriltag"]
     """Printed board."""
+    images: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")
+    ] = ()
+    """Image files of one camera, or a folder of them."""
     size: Annotated[str | None, arg(metavar="CxR", help_behavior_hint="")] = None
     """Inner corners of a chessboard (9x6), or squares of a ChArUco board."""
     square_mm: Annotated[float | None, arg(metavar="MM", help_behavior_hint="")] = None
@@ -50,11 +52,19 @@ class Detect:
     """File of the intrinsics; if omitted, they are estimated from the board."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("board.json")
     """File of poses and corners to write."""
+    make_board: Annotated[Path | None, arg(metavar="FILE.pdf|svg", help_behavior_hint="")] = None
+    """Write the board at true size, to print; detect nothing."""
+    paper: Annotated[str, arg(metavar="NAME")] = "a4"
+    """Paper of --make-board: a4, letter, a3, tabloid, a2, a1 or a0."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Detect the board in every image and write the poses."""
+        """Detect the board in every image and write the poses, or print a board."""
+        if self.make_board is not None:
+            return self._make(self.make_board)
+        if not self.images:
+            raise InputError("no images: give image files or a folder, or --make-board FILE.pdf")
         require_writable(self.out, "--out")
         from evercal.recordings.image_files import image_files
 
@@ -86,6 +96,20 @@ class Detect:
             print_json(poses.to_dict())
         else:
             self._print(poses)
+        return 0
+
+    def _make(self, path: Path) -> int:
+        from evercal.calibration.boards.printing import label, write_board
+
+        if self.images:
+            raise InputError("--make-board: give no images; it detects nothing")
+        require_writable(path, "--make-board")
+        board = self._board()
+        write_board(path, board, self.paper)
+        if self.json:
+            print_json({"file": str(path), "paper": self.paper, "board": board.to_dict()})
+        else:
+            print(f"wrote {path} on {self.paper}: {label(board)} Measure the 100 mm ruler.")
         return 0
 
     def _board(self) -> "Board":

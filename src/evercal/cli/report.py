@@ -12,6 +12,7 @@ from evercal.cli.point_words import point_dict, point_of, point_text
 from evercal.cli.stores import open_localizer
 
 if TYPE_CHECKING:
+    from evercal.reports.board_views import BoardSeen
     from evercal.reports.calibration_images import AnnotatedImages
     from evercal.reports.calibration_page import NamedCalibration
 
@@ -49,6 +50,7 @@ class Report:
         point = point_of(self.at)
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.verdict import expected_error, tier, verdict
+        from evercal.reports.board_views import boards_seen
         from evercal.reports.calibration_page import NamedCalibration, calibration_page, difference
         from evercal.storage import write_bytes
 
@@ -57,9 +59,10 @@ class Report:
         if self.against is not None:
             older = NamedCalibration(self.against.name, read_calibration(self.against))
         file = NamedCalibration(self.calibration.name, calibration)
-        images = self._images(file, older)
+        boards = boards_seen(calibration, self.calibration.parent)
+        images = self._images(file, older, boards)
         store = None if self.store is None else str(self.store)
-        page = calibration_page(file, images, store, older, point)
+        page = calibration_page(file, images, store, older, point, boards)
         write_bytes(self.out, page.html.encode())
         text = calibration.verdict or verdict(calibration)
         if not self.json:
@@ -89,7 +92,10 @@ class Report:
         return 0
 
     def _images(
-        self, file: "NamedCalibration", older: "NamedCalibration | None"
+        self,
+        file: "NamedCalibration",
+        older: "NamedCalibration | None",
+        boards: "dict[str, BoardSeen]",
     ) -> "AnnotatedImages":
         from evercal.recordings.image_files import image_files
         from evercal.reports.calibration_images import (
@@ -110,4 +116,4 @@ class Report:
             localizer = open_localizer(self.store, self.device)
         before = None if older is None else older.calibration
         with progress_bar("drawing", len(files), "image") as bar:
-            return annotate_images(calibration, files, before, localizer, on_image=bar.update)
+            return annotate_images(calibration, files, before, localizer, boards, bar.update)

@@ -13,6 +13,9 @@ from evercal.cli.console import print_json, print_next, require_writable
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
 
+_BY_IMAGE = ("camera_from_board", "leave_one_out_mm", "information_percent")
+"""Checks with one value for each image."""
+
 
 @dataclass(frozen=True)
 class Solve:
@@ -85,13 +88,19 @@ class Solve:
     def _with_image_paths(self, calibration: "Calibration") -> "Calibration":
         """Make image paths relative to the calibration, where `evercal report` looks them up."""
         folder, target = self.camera_poses.absolute().parent, self.out.absolute().parent
-        images = tuple(
-            replace(image, name=Path(os.path.relpath(folder / image.name, target)).as_posix())
-            if (folder / image.name).is_file()
-            else image
-            for image in calibration.images
-        )
-        return replace(calibration, images=images)
+
+        def moved(name: str) -> str:
+            path = folder / name
+            return Path(os.path.relpath(path, target)).as_posix() if path.is_file() else name
+
+        images = tuple(replace(image, name=moved(image.name)) for image in calibration.images)
+        checks = {
+            key: {moved(name): item for name, item in value.items()} if key in _BY_IMAGE else value
+            for key, value in calibration.checks.items()
+        }
+        board = Path(os.path.relpath(self.camera_poses.absolute(), target)).as_posix()
+        source = {**calibration.source, "camera_poses": board}
+        return replace(calibration, images=images, checks=checks, source=source)
 
 
 def _check_lines(calibration: "Calibration") -> list[str]:

@@ -55,6 +55,12 @@ class SE3:
         return cls(quaternion, np.zeros((*shape, 3)))
 
     @classmethod
+    def from_translation(cls, translation_m: ArrayLike) -> Self:
+        """Create poses without rotation from (..., 3) translations, metres."""
+        pose = cls.identity(np.shape(translation_m)[:-1])
+        return cls(pose.rotation_wxyz, translation_m)
+
+    @classmethod
     def from_matrix(cls, matrix: ArrayLike, tolerance: float = 1e-3) -> Self:
         """Convert homogeneous matrices.
 

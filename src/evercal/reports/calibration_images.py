@@ -1,6 +1,6 @@
 """Images of a calibrated camera with the axes of the parent frame and the landmarks drawn in."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.calibration.from_images import map_digest
 from evercal.errors import InputError
-from evercal.geometry import resize_pixels
+from evercal.geometry import Camera, resize_pixels
 from evercal.recordings.images import read_image
+from evercal.reports.board_views import BoardSeen
 from evercal.reports.frame_axes import (
     AxesInView,
     axes_in_view,
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from evercal.localization.localizer import LearnedLocalizer
 
 Image = NDArray[np.uint8]
+Array = NDArray[np.float64]
 
 MAX_IMAGES = 4
 _WIDTH_PX = 640
@@ -91,11 +93,13 @@ def annotate_images(
     files: Sequence[ImageFile],
     older: Calibration | None = None,
     localizer: "LearnedLocalizer | None" = None,
+    boards: Mapping[str, BoardSeen] | None = None,
     on_image: Callable[[], object] = lambda: None,
 ) -> AnnotatedImages:
     """Draw a calibration into some of its images.
 
-    The older calibration is drawn pale and dashed; the localizer detects landmarks.
+    The older calibration is drawn pale and dashed; the localizer detects landmarks. Corners of
+    boards are drawn by name of the image.
     """
     camera = calibration.camera
     if camera is None:
@@ -120,9 +124,12 @@ def annotate_images(
             continue
         if not annotated:
             detail = close_up(image, camera, axes, older_axes, _CLOSE_UP_PX)
-        annotated.append(_annotate(calibration, file, image, (axes, older_axes), localizer))
+        use = file.use
+        board = boards.get(use.name) if boards and use is not None else None
+        drawer = board if board is not None else localizer
+        annotated.append(_annotate(calibration, file, image, (axes, older_axes), drawer))
         on_image()
-    if annotated and localizer is None:
+    if annotated and localizer is None and not boards:
         missing.append("No landmarks: pass --store to draw them.")
     other_map = localizer is not None and _is_other_map(calibration, localizer)
     return AnnotatedImages(tuple(annotated), axes, older_axes, detail, tuple(missing), other_map)
@@ -168,9 +175,9 @@ def _annotate(
     file: ImageFile,
     image: Image,
     axes: tuple[AxesInView, AxesInView | None],
-    localizer: "LearnedLocalizer | None",
+    evidence: "LearnedLocalizer | BoardSeen | None",
 ) -> AnnotatedImage:
-    """Resize an image to the page width and draw landmarks and axes."""
+    """Resize an image to the page width and draw corners or landmarks, and axes."""
     import cv2
 
     assert calibration.camera is not None, "annotate_images requires intrinsics"
@@ -178,8 +185,11 @@ def _annotate(
     method = cv2.INTER_AREA if image.shape[1] > _WIDTH_PX else cv2.INTER_CUBIC
     large = cv2.resize(image, (_WIDTH_PX, height), interpolation=method).astype(np.uint8)
     summary, count = _use(file.use), None
-    if localizer is not None:
-        large, detection, count = _with_landmarks(calibration, image, large, localizer)
+    if isinstance(evidence, BoardSeen):
+        large, detection = _with_corners(calibration.camera, large, evidence)
+        summary = f"{summary}; {detection}"
+    elif evidence is not None:
+        large, detection, count = _with_landmarks(calibration, image, large, evidence)
         summary = f"{summary}; {detection}"
     scale, frame = _WIDTH_PX / calibration.camera.width, calibration.parent_frame
     now, before = axes
@@ -210,15 +220,33 @@ def _with_landmarks(
     residuals = own * errors.errors_px
     limits = (0.0, _MAX_RESIDUAL_PX * own)
     drawn = overlay_points(large, pixels, residuals, 3.5, limits, "residual (px)")
-    vectors = enlarged * (errors.projected - errors.pixels)
-    times = exaggeration(vectors)
-    lines = np.stack([pixels, pixels + times * vectors], 1)
-    drawn = overlay_lines(drawn, list(lines), [_VECTOR_COLOUR] * len(lines), 1, rims=False)
+    drawn, times = _with_vectors(drawn, pixels, enlarged * (errors.projected - errors.pixels))
     median = float(np.nanmedian(residuals)) if np.isfinite(residuals).any() else np.nan
     summary = (
         f"{len(residuals)} landmarks, median residual {median:.2f} px, lines {times} times as long"
     )
     return drawn, summary, len(residuals)
+
+
+def _with_corners(camera: Camera, large: Image, board: BoardSeen) -> tuple[Image, str]:
+    """The enlarged image with corners and residual vectors, and a summary."""
+    enlarged = large.shape[1] / camera.width
+    errors = board.projected(camera) - board.view.pixels
+    pixels = resize_pixels(board.view.pixels, enlarged)
+    lengths = np.linalg.norm(errors, axis=1)
+    limits = (0.0, max(1.0, float(np.nanpercentile(lengths, 90))))
+    drawn = overlay_points(large, pixels, lengths, 2.5, limits, "residual (px)")
+    drawn, times = _with_vectors(drawn, pixels, enlarged * errors)
+    rms = float(np.sqrt(np.nanmean(lengths**2)))
+    return drawn, f"{len(pixels)} corners, {rms:.2f} px rms, lines {times} times as long"
+
+
+def _with_vectors(image: Image, pixels: Array, vectors: Array) -> tuple[Image, int]:
+    """The image with residual vectors (n, 2), and the factor of their length."""
+    times = exaggeration(vectors)
+    lines = np.stack([pixels, pixels + times * vectors], 1)
+    colours = [_VECTOR_COLOUR] * len(lines)
+    return overlay_lines(image, list(lines), colours, 1, rims=False), times
 
 
 def exaggeration(vectors: NDArray[np.float64]) -> int:

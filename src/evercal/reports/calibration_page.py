@@ -13,6 +13,7 @@ from evercal.calibration.located import deviations, length_mm_deg
 from evercal.calibration.verdict import TIERS, expected_error, tier, verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.reports.board_views import BoardSeen, board_scene, contributions, estimates
 from evercal.reports.calibration_charts import ellipsoid_projections, error_terms, residual_bars
 from evercal.reports.calibration_images import AnnotatedImages
 from evercal.reports.overlay import encode_image
@@ -22,6 +23,18 @@ _CHECKS = {
     "repeatability": "difference between two halves of the data",
     "held_out": "error on held-out data",
 }
+_SHOWN_ELSEWHERE = {
+    "image_scatter",
+    "warnings",
+    "left_open",
+    "camera_sigma",
+    "scale",
+    "scale_sigma",
+    "corner_sigma_px",
+    "time_offset_s",
+    "time_offset_sigma_s",
+}
+"""Checks with a place of their own in the report."""
 _LONGEST_CELL = 160
 _SHARE = 0.95
 
@@ -77,9 +90,11 @@ def calibration_page(
     store: str | None = None,
     older: NamedCalibration | None = None,
     point_m: tuple[float, float, float] | None = None,
+    boards: dict[str, BoardSeen] | None = None,
 ) -> CalibrationPage:
     """Write the report of a calibration.
 
+    `boards` are the boards in its images, which are drawn with the cameras in the base frame.
     `store` is the path of the store whose landmarks are drawn. `point_m` is a point in the camera
     frame, metres, whose standard deviation is reported.
 
@@ -115,11 +130,15 @@ def calibration_page(
         same_map=older is not None and _same_map(calibration, older.calibration),
         pictures=_pictures(images, calibration.parent_frame),
         images=images,
+        boards_drawn=bool(boards),
         store=store,
         residuals=_residuals(calibration),
         uses=_use_table(calibration),
         ellipsoid=_ellipsoid(calibration) if _has_uncertainty(calibration) else None,
         terms=_terms(calibration),
+        board_scene=board_scene(calibration, boards) if boards else None,
+        estimates=estimates(calibration),
+        contributions=contributions(calibration),
         checks=checks,
         source=Table(("property", "value"), _source_rows(file)),
         missing=missing,
@@ -283,7 +302,7 @@ def _source_rows(file: NamedCalibration) -> list[tuple[str, str]]:
             ("principal point cx, cy", f"{camera.cx:.3f}, {camera.cy:.3f} pixels"),
             ("distortion k1 k2 p1 p2 k3 ...", distortion or "none"),
         ]
-    titled = {f"{key}_{unit}" for key in _CHECKS for unit in ("mm", "deg")} | {"image_scatter"}
+    titled = {f"{key}_{unit}" for key in _CHECKS for unit in ("mm", "deg")} | _SHOWN_ELSEWHERE
     rows += [
         (key.replace("_", " "), _cell(value))
         for key, value in calibration.checks.items()

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.board_poses import BoardPoses, board_poses, read_board_poses
 from evercal.calibration.boards.corners import (
@@ -203,3 +204,20 @@ def test_charuco_boards_of_older_opencv_are_detected() -> None:
     view = find_board(np.repeat(image[..., None], 3, 2).astype(np.uint8), board)
     assert isinstance(view, BoardView)
     assert len(view.points_m) == 20
+
+
+def test_a_partly_seen_chessboard_is_refused_with_what_was_found() -> None:
+    image = photographed(CHESSBOARD, view_of(CHESSBOARD, 0))
+    reason = find_board(image, Board("chessboard", 0.03, 12, 9))
+    assert isinstance(reason, str)
+    assert "a part of a chessboard, " in reason
+    assert "not 12x9 inner corners; show the whole board, or correct --size" in reason
+
+
+def test_every_window_of_refinement_stays_between_edges() -> None:
+    # A strongly tilted board: rows are 3 times closer than columns.
+    rotation = Rotation.from_euler("x", 65, degrees=True).as_quat(scalar_first=True)
+    pose = SE3(rotation, np.array([-0.12, -0.03, 0.5]))
+    view = detect(CHESSBOARD, pose)
+    error = view.pixels - CAMERA.project(pose.apply(view.points_m))
+    assert np.sqrt((error**2).mean()) < 0.06

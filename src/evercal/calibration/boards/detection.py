@@ -25,6 +25,13 @@ BoardKind = Literal["chessboard", "charuco", "apriltag"]
 
 _MIN_CORNERS = 6
 """Minimum number of ChArUco corners for a well determined pose."""
+_LARGEST_CHANGE = 0.3
+"""Maximum change of the step from corner to corner, parts of the mean step."""
+_WINDOW = 0.5
+"""Reach of the window of refinement on a chessboard, parts of a square."""
+_SMALLEST_WINDOW_PX = 2
+_LARGEST_DOUBLED_PX = 1400
+"""Width of the widest image that is searched again at double size."""
 
 
 @dataclass(frozen=True)
@@ -96,41 +103,109 @@ def find_board(image: Image, board: Board) -> BoardView | str:
 
 
 def _find_chessboard(grey: NDArray, board: Board) -> BoardView | str:
+    x, y = np.meshgrid(np.arange(float(board.columns)), np.arange(float(board.rows)))
+    points = board.size_m * np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
+    for find in (_classic, _by_sectors, _by_sectors_of_double):
+        pixels = find(grey, (board.columns, board.rows))
+        if pixels is None:
+            continue
+        refined = _refined(grey, BoardView(points, pixels), _WINDOW * board.size_m)
+        grid = refined.pixels.reshape(board.rows, board.columns, 2)
+        if _is_even(grid):
+            if not board.half_turn and not _first_square_is_bright(grey, grid):
+                grid = grid[::-1, ::-1]
+            return BoardView(points, grid.reshape(-1, 2))
+    return _no_chessboard(grey, board)
+
+
+def _classic(grey: NDArray, size: tuple[int, int]) -> Array | None:
+    """Find quadrangles and join them; 40 times faster than sectors."""
     import cv2
 
-    shape = (board.columns, board.rows)
-    for flags in (0, cv2.CALIB_CB_EXHAUSTIVE):
-        detected, pixels = cv2.findChessboardCornersSB(
-            grey, shape, flags=flags | cv2.CALIB_CB_NORMALIZE_IMAGE
-        )
-        if detected:
-            break
-    else:
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    detected, pixels = cv2.findChessboardCorners(grey, size, flags=flags)
+    return pixels.reshape(-1, 2).astype(np.float64) if detected else None
+
+
+def _by_sectors(grey: NDArray, size: tuple[int, int]) -> Array | None:
+    import cv2
+
+    detected, pixels = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    return pixels.reshape(-1, 2).astype(np.float64) if detected else None
+
+
+def _by_sectors_of_double(grey: NDArray, size: tuple[int, int]) -> Array | None:
+    """Search an enlarged image, for small or tilted squares."""
+    import cv2
+
+    if grey.shape[1] > _LARGEST_DOUBLED_PX:
+        return None
+    double = cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    pixels = _by_sectors(np.asarray(double), size)
+    return None if pixels is None else (pixels - 0.5) / 2
+
+
+def _is_even(grid: Array) -> bool:
+    """Return whether steps between corners (rows, columns, 2) change slowly, as on a flat board."""
+    for axis in (0, 1):
+        steps = np.diff(grid, axis=axis)
+        change = np.linalg.norm(np.diff(steps, axis=axis), axis=2)
+        if (change > _LARGEST_CHANGE * np.linalg.norm(steps, axis=2).mean()).any():
+            return False
+    return True
+
+
+def _no_chessboard(grey: NDArray, board: Board) -> str:
+    """Return why a chessboard was not detected."""
+    import cv2
+
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
+    detected, _, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
+    wanted = f"{board.columns}x{board.rows} inner corners"
+    if detected:
+        rows, columns = np.shape(meta)[:2]
         return (
-            f"no chessboard with {board.columns}x{board.rows} inner corners; the whole board must"
-            f" be visible, sharp and without glare"
+            f"a part of a chessboard, {columns}x{rows} inner corners, not {wanted}; show the whole"
+            f" board, or correct --size"
         )
-    grid = _sharpened(grey, pixels).reshape(board.rows, board.columns, 2)
-    if not board.half_turn and not _first_square_is_bright(grey, grid):
-        grid = grid[::-1, ::-1]
-    x, y = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
-    points = board.size_m * np.stack([x, y, np.zeros_like(x)], -1).astype(np.float64)
-    return BoardView(points.reshape(-1, 3), grid.reshape(-1, 2))
+    return f"no chessboard with {wanted}; show the whole board, sharp and without glare"
 
 
-def _sharpened(grey: NDArray, pixels: NDArray) -> Array:
-    """Refine corners to a few hundredths of a pixel, about three times better than detected."""
+def _refined(grey: NDArray, view: BoardView, reach_m: float) -> BoardView:
+    """Refine corners to a few hundredths of a pixel; those without space keep their place.
+
+    Windows reach at most `reach_m` on the board, where the next edge of the print may lie.
+    """
     import cv2
 
-    corners = np.ascontiguousarray(pixels, dtype=np.float32).reshape(-1, 1, 2)
-    spacing = float(np.linalg.norm(np.diff(corners[:, 0], axis=0), axis=1).min())
-    # The largest window that does not reach the next corner.
-    half = int(np.clip(0.3 * spacing, 2, 11))
+    points = view.points_m[:, :2]
+    homography, _ = cv2.findHomography(points, view.pixels)
+    if homography is None:
+        return view
+    half = np.minimum(reach_m * _clearance(homography, points), 11).astype(int)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
-    refined = cv2.cornerSubPix(grey, corners.copy(), (half, half), (-1, -1), stop)
-    lost = np.linalg.norm(refined - corners, axis=2) > half
-    refined[lost] = corners[lost]
-    return refined.reshape(-1, 2).astype(np.float64)
+    start = np.ascontiguousarray(view.pixels, dtype=np.float32)
+    refined = start.copy()
+    for size in np.unique(half[half >= _SMALLEST_WINDOW_PX]):
+        window, moved = (int(size), int(size)), start[half == size, None].copy()
+        refined[half == size] = cv2.cornerSubPix(grey, moved, window, (-1, -1), stop)[:, 0]
+    lost = np.linalg.norm(refined - start, axis=1) > half
+    refined[lost] = start[lost]
+    return BoardView(view.points_m, refined.astype(np.float64))
+
+
+def _clearance(homography: NDArray, points: Array) -> Array:
+    """Return half the side (n,) of the largest square window around each corner, pixels.
+
+    No line of the board one unit away crosses it.
+    """
+    ends = points[:, None] + 1e-4 * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    mapped = np.concatenate([ends, np.ones((*ends.shape[:2], 1))], 2) @ homography.T
+    pixels = mapped[..., :2] / mapped[..., 2:]
+    along, down = (1e4 * (pixels[:, k] - pixels[:, 0]) for k in (1, 2))
+    area = np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
+    longer = np.maximum(np.abs(along).sum(1), np.abs(down).sum(1))
+    return area / np.maximum(longer, 1e-9)
 
 
 def _first_square_is_bright(grey: NDArray, grid: Array) -> bool:
@@ -162,7 +237,8 @@ def _find_charuco(grey: NDArray, board: Board) -> BoardView | str:
             corners = np.reshape(pixels, (-1, 2)).astype(np.float64)
             flat = np.linalg.svd(points - points.mean(0), compute_uv=False)
             if flat[1] > 0.5 * board.size_m:
-                return BoardView(points, corners)
+                gap = (board.size_m - board.marker_m) / 2
+                return _refined(grey, BoardView(points, corners), gap)
     count = 0 if ids is None else len(ids)
     return (
         f"{count} corners of the ChArUco board; {_MIN_CORNERS} in two rows are required; check"
@@ -225,6 +301,11 @@ def _square_by_its_sides(grey: NDArray, square: Array) -> Array:
     refined = crossings[:, :2] / crossings[:, 2:]
     moved = np.linalg.norm(refined - square, axis=1)
     return refined if np.isfinite(moved).all() and moved.max() < 3.0 else square
+
+
+def dictionary_of(board: Board) -> Any:
+    """Return the dictionary of markers of a board."""
+    return _dictionary(board.dictionary)
 
 
 def _dictionary(name: str) -> Any:

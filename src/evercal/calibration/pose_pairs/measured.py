@@ -74,3 +74,10 @@ def measured(corners: BoardCorners, camera: Camera, starts: SE3) -> Measured:
     """Fit the pose of the board in every image from (n,) starts."""
     poses = [board_pose(v, camera, s) for v, s in zip(corners.views, starts, strict=True)]
     return Measured(camera, poses, pixel_sigma(poses))
+
+
+def middle_of(corners: BoardCorners | None) -> NDArray[np.float64]:
+    """(3,) middle of the board's corners, metres; the origin without corners."""
+    if corners is None:
+        return np.zeros(3)
+    return np.mean([view.points_m.mean(0) for view in corners.views], 0)

@@ -93,6 +93,10 @@ class Extras:
             mean=np.append(self.mean, 0.0),
         )
 
+    def indices(self, group: str) -> NDArray[np.int64]:
+        """Return the indices of a group."""
+        return np.flatnonzero([name == group for name in self.groups])
+
     def without_prior(self, name: str) -> Self:
         """Free an unknown."""
         information, k = self.information.copy(), self.names.index(name)
@@ -107,7 +111,7 @@ class Extras:
         """Return the rows (k, q) of unit variance that make up the prior of each group."""
         rows = []
         for group in dict.fromkeys(self.groups):
-            own = np.flatnonzero([name == group for name in self.groups])
+            own = self.indices(group)
             values, axes = np.linalg.eigh(self.information[np.ix_(own, own)])
             kept = values > 1e-14 * max(values.max(), 1e-300)
             whiten = np.zeros((int(kept.sum()), len(self.names)))

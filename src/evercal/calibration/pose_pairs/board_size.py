@@ -1,0 +1,75 @@
+"""Test a stated size of the squares, or scale, against the motions of the robot."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from evercal.calibration.pose_pairs.fit import HandEyeFit, agreement, robust_fit
+from evercal.calibration.pose_pairs.measured import BoardCorners
+from evercal.calibration.pose_pairs.pose_equation import PoseEquation
+
+SIZE_SIGMA = 0.002
+"""Relative standard deviation of a stated square size, and of a depth error of all images."""
+_SIZE_SIGMAS = 3.0
+"""Significance of a wrong size, standard deviations."""
+_LARGE_SIZE, _MUCH_BETTER = 0.1, 3.0
+"""An error of the size above the first number is believed only if the residuals fall by the second
+factor."""
+
+
+def with_tested_size(
+    equation: PoseEquation, fit: HandEyeFit, corners: BoardCorners | None
+) -> tuple[PoseEquation, HandEyeFit, list[str]]:
+    """Free the size of the squares if the robot's motions contradict what was stated.
+
+    The noise is estimated again with the free size: a wrong size looks like noise otherwise.
+    """
+    free = replace(equation, extras=equation.extras.without_prior("size"))
+    freed = robust_fit(free, agreement(free, fit.at))
+    k = equation.extras.names.index("size")
+    off, sigma = float(freed.at.extras[k]), float(freed.sigma[12 + k])
+    sigma *= float(np.sqrt(1 + _alike(freed)))
+    if abs(off) < max(_SIZE_SIGMAS * sigma, SIZE_SIGMA):
+        return equation, fit, []
+    better = _misfit(fit) / _misfit(freed)
+    larger = "larger" if off > 0 else "smaller"
+    if abs(off) > _LARGE_SIZE and better < _MUCH_BETTER:
+        warning = (
+            f"a board {100 * abs(off):.0f} % {larger} than stated would fit the robot's motions"
+            f" better, but not well: check its size, the robot poses and the intrinsics"
+        )
+        return equation, fit, [warning]
+    stated = None if corners is None else corners.size_m
+    size = f"a square or tag of 24 mm would measure {24 * (1 + off):.2f} mm"
+    if stated is not None:
+        size = f"its side measures {1000 * stated * (1 + off):.2f} mm, not {1000 * stated:.2f} mm"
+    warning = (
+        f"the board is {100 * abs(off):.2f} +- {100 * sigma:.2f} % {larger} than stated, by the"
+        f" robot's motions"
+        f" ({abs(off) / sigma:.0f} standard deviations): {size}; check its size and the focal"
+        f" length. The calibration uses the estimated size"
+    )
+    return free, freed, [warning]
+
+
+def _alike(fit: HandEyeFit) -> float:
+    """Return by how much errors that are alike in similar poses enlarge the variance of the size.
+
+    Errors of an arm depend on its pose. Together as large as the noise, they may move the size by
+    as much as all poses together, where independent noise averages out.
+    """
+    noise = sum(np.trace(fit.contributions[kind][:3, :3]) for kind in fit.levels.kinds)
+    return float(noise / np.trace(fit.covariance[:3, :3]) * fit.inliers.sum())
+
+
+def widened(equation: PoseEquation, fit: HandEyeFit) -> HandEyeFit:
+    """Add what errors of an arm that are alike in similar poses do through an unknown size."""
+    k = 12 + equation.extras.names.index("size")
+    column = fit.covariance[:, k]
+    added = _alike(fit) * np.outer(column, column) / max(fit.covariance[k, k], 1e-300)
+    return replace(fit, covariance=fit.covariance + added)
+
+
+def _misfit(fit: HandEyeFit) -> float:
+    """Root mean square residual of the translations, metres."""
+    return float(np.sqrt((fit.residual[fit.inliers, :3] ** 2).mean()))

@@ -1,0 +1,182 @@
+"""`PairSolution`: a fit of pose pairs, and the calibration made of it."""
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from evercal.calibration.boards.lens import moved_camera
+from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse, Mount
+from evercal.calibration.pose_pairs.checks import held_out_error, left_open, repeatability
+from evercal.calibration.pose_pairs.fit import HandEyeFit
+from evercal.calibration.pose_pairs.measured import BoardCorners, Measured, middle_of
+from evercal.calibration.pose_pairs.pairs import PosePairs
+from evercal.calibration.pose_pairs.pose_equation import PoseEquation
+from evercal.calibration.verdict import verdict
+from evercal.geometry import SE3, Camera
+
+Array = NDArray[np.floating]
+
+_CAUSES = {
+    "translation": "position of robot and camera poses",
+    "depth": "distance from camera to board, image by image",
+    "rotation about board": "rotation of the board in the image",
+    "rotation about gripper": "rotation of the robot's gripper",
+}
+_EXTRA_CAUSES = {
+    "known": "corners of the board",
+    "intrinsics": "intrinsics",
+    "shared depth": "distance from camera to board, all images",
+    "size": "size of the squares, or scale",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PairSolution:
+    """A fit and its pose pairs."""
+
+    pairs: PosePairs
+    rows: NDArray[np.int64]
+    """Pairs of the equation, sorted by value."""
+    first: NDArray[np.int64]
+    """(n,) for every pair, the first equal pair."""
+    equation: PoseEquation
+    fit: HandEyeFit
+    mount: Mount
+    scale: float
+    """Metres per unit of the camera's lengths."""
+    warnings: tuple[str, ...]
+    corners: BoardCorners | None = None
+    lens: Measured | None = None
+
+    @property
+    def parent(self) -> str:
+        """Frame that carries the camera."""
+        return "gripper" if self.mount == "eye_in_hand" else "base"
+
+    @property
+    def camera(self) -> Camera | None:
+        """Estimated intrinsics, with corners."""
+        if self.lens is None:
+            return None
+        change = self.fit.at.extras[self.equation.extras.indices("intrinsics")]
+        return moved_camera(self.lens.camera, change)
+
+    @property
+    def fixed_from_board(self) -> SE3:
+        """Estimated pose of the board."""
+        middle = self._board_scale * middle_of(self.corners)
+        return self.fit.at.fixed_from_board @ SE3.from_translation(-middle)
+
+    @property
+    def _board_scale(self) -> float:
+        """Metres per unit of the board's lengths."""
+        size = self.fit.at.extras[self.equation.extras.indices("size")]
+        return self.scale * (1 + float(size[0]))
+
+    @property
+    def camera_from_board(self) -> SE3:
+        """(len(rows),) board poses by the robot's poses and the calibration."""
+        equation, carried = self.equation, self.fit.at.parent_from_camera
+        rotation = Rotation.from_matrix(equation.robot_rotation).as_quat(scalar_first=True)
+        fixed_from_parent = SE3(rotation, np.asarray(equation.robot_translation, np.float64))
+        return (fixed_from_parent @ carried).inverse() @ self.fixed_from_board
+
+    def calibration(self, time_offset_s: float | None = None) -> Calibration:
+        """Return the calibration, with another time offset than that of the fit if given."""
+        covariance = self.fit.factor * self.fit.covariance[:6, :6]
+        calibration = Calibration(
+            mount=self.mount,
+            parent_from_child=self.fit.at.parent_from_camera,
+            covariance=(covariance + covariance.T) / 2,
+            parent_frame=self.parent,
+            camera=self.camera,
+            images=self._images(),
+            error_terms=self._error_terms(),
+            checks=self._checks(time_offset_s),
+            created=datetime.now(UTC).isoformat(timespec="seconds"),
+        )
+        return replace(calibration, verdict=verdict(calibration))
+
+    def _checks(self, time_offset_s: float | None) -> dict[str, Any]:
+        fit, extras = self.fit, self.equation.extras
+        used = fit.residual[fit.inliers].reshape(-1, 2, 3)
+        rms = np.sqrt((used**2).sum(2).mean(0))
+        distance = np.linalg.norm(self.equation.camera_translation[fit.inliers], axis=1)
+        fixed = "base" if self.mount == "eye_in_hand" else "gripper"
+        checks: dict[str, Any] = {
+            "poses_given": len(self.pairs),
+            "poses_used": int(fit.inliers.sum()),
+            "residual_mm": 1000 * float(rms[0]),
+            "residual_deg": float(np.rad2deg(rms[1])),
+            **held_out_error(self.equation, fit),
+            **repeatability(self.equation, fit),
+            "target_m": float(np.median(distance)),
+            f"{fixed}_from_board": _pose_dict(self.fixed_from_board),
+            "leave_one_out_mm": self._by_name(1000 * np.linalg.norm(fit.moved[:, :3], axis=1)),
+            "information_percent": self._by_name(100 * fit.information),
+            "camera_from_board": self._board_poses(),
+            "left_open": left_open(fit, self.parent),
+            "warnings": list(self.warnings),
+        }
+        sigma = dict(zip(extras.names, fit.sigma[12:].tolist(), strict=True))
+        value = dict(zip(extras.names, fit.at.extras.tolist(), strict=True))
+        if "clock" in sigma:
+            offset = value["clock"] if time_offset_s is None else time_offset_s
+            checks |= {"time_offset_s": offset, "time_offset_sigma_s": sigma["clock"]}
+        checks |= {"scale": self._board_scale, "scale_sigma": sigma["size"]}
+        if self.lens is not None:
+            checks["corner_sigma_px"] = self.lens.sigma_px
+            lens = [name for name, g in zip(extras.names, extras.groups, strict=True)
+                    if g == "intrinsics"]  # fmt: skip
+            checks["camera_sigma"] = {name: sigma[name] for name in lens}
+        return checks
+
+    def _by_name(self, values: Array) -> dict[str, float]:
+        named = zip(self.rows, self.fit.inliers, values.tolist(), strict=True)
+        return {self.pairs.names[i]: value for i, used, value in named if used}
+
+    def _board_poses(self) -> dict[str, object]:
+        """Return the board pose of every pair by name, as JSON values."""
+        poses = zip(self.rows, self.camera_from_board, strict=True)
+        return {self.pairs.names[i]: _pose_dict(pose) for i, pose in poses}
+
+    def _images(self) -> tuple[ImageUse, ...]:
+        """Return the use of every pair in the given order."""
+        row_of = {int(pair): row for row, pair in enumerate(self.rows)}
+        uses = []
+        for i, name in enumerate(self.pairs.names):
+            if i not in row_of:
+                other = self.pairs.names[self.first[i]]
+                uses.append(ImageUse(name, False, f"repeats {other}, which adds nothing"))
+                continue
+            row = row_of[i]
+            lengths = np.linalg.norm(self.fit.residual[row].reshape(2, 3), axis=1)
+            mm, deg = 1000 * float(lengths[0]), float(np.rad2deg(lengths[1]))
+            sigmas = float(np.sqrt(self.fit.distance2[row] / 6))
+            reason = (
+                f"disagrees with the others by {mm:.1f} mm and {deg:.2f} deg, {sigmas:.1f} times"
+                " their noise"
+            )
+            used = bool(self.fit.inliers[row])
+            uses.append(ImageUse(name, used, "" if used else reason, mm, deg))
+        return tuple(uses)
+
+    def _error_terms(self) -> tuple[ErrorTerm, ...]:
+        fit, terms = self.fit, []
+        for name, cause in (_CAUSES | _EXTRA_CAUSES).items():
+            part = fit.contributions.get(name)
+            if part is not None and np.trace(part) > 1e-12 * np.trace(fit.covariance[:6, :6]):
+                terms.append(ErrorTerm.of(cause, part))
+        rest = fit.factor * fit.covariance[:6, :6] - sum(fit.contributions.values())
+        return (*terms, ErrorTerm.of("few poses, and errors alike in similar poses", rest))
+
+
+def _pose_dict(pose: SE3) -> dict[str, object]:
+    return {
+        "translation_m": pose.translation_m.tolist(),
+        "quaternion_wxyz": pose.rotation_wxyz.tolist(),
+    }
