@@ -13,6 +13,7 @@ VERBS = {
     "handeye": "pose pairs: errors, ellipsoids, outliers, scale, time",
     "boards": "detection of rendered boards, beside the finders of OpenCV",
     "handeye-boards": "boards through a lens found from the same images, beside other solvers",
+    "mistakes": "mistakes in pose files that must be refused and named, and clean recordings",
     "many-keyframes": "localization among thousands of keyframes of other rooms",
     "peers": "SIFT and XFeat on the same frames",
     "tune": "the setting of every continual method, on held-out training frames",

@@ -27,9 +27,15 @@ _MIN_CORNERS = 6
 """Minimum number of ChArUco corners for a well determined pose."""
 _LARGEST_CHANGE = 0.3
 """Maximum change of the step from corner to corner, parts of the mean step."""
-_WINDOW = 0.5
-"""Reach of the window of refinement on a chessboard, parts of a square."""
 _SMALLEST_WINDOW_PX = 2
+_EDGE_BLUR_PX = 2.0
+"""Width of an edge in the image."""
+_LEAST_REACH_PX, _MOST_REACH_PX = 1.5, 5.0
+"""Smallest and largest distance of samples from an edge."""
+_SAMPLES = 24
+"""Samples along an edge."""
+_LARGEST_MOVE_PX = 3.0
+"""Largest change of a corner by its edges."""
 _LARGEST_DOUBLED_PX = 1400
 """Width of the widest image that is searched again at double size."""
 
@@ -109,8 +115,8 @@ def _find_chessboard(grey: NDArray, board: Board) -> BoardView | str:
         pixels = find(grey, (board.columns, board.rows))
         if pixels is None:
             continue
-        refined = _refined(grey, BoardView(points, pixels), _WINDOW * board.size_m)
-        grid = refined.pixels.reshape(board.rows, board.columns, 2)
+        view = _sharpened(grey, BoardView(points, pixels), board)
+        grid = view.pixels.reshape(board.rows, board.columns, 2)
         if _is_even(grid):
             if not board.half_turn and not _first_square_is_bright(grey, grid):
                 grid = grid[::-1, ::-1]
@@ -171,10 +177,19 @@ def _no_chessboard(grey: NDArray, board: Board) -> str:
     return f"no chessboard with {wanted}; show the whole board, sharp and without glare"
 
 
-def _refined(grey: NDArray, view: BoardView, reach_m: float) -> BoardView:
-    """Refine corners to a few hundredths of a pixel; those without space keep their place.
+def _sharpened(grey: NDArray, view: BoardView, board: Board) -> BoardView:
+    """Refine the corners of squares to one or two hundredths of a pixel.
 
-    Windows reach at most `reach_m` on the board, where the next edge of the print may lie.
+    Windows and edges keep away from markers and from the next corner.
+    """
+    gap_m = (board.size_m - board.marker_m) / 2
+    return _by_edges(grey, _in_windows(grey, view, gap_m), board.size_m, gap_m)
+
+
+def _in_windows(grey: NDArray, view: BoardView, reach_m: float) -> BoardView:
+    """Refine corners in windows that reach at most `reach_m` on the board.
+
+    Corners without space for a window keep their place.
     """
     import cv2
 
@@ -199,13 +214,18 @@ def _clearance(homography: NDArray, points: Array) -> Array:
 
     No line of the board one unit away crosses it.
     """
-    ends = points[:, None] + 1e-4 * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    mapped = np.concatenate([ends, np.ones((*ends.shape[:2], 1))], 2) @ homography.T
-    pixels = mapped[..., :2] / mapped[..., 2:]
-    along, down = (1e4 * (pixels[:, k] - pixels[:, 0]) for k in (1, 2))
+    along, down = _steps(homography, points)
     area = np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
     longer = np.maximum(np.abs(along).sum(1), np.abs(down).sum(1))
     return area / np.maximum(longer, 1e-9)
+
+
+def _steps(homography: NDArray, points: Array) -> Array:
+    """Return the (2, n, 2) derivatives of pixels by x and y of points (n, 2) on the board."""
+    mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
+    depth = mapped[:, 2:]
+    pixels = mapped[:, :2] / depth
+    return np.stack([(h[:2] - pixels * h[2]) / depth for h in (homography[:, 0], homography[:, 1])])
 
 
 def _first_square_is_bright(grey: NDArray, grid: Array) -> bool:
@@ -237,8 +257,7 @@ def _find_charuco(grey: NDArray, board: Board) -> BoardView | str:
             corners = np.reshape(pixels, (-1, 2)).astype(np.float64)
             flat = np.linalg.svd(points - points.mean(0), compute_uv=False)
             if flat[1] > 0.5 * board.size_m:
-                gap = (board.size_m - board.marker_m) / 2
-                return _refined(grey, BoardView(points, corners), gap)
+                return _sharpened(grey, BoardView(points, corners), board)
     count = 0 if ids is None else len(ids)
     return (
         f"{count} corners of the ChArUco board; {_MIN_CORNERS} in two rows are required; check"
@@ -274,33 +293,79 @@ def _square_by_its_sides(grey: NDArray, square: Array) -> Array:
     Blur rounds outer corners: they are detected 0.1 px or more too far inside. Edges do not move.
     OpenCV's refinement by lines is off by half a pixel in some versions.
     """
+    sides = np.roll(square, -1, axis=0) - square
+    reach = np.clip(0.04 * np.linalg.norm(sides, axis=1), 2.0, 5.0)
+    edges = _edges(grey, square + 0.1 * sides, square + 0.9 * sides, reach, 5 * _SAMPLES)
+    return _crossings(square, np.roll(_lines(edges), 1, axis=0), _lines(edges))
+
+
+def _by_edges(grey: NDArray, view: BoardView, size_m: float, gap_m: float) -> BoardView:
+    """Refine corners by lines along the edges of the squares that meet in each of them.
+
+    Edges are longer than the windows that fit around a corner, most of all beside markers.
+    """
     import cv2
 
+    points = view.points_m[:, :2]
+    homography, _ = cv2.findHomography(points, view.pixels)
+    if homography is None:
+        return view
+    along, down = size_m * _steps(homography, points)
+    area = np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
     lines = []
-    for start, end in zip(square, np.roll(square, -1, axis=0), strict=True):
-        length = float(np.linalg.norm(end - start))
-        along = (end - start) / max(length, 1e-9)
-        across = np.array([along[1], -along[0]])
-        reach = float(np.clip(0.04 * length, 2.0, 5.0))
-        offsets = np.linspace(-reach, reach, 33)
-        points = start + np.linspace(0.1, 0.9, max(8, int(0.8 * length)))[:, None] * (end - start)
-        grid = (points[:, None] + offsets[:, None] * across).astype(np.float32)
-        values = cv2.remap(grey, grid[..., 0], grid[..., 1], cv2.INTER_LINEAR).astype(np.float64)
-        slope = np.abs(np.gradient(values, axis=1))
-        # Keep the edge and remove the noise beside it.
-        slope = np.where(slope > 0.3 * slope.max(1, keepdims=True), slope, 0.0)
-        strength = slope.sum(1)
-        if strength.min() <= 0:
-            return square
-        edge = points + (slope @ offsets / strength)[:, None] * across
-        x, y, u, v = np.ravel(
-            cv2.fitLine(edge.astype(np.float32), cv2.DIST_HUBER, 0, 0.001, 0.001)
-        )[[2, 3, 0, 1]]
-        lines.append([v, -u, u * y - v * x])
-    crossings = np.cross(np.roll(lines, 1, axis=0), lines)
-    refined = crossings[:, :2] / crossings[:, 2:]
-    moved = np.linalg.norm(refined - square, axis=1)
-    return refined if np.isfinite(moved).all() and moved.max() < 3.0 else square
+    for step in (along, down):
+        free = (
+            gap_m / size_m * area / np.maximum(np.linalg.norm(step, axis=1), 1e-9) - _EDGE_BLUR_PX
+        )
+        reach = np.where(free >= _LEAST_REACH_PX, np.minimum(free, _MOST_REACH_PX), np.nan)
+        arms = [
+            _edges(grey, view.pixels + sign * 0.08 * step, view.pixels + sign * 0.5 * step, reach)
+            for sign in (-1, 1)
+        ]
+        lines.append(_lines(np.concatenate(arms, axis=1)))
+    return BoardView(view.points_m, _crossings(view.pixels, *lines))
+
+
+def _edges(grey: NDArray, starts: Array, ends: Array, reach: Array, count: int = _SAMPLES) -> Array:
+    """Return points (n, count, 2) on the edges between points (n, 2); NaN where there are none.
+
+    Edges are searched up to `reach` (n,) pixels to either side.
+    """
+    import cv2
+
+    sides = ends - starts
+    across = np.stack([sides[:, 1], -sides[:, 0]], 1)
+    across /= np.maximum(np.linalg.norm(sides, axis=1, keepdims=True), 1e-9)
+    offsets = np.linspace(-1, 1, 33) * np.nan_to_num(reach)[:, None]
+    points = starts[:, None] + np.linspace(0, 1, count)[:, None] * sides[:, None]
+    grid = points[:, :, None] + offsets[:, None, :, None] * across[:, None, None]
+    x, y = grid.reshape(len(starts), -1, 2).astype(np.float32).transpose(2, 0, 1)
+    values = cv2.remap(grey, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+    values = np.asarray(values, dtype=np.float64).reshape(grid.shape[:3])
+    slope = np.abs(np.gradient(values, axis=2))
+    # Keep the edge and remove the noise beside it.
+    slope = np.where(slope > 0.3 * slope.max(2, keepdims=True), slope, 0.0)
+    strength = slope.sum(2)
+    offset = (slope * offsets[:, None]).sum(2) / np.where(strength > 0, strength, np.nan)
+    offset[np.isnan(reach)] = np.nan
+    return points + offset[..., None] * across[:, None]
+
+
+def _lines(points: Array) -> Array:
+    """Fit homogeneous lines (n, 3) of unit normals to points (n, k, 2)."""
+    middle = points.mean(1)
+    spread = np.einsum("nki,nkj->nij", points - middle[:, None], points - middle[:, None])
+    normal = np.linalg.eigh(np.nan_to_num(spread))[1][:, :, 0]
+    return np.column_stack([normal, -(normal * middle).sum(1)])
+
+
+def _crossings(corners: Array, first: Array, second: Array) -> Array:
+    """Return where lines (n, 3) cross; corners (n, 2) where they cross far off or not at all."""
+    crossing = np.cross(first, second)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        refined = crossing[:, :2] / crossing[:, 2:]
+    moved = np.linalg.norm(refined - corners, axis=1)
+    return np.where((moved < _LARGEST_MOVE_PX)[:, None], refined, corners)
 
 
 def dictionary_of(board: Board) -> Any:

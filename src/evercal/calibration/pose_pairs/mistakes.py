@@ -55,6 +55,8 @@ _MOST = 0.9
 """Share of images that show the board ahead of the camera, if a reading is right."""
 _COHERENT = 0.8
 """Length of the mean of directions above which they are similar in all images."""
+_OBLIQUE = np.cos(np.deg2rad(45.0))
+"""Cosine of the mean angle from the optical axis at which similar directions are suspect."""
 _LONG_M = 0.4
 """Distance of a camera or board from its gripper above which a reading is suspect."""
 _FITTED = 30
@@ -157,7 +159,9 @@ def _require_plausible(pairs: PosePairs, mount: Mount, fit: Agreement) -> None:
     message, best, seen = max(others, key=lambda other: other[1])
     rays = camera.translation_m / np.linalg.norm(camera.translation_m, axis=1)[:, None].clip(1e-9)
     behind = (rays[:, 2] < 0).mean() > _MOST
-    beside = _ahead(camera) < 1 - _MOST / 2 and np.linalg.norm(rays.mean(0)) > _COHERENT
+    mean = rays.mean(0)
+    coherent = float(np.linalg.norm(mean))
+    beside = coherent > _COHERENT and mean[2] < _OBLIQUE * coherent
     carried = x if mount == "eye_in_hand" else z
     odd = behind or beside or np.linalg.norm(carried.translation_m) > _LONG_M
     if odd and best > given + _CLEARLY and _ahead(seen) > _MOST:
