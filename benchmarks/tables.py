@@ -271,6 +271,15 @@ def _bump(sources: Sequence[Published], _: str) -> str:
     return markdown([[title, *shares], ["reported as moved", *shares.values()]])
 
 
+def _rows(sources: Sequence[Published], columns: str) -> str:
+    """Tabulate rows as they are; the argument lists their columns, separated by commas."""
+    frame = pd.concat([_frame(source) for source in sources])
+    names = [name for name in columns.split(",") if name] or list(frame.columns)
+    cells = frame[names].map(lambda v: f"{v:.3g}" if isinstance(v, float) else str(v))
+    table = [[name.replace("_", " ") for name in names], *cells.replace("nan", "").to_numpy()]
+    return markdown([[str(cell) for cell in row] for row in table])
+
+
 def _tuning(sources: Sequence[Published], _: str) -> str:
     """Tabulate `tune`: the trials of each method, the selected one in bold.
 
@@ -343,6 +352,7 @@ KINDS: dict[str, Callable[[Sequence[Published], str], str]] = {
     "badposes": _bad_poses,
     "trials": _trials,
     "bump": _bump,
+    "rows": _rows,
     "tuning": _tuning,
 }
 """Kinds of tables; those of `evercal bench` come first."""

@@ -34,12 +34,18 @@ Array = NDArray[np.floating]
 
 SUSPECT_M, SUSPECT_RAD = 0.01, np.deg2rad(1.0)
 """Residuals above which other readings are tested."""
+_FEW = 0.8
+"""Share of inliers below which other readings are tested."""
 HOPELESS_M, HOPELESS_RAD = 0.05, np.deg2rad(3.0)
 """Residuals above which the pairs are refused."""
 _EXACT = 1e-5
 """Residual, metres or radians, that is not improved."""
 _BETTER = 3.0
 """Factor by which another reading must reduce the residuals of translation or rotation."""
+_MORE = 0.2
+"""Share of poses, rejected before, that another reading must explain instead."""
+_SCREENED = 1.5
+"""Factor by which another reading must reduce the differences of angles to be fitted."""
 _SPOILT = 1.2
 """Largest factor by which it may enlarge the others."""
 _NEAR_M, _FAR_M, _SPREAD = 0.1, 0.7, 0.8
@@ -97,7 +103,7 @@ def require_agreement(
         InputError: Another reading of the poses fits far better or is far more plausible, or the
             residuals are too large.
     """
-    suspect = fit.metres > SUSPECT_M or fit.radians > SUSPECT_RAD or fit.inliers.mean() < 0.6
+    suspect = fit.metres > SUSPECT_M or fit.radians > SUSPECT_RAD or fit.inliers.mean() < _FEW
     readings = [_Reading(*other, mount) for other in _other_conventions(pairs, suspect)]
     if suspect:
         readings = [*_readings(pairs, mount), *readings]
@@ -180,10 +186,12 @@ def _ahead(camera_from_board: SE3) -> float:
 
 
 def _clearly_better(other: Agreement, fit: Agreement) -> bool:
-    """Whether a reading improves translation or rotation by far, and spoils neither."""
+    """Whether a reading improves translation or rotation by far, or explains many more poses."""
     metres = max(other.metres, _EXACT) / max(fit.metres, _EXACT)
     radians = max(other.radians, _EXACT) / max(fit.radians, _EXACT)
-    return min(metres, radians) * _BETTER < 1 and max(metres, radians) < _SPOILT
+    more = float(other.inliers.mean() - fit.inliers.mean())
+    better = min(metres, radians) * _BETTER < 1 or more > _MORE
+    return better and max(metres, radians) < _SPOILT
 
 
 def _plausibility(reading: _Reading, fit: Agreement) -> float:
@@ -255,7 +263,7 @@ def _other_conventions(pairs: PosePairs, every: bool) -> Iterator[tuple[str, Pos
     of quaternions keeps all angles.
     """
     robot, camera = pairs.base_from_gripper, pairs.camera_from_board
-    limit = mismatch_rad(robot, camera) / _BETTER
+    limit = mismatch_rad(robot, camera) / _SCREENED
     found: list[tuple[float, int, str, PosePairs]] = []
     for name, part in {"robot": "base_from_gripper", "camera": "camera_from_board"}.items():
         poses, other = (robot, camera) if name == "robot" else (camera, robot)
