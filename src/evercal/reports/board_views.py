@@ -64,7 +64,7 @@ def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:
 
 
 def board_scene(calibration: Calibration, seen: dict[str, BoardSeen]) -> Picture | None:
-    """Draw the board and the cameras in the frame of the robot's base; None without them."""
+    """Draw the board and the cameras in the frame of the robot's base; None without corners."""
     board = calibration.checks.get("base_from_board")
     camera = calibration.camera
     if not seen or camera is None:
@@ -124,7 +124,7 @@ def estimates(calibration: Calibration) -> Table | None:
 
 
 def contributions(calibration: Calibration) -> Table | None:
-    """Return what each image contributes, largest first; None for other calibrations."""
+    """Return what each image contributes, largest first; None without board images."""
     share = calibration.checks.get("information_percent")
     moved = calibration.checks.get("leave_one_out_mm")
     if not isinstance(share, dict) or not isinstance(moved, dict):

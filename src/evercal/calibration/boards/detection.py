@@ -34,8 +34,9 @@ _LEAST_REACH_PX, _MOST_REACH_PX = 1.5, 5.0
 """Smallest and largest distance of samples from an edge."""
 _SAMPLES = 24
 """Samples along an edge."""
-_LARGEST_MOVE_PX = 3.0
-"""Largest change of a corner by its edges."""
+_LARGEST_MOVE_PX = 0.5
+"""Largest change of a refined corner by its edges; of a tag, whose corners blur rounds, six
+times that."""
 _LARGEST_DOUBLED_PX = 1400
 """Width of the widest image that is searched again at double size."""
 
@@ -296,7 +297,8 @@ def _square_by_its_sides(grey: NDArray, square: Array) -> Array:
     sides = np.roll(square, -1, axis=0) - square
     reach = np.clip(0.04 * np.linalg.norm(sides, axis=1), 2.0, 5.0)
     edges = _edges(grey, square + 0.1 * sides, square + 0.9 * sides, reach, 5 * _SAMPLES)
-    return _crossings(square, np.roll(_lines(edges), 1, axis=0), _lines(edges))
+    lines = _lines(edges)
+    return _crossings(square, np.roll(lines, 1, axis=0), lines, 6 * _LARGEST_MOVE_PX)
 
 
 def _by_edges(grey: NDArray, view: BoardView, size_m: float, gap_m: float) -> BoardView:
@@ -327,7 +329,7 @@ def _by_edges(grey: NDArray, view: BoardView, size_m: float, gap_m: float) -> Bo
 
 
 def _edges(grey: NDArray, starts: Array, ends: Array, reach: Array, count: int = _SAMPLES) -> Array:
-    """Return points (n, count, 2) on the edges between points (n, 2); NaN where there are none.
+    """Return points (n, count, 2) on the edges between points (n, 2); NaN without an edge.
 
     Edges are searched up to `reach` (n,) pixels to either side.
     """
@@ -359,13 +361,15 @@ def _lines(points: Array) -> Array:
     return np.column_stack([normal, -(normal * middle).sum(1)])
 
 
-def _crossings(corners: Array, first: Array, second: Array) -> Array:
+def _crossings(
+    corners: Array, first: Array, second: Array, reach_px: float = _LARGEST_MOVE_PX
+) -> Array:
     """Return where lines (n, 3) cross; corners (n, 2) where they cross far off or not at all."""
     crossing = np.cross(first, second)
     with np.errstate(divide="ignore", invalid="ignore"):
         refined = crossing[:, :2] / crossing[:, 2:]
     moved = np.linalg.norm(refined - corners, axis=1)
-    return np.where((moved < _LARGEST_MOVE_PX)[:, None], refined, corners)
+    return np.where((moved < reach_px)[:, None], refined, corners)
 
 
 def dictionary_of(board: Board) -> Any:

@@ -97,7 +97,7 @@ def require_agreement(
 ) -> None:
     """Check that pose pairs agree, and diagnose them otherwise.
 
-    Camera poses `of_board` must see it; those in a map may see anything.
+    Camera poses `of_board` must see the board; camera poses in a map may see anything.
 
     Raises:
         InputError: Another reading of the poses fits far better or is far more plausible, or the
