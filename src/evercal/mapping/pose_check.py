@@ -150,7 +150,11 @@ def depth_scale(recording: PreparedFrames, pairs: list[MatchedPair]) -> float:
     Matches with clear parallax are triangulated.
     """
     depths = [_triangulated(recording, pair) for pair in pairs]
-    depth = np.concatenate([np.zeros(0), *depths])
+    return scale_of_depths(np.concatenate([np.zeros(0), *depths]))
+
+
+def scale_of_depths(depth: np.ndarray) -> float:
+    """Return the factor of `depth_scale` for depths (n,) of a recording."""
     if len(depth) < MIN_DEPTHS:
         return 1.0
     near, middle, far = np.quantile(depth, [0.1, 0.5, 0.9])

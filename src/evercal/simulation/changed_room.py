@@ -35,7 +35,18 @@ def changed_room(before: Room, seed: int) -> Room:
 
     Unchanged objects keep their order; lamps that are off or dimmed have new materials.
     """
-    items = _rearranged(before, np.random.default_rng([seed, 12, before.seed]))
+    return relit(rearranged(before, seed), seed)
+
+
+def rearranged(before: Room, seed: int) -> Room:
+    """Move or remove a share of the small objects."""
+    rng = np.random.default_rng([seed, 12, before.seed])
+    return replace(before, items=_rearranged(before, rng))
+
+
+def relit(before: Room, seed: int) -> Room:
+    """Switch and dim lamps."""
+    items = list(before.items)
     lamps = [i for i, item in enumerate(items) if any(mat.emission > 0 for _, mat in item.parts)]
     ceiling, *factors = _factors(1 + len(lamps), np.random.default_rng([seed, 13, before.seed]))
     for factor, i in zip(factors, lamps, strict=True):
@@ -75,13 +86,13 @@ def _rearranged(before: Room, rng: np.random.Generator) -> list[Item]:
     for number, i in enumerate(touched.tolist()):
         item = remaining.pop(i)
         rest = list(remaining.values())
-        moved = _moved(item, before, rest, rng) if number % 2 == 0 else None
+        moved = moved_item(item, before, rest, rng) if number % 2 == 0 else None
         if moved is not None:
             remaining[i] = moved
     return [remaining[i] for i in sorted(remaining)]
 
 
-def _moved(item: Item, room: Room, rest: list[Item], rng: np.random.Generator) -> Item | None:
+def moved_item(item: Item, room: Room, rest: list[Item], rng: np.random.Generator) -> Item | None:
     """The item at a free position on the floor or on furniture; None after 60 failed attempts."""
     low, high = item.bounds_m()
     middle = (low + high)[:2] / 2
