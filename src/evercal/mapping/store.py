@@ -69,12 +69,7 @@ class MapStore(StageStore):
         """
 
         def read(manifest: Manifest) -> Self:
-            payload = manifest.payload
-            if payload.get("kind") != KIND:
-                raise InputError(
-                    f"store {root}: holds networks of strategy {payload.get('strategy')!r}, not a"
-                    " map"
-                )
+            payload = require_map(root, manifest)
             first, *centroids = (str(name) for name in payload["networks"])
             path = root / first
             local = load_encoder(path) if encoder is None else own_encoder(encoder, path)
@@ -135,7 +130,7 @@ class MapStore(StageStore):
             save_tensors(folder / KEYFRAMES, scene.keyframes.to_tensors())
             write_report(folder, report)
 
-        self.add(scene.name, write, self._payload())
+        self.add(scene.name, write, self.payload)
         self.contents.scenes.append(scene)
 
     def update(self, scene: SceneMap) -> None:
@@ -147,11 +142,27 @@ class MapStore(StageStore):
             InputError: As `commit`, and where a file of the store is missing or was changed.
         """
         index = [stored.name for stored in self.contents.scenes].index(scene.name)
-        self.replace(index, lambda folder: write_scene(folder, scene), self._payload())
+        self.replace(index, lambda folder: write_scene(folder, scene), self.payload)
         self.contents.scenes[index] = scene
 
-    def _payload(self) -> dict[str, object]:
+    @property
+    def payload(self) -> dict[str, object]:
+        """Settings in the manifest."""
         return {"kind": KIND, "strategy": STRATEGY, "short_side": self.contents.short_side}
+
+
+def require_map(root: Path, manifest: Manifest) -> dict[str, Any]:
+    """The payload of a map's manifest.
+
+    Raises:
+        InputError: The store holds networks.
+    """
+    payload = manifest.payload
+    if payload.get("kind") != KIND:
+        raise InputError(
+            f"store {root}: holds networks of strategy {payload.get('strategy')!r}, not a map"
+        )
+    return payload
 
 
 def is_free(root: Path) -> bool:
