@@ -282,3 +282,49 @@ def test_a_second_object_of_one_map_does_not_overwrite_its_scenes(
     with pytest.raises(InputError, match="another process has changed it"):
         second.learn(arcs[1])
     assert Map.open(tmp_path / "map", device="cpu").scenes == ("one",)
+
+
+def test_a_merged_map_gives_the_answers_of_one_that_learned_in_turn(
+    learned: tuple[Map, tuple[LearnReport, LearnReport]],
+    hall: Recording,
+    arcs: tuple[Recording, Recording],
+    tmp_path: Path,
+) -> None:
+    turn = Map.open(learned[0].path, device="cpu")
+    turn.pack(tmp_path / "turn.zip")
+    Map.unpack(tmp_path / "turn.zip", tmp_path / "hall", device="cpu").remove("arc")
+    Map.open(tmp_path / "arc", device="cpu").learn(arcs[0], name="arc", memory="300kB")
+    merged = Map.open(tmp_path / "merged", device="cpu")
+    joined = merged.merge(tmp_path / "hall", tmp_path / "arc")
+    assert joined.added == merged.scenes == turn.scenes == ("hall", "arc")
+    images = [scene.test[i].read_image() for scene in (hall, arcs[0]) for i in (3, 12, 20)]
+    for image in images:
+        expected, estimate = turn.localize(image), merged.localize(image)
+        assert (estimate.status, estimate.scene) == ("ok", expected.scene)
+        assert estimate.support == expected.support
+        for one, other in (
+            (estimate.uncertain_pose, expected.uncertain_pose),
+            (estimate.uncertain_pose, merged.localizer.localize(image).uncertain_pose),
+        ):
+            assert one is not None
+            assert other is not None
+            np.testing.assert_array_equal(one.pose.matrix(), other.pose.matrix())
+            np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+def test_a_scene_is_renamed_and_removed_while_a_localizer_answers(
+    hall_only: Map, hall: Recording, tmp_path: Path
+) -> None:
+    hall_only.pack(tmp_path / "hall.zip")
+    opened = Map.unpack(tmp_path / "hall.zip", tmp_path / "map", device="cpu")
+    opened.merge(hall_only.path, on_clash="rename")
+    opened.rename("hall", "first")
+    before, image = opened.localizer, hall.test[9].read_image()
+    opened.remove("first")
+    assert opened.scenes == ("hall-2",)
+    assert opened.localize(image).scene == "hall-2"
+    assert before.localize(image).scene in ("first", "hall-2")
+    assert before.scenes == ("first", "hall-2")
+    opened.remove("hall-2")
+    with pytest.raises(InputError, match="no scene learned yet"):
+        opened.localize(image)

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from evercal.errors import InputError
 from evercal.features.device import device_of
@@ -32,8 +32,11 @@ if TYPE_CHECKING:
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import Localizer
     from evercal.localization.query import LocalizeOptions
+    from evercal.localization.refreshing import RefreshReport
     from evercal.mapping.build import Adjusted, MapOptions, OnProgress
+    from evercal.mapping.manage import Merged, OnClash
     from evercal.mapping.memory_budget import MemoryBudget
+    from evercal.mapping.refresh import RefreshOptions
 
 PathLike = str | os.PathLike[str]
 
@@ -199,7 +202,8 @@ class Map:
 
                 built = built.take(fewest_keyframes(contents, built, split.train, on_progress))
             scene = fit_acceptance(
-                contents.with_scene(built.scene),
+                # Alone in a map, so that the threshold does not depend on the other scenes.
+                contents.empty().with_scene(built.scene),
                 built.corrected(split.held_out),
                 left_out=built.left_out(split.train),
                 noise=built.independent_noise,
@@ -223,6 +227,117 @@ class Map:
             self._store.commit(scene, asdict(report))
         self._localizer = None
         return report
+
+    def refresh(
+        self,
+        images: ImageSource | Recording,
+        *,
+        camera: Camera | None = None,
+        options: RefreshOptions | None = None,
+        on_progress: OnProgress = lambda *_: None,
+    ) -> RefreshReport:
+        """Follow a changed room: new images of a scene replace what is gone, in the same memory.
+
+        Images need no poses: they are located in the map. Images that cannot be located precisely
+        are left out. Keyframes that stay keep the base frame.
+
+        Args:
+            images: A folder, image files or arrays (H, W, 3) of one camera, or a recording, whose
+                training frames are used.
+            camera: Intrinsics. Default: those of the camera that recorded the scene.
+            options: Thresholds.
+            on_progress: Called with the current step, how much of it is done, and its total.
+
+        Raises:
+            InputError: Too few images are located, the refreshed map would locate fewer of them, or
+                another process writes into the map. The map is unchanged.
+        """
+        from evercal.calibration.from_images import Images
+        from evercal.localization.refreshing import refresh_scene
+
+        if isinstance(images, Recording):
+            given = [(frame.name, frame.read_image()) for frame in images.train]
+        else:
+            given = Images.of(images, camera).images
+        with self._store.writing():
+            scene, report = refresh_scene(self.localizer, given, camera, options, on_progress)
+            self._store.refresh(scene, asdict(report))
+        self._localizer = None
+        return report
+
+    def undo_refresh(self, scene: str) -> None:
+        """Bring back the state of a scene before its last refresh.
+
+        Raises:
+            InputError: No such scene, nothing to undo, or another process writes into the map.
+        """
+        self._store.undo(scene)
+        self._localizer = None
+
+    def remove(self, *names: str) -> None:
+        """Remove scenes, all in one step; the other scenes do not change.
+
+        Raises:
+            InputError: No such scene, or another process writes into the map.
+        """
+        from evercal.mapping.manage import remove_scenes
+
+        remove_scenes(self._store, names)
+        self._localizer = None
+
+    def rename(self, name: str, new: str) -> None:
+        """Give a scene another name.
+
+        Raises:
+            InputError: No such scene, a name that is taken or unusable, or another process writes
+                into the map.
+        """
+        from evercal.mapping.manage import rename_scene
+
+        rename_scene(self._store, name, new)
+        self._localizer = None
+
+    def merge(self, *others: PathLike, on_clash: OnClash = "refuse") -> Merged:
+        """Add the scenes of other maps, all in one step; see `mapping.manage.merge_maps`.
+
+        Raises:
+            InputError: Not a map, another encoder or image size, a name that is taken, or another
+                process writes into the map.
+        """
+        from evercal.mapping.manage import merge_maps
+
+        merged = merge_maps(self._store, others, on_clash)
+        self._localizer = None
+        return merged
+
+    def pack(self, file: PathLike) -> None:
+        """Write the map into one file, a zip archive; an existing file is replaced.
+
+        Raises:
+            InputError: No scene has been learned, or a file of the map is missing or was changed.
+        """
+        from evercal.mapping.manage import pack_map
+
+        pack_map(self.path, Path(file))
+
+    @classmethod
+    def unpack(cls, file: PathLike, path: PathLike, **how: Any) -> Self:
+        """Extract a map that `pack` has written, and open it.
+
+        The file is not trusted, see `mapping.manage.unpack_map`.
+
+        Args:
+            file: the archive.
+            path: folder of the map; it must be new.
+            how: as `open`.
+
+        Raises:
+            InputError: The folder holds something, or the archive is no complete map.
+        """
+        from evercal.mapping.manage import unpack_map
+
+        unpack_map(Path(file), Path(path))
+        return cls.open(path, **how)
 
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         """Estimate the camera pose of one image, see `Localizer.localize`."""

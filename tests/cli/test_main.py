@@ -16,7 +16,7 @@ import evercal
 from evercal.cli import main
 
 VERBS = {
-    "Map": ["learn", "localize", "evaluate", "info", "verify"],
+    "Map": ["learn", "localize", "evaluate", "info", "verify", "map"],
     "Calibrate": ["calibrate", "check", "watch", "audit", "align"],
     "Boards and pose pairs": ["detect", "solve"],
     "Results": ["export", "report"],
@@ -79,10 +79,9 @@ def test_help_of_a_verb_fits_and_has_an_example(
 def test_messages_name_existing_options(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     options = set(OTHER_PROGRAMS)
-    for verb in ALL:
-        options |= set(
-            re.findall(r"^│ (?:-h, )?(--[a-z-]+)", run(verb, "--help").out, re.MULTILINE)
-        )
+    for words in [*([verb] for verb in ALL), ["map", "merge"]]:
+        page = run(*words, "--help").out
+        options |= set(re.findall(r"^│ (?:-h, )?(--[a-z-]+)", page, re.MULTILINE))
     assert "--robot-poses" in options
     for path in Path(evercal.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from evercal.errors import InputError
 
 _GROUPS = {
-    "Map": ("learn", "localize", "evaluate", "info", "verify"),
+    "Map": ("learn", "localize", "refresh", "evaluate", "info", "verify", "map"),
     "Calibrate": ("calibrate", "check", "watch", "audit", "align"),
     "Boards and pose pairs": ("detect", "solve"),
     "Results": ("export", "report"),
@@ -106,7 +106,9 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.inspect import Inspect
     from evercal.cli.learn import Learn
     from evercal.cli.localize import Localize
+    from evercal.cli.map import Maps
     from evercal.cli.pretrain import Pretrain, pretrain_with_options
+    from evercal.cli.refresh import Refresh
     from evercal.cli.report import Report
     from evercal.cli.simulate import Simulate
     from evercal.cli.solve import Solve
@@ -126,9 +128,11 @@ def _verbs(first: str) -> dict[str, Any]:
         "solve": Solve,
         "export": ExportCalibration,
         "report": Report,
+        "refresh": Refresh,
         "evaluate": Evaluate,
         "info": Info,
         "verify": Verify,
+        "map": Maps,
         "inspect": Inspect,
         "convert": Convert,
         "simulate": Simulate,

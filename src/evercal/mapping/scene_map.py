@@ -83,6 +83,10 @@ class MapContents:
         """The same map with one more scene."""
         return MapContents(self.encoder, self.short_side, [*self.scenes, scene])
 
+    def empty(self) -> "MapContents":
+        """The same map without scenes."""
+        return MapContents(self.encoder, self.short_side)
+
 
 class LeftOut(NamedTuple):
     """Frames that are located without the keyframes recorded near them."""

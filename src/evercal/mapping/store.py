@@ -5,11 +5,13 @@ stages/0001-NAME/
   keyframes.safetensors    images, poses, depths, landmarks, descriptors
   correction.safetensors   slowly varying corrections, where there are any
   report.json
+  refreshes.json           reports of refreshes, and previous-* files: the state before the last one
 """
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -33,6 +35,9 @@ from evercal.storage.tensors import load_tensors, save_tensors
 KIND, STRATEGY = "map", "evercal"
 """Kind of store in its manifest, and its name among the strategies of `evercal learn`."""
 SCENE, KEYFRAMES, CORRECTION = "scene.json", "keyframes.safetensors", "correction.safetensors"
+REFRESHES = "refreshes.json"
+_STATE, _PREVIOUS = (SCENE, KEYFRAMES, CORRECTION), "previous-"
+"""Files that a refresh replaces, and the prefix of their state before."""
 
 _FIELDS = (
     "name", "camera", "adjusted_camera", "train_frames", "min_support", "covariance_scale",
@@ -69,12 +74,7 @@ class MapStore(StageStore):
         """
 
         def read(manifest: Manifest) -> Self:
-            payload = manifest.payload
-            if payload.get("kind") != KIND:
-                raise InputError(
-                    f"store {root}: holds networks of strategy {payload.get('strategy')!r}, not a"
-                    " map"
-                )
+            payload = require_map(root, manifest)
             first, *centroids = (str(name) for name in payload["networks"])
             path = root / first
             local = load_encoder(path) if encoder is None else own_encoder(encoder, path)
@@ -135,7 +135,7 @@ class MapStore(StageStore):
             save_tensors(folder / KEYFRAMES, scene.keyframes.to_tensors())
             write_report(folder, report)
 
-        self.add(scene.name, write, self._payload())
+        self.add(scene.name, write, self.payload)
         self.contents.scenes.append(scene)
 
     def update(self, scene: SceneMap) -> None:
@@ -146,12 +146,77 @@ class MapStore(StageStore):
         Raises:
             InputError: As `commit`, and where a file of the store is missing or was changed.
         """
-        index = [stored.name for stored in self.contents.scenes].index(scene.name)
-        self.replace(index, lambda folder: write_scene(folder, scene), self._payload())
-        self.contents.scenes[index] = scene
+        self._exchange(scene, lambda folder: write_scene(folder, scene))
 
-    def _payload(self) -> dict[str, object]:
+    def refresh(self, scene: SceneMap, report: Mapping[str, object]) -> None:
+        """Replace a scene of the same name by its refreshed map: whole, or not at all.
+
+        The state before is kept for `undo`.
+
+        Raises:
+            InputError: As `update`.
+        """
+
+        def write(folder: Path) -> None:
+            for name in _STATE:
+                _move(folder / name, folder / f"{_PREVIOUS}{name}")
+            write_scene(folder, scene)
+            save_tensors(folder / KEYFRAMES, scene.keyframes.to_tensors())
+            write_json(folder / REFRESHES, {"refreshes": [*refreshes(folder), dict(report)]})
+
+        self._exchange(scene, write)
+
+    def undo(self, name: str) -> None:
+        """Bring back the state of a scene before its last refresh: whole, or not at all.
+
+        Raises:
+            InputError: As `update`, and where there was no refresh since the last `undo`.
+        """
+        names = [stored.name for stored in self.contents.scenes]
+        if name not in names:
+            raise InputError(f"scene {name!r}: store {self.root} has {', '.join(names) or 'none'}")
+        before = self.folder(self.stages[names.index(name)])
+        if not (before / f"{_PREVIOUS}{SCENE}").exists():
+            raise InputError(f"scene {name!r}: no refresh to undo")
+
+        def write(folder: Path) -> None:
+            for part in _STATE:
+                (folder / part).unlink(missing_ok=True)
+                _move(folder / f"{_PREVIOUS}{part}", folder / part)
+            write_json(folder / REFRESHES, {"refreshes": refreshes(folder)[:-1]})
+
+        self.replace(names.index(name), write, self.payload)
+        scenes = [*self.contents.scenes]
+        scenes[names.index(name)] = read_scene(self.folder(self.stages[names.index(name)]))
+        self.contents = replace(self.contents, scenes=scenes)
+
+    def _exchange(self, scene: SceneMap, write: Callable[[Path], None]) -> None:
+        """Rewrite a stage, and replace its scene in a copy of the contents."""
+        index = [stored.name for stored in self.contents.scenes].index(scene.name)
+        self.replace(index, write, self.payload)
+        # A localizer that still answers keeps the contents it was made with.
+        scenes = [*self.contents.scenes]
+        scenes[index] = scene
+        self.contents = replace(self.contents, scenes=scenes)
+
+    @property
+    def payload(self) -> dict[str, object]:
+        """Settings in the manifest."""
         return {"kind": KIND, "strategy": STRATEGY, "short_side": self.contents.short_side}
+
+
+def require_map(root: Path, manifest: Manifest) -> dict[str, Any]:
+    """The payload of a map's manifest.
+
+    Raises:
+        InputError: The store holds networks.
+    """
+    payload = manifest.payload
+    if payload.get("kind") != KIND:
+        raise InputError(
+            f"store {root}: holds networks of strategy {payload.get('strategy')!r}, not a map"
+        )
+    return payload
 
 
 def is_free(root: Path) -> bool:
@@ -185,6 +250,19 @@ def write_scene(folder: Path, scene: SceneMap) -> None:
     (folder / CORRECTION).unlink(missing_ok=True)  # of the scene that is replaced
     if scene.frame.correction is not None:
         save_tensors(folder / CORRECTION, correction_tensors(scene.frame.correction))
+
+
+def refreshes(folder: Path) -> list[dict[str, Any]]:
+    """Reports of the refreshes of a scene, oldest first."""
+    file = folder / REFRESHES
+    return json.loads(file.read_text())["refreshes"] if file.exists() else []
+
+
+def _move(source: Path, target: Path) -> None:
+    """Move a file; one that does not exist leaves no target."""
+    target.unlink(missing_ok=True)
+    if source.exists():
+        source.rename(target)
 
 
 def read_scene(folder: Path) -> SceneMap:

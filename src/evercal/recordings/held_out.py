@@ -39,15 +39,24 @@ def named_recording(recording: Recording, name: str | None, taken: Iterable[str]
     Raises:
         InputError: A name that is among the names `taken`, or that is no single word of a path.
     """
-    name = recording.name if name is None else name
-    if not name.strip() or name.startswith(".") or re.search(r"[/\\=\x00-\x1f]", name):
-        raise InputError(
-            f"scene name {name!r}: give one with --name that is not empty, does not begin with a"
-            " dot and holds no slash, '=' or line break"
-        )
+    name = checked_name(recording.name if name is None else name)
     if name in taken:
         raise InputError(f"scene {name!r}: a scene of this name exists; give another with --name")
     return replace(recording, name=name)
+
+
+def checked_name(name: str) -> str:
+    """A name that a scene can have.
+
+    Raises:
+        InputError: A name that is no single word of a path.
+    """
+    if not name.strip() or name.startswith(".") or re.search(r"[/\\=\x00-\x1f]", name):
+        raise InputError(
+            f"scene name {name!r}: give one that is not empty, does not begin with a dot and holds"
+            " no slash, '=' or line break"
+        )
+    return name
 
 
 def require_frames(recording: Recording, least: int = MIN_TRAIN_FRAMES) -> None:

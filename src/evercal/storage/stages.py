@@ -27,8 +27,12 @@ from evercal.storage.manifest import MANIFEST, Manifest, write_manifest
 SCHEMA = 5
 STAGES = "stages"
 REPORT = "report.json"
-_STAGE = re.compile(r"\d{4}-[\w.~-]*")
+_STAGE = re.compile(r"\d{4,}-[\w.~-]*")
+_MADE = "made"
+"""Key of the payload: the stages ever added. No name is used again after its stage was removed."""
 Result = TypeVar("Result")
+Write = Callable[[Path], None]
+"""Writes the files of a stage into a folder."""
 
 
 def is_store(root: Path) -> bool:
@@ -127,28 +131,46 @@ class StageStore:
     def add(
         self,
         name: str,
-        write: Callable[[Path], None],
+        write: Write,
         payload: Mapping[str, object],
         superseded: Callable[[str], bool] = lambda _: False,
     ) -> None:
-        """Add a stage: whole, or not at all.
-
-        Characters of the name that a folder cannot hold are replaced. `write` fills an empty
-        folder, and `superseded` files of earlier stages are dropped.
+        """Add a stage: whole, or not at all; see `change`.
 
         Raises:
             InputError: As `writing`.
         """
-        legal = re.sub(r"[^\w.-]", "_", name)[:60]
-        stage = f"{len(self.stages) + 1:04d}-{legal}"
-        with self.writing() as before:
-            temporary = self._empty(stage)
-            write(temporary)
-            self._publish([*self.stages, stage], stage, payload, before, superseded)
+        self.change(self.stages, [(name, write)], payload, superseded)
 
-    def replace(
-        self, index: int, write: Callable[[Path], None], payload: Mapping[str, object]
+    def change(
+        self,
+        kept: Sequence[str],
+        added: Sequence[tuple[str, Write]],
+        payload: Mapping[str, object],
+        superseded: Callable[[str], bool] = lambda _: False,
     ) -> None:
+        """Keep some stages and add others after them, in one step: all of it, or nothing.
+
+        Args:
+            kept: Stages to keep, in order; the others are removed.
+            added: Name and writer of each new stage. The writer fills an empty folder. Characters
+                of the name that a folder cannot hold are replaced.
+            payload: Settings of the store.
+            superseded: Files of kept stages that are dropped.
+
+        Raises:
+            InputError: As `writing`.
+        """
+        with self.writing() as before:
+            made, new = _made(before), []
+            for number, (name, write) in enumerate(added, made + 1):
+                legal = re.sub(r"[^\w.-]", "_", name)[:60]
+                new.append(f"{number:04d}-{legal}")
+                write(self._empty(new[-1]))
+            settings = {**payload, _MADE: made + len(new)}
+            self._publish([*kept, *new], new, settings, before, superseded)
+
+    def replace(self, index: int, write: Write, payload: Mapping[str, object]) -> None:
         """Replace a stage: whole, or not at all.
 
         `write` changes files in a copy of the stage's folder.
@@ -168,7 +190,8 @@ class StageStore:
                     shutil.copyfile(self.root / file, temporary / Path(file).name)
             write(temporary)
             stages = [*self.stages[:index], stage, *self.stages[index + 1 :]]
-            self._publish(stages, stage, payload, before, lambda _: False)
+            settings = {**payload, _MADE: _made(before)}
+            self._publish(stages, [stage], settings, before, lambda _: False)
 
     def reports(self) -> list[dict[str, Any]]:
         """`report.json` of every stage, in order."""
@@ -189,17 +212,19 @@ class StageStore:
     def _publish(
         self,
         stages: list[str],
-        new: str,
+        new: Sequence[str],
         payload: Mapping[str, object],
         before: Manifest | None,
         superseded: Callable[[str], bool],
     ) -> None:
-        """Move a prepared stage into place and write the manifest: the store is then `stages`."""
-        replace_folder(self.folder(f".{new}"), self.folder(new))
-        files = [*self.networks, *(f"{STAGES}/{new}/{p.name}" for p in self.folder(new).iterdir())]
+        """Move prepared stages into place and write the manifest: the store is then `stages`."""
+        files = [*self.networks]
+        for stage in new:
+            replace_folder(self.folder(f".{stage}"), self.folder(stage))
+            files += [f"{STAGES}/{stage}/{path.name}" for path in self.folder(stage).iterdir()]
         for file in before.files if before else ():
             stage, _, name = file.removeprefix(f"{STAGES}/").partition("/")
-            if stage in stages and stage != new and not superseded(name):
+            if stage in stages and stage not in new and not superseded(name):
                 files.append(file)
         settings = {"schema": SCHEMA, **payload, "networks": list(self.networks), "stages": stages}
         write_manifest(self.root, settings, files, before)
@@ -218,6 +243,13 @@ class StageStore:
                     path.unlink(missing_ok=True)
         for unfinished in self.root.glob(".*.tmp"):
             unfinished.unlink(missing_ok=True)
+
+
+def _made(manifest: Manifest | None) -> int:
+    """Number of stages that were ever added to a store."""
+    return (
+        0 if manifest is None else int(manifest.payload.get(_MADE, len(manifest.payload["stages"])))
+    )
 
 
 def write_report(folder: Path, report: Mapping[str, object]) -> None:

@@ -1,0 +1,113 @@
+"""`evercal refresh`."""
+
+import dataclasses
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from evercal.cli.console import print_json, print_next, size
+from evercal.cli.device import Device
+from evercal.cli.image_words import camera_for
+from evercal.cli.networks import Bars
+from evercal.errors import InputError
+
+if TYPE_CHECKING:
+    from evercal.localization.refreshing import RefreshReport
+    from evercal.recordings import Recording
+
+_LISTED = 5
+"""Images left out that are printed."""
+
+
+@dataclass(frozen=True)
+class Refresh:
+    """Follow a changed room: new images replace what is gone, in the same memory.
+
+    The images need no poses: they are located in the map. What was moved or removed leaves the map,
+    and the base frame stays where the unmoved keyframes hold it.
+
+    Example: evercal refresh cell.evercal images/
+    """
+
+    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    """Folder of the map."""
+    images: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="RECORDING|IMAGE...", help_behavior_hint="")
+    ] = ()
+    """Images of one camera, a folder of them, or a recording."""
+    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """File of the intrinsics. Default: those of the camera that recorded the scene."""
+    undo: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="")] = None
+    """Bring back the state of a scene before its last refresh."""
+    device: Device = "auto"
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Refresh, or undo the last refresh."""
+        if (self.undo is None) == (not self.images):
+            raise InputError("give images of the changed room, or --undo SCENE")
+        from evercal.map import Map
+        from evercal.storage import read_manifest
+
+        read_manifest(self.store)
+        cell = Map.open(self.store, device=self.device)
+        if self.undo is not None:
+            cell.undo_refresh(self.undo)
+            if self.json:
+                print_json({"scene": self.undo, "undone": True})
+            else:
+                print(f"{self.undo}: the state before its last refresh is back")
+            return 0
+        recording = _recording(self.images)
+        stream = sys.stderr if self.json else sys.stdout
+        with Bars("", stream) as bars:
+            if recording is not None:
+                report = cell.refresh(recording, on_progress=bars.step)
+            else:
+                from evercal.recordings.image_files import image_files
+
+                files = image_files(self.images)
+                camera = camera_for(self.camera, files)
+                report = cell.refresh(files, camera=camera, on_progress=bars.step)
+        if self.json:
+            print_json(dataclasses.asdict(report))
+            return 0
+        print("\n".join(_lines(report)))
+        print_next("evercal", "refresh", self.store, "--undo", report.scene)
+        return 0
+
+
+def _recording(paths: tuple[Path, ...]) -> "Recording | None":
+    """The recording at a single path; None for images."""
+    from evercal.recordings import load_recording
+
+    if len(paths) != 1 or paths[0].is_file():
+        return None
+    try:
+        return load_recording(paths[0])
+    except InputError:
+        return None
+
+
+def _lines(report: "RefreshReport") -> list[str]:
+    share = report.landmarks_gone / max(report.landmarks_checked, 1)
+    lines = [
+        f"{report.scene}: {report.located} of {report.images} images located, refreshed in"
+        f" {report.seconds:.1f} s",
+        f"  landmarks    {report.landmarks_gone:,} of {report.landmarks_checked:,} in view are gone"
+        f" ({100 * share:.0f} %)",
+        f"  keyframes    {report.keyframes_left} replaced, {report.keyframes_added} new;"
+        f" {size(report.memory_bytes)}",
+        f"  base frame   moved by {report.shift_mm:.2f} mm and {report.shift_deg:.3f} deg"
+        f" (standard deviation {report.shift_sigma_mm:.2f} mm, {report.shift_sigma_deg:.3f} deg;"
+        f" {report.verified} images outside the map)",
+    ]
+    left_out = list(report.left_out.items())
+    lines += [f"  left out     {name}: {reason}" for name, reason in left_out[:_LISTED]]
+    if len(left_out) > _LISTED:
+        lines.append(f"  left out     and {len(left_out) - _LISTED} more images")
+    return lines

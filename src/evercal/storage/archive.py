@@ -1,0 +1,170 @@
+"""Zip archives of folders: written as one file, and extracted without trust in their content."""
+
+import contextlib
+import errno
+import os
+import shutil
+import stat
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from evercal.errors import InputError
+from evercal.storage.atomic import replacing
+
+_DIRECTORY_BYTES = 512
+"""Size of an entry in the central directory, bytes, on average and at most: Python keeps all
+entries in memory before any of them can be checked."""
+_CHUNK = 1 << 20
+_SAME_TIME = (1980, 1, 1, 0, 0, 0)
+
+
+@dataclass(frozen=True)
+class ArchiveLimits:
+    """What an archive may contain."""
+
+    bytes: int = 20 * 10**9
+    """Size of all extracted files."""
+    files: int = 200_000
+    """Number of entries."""
+
+
+def write_archive(file: str | os.PathLike[str], root: Path, names: Iterable[str]) -> None:
+    """Write files of a folder into one zip archive, whole or not at all.
+
+    Entries are stored, not compressed: JPEG images and half floats hardly shrink. The same files
+    give the same bytes.
+
+    Args:
+        file: The archive; an existing one is replaced.
+        root: Folder of the files.
+        names: Paths relative to `root`, with forward slashes.
+
+    Raises:
+        OSError: A missing file, a full disk or no permission to write.
+    """
+    with replacing(file) as out, zipfile.ZipFile(out, "w") as archive:
+        for name in names:
+            entry = zipfile.ZipInfo(name, _SAME_TIME)
+            entry.external_attr = (stat.S_IFREG | 0o644) << 16
+            entry.file_size = (root / name).stat().st_size  # above 2 GiB the header is longer
+            with open(root / name, "rb") as source, archive.open(entry, "w") as target:
+                shutil.copyfileobj(source, target, _CHUNK)
+
+
+def check_archive(file: Path, limits: ArchiveLimits = ArchiveLimits()) -> list[str]:
+    """Check the entries of a zip archive without extracting them.
+
+    Returns:
+        The paths of its files.
+
+    Raises:
+        InputError: No zip archive; an absolute path, a path with `..`, a duplicate, a link, an
+            encrypted entry; too many entries or too large ones.
+    """
+    with _opened(file, limits) as archive:
+        return [e.filename for e in _checked(archive, file, limits) if not e.is_dir()]
+
+
+def extract_archive(file: Path, folder: Path, limits: ArchiveLimits = ArchiveLimits()) -> None:
+    """Extract a zip archive into a folder that does not exist yet.
+
+    Sizes are checked twice: as the archive states them, and while the files are written.
+
+    Raises:
+        InputError: As `check_archive`, or an entry does not have its stated size or checksum.
+            What was extracted before stays in the folder.
+    """
+    folder.mkdir(parents=True)
+    with _opened(file, limits) as archive:
+        for entry in _checked(archive, file, limits):
+            path = folder / entry.filename
+            if entry.is_dir():
+                path.mkdir(parents=True, exist_ok=True)
+                continue
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _extract(archive, entry, path)
+
+
+@contextlib.contextmanager
+def _opened(file: Path, limits: ArchiveLimits) -> Iterator[zipfile.ZipFile]:
+    """A zip archive; what the library raises for broken ones becomes one line."""
+    broken: object
+    try:
+        with zipfile.ZipFile(_bounded(file, limits)) as archive:
+            yield archive
+            return
+    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError) as error:
+        broken = error
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # a broken offset
+            raise
+        broken = error
+    raise InputError(f"{file}: not a readable zip archive ({broken})")
+
+
+def _bounded(file: Path, limits: ArchiveLimits) -> Path:
+    """The file, if its central directory is small enough to be read."""
+    with open(file, "rb") as opened:
+        # The library's own search, so that both find the same directory.
+        end = zipfile._EndRecData(opened)  # pyright: ignore[reportAttributeAccessIssue]
+    if not end:
+        raise InputError(f"{file}: not a zip archive")
+    if max(end[4], end[5] // _DIRECTORY_BYTES) > limits.files:
+        raise InputError(f"{file}: more than {limits.files:,} entries; split it")
+    return file
+
+
+def _checked(archive: zipfile.ZipFile, file: Path, limits: ArchiveLimits) -> list[zipfile.ZipInfo]:
+    """The entries, if all of them may be extracted."""
+    entries, total = archive.infolist(), 0
+    files: set[str] = set()
+    folders: set[str] = set()
+    for entry in entries:
+        # `filename` ends at a zero byte, `orig_filename` does not.
+        name, kind = entry.orig_filename, stat.S_IFMT(entry.external_attr >> 16)
+        path = PurePosixPath(name.removesuffix("/"))
+        if not _stays_inside(name):
+            raise InputError(f"{file}: entry {name!r} leaves the folder; nothing was extracted")
+        if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+            raise InputError(f"{file}: entry {name!r} is a link or device; only files are allowed")
+        if entry.flag_bits & 1:
+            raise InputError(f"{file}: entry {name!r} is encrypted; give an archive without")
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise InputError(f"{file}: entry {name!r} is neither stored nor deflated")
+        if entry.is_dir():
+            folders.add(str(path))
+        elif str(path) in files:
+            raise InputError(f"{file}: entry {name!r} comes twice")
+        else:
+            files.add(str(path))
+        folders.update(map(str, path.parents))
+        total += entry.file_size
+    if files & folders:
+        raise InputError(f"{file}: entry {min(files & folders)!r} is a file and a folder")
+    if total > limits.bytes:
+        raise InputError(
+            f"{file}: {total / 1e9:.1f} GB when extracted; at most {limits.bytes / 1e9:.1f} GB"
+        )
+    return entries
+
+
+def _stays_inside(name: str) -> bool:
+    """Whether a path is relative, plain, and no path of Windows."""
+    parts = name.removesuffix("/").split("/")
+    plain = all(part not in ("", ".", "..") and len(part.encode()) <= 255 for part in parts)
+    return plain and not set(name) & {"\\", "\0"} and parts[0][1:2] != ":" and len(name) <= 1024
+
+
+def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) -> None:
+    left = entry.file_size
+    with archive.open(entry) as source, open(path, "xb") as target:
+        while data := source.read(_CHUNK):
+            left -= len(data)
+            if left < 0:
+                raise zipfile.BadZipFile(f"entry {entry.filename!r} is larger than it states")
+            target.write(data)
+    if left:
+        raise zipfile.BadZipFile(f"entry {entry.filename!r} is smaller than it states")

@@ -1,0 +1,88 @@
+"""`evercal map`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evercal.cli import main
+
+
+@pytest.fixture
+def copy(hall_store: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(hall_store, tmp_path / "copy"))
+
+
+def scenes(run: Any, store: Path) -> list[str]:
+    ran = run("map", "list", store, "--json")
+    assert ran.code == 0
+    return [scene["name"] for scene in json.loads(ran.out)["scenes"]]
+
+
+def test_a_map_is_packed_unpacked_merged_renamed_and_emptied(
+    run: Any, copy: Path, tmp_path: Path
+) -> None:
+    ran = run("map", "list", copy)
+    assert ran.out.startswith("hall: 7 keyframes, ")
+    ran = run("map", "pack", copy, tmp_path / "hall.zip")
+    assert (ran.code, ran.err) == (0, [])
+    assert ran.out.splitlines()[-1] == f"next: evercal map unpack {tmp_path / 'hall.zip'} STORE"
+    record = json.loads(run("map", "pack", copy, tmp_path / "hall.zip", "--json").out)
+    assert record["bytes"] == (tmp_path / "hall.zip").stat().st_size
+    two = tmp_path / "two"
+    ran = run("map", "unpack", tmp_path / "hall.zip", two, "--json")
+    assert json.loads(ran.out) == {"store": str(two), "scenes": ["hall"]}
+    assert run("map", "rename", two, "hall", "lobby").code == 0
+    record = json.loads(run("map", "merge", tmp_path / "new", copy, two, "--json").out)
+    assert record["added"] == record["scenes"] == ["hall", "lobby"]
+    ran = run("map", "merge", two, tmp_path / "new", "--on-clash", "rename")
+    assert ran.out.startswith("added hall, lobby-2; lobby is now lobby-2; scenes of ")
+    assert scenes(run, two) == ["lobby", "hall", "lobby-2"]
+    ran = run("map", "remove", two, "lobby", "lobby-2", "hall")
+    assert (ran.code, ran.out.splitlines()[0][-4:]) == (0, "none")
+    assert run("map", "list", two).out == f"{two}: no scene\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["list", "GONE"], "GONE: no such folder"),
+        (["remove", "STORE", "attic"], "scene 'attic': map STORE has no scene of this name"),
+        (["remove", "STORE"], "no scene given"),
+        (["merge", "STORE"], "no map given"),
+        (["rename", "STORE", "hall", ".x"], "scene name '.x'"),
+        (["rename", "GONE", "hall", "x"], "GONE: no such folder"),
+        (["merge", "STORE", "STORE"], "is the map that scenes are merged into"),
+        (["merge", "GONE", "GONE"], "GONE: no such folder"),
+        (["merge", "STORE", "STORE", "--on-clash", "win"], "--on-clash"),
+        (["pack", "STORE", "GONE/x.zip"], "FILE GONE/x.zip: folder GONE does not exist"),
+        (["pack", "GONE", "STORE.zip"], "GONE: no such folder"),
+        (["unpack", "GONE", "NEW"], "GONE: no such file"),
+        (["unpack", "STORE/manifest.json", "NEW"], "not a zip archive"),
+        (["unpack", "STORE/manifest.json", "STORE"], "STORE: exists; give a new folder"),
+    ],
+)
+def test_misuse_is_one_line_and_changes_nothing(
+    run: Any, copy: Path, tmp_path: Path, snapshot: Any, words: list[str], message: str
+) -> None:
+    for word, path in (("STORE", copy), ("GONE", tmp_path / "gone"), ("NEW", tmp_path / "new")):
+        words = [given.replace(word, str(path)) for given in words]
+        message = message.replace(word, str(path))
+    before = snapshot(tmp_path)
+    ran = run("map", *words, "--json")
+    assert ran.code == 2
+    assert message in json.loads(ran.out)["error"]
+    assert "Traceback" not in "".join(ran.err)
+    assert {k: v for k, v in snapshot(tmp_path).items() if not k.endswith(".lock")} == before
+
+
+@pytest.mark.parametrize("action", ["list", "remove", "rename", "merge", "pack", "unpack"])
+def test_help_of_an_action_has_an_example(action: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["map", action, "--help"]) == 0
+    page = capsys.readouterr().out
+    assert f"Example: evercal map {action} " in page
+    assert "--json" in page

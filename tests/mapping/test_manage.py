@@ -1,0 +1,414 @@
+"""Scenes are removed, renamed, merged, packed and unpacked: completely, or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from evercal.errors import InputError
+from evercal.mapping import manage
+from evercal.mapping.manage import (
+    OnClash,
+    merge_maps,
+    pack_map,
+    remove_scenes,
+    rename_scene,
+    unpack_map,
+)
+from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.mapping.store import MapStore
+from evercal.storage.archive import ArchiveLimits
+from evercal.storage.manifest import MANIFEST, Manifest, verify, write_manifest
+
+Make = Callable[[Path, Sequence[SceneMap]], MapStore]
+Tree = Callable[[Path], dict[str, str]]
+Contents = Callable[[MapContents], list[object]]
+Record = Callable[[Path, Callable[[], object]], list[Path]]
+
+
+@pytest.fixture
+def root(scenes: list[SceneMap], tmp_path: Path, make: Make) -> Path:
+    """A map of alpha, beta and gamma."""
+    return make(tmp_path / "store", scenes).root
+
+
+@pytest.fixture
+def other(scenes: list[SceneMap], tmp_path: Path, make: Make) -> Path:
+    """A map of beta, with a threshold of its own, and delta."""
+    beta, delta = replace(scenes[1], min_support=0.7), replace(scenes[2], name="delta")
+    return make(tmp_path / "other", [beta, delta]).root
+
+
+def names(root: Path) -> list[str]:
+    return [scene.name for scene in MapStore.open(root).contents.scenes]
+
+
+def supports(root: Path) -> dict[str, float]:
+    return {scene.name: scene.min_support for scene in MapStore.open(root).contents.scenes}
+
+
+@pytest.mark.parametrize("gone", [["alpha"], ["beta"], ["gamma", "alpha"], ["beta", "alpha"]])
+def test_removed_scenes_are_gone_and_the_others_unchanged(
+    gone: list[str], root: Path, scenes: list[SceneMap], content: Contents
+) -> None:
+    before = {scene.name: scene for scene in MapStore.open(root).contents.scenes}
+    store = MapStore.open(root)
+    remove_scenes(store, gone)
+    left = [scene for name, scene in before.items() if name not in gone]
+    opened = MapStore.open(root)
+    for contents in (store.contents, opened.contents):
+        assert content(contents) == content(replace(contents, scenes=left))
+    assert verify(root) == []
+    assert sorted(os.listdir(root / "stages")) == sorted(opened.stages)
+
+
+def test_a_map_without_scenes_can_grow_again(root: Path, scenes: list[SceneMap]) -> None:
+    store = MapStore.open(root)
+    remove_scenes(store, ["alpha", "beta", "gamma"])
+    assert names(root) == []
+    store.commit(scenes[1], {"scene": "beta"})
+    assert names(root) == ["beta"]
+
+
+def test_no_folder_name_is_used_again(root: Path, scenes: list[SceneMap]) -> None:
+    """A process that opened the map before would take the new scene for the old one."""
+    late, store = MapStore.open(root), MapStore.open(root)
+    remove_scenes(store, ["gamma"])
+    store.commit(replace(scenes[2], min_support=0.9), {"scene": "gamma"})
+    assert store.stages == ["0001-alpha", "0002-beta", "0004-gamma"]
+    rename_scene(store, "gamma", "hall")
+    with pytest.raises(InputError, match="another process has changed it"):
+        late.commit(replace(scenes[2], name="delta"), {})
+    MapStore.open(root).commit(replace(scenes[2], name="delta"), {})
+    assert MapStore.open(root).stages[-1] == "0005-delta"
+
+
+def test_a_renamed_scene_keeps_its_place_and_content(
+    root: Path, scenes: list[SceneMap], content: Contents
+) -> None:
+    before, store = MapStore.open(root).contents, MapStore.open(root)
+    rename_scene(store, "alpha", "Küche 2")
+    renamed = [replace(before.scenes[0], name="Küche 2"), *before.scenes[1:]]
+    opened = MapStore.open(root)
+    for contents in (store.contents, opened.contents):
+        assert content(contents) == content(replace(before, scenes=renamed))
+    assert opened.reports()[0] == {"scene": "Küche 2", "seconds": 1.5}
+    rename_scene(opened, "Küche 2", "alpha")
+    assert content(MapStore.open(root).contents) == content(before)
+
+
+def test_misuse_is_refused_by_name_and_changes_nothing(root: Path, tree: Tree) -> None:
+    before, store = tree(root), MapStore.open(root)
+    attempts: list[tuple[Callable[[], object], str]] = [
+        (lambda: remove_scenes(store, ["alpha", "attic"]), "'attic'.* it has alpha, beta, gamma"),
+        (lambda: rename_scene(store, "attic", "a"), "scene 'attic'"),
+        (lambda: rename_scene(store, "alpha", "beta"), "scene 'beta': .* has a scene of this name"),
+        (lambda: rename_scene(store, "alpha", "a/b"), "scene name 'a/b'"),
+        (lambda: merge_maps(store, [root]), "is the map that scenes are merged into"),
+        (lambda: merge_maps(store, [root / "gone"]), "gone: no such folder"),
+        (lambda: pack_map(root, root / "x.zip"), "lies inside the map"),
+    ]
+    for attempt, message in attempts:
+        with pytest.raises(InputError, match=message):
+            attempt()
+    with MapStore.open(root).writing():
+        for change in (
+            lambda: remove_scenes(store, ["beta"]),
+            lambda: rename_scene(store, "beta", "b"),
+        ):
+            with pytest.raises(InputError, match="another process is writing"):
+                change()
+    assert tree(root) == before
+    assert [scene.name for scene in store.contents.scenes] == ["alpha", "beta", "gamma"]
+
+
+@pytest.mark.parametrize(
+    ("on_clash", "expected"),
+    [
+        ("rename", {"alpha": 0.0, "beta": 0.1, "gamma": 0.2, "beta-2": 0.7, "delta": 0.2}),
+        ("skip", {"alpha": 0.0, "beta": 0.1, "gamma": 0.2, "delta": 0.2}),
+        ("replace", {"alpha": 0.0, "gamma": 0.2, "beta": 0.7, "delta": 0.2}),
+    ],
+)
+def test_names_that_are_taken(
+    on_clash: OnClash, expected: dict[str, float], root: Path, other: Path, tree: Tree
+) -> None:
+    before, source, store = tree(root), tree(other), MapStore.open(root)
+    with pytest.raises(InputError, match=r"scene 'beta' of map .*other: the name is taken"):
+        merge_maps(store, [other])
+    assert tree(root) == before
+    merged = merge_maps(store, [other], on_clash)
+    assert supports(root) == pytest.approx(expected)
+    assert list(supports(root)) == list(expected)
+    assert [scene.name for scene in store.contents.scenes] == list(expected)
+    assert merged.renamed == ((("beta", "beta-2"),) if on_clash == "rename" else ())
+    assert (merged.skipped, merged.replaced) == (
+        ("beta",) if on_clash == "skip" else (),
+        ("beta",) if on_clash == "replace" else (),
+    )
+    reports = {report["scene"] for report in MapStore.open(root).reports()}
+    assert reports == set(expected)
+    assert verify(root) == []
+    assert tree(other) == source
+
+
+def test_two_maps_with_one_name_between_them(
+    other: Path, scenes: list[SceneMap], tmp_path: Path, make: Make
+) -> None:
+    third = make(tmp_path / "third", [replace(scenes[0], name="delta")]).root
+    for on_clash, expected in (
+        ("rename", ["beta", "delta", "delta-2"]),
+        ("skip", ["beta", "delta"]),
+        ("replace", ["beta", "delta"]),
+    ):
+        store = MapStore.create(tmp_path / on_clash)
+        merge_maps(store, [other, third], on_clash)  # type: ignore[arg-type]
+        assert names(store.root) == expected
+
+
+def test_a_new_map_has_the_encoder_of_the_first_one(
+    other: Path, tmp_path: Path, content: Contents
+) -> None:
+    store = MapStore.create(tmp_path / "new")
+    merge_maps(store, [other])
+    opened, source = MapStore.open(tmp_path / "new"), MapStore.open(other)
+    assert opened.networks == source.networks
+    assert (opened.contents.short_side, store.contents.short_side) == (48, 48)
+    assert content(opened.contents) == content(source.contents) == content(store.contents)
+
+
+@pytest.mark.parametrize("difference", ["encoder", "size"])
+def test_maps_of_other_networks_are_refused(
+    difference: str, root: Path, scenes: list[SceneMap], tmp_path: Path, tree: Tree
+) -> None:
+    foreign = MapStore.create(
+        tmp_path / "foreign", short_side=48 if difference == "encoder" else 96
+    )
+    foreign.commit(replace(scenes[0], name="new"), {"scene": "new"})
+    before = tree(root)
+    message = "another encoder" if difference == "encoder" else "image size 96, map .* has 48"
+    with pytest.raises(InputError, match=rf"map .*foreign: .*{message}"):
+        merge_maps(MapStore.open(root), [foreign.root])
+    assert tree(root) == before
+
+
+def test_a_damaged_map_is_not_merged(root: Path, other: Path, tree: Tree) -> None:
+    file = other / "stages" / "0002-delta" / "keyframes.safetensors"
+    file.write_bytes(file.read_bytes()[:-1] + b"\0")
+    before = tree(root)
+    with pytest.raises(InputError, match=r"keyframes\.safetensors: checksum does not match"):
+        merge_maps(MapStore.open(root), [other], "skip")
+    assert tree(root) == before
+
+
+def test_a_map_that_changes_while_it_is_copied_is_refused(
+    root: Path, other: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = manage.read_store
+
+    def late(*args: object) -> object:
+        result = read(*args)  # type: ignore[arg-type]
+        remove_scenes(MapStore.open(other), ["delta"])
+        return result
+
+    monkeypatch.setattr(manage, "read_store", late)
+    with pytest.raises(InputError, match=r"map .*other: another process has changed it"):
+        merge_maps(MapStore.open(root), [other], "skip")
+    assert names(root) == ["alpha", "beta", "gamma"]
+
+
+@pytest.mark.parametrize("action", ["remove", "rename", "merge", "merge into new"])
+def test_a_kill_at_any_step_leaves_the_old_state_or_the_new_one(
+    action: str,
+    root: Path,
+    other: Path,
+    tmp_path: Path,
+    every_step: Record,
+    tree: Tree,
+    content: Contents,
+) -> None:
+    def change(where: Path) -> None:
+        if action == "remove":
+            remove_scenes(MapStore.open(where), ["beta", "alpha"])
+        elif action == "rename":
+            rename_scene(MapStore.open(where), "beta", "b")
+        else:
+            merge_maps(MapStore.open_or_create(where), [other], "rename")
+
+    def state(where: Path) -> object:
+        return content(MapStore.open(where).contents) if (where / MANIFEST).exists() else None
+
+    where = tmp_path / "new" if action == "merge into new" else root
+    before = state(where)
+    snapshots = every_step(where, lambda: change(where))
+    after, final = state(where), tree(where)
+    outcomes = [state(snapshot) for snapshot in snapshots]
+    assert all(outcome in (before, after) for outcome in outcomes)
+    first = outcomes.index(after)
+    assert all(outcome == after for outcome in outcomes[first:])
+    assert first > 0
+    for i in {0, first // 2, first - 1}:
+        again = tmp_path / "again" / str(i)
+        if snapshots[i].exists():
+            shutil.copytree(snapshots[i], again)
+        change(again)
+        assert tree(again) == final
+
+
+@pytest.mark.parametrize("action", ["remove", "rename", "merge", "unpack", "pack"])
+def test_a_full_disk_at_any_step_leaves_the_old_state(
+    action: str,
+    root: Path,
+    other: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    content: Contents,
+) -> None:
+    pack_map(root, tmp_path / "packed.zip")
+    before, sync, failures = content(MapStore.open(root).contents), os.fsync, 0
+    for last in range(100):
+        left = [last]
+
+        def full(descriptor: int, left: list[int] = left) -> None:
+            left[0] -= 1
+            if left[0] < 0:
+                raise OSError(28, "No space left on device")
+            sync(descriptor)
+
+        store, target = MapStore.open(root), tmp_path / "target"
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", full)
+            try:
+                if action == "remove":
+                    remove_scenes(store, ["beta"])
+                elif action == "rename":
+                    rename_scene(store, "beta", "b")
+                elif action == "merge":
+                    merge_maps(store, [other], "rename")
+                elif action == "unpack":
+                    unpack_map(tmp_path / "packed.zip", target)
+                else:
+                    pack_map(root, target)
+            except OSError:
+                failures += 1
+        if action in ("pack", "unpack"):
+            if target.exists():
+                break
+            assert not [
+                p for p in tmp_path.iterdir() if "target" in p.name and ".lock" not in p.name
+            ]
+        elif content(MapStore.open(root).contents) != before:
+            break
+    assert failures >= 2
+    assert verify(root) == []
+
+
+def test_a_packed_map_is_unpacked_to_the_same_files(root: Path, tmp_path: Path, tree: Tree) -> None:
+    (root / "notes.txt").write_text("not of the map")
+    pack_map(root, tmp_path / "map.zip")
+    unpack_map(tmp_path / "map.zip", tmp_path / "deep" / "copy")
+    (root / "notes.txt").unlink()
+    assert tree(tmp_path / "deep" / "copy") == tree(root)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    unpack_map(tmp_path / "map.zip", empty)
+    assert tree(empty) == tree(root)
+    for taken in (root, tmp_path / "map.zip"):
+        with pytest.raises(InputError, match="exists; give a new folder"):
+            unpack_map(tmp_path / "map.zip", taken)
+
+
+def test_pack_reads_again_if_another_process_changes_the_map(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, changes = manage.write_archive, iter("c")
+
+    def late(*args: object) -> None:
+        for _ in changes:
+            remove_scenes(MapStore.open(root), ["alpha"])
+        write(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(manage, "write_archive", late)
+    pack_map(root, tmp_path / "map.zip")
+    unpack_map(tmp_path / "map.zip", tmp_path / "copy")
+    assert names(tmp_path / "copy") == ["beta", "gamma"]
+
+
+def rezipped(source: Path, target: Path, change: Callable[[dict[str, bytes]], None]) -> Path:
+    """An archive with changed entries."""
+    with zipfile.ZipFile(source) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    change(entries)
+    with zipfile.ZipFile(target, "w") as archive:
+        for name, data in entries.items():
+            archive.writestr(name, data)
+    return target
+
+
+def test_archives_that_are_no_complete_map_are_refused(
+    root: Path, scenes: list[SceneMap], tmp_path: Path, tree: Tree
+) -> None:
+    packed = tmp_path / "map.zip"
+    pack_map(root, packed)
+    keyframes, scene = "stages/0001-alpha/keyframes.safetensors", "stages/0002-beta/scene.json"
+    schema = tmp_path / "schema"
+    shutil.copytree(root, schema)
+    listed = Manifest.read(schema)
+    write_manifest(schema, {**listed.payload, "schema": 99}, [*listed.files], listed)
+    foreign = tmp_path / "foreign"
+    shutil.copytree(root, foreign)
+    (foreign / scene).write_text(json.dumps({"name": ["no", "scene"]}))
+    write_manifest(foreign, listed.payload, [*listed.files])
+
+    def of(folder: Path) -> Callable[[dict[str, bytes]], None]:
+        return lambda entries: entries.update({n: (folder / n).read_bytes() for n in entries})
+
+    changes: list[tuple[Callable[[dict[str, bytes]], object], str]] = [
+        (lambda e: e.update({keyframes: e[keyframes][:-1] + b"\0"}), "checksum does not match"),
+        (lambda e: e.update({scene: b"{}"}), "2 bytes, expected"),
+        (lambda e: e.pop(keyframes), "missing"),
+        (lambda e: e.pop(MANIFEST), "no manifest.json in it"),
+        (lambda e: e.update({MANIFEST: e[MANIFEST][:-9]}), "broken"),
+        (lambda e: e.update({"extra.sh": b"x"}), "extra.sh is not in its manifest"),
+        (lambda e: e.update({"../evil": b"x"}), "leaves the folder"),
+        (of(schema), "schema 99 is not 5; update evercal"),
+        (of(foreign), "is not a map that evercal wrote"),
+    ]
+    before = tree(tmp_path)
+    for change, message in changes:
+        broken = rezipped(packed, tmp_path / "broken.zip", change)  # type: ignore[arg-type]
+        with pytest.raises(InputError, match=message) as refused:
+            unpack_map(broken, tmp_path / "copy")
+        assert str(refused.value).startswith(str(broken))
+        assert "\n" not in str(refused.value)
+        assert "unpacking" not in str(refused.value)
+        broken.unlink()
+    with pytest.raises(InputError, match="when extracted; at most"):
+        unpack_map(packed, tmp_path / "copy", ArchiveLimits(bytes=10_000))
+    left = tree(tmp_path)
+    left.pop(".copy.lock")
+    assert left == before
+    assert not (tmp_path / "copy").exists()
+
+
+@pytest.mark.parametrize("step", ["first", "middle", "last"])
+def test_unpacking_that_was_killed_can_be_repeated(
+    step: str, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tree: Tree
+) -> None:
+    pack_map(root, tmp_path / "map.zip")
+    killed = tmp_path / ".copy.unpacking"
+    shutil.copytree(root, killed)
+    if step != "last":
+        shutil.rmtree(killed / "stages")
+    if step == "first":
+        (killed / MANIFEST).unlink()
+    unpack_map(tmp_path / "map.zip", tmp_path / "copy")
+    assert tree(tmp_path / "copy") == tree(root)
+    assert not killed.exists()

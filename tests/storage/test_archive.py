@@ -1,0 +1,149 @@
+"""Archives are extracted whole and inside their folder, or refused."""
+
+from __future__ import annotations
+
+import io
+import stat
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from evercal.errors import InputError
+from evercal.storage.archive import ArchiveLimits, check_archive, extract_archive, write_archive
+
+Tree = Callable[[Path], dict[str, str]]
+FILES = {"a.txt": b"first", "deep/er/b.bin": bytes(3_000_000), "deep/empty": b""}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name, data in FILES.items():
+        (tmp_path / "in" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "in" / name).write_bytes(data)
+    return tmp_path / "in"
+
+
+def zipped(path: Path, *entries: tuple[str | zipfile.ZipInfo, bytes], deflate: bool = True) -> Path:
+    kind = zipfile.ZIP_DEFLATED if deflate else zipfile.ZIP_STORED
+    with zipfile.ZipFile(path, "w", kind) as archive:
+        for name, data in entries:
+            archive.writestr(name, data)
+    return path
+
+
+def test_round_trip_gives_the_same_files_and_bytes(
+    folder: Path, tmp_path: Path, tree: Tree
+) -> None:
+    write_archive(tmp_path / "one.zip", folder, FILES)
+    extract_archive(tmp_path / "one.zip", tmp_path / "out")
+    assert tree(tmp_path / "out") == tree(folder)
+    assert sorted(check_archive(tmp_path / "one.zip")) == sorted(FILES)
+    write_archive(tmp_path / "two.zip", tmp_path / "out", FILES)
+    assert (tmp_path / "two.zip").read_bytes() == (tmp_path / "one.zip").read_bytes()
+
+
+def test_a_missing_file_leaves_the_old_archive(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "one.zip").write_bytes(b"old")
+    with pytest.raises(FileNotFoundError):
+        write_archive(tmp_path / "one.zip", folder, [*FILES, "missing"])
+    assert (tmp_path / "one.zip").read_bytes() == b"old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "one.zip"]
+
+
+def info(name: str, mode: int) -> zipfile.ZipInfo:
+    entry = zipfile.ZipInfo(name)
+    entry.external_attr = mode << 16
+    return entry
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        (["../evil"], "leaves the folder"),
+        (["a/../../evil"], "leaves the folder"),
+        (["/etc/evil"], "leaves the folder"),
+        (["a//b"], "leaves the folder"),
+        (["./a"], "leaves the folder"),
+        (["..\\evil"], "leaves the folder"),
+        (["C:/evil"], "leaves the folder"),
+        (["x" * 300], "leaves the folder"),
+        (["a", "a"], "comes twice"),
+        (["a", "a/b"], "is a file and a folder"),
+        ([info("link", stat.S_IFLNK | 0o777)], "is a link or device"),
+        ([info("pipe", stat.S_IFIFO | 0o644)], "is a link or device"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_entries_that_may_not_be_extracted(
+    entries: list[str | zipfile.ZipInfo], message: str, tmp_path: Path, tree: Tree
+) -> None:
+    path = zipped(tmp_path / "x.zip", *((entry, b"data") for entry in entries))
+    before = tree(tmp_path)
+    with pytest.raises(InputError, match=message) as refused:
+        extract_archive(path, tmp_path / "out" / "er")
+    assert "\n" not in str(refused.value)
+    with pytest.raises(InputError, match=message):
+        check_archive(path)
+    assert tree(tmp_path) == before
+
+
+def test_more_than_the_limits_is_refused(tmp_path: Path) -> None:
+    bomb = zipped(tmp_path / "bomb.zip", *((f"{i}", bytes(10**6)) for i in range(20)))
+    assert bomb.stat().st_size < 100_000
+    with pytest.raises(InputError, match=r"0\.0 GB when extracted; at most 0\.0 GB"):
+        extract_archive(bomb, tmp_path / "out", ArchiveLimits(bytes=19 * 10**6))
+    with pytest.raises(InputError, match="more than 19 entries"):
+        extract_archive(bomb, tmp_path / "out2", ArchiveLimits(files=19))
+    extract_archive(bomb, tmp_path / "out3", ArchiveLimits(20 * 10**6, 20))
+
+
+def test_an_entry_that_is_larger_than_it_states_is_refused(tmp_path: Path) -> None:
+    path = zipped(tmp_path / "x.zip", ("zeros", bytes(10**6)))
+    data = path.read_bytes()
+    stated = struct.pack("<I", 10**6)
+    assert data.count(stated) == 2  # beside the data, and in the directory
+    path.write_bytes(data.replace(stated, struct.pack("<I", 100)))
+    with pytest.raises(InputError, match="not a readable zip archive"):
+        extract_archive(path, tmp_path / "out")
+    assert sum(file.stat().st_size for file in (tmp_path / "out").iterdir()) <= 100
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    for data in (b"", b"PK", b"no archive" * 1000):
+        (tmp_path / "x").write_bytes(data)
+        with pytest.raises(InputError, match="not a zip archive"):
+            check_archive(tmp_path / "x")
+
+
+def whole() -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("a", "b/c"):
+            archive.writestr(name, b"text " * 40)
+    return file.getvalue()
+
+
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_changed_bytes_are_refused_or_change_nothing_outside(
+    data: st.DataObject, tmp_path: Path
+) -> None:
+    root = tmp_path / str(len(list(tmp_path.iterdir())))
+    root.mkdir()
+    mutated = bytearray(whole())
+    for _ in range(data.draw(st.integers(1, 4))):
+        mutated[data.draw(st.integers(0, len(mutated) - 1))] = data.draw(st.integers(0, 255))
+    (root / "x.zip").write_bytes(mutated)
+    try:
+        extract_archive(root / "x.zip", root / "out", ArchiveLimits(10_000, 10))
+    except InputError as error:
+        assert "\n" not in str(error)  # noqa: PT017 - other archives are extracted
+    assert {path.name for path in root.iterdir()} <= {"x.zip", "out"}
+    assert not any(path.is_symlink() for path in root.rglob("*"))
