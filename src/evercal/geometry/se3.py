@@ -58,7 +58,7 @@ class SE3:
     def from_translation(cls, translation_m: ArrayLike) -> Self:
         """Create poses without rotation from (..., 3) translations, metres."""
         pose = cls.identity(np.shape(translation_m)[:-1])
-        return cls(pose.rotation_wxyz, translation_m)
+        return cls(pose.rotation_wxyz, np.asarray(translation_m, dtype=np.float64))
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike, tolerance: float = 1e-3) -> Self:
