@@ -14,6 +14,7 @@ VERBS = {
     "boards": "detection of rendered boards, beside the finders of OpenCV",
     "handeye-boards": "boards through a lens found from the same images, beside other solvers",
     "mistakes": "mistakes in pose files that must be refused and named, and clean recordings",
+    "refresh": "a map in a rendered room that changes in ten rounds",
     "many-keyframes": "localization among thousands of keyframes of other rooms",
     "peers": "SIFT and XFeat on the same frames",
     "tune": "the setting of every continual method, on held-out training frames",
@@ -29,6 +30,7 @@ MODULES = {
     "handeye": "hand_eye",
     "handeye-boards": "hand_eye_boards",
     "many-keyframes": "many_keyframes",
+    "refresh": "changing_room",
     "tune": "tuning",
 }
 """Modules whose names differ from their verbs."""

@@ -7,9 +7,22 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from tabulate import tabulate
 from tqdm import tqdm
 
-from evercal.recordings import Frame, generic
+from evercal.evaluation.metrics import share_inside
+from evercal.features.encoder import Encoder, load_encoder
+from evercal.geometry import pose_distance
+from evercal.localization.estimate import PoseEstimate
+from evercal.localization.fit_acceptance import fit_acceptance
+from evercal.localization.localizer import Localizer
+from evercal.localization.refreshing import refresh_scene
+from evercal.mapping.build import MapOptions, build_map
+from evercal.mapping.memory_budget import MemoryBudget
+from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.recordings import Frame, Recording, generic, load_recording
+from evercal.recordings.held_out import split_held_out
+from evercal.recordings.samples import sample_rooms
 from evercal.simulation.box_room import default_camera
 from evercal.simulation.cell import write_jpeg
 from evercal.simulation.cell_paths import sweep_shots
@@ -17,6 +30,7 @@ from evercal.simulation.changed_room import moved_item, rearranged, relit
 from evercal.simulation.furnished.panda import Panda
 from evercal.simulation.furnished.renderer import Renderer, RenderOptions
 from evercal.simulation.furnished.rooms import Room, room
+from evercal.storage import write_json
 
 FURNITURE_ROUND = 5
 MOVABLE = ("armchair", "floor lamp", "side table", "chair", "stool")
@@ -91,3 +105,114 @@ def render(
                 with generic.SceneWriter(root, f"round-{number:02d}") as writer:
                     for frame, split in done:
                         writer.add(frame, split)
+
+
+VARIANTS: tuple[str, ...] = (
+    "as learned",
+    "refreshed",
+    "refreshed, a fifth of the images wrong",
+    "learned anew",
+)
+
+
+def run(
+    data: tuple[Path, ...] = (Path("runs/changing-room"),),
+    keyframes: int = 16,
+    out: Path = Path("runs/refresh.json"),
+) -> None:
+    """A map in a room that changes: as it was learned, refreshed after every change, learned anew.
+
+    Refreshes get the training images of a round without poses; test frames are scored.
+
+    Args:
+        data: Recordings of `render`.
+        keyframes: Keyframes of every map.
+        out: File of the rows.
+    """
+    rows: list[dict[str, object]] = []
+    for root in data:
+        rows += _rounds(root, keyframes)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(out, {"settings": {"keyframes": keyframes}, "rows": rows})
+    print(tabulate(rows, headers="keys", floatfmt=".3g", tablefmt="github", missingval=""))
+
+
+def _rounds(root: Path, keyframes: int) -> list[dict[str, object]]:
+    encoder, recordings = load_encoder(), [load_recording(p) for p in sorted(root.iterdir())]
+    wrong = [f.read_image() for f in sample_rooms()[1].scene.train[::8]]
+    first = _learned(recordings[0], encoder, keyframes)
+    scenes = dict.fromkeys(VARIANTS[:3], first)
+    bounds, rows = dict.fromkeys(VARIANTS, 0.0), []
+    for number, recording in enumerate(recordings):
+        images = [(frame.name, frame.read_image()) for frame in recording.train]
+        mixed = [*images, *((f"wrong-{i}", w) for i, w in enumerate(wrong[: len(images) // 4]))]
+        seconds = dict.fromkeys(VARIANTS, 0.0)
+        if number:
+            for variant, given in zip(VARIANTS[1:3], (images, mixed), strict=True):
+                localizer = Localizer(MapContents(encoder, 240, [scenes[variant]]))
+                scenes[variant], report = refresh_scene(localizer, given)
+                bounds[variant] = float(np.hypot(bounds[variant], report.shift_sigma_mm))
+                seconds[variant] = report.seconds
+            scenes[VARIANTS[3]] = _learned(recording, encoder, keyframes)
+        answers = {v: _answers(scene, recording, encoder) for v, scene in scenes.items()}
+        for variant, estimates in answers.items():
+            drift = _drift(estimates, answers[VARIANTS[0]])
+            rows.append({
+                "room": root.name, "round": number, "map": variant,
+                **_scores(estimates, recording),
+                "keyframes": len(scenes[variant].keyframes),
+                "kB": scenes[variant].keyframes.bytes / 1000,
+                "drift_mm": drift, "stated_sigma_mm": bounds[variant],
+                "seconds": seconds[variant],
+            })  # fmt: skip
+            print(rows[-1], flush=True)
+    return rows
+
+
+def _learned(recording: Recording, encoder: Encoder, keyframes: int) -> SceneMap:
+    """Learn the training frames of a recording."""
+    split, options = split_held_out(recording.train), MapOptions()
+    budget = MemoryBudget(share=0.0, least=keyframes)
+    options = replace(options, memory=budget, size=replace(options.size, cells=240))
+    built = build_map(recording.name, split.train, encoder, options)
+    return fit_acceptance(
+        MapContents(encoder, 240, [built.scene]),
+        built.corrected(split.held_out),
+        left_out=built.left_out(split.train),
+        noise=built.independent_noise,
+    )
+
+
+def _answers(scene: SceneMap, recording: Recording, encoder: Encoder) -> list[PoseEstimate]:
+    localizer = Localizer(MapContents(encoder, 240, [scene]))
+    return [localizer.localize(frame.read_image()) for frame in recording.test]
+
+
+def _scores(estimates: list[PoseEstimate], recording: Recording) -> dict[str, object]:
+    """Return accuracy and coverage of the answers to test frames."""
+    errors, squared = [], []
+    for estimate, frame in zip(estimates, recording.test, strict=True):
+        pose, true = estimate.uncertain_pose, frame.base_from_camera
+        assert true is not None
+        if estimate.status != "ok" or pose is None:
+            errors.append(np.inf)
+            continue
+        errors.append(1000 * float(pose_distance(pose.pose, true)[0]))
+        squared.append(pose.squared_mahalanobis(true))
+    return {
+        "images": len(errors),
+        "located": int(np.isfinite(errors).sum()),
+        "within_1_cm": int((np.array(errors) < 10).sum()),
+        "median_mm": float(np.median(errors)),
+        "inside_95": share_inside(squared),
+    }
+
+
+def _drift(estimates: list[PoseEstimate], fixed: list[PoseEstimate]) -> float:
+    """Length of the mean difference of positions to those by the map that never changes, mm."""
+    pairs = [
+        (a.base_from_camera.translation_m - b.base_from_camera.translation_m)
+        for a, b in zip(estimates, fixed, strict=True)
+        if a.status == b.status == "ok" and a.base_from_camera and b.base_from_camera
+    ]
+    return 1000 * float(np.linalg.norm(np.median(pairs, axis=0))) if pairs else float("nan")
