@@ -214,6 +214,12 @@ class Localizer:
             InputError: Not an image, a camera with another aspect ratio than the image's, or no
                 camera given and no scene was recorded at this aspect ratio.
         """
+        return self.located(image, camera)[0]
+
+    def located(
+        self, image: np.ndarray, camera: Camera | None = None
+    ) -> tuple[PoseEstimate, Hypothesis]:
+        """`localize`, and the pose in the map's frame, for tracking."""
         began = time.perf_counter()
         image, contents = as_rgb(image), self.contents
         cameras = cameras_in_scenes(camera, image, contents.scenes)
@@ -228,7 +234,15 @@ class Localizer:
         rival: Hypothesis | None = None
         if self._accepted(best):
             best, rival = self._settled(query, best, cameras)
-        return self._answer(query, best, rival, 1000 * (time.perf_counter() - began))
+        return self._answer(query, best, rival, 1000 * (time.perf_counter() - began)), best
+
+    def accepts(self, hypothesis: Hypothesis, times: float = 1.0) -> bool:
+        """Whether a pose has `times` the support that its scene requires."""
+        return self._accepted(hypothesis, times)
+
+    def answer(self, query: Query, found: Hypothesis, milliseconds: float) -> PoseEstimate:
+        """The answer for a pose in the map's frame."""
+        return self._answer(query, found, None, milliseconds)
 
     def localize_batch(
         self, images: Sequence[np.ndarray], cameras: Sequence[Camera | None]
@@ -321,12 +335,12 @@ class Localizer:
         pose = rough.pnp.pose
         if near is None and inliers < self.options.aligned_inliers:
             return Hypothesis(candidate.scene, pose, pnp_inliers=inliers)
-        aligned = self._aligned(query, candidate, camera, pose.pose, rough.change)
+        aligned = self.aligned(query, candidate, camera, pose.pose, rough.change)
         if aligned is None:
             return Hypothesis(candidate.scene, pose, pnp_inliers=inliers)
         return replace(aligned, pnp_inliers=inliers, matches=rough.matches)
 
-    def _aligned(
+    def aligned(
         self,
         query: Query,
         candidate: Candidate,
@@ -465,7 +479,7 @@ class Localizer:
         assert best.templates is not None, "an aligned pose"
         for step in pattern_steps(best.points_m, best.templates, pose.translation_m):
             start = displaced(pose, step)
-            rival = self._aligned(query, best.candidate, camera, start, change, coarse=False)
+            rival = self.aligned(query, best.candidate, camera, start, change, coarse=False)
             if rival is not None:
                 yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)
 

@@ -1,0 +1,193 @@
+"""`Tracker`: the camera poses of a stream; the last pose and its motion are the prior.
+
+A tracked frame is not encoded and not matched: landmarks of the keyframes next to the predicted
+pose are aligned at once. The pose must pass the same acceptance as that of a single image. A frame
+that does not is located from nothing.
+"""
+
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evercal.geometry import SE3, Camera, pose_distance
+from evercal.localization.estimate import PoseEstimate
+from evercal.localization.localizer import Localizer, cameras_in_scenes, prior_of
+from evercal.localization.query import Candidate, Hypothesis, Query
+from evercal.recordings.images import as_rgb
+
+TrackState = Literal["tracking", "relocalized", "lost"]
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """How a stream is tracked."""
+
+    keyframes: int = 4
+    """Keyframes next to the predicted pose that are aligned."""
+    fallback_s: float = 1 / 15
+    """Time between frames without stamps."""
+    longest_gap_s: float = 0.5
+    """After a longer gap the frame is located from nothing."""
+    reach_m: float = 0.10
+    """A pose that is farther from its prediction is verified by locating the frame."""
+    reach_deg: float = 8.0
+    """The same for the rotation."""
+    settled: float = 2.0
+    """The prediction counts if the last support was so many times the threshold."""
+    smooth: float = 0.0
+    """Time constant of the smoothed pose in seconds; 0 returns measurements."""
+    jump_sigmas: float = 4.0
+    """A measurement so far from the smoothed pose, in standard deviations, is a jump: the smoothed
+    pose follows at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedFrame:
+    """A frame of a stream."""
+
+    number: int
+    """Number of the frame, from 0."""
+    stamp_s: float
+    """Its time."""
+    state: TrackState
+    """`tracking`: found near its prediction. `relocalized`: located from nothing. `lost`: no
+    pose."""
+    estimate: PoseEstimate
+    """The answer."""
+    smoothed: SE3 | None = None
+    """base_from_camera, smoothed; None where lost or without smoothing."""
+    jumped: bool = False
+    """Whether the smoothed pose was reset to this measurement."""
+
+
+@dataclass(eq=False)
+class Tracker:
+    """Locates the frames of one camera in order.
+
+    Args:
+        localizer: Localizer of the map.
+        camera: Intrinsics. Default: those of the camera that recorded the scene.
+        options: Effort and thresholds.
+    """
+
+    localizer: Localizer
+    camera: Camera | None = None
+    options: TrackOptions = field(default_factory=TrackOptions)
+    _scene: int = -1
+    _poses: list[tuple[float, SE3]] = field(default_factory=list)
+    """Times and poses map_from_camera of the last two frames."""
+    _change: NDArray[np.floating] | None = None
+    _smoothed: tuple[float, SE3] | None = None
+    _number: int = 0
+
+    def track(self, image: np.ndarray, stamp_s: float | None = None) -> TrackedFrame:
+        """Locate the next frame.
+
+        Args:
+            image: (H, W, 3) or (H, W) uint8, as for `Localizer.localize`.
+            stamp_s: Time of the image, seconds. Default: frames at `fallback_s`.
+
+        Raises:
+            InputError: As `Localizer.localize`.
+        """
+        number, self._number = self._number, self._number + 1
+        stamp = number * self.options.fallback_s if stamp_s is None else stamp_s
+        estimate = self._near_prediction(as_rgb(image), stamp)
+        state: TrackState = "tracking"
+        if estimate is None:
+            estimate, found = self.localizer.located(image, self.camera)
+            state = "relocalized" if estimate.status == "ok" else "lost"
+            self._poses.clear()
+            if estimate.status == "ok":
+                self._remember(found, stamp)
+        smoothed, jumped = self._smooth(estimate, stamp)
+        return TrackedFrame(number, stamp, state, estimate, smoothed, jumped)
+
+    def frames(
+        self, images: Iterable[np.ndarray | tuple[float, np.ndarray]]
+    ) -> Iterator[TrackedFrame]:
+        """Locate images, or times and images, in order."""
+        for item in images:
+            stamp, image = item if isinstance(item, tuple) else (None, item)
+            yield self.track(image, stamp)
+
+    def _near_prediction(self, image: np.ndarray, stamp: float) -> PoseEstimate | None:
+        """Align the landmarks around the predicted pose; None if that does not suffice."""
+        began, predicted = time.perf_counter(), self._predicted(stamp)
+        if predicted is None:
+            return None
+        localizer, contents = self.localizer, self.localizer.contents
+        cameras = cameras_in_scenes(self.camera, image, contents.scenes)
+        priors = tuple(prior_of(self.camera, image, scene.camera) for scene in contents.scenes)
+        query = Query(image, torch.zeros(0), localizer.options.patches_short_side, priors)
+        candidate = Candidate(self._scene, self._next_keyframes(predicted))
+        change = np.zeros(5) if self._change is None else self._change
+        for coarse in (False, True):
+            found = localizer.aligned(
+                query, candidate, cameras[self._scene], predicted, change, coarse
+            )
+            if found is not None and self._trusted(found, predicted):
+                self._remember(found, stamp)
+                return localizer.answer(query, found, 1000 * (time.perf_counter() - began))
+        return None
+
+    def _predicted(self, stamp: float) -> SE3 | None:
+        """Pose of the next frame at constant velocity."""
+        if not self._poses:
+            return None
+        (last, pose), before = self._poses[-1], self._poses[:-1]
+        if not 0 <= stamp - last <= self.options.longest_gap_s:
+            return None
+        if not before or last <= before[0][0]:
+            return pose
+        share = (stamp - last) / (last - before[0][0])
+        return pose @ SE3.exp(share * (before[0][1].inverse() @ pose).log())
+
+    def _next_keyframes(self, pose: SE3) -> NDArray[np.int64]:
+        """Return the keyframes of the scene with the most similar views."""
+        keyframes = self.localizer.contents.scenes[self._scene].keyframes
+        first = sum(len(s.keyframes) for s in self.localizer.contents.scenes[: self._scene])
+        metres, radians = pose_distance(pose, keyframes.base_from_camera)
+        spread = max(float(np.median(metres)), 1e-6)
+        order = np.argsort(metres / spread + radians, kind="stable")
+        return first + order[: self.options.keyframes]
+
+    def _trusted(self, found: Hypothesis, predicted: SE3) -> bool:
+        """Whether a pose is accepted and near its prediction."""
+        if found.pose is None or not self.localizer.accepts(found):
+            return False
+        metres, radians = pose_distance(found.pose.pose, predicted)
+        frame = self.localizer.contents.scenes[self._scene].frame
+        scale = 1.0 if frame.similarity is None else frame.similarity.scale
+        near = float(metres) * scale < self.options.reach_m
+        return near and float(radians) < np.deg2rad(self.options.reach_deg)
+
+    def _remember(self, found: Hypothesis, stamp: float) -> None:
+        """Keep what predicts the next frame."""
+        if found.pose is None:
+            return
+        self._scene = found.scene
+        self._change = None if found.refined is None else found.refined.change
+        settled = self.localizer.accepts(found, self.options.settled) or bool(self._poses)
+        self._poses = [*self._poses[-1:], (stamp, found.pose.pose)] if settled else []
+
+    def _smooth(self, estimate: PoseEstimate, stamp: float) -> tuple[SE3 | None, bool]:
+        """Return the smoothed pose, and whether it follows a jump."""
+        pose = estimate.uncertain_pose
+        if self.options.smooth <= 0 or estimate.status != "ok" or pose is None:
+            self._smoothed = None
+            return None, False
+        if self._smoothed is None:
+            self._smoothed = (stamp, pose.pose)
+            return pose.pose, True
+        last, before = self._smoothed
+        jumped = pose.squared_mahalanobis(before) > 6 * self.options.jump_sigmas**2
+        gain = 1 - np.exp(-max(stamp - last, 0.0) / self.options.smooth)
+        now = pose.pose if jumped else before @ SE3.exp(gain * (before.inverse() @ pose.pose).log())
+        self._smoothed = (stamp, now)
+        return now, bool(jumped)
