@@ -54,6 +54,8 @@ class PoseEstimate:
     """Shares that sum to the covariance; empty for networks."""
     alternatives: tuple[SE3, ...] = ()
     """The poses base_from_camera of an ambiguous image, the stronger one first."""
+    omitted: tuple[str, ...] = ()
+    """Steps that a time budget left out, see `Localizer.localize`."""
     support: float = 0.0
     """Support of the pose, see `localization.acceptance`."""
 

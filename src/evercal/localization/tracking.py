@@ -39,6 +39,8 @@ class TrackOptions:
     """The same for the rotation."""
     settled: float = 2.0
     """The prediction counts if the last support was so many times the threshold."""
+    at_most_ms: float | None = None
+    """Time for a frame; steps that would exceed it are left out, see `PoseEstimate.omitted`."""
     smooth: float = 0.0
     """Time constant of the smoothed pose in seconds; 0 returns measurements."""
     jump_sigmas: float = 4.0
@@ -97,10 +99,14 @@ class Tracker:
         """
         number, self._number = self._number, self._number + 1
         stamp = number * self.options.fallback_s if stamp_s is None else stamp_s
+        began = time.perf_counter()
         estimate = self._near_prediction(as_rgb(image), stamp)
         state: TrackState = "tracking"
         if estimate is None:
-            estimate, found = self.localizer.located(image, self.camera)
+            left = self.options.at_most_ms
+            if left is not None:
+                left -= 1000 * (time.perf_counter() - began)
+            estimate, found = self.localizer.located(image, self.camera, left)
             state = "relocalized" if estimate.status == "ok" else "lost"
             self._poses.clear()
             if estimate.status == "ok":
