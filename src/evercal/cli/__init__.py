@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from evercal.errors import InputError
 
 _GROUPS = {
-    "Map": ("learn", "localize", "evaluate", "info", "verify", "map"),
+    "Map": ("learn", "localize", "evaluate", "info", "verify", "map", "serve"),
     "Calibrate": ("calibrate", "check", "watch", "audit", "align"),
     "Boards and pose pairs": ("detect", "solve"),
     "Results": ("export", "report"),
@@ -109,6 +109,7 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.map import Maps
     from evercal.cli.pretrain import Pretrain, pretrain_with_options
     from evercal.cli.report import Report
+    from evercal.cli.serve import Serve
     from evercal.cli.simulate import Simulate
     from evercal.cli.solve import Solve
     from evercal.cli.verify import Verify
@@ -131,6 +132,7 @@ def _verbs(first: str) -> dict[str, Any]:
         "info": Info,
         "verify": Verify,
         "map": Maps,
+        "serve": Serve,
         "inspect": Inspect,
         "convert": Convert,
         "simulate": Simulate,
