@@ -84,18 +84,20 @@ class Guard:
                 return await send({"type": "websocket.close", "code": 1008, "reason": refusal[1]})
             return await self._app(scope, receive, send)
         began, status = time.perf_counter(), [500]
+        body = _Body(receive, self._most(scope))
 
         async def counted(message: Message) -> None:
             if message["type"] == "http.response.start":
                 status[0] = message["status"]
+                if status[0] >= 400 and b"expect" not in headers:
+                    await body.drain()
             await send(message)
 
         try:
             if refusal is not None:
-                await _drain(receive)
                 await _refuse(counted, *refusal)
             else:
-                await self._app(scope, self._bounded(scope, receive), counted)
+                await self._app(scope, body.read, counted)
         finally:
             route = getattr(scope.get("route"), "path", "other")
             self._metrics.requests.labels(_method(scope), route, status[0]).inc()
@@ -132,19 +134,39 @@ class Guard:
             None if int(length) <= most else (413, f"body of {int(length)} bytes; at most {most}")
         )
 
-    def _bounded(self, scope: MutableMapping[str, Any], receive: Receive) -> Receive:
-        """Bodies of unstated length are counted while they arrive."""
-        most, total = self._most(scope), [0]
 
-        async def bounded() -> Message:
-            message = await receive()
-            total[0] += len(message.get("body", b""))
-            if total[0] > most:
-                await _drain(receive)
-                raise HTTPException(413, f"body of more than {most} bytes")
-            return message
+class _Body:
+    """The body of a request, counted while it arrives."""
 
-        return bounded
+    def __init__(self, receive: Receive, most: int):
+        self._receive, self._most, self._total, self._ended = receive, most, 0, False
+
+    async def read(self) -> Message:
+        """The next part.
+
+        Raises:
+            HTTPException: There is more than is allowed.
+        """
+        message = await self._next()
+        if self._total > self._most:
+            raise HTTPException(413, f"body of more than {self._most} bytes")
+        return message
+
+    async def drain(self) -> None:
+        """Read the rest for a moment.
+
+        A connection that is closed with unread bytes is reset, and the client misses the answer.
+        """
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_DRAIN_S):
+                while not self._ended:
+                    await self._next()
+
+    async def _next(self) -> Message:
+        message = await self._receive()
+        self._total += len(message.get("body", b""))
+        self._ended = not message.get("more_body", False)
+        return message
 
 
 def _method(scope: MutableMapping[str, Any]) -> str:
@@ -159,17 +181,13 @@ def _hostname(host: str) -> str | None:
         return None
 
 
-async def _drain(receive: Receive) -> None:
-    """Read the rest of a body for a moment: a client that is still sending misses the answer."""
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(_DRAIN_S):
-            while (await receive()).get("more_body", False):
-                pass
-
-
 async def _refuse(send: Send, status: int, reason: str) -> None:
     body = json.dumps({"error": reason}).encode()
-    headers = [(b"content-type", b"application/json"), (b"connection", b"close")]
+    headers = [
+        (b"content-type", b"application/json"),
+        (b"content-length", str(len(body)).encode()),
+        (b"connection", b"close"),
+    ]
     if status == 401:
         headers.append((b"www-authenticate", b"Bearer"))
     await send({"type": "http.response.start", "status": status, "headers": headers})

@@ -31,6 +31,7 @@ POLL_S = 0.5
 """Interval of the search for changes that other processes make to the map."""
 DRAIN_S = 30
 """Time that requests get to finish when the service is stopped."""
+LINGER_S = 1.0
 LEAST_TOKEN = 16
 
 
@@ -138,8 +139,19 @@ _ANSWERS: dict[type[Exception], Callable[[Request, Exception], JSONResponse]] = 
 class JsonErrors(H11Protocol):
     """HTTP/1.1 whose answer to what is no HTTP is JSON as all others."""
 
+    _refused = False
+
+    def data_received(self, data: bytes) -> None:
+        """Read from a client; what follows a refused request is dropped."""
+        if not self._refused:
+            super().data_received(data)
+
     def send_400_response(self, msg: str) -> None:
-        """Answer and close the connection."""
+        """Answer, and close the connection a moment later.
+
+        A connection that is closed with unread bytes is reset, and the client misses the answer.
+        """
+        self._refused = True
         body = b'{"error": "not a valid HTTP request, or its headers are too large"}'
         headers = [("content-type", "application/json"), ("connection", "close")]
         with suppress(h11.LocalProtocolError):  # an answer is under way
@@ -149,7 +161,8 @@ class JsonErrors(H11Protocol):
                 h11.EndOfMessage(),
             ):
                 self.transport.write(self.conn.send(event) or b"")
-        self.transport.close()
+        self.transport.write_eof()
+        self.loop.call_later(LINGER_S, self.transport.close)
 
 
 def bound_socket(options: ServeOptions) -> socket.socket:
@@ -215,7 +228,7 @@ class Server(uvicorn.Server):
             ws_max_size=64 * 1024 * 1024,
             ws_max_queue=4,
             loop="asyncio",
-            log_level="warning",
+            log_level="error",
             access_log=False,
             server_header=False,
             timeout_graceful_shutdown=DRAIN_S,
