@@ -27,6 +27,7 @@ ORDER = (
     "evaluation",
     "map",
     "reports",
+    "service",
     "simulation",
     "continual",
     "cli",

@@ -27,12 +27,14 @@ if TYPE_CHECKING:
     from evercal.recordings import Recording as Recording
     from evercal.recordings import load_recording as load_recording
     from evercal.recordings import read_image as read_image
+    from evercal.service.client import Client as Client
 
 __version__ = "0.2.0.dev0"
 
 _PUBLIC = {
     "Calibration": "evercal.calibration.calibration",
     "Camera": "evercal.geometry",
+    "Client": "evercal.service.client",
     "Frame": "evercal.recordings",
     "InputError": "evercal.errors",
     "LearnReport": "evercal.map",

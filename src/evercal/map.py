@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
     from evercal.localization.query import LocalizeOptions
     from evercal.localization.refreshing import RefreshReport
+    from evercal.localization.tracking import TrackedFrame, TrackOptions
     from evercal.mapping.build import Adjusted, MapOptions, OnProgress
     from evercal.mapping.manage import Merged, OnClash
     from evercal.mapping.memory_budget import MemoryBudget
@@ -342,6 +343,30 @@ class Map:
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         """Estimate the camera pose of one image, see `Localizer.localize`."""
         return self.localizer.localize(image, camera)
+
+    def track(
+        self,
+        frames: Iterable[np.ndarray | tuple[float, np.ndarray]],
+        *,
+        camera: Camera | None = None,
+        options: TrackOptions | None = None,
+    ) -> Iterator[TrackedFrame]:
+        """Locate the frames of one camera in order; the last pose is the prior of the next one.
+
+        Args:
+            frames: Images (H, W, 3), or pairs of time in seconds and image.
+            camera: Intrinsics. Default: those of the camera that recorded the scene.
+            options: Effort, time for a frame, smoothing.
+
+        Yields:
+            State (`tracking`, `relocalized` or `lost`) and answer of each frame.
+
+        Raises:
+            InputError: As `localize`.
+        """
+        from evercal.localization.tracking import Tracker, TrackOptions
+
+        return Tracker(self.localizer, camera, options or TrackOptions()).frames(frames)
 
     def calibrate(
         self,

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from evercal.errors import InputError
 
 _GROUPS = {
-    "Map": ("learn", "localize", "refresh", "evaluate", "info", "verify", "map"),
+    "Map": ("learn", "localize", "track", "refresh", "evaluate", "info", "verify", "map", "serve"),
     "Calibrate": ("calibrate", "check", "watch", "audit", "align"),
     "Boards and pose pairs": ("detect", "solve"),
     "Results": ("export", "report"),
@@ -110,8 +110,10 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.pretrain import Pretrain, pretrain_with_options
     from evercal.cli.refresh import Refresh
     from evercal.cli.report import Report
+    from evercal.cli.serve import Serve
     from evercal.cli.simulate import Simulate
     from evercal.cli.solve import Solve
+    from evercal.cli.track import Track
     from evercal.cli.verify import Verify
     from evercal.cli.watch import Watch
 
@@ -128,11 +130,13 @@ def _verbs(first: str) -> dict[str, Any]:
         "solve": Solve,
         "export": ExportCalibration,
         "report": Report,
+        "track": Track,
         "refresh": Refresh,
         "evaluate": Evaluate,
         "info": Info,
         "verify": Verify,
         "map": Maps,
+        "serve": Serve,
         "inspect": Inspect,
         "convert": Convert,
         "simulate": Simulate,

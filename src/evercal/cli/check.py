@@ -10,6 +10,7 @@ from evercal.cli.console import print_json, print_next, progress_bar
 from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for, read_images
 from evercal.cli.stores import open_map
+from evercal.reports.answers import check_record
 
 if TYPE_CHECKING:
     from evercal.calibration.drift import Shift
@@ -48,8 +49,7 @@ class Check:
         with progress_bar("localizing", len(images), "image") as bar:
             shift = check(localizer, images, reference, camera, on_image=bar.update)
         if self.json:
-            rejected = [vars(use) for use in shift.images if not use.used]
-            print_json({**shift_dict(shift), "images": len(shift.images), "left_out": rejected})
+            print_json(check_record(shift))
         else:
             print(shift_line(shift))
             for use in shift.images:
@@ -68,17 +68,3 @@ def shift_line(shift: "Shift") -> str:
     if shift.moved:
         return f"The camera has moved by {size} ({confidence}; {spread}). Calibrate it again."
     return f"The camera has not moved: it is within {size} of its reference ({spread})."
-
-
-def shift_dict(shift: "Shift") -> dict[str, object]:
-    """The answer as JSON values."""
-    return {
-        "moved": shift.moved,
-        "translation_mm": shift.translation_mm,
-        "rotation_deg": shift.rotation_deg,
-        "sigma_mm": shift.sigma_mm,
-        "sigma_deg": shift.sigma_deg,
-        "confidence": shift.confidence,
-        "same_map": shift.same_map,
-        "reference_from_now": shift.reference_from_now.matrix().tolist(),
-    }

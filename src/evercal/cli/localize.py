@@ -13,12 +13,12 @@ from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for
 from evercal.cli.point_words import Point, point_dict, point_of, point_text
 from evercal.cli.stores import open_localizer
+from evercal.reports.answers import Answer, answer_row, budget_of, finite_pose, unit_known
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from evercal.calibration.calibration import ErrorTerm
-    from evercal.geometry import Camera, UncertainPose
+    from evercal.geometry import Camera
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import LearnedLocalizer
 
@@ -80,7 +80,7 @@ class Localize:
             image = read_image(path)
             estimate = localizer.localize(image, camera)
             milliseconds = 1000 * (time.perf_counter() - began)
-            known = self._unit_known(localizer, estimate.scene)
+            known = unit_known(localizer, estimate.scene)
             if self.overlay is not None and estimate.scene is not None:
                 intrinsics = camera or scene_camera(localizer, estimate.scene)
                 drawn = draw_estimate(image, estimate, intrinsics, legend=known)
@@ -94,12 +94,6 @@ class Localize:
                 bar.update()
         return answers
 
-    @staticmethod
-    def _unit_known(localizer: "LearnedLocalizer", name: str | None) -> bool:
-        """Whether answers in a scene are in metres; those of networks are taken to be."""
-        scenes = [scene for scene in localizer.contents.scenes if scene.name == name]
-        return all(getattr(scene, "unit_known", True) for scene in scenes)
-
     def _next(self, files: list[Path], located: int) -> None:
         if not located:
             print_next("evercal", "learn", self.store, "RECORDING")
@@ -107,17 +101,6 @@ class Localize:
             print_next("evercal", "localize", self.store, files[0], "--overlay", "DIR")
         else:
             print_next("evercal", "evaluate", self.store, "RECORDING")
-
-
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """One image and its estimate."""
-
-    path: Path
-    estimate: "PoseEstimate"
-    milliseconds: float
-    unit_known: bool = True
-    """Whether lengths are in metres; else their unit is unknown."""
 
 
 def _overlay_name(files: list[Path], number: int) -> str:
@@ -128,53 +111,12 @@ def _overlay_name(files: list[Path], number: int) -> str:
 
 
 def as_dict(answer: Answer, point: Point | None = None) -> dict[str, object]:
-    """One image's entry in the JSON output; null without a pose. `point` is that of --at.
-
-    Where the unit of length is unknown, lengths are in that unit and there are no millimetres.
-    """
-    from evercal.recordings.formats.generic import pose_to_dict
-
-    estimate = answer.estimate
-    pose, uncertain = pose_to_dict(estimate.base_from_camera), _finite(estimate)
-    metric = uncertain if answer.unit_known else None
-    if pose is not None and estimate.base_from_camera is not None:
-        pose["matrix"] = estimate.base_from_camera.matrix().tolist()
-    terms = [{**vars(term), "share": share} for term, share in budget_of(estimate)]
-    if not answer.unit_known:
-        terms = [{**term, "translation_mm": None} for term in terms]
-    unit = "metres" if answer.unit_known else "unknown"
-    entry = {
-        "path": str(answer.path),
-        "status": estimate.status,
-        "reason": estimate.reason,
-        "scene": estimate.scene,
-        "unit": unit if pose is not None or estimate.alternatives else None,
-        "base_from_camera": pose,
-        "alternatives": [pose_to_dict(other) for other in estimate.alternatives],
-        "covariance": None if uncertain is None else uncertain.covariance.tolist(),
-        "error_terms": terms,
-        "inliers": int(estimate.inliers),
-        "inlier_ratio": float(estimate.inlier_ratio),
-        "ms": answer.milliseconds,
-    }
+    """One image's entry in the JSON output, see `answer_row`. `point` is that of --at."""
+    entry, uncertain = answer_row(answer), finite_pose(answer.estimate)
     if point is not None:
+        metric = uncertain if answer.unit_known else None
         entry["at"] = None if metric is None else point_dict(point, metric)
     return entry
-
-
-def _finite(estimate: "PoseEstimate") -> "UncertainPose | None":
-    """The pose with its covariance; None without a usable one."""
-    uncertain = estimate.uncertain_pose
-    finite = uncertain is not None and all(map(math.isfinite, uncertain.covariance.flat))
-    return uncertain if finite else None
-
-
-def budget_of(estimate: "PoseEstimate") -> "list[tuple[ErrorTerm, float]]":
-    """The causes of an answer's covariance, each with its share of the position's variance."""
-    from evercal.calibration.calibration import ErrorTerm, position_shares
-
-    terms = [ErrorTerm.of(term.name, term.covariance) for term in estimate.terms]
-    return list(zip(terms, position_shares(terms), strict=True))
 
 
 def as_text(answer: Answer, point: Point | None = None) -> str:
@@ -202,7 +144,7 @@ def as_text(answer: Answer, point: Point | None = None) -> str:
     ]
     if budget := _budget_words(estimate):
         lines.insert(-1, f"  budget       {budget} of the position's variance")
-    uncertain = _finite(estimate)
+    uncertain = finite_pose(estimate)
     if point is not None and uncertain is not None and answer.unit_known:
         lines.insert(-1, f"  point        sd {point_text(point, uncertain)}")
     return "\n".join(lines)

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.check import shift_dict, shift_line
+from evercal.cli.check import shift_line
 from evercal.cli.console import print_json
 from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for
 from evercal.cli.stores import open_map
 from evercal.errors import InputError
+from evercal.reports.answers import shift_dict
 
 if TYPE_CHECKING:
     import numpy as np

@@ -1,0 +1,131 @@
+"""`evercal track`."""
+
+from collections import Counter
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from tyro.conf import Positional, arg
+
+from evercal.cli.console import print_json, print_next, require_writable
+from evercal.cli.device import Device
+from evercal.cli.stores import open_map
+from evercal.errors import InputError
+from evercal.reports.answers import unit_known
+
+if TYPE_CHECKING:
+    from evercal.geometry import Camera
+    from evercal.localization.tracking import TrackedFrame
+
+
+@dataclass(frozen=True)
+class Track:
+    """Locate the frames of a camera, a video or a folder one after another.
+
+    The last pose is the prior of the next one: a tracked frame takes less than half the time of a
+    single image. Exit code 1 if no frame was located.
+
+    Example: evercal track cell.evercal video.mp4 --out track.tum
+    """
+
+    store: Annotated[Positional[Path], arg(metavar="STORE")]
+    """Folder of the map."""
+    source: Annotated[Positional[str], arg(metavar="SOURCE")]
+    """Number (0) or device of a camera, an address (rtsp://...), a video file or a folder."""
+    out: Annotated[
+        tuple[Path, ...], arg(metavar="FILE...", help_behavior_hint="(default: none)")
+    ] = ()
+    """Files to write: .jsonl (JSON lines), .tum or .txt (TUM), .mcap (Foxglove)."""
+    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Intrinsics. Default: those of the camera that recorded the scene."""
+    at_most: Annotated[float | None, arg(metavar="MS", help_behavior_hint="")] = None
+    """Time for a frame, milliseconds. What was left out is in the answer (`omitted`)."""
+    smooth: Annotated[float, arg(metavar="SECONDS")] = 0.0
+    """Time constant of smoothed poses; 0 writes measurements. A jump is followed at once."""
+    rate: Annotated[float, arg(metavar="HZ")] = 15.0
+    """Frames per second of a folder without times in its file names."""
+    most: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Stop after so many frames."""
+    device: Device = "auto"
+    json: bool = False
+    """Print one JSON object with the summary."""
+
+    def run(self) -> int:
+        """Track until the source ends or Ctrl-C."""
+        if self.rate <= 0 or self.smooth < 0 or (self.at_most is not None and self.at_most <= 0):
+            raise InputError("--rate and --at-most are above 0, --smooth is 0 or more")
+        for path in self.out:
+            require_writable(path, "--out")
+        from evercal.localization.tracking import Tracker, TrackOptions
+        from evercal.recordings.streams import stream
+        from evercal.reports.track_files import TrackFile, track_row
+
+        frames, localizer = stream(self.source, self.rate), open_map(self.store, self.device)
+        options = TrackOptions(
+            fallback_s=1 / self.rate, at_most_ms=self.at_most, smooth=self.smooth
+        )
+        tracker: Tracker | None = None
+        states: Counter[str] = Counter()
+        times: list[float] = []
+        with ExitStack() as stack:
+            files = [stack.enter_context(TrackFile(path)) for path in self.out]
+            try:
+                for name, stamp, image in frames:
+                    tracker = tracker or Tracker(localizer, self._camera(image), options)
+                    frame = tracker.track(image, stamp)
+                    states[frame.state] += 1
+                    times.append(frame.estimate.milliseconds)
+                    if files:
+                        known = unit_known(localizer, frame.estimate.scene)
+                        row = track_row(frame, name, known)
+                        for file in files:
+                            file.write(frame, row, image)
+                    if not self.json:
+                        print(_line(name, frame), flush=True)
+                    if self.most is not None and len(times) >= self.most:
+                        break
+            except KeyboardInterrupt:
+                pass
+        if not times:
+            raise InputError(f"{self.source}: no frame could be read")
+        self._summary(states, times)
+        return 0 if states["tracking"] + states["relocalized"] else 1
+
+    def _camera(self, image: np.ndarray) -> "Camera | None":
+        if self.camera is None:
+            return None
+        from evercal.recordings.poses.camera_file import read_camera
+
+        return read_camera(self.camera, (image.shape[1], image.shape[0]))
+
+    def _summary(self, states: Counter[str], times: list[float]) -> None:
+        middle, high = np.quantile(times, [0.5, 0.99]).tolist()
+        if self.json:
+            counts = {state: states[state] for state in ("tracking", "relocalized", "lost")}
+            files = [str(path) for path in self.out]
+            print_json(
+                {"frames": len(times), **counts, "ms_p50": middle, "ms_p99": high, "out": files}
+            )
+            return
+        print(
+            f"{len(times)} frames: {states['tracking']} tracked, {states['relocalized']}"
+            f" relocalized, {states['lost']} lost; {middle:.0f} ms (median), {high:.0f} ms (99 %)"
+        )
+        if not self.out:
+            print_next("evercal", "track", self.store, self.source, "--out", "track.jsonl")
+
+
+def _line(name: str, frame: "TrackedFrame") -> str:
+    estimate = frame.estimate
+    if frame.state == "lost" or estimate.base_from_camera is None:
+        return f"{name}: lost ({estimate.reason or estimate.status})"
+    x, y, z = 1000 * estimate.base_from_camera.translation_m
+    pose = estimate.uncertain_pose
+    sigma = f" +- {pose.sigma_mm:.1f}" if pose is not None else ""
+    left = f", without {', '.join(estimate.omitted)}" if estimate.omitted else ""
+    return (
+        f"{name}: {frame.state}, {estimate.scene}, {x:+.1f} {y:+.1f} {z:+.1f}{sigma} mm,"
+        f" {estimate.milliseconds:.0f} ms{left}"
+    )

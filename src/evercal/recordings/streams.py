@@ -1,0 +1,88 @@
+"""Frames of a stream in order: a camera, a video file, a network stream, or a folder of images."""
+
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.errors import InputError
+from evercal.recordings.image_files import image_files
+from evercal.recordings.images import read_image
+from evercal.recordings.poses.row_files import times_in_names
+
+_LIVE = re.compile(r"\d+|/dev/\S+|(rtsp|rtsps|http|https|udp|tcp)://\S+")
+"""Sources whose frames have the time of their arrival."""
+_MOST_UNREADABLE = 30
+"""Unreadable frames in a row after which a live source has ended."""
+
+
+class StreamFrame(NamedTuple):
+    """One frame."""
+
+    name: str
+    """File name, or number."""
+    stamp_s: float
+    """Seconds: in the file's name, since the start of a video, or of arrival (Unix time)."""
+    image: NDArray[np.uint8]
+    """(H, W, 3) RGB."""
+
+
+def stream(source: str, rate: float = 15.0) -> Iterator[StreamFrame]:
+    """Read a source frame by frame.
+
+    Args:
+        source: Number or device of a camera, address of a network stream, video file, or folder.
+        rate: Frames per second of a folder whose file names hold no times.
+
+    Raises:
+        InputError: The source does not exist or cannot be opened, or a file cannot be read.
+    """
+    if not _LIVE.fullmatch(source):
+        path = Path(source)
+        if not path.exists():
+            raise InputError(
+                f"{source}: no such folder or video; give one, a camera's number (0), a device"
+                " (/dev/video0) or an address (rtsp://...)"
+            )
+        if path.is_dir():
+            return _images(path, rate)
+    return _captured(source)
+
+
+def _images(folder: Path, rate: float) -> Iterator[StreamFrame]:
+    files = image_files([folder])
+    stamps = times_in_names([path.name for path in files])
+    for i, path in enumerate(files):
+        stamp = i / rate if stamps is None else float(stamps[i])
+        yield StreamFrame(path.name, stamp, read_image(path))
+
+
+def _captured(source: str) -> Iterator[StreamFrame]:
+    """Frames by OpenCV."""
+    import cv2
+
+    live = bool(_LIVE.fullmatch(source))
+    capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
+    if not capture.isOpened():
+        raise InputError(f"{source}: cannot be opened as a video; check path, address and codec")
+
+    def frames() -> Iterator[StreamFrame]:
+        number, unreadable = 0, 0
+        try:
+            while unreadable < (_MOST_UNREADABLE if live else 1):
+                good, bgr = capture.read()
+                if not good:
+                    unreadable += 1
+                    continue
+                stamp = time.time() if live else capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+                image = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+                yield StreamFrame(str(number), stamp, image)
+                number, unreadable = number + 1, 0
+        finally:
+            capture.release()
+
+    return frames()

@@ -1,0 +1,45 @@
+"""`Desk`: a bounded queue before a few threads that locate images."""
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, TypeVar
+
+import torch
+
+from evercal.service.jobs import QueueFullError
+
+Result = TypeVar("Result")
+
+
+class Desk:
+    """Works on images in threads, one image for each, as `localize_batch` does.
+
+    Args:
+        most: Requests that wait, at most.
+    """
+
+    def __init__(self, most: int):
+        workers = torch.get_num_threads()
+        self._most, self.waiting = most + workers, 0
+        self._pool = ThreadPoolExecutor(workers, "image", torch.set_num_threads, (1,))
+
+    async def run(self, work: Callable[..., Result], *args: Any, **named: Any) -> Result:
+        """The result of a function, called in a thread.
+
+        Raises:
+            QueueFullError: Too many requests wait.
+        """
+        if self.waiting >= self._most:
+            raise QueueFullError("too many requests wait; try again")
+        self.waiting += 1
+        try:
+            loop = asyncio.get_running_loop()
+            return await loop.run_in_executor(self._pool, partial(work, *args, **named))
+        finally:
+            self.waiting -= 1
+
+    def close(self) -> None:
+        """Wait for the images at work."""
+        self._pool.shutdown()

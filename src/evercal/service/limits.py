@@ -1,0 +1,159 @@
+"""What a request may contain: sizes, images, and small files such as intrinsics."""
+
+import io
+import json
+import tempfile
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from evercal.errors import InputError
+
+if TYPE_CHECKING:
+    from evercal.geometry import SE3, Camera
+
+Content = TypeVar("Content")
+_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
+_SMALL_BYTES = 64 * 1024
+"""Largest file of intrinsics."""
+_TEXT_BYTES = 4 * 1024 * 1024
+"""Largest file of robot poses, and largest calibration."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Sizes above which a request is refused, and how many wait."""
+
+    body_bytes: int = 128 * 10**6
+    """Body of a request with images."""
+    archive_bytes: int = 4 * 10**9
+    """Body of a request with a recording."""
+    unpacked_bytes: int = 20 * 10**9
+    """Size of a recording when it is extracted."""
+    pixels: int = 50 * 10**6
+    """Pixels of one image."""
+    images: int = 500
+    """Images of one calibration."""
+    queue: int = 64
+    """Images that wait to be located; requests beyond are refused with status 429."""
+    jobs: int = 16
+    """Recordings that wait to be learned."""
+
+
+class TooLargeError(InputError):
+    """More than a limit allows; status 413."""
+
+
+def decoded(data: bytes, name: str, limits: Limits) -> np.ndarray:
+    """Pixels (h, w, 3) uint8 RGB of an image file.
+
+    The size in the file's header is checked before anything is decoded.
+
+    Raises:
+        InputError: No image, or one with too many pixels.
+    """
+    import cv2
+
+    from evercal.recordings.images import decode_image
+
+    width, height = _header_size(data, name)
+    if width * height > limits.pixels:
+        raise TooLargeError(f"{name}: {width}x{height} pixels; at most {limits.pixels:,} in all")
+    try:
+        image = decode_image(np.frombuffer(data, np.uint8))
+    except cv2.error:
+        image = None
+    if image is None or image.shape[0] * image.shape[1] > limits.pixels:
+        raise InputError(f"{name}: not a readable image ({len(data)} bytes)")
+    return image
+
+
+def _header_size(data: bytes, name: str) -> tuple[int, int]:
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about images that the caller refuses
+            with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
+                return image.size
+    except Image.DecompressionBombError:
+        raise TooLargeError(f"{name}: too many pixels") from None
+    except Exception:  # every format raises errors of its own for broken headers
+        raise InputError(
+            f"{name}: not a readable image ({len(data)} bytes); send PNG, JPEG, BMP, TIFF or WebP"
+        ) from None
+
+
+@lru_cache(maxsize=64)  # a robot sends the same intrinsics with every image
+def camera_of(data: bytes, size: tuple[int, int]) -> "Camera":
+    """Intrinsics in a file that `--camera` would read, for images of a size (width, height).
+
+    Raises:
+        InputError: No intrinsics, or the file is too large.
+    """
+    from evercal.recordings.poses.camera_file import read_camera
+
+    return _from_text(data, "camera", ".json", _SMALL_BYTES, lambda path: read_camera(path, size))
+
+
+def poses_of(data: bytes, ending: str, images: list[str]) -> "SE3":
+    """(n,) base_from_gripper of n images from a pose table.
+
+    Args:
+        data: Content of the table.
+        ending: Ending of its file name.
+        images: Names of the images, which rows are paired with.
+
+    Raises:
+        InputError: No pose table, or one that does not fit the images.
+    """
+    from evercal.recordings.poses.pairing import poses_of_images
+
+    files = [Path(name) for name in images]
+    ending = ending.lower() if ending.lower() in (".csv", ".txt", ".json", ".tum") else ".csv"
+    return _from_text(
+        data, "robot_poses", ending, _TEXT_BYTES, lambda path: poses_of_images(path, files)
+    )
+
+
+def _from_text(
+    data: bytes, name: str, ending: str, most: int, read: Callable[[Path], Content]
+) -> Content:
+    """Read text that came over the network as a file; messages name the part of the request."""
+    if len(data) > most:
+        raise TooLargeError(f"{name}: {len(data)} bytes; at most {most}")
+    if data[:2] == b"PK" or b"\0" in data:
+        raise InputError(f"{name}: not a text file; send JSON, YAML or a table as text")
+    with tempfile.TemporaryDirectory(prefix="evercal-") as folder:
+        path = Path(folder, name + ending)
+        path.write_bytes(data)
+        return _plainly(name, lambda: read(path), str(path))
+
+
+def json_of(
+    data: bytes, name: str, convert: Callable[[object], Content], most: int = _TEXT_BYTES
+) -> Content:
+    """Convert a JSON value that came over the network.
+
+    Raises:
+        InputError: Not JSON, too large, or `convert` raises an error.
+    """
+    if len(data) > most:
+        raise TooLargeError(f"{name}: {len(data)} bytes; at most {most}")
+    return _plainly(name, lambda: convert(json.loads(data)))
+
+
+def _plainly(name: str, read: Callable[[], Content], path: str | None = None) -> Content:
+    """One line for whatever a reader raises for values that no program of evercal wrote."""
+    try:
+        return read()
+    except InputError as error:
+        raise InputError(str(error).replace(path or name, name)) from None
+    except Exception as error:  # deep nesting, infinite numbers, wrong types
+        what = str(error).partition("\n")[0] or type(error).__name__
+        raise InputError(f"{name}: cannot be read ({what[:200]})") from None

@@ -1,0 +1,126 @@
+"""Streams: tracked, lost, found again, within a time budget."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evercal.geometry import SE3, UncertainPose, pose_distance
+from evercal.localization.estimate import PoseEstimate
+from evercal.localization.localizer import Localizer
+from evercal.localization.tracking import Tracker, TrackOptions
+from evercal.mapping.scene_map import MapContents
+from evercal.recordings.frame import Recording
+from evercal.simulation.box_room import BoxRoom
+
+
+@pytest.fixture(scope="module")
+def views(hall: Recording, hall_room: BoxRoom) -> list[tuple[np.ndarray, SE3]]:
+    """40 views along the middle of the recording's path, 15 a second at 0.1 m/s."""
+    a, b = hall.test[10].base_from_camera, hall.test[16].base_from_camera
+    assert a is not None
+    assert b is not None
+    step = (a.inverse() @ b).log()
+    poses = [a @ SE3.exp(s * step) for s in np.linspace(0, 1, 16)]
+    return [(hall_room.render(hall.train[0].camera, pose), pose) for pose in poses]
+
+
+def test_frames_are_tracked_as_exactly_as_single_images(
+    hall_map: MapContents, views: list[tuple[np.ndarray, SE3]]
+) -> None:
+    tracker, localizer = Tracker(Localizer(hall_map)), Localizer(hall_map)
+    frames = [tracker.track(image, i / 15) for i, (image, _) in enumerate(views)]
+    assert frames[0].state == "relocalized"
+    assert {frame.state for frame in frames[2:]} == {"tracking"}
+    errors = []
+    for frame, (image, pose) in zip(frames, views, strict=True):
+        for estimate in (frame.estimate, localizer.localize(image)):
+            assert estimate.base_from_camera is not None
+            errors.append(float(pose_distance(estimate.base_from_camera, pose)[0]))
+    tracked, single = np.array(errors).reshape(-1, 2).T
+    assert np.median(tracked) < 1.3 * np.median(single) + 1e-4
+    assert tracked.max() < 0.01
+
+
+def test_a_covered_lens_is_lost_and_found_within_two_frames(
+    hall_map: MapContents, views: list[tuple[np.ndarray, SE3]]
+) -> None:
+    images = [image for image, _ in views]
+    images[5:9] = [np.zeros_like(images[0])] * 4
+    states = [frame.state for frame in Tracker(Localizer(hall_map)).frames(images)]
+    assert states[2:5] == ["tracking"] * 3
+    assert states[5:9] == ["lost"] * 4
+    assert "relocalized" in states[9:11]
+    assert states[11:] == ["tracking"] * 5
+
+
+def test_a_jump_is_located_from_nothing(
+    hall: Recording, hall_map: MapContents, views: list[tuple[np.ndarray, SE3]]
+) -> None:
+    tracker = Tracker(Localizer(hall_map))
+    for image, _ in views[:4]:
+        tracker.track(image)
+    far = hall.test[1]
+    frame = tracker.track(far.read_image())
+    assert frame.state == "relocalized"
+    assert frame.estimate.base_from_camera is not None
+    assert far.base_from_camera is not None
+    assert pose_distance(frame.estimate.base_from_camera, far.base_from_camera)[0] < 0.01
+
+
+def test_a_long_gap_and_time_that_runs_backwards_are_no_prediction(
+    hall_map: MapContents, views: list[tuple[np.ndarray, SE3]]
+) -> None:
+    tracker = Tracker(Localizer(hall_map))
+    stamps = (0.0, 0.1, 0.2, 5.0, 5.1, 4.0)
+    frames = [tracker.track(views[0][0], stamp) for stamp in stamps]
+    assert [frame.state for frame in frames][2:] == [
+        "tracking",
+        "relocalized",
+        "tracking",
+        "relocalized",
+    ]
+
+
+def test_a_time_budget_leaves_steps_out_and_names_them(hall_map: MapContents) -> None:
+    localizer = Localizer(hall_map)
+    noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
+    long = localizer.localize(noise)
+    short = localizer.localize(noise, at_most_ms=1.0)
+    assert long.omitted == ()
+    assert "turned images" in short.omitted
+    assert "unknown intrinsics" in short.omitted
+    assert short.milliseconds < 0.5 * long.milliseconds
+    tracker = Tracker(localizer, options=TrackOptions(at_most_ms=1.0))
+    assert tracker.track(noise).estimate.omitted == short.omitted
+
+
+def smoothed(positions_m: list[float], sigma_m: float = 0.001) -> tuple[list[float], list[bool]]:
+    """Feed positions along x to the smoother of a tracker without a map."""
+    tracker = Tracker.__new__(Tracker)
+    tracker.options, tracker._smoothed = TrackOptions(smooth=0.5), None
+    values: list[float] = []
+    jumps: list[bool] = []
+    lost = PoseEstimate("failed", "", None, None, None, 0, 0.0, 1.0)
+    for i, x in enumerate(positions_m):
+        pose = SE3.from_translation([x, 0, 0])
+        uncertain = UncertainPose(pose, sigma_m**2 * np.eye(6))
+        estimate = PoseEstimate("ok", "", "room", uncertain.pose, uncertain.covariance, 9, 1.0, 1.0)
+        now, jumped = tracker._smooth(estimate, i / 15)
+        assert now is not None
+        values.append(float(now.translation_m[0]))
+        jumps.append(jumped)
+    tracker._smooth(lost, 9.0)
+    assert tracker._smoothed is None
+    return values, jumps
+
+
+def test_smoothing_reduces_noise_and_never_hides_a_jump() -> None:
+    rng = np.random.default_rng(0)
+    noisy = (0.001 * rng.normal(size=60)).tolist()
+    values, jumps = smoothed(noisy)
+    assert np.std(values[20:]) < 0.5 * np.std(noisy[20:])
+    assert jumps == [True] + [False] * 59
+    values, jumps = smoothed([0.0] * 5 + [0.05] * 5)
+    assert values == [0.0] * 5 + [0.05] * 5
+    assert jumps[5]

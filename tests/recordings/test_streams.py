@@ -1,0 +1,59 @@
+"""Frames of folders, videos and sources that do not exist."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from evercal.errors import InputError
+from evercal.recordings.images import write_image
+from evercal.recordings.streams import stream
+
+
+def image(value: int) -> np.ndarray:
+    picture = np.full((48, 64, 3), value, np.uint8)
+    picture[:, :32] = (200, 30, 10)
+    return picture
+
+
+def test_a_folder_in_natural_order_with_times_of_its_names(tmp_path: Path) -> None:
+    for i in (10, 9, 2):
+        write_image(tmp_path / f"image-{i}.png", image(i))
+    frames = list(stream(str(tmp_path), rate=10))
+    assert [frame.name for frame in frames] == ["image-2.png", "image-9.png", "image-10.png"]
+    assert [frame.stamp_s for frame in frames] == pytest.approx([0, 0.1, 0.2])
+    assert frames[1].image[0, 40].tolist() == [9, 9, 9]
+
+
+def test_a_video_with_its_own_times(tmp_path: Path) -> None:
+    path = tmp_path / "video.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20, (64, 48))
+    for i in range(6):
+        writer.write(image(40 * i)[..., ::-1])
+    writer.release()
+    frames = list(stream(str(path)))
+    assert [frame.stamp_s for frame in frames] == pytest.approx(np.arange(6) / 20, abs=1e-3)
+    assert frames[4].image[20, 50] == pytest.approx([160] * 3, abs=6)
+    assert frames[4].image[20, 10] == pytest.approx([200, 30, 10], abs=12)  # RGB
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("missing", "no such folder or video; give one, a camera's number"),
+        ("97", "97: cannot be opened as a video"),
+    ],
+)
+def test_sources_that_do_not_exist(source: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        list(stream(source))
+
+
+def test_files_that_are_no_video(tmp_path: Path) -> None:
+    (tmp_path / "notes.mp4").write_text("no video")
+    with pytest.raises(InputError, match="cannot be opened as a video"):
+        list(stream(str(tmp_path / "notes.mp4")))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="image"):
+        list(stream(str(tmp_path / "empty")))

@@ -1,0 +1,107 @@
+"""The client has the methods of `Map` and returns the same types."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+import evercal
+from evercal import Calibration, Client, InputError, LearnReport, Map
+from evercal.geometry import SE3, pose_distance
+from evercal.recordings import read_image, write_image
+
+if TYPE_CHECKING:
+    from evercal.recordings import Recording
+
+
+@pytest.fixture
+def client(hall_service: Any) -> Client:
+    return evercal.Client(hall_service.url)
+
+
+def test_estimates_are_those_of_the_map(
+    client: Client, hall_store: Path, image: Path, hall: Recording
+) -> None:
+    opened, pixels = Map.open(hall_store, device="cpu"), read_image(image)
+    assert client.scenes == opened.scenes
+    for given, camera in ((image, None), (pixels, None), (str(image), hall.test[7].camera)):
+        got, expected = client.localize(given, camera), opened.localize(pixels, camera)
+        assert (got.status, got.scene, got.inliers) == ("ok", "hall", expected.inliers)
+        assert got.base_from_camera is not None
+        assert expected.base_from_camera is not None
+        assert pose_distance(got.base_from_camera, expected.base_from_camera)[0] < 1e-12
+        assert got.covariance is not None
+        np.testing.assert_array_equal(got.covariance, expected.covariance)
+
+
+def test_calibrations_and_checks(
+    client: Client, hall_store: Path, hall: Recording, tmp_path: Path
+) -> None:
+    rng, opened = np.random.default_rng(0), Map.open(hall_store, device="cpu")
+    frame = hall.test[3]
+    for i in range(3):
+        noisy = frame.read_image() + rng.normal(0, 4, (240, 320, 3))
+        write_image(tmp_path / f"{i}.png", noisy.clip(0, 255).astype("u1"))
+    got = client.calibrate(tmp_path, camera=frame.camera)
+    expected = opened.calibrate(tmp_path, camera=frame.camera)
+    assert isinstance(got, Calibration)
+    assert got.source == expected.source
+    np.testing.assert_allclose(
+        got.parent_from_child.matrix(), expected.parent_from_child.matrix(), atol=1e-12
+    )
+    assert [use.name for use in got.images] == ["0.png", "1.png", "2.png"]
+    shift = client.check([tmp_path / "0.png"], got)
+    assert shift.same_map
+    assert not shift.moved
+    assert shift.translation_mm == pytest.approx(
+        opened.check([tmp_path / "0.png"], expected).translation_mm
+    )
+    arm = SE3.stack([SE3.identity()] * 3)
+    fixed = client.calibrate(tmp_path, robot_poses=arm, mount="eye_to_hand")
+    assert fixed.mount == "eye_to_hand"
+    with pytest.raises(InputError, match="robot_poses: 1 poses for 3 images"):
+        client.calibrate(tmp_path, robot_poses=arm[:1])
+
+
+def test_scenes_are_learned_and_removed(serve: Any, copy: Path, recording: Path) -> None:
+    with serve(copy, recordings=recording.parent) as service:
+        client, steps = Client(service.url), set()
+        report = client.learn(
+            recording, name="attic", memory="40%", on_progress=lambda step, *_: steps.add(step)
+        )
+        assert isinstance(report, LearnReport)
+        assert (report.scene, report.train_frames) == ("attic", 26)
+        assert report.adjusted is not None
+        assert isinstance(report.adjusted.wrong_poses, tuple)
+        assert steps
+        assert client.scenes == ("hall", "attic")
+        with pytest.raises(InputError, match="scene 'attic': a scene of this name exists"):
+            client.learn("alpha", name="attic", on_server=True)
+        with pytest.raises(InputError, match=r"alpha/images: images: no known scene format"):
+            client.learn("alpha/images", on_server=True)
+        client.remove("attic")
+        assert client.scenes == ("hall",)
+
+
+def test_refusals_are_the_lines_of_the_service(client: Client, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"image\.png: 2x2 pixels|camera|aspect|image"):
+        client.localize(np.zeros((2, 200, 3), np.uint8), evercal.Camera(4, 3, 4.0, 4.0, 2.0, 1.5))
+    with pytest.raises(InputError, match="scene 'attic': the map has no scene"):
+        client.remove("attic")
+    with pytest.raises(InputError, match=r"gone\.png: cannot be read"):
+        client.localize(tmp_path / "gone.png")
+    with pytest.raises(InputError, match="gone: no such folder"):
+        client.learn(tmp_path / "gone")
+    with pytest.raises(InputError, match=r"127\.0\.0\.1:1: no answer"):
+        _ = Client("http://127.0.0.1:1").scenes
+
+
+def test_a_token_is_sent(serve: Any, hall_store: Path, image: Path) -> None:
+    token = "0123456789abcdef"
+    with serve(hall_store, token=token) as service:
+        assert Client(service.url, token).localize(image).status == "ok"
+        with pytest.raises(InputError, match="send 'Authorization: Bearer TOKEN'"):
+            Client(service.url).localize(image)

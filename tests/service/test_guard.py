@@ -1,0 +1,155 @@
+"""Who may ask, and how much a request may hold."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from evercal.errors import InputError
+from evercal.service.limits import Limits
+from evercal.service.server import ServeOptions, bound_socket
+
+TOKEN = "a-token-of-32-characters-or-more"
+
+
+@pytest.fixture(scope="module")
+def guarded(hall_store: Path) -> Iterator[Any]:
+    from .conftest import running
+
+    limits = Limits(body_bytes=100_000, archive_bytes=200_000)
+    with running(hall_store, token=TOKEN, limits=limits) as service:
+        yield service
+
+
+@pytest.mark.parametrize(
+    ("given", "status"),
+    [
+        (f"Bearer {TOKEN}", 200),
+        (f"Bearer {TOKEN}x", 401),
+        (f"Bearer {TOKEN[:-1]}", 401),
+        (TOKEN, 401),
+        ("Bearer ", 401),
+        ("", 401),
+        (None, 401),
+        ("Bearer \xe9", 401),
+    ],
+)
+def test_a_token_is_needed(guarded: Any, given: str | None, status: int) -> None:
+    headers = {} if given is None else {"Authorization": given}
+    got = guarded.ask("GET", "/scenes", headers=headers)
+    assert got.status == status
+    if status == 401:
+        assert got.json == {"error": "send 'Authorization: Bearer TOKEN'"}
+        assert got.headers["www-authenticate"] == "Bearer"
+
+
+def test_what_needs_no_token_holds_nothing_of_the_map(guarded: Any) -> None:
+    assert guarded.ask("GET", "/health").status == 200
+    for path in ("/docs", "/openapi.json"):
+        got = guarded.ask("GET", path)
+        assert got.status == 200
+        assert b"hall" not in got.body
+    assert guarded.ask("GET", "/metrics").status == 401
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(guarded.url.replace("http", "ws") + "/track")
+    headers = {"Authorization": f"Bearer {TOKEN}"}
+    with connect(guarded.url.replace("http", "ws") + "/track", additional_headers=headers) as ws:
+        ws.send(b"x")
+        assert "error" in str(ws.recv())
+
+
+def test_long_bodies_are_refused_before_and_while_they_are_read(guarded: Any) -> None:
+    headers = {"Authorization": f"Bearer {TOKEN}"}
+    for path, most in (("/localize", 100_000), ("/scenes", 200_000)):
+        kind = {"Content-Type": "application/zip"}
+        for length in ({"Content-Length": str(most + 1)}, {}):
+            body = b"x" * (most + 1)
+            # http.client sends an iterator in chunks.
+            sent = body if length else iter([body[i : i + 9_999] for i in range(0, most, 9_999)])
+            got = guarded.ask("POST", path, body=sent, headers={**headers, **kind, **length})
+            if path == "/scenes" or length:
+                assert (got.status, list(got.json)) == (413, ["error"])
+        parts = [("image", ("a.png", b"x" * most))]
+        if path == "/localize":
+            got = guarded.ask("POST", path, parts, headers=headers)
+            assert got.status == 413
+    got = guarded.ask("POST", "/localize", body=b"x" * 200_000)  # without a token
+    assert got.status == 401
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({}, 200),
+        ({"Host": "localhost"}, 200),
+        ({"Host": "LOCALHOST:80"}, 200),
+        ({"Host": "[::1]:80"}, 200),
+        ({"Host": "evil.example"}, 403),
+        ({"Host": "127.0.0.1.evil.example"}, 403),
+        ({"Host": "[::1"}, 403),
+        ({"Host": "localhost", "Origin": "http://localhost"}, 200),
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": "null"}, 403),
+    ],
+)
+def test_web_pages_do_not_reach_a_service_without_a_token(
+    hall_service: Any, headers: dict[str, str], status: int
+) -> None:
+    got = hall_service.ask("GET", "/scenes", headers=headers)
+    assert got.status == status
+    assert list(got.json) == (["scenes"] if status == 200 else ["error"])
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"garbage\r\n\r\n",
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" * 10,
+        b"GET /health HTTP/1.1\r\nX: " + b"x" * 200_000 + b"\r\n\r\n",
+        b"GET /health HTTP/9.9\r\n\r\n",
+        b"POST /localize HTTP/1.1\r\nHost: a\r\nContent-Length: x\r\n\r\n",
+        b"POST /localize HTTP/1.1\r\nHost: a\r\nContent-Length: -1\r\n\r\n",
+        b"GET /\0 HTTP/1.1\r\nHost: a\r\n\r\n",
+    ],
+)
+def test_what_is_no_http_gets_one_line(hall_service: Any, data: bytes) -> None:
+    host, port = hall_service.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=10) as connection:
+        connection.sendall(data)
+        answer = b""
+        while received := connection.recv(65536):
+            answer += received
+    assert answer.startswith(b"HTTP/1.1 4")
+    assert b'{"error": "' in answer
+    assert hall_service.ask("GET", "/health").status == 200
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"host": "0.0.0.0"}, "--host 0.0.0.0: other machines could use the map; give --token"),
+        ({"host": "::"}, "--host ::: other machines"),
+        ({"host": "example.invalid"}, "other machines"),
+        ({"token": "short"}, "--token: give at least 16"),
+        ({"token": "x" * 20 + " "}, "--token: give at least 16"),
+        ({"host": "example.invalid", "token": TOKEN}, "--host example.invalid --port 0: "),
+        ({"port": 70_000}, "--port 70000: "),
+    ],
+)
+def test_addresses_that_are_refused(options: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message.replace(".", r"\.")):
+        bound_socket(ServeOptions(tmp_path, **{"port": 0, **options}))
+
+
+def test_a_token_opens_all_addresses_and_a_port_is_used_once(tmp_path: Path) -> None:
+    with bound_socket(ServeOptions(tmp_path, "0.0.0.0", 0, TOKEN)) as first:
+        first.listen()
+        port = first.getsockname()[1]
+        with pytest.raises(InputError, match=f"--port {port}: Address already in use"):
+            bound_socket(ServeOptions(tmp_path, "0.0.0.0", port, TOKEN))

@@ -1,0 +1,92 @@
+"""Malformed requests get one line and a status of the client's fault; the service goes on."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from evercal.service.limits import Limits
+
+from .malformed import malformed
+
+# The parser of forms leaves the last part of a truncated body to the garbage collector.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@pytest.fixture(scope="module")
+def narrow(hall_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A service with a folder of recordings, and small limits."""
+    from .conftest import running
+
+    limits = Limits(unpacked_bytes=10 * 10**6)
+    with running(hall_store, limits=limits, recordings=tmp_path_factory.mktemp("r")) as service:
+        yield service
+
+
+def answer_to(url: str, data: bytes) -> tuple[int, bytes]:
+    """Status and body of what comes back for raw bytes."""
+    host, port = url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=30) as connection:
+        connection.sendall(data)
+        answer = b""
+        while received := connection.recv(65536):
+            answer += received
+    head, _, body = answer.partition(b"\r\n\r\n")
+    return int(head.split()[1]) if head else 0, body
+
+
+def statuses(service: Any, seeds: range) -> Counter[int]:
+    counts: Counter[int] = Counter()
+    for seed in seeds:
+        status, body = answer_to(service.url, malformed(seed))
+        assert 400 <= status < 500, (seed, status, malformed(seed)[:200])
+        error = json.loads(body)
+        assert list(error) == ["error"], seed
+        assert "\n" not in error["error"], seed
+        counts[status] += 1
+    assert service.ask("GET", "/scenes").json == {"scenes": ["hall"]}
+    assert list(service.service.uploads.iterdir()) == []
+    assert service.service.desk.waiting == 0
+    assert service.service.jobs.pending == []
+    return counts
+
+
+def test_malformed_requests(narrow: Any, image: Path) -> None:
+    counts = statuses(narrow, range(100))
+    assert {400, 404, 413, 422} <= counts.keys()
+    row = narrow.ask("POST", "/localize", [("image", (image.name, image.read_bytes()))]).json
+    assert row["status"] == "ok"
+
+
+@pytest.mark.slow
+def test_a_thousand_malformed_requests(narrow: Any) -> None:
+    print(statuses(narrow, range(100, 1100)))  # noqa: T201
+
+
+def test_clients_that_vanish(narrow: Any, image: Path) -> None:
+    """Connections are closed in the middle of a request, and before an answer."""
+    host, port = narrow.url.removeprefix("http://").split(":")
+    body = b"POST /localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data;"
+    body += b" boundary=edge\r\nContent-Length: 100000\r\n\r\n--edge\r\n"
+
+    def vanish(data: bytes) -> None:
+        with socket.create_connection((host, int(port)), timeout=30) as connection:
+            connection.sendall(data)
+
+    threads = [threading.Thread(target=vanish, args=(body[: 10 * i],)) for i in range(1, 20)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    got = narrow.ask("POST", "/localize", [("image", (image.name, image.read_bytes()))])
+    assert got.json["status"] == "ok"
+    assert narrow.service.desk.waiting == 0

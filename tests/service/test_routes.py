@@ -1,0 +1,181 @@
+"""The service answers as the command line does, and refuses with one line."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from evercal.map import Map
+from evercal.recordings import read_image
+from evercal.reports.answers import Answer, answer_row
+from evercal.service.limits import Limits
+
+if TYPE_CHECKING:
+    from evercal.recordings import Recording
+
+
+def part(path: Path) -> tuple[str, bytes]:
+    return path.name, path.read_bytes()
+
+
+def huge_png(side: int) -> bytes:
+    """A PNG of 100 bytes whose header states `side` x `side` pixels."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        crc = struct.pack(">I", zlib.crc32(kind + data))
+        return struct.pack(">I", len(data)) + kind + data + crc
+
+    header = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+    data = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + data
+
+
+def test_localize_gives_the_row_of_the_command(
+    hall_service: Any, hall_store: Path, image: Path, hall: Recording
+) -> None:
+    opened, camera = Map.open(hall_store, device="cpu"), hall.test[7].camera
+    parts = [("image", part(image))]
+    lens = ("camera.json", json.dumps(camera.to_dict()).encode())
+    for given, sent in ((None, parts), (camera, [*parts, ("camera", lens)])):
+        got = hall_service.ask("POST", "/localize", sent)
+        assert got.status == 200
+        estimate = opened.localize(read_image(image), given)
+        expected = json.loads(json.dumps(answer_row(Answer(Path("hall.png"), estimate, 0.0))))
+        assert expected["status"] == "ok"
+        assert got.json.pop("ms") > 0
+        assert {**got.json, "ms": 0.0} == expected
+
+
+def test_an_unknown_place_is_an_answer(hall_service: Any, tmp_path: Path) -> None:
+    from evercal.recordings import write_image
+
+    write_image(tmp_path / "black.png", np.zeros((240, 320, 3), np.uint8))
+    got = hall_service.ask("POST", "/localize", [("image", part(tmp_path / "black.png"))])
+    assert got.status == 200
+    assert got.json["status"] in ("unknown_scene", "failed")
+    assert got.json["base_from_camera"] is None
+
+
+def test_health_scenes_page_and_metrics(hall_service: Any, image: Path) -> None:
+    assert hall_service.ask("GET", "/health").json == {"status": "ok", "scenes": 1}
+    assert hall_service.ask("GET", "/scenes").json == {"scenes": ["hall"]}
+    assert b"swagger" in hall_service.ask("GET", "/docs").body
+    paths = hall_service.ask("GET", "/openapi.json").json["paths"]
+    assert set(paths) == {
+        "/health", "/scenes", "/localize", "/calibrations", "/check", "/jobs/{key}", "/metrics",
+        "/scenes/{name}",
+    }  # fmt: skip
+
+    def count(line: str) -> float:
+        text = hall_service.ask("GET", "/metrics").body.decode()
+        values = [row.split()[-1] for row in text.splitlines() if row.startswith(line)]
+        return float(values[0]) if values else 0.0
+
+    line = 'evercal_requests_total{method="POST",route="/localize",status="200"}'
+    before, answers = count(line), count('evercal_answers_total{status="ok"}')
+    hall_service.ask("POST", "/localize", [("image", part(image))])
+    assert count(line) == before + 1
+    assert count('evercal_answers_total{status="ok"}') == answers + 1
+    assert count("evercal_scenes") == 1
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "parts", "status", "message"),
+    [
+        ("POST", "/localize", [], 422, "image: Field required"),
+        ("POST", "/localize", [("image", "text")], 422, "image: "),
+        ("POST", "/localize", [("image", ("a.png", b""))], 400, "a.png: not a readable image"),
+        ("POST", "/localize", [("image", ("a.png", b"x" * 99))], 400, "a.png: not a readable"),
+        ("POST", "/localize", [("image", ("a", huge_png(60_000)))], 413, "a: too many pixels"),
+        ("POST", "/localize", [("image", ("a", huge_png(8_000)))], 413, "a: 8000x8000 pixels"),
+        ("POST", "/localize", [("image", ("a", huge_png(20)))], 400, "a: not a readable image"),
+        ("POST", "/localize", [("image", "IMAGE"), ("camera", ("c", b"{"))], 400, "camera: "),
+        ("POST", "/localize", [("image", "IMAGE"), ("camera", ("c", b"PK"))], 400, "not a text"),
+        (
+            "POST",
+            "/localize",
+            [("image", "IMAGE"), ("camera", ("c", b"[" * 60_000))],
+            400,
+            "camera",
+        ),
+        (
+            "POST",
+            "/localize",
+            [("image", "IMAGE"), ("camera", ("c", b" " * 70_000))],
+            413,
+            "camera",
+        ),
+        ("POST", "/calibrations", [], 422, "images: Field required"),
+        ("POST", "/calibrations", [("images", ("a", b"x"))], 400, "a: not a readable image"),
+        (
+            "POST",
+            "/calibrations",
+            [("images", "IMAGE"), ("robot_poses", ("p.csv", b"a,b\n1,2"))],
+            400,
+            "robot_poses",
+        ),
+        ("POST", "/calibrations", [("images", "IMAGE"), ("mount", "table")], 422, "mount"),
+        ("POST", "/check", [("images", "IMAGE")], 422, "calibration: Field required"),
+        (
+            "POST",
+            "/check",
+            [("images", "IMAGE"), ("calibration", ("c", b"[]"))],
+            400,
+            "calibration: cannot be read ('format' is not 'evercal-calibration')",
+        ),
+        ("GET", "/jobs/none", None, 404, "no such job"),
+        ("GET", "/nowhere", None, 404, "Not Found"),
+        ("PUT", "/localize", None, 405, "Method Not Allowed"),
+        ("DELETE", "/scenes/attic", None, 404, "scene 'attic'"),
+        ("DELETE", "/scenes/..%2F..%2Fetc", None, 404, ""),
+        ("POST", "/scenes", None, 415, "send application/zip or application/json"),
+    ],
+)
+def test_refusals_are_one_line(
+    hall_service: Any, image: Path, method: str, path: str, parts: Any, status: int, message: str
+) -> None:
+    if parts is not None:
+        parts = [(name, part(image) if value == "IMAGE" else value) for name, value in parts]
+    got = hall_service.ask(method, path, parts)
+    assert (got.status, list(got.json)) == (status, ["error"])
+    assert message in got.json["error"]
+    assert "\n" not in got.json["error"]
+    assert "/tmp" not in got.json["error"]
+
+
+def test_limits_of_images_and_of_the_queue(serve: Any, hall_store: Path, image: Path) -> None:
+    with serve(hall_store, limits=Limits(images=2, queue=0, pixels=1000)) as service:
+        got = service.ask("POST", "/calibrations", [("images", part(image))] * 3)
+        assert (got.status, got.json["error"]) == (413, "images: 3 given; at most 2")
+        got = service.ask("POST", "/localize", [("image", part(image))])
+        assert (got.status, got.json["error"].partition(":")[0]) == (413, "hall.png")
+        service.service.desk.waiting = 1000
+        got = service.ask("POST", "/localize", [("image", part(image))])
+        assert (got.status, got.json["error"]) == (429, "too many requests wait; try again")
+        service.service.desk.waiting = 0
+
+
+def test_stream_of_frames(hall_service: Any, image: Path, hall: Recording) -> None:
+    from websockets.sync.client import connect
+
+    camera = json.dumps(hall.test[7].camera.to_dict())
+    row = hall_service.ask("POST", "/localize", [("image", part(image))]).json
+    with connect(hall_service.url.replace("http", "ws") + "/track", max_size=None) as socket:
+        socket.send(image.read_bytes())
+        first = json.loads(socket.recv())
+        assert {**first, "path": "", "ms": 0} == {**row, "path": "", "ms": 0}
+        socket.send(b"no image")
+        assert json.loads(socket.recv())["error"].startswith("frame 1: not a readable image")
+        socket.send(camera)
+        for number in (2, 3):
+            socket.send(image.read_bytes())
+            assert json.loads(socket.recv())["path"] == f"frame {number}"
+        socket.send("{")
+        socket.send(image.read_bytes())
+        assert json.loads(socket.recv())["error"].startswith("camera: ")
