@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, require_writable
@@ -16,6 +15,8 @@ from evercal.errors import InputError
 from evercal.reports.answers import unit_known
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from evercal.geometry import Camera
     from evercal.localization.tracking import TrackedFrame
 
@@ -93,7 +94,7 @@ class Track:
         self._summary(states, times)
         return 0 if states["tracking"] + states["relocalized"] else 1
 
-    def _camera(self, image: np.ndarray) -> "Camera | None":
+    def _camera(self, image: "np.ndarray") -> "Camera | None":
         if self.camera is None:
             return None
         from evercal.recordings.poses.camera_file import read_camera
@@ -101,6 +102,8 @@ class Track:
         return read_camera(self.camera, (image.shape[1], image.shape[0]))
 
     def _summary(self, states: Counter[str], times: list[float]) -> None:
+        import numpy as np
+
         middle, high = np.quantile(times, [0.5, 0.99]).tolist()
         if self.json:
             counts = {state: states[state] for state in ("tracking", "relocalized", "lost")}

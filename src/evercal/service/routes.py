@@ -1,6 +1,7 @@
 """The endpoints. Every request is answered from one state of the map."""
 
 import json
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,7 +14,10 @@ from starlette.websockets import WebSocketDisconnect
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.reports.answers import check_record
+from evercal.localization.localizer import Localizer
+from evercal.localization.tracking import Tracker
+from evercal.reports.answers import check_record, unit_known
+from evercal.reports.track_files import track_row
 from evercal.service.desk import Desk
 from evercal.service.guard import Metrics
 from evercal.service.jobs import Jobs, QueueFullError
@@ -164,10 +168,11 @@ async def metrics(request: Request) -> Response:
 async def track(socket: WebSocket) -> None:
     """Frames in, rows out: each binary message is an image file, each answer a JSON row.
 
-    A text message holds the intrinsics of the frames that follow, as `camera` of `/localize`. A
+    Rows have the state of the tracking (`tracking`, `relocalized`, `lost`). A text message holds the intrinsics of the frames that follow, as `camera` of `/localize`. A
     frame that cannot be used is answered with `{"error": ...}`.
     """
     service, lens, number = service_of(socket), None, 0
+    followed = Followed(service)
     await socket.accept()
     try:
         while True:
@@ -179,7 +184,7 @@ async def track(socket: WebSocket) -> None:
                 continue
             name, number = f"frame {number}", number + 1
             try:
-                row = await service.desk.run(next_row, service, message["bytes"], name, lens)
+                row = await service.desk.run(followed.row, message["bytes"], name, lens)
             except (InputError, QueueFullError) as error:
                 row = {"path": name, "error": one_line(error)}
             await socket.send_text(json.dumps(row, allow_nan=False))
@@ -187,9 +192,23 @@ async def track(socket: WebSocket) -> None:
         return
 
 
-def next_row(service: Service, data: bytes, name: str, lens: bytes | None) -> dict[str, Any]:
-    """The row of one frame of a stream. Frames are located one by one, without the last pose."""
-    return _located(service, data, name, lens)
+class Followed:
+    """A stream of frames; it is tracked anew when the map or the intrinsics change."""
+
+    def __init__(self, service: Service):
+        self._service = service
+        self._of: tuple[Localizer, bytes | None] | None = None
+        self._tracker: Tracker | None = None
+
+    def row(self, data: bytes, name: str, lens: bytes | None) -> dict[str, Any]:
+        """The row of the next frame, with the state of the tracking."""
+        localizer = self._service.live.current.localizer
+        image = decoded(data, name, self._service.limits)
+        if self._tracker is None or self._of != (localizer, lens):
+            self._tracker = Tracker(localizer, _camera(lens, image))
+            self._of = (localizer, lens)
+        frame = self._tracker.track(image, time.monotonic())
+        return track_row(frame, name, unit_known(localizer, frame.estimate.scene))
 
 
 def one_line(error: object) -> str:
