@@ -168,8 +168,9 @@ async def metrics(request: Request) -> Response:
 async def track(socket: WebSocket) -> None:
     """Frames in, rows out: each binary message is an image file, each answer a JSON row.
 
-    Rows have the state of the tracking (`tracking`, `relocalized`, `lost`). A text message holds the intrinsics of the frames that follow, as `camera` of `/localize`. A
-    frame that cannot be used is answered with `{"error": ...}`.
+    Rows have the state of the tracking (`tracking`, `relocalized`, `lost`). A text message holds
+    the intrinsics of the frames that follow, as `camera` of `/localize`. A frame that cannot be
+    used is answered with `{"error": ...}`.
     """
     service, lens, number = service_of(socket), None, 0
     followed = Followed(service)
