@@ -14,6 +14,7 @@ VERBS = {
     "boards": "detection of rendered boards, beside the finders of OpenCV",
     "handeye-boards": "boards through a lens found from the same images, beside other solvers",
     "mistakes": "mistakes in pose files that must be refused and named, and clean recordings",
+    "tracking": "a stream with holes: tracked, beside the location of single frames",
     "refresh": "a map in a rendered room that changes in ten rounds",
     "many-keyframes": "localization among thousands of keyframes of other rooms",
     "peers": "SIFT and XFeat on the same frames",

@@ -20,7 +20,7 @@ VERBS = {
     "Calibrate": ["calibrate", "check", "watch", "audit", "align"],
     "Boards and pose pairs": ["detect", "solve"],
     "Results": ["export", "report"],
-    "Recordings": ["inspect", "convert", "simulate", "demo"],
+    "Recordings": ["inspect", "convert", "reconstruct", "simulate", "demo"],
     "Networks": ["bench", "bench-report", "pretrain"],
 }
 ALL = [verb for verbs in VERBS.values() for verb in verbs]

@@ -21,7 +21,7 @@ _GROUPS = {
     "Calibrate": ("calibrate", "check", "watch", "audit", "align"),
     "Boards and pose pairs": ("detect", "solve"),
     "Results": ("export", "report"),
-    "Recordings": ("inspect", "convert", "simulate", "demo"),
+    "Recordings": ("inspect", "convert", "reconstruct", "simulate", "demo"),
     "Networks": ("bench", "bench-report", "pretrain"),
 }
 """Verbs by purpose, in the order of the help."""
@@ -108,6 +108,7 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.localize import Localize
     from evercal.cli.map import Maps
     from evercal.cli.pretrain import Pretrain, pretrain_with_options
+    from evercal.cli.reconstruct import Reconstruct
     from evercal.cli.refresh import Refresh
     from evercal.cli.report import Report
     from evercal.cli.serve import Serve
@@ -139,6 +140,7 @@ def _verbs(first: str) -> dict[str, Any]:
         "serve": Serve,
         "inspect": Inspect,
         "convert": Convert,
+        "reconstruct": Reconstruct,
         "simulate": Simulate,
         "bench": Bench,
         "bench-report": BenchReport,

@@ -1,0 +1,60 @@
+"""`evercal reconstruct`."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from evercal.cli.console import print_json, print_next
+from evercal.cli.networks import Bars
+
+_CONNECTED = 0.8
+"""Share of the frames in one part below which the video does not hold together."""
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Estimate camera poses from a plain video or images, to learn a map from.
+
+    The unit of length is arbitrary until 'evercal align'. The same command continues where it was
+    stopped. Exit code 1 if less than 80 % of the frames connect.
+
+    Example: evercal reconstruct phone.mp4 capture/
+    """
+
+    source: Annotated[Positional[Path], arg(metavar="VIDEO|DIR")]
+    """Video file, or folder of images of one camera."""
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """New folder: a COLMAP model and its images."""
+    motion: Annotated[float, arg(metavar="SHARE")] = 0.04
+    """Motion from one chosen frame of a video to the next, parts of its width."""
+    most: Annotated[int, arg(metavar="N")] = 300
+    """Frames, at most."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Reconstruct and print a summary."""
+        from evercal.recordings.reconstruct import ReconstructOptions, reconstruct
+
+        options = ReconstructOptions(motion=self.motion, most_frames=self.most)
+        with Bars() as bars:
+            found = reconstruct(self.source, self.out, options, bars.step)
+        whole = found.posed >= _CONNECTED * found.frames
+        if self.json:
+            print_json({"out": str(self.out), **dataclasses.asdict(found)})
+            return 0 if whole else 1
+        print(
+            f"{self.out}: {found.posed} of {found.frames} frames have a pose, {found.points:,}"
+            f" points, residual {found.residual_px:.2f} px"
+        )
+        if not whole:
+            parts = ", ".join(map(str, found.parts))
+            print(
+                f"the video does not hold together: parts of {parts} frames; move more slowly"
+                " where they end, and return to places seen before"
+            )
+        print_next("evercal", "learn", "cell.evercal", self.out)
+        return 0 if whole else 1

@@ -1,0 +1,244 @@
+"""`reconstruct`: camera poses from a plain video or images, by structure from motion (pycolmap).
+
+    OUT/images/         chosen frames
+    OUT/frames.json     written when all frames are chosen
+    OUT/database.db     features and matches
+    OUT/sparse/0/       the model, read as a COLMAP recording
+
+Every finished step is kept, so the same call continues an interrupted one. The unit of length is
+arbitrary until the map is aligned.
+"""
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.errors import InputError
+from evercal.recordings.images import write_image
+from evercal.recordings.streams import StreamFrame, stream
+from evercal.storage import write_json
+
+OnStep = Callable[[str, int, int], object]
+"""Called with the name of the step, how much of it is done, and its total."""
+
+_SMALL_PX = 320
+"""Width of the copy in which motion and sharpness are measured."""
+_LEAST_FRAMES = 12
+_FRAMES, _DATABASE, _MODEL = "frames.json", "database.db", "sparse"
+
+
+@dataclass(frozen=True)
+class ReconstructOptions:
+    """How frames are chosen and matched."""
+
+    motion: float = 0.04
+    """Median motion of corners from one chosen frame of a video to the next, parts of its width."""
+    most_frames: int = 300
+    """Frames, at most; of more, every n-th is used."""
+    exhaustive: int = 60
+    """Up to so many frames, every pair is matched. Of more, neighbours are, and for loops every
+    pair among so many frames spread over all."""
+    camera_model: str = "OPENCV"
+    """COLMAP's camera model, shared by all frames."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Outcome, as JSON values."""
+
+    frames: int
+    """Chosen frames."""
+    posed: int
+    """Frames with a pose in the largest part."""
+    parts: tuple[int, ...]
+    """Frames of each part that does not connect to the others, largest first."""
+    points: int
+    """Triangulated points of the largest part."""
+    residual_px: float
+    """Mean reprojection error."""
+
+
+def reconstruct(
+    source: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    options: ReconstructOptions | None = None,
+    on_step: OnStep = lambda *_: None,
+) -> Reconstruction:
+    """Reconstruct camera poses from a video or a folder of images of one camera.
+
+    Args:
+        source: Video file or folder.
+        out: New folder, or that of an interrupted call with the same source.
+        options: How frames are chosen and matched.
+        on_step: Called with the current step.
+
+    Raises:
+        InputError: The extra `colmap` is not installed, the source cannot be read, too few frames,
+            or no two frames connect.
+    """
+    try:
+        import pycolmap
+    except ImportError:
+        raise InputError("reconstruction takes the extra: pip install 'evercal[colmap]'") from None
+    options, root = options or ReconstructOptions(), Path(out)
+    names = _chosen(str(source), root, options, on_step)
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    database = root / _DATABASE
+    if not (root / "matched").exists():
+        database.unlink(missing_ok=True)
+        on_step("detecting features", 0, 1)
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = options.camera_model
+        mode = pycolmap.CameraMode.SINGLE
+        pycolmap.extract_features(
+            database, root / "images", camera_mode=mode, reader_options=reader
+        )
+        on_step("detecting features", 1, 1)
+        on_step("matching", 0, 1)
+        _match(pycolmap, root, names, options)
+        (root / "matched").touch()
+        on_step("matching", 1, 1)
+    models = _mapped(pycolmap, root, len(names), on_step)
+    if not models:
+        raise InputError(
+            f"{source}: its frames do not connect to a model; record a textured scene slowly, with"
+            " sideways motion and at least two thirds of overlap"
+        )
+    best = models[0]
+    return Reconstruction(
+        frames=len(names),
+        posed=best.num_reg_images(),
+        parts=tuple(model.num_reg_images() for model in models),
+        points=best.num_points3D(),
+        residual_px=float(best.compute_mean_reprojection_error()),
+    )
+
+
+def _chosen(source: str, root: Path, options: ReconstructOptions, on_step: OnStep) -> list[str]:
+    """Write the frames to reconstruct, and return their names."""
+    record, settings = root / _FRAMES, {"source": str(Path(source).resolve()), **asdict(options)}
+    if record.exists():
+        known = json.loads(record.read_text())
+        if known["settings"] != settings:
+            raise InputError(f"{root}: holds frames of {known['settings']['source']} with other"
+                             " options; give another folder")  # fmt: skip
+        return known["names"]
+    if root.exists() and any(p.name not in ("images", _DATABASE) for p in root.iterdir()):
+        raise InputError(f"{root}: is not empty; give a new folder")
+    shutil.rmtree(root / "images", ignore_errors=True)  # of an interrupted call
+    images = Path(source).is_dir()
+    names = []
+    for frame in stream(source) if images else _moving(stream(source), options.motion):
+        name = Path(frame.name).stem + ".jpg" if images else f"{int(frame.name):06d}.jpg"
+        (root / "images").mkdir(parents=True, exist_ok=True)
+        write_image(root / "images" / name, frame.image)
+        names.append(name)
+    on_step("choosing frames", len(names), max(len(names), 1))
+    keep = names[:: max(1, -(-len(names) // options.most_frames))]
+    for name in set(names) - set(keep):
+        (root / "images" / name).unlink()
+    if len(keep) < _LEAST_FRAMES:
+        raise InputError(
+            f"{source}: {len(keep)} frames to reconstruct, at least {_LEAST_FRAMES} are required;"
+            " record longer, or move more"
+        )
+    write_json(record, {"settings": settings, "names": keep})
+    return keep
+
+
+def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFrame]:
+    """Yield the sharpest frame of each step of a moving camera."""
+    last: NDArray[np.uint8] | None = None
+    best: tuple[float, StreamFrame, NDArray[np.uint8]] | None = None
+    for frame in frames:
+        small = _small(frame.image)
+        moved = np.inf if last is None else _motion(last, small)
+        if best is not None and moved > 1.5 * motion:
+            yield best[1]
+            last, best = best[2], None
+            moved = _motion(last, small)
+        if moved > motion:
+            sharp = _sharpness(small)
+            if best is None or sharp > best[0]:
+                best = (sharp, frame, small)
+    if best is not None:
+        yield best[1]
+
+
+def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    import cv2
+
+    scale = _SMALL_PX / image.shape[1]
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)
+
+
+def _motion(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> float:
+    """Median motion of corners, parts of the width; infinite if most are lost."""
+    import cv2
+
+    corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 7)
+    if corners is None:
+        return np.inf
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None)  # pyright: ignore
+    found = status.ravel() == 1
+    if found.mean() < 0.3:
+        return np.inf
+    return float(np.median(np.linalg.norm((moved - corners)[found], axis=-1))) / _SMALL_PX
+
+
+def _sharpness(grey: NDArray[np.uint8]) -> float:
+    import cv2
+
+    return float(cv2.Laplacian(grey, cv2.CV_64F).var())
+
+
+def _match(pycolmap: Any, root: Path, names: list[str], options: ReconstructOptions) -> None:
+    """Match frames: all pairs of few, else neighbours and, for loops, pairs of spread frames."""
+    if len(names) <= options.exhaustive:
+        pycolmap.match_exhaustive(root / _DATABASE)
+        return
+    pycolmap.match_sequential(root / _DATABASE)
+    some = np.linspace(0, len(names) - 1, options.exhaustive).round().astype(int)
+    pairs = root / "pairs.txt"
+    lines = [f"{names[i]} {names[j]}" for a, i in enumerate(some) for j in some[a + 1 :]]
+    pairs.write_text("\n".join(lines) + "\n")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = pairs
+    pycolmap.match_image_pairs(root / _DATABASE, pairing_options=pairing)
+
+
+def _mapped(pycolmap: Any, root: Path, count: int, on_step: OnStep) -> list[Any]:
+    """Return the models, largest first; the largest is written as number 0."""
+    model = root / _MODEL
+    if (model / "0").is_dir():
+        found = [pycolmap.Reconstruction(path) for path in sorted(model.iterdir())]
+        return sorted(found, key=lambda m: -m.num_reg_images())
+    working, done = root / "mapping", iter(range(1, count + 1))
+    shutil.rmtree(working, ignore_errors=True)
+    working.mkdir()
+    on_step("mapping", 0, count)
+    found = pycolmap.incremental_mapping(
+        root / _DATABASE,
+        root / "images",
+        working,
+        next_image_callback=lambda: on_step("mapping", next(done, count), count),
+    )
+    on_step("mapping", count, count)
+    models = sorted(found.values(), key=lambda m: -m.num_reg_images())
+    shutil.rmtree(working)
+    for number, item in enumerate(models):
+        folder = root / f".{_MODEL}" / str(number)
+        folder.mkdir(parents=True, exist_ok=True)
+        item.write(folder)
+    if models:
+        os.replace(root / f".{_MODEL}", model)
+    return models

@@ -1,0 +1,105 @@
+"""Structure from motion of plain images and videos."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from evercal.errors import InputError
+from evercal.geometry import SE3
+from evercal.recordings import load_recording
+from evercal.recordings.images import write_image
+from evercal.recordings.reconstruct import _moving, reconstruct
+from evercal.recordings.samples import sample_rooms
+from evercal.recordings.streams import StreamFrame
+
+pytest.importorskip("pycolmap")
+
+
+def frame(number: int, shift_px: int, blur: float = 0) -> StreamFrame:
+    """A part of a wide random picture."""
+    noise = np.random.default_rng(0).integers(0, 255, (60, 200)).astype(np.uint8)
+    wide = cv2.resize(noise, (1600, 480), interpolation=cv2.INTER_CUBIC)
+    if blur:
+        wide = cv2.GaussianBlur(wide, (0, 0), blur)
+    part = np.asarray(wide[:, shift_px : shift_px + 640], np.uint8)
+    return StreamFrame(str(number), number / 30, np.repeat(part[..., None], 3, 2))
+
+
+def test_frames_of_a_standing_camera_are_left_out() -> None:
+    shifts = [0] * 5 + [10 * i for i in range(40)] + [390] * 5
+    chosen = list(_moving((frame(i, s) for i, s in enumerate(shifts)), 0.05))
+    steps = np.diff([shifts[int(f.name)] for f in chosen])
+    assert chosen[0].name == "0"
+    assert steps.min() > 0.05 * 640 - 1
+    assert steps.max() <= 1.5 * 0.05 * 640 + 10
+
+
+def test_the_sharpest_frame_of_a_step_is_chosen() -> None:
+    frames = [frame(0, 0), *(frame(i, 30 + 2 * i, 0.1 if i == 4 else 3.0) for i in range(1, 9))]
+    chosen = [f.name for f in _moving(iter(frames), 0.05)]
+    assert chosen[:2] == ["0", "4"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Images without poses."""
+    root = tmp_path_factory.mktemp("plain")
+    for item in sample_rooms()[0].scene.train[:20]:
+        write_image(root / f"{item.name}.png", item.read_image())
+    return root
+
+
+def apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances of points (n, 3) after the best similarity (Umeyama 1991)."""
+    a, b = a - a.mean(0), b - b.mean(0)
+    u, s, v = np.linalg.svd(b.T @ a)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ v))])
+    scale = (s * np.diag(sign)).sum() / (a**2).sum()
+    return np.linalg.norm(b - scale * a @ (u @ sign @ v).T, axis=1)
+
+
+def test_poses_agree_with_the_truth_up_to_a_similarity(folder: Path, tmp_path: Path) -> None:
+    steps: list[str] = []
+    found = reconstruct(folder, tmp_path / "out", on_step=lambda name, *_: steps.append(name))
+    assert found.posed >= 18
+    assert {"choosing frames", "detecting features", "matching", "mapping"} <= set(steps)
+    recording = load_recording(tmp_path / "out")
+    assert not recording.metric
+    truth = {f.name: f.base_from_camera for f in sample_rooms()[0].scene.train}
+    poses = [f.base_from_camera for f in recording.train]
+    true = SE3.stack([pose for f in recording.train if (pose := truth[Path(f.name).stem])])
+    own = SE3.stack([pose for pose in poses if pose is not None])
+    assert np.median(apart(own.translation_m, true.translation_m)) < 0.02
+    focal = sample_rooms()[0].scene.train[0].camera.fx
+    assert recording.train[0].camera.fx == pytest.approx(focal, rel=0.05)
+
+    again: list[str] = []
+    repeated = reconstruct(folder, tmp_path / "out", on_step=lambda n, *_: again.append(n))
+    assert repeated == replace(found, residual_px=repeated.residual_px)
+    assert repeated.residual_px == pytest.approx(found.residual_px)
+    assert not again  # nothing is computed twice
+    with pytest.raises(InputError, match=r"holds frames of .* give another folder"):
+        reconstruct(tmp_path, tmp_path / "out")
+
+
+def test_sources_that_cannot_be_reconstructed(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    (tmp_path / "few").mkdir()
+    (tmp_path / "noise").mkdir()
+    for i in range(5):
+        write_image(tmp_path / f"few/{i}.png", rng.integers(0, 255, (60, 80, 3)).astype("u1"))
+    with pytest.raises(InputError, match="5 frames to reconstruct, at least 12 are required"):
+        reconstruct(tmp_path / "few", tmp_path / "out")
+    for i in range(12):
+        write_image(tmp_path / f"noise/{i}.png", rng.integers(0, 255, (120, 160, 3)).astype("u1"))
+    with pytest.raises(InputError, match="do not connect to a model"):
+        reconstruct(tmp_path / "noise", tmp_path / "other")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="is not empty; give a new folder"):
+        reconstruct(tmp_path / "noise", tmp_path / "full")
+    assert (tmp_path / "full/notes.txt").read_text() == "mine"
