@@ -21,6 +21,7 @@ App = Callable[[MutableMapping[str, Any], Receive, Send], Awaitable[None]]
 OPEN = ("/health", "/docs", "/openapi.json")
 """Paths without a token: they hold nothing of the map."""
 _DRAIN_S = 1.0
+_HEADER_BYTES = 32 * 1024
 _LOCAL = ("localhost", "127.0.0.1", "::1")
 
 
@@ -126,6 +127,9 @@ class Guard:
     def _too_long(
         self, scope: MutableMapping[str, Any], headers: dict[bytes, bytes]
     ) -> tuple[int, str] | None:
+        size = sum(len(name) + len(value) for name, value in scope["headers"])
+        if size + len(scope.get("raw_path") or b"") + len(scope["query_string"]) > _HEADER_BYTES:
+            return 431, f"headers and path of more than {_HEADER_BYTES} bytes"
         length = headers.get(b"content-length", b"0")
         if not length.isdigit():
             return 400, "content-length is not a number"
