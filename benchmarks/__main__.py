@@ -22,6 +22,7 @@ VERBS = {
     "paper": "the first steps of preset paper",
     "trainer": "time of a training step",
     "speed": "time of localization and SARS",
+    "serve": "latency of the HTTP service, alone and while a scene is learned",
     "intervals": "coverage of confidence intervals",
     "publish": "write results to results/NAME.jsonl",
     "tables": "generate the tables of the docs from results/",

@@ -41,7 +41,7 @@ class Serve:
     """Print one JSON object when it accepts requests."""
 
     def run(self) -> int:
-        """Serve until the process is told to stop."""
+        """Serve until SIGTERM or Ctrl-C."""
         try:
             from evercal.service.server import ServeOptions, serve
         except ImportError as error:

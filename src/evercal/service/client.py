@@ -263,7 +263,7 @@ def _archive(recording: Path, file: Any) -> None:
 
     if not recording.exists():
         raise InputError(f"{recording}: no such folder; give the folder of a recorded scene")
-    with zipfile.ZipFile(file, "w") as archive:
+    with zipfile.ZipFile(file, "w", strict_timestamps=False) as archive:
         if recording.is_file():
             archive.write(recording, recording.name)
         else:

@@ -64,8 +64,7 @@ class Guard:
 
     Args:
         app: The service.
-        token: Requests must have it as bearer token; None for a service that only this machine
-            reaches.
+        token: Requests must have it as bearer token. Without one, only this machine may ask.
         limits: Sizes of bodies.
         metrics: Counters.
     """

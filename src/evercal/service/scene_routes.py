@@ -47,7 +47,7 @@ async def learn(
     """Learn a recording in another process; the answer is a job.
 
     Send a zip archive of the recording, or `{"path": ...}` below the folder that the service was
-    started with. `name` and `memory` are those of `evercal learn`.
+    started with. `name` and `memory` mean the same as for `evercal learn`.
     """
     service = service_of(request)
     if len(service.jobs.pending) > service.limits.jobs:
