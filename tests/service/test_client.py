@@ -73,7 +73,7 @@ def test_scenes_are_learned_and_removed(serve: Any, copy: Path, recording: Path)
             recording, name="attic", memory="40%", on_progress=lambda step, *_: steps.add(step)
         )
         assert isinstance(report, LearnReport)
-        assert (report.scene, report.train_frames) == ("attic", 26)
+        assert (report.scene, report.train_frames) == ("attic", 12)
         assert report.adjusted is not None
         assert isinstance(report.adjusted.wrong_poses, tuple)
         assert steps
