@@ -22,7 +22,8 @@ from evercal.errors import InputError
 from evercal.evaluation.metrics import CHI2_6
 from evercal.geometry import SE3
 from evercal.localization.localizer import Localizer
-from evercal.map import LearnReport, Map
+from evercal.learning.scene import LearnReport
+from evercal.map import Map
 from evercal.recordings import Recording, load_recording
 from evercal.recordings.samples import FOLDER, ROOMS
 

@@ -110,6 +110,8 @@ def run(
         "ms_p50": float(np.median(ms)),
         "ms_p99": float(np.quantile(ms, 0.99)),
         "tracking_ms_p50": float(np.median(near)),
+        "all_ms_p99": float(np.quantile([ms for _, _, ms in tracked], 0.99)),
+        "over_budget": 0 if at_most is None else sum(ms > at_most for _, _, ms in tracked),
         "per_second": 1000 / float(np.mean(ms)),
         "single_ms_p50": float(np.median(single_ms)),
     }

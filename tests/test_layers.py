@@ -25,6 +25,7 @@ ORDER = (
     "localization",
     "calibration",
     "evaluation",
+    "learning",
     "map",
     "reports",
     "service",

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from evercal.geometry import SE3 as SE3
     from evercal.geometry import Camera as Camera
     from evercal.geometry import UncertainPose as UncertainPose
+    from evercal.learning.scene import LearnReport as LearnReport
     from evercal.localization.estimate import PoseEstimate as PoseEstimate
     from evercal.localization.query import LocalizeOptions as LocalizeOptions
-    from evercal.map import LearnReport as LearnReport
     from evercal.map import Map as Map
     from evercal.mapping.build import MapOptions as MapOptions
     from evercal.recordings import Frame as Frame
@@ -37,7 +37,7 @@ _PUBLIC = {
     "Client": "evercal.service.client",
     "Frame": "evercal.recordings",
     "InputError": "evercal.errors",
-    "LearnReport": "evercal.map",
+    "LearnReport": "evercal.learning.scene",
     "LocalizeOptions": "evercal.localization.query",
     "Map": "evercal.map",
     "MapOptions": "evercal.mapping.build",

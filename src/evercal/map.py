@@ -8,9 +8,8 @@ images loads no module that learns or calibrates.
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -25,51 +24,21 @@ if TYPE_CHECKING:
 
     from evercal.calibration.calibration import Calibration, Mount
     from evercal.calibration.drift import Shift
-    from evercal.calibration.eye_in_hand import HandEyeReport
     from evercal.calibration.from_images import ImageSource
     from evercal.evaluation import Scores
     from evercal.geometry import SE3, Camera
+    from evercal.learning.many import Learned
+    from evercal.learning.scene import LearnReport
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.localizer import Localizer
     from evercal.localization.query import LocalizeOptions
     from evercal.localization.refreshing import RefreshReport
     from evercal.localization.tracking import TrackedFrame, TrackOptions
-    from evercal.mapping.build import Adjusted, MapOptions, OnProgress
+    from evercal.mapping.build import MapOptions, OnProgress
     from evercal.mapping.manage import Merged, OnClash
-    from evercal.mapping.memory_budget import MemoryBudget
     from evercal.mapping.refresh import RefreshOptions
 
 PathLike = str | os.PathLike[str]
-
-
-@dataclass(frozen=True)
-class LearnReport:
-    """Outcome of learning a scene, as JSON values."""
-
-    scene: str
-    """Name of the scene."""
-    seconds: float
-    """Wall time."""
-    memory_bytes: int
-    """Size of the keyframes of all scenes."""
-    frames_kept: int
-    """Keyframes of this scene."""
-    train_frames: int
-    """Frames that were learned."""
-    held_out_frames: int
-    """Frames that acceptance was fitted to."""
-    min_support: float = 0.0
-    """Support below which poses in this scene are rejected."""
-    landmarks: int = 0
-    """Landmarks of this scene."""
-    adjusted: Adjusted | None = None
-    """Changes by bundle adjustment; None for networks."""
-    hand_eye: HandEyeReport | None = None
-    """The estimated camera on the gripper; None where the recording states camera poses."""
-    iterations: int = 0
-    """Training steps; 0 for a map."""
-    head_bytes: int = 0
-    """Size of the networks; 0 for a map."""
 
 
 class Map:
@@ -167,67 +136,83 @@ class Map:
             InputError: A recording that cannot be used, a name that is taken, or another process
                 is writing into the map.
         """
-        from evercal.localization.fit_acceptance import fit_acceptance
-        from evercal.mapping.build import MapOptions, build_map
-        from evercal.mapping.memory_budget import MemoryBudget
-        from evercal.recordings import load_recording, posed_recording
-        from evercal.recordings.frame import MIN_GRIPPER_FRAMES, MIN_TRAIN_FRAMES
-        from evercal.recordings.held_out import (
-            lacks_camera_poses,
-            named_recording,
-            require_frames,
-            split_held_out,
-        )
+        from evercal.learning.scene import learn_scene
+        from evercal.recordings import load_recording
+        from evercal.recordings.held_out import named_recording
 
-        began = time.perf_counter()
-        budget = MemoryBudget.parse(memory)
         loaded = recording if isinstance(recording, Recording) else load_recording(recording)
         loaded = named_recording(loaded, name, self.scenes)
         with self._store.writing():
-            contents, start, least = self._store.contents, None, MIN_TRAIN_FRAMES
-            options = options or MapOptions()
-            if lacks_camera_poses(loaded):
-                from evercal.calibration.eye_in_hand import posed_by_gripper
-
-                posed = posed_by_gripper(loaded, contents.encoder, on_progress)
-                loaded, start, options = posed.recording, posed.start, options.for_hand_eye()
-                least, budget = MIN_GRIPPER_FRAMES, replace(budget, least=MIN_GRIPPER_FRAMES)
-            loaded = posed_recording(loaded)
-            require_frames(loaded, least)
-            split = split_held_out(loaded.train)
-            options = _sized(options, budget, contents.short_side)
-            built = build_map(loaded.name, split.train, contents.encoder, options, on_progress)
-            built = replace(built, scene=replace(built.scene, metric=loaded.metric))
-            if budget.auto:
-                from evercal.localization.fewest_keyframes import fewest_keyframes
-
-                built = built.take(fewest_keyframes(contents, built, split.train, on_progress))
-            scene = fit_acceptance(
-                # Alone in a map, so that the threshold does not depend on the other scenes.
-                contents.empty().with_scene(built.scene),
-                built.corrected(split.held_out),
-                left_out=built.left_out(split.train),
-                noise=built.independent_noise,
+            contents = self._store.contents
+            scene, report = learn_scene(
+                loaded, contents, memory, gripper_from_camera, options, on_progress
             )
-            report = LearnReport(
-                scene=scene.name,
-                seconds=time.perf_counter() - began,
-                memory_bytes=contents.with_scene(scene).memory_bytes,
-                frames_kept=len(scene.keyframes),
-                train_frames=len(split.train),
-                held_out_frames=len(split.held_out),
-                min_support=scene.min_support,
-                landmarks=scene.landmarks,
-                adjusted=built.adjusted,
-            )
-            if start is not None:
-                from evercal.calibration.eye_in_hand import hand_eye_report
-
-                hand_eye = hand_eye_report(start, built, gripper_from_camera)
-                report = replace(report, hand_eye=hand_eye)
             self._store.commit(scene, asdict(report))
         self._localizer = None
         return report
+
+    def learn_many(
+        self,
+        recordings: Iterable[PathLike | Recording],
+        *,
+        workers: int = 2,
+        memory: str | int | None = None,
+        options: MapOptions | None = None,
+        on_scene: Callable[[LearnReport], object] = lambda _: None,
+        on_progress: OnProgress = lambda *_: None,
+    ) -> tuple[LearnReport, ...]:
+        """Learn recordings in several processes at once; the map is as if learned in turn.
+
+        Scenes are added in the order of the recordings. A recording that cannot be used does not
+        stop the others.
+
+        Args:
+            recordings: Recordings or their paths.
+            workers: Processes; they share the threads of this machine.
+            memory: Keyframes of each scene, as for `learn`.
+            options: Sizes and priors of the map.
+            on_scene: Called after each scene was added.
+            on_progress: Called with the step, the recordings done, and their number.
+
+        Raises:
+            InputError: A name that is taken, before anything is learned; or, after the others were
+                learned, recordings that cannot be used.
+        """
+        from evercal.learning.many import LearnTask, learn_scenes
+        from evercal.mapping.memory_budget import MemoryBudget
+        from evercal.recordings import load_recording
+        from evercal.recordings.held_out import named_recording
+
+        MemoryBudget.parse(memory)
+        loaded: list[Recording] = []
+        for item in recordings:
+            recording = item if isinstance(item, Recording) else load_recording(item)
+            taken = {*self.scenes, *(other.name for other in loaded)}
+            loaded.append(named_recording(recording, None, taken))
+        reports: list[LearnReport] = []
+        failed: list[str] = []
+        with self._store.writing():
+            task = LearnTask(self._store.contents.empty(), memory, options)
+            ready: dict[int, Learned] = {}
+            on_progress("learning", 0, len(loaded))
+            for done, outcome in enumerate(learn_scenes(task, loaded, workers), 1):
+                on_progress("learning", done, len(loaded))
+                ready[outcome.number] = outcome
+                while (learned := ready.pop(len(reports) + len(failed), None)) is not None:
+                    if learned.scene is None or learned.report is None:
+                        failed.append(f"{loaded[learned.number].name} ({learned.error})")
+                        continue
+                    size = self._store.contents.with_scene(learned.scene).memory_bytes
+                    report = replace(learned.report, memory_bytes=size)
+                    self._store.commit(learned.scene, asdict(report))
+                    self._localizer = None
+                    reports.append(report)
+                    on_scene(report)
+        if failed:
+            raise InputError(
+                f"{len(failed)} of {len(loaded)} recordings were not learned: {'; '.join(failed)}"
+            )
+        return tuple(reports)
 
     def refresh(
         self,
@@ -438,14 +423,3 @@ class Map:
         from evercal.evaluation.score_scenes import evaluate
 
         return evaluate(self.localizer, recordings)
-
-
-def _sized(options: MapOptions, budget: MemoryBudget, short_side: int) -> MapOptions:
-    """Options with the memory of a scene and the working size of a map."""
-    from evercal.mapping.memory_budget import MemoryBudget
-
-    if budget.auto:
-        from evercal.localization.fewest_keyframes import MOST_SHARE
-
-        budget = MemoryBudget(share=MOST_SHARE)
-    return replace(options, memory=budget, size=replace(options.size, cells=short_side))

@@ -13,8 +13,9 @@ from evercal.calibration.eye_in_hand import lacks_camera_poses
 from evercal.calibration.verdict import TIERS, tier
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
+from evercal.learning.scene import LearnReport
 from evercal.localization.localizer import Localizer
-from evercal.map import LearnReport, Map
+from evercal.map import Map
 from evercal.mapping.scene_map import MapContents
 from evercal.recordings import Recording, load_recording
 from evercal.recordings.samples import FOLDER

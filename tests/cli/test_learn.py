@@ -228,6 +228,6 @@ def test_other_folders_are_not_overwritten(
 
 
 def test_json_fields_are_those_of_the_report() -> None:
-    from evercal.map import LearnReport
+    from evercal.learning.scene import LearnReport
 
     assert {field.name for field in dataclasses.fields(LearnReport)} == KEYS

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import threading
+import time
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -91,8 +95,52 @@ def test_a_time_budget_leaves_steps_out_and_names_them(hall_map: MapContents) ->
     assert "turned images" in short.omitted
     assert "unknown intrinsics" in short.omitted
     assert short.milliseconds < 0.5 * long.milliseconds
-    tracker = Tracker(localizer, options=TrackOptions(at_most_ms=1.0))
-    assert tracker.track(noise).estimate.omitted == short.omitted
+
+
+def test_a_time_for_a_frame_is_kept_while_frames_are_located(
+    hall_map: MapContents, views: list[tuple[np.ndarray, SE3]]
+) -> None:
+    localizer, images = Localizer(hall_map), [image for image, _ in views]
+    localizer.localize(images[0])
+    slow, ended = Localizer.located, threading.Event()
+
+    def located(self: Localizer, *given: Any) -> Any:
+        ended.wait(30)
+        return slow(self, *given)
+
+    tracker = Tracker(localizer, options=TrackOptions(at_most_ms=100.0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Localizer, "located", located)
+        frames = [tracker.track(images[0], 0.0), tracker.track(images[1], 0.02)]
+        ended.set()
+        deadline = time.monotonic() + 30
+        while (frame := tracker.track(images[2], 0.04)).state == "lost":
+            assert time.monotonic() < deadline
+            frames.append(frame)
+    assert {frame.state for frame in frames} == {"lost"}
+    assert all("localization" in frame.estimate.omitted for frame in frames)
+    assert frame.state == "relocalized"
+    pose = frame.estimate.base_from_camera
+    assert pose is not None
+    assert pose_distance(pose, views[2][1])[0] < 0.01
+    assert tracker.track(images[3], 0.06).state == "tracking"
+
+
+def test_a_dark_frame_ends_the_tracking_in_time(
+    hall_map: MapContents, views: list[tuple[np.ndarray, SE3]]
+) -> None:
+    localizer, images = Localizer(hall_map), [image for image, _ in views]
+    localizer.localize(images[0])
+    tracker = Tracker(localizer, options=TrackOptions(at_most_ms=1000.0))
+    assert [tracker.track(image, 0.1 * i).state for i, image in enumerate(images[:3])] == [
+        "relocalized",
+        "tracking",
+        "tracking",
+    ]
+    tracker.options = TrackOptions(at_most_ms=1.0)
+    dark = tracker.track(np.zeros_like(images[0]), 0.3)
+    assert (dark.state, dark.estimate.base_from_camera) == ("lost", None)
+    assert "localization" in dark.estimate.omitted
 
 
 def smoothed(positions_m: list[float], sigma_m: float = 0.001) -> tuple[list[float], list[bool]]:

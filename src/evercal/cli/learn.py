@@ -18,7 +18,7 @@ from evercal.errors import InputError
 if TYPE_CHECKING:
     from evercal.calibration.eye_in_hand import HandEyeReport
     from evercal.geometry import SE3
-    from evercal.map import LearnReport
+    from evercal.learning.scene import LearnReport
     from evercal.mapping.build import Adjusted
     from evercal.recordings import Recording
 
@@ -27,16 +27,17 @@ if TYPE_CHECKING:
 class Learn:
     """Learn a scene from a recording; scenes learned before do not change.
 
-    A recording with gripper poses and no camera poses also yields gripper_from_camera. Training of
-    a network continues where it was stopped.
+    A recording with gripper poses and no camera poses also yields gripper_from_camera. Several
+    recordings become one scene each, several at once with --workers. Training of a network
+    continues where it was stopped.
 
     Example: evercal learn cell.evercal wrist_recording/ --calibration wrist.json
     """
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the map; created if it is missing."""
-    scene: Annotated[Positional[Path], arg(metavar="RECORDING")]
-    """Folder of the recording, or file of a bag."""
+    recordings: Annotated[Positional[tuple[Path, ...]], arg(metavar="RECORDING")]
+    """Folders of recordings, or files of bags."""
     name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Name of the scene. Default: the recording's own name."""
     memory: Annotated[str | None, arg(metavar="SHARE|BYTES|auto", help_behavior_hint="")] = None
@@ -54,26 +55,72 @@ class Learn:
     """How the recording is read."""
     networks: Annotated[NetworkOptions, arg(name="")] = field(default_factory=NetworkOptions)
     """Strategies that train a network."""
+    workers: Annotated[int, arg(metavar="N")] = 1
+    """Recordings that are learned at once; the threads of this machine are shared."""
     device: Device = "auto"
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
         """Learn and print a summary."""
-        require_writable(self.calibration, "--calibration")
-        from evercal.mapping.memory_budget import MemoryBudget
+        if not self.recordings:
+            raise InputError("no recording given; name one or more")
+        if self.workers < 1:
+            raise InputError(f"--workers {self.workers}: give a number >= 1")
+        return self._run_one(self.recordings[0]) if len(self.recordings) == 1 else self._run_many()
 
-        try:
-            MemoryBudget.parse(self.memory)
-        except InputError as error:
-            raise InputError(f"--{error}") from None
+    def _run_many(self) -> int:
+        """Learn several recordings; print a summary of each."""
+        self._refuse(
+            "several recordings are learned; omit the option or give one recording",
+            name=self.name,
+            calibration=self.calibration,
+            gripper_from_camera=self.gripper_from_camera,
+        )
+        if (self.strategy or strategy_of(self.store) or MAP) != MAP:
+            raise InputError("several recordings: a network learns one at a time; give one")
+        self._require_parsed_memory()
+        self.networks.refuse()
+        from evercal.map import Map
+
+        loaded = [self.reading.recording(path, None) for path in self.recordings]
+        cell = Map.open(self.store, device=self.device, encoder=self._encoder())
+        stream = sys.stderr if self.json else sys.stdout
+        with Bars(f"{len(loaded)} recordings, {self.workers} at once", stream) as bars:
+
+            def show(report: "LearnReport") -> None:
+                bars.write("\n".join(summary(report)))
+
+            reports = cell.learn_many(
+                loaded,
+                workers=self.workers,
+                memory=self.memory,
+                on_scene=show,
+                on_progress=bars.step,
+            )
+        if self.json:
+            print_json({"scenes": [dataclasses.asdict(report) for report in reports]})
+            return 0
+        print_next("evercal", "localize", self.store, "IMAGE")
+        return 0
+
+    def _run_one(self, path: Path) -> int:
+        if self.workers > 1:
+            raise InputError(f"--workers {self.workers}: one recording is learned; omit the option")
+        require_writable(self.calibration, "--calibration")
+        self._require_parsed_memory()
         from evercal.calibration.eye_in_hand import lacks_camera_poses
         from evercal.recordings import posed_recording
         from evercal.recordings.held_out import split_held_out
 
-        recording = self.reading.recording(self.scene, self.name)
+        recording = self.reading.recording(path, self.name)
         if not lacks_camera_poses(recording):
-            self._refuse_hand_eye(recording.name)
+            self._refuse(
+                f"{recording.name} states camera poses, so gripper_from_camera is not estimated;"
+                " omit the option",
+                gripper_from_camera=self.gripper_from_camera,
+                calibration=self.calibration,
+            )
             recording = posed_recording(recording)
         held_out = len(split_held_out(recording.train).held_out)
         start = (
@@ -99,7 +146,7 @@ class Learn:
             align = ("evercal", "align", self.store, report.scene)
             print_next(*align, "IMAGE...", "--robot-poses", "FILE")
         elif recording.test:
-            scene = str(self.scene) if self.name is None else f"{self.name}={self.scene}"
+            scene = str(path) if self.name is None else f"{self.name}={path}"
             print_next("evercal", "evaluate", self.store, scene)
         else:
             print_next("evercal", "localize", self.store, "IMAGE")
@@ -114,15 +161,14 @@ class Learn:
                 f"--strategy {strategy}: {self.store} was made with {made_with}; omit the option or"
                 " start a new store"
             )
-        if self.encoder is not None and not self.encoder.is_file():
-            raise InputError(f"--encoder {self.encoder}: no such file")
+        encoder = self._encoder()
         rough = self._rough()
         if strategy != MAP:
             request = LearnRequest(
                 self.store,
                 strategy,
                 self.memory or "10%",
-                self.encoder,
+                encoder,
                 self.device,
                 rough,
                 self.networks,
@@ -131,7 +177,7 @@ class Learn:
         self.networks.refuse()
         from evercal.map import Map
 
-        cell = Map.open(self.store, device=self.device, encoder=self.encoder)
+        cell = Map.open(self.store, device=self.device, encoder=encoder)
         with Bars(start, stream) as bars:
             return cell.learn(
                 recording, memory=self.memory, gripper_from_camera=rough, on_progress=bars.step
@@ -144,16 +190,25 @@ class Learn:
 
         return read_transform(self.gripper_from_camera)
 
-    def _refuse_hand_eye(self, scene: str) -> None:
-        for option, value in (
-            ("--gripper-from-camera", self.gripper_from_camera),
-            ("--calibration", self.calibration),
-        ):
+    def _encoder(self) -> Path | None:
+        if self.encoder is not None and not self.encoder.is_file():
+            raise InputError(f"--encoder {self.encoder}: no such file")
+        return self.encoder
+
+    def _require_parsed_memory(self) -> None:
+        from evercal.mapping.memory_budget import MemoryBudget
+
+        try:
+            MemoryBudget.parse(self.memory)
+        except InputError as error:
+            raise InputError(f"--{error}") from None
+
+    @staticmethod
+    def _refuse(why: str, **options: object) -> None:
+        """Refuse options that were given and do not apply."""
+        for name, value in options.items():
             if value is not None:
-                raise InputError(
-                    f"{option} {value}: {scene} states camera poses, so gripper_from_camera is not"
-                    " estimated; omit the option"
-                )
+                raise InputError(f"--{name.replace('_', '-')} {value}: {why}")
 
     def _write_hand_eye(self, report: "LearnReport") -> None:
         from evercal.cli.stores import open_localizer

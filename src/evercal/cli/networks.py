@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
     from evercal.geometry import SE3
-    from evercal.map import LearnReport
+    from evercal.learning.scene import LearnReport
     from evercal.recordings import Recording
 
 
@@ -124,6 +124,12 @@ class Bars:
             self._close()
         return bar
 
+    def write(self, text: str) -> None:
+        """Print lines above the bar."""
+        from tqdm import tqdm
+
+        tqdm.write(text, file=self._stream)
+
     def event(self, event: object) -> None:
         """Show an event of network training."""
         from evercal.continual.learning.learn_scene import MapProgress
@@ -145,4 +151,10 @@ class Bars:
             self._bar = None
 
 
-_UNITS = {"encoding": "image", "mapping": "keyframe", "matching": "pair", "adjusting": "round"}
+_UNITS = {
+    "encoding": "image",
+    "learning": "scene",
+    "mapping": "keyframe",
+    "matching": "pair",
+    "adjusting": "round",
+}

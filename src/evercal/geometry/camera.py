@@ -106,12 +106,17 @@ class Camera:
         Beyond it the polynomial folds back, so points far outside the view land in the image.
         """
         k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
-        squared = np.polynomial.Polynomial([0, 1])
-        above = np.polynomial.Polynomial([1, k1, k2, k3])
-        below = np.polynomial.Polynomial([1, k4, k5, k6])
-        slope = above * below + 2 * squared * (above.deriv() * below - above * below.deriv())
-        turns = np.concatenate([slope.trim().roots(), below.trim().roots()])
-        real = turns.real[(np.abs(turns.imag) < 1e-9) & (turns.real > 0)]
+        if not (k4 or k5 or k6):
+            roots = np.polynomial.polynomial.polyroots(
+                np.trim_zeros([1.0, 3 * k1, 5 * k2, 7 * k3], "b")
+            )
+        else:
+            squared = np.polynomial.Polynomial([0, 1])
+            above = np.polynomial.Polynomial([1, k1, k2, k3])
+            below = np.polynomial.Polynomial([1, k4, k5, k6])
+            slope = above * below + 2 * squared * (above.deriv() * below - above * below.deriv())
+            roots = np.concatenate([slope.trim().roots(), below.trim().roots()])
+        real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
         return math.sqrt(min(real, default=math.inf))
 
     @property
@@ -186,15 +191,21 @@ class Camera:
             both focal lengths, the principal point in pixels, k1 and k2.
         """
         plane = np.asarray(plane, dtype=np.float64)
-        focal, r2 = np.array([self.fx, self.fy]), (plane**2).sum(-1)
+        x, y = plane[..., 0], plane[..., 1]
+        (u, v), (a, b, d) = self._distorted(x, y)
+        # One row for each entry: products of small matrices take several times as long.
+        by_plane, lens = np.empty((2, 2, *x.shape)), np.zeros((2, 5, *x.shape))
+        by_plane[0, 0], by_plane[0, 1] = self.fx * a, self.fx * b
+        by_plane[1, 0], by_plane[1, 1] = self.fy * b, self.fy * d
+        r2 = x * x + y * y
         _, _, _, _, _, k4, k5, k6 = self.coefficients
-        below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        lens = np.zeros((*plane.shape, 5))
-        lens[..., 0] = self._distort(plane) * focal
-        lens[..., 0, 1] = lens[..., 1, 2] = 1
-        lens[..., 3] = plane * (r2 / below)[..., None] * focal
-        lens[..., 4] = plane * (r2**2 / below)[..., None] * focal
-        return self._distortion_slope(plane) * focal[:, None], lens
+        first = r2 / (1 + r2 * (k4 + r2 * (k5 + r2 * k6))) if k4 or k5 or k6 else r2
+        for row, focal, ideal, distorted in ((0, self.fx, x, u), (1, self.fy, y, v)):
+            lens[row, 0] = focal * distorted
+            lens[row, 1 + row] = 1
+            lens[row, 3] = focal * ideal * first
+            lens[row, 4] = lens[row, 3] * r2
+        return np.moveaxis(by_plane, (0, 1), (-2, -1)), np.moveaxis(lens, (0, 1), (-2, -1))
 
     def to_dict(self) -> dict[str, object]:
         """Plain numbers for JSON."""
@@ -216,32 +227,34 @@ class Camera:
 
     def _distort(self, plane: Array) -> Array:
         """(..., 2) ideal to distorted points of the plane z = 1."""
-        _, _, p1, p2, *_ = self.coefficients
-        x, y = plane[..., 0], plane[..., 1]
-        r2 = x * x + y * y
-        radial, _ = self._radial(r2)
-        u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        (u, v), _ = self._distorted(plane[..., 0], plane[..., 1])
         return np.stack([u, v], axis=-1)
 
-    def _distortion_slope(self, plane: Array) -> Array:
-        """(..., 2, 2) derivatives of distorted by ideal points (..., 2) of the plane z = 1."""
+    def _distorted(self, x: Array, y: Array) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
+        """Distorted points (u, v), and their derivatives du/dx, du/dy = dv/dx and dv/dy."""
         _, _, p1, p2, *_ = self.coefficients
-        x, y = plane[..., 0], plane[..., 1]
-        radial, change = self._radial(x * x + y * y)
-        slope = np.empty((*plane.shape, 2))
-        slope[..., 0, 0] = radial + 2 * x * x * change + 2 * p1 * y + 6 * p2 * x
-        slope[..., 0, 1] = slope[..., 1, 0] = 2 * (x * y * change + p1 * x + p2 * y)
-        slope[..., 1, 1] = radial + 2 * y * y * change + 6 * p1 * y + 2 * p2 * x
-        return slope
+        r2 = x * x + y * y
+        radial, change = self._radial(r2)
+        twice = 2 * change
+        u, v, cross = x * radial, y * radial, x * y * twice
+        a, d = radial + x * x * twice, radial + y * y * twice
+        if p1 or p2:
+            u = u + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+            v = v + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+            cross = cross + 2 * (p1 * x + p2 * y)
+            a, d = a + 2 * p1 * y + 6 * p2 * x, d + 6 * p1 * y + 2 * p2 * x
+        return (u, v), (a, cross, d)
 
     def _radial(self, r2: Array) -> tuple[Array, Array]:
         """Radial scale of points at squared distances from the axis, and its derivative by them."""
         k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
+        above = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        steeper = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+        if not (k4 or k5 or k6):
+            return above, steeper
         below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
-        steeper = k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))
-        return radial, steeper / below
+        radial = above / below
+        return radial, (steeper - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
 
     def _undistorted(self, distorted: Array) -> Array:
         """(..., 2) distorted to ideal points of the plane z = 1; NaN outside their range."""
@@ -249,12 +262,11 @@ class Camera:
         for _ in range(50):  # Newton's method: a few steps but close to `widest`
             far = np.sqrt((plane**2).sum(-1, keepdims=True))
             plane = plane * np.minimum(1, 0.999999 * self.widest / np.maximum(far, 1e-12))
-            off = self._distort(plane) - distorted
-            lost = np.abs(off).max(-1) > _EXACT
+            at, (a, b, d) = self._distorted(plane[..., 0], plane[..., 1])
+            u, v = at[0] - distorted[..., 0], at[1] - distorted[..., 1]
+            lost = np.maximum(np.abs(u), np.abs(v)) > _EXACT
             if not lost.any():
                 break
-            (a, b), (_, d) = np.moveaxis(self._distortion_slope(plane), (-2, -1), (0, 1))
-            u, v = off[..., 0], off[..., 1]
             step = np.stack([d * u - b * v, a * v - b * u], -1) / (a * d - b * b)[..., None]
             plane = plane - step
         return np.where(lost[..., None], np.nan, plane)

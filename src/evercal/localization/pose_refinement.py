@@ -88,7 +88,7 @@ def refine_pose(
         slope = white[:, 0, None] * slope[0] + white[:, 1, None] * slope[1]
         squares = (residual**2).sum(0)
         # Robust scale: the median of a 2-D Gaussian's squared norm is 1.386 variances.
-        variance = max(float(np.median(squares)) / 1.386, 0.05)
+        variance = max(_median(squares) / 1.386, 0.05)
         root = 1 / np.sqrt(1 + squares / variance)
         rows = (slope * root).transpose(1, 0, 2).reshape(count, -1)
         data = rows @ rows.T + 1e-9 * np.eye(count)
@@ -116,6 +116,13 @@ def refine_pose(
     return RefinedPose(
         pose, np.hypot(*raw), current, moved, covariance[6:, 6:], variance, by_intrinsics
     )
+
+
+def _median(values: Array) -> float:
+    """Median of (n,) values; np.median takes three times as long for some hundred of them."""
+    half = len(values) // 2
+    middle = np.partition(values, (half - 1, half))[half - 1 : half + 1]
+    return float(middle[1] if len(values) % 2 else middle.mean())
 
 
 def changed_camera(camera: Camera, change: Array) -> Camera:

@@ -93,6 +93,11 @@ class TimeBudget:
     omitted: list[str] = field(default_factory=list)
     """Steps that were left out."""
 
+    @property
+    def left_s(self) -> float:
+        """Time that is left, seconds."""
+        return self.until - time.perf_counter()
+
     def allows(self, step: str, expected_s: float) -> bool:
         """Whether a step of an expected duration fits; one that does not is noted."""
         fits = time.perf_counter() + expected_s <= self.until

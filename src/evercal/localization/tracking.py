@@ -7,7 +7,7 @@ that does not is located from nothing.
 
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -15,12 +15,18 @@ import torch
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, pose_distance
+from evercal.localization.background_search import BackgroundSearch
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer, cameras_in_scenes, prior_of
-from evercal.localization.query import Candidate, Hypothesis, Query
+from evercal.localization.query import Candidate, Hypothesis, Query, TimeBudget
 from evercal.recordings.images import as_rgb
 
 TrackState = Literal["tracking", "relocalized", "lost"]
+_SEARCHING = "localization takes longer than the time for a frame"
+_MARGIN = 1.3
+"""An alignment may take so many times as long as the last one."""
+_ANSWER_S = 0.002
+"""Time to answer after waiting."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +46,8 @@ class TrackOptions:
     settled: float = 2.0
     """The prediction counts if the last support was so many times the threshold."""
     at_most_ms: float | None = None
-    """Time for a frame; steps that would exceed it are left out, see `PoseEstimate.omitted`."""
+    """Time for a frame. Where alignment fails, the frame is located in the background, and frames
+    are answered as `lost` meanwhile, see `PoseEstimate.omitted`. One alignment always runs."""
     smooth: float = 0.0
     """Time constant of the smoothed pose in seconds; 0 returns measurements."""
     jump_sigmas: float = 4.0
@@ -86,6 +93,10 @@ class Tracker:
     _change: NDArray[np.floating] | None = None
     _smoothed: tuple[float, SE3] | None = None
     _number: int = 0
+    _alignment_s: float = 0.0
+    """Time of the last alignment."""
+    _search: BackgroundSearch | None = None
+    """Locates frames, where the time for a frame is limited."""
 
     def track(self, image: np.ndarray, stamp_s: float | None = None) -> TrackedFrame:
         """Locate the next frame.
@@ -99,18 +110,12 @@ class Tracker:
         """
         number, self._number = self._number, self._number + 1
         stamp = number * self.options.fallback_s if stamp_s is None else stamp_s
-        began = time.perf_counter()
-        estimate = self._near_prediction(as_rgb(image), stamp)
-        state: TrackState = "tracking"
-        if estimate is None:
-            left = self.options.at_most_ms
-            if left is not None:
-                left -= 1000 * (time.perf_counter() - began)
-            estimate, found = self.localizer.located(image, self.camera, left)
-            state = "relocalized" if estimate.status == "ok" else "lost"
-            self._poses.clear()
-            if estimate.status == "ok":
-                self._remember(found, stamp)
+        image = as_rgb(image)
+        if self.options.at_most_ms is None:
+            estimate, state = self._located(image, stamp)
+        else:
+            until = time.perf_counter() + self.options.at_most_ms / 1000
+            estimate, state = self._located_in_time(image, stamp, TimeBudget(until))
         smoothed, jumped = self._smooth(estimate, stamp)
         return TrackedFrame(number, stamp, state, estimate, smoothed, jumped)
 
@@ -122,7 +127,56 @@ class Tracker:
             stamp, image = item if isinstance(item, tuple) else (None, item)
             yield self.track(image, stamp)
 
-    def _near_prediction(self, image: np.ndarray, stamp: float) -> PoseEstimate | None:
+    def _located(self, image: np.ndarray, stamp: float) -> tuple[PoseEstimate, TrackState]:
+        estimate = self._near_prediction(image, stamp, TimeBudget())
+        if estimate is not None:
+            return estimate, "tracking"
+        estimate, found = self.localizer.located(image, self.camera)
+        self._poses.clear()
+        if estimate.status != "ok":
+            return estimate, "lost"
+        self._remember(found, stamp)
+        return estimate, "relocalized"
+
+    def _located_in_time(
+        self, image: np.ndarray, stamp: float, budget: TimeBudget
+    ) -> tuple[PoseEstimate, TrackState]:
+        """The same within a budget; what takes longer goes on in the background."""
+        began = time.perf_counter()
+        self._search = search = self._search or BackgroundSearch(self.localizer, self.camera)
+        adopted = search.under_way and self._adopted(search, budget)
+        estimate = self._near_prediction(image, stamp, budget)
+        if estimate is not None:
+            estimate = replace(estimate, omitted=tuple(budget.omitted))
+            return estimate, "relocalized" if adopted else "tracking"
+        self._poses.clear()
+        if not search.under_way:
+            search.start(image, stamp)
+            if (done := search.take(budget.left_s - _ANSWER_S)) is not None:
+                estimate, found = done[1]
+                if estimate.status == "ok":
+                    self._remember(found, stamp)
+                return estimate, "relocalized" if estimate.status == "ok" else "lost"
+        budget.allows("localization", np.inf)
+        spent = 1000 * (time.perf_counter() - began)
+        omitted = tuple(budget.omitted)
+        nothing = PoseEstimate("failed", _SEARCHING, None, None, None, 0, 0.0, spent)
+        return replace(nothing, omitted=omitted), "lost"
+
+    def _adopted(self, search: BackgroundSearch, budget: TimeBudget) -> bool:
+        """Take the pose of an earlier frame as prior, if it was found by now."""
+        earlier = search.take(budget.left_s - _MARGIN * self._alignment_s)
+        if earlier is None or earlier[1][0].status != "ok":
+            return False
+        stamp, (_, found) = earlier
+        assert found.pose is not None, "it was accepted"
+        self._scene, self._poses = found.scene, [(stamp, found.pose.pose)]
+        self._change = None if found.refined is None else found.refined.change
+        return True
+
+    def _near_prediction(
+        self, image: np.ndarray, stamp: float, budget: TimeBudget
+    ) -> PoseEstimate | None:
         """Align the landmarks around the predicted pose; None if that does not suffice."""
         began, predicted = time.perf_counter(), self._predicted(stamp)
         if predicted is None:
@@ -134,9 +188,13 @@ class Tracker:
         candidate = Candidate(self._scene, self._next_keyframes(predicted))
         change = np.zeros(5) if self._change is None else self._change
         for coarse in (False, True):
+            start = time.perf_counter()
+            if coarse and not budget.allows("coarse alignment", _MARGIN * self._alignment_s):
+                return None
             found = localizer.aligned(
                 query, candidate, cameras[self._scene], predicted, change, coarse
             )
+            self._alignment_s = time.perf_counter() - start
             if found is not None and self._trusted(found, predicted):
                 self._remember(found, stamp)
                 return localizer.answer(query, found, 1000 * (time.perf_counter() - began))

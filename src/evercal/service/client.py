@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from evercal.calibration.drift import Shift
     from evercal.calibration.from_images import ImageSource
     from evercal.geometry import SE3, Camera
+    from evercal.learning.scene import LearnReport
     from evercal.localization.estimate import PoseEstimate
-    from evercal.map import LearnReport
 
 Record = TypeVar("Record")
 Part = tuple[str, bytes]
@@ -147,7 +147,7 @@ class Client:
             InputError: A recording that cannot be used, a name that is taken, or no service
                 answers.
         """
-        from evercal.map import LearnReport
+        from evercal.learning.scene import LearnReport
 
         given = {"name": name, "memory": None if memory is None else str(memory)}
         fields = {key: value for key, value in given.items() if value is not None}

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from evercal.errors import InputError
+from evercal.learning.many import end_with_parent
 
 LEARNING, DONE, FAILED = "learning", "done", "failed"
 _EVERY_S = 0.2
@@ -51,7 +51,7 @@ def run(request: Request, out: Connection) -> None:
             (`done`, report) or (`failed`, message).
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service ends its jobs itself
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    end_with_parent()
     with suppress(OSError):
         os.nice(5)  # requests come first
     try:
@@ -60,13 +60,6 @@ def run(request: Request, out: Connection) -> None:
         out.send((FAILED, str(error)))
     except Exception as error:
         out.send((FAILED, f"internal error: {error!r}"))
-
-
-def _end_with(parent: int) -> None:
-    """End this process when the service was killed; the map keeps its last complete state."""
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(1)
 
 
 def _sender(out: Connection) -> Callable[[str, int, int], None]:

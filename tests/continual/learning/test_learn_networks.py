@@ -24,7 +24,7 @@ from evercal.continual.networks.trainer import Progress
 from evercal.continual.store import Checkpoint, NetworkStore, head_bytes
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.map import LearnReport
+from evercal.learning.scene import LearnReport
 from evercal.recordings import generic
 
 from ..stages import Rooms, Tree

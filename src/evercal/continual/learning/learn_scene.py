@@ -24,8 +24,8 @@ from evercal.errors import InputError
 from evercal.features.device import device_of
 from evercal.features.weights_file import network_bytes
 from evercal.geometry import SE3
+from evercal.learning.scene import LearnReport
 from evercal.localization.fit_acceptance import fit_acceptance
-from evercal.map import LearnReport
 from evercal.mapping.build import BuiltMap
 from evercal.recordings.frame import Frame, Recording, posed_recording
 from evercal.recordings.held_out import named_recording, require_frames, split_held_out

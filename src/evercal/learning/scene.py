@@ -1,0 +1,122 @@
+"""A scene of a map from a recording: keyframes, landmarks, adjusted poses, fitted acceptance."""
+
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from evercal.geometry import SE3
+from evercal.localization.fit_acceptance import fit_acceptance
+from evercal.mapping.build import Adjusted, MapOptions, OnProgress, build_map
+from evercal.mapping.memory_budget import MemoryBudget
+from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.recordings import posed_recording
+from evercal.recordings.frame import MIN_GRIPPER_FRAMES, MIN_TRAIN_FRAMES, Recording
+from evercal.recordings.held_out import lacks_camera_poses, require_frames, split_held_out
+
+if TYPE_CHECKING:
+    from evercal.calibration.eye_in_hand import HandEyeReport
+
+
+@dataclass(frozen=True)
+class LearnReport:
+    """Outcome of learning a scene, as JSON values."""
+
+    scene: str
+    """Name of the scene."""
+    seconds: float
+    """Wall time."""
+    memory_bytes: int
+    """Size of the keyframes of all scenes."""
+    frames_kept: int
+    """Keyframes of this scene."""
+    train_frames: int
+    """Frames that were learned."""
+    held_out_frames: int
+    """Frames that acceptance was fitted to."""
+    min_support: float = 0.0
+    """Support below which poses in this scene are rejected."""
+    landmarks: int = 0
+    """Landmarks of this scene."""
+    adjusted: Adjusted | None = None
+    """Changes by bundle adjustment; None for networks."""
+    hand_eye: "HandEyeReport | None" = None
+    """The estimated camera on the gripper; None where the recording states camera poses."""
+    iterations: int = 0
+    """Training steps; 0 for a map."""
+    head_bytes: int = 0
+    """Size of the networks; 0 for a map."""
+
+
+def learn_scene(
+    recording: Recording,
+    contents: MapContents,
+    memory: str | int | None = None,
+    gripper_from_camera: SE3 | None = None,
+    options: MapOptions | None = None,
+    on_progress: OnProgress = lambda *_: None,
+) -> tuple[SceneMap, LearnReport]:
+    """Build the map of one scene and fit its acceptance; nothing is written.
+
+    Args:
+        recording: Its training frames are learned; test frames are not read.
+        contents: Encoder, and the scenes that the report counts. The new scene does not depend on
+            them.
+        memory: Keyframes to keep, as for `Map.learn`.
+        gripper_from_camera: A rough one that the estimate is compared with.
+        options: Sizes and priors of the map; `memory` overrides theirs.
+        on_progress: Called with the current step, how much of it is done, and its total.
+
+    Raises:
+        InputError: The recording cannot be used.
+    """
+    began = time.perf_counter()
+    budget, options = MemoryBudget.parse(memory), options or MapOptions()
+    start, least = None, MIN_TRAIN_FRAMES
+    if lacks_camera_poses(recording):
+        from evercal.calibration.eye_in_hand import posed_by_gripper
+
+        posed = posed_by_gripper(recording, contents.encoder, on_progress)
+        recording, start, options = posed.recording, posed.start, options.for_hand_eye()
+        least, budget = MIN_GRIPPER_FRAMES, replace(budget, least=MIN_GRIPPER_FRAMES)
+    recording = posed_recording(recording)
+    require_frames(recording, least)
+    split = split_held_out(recording.train)
+    options = _sized(options, budget, contents.short_side)
+    built = build_map(recording.name, split.train, contents.encoder, options, on_progress)
+    built = replace(built, scene=replace(built.scene, metric=recording.metric))
+    if budget.auto:
+        from evercal.localization.fewest_keyframes import fewest_keyframes
+
+        built = built.take(fewest_keyframes(contents, built, split.train, on_progress))
+    scene = fit_acceptance(
+        # Alone in a map, so that the threshold does not depend on the other scenes.
+        contents.empty().with_scene(built.scene),
+        built.corrected(split.held_out),
+        left_out=built.left_out(split.train),
+        noise=built.independent_noise,
+    )
+    report = LearnReport(
+        scene=scene.name,
+        seconds=time.perf_counter() - began,
+        memory_bytes=contents.with_scene(scene).memory_bytes,
+        frames_kept=len(scene.keyframes),
+        train_frames=len(split.train),
+        held_out_frames=len(split.held_out),
+        min_support=scene.min_support,
+        landmarks=scene.landmarks,
+        adjusted=built.adjusted,
+    )
+    if start is not None:
+        from evercal.calibration.eye_in_hand import hand_eye_report
+
+        report = replace(report, hand_eye=hand_eye_report(start, built, gripper_from_camera))
+    return scene, report
+
+
+def _sized(options: MapOptions, budget: MemoryBudget, short_side: int) -> MapOptions:
+    """Options with the memory of a scene and the working size of a map."""
+    if budget.auto:
+        from evercal.localization.fewest_keyframes import MOST_SHARE
+
+        budget = MemoryBudget(share=MOST_SHARE)
+    return replace(options, memory=budget, size=replace(options.size, cells=short_side))

@@ -1,0 +1,176 @@
+"""Many recordings at once: the same map, in spite of bad recordings and killed workers."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evercal.errors import InputError
+from evercal.learning.many import LearnTask, learn_scenes
+from evercal.map import Map
+from evercal.recordings import Recording
+from evercal.recordings.frame import Frame
+from evercal.recordings.images import StoredImage
+
+
+class Deadly(StoredImage):
+    """An image whose first readers are killed."""
+
+    def __init__(self, pixels: np.ndarray, marks: Path, times: int):
+        self._pixels, self._marks, self._times = pixels, marks, times
+
+    def read(self) -> np.ndarray:
+        deaths = len(list(self._marks.iterdir()))
+        if deaths < self._times:
+            (self._marks / f"{deaths}").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return self._pixels
+
+
+def deadly(recording: Recording, marks: Path, times: int) -> Recording:
+    """The recording with an image that kills its reader."""
+    marks.mkdir()
+    first = recording.train[0]
+    image = Deadly(first.read_image(), marks, times)
+    return replace(recording, train=(replace(first, image=image), *recording.train[1:]))
+
+
+def poses(opened: Map, frames: tuple[Frame, ...]) -> list[np.ndarray]:
+    """Answers to images; nan for those that were rejected."""
+    answers = [opened.localize(frame.read_image()).base_from_camera for frame in frames]
+    return [np.full((4, 4), np.nan) if a is None else a.matrix() for a in answers]
+
+
+def test_the_map_is_that_of_learning_in_turn(
+    arcs: tuple[Recording, Recording], tmp_path: Path
+) -> None:
+    turn, many = Map.open(tmp_path / "turn"), Map.open(tmp_path / "many")
+    for recording in arcs:
+        turn.learn(recording, memory="40%")
+    seen, steps = [], []
+    reports = many.learn_many(
+        arcs,
+        memory="40%",
+        workers=2,
+        on_scene=lambda report: seen.append(report.scene),
+        on_progress=lambda *step: steps.append(step),
+    )
+    assert [report.scene for report in reports] == seen == ["one", "two"]
+    assert steps == [("learning", i, 2) for i in range(3)]
+    assert reports[0].memory_bytes < reports[1].memory_bytes
+    again = Map.open(tmp_path / "many")
+    assert again.scenes == turn.scenes
+    frames = (*arcs[0].test[::6], *arcs[1].test[::6])
+    a, b = poses(turn, frames), poses(again, frames)
+    assert np.isfinite(a).all()
+    # Threads of matrix products round differently.
+    np.testing.assert_allclose(a, b, atol=1e-7)
+
+
+def test_an_unusable_recording_does_not_stop_the_others(
+    rooms: tuple[Recording, ...], tmp_path: Path
+) -> None:
+    few = replace(rooms[0], name="few", train=rooms[0].train[:3])
+    opened = Map.open(tmp_path / "map")
+    with pytest.raises(InputError, match=r"1 of 3 recordings were not learned: few \(.*3 "):
+        opened.learn_many((rooms[0], few, rooms[1]), workers=2)
+    assert opened.scenes == Map.open(tmp_path / "map").scenes == ("alpha", "beta")
+
+
+def test_names_are_checked_before_anything_is_learned(
+    rooms: tuple[Recording, ...], tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match="alpha"):
+        Map.open(tmp_path / "map").learn_many((rooms[0], rooms[1], rooms[0]))
+    with pytest.raises(InputError, match="workers 0"):
+        Map.open(tmp_path / "map").learn_many(rooms[:2], workers=0)
+    assert not (tmp_path / "map/manifest.json").exists()
+
+
+def test_a_killed_worker_is_replaced(rooms: tuple[Recording, ...], tmp_path: Path) -> None:
+    once = deadly(rooms[0], tmp_path / "marks", 1)
+    opened = Map.open(tmp_path / "map")
+    reports = opened.learn_many((once, rooms[1]), workers=2)
+    assert [report.scene for report in reports] == ["alpha", "beta"]
+    assert len(list((tmp_path / "marks").iterdir())) == 1
+
+
+def test_a_recording_that_always_kills_is_given_up(
+    rooms: tuple[Recording, ...], tmp_path: Path
+) -> None:
+    always = deadly(rooms[0], tmp_path / "marks", 99)
+    opened = Map.open(tmp_path / "map")
+    with pytest.raises(InputError, match=r"alpha .*killed 3 times"):
+        opened.learn_many((always, rooms[1]), workers=2)
+    assert opened.scenes == ("beta",)
+    assert len(list((tmp_path / "marks").iterdir())) == 3
+
+
+PARENT = """
+import sys
+from evercal.map import Map
+
+if __name__ == "__main__":
+    Map.open(sys.argv[1]).learn_many(sys.argv[2:], workers=2)
+"""
+
+
+def test_workers_end_with_their_parent(rooms: tuple[Recording, ...], tmp_path: Path) -> None:
+    from evercal.recordings.formats import generic
+
+    for recording in rooms[:2]:
+        generic.write(tmp_path / recording.name, recording)
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT)
+    words = [tmp_path / "map", *(tmp_path / recording.name for recording in rooms[:2])]
+    with subprocess.Popen([sys.executable, script, *map(str, words)]) as parent:
+        children = wait_for(lambda: [c for c in children_of(parent.pid) if is_worker(c)])
+        parent.kill()
+    wait_for(lambda: not any(Path(f"/proc/{child}").exists() for child in children))
+
+
+def children_of(process: int) -> list[int]:
+    """Processes that another one has started, also from its threads."""
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            if int(status.read_text().rpartition(")")[2].split()[1]) == process:
+                found.append(int(status.parent.name))
+    return found
+
+
+def is_worker(process: int) -> bool:
+    """Whether a process is one of a pool, and not the tracker of its resources."""
+    try:
+        return b"spawn_main" in Path(f"/proc/{process}/cmdline").read_bytes()
+    except OSError:
+        return False
+
+
+def wait_for(condition):
+    """The first true value of a condition."""
+    deadline = time.monotonic() + 60
+    while not (value := condition()):
+        assert time.monotonic() < deadline, "it never became true"
+        time.sleep(0.05)
+    return value
+
+
+def test_stopping_early_ends_the_workers(rooms: tuple[Recording, ...]) -> None:
+    from evercal.features.encoder import load_encoder
+    from evercal.mapping.scene_map import MapContents
+
+    many = [replace(rooms[0], name=f"{i}") for i in range(4)]
+    outcomes = learn_scenes(LearnTask(MapContents(load_encoder(), 240)), many, 1)
+    assert next(iter(outcomes)).scene is not None
+    outcomes.close()  # pyright: ignore[reportAttributeAccessIssue]
+    wait_for(lambda: not [c for c in children_of(os.getpid()) if is_worker(c)])
