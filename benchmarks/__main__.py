@@ -23,6 +23,7 @@ VERBS = {
     "trainer": "time of a training step",
     "speed": "time of localization and SARS",
     "serve": "latency of the HTTP service, alone and while a scene is learned",
+    "faults": "commands that are killed, full disks and read-only folders",
     "intervals": "coverage of confidence intervals",
     "publish": "write results to results/NAME.jsonl",
     "tables": "generate the tables of the docs from results/",

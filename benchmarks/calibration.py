@@ -21,8 +21,8 @@ from evercal.calibration.from_images import Images, calibrate
 from evercal.errors import InputError
 from evercal.evaluation.metrics import CHI2_6
 from evercal.geometry import SE3
-from evercal.localization.localizer import Localizer
 from evercal.learning.scene import LearnReport
+from evercal.localization.localizer import Localizer
 from evercal.map import Map
 from evercal.recordings import Recording, load_recording
 from evercal.recordings.samples import FOLDER, ROOMS

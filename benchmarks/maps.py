@@ -18,8 +18,8 @@ from evercal.calibration.from_images import Images, calibrate
 from evercal.errors import InputError
 from evercal.evaluation import evaluate
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.localization.localizer import LocalizeOptions, Localizer
 from evercal.learning.scene import LearnReport
+from evercal.localization.localizer import LocalizeOptions, Localizer
 from evercal.map import Map
 from evercal.mapping.build import MapOptions
 from evercal.mapping.memory_budget import MemoryBudget

@@ -238,7 +238,7 @@ def of_format(
         return read(data)
     except KeyError as error:
         raise ValueError(f"{error} is missing") from None
-    except TypeError as error:
+    except (TypeError, AttributeError, IndexError) as error:
         raise ValueError(f"an entry has the wrong kind of value ({error})") from None
 
 

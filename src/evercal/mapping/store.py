@@ -266,7 +266,21 @@ def _move(source: Path, target: Path) -> None:
 
 
 def read_scene(folder: Path) -> SceneMap:
-    """Read a scene from its folder."""
+    """Read a scene from its folder.
+
+    Raises:
+        InputError: Files with other content than `write_scene` writes, whose checksums are right.
+    """
+    try:
+        return _read_scene(folder)
+    except (InputError, OSError):
+        raise
+    except Exception as error:  # nothing is assumed about what another program has written
+        reason = " ".join(repr(error).split())[:200]
+        raise InputError(f"{folder}: not a scene that evercal wrote ({reason})") from None
+
+
+def _read_scene(folder: Path) -> SceneMap:
     content = {"metric": True, **json.loads((folder / SCENE).read_text())}
     correction = None
     if (folder / CORRECTION).exists():

@@ -10,6 +10,8 @@ the one with the most images is read.
 """
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +65,12 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
         raise InputError(f"{folder}: no image has a pose; reconstruct with more overlap")
     images = _image_folder(root, folder, [image.name for image in posed])
     frames = tuple(
-        Frame(image.name, images / image.name, cameras[image.camera_id], _base_from_camera(image))
+        Frame(
+            image.name,
+            images / image.name,
+            cameras[image.camera_id],
+            _base_from_camera(folder, image),
+        )
         for image in posed
     )
     files = [p for p in images.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS]
@@ -95,6 +102,13 @@ def _is_model(folder: Path) -> bool:
     )
 
 
+_READ = "import pycolmap, sys; pycolmap.Reconstruction(sys.argv[1])"
+_LEAST_BYTES = 8
+"""No entry of a binary file is shorter."""
+_LEAST_S, _SLOWEST_BYTES_PER_S = 10.0, 5e6
+"""Time for reading a binary model."""
+
+
 def _read_models(root: Path) -> list[tuple[Path, Any]]:
     try:
         import pycolmap  # pyright: ignore[reportMissingImports]
@@ -109,12 +123,36 @@ def _read_models(root: Path) -> list[tuple[Path, Any]]:
         )
     models = []
     for folder in folders:
+        _require_ends(folder)
         try:
             models.append((folder, pycolmap.Reconstruction(str(folder))))
         except Exception as error:  # pycolmap passes C++ exceptions on as several types
             text = " ".join(str(error).split())[:200]
             raise InputError(f"{folder}: pycolmap cannot read the model: {text}") from None
     return models
+
+
+def _require_ends(folder: Path) -> None:
+    """Refuse binary files that pycolmap would read without end.
+
+    At the end of an incomplete file it goes on with what is left in memory. So a process of its
+    own reads the model first.
+    """
+    files = sorted(folder.glob("*.bin"))
+    for file in files:
+        size = file.stat().st_size
+        count = int.from_bytes(file.read_bytes()[:8], "little")
+        if size < 8 or count > (size - 8) / _LEAST_BYTES:
+            raise InputError(f"{file}: {size} bytes, too few for what it lists; copy it again")
+    seconds = _LEAST_S + sum(file.stat().st_size for file in files) / _SLOWEST_BYTES_PER_S
+    command = [sys.executable, "-c", _READ, str(folder)]
+    try:
+        if files:
+            subprocess.run(command, capture_output=True, timeout=seconds, check=False)
+    except subprocess.TimeoutExpired:
+        raise InputError(
+            f"{folder}: pycolmap does not finish reading it; a file is incomplete, copy it again"
+        ) from None
 
 
 def _camera(folder: Path, camera: Any) -> Camera:
@@ -141,11 +179,14 @@ def _camera(folder: Path, camera: Any) -> Camera:
         raise InputError(f"{folder}: {error}") from None
 
 
-def _base_from_camera(image: Any) -> SE3:
+def _base_from_camera(folder: Path, image: Any) -> SE3:
     camera_from_world: Any = image.cam_from_world
     if callable(camera_from_world):  # a method since pycolmap 3.12
         camera_from_world = camera_from_world()
-    return SE3.from_matrix(np.asarray(camera_from_world.matrix())).inverse()
+    try:
+        return SE3.from_matrix(np.asarray(camera_from_world.matrix())).inverse()
+    except ValueError as error:
+        raise InputError(f"{folder}: image {image.name}: {error}") from None
 
 
 def _image_folder(root: Path, folder: Path, names: list[str]) -> Path:

@@ -81,8 +81,11 @@ def _info(root: Path) -> dict[str, Any]:
         version = str(info["codebase_version"])
         if not version.startswith(("v2.", "v3.")):
             raise InputError(f"{file}: version {version}; this evercal reads v2 and v3")
-        if not isinstance(info["features"], dict) or not float(info["fps"]) > 0:
+        features = info["features"]
+        if not isinstance(features, dict) or not float(info["fps"]) > 0:
             raise ValueError("'features' is an object and 'fps' a number > 0")
+        if not all(isinstance(feature, dict) for feature in features.values()):
+            raise ValueError("every feature is an object")
         for name in ("data_path", "video_path"):
             if info.get(name) is not None:
                 path_inside(info[name], repr(name))
@@ -154,9 +157,14 @@ def _read_table(file: Path, columns: list[str]) -> Any:
     parquet = _parquet(file)
     try:
         return parquet.read_table(file, columns=columns).select(columns)
-    except Exception as error:  # pyarrow raises many types for damaged files
-        text = " ".join(str(error).split())[:200]
-        raise InputError(f"{file}: cannot be read: {text}") from None
+    except Exception as error:
+        raise _unreadable(file, error) from None
+
+
+def _unreadable(file: Path, error: Exception) -> InputError:
+    """The error for a damaged file; pyarrow raises many types."""
+    text = " ".join(str(error).split())[:200]
+    return InputError(f"{file}: cannot be read: {text}")
 
 
 def _images(
@@ -231,11 +239,15 @@ class _Embedded(StoredImage):
         return image_file(self._content())
 
     def _content(self) -> bytes:
-        with _parquet(self.path).ParquetFile(self.path) as file:
-            groups = range(file.num_row_groups)
-            ends = np.cumsum([file.metadata.row_group(group).num_rows for group in groups])
-        group = int(np.searchsorted(ends, self.row, side="right"))
-        cell = _row_group(self.path, group, self.key)[self.row - int(ends[group])]
+        parquet = _parquet(self.path)
+        try:
+            with parquet.ParquetFile(self.path) as file:
+                groups = range(file.num_row_groups)
+                ends = np.cumsum([file.metadata.row_group(group).num_rows for group in groups])
+            group = int(np.searchsorted(ends, self.row, side="right"))
+            cell = _row_group(self.path, group, self.key)[self.row - int(ends[group])]
+        except Exception as error:
+            raise _unreadable(self.path, error) from None
         if cell["bytes"]:
             return bytes(cell["bytes"])
         where = f"{self.path}: row {self.row}: image {cell['path']!r}"

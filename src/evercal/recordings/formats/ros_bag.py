@@ -176,7 +176,10 @@ def _bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
             f"{bag.path}: no camera_info for {image_topic} ({beside} is expected, there is"
             f" {' and '.join(topics) or 'none'}); record it, or give the intrinsics with --camera"
         )
-    message = next(bag.messages([beside])).content
+    first = next(bag.messages([beside]), None)
+    if first is None:
+        raise InputError(f"{bag.path}: {beside} has no message, although the bag lists some")
+    message = first.content
     try:
         return beside, _camera(message, image.rpartition("/")[2].startswith("image_rect"))
     except ValueError as error:

@@ -198,7 +198,10 @@ def _matrix(fields: Mapping[str, Any], data: Mapping[str, Any]) -> np.ndarray:
         what = f"camera {missing[0]!r}" if len(missing) < 4 else "'camera_matrix'"
         found = ", ".join(map(str, data)) or "nothing"
         raise ValueError(f"{what} is missing, there is {found}; {_EXPECTED}")
-    fx, fy, cx, cy = (_numbers([fields[name]], name)[0] for name in names)
+    numbers = [_numbers([fields[name]], name) for name in names]
+    if any(len(each) != 1 for each in numbers):
+        raise ValueError(f"{', '.join(names)} are numbers, got {[fields[name] for name in names]}")
+    (fx,), (fy,), (cx,), (cy,) = numbers
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 

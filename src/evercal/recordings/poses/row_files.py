@@ -165,12 +165,15 @@ def number_array(values: object, what: str) -> Array:
 
 
 def arrays_as_lists(path: Path) -> Any:
-    """An array of NPY as lists, or the arrays of NPZ by name; ValueError or BadZipFile."""
+    """An array of NPY as lists, or the arrays of NPZ by name; ValueError for damaged files."""
     with path.open("rb") as file:
-        loaded = np.load(file, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return loaded.tolist()
-        return {key: loaded[key].tolist() for key in loaded.files}
+        try:
+            loaded = np.load(file, allow_pickle=False)
+            if isinstance(loaded, np.ndarray):
+                return loaded.tolist()
+            return {key: loaded[key].tolist() for key in loaded.files}
+        except Exception as error:  # numpy raises many types for damaged files
+            raise ValueError(f"no readable arrays ({' '.join(str(error).split())[:200]})") from None
 
 
 def in_unit(stamps: Array, unit: str | None = None) -> Array:

@@ -61,15 +61,17 @@ class BagFile:
         try:
             self._reader = AnyReader(parts, default_typestore=types)
             self._reader.open()
+            found = self._reader.connections
+            links = [(str(x.topic), str(x.msgtype), int(x.msgcount)) for x in found]
         except Exception as error:  # damaged bags make rosbags raise many types
             raise InputError(f"{path}: rosbags cannot read it: {_reason(error)}") from None
         weakref.finalize(self, self._reader.close)
         self._lock = threading.Lock()
         self.kinds: dict[str, str] = {}
         self.counts: dict[str, int] = {}
-        for link in self._reader.connections:
-            self.kinds[link.topic] = link.msgtype
-            self.counts[link.topic] = self.counts.get(link.topic, 0) + link.msgcount
+        for topic, kind, count in links:
+            self.kinds[topic] = kind
+            self.counts[topic] = self.counts.get(topic, 0) + count
 
     def topics(self, *kinds: str) -> list[str]:
         """Names of the topics of some types that hold messages, sorted."""
