@@ -23,6 +23,8 @@ VERBS = {
     "trainer": "time of a training step",
     "speed": "time of localization and SARS",
     "serve": "latency of the HTTP service, alone and while a scene is learned",
+    "memory": "memory of a service and of a tracker over many images",
+    "many-recordings": "recordings learned at once, beside one after the other",
     "faults": "commands that are killed, full disks and read-only folders",
     "intervals": "coverage of confidence intervals",
     "publish": "write results to results/NAME.jsonl",
@@ -33,6 +35,7 @@ MODULES = {
     "handeye": "hand_eye",
     "handeye-boards": "hand_eye_boards",
     "many-keyframes": "many_keyframes",
+    "many-recordings": "many_recordings",
     "refresh": "changing_room",
     "tune": "tuning",
 }

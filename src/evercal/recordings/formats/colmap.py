@@ -125,7 +125,9 @@ def _read_models(root: Path) -> list[tuple[Path, Any]]:
     for folder in folders:
         _require_ends(folder)
         try:
-            models.append((folder, pycolmap.Reconstruction(str(folder))))
+            model = pycolmap.Reconstruction(str(folder))
+            _ = [image.name for image in model.images.values()]  # decodes UTF-8
+            models.append((folder, model))
         except Exception as error:  # pycolmap passes C++ exceptions on as several types
             text = " ".join(str(error).split())[:200]
             raise InputError(f"{folder}: pycolmap cannot read the model: {text}") from None
