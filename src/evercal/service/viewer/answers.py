@@ -52,7 +52,9 @@ class LocatedImage:
     tracked: Literal["tracking", "relocalized", "lost"] | None = None
     """State of a tracked frame; None for a single image."""
     stated: SE3 | None = None
-    """base_from_camera of the recording, if it has one."""
+    """base_from_camera that the estimate is compared with, if there is one."""
+    stated_by: str = "stated pose"
+    """Where it comes from."""
 
     @property
     def state(self) -> State:
@@ -133,7 +135,7 @@ def _estimate_rows(located: LocatedImage, localizer: Localizer) -> list[tuple[st
         if located.stated is not None:
             mm, deg = pose_distance_mm_deg(located.stated, pose)
             error = f"{mm:.1f} mm, {deg:.2f}°" if metric else f"{deg:.2f}°"
-            rows.append(("from stated pose", error))
+            rows.append((f"from {located.stated_by}", error))
     required = [s.min_support for s in localizer.contents.scenes if s.name == estimate.scene]
     least = f", at least {required[0]:.2f}" if required else ""
     rows.append(("support", f"{estimate.support:.2f}{least}"))
@@ -157,7 +159,7 @@ def _picture(
     drawn, times = draw_residuals(large, errors, scale)
     finite = errors.errors_px[np.isfinite(errors.errors_px)]
     middle = f"median {scale * float(np.median(finite)):.2f} px" if len(finite) else "none visible"
-    where = " at the stated pose" if pose is not None else ""
+    where = f" at the {located.stated_by}" if pose is not None else ""
     return drawn, [("residuals", f"{middle}{where}, lines x {times}")]
 
 

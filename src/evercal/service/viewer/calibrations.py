@@ -48,6 +48,24 @@ class CalibrationView:
         sigma = self.calibration.sigma_mm
         return f"{self.name}: {sigma:.2g} mm (1 sigma), ellipsoid x {scale:g}"
 
+    def rows(self) -> list[tuple[str, str]]:
+        """Names and values for the panel."""
+        calibration = self.calibration
+        where = "on the gripper" if self.on_gripper else "fixed"
+        x, y, z = 1000 * calibration.parent_from_child.translation_m
+        principal = Ellipsoid.of(calibration.uncertain_pose).sigmas_mm
+        rows = [
+            ("mount", where),
+            (f"in {calibration.parent_frame}", f"{x:+.1f} {y:+.1f} {z:+.1f} mm"),
+            ("1 sigma per axis", f"{calibration.sigma_mm:.2g} mm, {calibration.sigma_deg:.2g}°"),
+            ("principal axes", f"{principal} mm"),
+        ]
+        if self.scene is not None:
+            rows.append(("scene", self.scene))
+        if self.on_gripper:
+            rows.append(("drawn", "where --recording or --urdf states the gripper's pose"))
+        return rows
+
 
 def read_views(paths: Sequence[Path], default: Camera) -> list[CalibrationView]:
     """Read calibration files; `default` are intrinsics for files without.

@@ -10,7 +10,7 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.geometry import resize_pixels
+from evercal.geometry import Camera, resize_pixels
 from evercal.mapping.scene_map import SceneMap
 from evercal.reports.overlay import colour_map, overlay_points
 from evercal.service.viewer.frusta import Frustum
@@ -76,7 +76,8 @@ class Landmarks3D:
         """(n, 3) RGB: the pixel of the image, or viridis of the height or of the uncertainty."""
         if by == "image":
             return np.repeat(self.grey[:, None], 3, axis=1)
-        values = self.points_m[:, 2] if by == "height" else np.log(np.maximum(self.sigma_mm, 1e-6))
+        sigma = np.log(np.maximum(self.sigma_mm, 1e-6))
+        values = np.asarray(self.points_m[:, 2] if by == "height" else sigma, np.float64)
         if not len(values):
             return np.zeros((0, 3), np.uint8)
         low, high = np.percentile(values, [2, 98]).tolist()
@@ -90,6 +91,8 @@ class KeyframeView:
     scene: str
     number: int
     frustum: Frustum
+    camera: Camera
+    """Intrinsics at the size of `image`."""
     image: Image
     """(h, w, 3) RGB at working size."""
     pixels: Array
@@ -110,9 +113,24 @@ class KeyframeView:
         return overlay_points(large, pixels, self.depths_m, 2.5, legend="depth (m)")
 
     @property
-    def backdrop_m(self) -> float:
-        """A depth behind nearly all landmarks of the keyframe."""
-        return 1.05 * float(np.percentile(self.depths_m, 98)) if len(self.depths_m) else 1.0
+    def backdrop(self) -> "Backdrop":
+        """The image as a plane behind nearly all of its landmarks."""
+        depth = 1.05 * float(np.percentile(self.depths_m, 98)) if len(self.depths_m) else 1.0
+        camera = self.camera
+        width, height = depth * camera.width / camera.fx, depth * camera.height / camera.fy
+        middle = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
+        ahead = np.append((middle - (camera.cx, camera.cy)) / (camera.fx, camera.fy), 1.0)
+        return Backdrop(self.frustum.base_from_camera.apply(depth * ahead), width, height)
+
+
+@dataclass(frozen=True, eq=False)
+class Backdrop:
+    """A rectangle parallel to an image, in which a camera without distortion sees the image."""
+
+    centre_m: Array
+    """(3,) in the base frame."""
+    width_m: float
+    height_m: float
 
 
 def keyframe_views(scene: SceneMap) -> list[KeyframeView]:
@@ -124,8 +142,11 @@ def keyframe_views(scene: SceneMap) -> list[KeyframeView]:
             pose = scene.frame.similarity.pose(pose)
         image = np.repeat(keyframes.grey(i)[..., None], 3, axis=-1)
         depths = scale / marks.inverse_depth
-        frustum = Frustum.of(pose, camera)
-        views.append(KeyframeView(scene.name, i, frustum, image, marks.pixels, depths))
+        views.append(
+            KeyframeView(
+                scene.name, i, Frustum.of(pose, camera), camera, image, marks.pixels, depths
+            )
+        )
     return views
 
 

@@ -1,0 +1,64 @@
+"""An answer in the page: the picture and numbers beside the scene, the camera in it."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.localization.localizer import Localizer
+from evercal.service.viewer.answers import AnswerView, LocatedImage, answer_view
+from evercal.service.viewer.drawn import DrawnAnswer
+from evercal.service.viewer.stage import Stage
+from evercal.service.viewer.text import Rows, answer_html, note_html
+
+
+class AnswerPanel:
+    """Picture and numbers; made inside the folder that it belongs to.
+
+    Args:
+        stage: The scene.
+        name: Name of the nodes in the scene.
+        localizer: The map.
+        trail: Draw the way of the camera.
+        follow: Called with the scene of an answer.
+    """
+
+    def __init__(
+        self,
+        stage: Stage,
+        name: str,
+        localizer: Localizer,
+        trail: bool,
+        follow: Callable[[str | None], Any],
+    ):
+        self._localizer, self._follow, gui = localizer, follow, stage.server.gui
+        self._drawn = DrawnAnswer(stage, name, trail)
+        self._last: AnswerView | None = None
+        self._scale = 1.0
+        blank: NDArray[np.uint8] = np.full((240, 320, 3), 240, np.uint8)
+        self._image = gui.add_image(blank, jpeg_quality=80)
+        self._text = gui.add_html(note_html("No image yet."))
+
+    def show(self, located: LocatedImage, more: Rows = (), at_stated: bool = False) -> None:
+        """Show an answer; `more` are further rows."""
+        view = answer_view(located, self._localizer, at_stated)
+        self._follow(view.scene)
+        self._last = view
+        self._image.image = view.picture
+        self._text.content = answer_html(view, more)
+        self._drawn.show(view, self._scale)
+
+    def say(self, text: str) -> None:
+        """Show a sentence instead of numbers."""
+        self._text.content = note_html(text)
+
+    def resize(self, scale: float) -> None:
+        """Draw the ellipsoid with another factor."""
+        self._scale = scale
+        self.redraw()
+
+    def redraw(self) -> None:
+        """Draw the last answer again, when other scenes are shown."""
+        if self._last is not None:
+            self._drawn.show(self._last, self._scale)
