@@ -38,7 +38,7 @@ _OF_STATUS: dict[str, State] = {
 }
 _PICTURE_PX = 640
 _BAR_PX = 8
-"""Width of the coloured border of a picture."""
+"""Width of the coloured border around a picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +172,7 @@ def _camera(localizer: Localizer, located: LocatedImage) -> Camera:
 
 
 def _framed(picture: Image, colour: Colour) -> Image:
-    framed = picture.copy()
-    for edge in (np.s_[:_BAR_PX], np.s_[-_BAR_PX:], np.s_[:, :_BAR_PX], np.s_[:, -_BAR_PX:]):
-        framed[edge] = colour
+    height, width = picture.shape[0] + 2 * _BAR_PX, picture.shape[1] + 2 * _BAR_PX
+    framed = np.full((height, width, 3), colour, np.uint8)
+    framed[_BAR_PX:-_BAR_PX, _BAR_PX:-_BAR_PX] = picture
     return framed

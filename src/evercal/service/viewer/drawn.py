@@ -12,7 +12,7 @@ from evercal.service.viewer.frusta import Ellipsoid, Frustum
 from evercal.service.viewer.map_parts import THUMBNAIL_PX, resized
 from evercal.service.viewer.stage import Stage, add_frustum
 
-CALIBRATION_COLOUR = (126, 34, 206)
+CALIBRATION_COLOUR = (192, 38, 211)
 _TRAIL = 500
 """Positions of a stream that stay drawn."""
 _NOWHERE = Frustum(SE3.identity(), 1.0, 1.0)
@@ -41,7 +41,7 @@ class DrawnCalibrations:
                 (
                     frustum,
                     _add_ellipsoid(server, f"{name}/sigma", CALIBRATION_COLOUR),
-                    server.scene.add_label(f"{name}/label", view.name),
+                    server.scene.add_label(f"{name}/label", view.name, anchor="bottom-center"),
                 )
             )
         self.show()
@@ -79,7 +79,8 @@ class DrawnCalibrations:
             return
         place_frustum(frustum, shapes[0])
         place_ellipsoid(sphere, shapes[1], self._scale)
-        label.position = shapes[1].centre_m
+        above = shapes[0].corners(self._stage.frustum_m)[:, 2].max()
+        label.position = (*shapes[1].centre_m[:2], max(above, shapes[1].centre_m[2]))
         label.text = view.label(self._scale)
 
 

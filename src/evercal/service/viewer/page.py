@@ -89,7 +89,7 @@ class Page:
                 self._parts.append(
                     Playback(stage, recording, localizer, hand, panel.follow, self._move)
                 )
-            KeyframePanel(stage)
+            KeyframePanel(stage, panel)
             CalibrationPanel(stage, self._calibrations, scale, self._resize)
             self._resize(scale)
             self._calibrations.move(self._gripper(None))
@@ -170,7 +170,11 @@ def start_server(host: str, port: int) -> viser.ViserServer:
             server.stop()
         raise InputError(f"--host {host} --port {port}: Address already in use; give another one")
     server.gui.configure_theme(
-        show_logo=False, show_share_button=False, control_width="large", brand_color=(37, 99, 235)
+        dark_mode=True,
+        show_logo=False,
+        show_share_button=False,
+        control_width="large",
+        brand_color=(37, 99, 235),
     )
     return server
 

@@ -34,15 +34,21 @@ class MapPanel:
             options = [*stage.scenes, *([ALL] if len(stage.scenes) > 1 else [])]
             self._scene = gui.add_dropdown("Scene", options)
             colour = gui.add_dropdown("Colour", COLOURINGS)
-            size = gui.add_slider(
-                "Points, mm", 0.5, 20.0, 0.5, min(20.0, max(0.5, round(4 * stage.extent_m) / 2))
+            self._size = gui.add_slider(
+                "Points, mm", 0.5, 20.0, 0.5, min(20.0, max(0.5, round(2 * 6 * stage.extent_m) / 2))
             )
-            visible = gui.add_checkbox("Keyframes", True)
+            self._keyframes = gui.add_checkbox("Keyframes", True)
         self._scene.on_update(lambda _: self._changed())
         colour.on_update(lambda _: stage.colour_by(colour.value))
-        size.on_update(lambda _: stage.resize_points(size.value))
-        visible.on_update(lambda _: stage.show_keyframes(visible.value))
-        stage.resize_points(size.value)
+        for handle in (self._size, self._keyframes):
+            handle.on_update(lambda _: self.inspect(False))
+        self.inspect(False)
+
+    def inspect(self, through: bool) -> None:
+        """Draw points and keyframes as chosen; to look through a keyframe, small points alone."""
+        size = self._size.value
+        self._stage.resize_points(min(size, 3.0) if through else size)
+        self._stage.show_keyframes(self._keyframes.value and not through)
 
     def follow(self, scene: str | None) -> None:
         """Show the scene of an answer."""
@@ -59,10 +65,11 @@ class KeyframePanel:
 
     Args:
         stage: The scene.
+        map_panel: How points and keyframes are drawn.
     """
 
-    def __init__(self, stage: Stage):
-        self._stage, gui = stage, stage.server.gui
+    def __init__(self, stage: Stage, map_panel: MapPanel):
+        self._stage, self._map, gui = stage, map_panel, stage.server.gui
         self._before: dict[int, tuple[Any, ...]] = {}
         with gui.add_folder("Keyframe"):
             self._text = gui.add_html(note_html("Click a keyframe to look through it."))
@@ -94,7 +101,7 @@ class KeyframePanel:
             camera.position = pose.translation_m
             camera.wxyz = pose.rotation_wxyz
             camera.fov = frustum.fov_rad
-        stage.show_keyframes(False)
+        self._map.inspect(True)
         stage.mark(view)
         rows = [
             ("keyframe", f"{view.number} of {view.scene}"),
@@ -116,7 +123,7 @@ class KeyframePanel:
                 client.scene.remove_by_name(_THROUGH)
                 camera = client.camera
                 camera.position, camera.look_at, camera.up_direction, camera.fov = before
-        self._stage.show_keyframes(True)
+        self._map.inspect(False)
         self._back.visible = False
 
 

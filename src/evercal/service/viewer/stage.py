@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import viser
 
+from evercal.geometry import SE3
 from evercal.mapping.scene_map import SceneMap
 from evercal.service.viewer.frusta import Frustum
 from evercal.service.viewer.map_parts import (
@@ -16,10 +17,10 @@ from evercal.service.viewer.map_parts import (
     shares,
 )
 
-KEYFRAME_COLOUR = (70, 90, 120)
+KEYFRAME_COLOUR = (120, 144, 180)
 CHOSEN_COLOUR = (236, 72, 153)
-_FRUSTUM = 0.06
-"""Size of a frustum as a share of the extent of the map."""
+_FRUSTUM = (0.02, 0.05)
+"""Least and largest size of a frustum as a share of the extent of the map."""
 
 
 class Stage:
@@ -38,18 +39,14 @@ class Stage:
         self._names = [scene.name for scene in scenes]
         self.shown: str | None = self._names[0]
         self.extent_m = _extent(self.landmarks[0])
+        self.frustum_m = _frustum_size(self.keyframes[0], self.extent_m)
         self._frames, self._clouds = [], []
         self._frusta: dict[tuple[str, int], viser.CameraFrustumHandle] = {}
         with server.atomic():
             self._add_base()
             for i in range(len(scenes)):
                 self._add_scene(i)
-        self._look_from_above()
-
-    @property
-    def frustum_m(self) -> float:
-        """Size of a frustum."""
-        return _FRUSTUM * self.extent_m
+        self._look_from_behind()
 
     @property
     def scenes(self) -> list[str]:
@@ -74,8 +71,9 @@ class Stage:
 
     def resize_points(self, size_mm: float) -> None:
         """Draw landmarks with a diameter in millimetres."""
-        for cloud in self._clouds:
-            cloud.point_size = size_mm / 1000
+        with self.server.atomic():
+            for cloud in self._clouds:
+                cloud.point_size = size_mm / 1000
 
     def show_keyframes(self, visible: bool) -> None:
         """Show or hide the keyframes."""
@@ -83,12 +81,12 @@ class Stage:
             for frustum in self._frusta.values():
                 frustum.visible = visible
 
-    def mark(self, chosen: KeyframeView | None) -> None:
-        """Hide the frustum that is looked through, and colour it for later."""
-        key = None if chosen is None else (chosen.scene, chosen.number)
+    def mark(self, chosen: KeyframeView) -> None:
+        """Colour the keyframe that was chosen last."""
         with self.server.atomic():
             for name, frustum in self._frusta.items():
-                frustum.color = CHOSEN_COLOUR if name == key else KEYFRAME_COLOUR
+                own = name == (chosen.scene, chosen.number)
+                frustum.color = CHOSEN_COLOUR if own else KEYFRAME_COLOUR
 
     def on_keyframe(self, chosen: Callable[[KeyframeView, viser.ClientHandle], Any]) -> None:
         """Call a function when a keyframe is clicked."""
@@ -135,18 +133,25 @@ class Stage:
             side,
             cell_size=0.1 if self.extent_m < 1.5 else 0.5,
             section_size=1.0,
-            cell_color=(225, 228, 232),
-            section_color=(190, 196, 205),
+            cell_color=(52, 57, 66),
+            section_color=(80, 87, 99),
         )
 
-    def _look_from_above(self) -> None:
-        """Begin with a view of the whole first scene."""
+    def _look_from_behind(self) -> None:
+        """Begin above and behind the keyframes of the first scene, beside the panel."""
+        poses = SE3.stack([view.frustum.base_from_camera for view in self.keyframes[0]])
         points = self.landmarks[0].points_m
-        centre = np.median(points, axis=0) if len(points) else np.zeros(3)
-        camera, away = self.server.initial_camera, 1.6 * self.extent_m
-        position = centre + away * np.array([-0.55, -0.75, 0.55])
-        camera.position = (float(position[0]), float(position[1]), float(position[2]))
-        camera.look_at = (float(centre[0]), float(centre[1]), float(centre[2]))
+        middle = poses.translation_m.mean(0)
+        target = 0.6 * middle + 0.4 * (np.median(points, axis=0) if len(points) else middle)
+        ahead = poses.rotation_matrix()[:, :, 2].mean(0) * (1, 1, 0)
+        length = float(np.linalg.norm(ahead))
+        ahead = ahead / length if length > 0.1 else np.array([0.0, 1.0, 0.0])
+        right = np.array([ahead[1], -ahead[0], 0.0])
+        eye = target + self.extent_m * (-0.8 * ahead + 0.25 * right + (0, 0, 0.5))
+        target = target + 0.15 * self.extent_m * right  # the panel covers the right of the window
+        camera = self.server.initial_camera
+        camera.position = (float(eye[0]), float(eye[1]), float(eye[2]))
+        camera.look_at = (float(target[0]), float(target[1]), float(target[2]))
 
 
 def add_frustum(
@@ -173,6 +178,17 @@ def add_frustum(
         cast_shadow=False,
         receive_shadow=False,
     )
+
+
+def _frustum_size(keyframes: Sequence[KeyframeView], extent_m: float) -> float:
+    """Size at which neighbouring keyframes hardly overlap, within `_FRUSTUM`."""
+    least, most = (share * extent_m for share in _FRUSTUM)
+    places = np.array([view.frustum.base_from_camera.translation_m for view in keyframes])
+    if len(places) < 2:
+        return most
+    apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    np.fill_diagonal(apart, np.inf)
+    return float(np.clip(0.6 * np.median(apart.min(1)), least, most))
 
 
 def _extent(landmarks: Landmarks3D) -> float:

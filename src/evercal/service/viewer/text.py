@@ -22,11 +22,11 @@ def chip(text: str, colour: tuple[int, int, int]) -> str:
 def table(rows: Rows) -> str:
     """Names and values, one pair a line."""
     lines = [
-        f'<tr><td style="{_CELL};opacity:0.65;white-space:nowrap">{escape(name)}</td>'
+        f'<tr><td style="{_CELL};opacity:0.65;width:38%">{escape(name)}</td>'
         f'<td style="{_CELL};overflow-wrap:anywhere">{escape(value)}</td></tr>'
         for name, value in rows
     ]
-    return f'<table style="font-size:0.82em;line-height:1.35">{"".join(lines)}</table>'
+    return f'<table style="width:100%;font-size:0.82em;line-height:1.35">{"".join(lines)}</table>'
 
 
 def answer_html(view: AnswerView, more: Rows = ()) -> str:
