@@ -50,8 +50,9 @@ class AnswerPanel:
         self._drawn.show(view, self._scale)
 
     def say(self, text: str) -> None:
-        """Show a sentence instead of numbers."""
-        self._text.content = note_html(text)
+        """Show a sentence above the last answer."""
+        last = "" if self._last is None else answer_html(self._last)
+        self._text.content = note_html(text) + last
 
     def resize(self, scale: float) -> None:
         """Draw the ellipsoid with another factor."""

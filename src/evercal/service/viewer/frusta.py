@@ -68,6 +68,9 @@ class Ellipsoid:
 
 
 def readable_scale(ellipsoids: list[Ellipsoid]) -> int:
-    """The round factor that draws the largest ellipsoid with a half axis of about `DRAWN_M`."""
-    longest = max((float(ellipsoid.axes_m[-1]) for ellipsoid in ellipsoids), default=0.0)
+    """The round factor that draws the largest ellipsoid with a half axis of about `DRAWN_M`.
+
+    Without ellipsoids, that of a standard deviation of 1 mm.
+    """
+    longest = max((float(ellipsoid.axes_m[-1]) for ellipsoid in ellipsoids), default=0.001)
     return max([scale for scale in _SCALES if scale * longest <= DRAWN_M], default=1)
