@@ -23,6 +23,7 @@ VERBS = {
     "trainer": "time of a training step",
     "speed": "time of localization and SARS",
     "serve": "latency of the HTTP service, alone and while a scene is learned",
+    "view": "a large map in the browser: seconds until it is shown, bytes, frames per second",
     "intervals": "coverage of confidence intervals",
     "publish": "write results to results/NAME.jsonl",
     "tables": "generate the tables of the docs from results/",

@@ -35,14 +35,19 @@ ARM = """<robot name="arm">
     <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/>
   </joint>
 </robot>"""
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-FLAGS = (
-    "--no-sandbox --disable-quic --no-first-run --disable-background-networking"
-    " --disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader"
-    " --enable-unsafe-swiftshader"
-).split()
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+CHROMIUM = next((path for path in map(shutil.which, NAMES) if path), None)
+FLAGS = [
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
 
 
 @pytest.fixture(scope="module")

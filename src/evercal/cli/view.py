@@ -5,6 +5,7 @@ import signal
 import socket
 import sys
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -76,17 +77,10 @@ class View:
             host=self.host,
             port=self.port,
         )
-        stopped = threading.Event()
-
-        def stop(number: int, frame: FrameType | None) -> None:
-            stopped.set()
-
-        signal.signal(signal.SIGTERM, stop)
         try:
             page = Page(open_map(self.store, self.device), options)
             try:
-                self._ready(page.url)
-                stopped.wait()
+                _until_stopped(lambda: self._ready(page.url))
             finally:
                 page.close()
         except KeyboardInterrupt:
@@ -101,3 +95,18 @@ class View:
         tunnel = shlex.join(["ssh", "-L", f"{port}:127.0.0.1:{port}", socket.gethostname()])
         print(f"view of {self.store} at {url} (from another machine: {tunnel}); Ctrl-C ends it")
         sys.stdout.flush()
+
+
+def _until_stopped(ready: Callable[[], object]) -> None:
+    """Call `ready` and return at SIGTERM; Ctrl-C raises KeyboardInterrupt."""
+    stopped = threading.Event()
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        stopped.set()
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        ready()
+        stopped.wait()
+    finally:
+        signal.signal(signal.SIGTERM, before)
