@@ -98,13 +98,14 @@ def test_a_taken_port_is_refused(localizer: Localizer) -> None:
 
 def test_a_bad_file_is_named(localizer: Localizer, files: Path) -> None:
     (files / "bent.urdf").write_text("<robot")
-    for options, message in (
+    cases: list[tuple[dict[str, Any], str]] = [
         ({"urdf": files / "bent.urdf"}, "bent.urdf: no usable URDF"),
         ({"urdf": files / "gone.urdf"}, "gone.urdf: no such URDF file"),
         ({"recording": files / "gone"}, "gone: no such folder"),
         ({"live": str(files / "gone")}, "gone: no such folder or video"),
         ({"calibrations": (files / "arm.urdf",)}, "arm.urdf: "),
-    ):
+    ]
+    for options, message in cases:
         with pytest.raises(InputError, match=message):
             Page(localizer, ViewOptions(port=0, **options))
 
@@ -167,7 +168,7 @@ def test_a_browser_shows_the_map(
     localizer: Localizer, files: Path, browser: Any, tmp_path: Path
 ) -> None:
     calibrations = (files / "fixed.json", files / "hand.json")
-    options = {
+    options: dict[str, Any] = {
         "calibrations": calibrations,
         "recording": files / "hall",
         "urdf": files / "arm.urdf",
