@@ -1,5 +1,6 @@
 """An answer in the page: the picture and numbers beside the scene, the camera in it."""
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -33,7 +34,8 @@ class AnswerPanel:
         follow: Callable[[str | None], Any],
     ):
         self._localizer, self._follow, gui = localizer, follow, stage.server.gui
-        self._drawn = DrawnAnswer(stage, name, trail)
+        self._drawn, self._trail = DrawnAnswer(stage, name), trail
+        self._lock = threading.Lock()  # the scene is chosen in another thread than answers come
         self._last: AnswerView | None = None
         self._scale = 1.0
         blank: NDArray[np.uint8] = np.full((240, 320, 3), 240, np.uint8)
@@ -44,10 +46,13 @@ class AnswerPanel:
         """Show an answer; `more` are further rows."""
         view = answer_view(located, self._localizer, at_stated)
         self._follow(view.scene)
-        self._last = view
-        self._image.image = view.picture
-        self._text.content = answer_html(view, more)
-        self._drawn.show(view, self._scale)
+        with self._lock:
+            self._last = view
+            self._image.image = view.picture
+            self._text.content = answer_html(view, more)
+            self._drawn.show(view, self._scale)
+            if self._trail:
+                self._drawn.extend(view)
 
     def say(self, text: str) -> None:
         """Show a sentence above the last answer."""
@@ -61,5 +66,6 @@ class AnswerPanel:
 
     def redraw(self) -> None:
         """Draw the last answer again, when other scenes are shown."""
-        if self._last is not None:
-            self._drawn.show(self._last, self._scale)
+        with self._lock:
+            if self._last is not None:
+                self._drawn.show(self._last, self._scale)

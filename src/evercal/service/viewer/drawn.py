@@ -90,10 +90,9 @@ class DrawnAnswer:
     Args:
         stage: The scene.
         name: Name of its nodes.
-        trail: Draw the way of the camera.
     """
 
-    def __init__(self, stage: Stage, name: str, trail: bool = False):
+    def __init__(self, stage: Stage, name: str):
         self._stage, server = stage, stage.server
         size = 1.3 * stage.frustum_m
         self._cameras = [
@@ -108,7 +107,6 @@ class DrawnAnswer:
             np.zeros((0, 2, 3), np.uint8),
             thickness=2.0,
             thickness_units="screen",
-            visible=trail,
         )
         self._way: list[tuple[np.ndarray, tuple[int, int, int]]] = []
         self._before: tuple[str | None, Frustum] | None = None
@@ -132,8 +130,7 @@ class DrawnAnswer:
             self._sphere.visible = view.ellipsoid is not None and visible
             if view.ellipsoid is not None:
                 place_ellipsoid(self._sphere, view.ellipsoid, scale)
-            if self._trail.visible:
-                self._extend(view)
+            self._trail.visible = visible
 
     def _show_last(self, view: AnswerView) -> None:
         if view.frusta:
@@ -144,8 +141,8 @@ class DrawnAnswer:
             self._last.visible = self._stage.shows(scene)
             place_frustum(self._last, frustum)
 
-    def _extend(self, view: AnswerView) -> None:
-        """Lengthen the way; a lost frame interrupts it."""
+    def extend(self, view: AnswerView) -> None:
+        """Lengthen the way of the camera; a lost frame interrupts it."""
         if len(view.frusta) != 1:
             self._way.append((np.full(3, np.nan), view.colour))
         else:

@@ -65,7 +65,6 @@ class Playback:
             self.panel = AnswerPanel(stage, "/frame", localizer, False, follow)
         for handle in (self._slider, self._play, self._at_stated):
             handle.on_update(lambda _: self._wake.set())
-        self._wake.set()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
@@ -81,18 +80,19 @@ class Playback:
 
     def _run(self) -> None:
         """Show the frame of the slider; what it passed meanwhile is left out."""
+        shown: tuple[int, bool] | None = None
         while not self._closed.is_set():
-            self._wake.wait()
+            wanted = min(self._slider.value, len(self.frames) - 1), self._at_stated.value
+            if wanted != shown:
+                self._show(*wanted)
+                shown = wanted
+            if not self._play.value:
+                self._wake.wait()
+            elif not self._wake.wait(_PLAY_S):
+                self._slider.value = (wanted[0] + 1) % len(self.frames)
             self._wake.clear()
-            if self._closed.is_set():
-                return
-            number = min(self._slider.value, len(self.frames) - 1)
-            self._show(number)
-            if self._play.value and not self._wake.wait(_PLAY_S):
-                self._slider.value = (number + 1) % len(self.frames)
-                self._wake.set()
 
-    def _show(self, number: int) -> None:
+    def _show(self, number: int, at_stated: bool) -> None:
         frame = self.frames[number]
         try:
             image = frame.read_image()
@@ -103,4 +103,4 @@ class Playback:
             return
         stated, by = stated_pose(frame, self._gripper_from_camera)
         located = LocatedImage(frame.name, image, estimate, None, stated, by)
-        self.panel.show(located, (), self._at_stated.value)
+        self.panel.show(located, (), at_stated)
