@@ -183,7 +183,8 @@ def test_a_browser_shows_the_map(
         visit.on("request", lambda r: None if r.url.startswith(own) else elsewhere.append(r.url))
         visit.goto(page.url)
         visit.wait_for_selector("canvas", timeout=120_000)
-        for text in ("located", "hall", "Keyframe", "fixed: 2.2 mm (1 sigma), ellipsoid x 10"):
+        # The second calibration, the recording's frame and the keyframes are there.
+        for text in ("located", "on the gripper", "3 / 2 / 1 mm", "Click a keyframe"):
             seen_until(visit, text)
         time.sleep(2)
         picture = visit.screenshot(path=os.environ.get("VIEW_SCREENSHOT", tmp_path / "view.png"))
