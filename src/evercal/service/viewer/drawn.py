@@ -98,7 +98,8 @@ class DrawnAnswer:
         self._cameras = [
             add_frustum(server, f"{name}/{i}", _NOWHERE, size, GREEN) for i in range(2)
         ]
-        self._stated = add_frustum(server, f"{name}/stated", _NOWHERE, size, BLUE)
+        # Smaller, so that both are seen where they coincide.
+        self._stated = add_frustum(server, f"{name}/stated", _NOWHERE, 0.6 * size, BLUE)
         self._last = add_frustum(server, f"{name}/last", _NOWHERE, size, GREY)
         self._sphere = _add_ellipsoid(server, f"{name}/sigma", GREEN)
         self._trail = server.scene.add_line_segments(
