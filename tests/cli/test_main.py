@@ -16,7 +16,18 @@ import evercal
 from evercal.cli import main
 
 VERBS = {
-    "Map": ["learn", "localize", "track", "refresh", "evaluate", "info", "verify", "map", "serve"],
+    "Map": [
+        "learn",
+        "localize",
+        "track",
+        "view",
+        "refresh",
+        "evaluate",
+        "info",
+        "verify",
+        "map",
+        "serve",
+    ],
     "Calibrate": ["calibrate", "check", "watch", "audit", "align"],
     "Boards and pose pairs": ["detect", "solve"],
     "Results": ["export", "report"],

@@ -15,7 +15,8 @@ from evercal.localization.estimate import PoseEstimate
 from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import write_image
-from evercal.reports.calibration_images import annotate_images, exaggeration, select_images
+from evercal.reports.calibration_images import annotate_images, select_images
+from evercal.reports.overlay import exaggeration
 
 
 def pose(quaternion: ArrayLike, translation: ArrayLike) -> SE3:

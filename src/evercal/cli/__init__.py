@@ -17,7 +17,18 @@ from typing import Any, Protocol
 from evercal.errors import InputError
 
 _GROUPS = {
-    "Map": ("learn", "localize", "track", "refresh", "evaluate", "info", "verify", "map", "serve"),
+    "Map": (
+        "learn",
+        "localize",
+        "track",
+        "view",
+        "refresh",
+        "evaluate",
+        "info",
+        "verify",
+        "map",
+        "serve",
+    ),
     "Calibrate": ("calibrate", "check", "watch", "audit", "align"),
     "Boards and pose pairs": ("detect", "solve"),
     "Results": ("export", "report"),
@@ -116,6 +127,7 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.solve import Solve
     from evercal.cli.track import Track
     from evercal.cli.verify import Verify
+    from evercal.cli.view import View
     from evercal.cli.watch import Watch
 
     return {
@@ -138,6 +150,7 @@ def _verbs(first: str) -> dict[str, Any]:
         "verify": Verify,
         "map": Maps,
         "serve": Serve,
+        "view": View,
         "inspect": Inspect,
         "convert": Convert,
         "reconstruct": Reconstruct,

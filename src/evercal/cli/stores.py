@@ -44,8 +44,8 @@ def open_map(store: Path, device: str) -> "Localizer":
     strategy = strategy_of(store)
     if strategy not in (MAP, None):
         raise InputError(
-            f"{store}: holds networks of strategy {strategy}; calibration needs a map, so learn the"
-            " scene with the default strategy"
+            f"{store}: holds networks of strategy {strategy}, and this needs a map; learn the scene"
+            " with the default strategy"
         )
     from evercal.localization.localizer import Localizer
 

@@ -41,7 +41,7 @@ def stream(source: str, rate: float = 15.0) -> Iterator[StreamFrame]:
     Raises:
         InputError: The source does not exist or cannot be opened, or a file cannot be read.
     """
-    if not _LIVE.fullmatch(source):
+    if not is_live(source):
         path = Path(source)
         if not path.exists():
             raise InputError(
@@ -51,6 +51,11 @@ def stream(source: str, rate: float = 15.0) -> Iterator[StreamFrame]:
         if path.is_dir():
             return _images(path, rate)
     return _captured(source)
+
+
+def is_live(source: str) -> bool:
+    """Whether frames arrive in real time: a camera or a network stream."""
+    return bool(_LIVE.fullmatch(source))
 
 
 def _images(folder: Path, rate: float) -> Iterator[StreamFrame]:
@@ -65,7 +70,7 @@ def _captured(source: str) -> Iterator[StreamFrame]:
     """Frames by OpenCV."""
     import cv2
 
-    live = bool(_LIVE.fullmatch(source))
+    live = is_live(source)
     capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
     if not capture.isOpened():
         raise InputError(f"{source}: cannot be opened as a video; check path, address and codec")

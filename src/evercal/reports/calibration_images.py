@@ -21,8 +21,8 @@ from evercal.reports.frame_axes import (
     draw_axes,
     draw_directions,
 )
-from evercal.reports.overlay import overlay_lines, overlay_points
-from evercal.reports.pictures import landmark_errors
+from evercal.reports.overlay import overlay_points, overlay_vectors
+from evercal.reports.pictures import draw_residuals, landmark_errors
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import LearnedLocalizer
@@ -34,11 +34,6 @@ MAX_IMAGES = 4
 _WIDTH_PX = 640
 _CLOSE_UP_PX = 480
 _ASPECT_TOLERANCE = 0.01
-_MAX_RESIDUAL_PX = 2.0
-"""Upper end of the colour scale, pixels of the working image."""
-_VECTOR_PX = 25.0
-"""Length of long residual vectors as drawn, pixels of the page."""
-_VECTOR_COLOUR = (255, 140, 40)
 
 
 @dataclass(frozen=True)
@@ -215,12 +210,8 @@ def _with_landmarks(
     if errors is None:
         return large, estimate.reason or estimate.status.replace("_", " "), 0
     own = image.shape[0] / errors.height
-    enlarged = large.shape[0] / errors.height
-    pixels = resize_pixels(errors.pixels, enlarged)
     residuals = own * errors.errors_px
-    limits = (0.0, _MAX_RESIDUAL_PX * own)
-    drawn = overlay_points(large, pixels, residuals, 3.5, limits, "residual (px)")
-    drawn, times = _with_vectors(drawn, pixels, enlarged * (errors.projected - errors.pixels))
+    drawn, times = draw_residuals(large, errors, own)
     median = float(np.nanmedian(residuals)) if np.isfinite(residuals).any() else np.nan
     summary = (
         f"{len(residuals)} landmarks, median residual {median:.2f} px, lines {times} times as long"
@@ -236,25 +227,9 @@ def _with_corners(camera: Camera, large: Image, board: BoardSeen) -> tuple[Image
     lengths = np.linalg.norm(errors, axis=1)
     limits = (0.0, max(1.0, float(np.nanpercentile(lengths, 90))))
     drawn = overlay_points(large, pixels, lengths, 2.5, limits, "residual (px)")
-    drawn, times = _with_vectors(drawn, pixels, enlarged * errors)
+    drawn, times = overlay_vectors(drawn, pixels, enlarged * errors)
     rms = float(np.sqrt(np.nanmean(lengths**2)))
     return drawn, f"{len(pixels)} corners, {rms:.2f} px rms, lines {times} times as long"
-
-
-def _with_vectors(image: Image, pixels: Array, vectors: Array) -> tuple[Image, int]:
-    """The image with residual vectors (n, 2), and the factor of their length."""
-    times = exaggeration(vectors)
-    lines = np.stack([pixels, pixels + times * vectors], 1)
-    colours = [_VECTOR_COLOUR] * len(lines)
-    return overlay_lines(image, list(lines), colours, 1, rims=False), times
-
-
-def exaggeration(vectors: NDArray[np.float64]) -> int:
-    """Factor that makes residual vectors (n, 2) visible, the same for all: 1, 2, 5, 10, ..."""
-    lengths = np.linalg.norm(vectors, axis=1)
-    long = float(np.nanpercentile(lengths, 90)) if np.isfinite(lengths).any() else _VECTOR_PX
-    factors = [1, 2, 5, 10, 20, 50, 100]
-    return max([factor for factor in factors if factor * long <= _VECTOR_PX], default=1)
 
 
 def _use(use: ImageUse | None) -> str:

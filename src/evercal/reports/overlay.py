@@ -12,6 +12,9 @@ _NAN_COLOUR = (160, 160, 160)
 _FRACTION_BITS = 4  # of a pixel, for OpenCV's drawing functions
 _FONT = 0  # cv2.FONT_HERSHEY_SIMPLEX; OpenCV is imported inside functions only
 _MARGIN = 6
+_VECTOR_PX = 25.0
+"""Length of long residual vectors as drawn, pixels."""
+_VECTOR_COLOUR = (255, 140, 40)
 
 
 def overlay_points(
@@ -37,7 +40,7 @@ def overlay_points(
     if colours.ndim == 1:
         values = colours.astype(np.float64)
         limits = limits or _limits(values)
-        colours = _colour_map(values, limits)
+        colours = colour_map(values, limits)
         drawn[:] = cv2.cvtColor(drawn, cv2.COLOR_RGB2GRAY)[..., None]
     edge = np.array([image.shape[1] - 0.5, image.shape[0] - 0.5]) + radius
     with np.errstate(invalid="ignore"):
@@ -82,6 +85,24 @@ def overlay_lines(
     return drawn
 
 
+def overlay_vectors(
+    image: Image, pixels: NDArray[np.float64], vectors: NDArray[np.float64]
+) -> tuple[Image, int]:
+    """Draw residual vectors (n, 2) at pixels (n, 2); returns the factor of their length, too."""
+    times = exaggeration(vectors)
+    lines = np.stack([pixels, pixels + times * vectors], 1)
+    colours = [_VECTOR_COLOUR] * len(lines)
+    return overlay_lines(image, list(lines), colours, 1, rims=False), times
+
+
+def exaggeration(vectors: NDArray[np.float64]) -> int:
+    """Factor that makes residual vectors (n, 2) visible, the same for all: 1, 2, 5, 10, ..."""
+    lengths = np.linalg.norm(vectors, axis=1)
+    long = float(np.nanpercentile(lengths, 90)) if np.isfinite(lengths).any() else _VECTOR_PX
+    factors = [1, 2, 5, 10, 20, 50, 100]
+    return max([factor for factor in factors if factor * long <= _VECTOR_PX], default=1)
+
+
 def encode_image(image: Image, kind: Literal["png", "jpg"] = "png") -> bytes:
     """Encode an image as PNG, or as JPEG, which is smaller but lossy."""
     import cv2
@@ -115,7 +136,7 @@ def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
     return low, high
 
 
-def _colour_map(values: NDArray[np.float64], limits: tuple[float, float]) -> Image:
+def colour_map(values: NDArray[np.float64], limits: tuple[float, float]) -> Image:
     """Map values (n,) to (n, 3) RGB with viridis."""
     import cv2
 
@@ -142,7 +163,7 @@ def _draw_legend(image: Image, text: str, limits: tuple[float, float]) -> None:
         return
     panel = np.full((height, width + 8, 3), 255, np.uint8)
     ramp = np.linspace(*limits, num=width) if limits[1] > limits[0] else np.full(width, limits[0])
-    panel[4 : line - 2, 4 : 4 + width] = _colour_map(ramp, limits)
+    panel[4 : line - 2, 4 : 4 + width] = colour_map(ramp, limits)
     right = cv2.getTextSize(high, _FONT, scale, 1)[0][0]
     middle = cv2.getTextSize(text, _FONT, scale, 1)[0][0]
     for label, x in ((low, 4), (text, 4 + (width - middle) // 2), (high, 4 + width - right)):

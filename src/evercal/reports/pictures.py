@@ -7,7 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.geometry import resize_pixels
-from evercal.reports.overlay import overlay_points
+from evercal.reports.overlay import overlay_points, overlay_vectors
+
+MAX_RESIDUAL_PX = 2.0
+"""Upper end of the colour scale of residuals, pixels of the working image."""
 
 if TYPE_CHECKING:
     from evercal.geometry import SE3, Camera
@@ -100,6 +103,21 @@ def landmark_errors(
     projected = working_camera.project(points)
     errors = np.linalg.norm(estimate.pixels - projected, axis=1)
     return LandmarkErrors(estimate.pixels, projected, errors, working_camera.height)
+
+
+def draw_residuals(
+    image: NDArray[np.uint8], errors: LandmarkErrors, scale: float = 1.0
+) -> tuple[NDArray[np.uint8], int]:
+    """Draw landmarks, coloured by their residual, with lines from detections to projections.
+
+    The image may have any size. `scale` are pixels of the camera's image per pixel of the working
+    image; the legend is in pixels of the former. Returns the factor of the lines' length, too.
+    """
+    enlarged = image.shape[0] / errors.height
+    pixels, limits = resize_pixels(errors.pixels, enlarged), (0.0, MAX_RESIDUAL_PX * scale)
+    residuals = scale * errors.errors_px
+    drawn = overlay_points(image, pixels, residuals, 3.5, limits, "residual (px)")
+    return overlay_vectors(drawn, pixels, enlarged * (errors.projected - errors.pixels))
 
 
 def _scene(localizer: "LearnedLocalizer", name: str) -> "LearnedScene":

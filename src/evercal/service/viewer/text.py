@@ -1,0 +1,48 @@
+"""HTML of the panel; names of files and scenes are escaped."""
+
+from collections.abc import Sequence
+from html import escape
+
+from evercal.service.viewer.answers import AnswerView
+
+Rows = Sequence[tuple[str, str]]
+_CELL = "padding:1px 8px 1px 0;vertical-align:top"
+
+
+def chip(text: str, colour: tuple[int, int, int]) -> str:
+    """A word on a coloured ground."""
+    red, green, blue = colour
+    style = (
+        f"background:rgb({red},{green},{blue});color:white;border-radius:4px;padding:2px 8px;"
+        "font-weight:600"
+    )
+    return f'<span style="{style}">{escape(text)}</span>'
+
+
+def table(rows: Rows) -> str:
+    """Names and values, one pair a line."""
+    lines = [
+        f'<tr><td style="{_CELL};opacity:0.65;width:38%">{escape(name)}</td>'
+        f'<td style="{_CELL};overflow-wrap:anywhere">{escape(value)}</td></tr>'
+        for name, value in rows
+    ]
+    return f'<table style="width:100%;font-size:0.82em;line-height:1.35">{"".join(lines)}</table>'
+
+
+def answer_html(view: AnswerView, more: Rows = ()) -> str:
+    """State and numbers of an answer; `more` are further rows."""
+    return _block(chip(view.state, view.colour) + table([*view.rows, *more]))
+
+
+def rows_html(rows: Rows) -> str:
+    """A table alone."""
+    return _block(table(rows))
+
+
+def note_html(text: str) -> str:
+    """A sentence."""
+    return _block(f'<span style="font-size:0.82em;opacity:0.75">{escape(text)}</span>')
+
+
+def _block(inner: str) -> str:
+    return f'<div style="padding:2px 12px 6px">{inner}</div>'
