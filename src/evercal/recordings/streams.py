@@ -31,6 +31,11 @@ class StreamFrame(NamedTuple):
     """(H, W, 3) RGB."""
 
 
+def is_live(source: str) -> bool:
+    """Whether a source is a camera or a network stream, not a file or folder."""
+    return _LIVE.fullmatch(source) is not None
+
+
 def stream(source: str, rate: float = 15.0) -> Iterator[StreamFrame]:
     """Read a source frame by frame.
 
@@ -41,7 +46,7 @@ def stream(source: str, rate: float = 15.0) -> Iterator[StreamFrame]:
     Raises:
         InputError: The source does not exist or cannot be opened, or a file cannot be read.
     """
-    if not _LIVE.fullmatch(source):
+    if not is_live(source):
         path = Path(source)
         if not path.exists():
             raise InputError(
@@ -65,7 +70,7 @@ def _captured(source: str) -> Iterator[StreamFrame]:
     """Frames by OpenCV."""
     import cv2
 
-    live = bool(_LIVE.fullmatch(source))
+    live = is_live(source)
     capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
     if not capture.isOpened():
         raise InputError(f"{source}: cannot be opened as a video; check path, address and codec")
