@@ -76,12 +76,11 @@ def next_views(
         free &= ~_near(pose, reachable_poses, options)
     added, information = state.added(reachable_poses), state.information
     free &= np.trace(added, axis1=1, axis2=2) > 0
-    now = np.linalg.inv(information)[state.target, state.target]
+    now = _covariances(information, state.target)
     sigmas, chosen = [axis_deviation(now)], []
     while len(chosen) < count and free.any():
         rows = np.flatnonzero(free)
-        covariances = np.linalg.inv(information + added[rows])
-        covariances = covariances[:, state.target, state.target]
+        covariances = _covariances(information + added[rows], state.target)
         best = int(np.argmin(_cost(covariances, options)))
         chosen.append(int(rows[best]))
         sigmas.append(axis_deviation(covariances[best]))
@@ -90,6 +89,12 @@ def next_views(
     index = np.array(chosen, np.int64)
     millimetres, degrees = zip(*sigmas, strict=True)
     return NextViews(index, reachable_poses[index], millimetres, degrees)
+
+
+def _covariances(information: Array, target: slice) -> Array:
+    """(..., 6, 6) of the target by matrices (..., N, N)."""
+    columns = np.eye(information.shape[-1])[:, target]
+    return np.linalg.solve(information, columns)[..., target, :]
 
 
 def _cost(covariances: Array, options: NextViewOptions) -> Array:
