@@ -13,6 +13,7 @@ VERBS = {
     "handeye": "pose pairs: errors, ellipsoids, outliers, scale, time",
     "boards": "detection of rendered boards, beside the finders of OpenCV",
     "handeye-boards": "boards through a lens found from the same images, beside other solvers",
+    "next-views": "poses of a wrist recording until a stated accuracy, by how they are chosen",
     "mistakes": "mistakes in pose files that must be refused and named, and clean recordings",
     "tracking": "a stream with holes: tracked, beside the location of single frames",
     "refresh": "a map in a rendered room that changes in ten rounds",
@@ -32,6 +33,7 @@ MODULES = {
     "handeye": "hand_eye",
     "handeye-boards": "hand_eye_boards",
     "many-keyframes": "many_keyframes",
+    "next-views": "next_views",
     "refresh": "changing_room",
     "tune": "tuning",
 }

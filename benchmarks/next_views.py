@@ -6,6 +6,7 @@ noise for all views, not the truth. The deviation is that of the best linear est
 `simulated` estimates draws of noise and compares.
 """
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -15,8 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from evercal.calibration.next_views import NextViewOptions, next_views
 from evercal.calibration.view_information import HandEyeViews, ScenePoints, ViewNoise
-from evercal.geometry import SE3, UncertainPose, pose_distance
+from evercal.errors import InputError
+from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
 from evercal.geometry.uncertain_pose import axis_deviation
+from evercal.map import Map
+from evercal.recordings import Frame, Recording
 from evercal.simulation.box_room import default_camera
 from evercal.simulation.cell_room import WORK_AREA_M
 from evercal.simulation.virtual_cell import VirtualCell, nominal_mount
@@ -25,7 +29,7 @@ Order = Callable[["Trial"], NDArray[np.int64]]
 
 FIRST = 3
 """Random poses that every order starts with."""
-LONGEST = 80
+LONGEST = 60
 """Poses after which an order counts as not reaching the accuracy."""
 
 
@@ -149,12 +153,50 @@ ORDERS: dict[str, tuple[Order, bool]] = {
 """Order, and whether the planner knows the points of the scene."""
 
 
+def learned_mm_deg(seed: int, poses: SE3) -> tuple[float, float]:
+    """Error of gripper_from_camera from images of the virtual cell at some poses."""
+    cell = VirtualCell(seed)
+    frames = []
+    for i, pose in enumerate(poses):
+        cell.robot.move_to(pose)
+        image = cell.wrist_camera.read()[1]
+        stated = cell.robot.base_from_gripper()
+        frames.append(Frame(f"{i:04d}", image, cell.intrinsics, None, stated))
+    with tempfile.TemporaryDirectory() as folder:
+        report = Map.open(folder, device="cpu").learn(Recording("wrist", tuple(frames), ()))
+    assert report.hand_eye is not None
+    estimate = report.hand_eye.gripper_from_camera.pose
+    return pose_distance_mm_deg(estimate, cell.truth.gripper_from_camera)
+
+
+def _print_images(cells: int, pool: int, count: int) -> None:
+    print(f"{cells} cells, {count} rendered images each; error of gripper_from_camera")
+    for name in ("random", "farthest in rotation", "A-optimal"):
+        order, visible = ORDERS[name]
+        errors, refused = [], 0
+        for seed in range(1, cells + 1):
+            draw = trial(seed, pool, visible)
+            try:
+                errors.append(learned_mm_deg(seed, draw.reachable[order(draw)[:count]]))
+            except InputError as error:
+                print(f"  {name}, cell {seed}: {error}")
+                refused += 1
+        millimetres, degrees = np.array(errors).T
+        rms = np.sqrt(np.mean(millimetres**2)), np.sqrt(np.mean(degrees**2))
+        print(
+            f"| {name} | {rms[0]:.2f} mm, {rms[1]:.3f} deg (root mean square) |"
+            f" {millimetres.max():.2f} mm | {refused} refused |",
+            flush=True,
+        )
+
+
 def run(
     draws: int = 10,
     pool: int = 200,
-    sigmas_mm: tuple[float, ...] = (0.2, 0.15, 0.1),
-    noise_draws: int = 200,
+    sigmas_mm: tuple[float, ...] = (0.3, 0.2, 0.15),
+    noise_draws: int = 100,
     at: int = 15,
+    images: int = 0,
 ) -> None:
     """Print the poses that each order needs.
 
@@ -164,7 +206,11 @@ def run(
         sigmas_mm: standard deviations per axis to reach.
         noise_draws: draws of noise of the simulated estimates.
         at: poses of the simulated estimates.
+        images: cells whose images are rendered and learned with `at` poses, instead of the above.
     """
+    if images:
+        _print_images(images, pool, at)
+        return
     print(f"{draws} draws, {pool} reachable poses; median (least to most) poses until sigma")
     names = " | ".join(f"{sigma:g} mm" for sigma in sigmas_mm)
     print(f"| order | {names} | sigma at {at} | simulated |")
