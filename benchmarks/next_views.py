@@ -1,4 +1,4 @@
-"""Poses of a wrist recording until gripper_from_camera has a stated accuracy, by how they are chosen.
+"""Poses of a wrist recording until a stated accuracy of the mount, by how they are chosen.
 
 Gripper poses are those of the virtual cell's arm, images are replaced by the camera poses that they
 would give, with noise from the points that they show. The planner knows a rough mount and one
@@ -42,25 +42,34 @@ class Trial:
     truth: HandEyeViews
     """The true mount with the noise of every view, before the first image."""
     planner: HandEyeViews
-    """What is known before the first image."""
+    """What is known before the first image: the drawing's mount, and nothing of the scene."""
+    aware: HandEyeViews
+    """The same with the points of the scene."""
+    added: NDArray[np.float64]
+    """(n, 12, 12) information of each pose at the truth."""
     rng: np.random.Generator
     start: NDArray[np.int64]
     """(FIRST,) poses that every order starts with."""
 
 
-def trial(seed: int, pool: int, visible: bool) -> Trial:
+def trial(seed: int, pool: int) -> Trial:
     """Draw a cell, a mount and a start."""
     rng = np.random.default_rng([seed, 41])
     cell = VirtualCell(seed)
     reachable = cell.reachable_poses(pool)
     mount, noise = cell.truth.gripper_from_camera, ViewNoise()
-    spread = np.array([0.3, 0.4, 0.08])
-    points = WORK_AREA_M + rng.uniform(-1, 1, (80, 3)) * spread
+    points = WORK_AREA_M + rng.uniform(-1, 1, (80, 3)) * (0.3, 0.4, 0.08)
     scene = ScenePoints(default_camera(640, 480), points)
     truth = HandEyeViews.start(mount, WORK_AREA_M, noise, scene)
-    known = scene if visible else None
-    planner = HandEyeViews.start(nominal_mount(), WORK_AREA_M, noise, known)
-    return Trial(reachable, truth, planner, rng, rng.choice(pool, FIRST, replace=False))
+    return Trial(
+        reachable,
+        truth,
+        HandEyeViews.start(nominal_mount(), WORK_AREA_M, noise),
+        HandEyeViews.start(nominal_mount(), WORK_AREA_M, noise, scene),
+        truth.added(reachable),
+        rng,
+        rng.choice(pool, FIRST, replace=False),
+    )
 
 
 def random_order(draw: Trial) -> NDArray[np.int64]:
@@ -81,17 +90,24 @@ def farthest_order(draw: Trial) -> NDArray[np.int64]:
     return np.array(chosen)
 
 
-def planned_order(draw: Trial, options: NextViewOptions) -> NDArray[np.int64]:
-    """The poses of `next_views`."""
+def planned(draw: Trial, start: HandEyeViews, options: NextViewOptions) -> NDArray[np.int64]:
+    """The poses of `next_views` after the first ones."""
     used = draw.reachable[draw.start]
-    state = draw.planner.with_views(used)
+    state = start.with_views(used)
     chosen = next_views(state, draw.reachable, LONGEST - FIRST, used, options)
+    return np.concatenate([draw.start, chosen.index])
+
+
+def unaware_order(draw: Trial) -> NDArray[np.int64]:
+    """The poses of `next_views` for a camera somewhere on the gripper."""
+    used = draw.reachable[draw.start]
+    chosen = next_views(HandEyeViews.recorded(used), draw.reachable, LONGEST - FIRST, used)
     return np.concatenate([draw.start, chosen.index])
 
 
 def covariances(draw: Trial, order: NDArray[np.int64]) -> NDArray[np.float64]:
     """(n, 6, 6) of gripper_from_camera after each pose, at the truth, without a prior."""
-    added = np.cumsum(draw.truth.added(draw.reachable[order]), 0)
+    added = np.cumsum(draw.added[order], 0)
     weak = np.diag([1e-2, 1e-2, 1e-2, 1e-4, 1e-4, 1e-4, *np.repeat([1e-4, 1e-6], 3)])
     return np.linalg.inv(added + weak)[:, :6, :6]
 
@@ -143,14 +159,14 @@ def _estimate(truth: HandEyeViews, stated: SE3, measured: SE3) -> SE3:
     return mount
 
 
-ORDERS: dict[str, tuple[Order, bool]] = {
-    "random": (random_order, False),
-    "farthest in rotation": (farthest_order, False),
-    "D-optimal": (lambda draw: planned_order(draw, NextViewOptions(criterion="D")), False),
-    "A-optimal": (lambda draw: planned_order(draw, NextViewOptions()), False),
-    "A-optimal, scene known": (lambda draw: planned_order(draw, NextViewOptions()), True),
+ORDERS: dict[str, Order] = {
+    "random": random_order,
+    "farthest in rotation": farthest_order,
+    "D-optimal": lambda draw: planned(draw, draw.planner, NextViewOptions(criterion="D")),
+    "A-optimal": lambda draw: planned(draw, draw.planner, NextViewOptions()),
+    "A-optimal, mount unknown": unaware_order,
+    "A-optimal, scene known": lambda draw: planned(draw, draw.aware, NextViewOptions()),
 }
-"""Order, and whether the planner knows the points of the scene."""
 
 
 def learned_mm_deg(seed: int, poses: SE3) -> tuple[float, float]:
@@ -172,12 +188,11 @@ def learned_mm_deg(seed: int, poses: SE3) -> tuple[float, float]:
 def _print_images(cells: int, pool: int, count: int) -> None:
     print(f"{cells} cells, {count} rendered images each; error of gripper_from_camera")
     for name in ("random", "farthest in rotation", "A-optimal"):
-        order, visible = ORDERS[name]
         errors, refused = [], 0
         for seed in range(1, cells + 1):
-            draw = trial(seed, pool, visible)
+            draw = trial(seed, pool)
             try:
-                errors.append(learned_mm_deg(seed, draw.reachable[order(draw)[:count]]))
+                errors.append(learned_mm_deg(seed, draw.reachable[ORDERS[name](draw)[:count]]))
             except InputError as error:
                 print(f"  {name}, cell {seed}: {error}")
                 refused += 1
@@ -194,7 +209,7 @@ def run(
     draws: int = 10,
     pool: int = 200,
     sigmas_mm: tuple[float, ...] = (0.3, 0.2, 0.15),
-    noise_draws: int = 100,
+    noise_draws: int = 20,
     at: int = 15,
     images: int = 0,
 ) -> None:
@@ -214,19 +229,17 @@ def run(
     print(f"{draws} draws, {pool} reachable poses; median (least to most) poses until sigma")
     names = " | ".join(f"{sigma:g} mm" for sigma in sigmas_mm)
     print(f"| order | {names} | sigma at {at} | simulated |")
-    for name, (order, visible) in ORDERS.items():
-        counts, expected, simulated = [], [], []
-        for seed in range(draws):
-            draw = trial(seed, pool, visible)
+    rows: dict[str, list[list[float]]] = {name: [] for name in ORDERS}
+    for seed in range(draws):
+        draw = trial(seed, pool)
+        for name, order in ORDERS.items():
             index = order(draw)
-            counts.append([reached(draw, index, sigma) for sigma in sigmas_mm])
-            expected.append(axis_deviation(covariances(draw, index)[at - 1])[0])
-            simulated.append(simulated_mm(draw, index[:at], noise_draws) if noise_draws else np.nan)
-        low, middle, high = np.quantile(counts, [0, 0.5, 1], axis=0)
+            sigma = axis_deviation(covariances(draw, index)[at - 1])[0]
+            counts = [reached(draw, index, limit) for limit in sigmas_mm]
+            rows[name].append([*counts, sigma, simulated_mm(draw, index[:at], noise_draws)])
+    for name, values in rows.items():
+        low, middle, high = np.quantile(values, [0, 0.5, 1], axis=0)
         cells = " | ".join(
-            f"{m:g} ({lo:g} to {hi:g})" for lo, m, hi in zip(low, middle, high, strict=True)
+            f"{middle[i]:g} ({low[i]:g} to {high[i]:g})" for i in range(len(sigmas_mm))
         )
-        print(
-            f"| {name} | {cells} | {np.median(expected):.3f} mm | {np.median(simulated):.3f} mm |",
-            flush=True,
-        )
+        print(f"| {name} | {cells} | {middle[-2]:.3f} mm | {middle[-1]:.3f} mm |", flush=True)

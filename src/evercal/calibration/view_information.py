@@ -28,6 +28,8 @@ ROUGH_M, ROUGH_RAD = 0.05, np.deg2rad(15.0)
 """Standard deviation of a `gripper_from_camera` that is stated without covariance, per axis."""
 _FAR_M, _ANY_RAD = 1.0, np.pi
 """Standard deviation of the pose of the scene before any image."""
+_AHEAD_M = 0.5
+"""Distance of the scene where the viewing directions do not show it."""
 LEAST_POINTS = 12
 """Points of the scene that a view must show to count."""
 
@@ -146,6 +148,27 @@ class HandEyeViews:
         scene = SE3.from_translation(np.asarray(scene_m, float))
         return cls(information, rough.pose, scene, noise or ViewNoise(), points)
 
+    @classmethod
+    def recorded(
+        cls,
+        base_from_gripper: SE3,
+        gripper_from_camera: UncertainPose | SE3 | None = None,
+        noise: ViewNoise | None = None,
+    ) -> Self:
+        """What images at (m,) gripper poses should determine.
+
+        Args:
+            base_from_gripper: of the images.
+            gripper_from_camera: a rough one. Default: the camera at the gripper's origin.
+            noise: of gripper and camera poses.
+        """
+        rough = gripper_from_camera
+        if rough is None:
+            rough = UncertainPose(SE3.identity(), np.diag(np.repeat([0.2, np.pi], 3) ** 2))
+        pose = rough.pose if isinstance(rough, UncertainPose) else rough
+        start = cls.start(rough, looked_at(base_from_gripper @ pose), noise)
+        return start.with_views(base_from_gripper)
+
     def with_views(self, base_from_gripper: SE3) -> Self:
         """After images at (n,) gripper poses."""
         added = self.added(base_from_gripper).sum(0)
@@ -181,6 +204,20 @@ class HandEyeViews:
 
     def _cameras(self, base_from_gripper: SE3) -> SE3:
         return base_from_gripper @ self.gripper_from_camera
+
+
+def looked_at(base_from_camera: SE3) -> Array:
+    """The point (3,) nearest to the optical axes of (n,) cameras, base frame.
+
+    For parallel axes it lies half a metre ahead of them.
+    """
+    axes = base_from_camera.rotation_matrix()[..., 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    ahead = (base_from_camera.translation_m + _AHEAD_M * axes).mean(0)
+    # A weak pull towards that point decides where the axes do not.
+    weight = 1e-3 * len(axes) * np.eye(3)
+    right = np.einsum("nij,nj->i", across, base_from_camera.translation_m) + weight @ ahead
+    return np.linalg.solve(across.sum(0) + weight, right)
 
 
 def pixel_slopes(camera: Camera, points_camera: Array) -> tuple[Array, Array, Array]:

@@ -42,7 +42,7 @@ class WristRecorder:
         (self._root / "images").mkdir(parents=True, exist_ok=True)
         if wrist.detect(self._root):
             if not (self._root / POSES).is_file():
-                raise InputError(f"{root}: holds other gripper poses than {POSES}; use a new folder")
+                raise InputError(f"{root}: holds gripper poses, but no {POSES}; use a new folder")
             self._frames = list(wrist.load(self._root).train)
             if any(frame.camera != camera for frame in self._frames):
                 raise InputError(f"{root}: was recorded with other intrinsics; use a new folder")

@@ -1,17 +1,15 @@
 """Recordings of a virtual cell, for who has no robot.
 
-    OUT/wrist/                    a recording of the camera on the gripper, see `live.recorder`
-    OUT/tripod/0000.jpg, ...      images of the fixed camera while the arm moves
-    OUT/reachable.csv             gripper poses that the arm can reach, for further views
-    OUT/rough.txt                 gripper_from_camera as in the drawing of the cell, 4x4
-    OUT/truth.json                true gripper_from_camera and base_from_tripod, and all settings
+OUT/wrist/                    a recording of the camera on the gripper, see `live.recorder`
+OUT/tripod/0000.jpg, ...      images of the fixed camera while the arm moves
+OUT/reachable.csv             gripper poses that the arm can reach, for further views
+OUT/rough.txt                 gripper_from_camera as in the drawing of the cell, 4x4
+OUT/truth.json                true gripper_from_camera and base_from_tripod, and all settings
 """
 
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-
-import numpy as np
 
 from evercal.errors import InputError
 from evercal.live.recorder import WristRecorder, pose_rows

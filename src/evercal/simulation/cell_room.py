@@ -5,6 +5,7 @@ Base frame: origin at the foot of the arm, on the table's top, z up, x over the 
 
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -50,7 +51,7 @@ def arm_surfaces(joints_rad: np.ndarray) -> list[Surface]:
     frames = joint_frames(joints_rad)
     points = np.concatenate([np.zeros((1, 3)), frames[[0, 2, 3, 4, 6, 7], :3, 3]])
     surfaces = []
-    for start, end in zip(points[:-1], points[1:], strict=True):
+    for start, end in pairwise(points):
         along = end - start
         length = np.linalg.norm(along)
         if length < 1e-6:

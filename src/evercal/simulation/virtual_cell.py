@@ -164,6 +164,7 @@ def _mount(rng: np.random.Generator) -> SE3:
 def _tripod(rng: np.random.Generator) -> SE3:
     """The true base_from_tripod: beside the arm, looking over the table."""
     side = 1.0 if rng.random() < 0.5 else -1.0
-    position = np.array([rng.uniform(-0.1, 0.2), side * rng.uniform(0.4, 0.6), rng.uniform(0.6, 0.8)])
+    low, high = (-0.1, 0.4, 0.6), (0.2, 0.6, 0.8)
+    position = rng.uniform(low, high) * (1.0, side, 1.0)
     target = WORK_AREA_M + rng.uniform(-1, 1, 3) * (0.08, 0.08, 0.02)
     return look_at(position, target, float(rng.uniform(-0.05, 0.05)))
