@@ -127,8 +127,8 @@ def test_pixel_slopes_match_numerical_derivatives() -> None:
 
 def test_a_view_without_the_scene_adds_nothing() -> None:
     points = ScenePoints(CAMERA, SCENE + np.random.default_rng(0).uniform(-0.1, 0.1, (30, 3)))
-    ahead = SE3.from_translation(SCENE - (0, 0, 0.6))
-    behind = SE3.from_translation(SCENE + (0, 0, 0.6))
+    lift = np.array([0, 0, 0.6])
+    ahead, behind = SE3.from_translation(SCENE - lift), SE3.from_translation(SCENE + lift)
     state = HandEyeViews.start(SE3.identity(), SCENE, NOISE, points)
     added = state.added(SE3.stack([ahead, behind]))
     assert np.linalg.matrix_rank(added[0]) == 6

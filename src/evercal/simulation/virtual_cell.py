@@ -25,7 +25,7 @@ LOWEST_M = 0.2
 
 _CENTRE_RAD = np.array([0.0, -0.6, 0.0, -2.2, 0.0, 1.75, 0.785])
 _SPREAD_RAD = np.array([0.8, 0.6, 0.5, 0.5, 0.7, 0.55, 1.2])
-_BLUR_STEPS = 5
+_BLUR_RAD, _MOST_BLUR_STEPS = 0.002, 16
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,11 @@ class VirtualCamera:
     def read(self) -> tuple[float, NDArray[np.uint8]]:
         """Take an image: time in seconds, and (H, W, 3) RGB."""
         options, stamp = self._cell.options, self._cell.clock.now()
-        times = stamp + options.exposure_s * (np.arange(_BLUR_STEPS) / (_BLUR_STEPS - 1) - 0.5)
-        first, last = (self._cell.robot.true_state(float(times[i]))[1] for i in (0, -1))
-        if np.abs(first - last).max() < 1e-6:
-            times = np.array([stamp])
+        ends = stamp - options.exposure_s / 2, stamp + options.exposure_s / 2
+        first, last = (self._cell.robot.true_state(time)[1] for time in ends)
+        # A joint step moves the image by about a pixel, so that copies join to a smear.
+        steps = int(min(np.ceil(np.abs(first - last).max() / _BLUR_RAD), _MOST_BLUR_STEPS))
+        times = np.linspace(*ends, steps + 1) if steps else [stamp]
         images = [self._render(float(time)) for time in times]
         mean = np.mean(images, axis=0, dtype=np.float32)
         return stamp, self._cell.with_noise(mean)
