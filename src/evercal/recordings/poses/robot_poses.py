@@ -141,11 +141,9 @@ def read_last_robot_pose(path: str | os.PathLike[str], convention: str | None = 
         else:
             first = next((i for i, line in enumerate(head) if line[:1] != "#"), len(head))
             # The last line is the header, or the only row, if no other follows.
-            text = [
-                *head[: first + 1],
-                *(tail[-1:] if tail[-1:] != head[first : first + 1] else ()),
-            ]
-            table = read_pose_table("\n".join(text), given) if first < len(head) else None
+            last = tail[-1:] if tail[-1:] != head[first : first + 1] else []
+            text = "\n".join([*head[: first + 1], *last])
+            table = read_pose_table(text, given) if first < len(head) else None
         if table is None:
             raise ValueError("no complete line of a pose in it yet")
         pose = poses_from_numbers(table.numbers, table.convention)[-1]
