@@ -14,7 +14,7 @@ from evercal.errors import InputError
 
 @dataclass(frozen=True)
 class Simulate:
-    """Render furnished rooms with a robot arm (extra `sim`), or record a virtual robot cell.
+    """Render furnished rooms with an arm (extra `sim`), or record a virtual robot cell.
 
     Example: evercal simulate cell --out cell/
     """
