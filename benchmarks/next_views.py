@@ -45,7 +45,7 @@ class Trial:
     """What is known before the first image: the drawing's mount, and nothing of the scene."""
     aware: HandEyeViews
     """The same with the points of the scene."""
-    added: NDArray[np.float64]
+    added: NDArray[np.floating]
     """(n, 12, 12) information of each pose at the truth."""
     rng: np.random.Generator
     start: NDArray[np.int64]
@@ -105,7 +105,7 @@ def unaware_order(draw: Trial) -> NDArray[np.int64]:
     return np.concatenate([draw.start, chosen.index])
 
 
-def covariances(draw: Trial, order: NDArray[np.int64]) -> NDArray[np.float64]:
+def covariances(draw: Trial, order: NDArray[np.int64]) -> NDArray[np.floating]:
     """(n, 6, 6) of gripper_from_camera after each pose, at the truth, without a prior."""
     added = np.cumsum(draw.added[order], 0)
     weak = np.diag([1e-2, 1e-2, 1e-2, 1e-4, 1e-4, 1e-4, *np.repeat([1e-4, 1e-6], 3)])

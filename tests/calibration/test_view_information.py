@@ -108,7 +108,8 @@ def test_the_covariance_is_that_of_estimates_from_drawn_noise() -> None:
             residual = (predicted.inverse() @ scene @ SE3.exp(x[6:]) @ measured).log()
             return np.einsum("nji,nj->ni", weights, residual).ravel()
 
-        errors.append(least_squares(cost, np.zeros(12), lambda _: slope, x_scale=1e-3).x[:6])
+        found = least_squares(cost, np.zeros(12), lambda _: slope, x_scale=1e-3)  # type: ignore[arg-type]
+        errors.append(found.x[:6])
     expected = np.linalg.inv(state.added(poses).sum(0))[:6, :6]
     squared = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(expected), errors)
     assert squared.mean() == pytest.approx(6.0, rel=0.12)  # chi-squared of six

@@ -19,7 +19,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, cross_matrix
 from evercal.mapping.scene_map import SceneMap
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 MOST_LANDMARKS = 80
 """Landmarks that are used; the expected deviations are those of so many."""
@@ -34,7 +34,7 @@ class HostedPoints:
 
     hosts: SE3
     """(m,) base_from_camera of the keyframes."""
-    host: NDArray[np.int64]
+    host: NDArray[np.integer]
     """(k,) keyframe of each landmark."""
     rays: Array
     """(k, 3) in the keyframe, z = 1."""
@@ -47,10 +47,10 @@ class HostedPoints:
         """(k, 3) base frame."""
         return self.hosts[self.host].apply(self.rays / self.inverse_depth[:, None])
 
-    def take(self, index: NDArray[np.int64]) -> "HostedPoints":
+    def take(self, index: NDArray[np.integer]) -> "HostedPoints":
         """The landmarks of an index, of the same keyframes."""
-        parts = (self.host, self.rays, self.inverse_depth, self.sigma)
-        return HostedPoints(self.hosts, *(part[index] for part in parts))
+        rays, depth, sigma = (p[index] for p in (self.rays, self.inverse_depth, self.sigma))
+        return HostedPoints(self.hosts, self.host[index], rays, depth, sigma)
 
     def found_from(self, base_from_camera: SE3) -> NDArray[np.bool_]:
         """(k,) whether a camera at a pose sees a landmark much as its keyframe does."""
@@ -66,18 +66,14 @@ class HostedPoints:
     def of(cls, scene: SceneMap) -> Self:
         """All landmarks of a scene."""
         frames = scene.keyframes
-        parts = []
-        for i, (marks, camera) in enumerate(zip(frames.landmarks, frames.cameras, strict=True)):
-            parts.append(
-                (
-                    np.full(len(marks), i),
-                    camera.unproject(np.asarray(marks.pixels, float)),
-                    np.asarray(marks.inverse_depth, float),
-                    np.asarray(marks.sigma, float),
-                )
-            )
-        joined = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return cls(frames.base_from_camera, *joined)
+        each = list(zip(frames.landmarks, frames.cameras, strict=True))
+        return cls(
+            frames.base_from_camera,
+            np.repeat(np.arange(len(each)), [len(marks) for marks, _ in each]),
+            np.concatenate([camera.unproject(marks.pixels) for marks, camera in each]),
+            np.concatenate([marks.inverse_depth for marks, _ in each]).astype(float),
+            np.concatenate([marks.sigma for marks, _ in each]).astype(float),
+        )
 
 
 @dataclass(frozen=True, eq=False)

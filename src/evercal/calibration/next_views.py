@@ -17,7 +17,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.geometry.uncertain_pose import axis_deviation
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, UncertainPose, cross_matrix
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 ROUGH_M, ROUGH_RAD = 0.05, np.deg2rad(15.0)
 """Standard deviation of a `gripper_from_camera` that is stated without covariance, per axis."""
@@ -220,7 +220,7 @@ def looked_at(base_from_camera: SE3) -> Array:
     return np.linalg.solve(across.sum(0) + weight, right)
 
 
-def pixel_slopes(camera: Camera, points_camera: Array) -> tuple[Array, Array, Array]:
+def pixel_slopes(camera: Camera, points_camera: Array) -> tuple[Array, Array, NDArray[np.integer]]:
     """Derivatives of pixels by the camera's pose, of the visible ones among (k, 3) points.
 
     Returns:

@@ -6,7 +6,7 @@ blurred, over- or underexposed, or show what another one shows. All limits are o
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,7 +160,7 @@ def sharpness(image: NDArray[np.uint8]) -> float:
     return float(np.sqrt(max(eigh(above, below, eigvals_only=True)[0], 0.0)))
 
 
-def _structure(band: NDArray[np.float32]) -> Array:
+def _structure(band: Any) -> Array:
     """(2, 2) mean structure tensor."""
     import cv2
 

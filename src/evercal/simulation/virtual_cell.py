@@ -84,7 +84,7 @@ class VirtualCamera:
         steps = int(min(np.ceil(np.abs(first - last).max() / _BLUR_RAD), _MOST_BLUR_STEPS))
         times = np.linspace(*ends, steps + 1) if steps else [stamp]
         images = [self._render(float(time)) for time in times]
-        mean = np.mean(images, axis=0, dtype=np.float32)
+        mean = np.asarray(np.mean(images, axis=0), np.float32)
         return stamp, self._cell.with_noise(mean)
 
     def _render(self, now_s: float) -> NDArray[np.uint8]:
