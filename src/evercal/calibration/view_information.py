@@ -121,7 +121,7 @@ class HandEyeViews:
     def estimate(self) -> UncertainPose:
         """Rough X with the covariance that the views so far should give."""
         covariance = np.linalg.inv(self.information)[self.target, self.target]
-        return UncertainPose(self.gripper_from_camera, covariance)
+        return UncertainPose(self.gripper_from_camera, np.asarray(covariance, np.float64))
 
     @classmethod
     def start(
