@@ -13,6 +13,8 @@ VERBS = {
     "handeye": "pose pairs: errors, ellipsoids, outliers, scale, time",
     "boards": "detection of rendered boards, beside the finders of OpenCV",
     "handeye-boards": "boards through a lens found from the same images, beside other solvers",
+    "next-views": "poses of a wrist recording until a stated accuracy, by how they are chosen",
+    "virtual-cell": "record, learn and calibrate virtual cells, compared with their truth",
     "mistakes": "mistakes in pose files that must be refused and named, and clean recordings",
     "tracking": "a stream with holes: tracked, beside the location of single frames",
     "refresh": "a map in a rendered room that changes in ten rounds",
@@ -37,6 +39,8 @@ MODULES = {
     "handeye-boards": "hand_eye_boards",
     "many-keyframes": "many_keyframes",
     "many-recordings": "many_recordings",
+    "next-views": "next_views",
+    "virtual-cell": "virtual_cell",
     "refresh": "changing_room",
     "tune": "tuning",
 }

@@ -24,6 +24,7 @@ ORDER = (
     "mapping",
     "localization",
     "calibration",
+    "live",
     "evaluation",
     "learning",
     "map",

@@ -32,3 +32,27 @@ def test_bad_input_is_one_line(run: Any, rooms: Any, tmp_path: Path) -> None:
         ran = run("inspect", *words)
         assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
         assert json.loads(run("inspect", *words, "--json").out).keys() == {"error"}
+
+
+def test_coverage_and_next_poses_of_a_wrist_recording(run: Any, tmp_path: Path) -> None:
+    cell = tmp_path / "cell"
+    ran = run("simulate", "cell", "--out", cell, "--frames", "9", "--size", "160x120", "--json")
+    made = json.loads(ran.out)
+    assert (ran.code, made["wrist"], made["frames"]) == (0, str(cell / "wrist"), 17)
+    words = ["inspect", cell / "wrist", "--coverage", "--next", cell / "reachable.csv"]
+    words += ["--count", "3", "--gripper-from-camera", cell / "rough.txt"]
+    record = json.loads(run(*words, "--json").out)
+    assert len(record["coverage"]["samples"]) == 9
+    assert record["coverage"]["ready"]
+    sigmas = [view["sigma_mm"] for view in record["next"]]
+    assert len(sigmas) == 3
+    assert sigmas == sorted(sigmas, reverse=True)
+    text = run(*words).out
+    assert "can be learned" in text
+    assert f"row {record['next'][0]['row']}:" in text
+
+
+def test_coverage_needs_gripper_poses(run: Any, rooms: Any) -> None:
+    ran = run("inspect", rooms[0], "--coverage")
+    assert (ran.code, len(ran.err)) == (2, 1)
+    assert "gripper poses" in ran.err[0]

@@ -21,6 +21,9 @@ from evercal.simulation.cell import Suite
         (("sim", "--out", "x", "--frames", "1"), "at least 2"),
         (("sim", "--out", "x", "--seed", "9000"), "reserved"),
         (("sim", "--out", "x", "--frames", "1000000000"), "GB are free"),
+        (("cell", "--out", "x", "--samples", "4"), "--samples"),
+        (("cell", "--out", "x", "--seed", "9000"), "reserved"),
+        (("cell", "--out", "x", "--size", "20x20"), "at least 64x64"),
     ],
 )
 def test_bad_input_is_refused_and_nothing_is_written(

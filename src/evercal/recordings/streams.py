@@ -31,6 +31,11 @@ class StreamFrame(NamedTuple):
     """(H, W, 3) RGB."""
 
 
+def is_live(source: str) -> bool:
+    """Whether a source is a camera or a network stream, not a file or folder."""
+    return _LIVE.fullmatch(source) is not None
+
+
 def stream(source: str, rate: float = 15.0) -> Iterator[StreamFrame]:
     """Read a source frame by frame.
 

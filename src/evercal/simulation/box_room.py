@@ -5,6 +5,7 @@ image is a set of perspective warps combined by depth, and rays intersect the ro
 Base frame: origin on the floor in the middle of the room, z up, metres.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -48,10 +49,10 @@ class BoxRoom:
         rng = np.random.default_rng(seed)
         self.seed = seed
         self.size_m = np.array([rng.uniform(3.0, 5.5), rng.uniform(3.0, 5.5), rng.uniform(2.3, 3)])
-        self._texture_px = texture_px
+        self.texture_px = texture_px
         self.surfaces: list[Surface] = []
         x, y, _ = self.size_m
-        self._add_box(np.array([-x / 2, -y / 2, 0]), self.size_m, rng, inward=True)
+        self.add_box(np.array([-x / 2, -y / 2, 0]), self.size_m, rng, inward=True)
         for _ in range(int(rng.integers(5, 14)) if furniture is None else furniture):
             size = np.array([rng.uniform(0.2, 1.2), rng.uniform(0.2, 1.2), rng.uniform(0.2, 1.4)])
             # Along the walls: the middle of the room stays free for cameras.
@@ -60,14 +61,14 @@ class BoxRoom:
             axis, sign = side // 2, 1 - 2 * (side % 2)
             centre[axis] = sign * (self.size_m[axis] - size[axis]) / 2 * rng.uniform(0.85, 0.999)
             height = max(0.0, rng.uniform(-1.0, self.size_m[2] - size[2]))
-            self._add_box(np.array([*(centre - size[:2] / 2), height]), size, rng, inward=False)
+            self.add_box(np.array([*(centre - size[:2] / 2), height]), size, rng, inward=False)
         for _ in range(int(rng.integers(4, 13))):
             self._add_picture(rng)
 
     def _texture(self, rng: np.random.Generator, calm: bool) -> tuple[np.ndarray, ...]:
         import cv2
 
-        side = self._texture_px
+        side = self.texture_px
         leaves = int(rng.integers(15, 80)) if calm else int(rng.integers(20, 160))
         picture = dead_leaves(side, side, rng, leaves)
         light = one_over_f(64, 2.0, rng)
@@ -82,16 +83,18 @@ class BoxRoom:
             pyramid.append(smaller.astype(np.uint8))
         return tuple(pyramid)
 
-    def _add_box(
-        self, low: np.ndarray, size: np.ndarray, rng: np.random.Generator, inward: bool
+    def add_box(
+        self, low: np.ndarray, size: np.ndarray, rng: np.random.Generator, inward: bool = False
     ) -> None:
-        ex, ey, ez = np.diag(size)
-        faces = [(low, ex, ez), (low + ey + ex, -ex, ez), (low + ex, ey, ez), (low + ey, -ey, ez)]
-        faces.append((low + ez, ex, ey))
-        if inward:
-            faces.append((low + ey, ex, -ey))
-            faces = [(corner + u, -u, v) for corner, u, v in faces]
-        for corner, u, v in faces:
+        """Add a textured box without its bottom; `inward` shows its inner sides and its floor.
+
+        Args:
+            low: (3,) its lowest corner, metres.
+            size: (3,) its sides, metres.
+            rng: source of the textures.
+            inward: whether it is seen from inside.
+        """
+        for corner, u, v in box_faces(low, np.diag(size), inward):
             pyramid = self._texture(rng, calm=inward or rng.random() < 0.3)
             self.surfaces.append(Surface(corner, u, v, pyramid))
 
@@ -106,8 +109,15 @@ class BoxRoom:
         pyramid = self._texture(rng, calm=False)
         self.surfaces.append(Surface(corner, unit_u * size[0], unit_v * size[1], pyramid))
 
-    def render(self, camera: Camera, base_from_camera: SE3) -> np.ndarray:
+    def render(
+        self, camera: Camera, base_from_camera: SE3, moving: Sequence[Surface] = ()
+    ) -> np.ndarray:
         """Render an image of an ideal pinhole camera.
+
+        Args:
+            camera: intrinsics without distortion.
+            base_from_camera: its pose.
+            moving: surfaces that are in the room for this image.
 
         Raises:
             ValueError: The camera has distortion.
@@ -118,7 +128,7 @@ class BoxRoom:
         nearness = np.zeros((camera.height, camera.width), np.float32)  # 1 / depth
         camera_from_base = base_from_camera.inverse()
         rotation = camera_from_base.rotation_matrix()
-        for surface in self.surfaces:
+        for surface in (*self.surfaces, *moving):
             corner = camera_from_base.apply(surface.corner_m)
             edges = np.stack([rotation @ surface.edge_u_m, rotation @ surface.edge_v_m], -1)
             _draw(image, nearness, surface.pyramid, corner, edges, camera)
@@ -179,6 +189,25 @@ class BoxRoom:
         eye = np.stack([x, y, z], -1)
         target = eye + np.stack([np.cos(heading), np.sin(heading), pitch], -1)
         return SE3.stack([look_at(eye[i], target[i], roll[i]) for i in range(frames)])
+
+
+def box_faces(
+    low: np.ndarray, edges: np.ndarray, inward: bool = False
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Corner and two edges, shape (3,), of each visible face of a box: all but its bottom.
+
+    Args:
+        low: (3,) the corner at which the edges start.
+        edges: (3, 3) right-handed orthogonal edges, one a row; the last one points up.
+        inward: whether the box is seen from inside, with its floor.
+    """
+    ex, ey, ez = edges
+    faces = [(low, ex, ez), (low + ey + ex, -ex, ez), (low + ex, ey, ez), (low + ey, -ey, ez)]
+    faces.append((low + ez, ex, ey))
+    if inward:
+        faces.append((low + ey, ex, -ey))
+        faces = [(corner + u, -u, v) for corner, u, v in faces]
+    return faces
 
 
 def _wave(t: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:

@@ -40,6 +40,8 @@ _KEYS = ("poses", "base_from_gripper", "camera_from_board", "T", "transforms", "
 """Keys of poses in JSON and NPZ."""
 _WIDTHS = (6, 7, 8, 12, 13, 16, 17)
 """Numbers of a pose, possibly after a stamp."""
+_END_BYTES = 1 << 16
+"""Bytes read at each end of a file that grows."""
 _LISTS = {"translation_m": ("x_m", "y_m", "z_m"), "quaternion_wxyz": ("qw", "qx", "qy", "qz")}
 """Columns of lists in JSON."""
 
@@ -114,6 +116,61 @@ def read_robot_poses(
         raise InputError(f"{path}: {error.naming(option)}") from None
     except (ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: {error}") from None  # also invalid JSON and arrays of text
+
+
+def read_last_robot_pose(path: str | os.PathLike[str], convention: str | None = None) -> SE3:
+    """Read the last complete row of a table or of JSON lines that another program appends to.
+
+    A row is complete once its line break is written. Long files are read at both ends only.
+
+    Args:
+        path: `.jsonl` holds one JSON object a line; other endings are read as a table.
+        convention: As `read_robot_poses`.
+
+    Raises:
+        InputError: The file is missing, has no complete row, or its row is no pose.
+    """
+    path = Path(path)
+    try:
+        head, tail = _ends(path)
+        given = None if convention is None else pose_convention(convention)
+        if given is None and path.suffix.lower() == ".tum":
+            given = pose_convention("tum")
+        if path.suffix.lower() == ".jsonl":
+            table = _data_table(json.loads(tail[-1]), given) if tail else None
+        else:
+            first = next((i for i, line in enumerate(head) if line[:1] != "#"), len(head))
+            # The last line is the header, or the only row, if no other follows.
+            last = tail[-1:] if tail[-1:] != head[first : first + 1] else []
+            text = "\n".join([*head[: first + 1], *last])
+            table = read_pose_table(text, given) if first < len(head) else None
+        if table is None:
+            raise ValueError("no complete line of a pose in it yet")
+        pose = poses_from_numbers(table.numbers, table.convention)[-1]
+        check_units(table.numbers, table.convention)
+    except FileNotFoundError:
+        raise InputError(f"{path}: file of robot poses is missing; check the path") from None
+    except OSError as error:
+        raise InputError(f"{path}: robot poses cannot be read ({error.strerror})") from None
+    except ConventionError as error:
+        raise InputError(f"{path}: {error.naming(None)}") from None
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{path}: {error}") from None
+    return pose
+
+
+def _ends(path: Path) -> tuple[list[str], list[str]]:
+    """Complete lines at the start and at the end of a file, blank ones left out."""
+    with path.open("rb") as file:
+        head = file.read(_END_BYTES)
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - _END_BYTES))
+        tail = file.read(_END_BYTES)
+    if size > _END_BYTES:
+        tail = tail[tail.find(b"\n") + 1 :]
+    parts = (part[: part.rfind(b"\n") + 1].decode("utf-8", "replace") for part in (head, tail))
+    first, last = ([line for line in part.splitlines() if line.strip()] for part in parts)
+    return first, last
 
 
 def _data_table(data: Any, given: PoseConvention | None) -> PoseTable:

@@ -1,0 +1,245 @@
+"""Poses of a wrist recording until a stated accuracy of the mount, by how they are chosen.
+
+Gripper poses are those of the virtual cell's arm, images are replaced by the camera poses that they
+would give, with noise from the points that they show. The planner knows a rough mount and one
+noise for all views, not the truth. The deviation is that of the best linear estimate at the truth;
+`simulated` estimates draws of noise and compares.
+"""
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from evercal.calibration.next_views import NextViewOptions, next_views
+from evercal.calibration.view_information import HandEyeViews, ScenePoints, ViewNoise
+from evercal.errors import InputError
+from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
+from evercal.geometry.uncertain_pose import axis_deviation
+from evercal.map import Map
+from evercal.recordings import Frame, Recording
+from evercal.simulation.box_room import default_camera
+from evercal.simulation.cell_room import WORK_AREA_M
+from evercal.simulation.virtual_cell import VirtualCell, nominal_mount
+
+Order = Callable[["Trial"], NDArray[np.int64]]
+
+FIRST = 3
+"""Random poses that every order starts with."""
+LONGEST = 60
+"""Poses after which an order counts as not reaching the accuracy."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One draw: poses of the arm, the mount, and what is seen."""
+
+    reachable: SE3
+    """(n,) base_from_gripper."""
+    truth: HandEyeViews
+    """The true mount with the noise of every view, before the first image."""
+    planner: HandEyeViews
+    """What is known before the first image: the drawing's mount, and nothing of the scene."""
+    aware: HandEyeViews
+    """The same with the points of the scene."""
+    added: NDArray[np.floating]
+    """(n, 12, 12) information of each pose at the truth."""
+    rng: np.random.Generator
+    start: NDArray[np.int64]
+    """(FIRST,) poses that every order starts with."""
+
+
+def trial(seed: int, pool: int) -> Trial:
+    """Draw a cell, a mount and a start."""
+    rng = np.random.default_rng([seed, 41])
+    cell = VirtualCell(seed)
+    reachable = cell.reachable_poses(pool)
+    mount, noise = cell.truth.gripper_from_camera, ViewNoise()
+    points = WORK_AREA_M + rng.uniform(-1, 1, (80, 3)) * (0.3, 0.4, 0.08)
+    scene = ScenePoints(default_camera(640, 480), points)
+    truth = HandEyeViews.start(mount, WORK_AREA_M, noise, scene)
+    return Trial(
+        reachable,
+        truth,
+        HandEyeViews.start(nominal_mount(), WORK_AREA_M, noise),
+        HandEyeViews.start(nominal_mount(), WORK_AREA_M, noise, scene),
+        truth.added(reachable),
+        rng,
+        rng.choice(pool, FIRST, replace=False),
+    )
+
+
+def random_order(draw: Trial) -> NDArray[np.int64]:
+    """Any pose that was not used."""
+    rest = np.setdiff1d(np.arange(len(draw.reachable)), draw.start)
+    return np.concatenate([draw.start, draw.rng.permutation(rest)])[:LONGEST]
+
+
+def farthest_order(draw: Trial) -> NDArray[np.int64]:
+    """The pose whose rotation differs most from all used ones."""
+    chosen = draw.start.tolist()
+    gap = np.full(len(draw.reachable), np.inf)
+    while len(chosen) < LONGEST:
+        for i in chosen[-1:] if len(chosen) > FIRST else chosen:
+            gap = np.minimum(gap, pose_distance(draw.reachable[i], draw.reachable)[1])
+        gap[chosen] = -1.0
+        chosen.append(int(gap.argmax()))
+    return np.array(chosen)
+
+
+def planned(draw: Trial, start: HandEyeViews, options: NextViewOptions) -> NDArray[np.int64]:
+    """The poses of `next_views` after the first ones."""
+    used = draw.reachable[draw.start]
+    state = start.with_views(used)
+    chosen = next_views(state, draw.reachable, LONGEST - FIRST, used, options)
+    return np.concatenate([draw.start, chosen.index])
+
+
+def unaware_order(draw: Trial) -> NDArray[np.int64]:
+    """The poses of `next_views` for a camera somewhere on the gripper."""
+    used = draw.reachable[draw.start]
+    chosen = next_views(HandEyeViews.recorded(used), draw.reachable, LONGEST - FIRST, used)
+    return np.concatenate([draw.start, chosen.index])
+
+
+def covariances(draw: Trial, order: NDArray[np.int64]) -> NDArray[np.floating]:
+    """(n, 6, 6) of gripper_from_camera after each pose, at the truth, without a prior."""
+    added = np.cumsum(draw.added[order], 0)
+    weak = np.diag([1e-2, 1e-2, 1e-2, 1e-4, 1e-4, 1e-4, *np.repeat([1e-4, 1e-6], 3)])
+    return np.linalg.inv(added + weak)[:, :6, :6]
+
+
+def reached(draw: Trial, order: NDArray[np.int64], sigma_mm: float) -> int:
+    """Poses after which the deviation of the position is below a limit."""
+    sigmas = [axis_deviation(covariance)[0] for covariance in covariances(draw, order)]
+    return next((i + 1 for i, sigma in enumerate(sigmas) if sigma <= sigma_mm), LONGEST)
+
+
+def simulated_mm(draw: Trial, order: NDArray[np.int64], draws: int) -> float:
+    """Root mean square error of the position per axis, from drawn noise and nonlinear estimates."""
+    truth, grippers = draw.truth, draw.reachable[order]
+    mount, scene = truth.gripper_from_camera, truth.base_from_scene
+    views, noise = len(order), truth.noise
+    cameras = scene.inverse() @ grippers @ mount
+    base_from_camera = grippers @ mount
+    assert truth.points is not None
+    image = noise.camera + np.linalg.inv(
+        truth.points.pose_information(base_from_camera, noise.pixel_px)
+    )
+    roots = np.linalg.cholesky(image)
+    errors = []
+    for _ in range(draws):
+        robot = draw.rng.standard_normal((views, 6)) @ np.linalg.cholesky(noise.gripper).T
+        seen = (roots @ draw.rng.standard_normal((views, 6, 1)))[..., 0]
+        stated, measured = grippers @ SE3.exp(robot), cameras @ SE3.exp(seen)
+        estimate = _estimate(truth, stated, measured)
+        errors.append(estimate.translation_m - mount.translation_m)
+    return 1000 * float(np.sqrt(np.mean(np.square(errors))))
+
+
+def _estimate(truth: HandEyeViews, stated: SE3, measured: SE3) -> SE3:
+    """Gauss-Newton from the truth; the weights are those of the model."""
+    mount, scene = truth.gripper_from_camera, truth.base_from_scene
+    weights = truth.weights(stated)
+    for _ in range(5):
+        residual = ((stated @ mount).inverse() @ scene @ measured).log()
+        jacobian = np.zeros((len(stated), 6, 12))
+        jacobian[:, :3, :3], jacobian[:, 3:, 3:6] = -mount.rotation_matrix().T, -np.eye(3)
+        jacobian[:, :, 6:] = measured.inverse().adjoint()
+        weighted = np.swapaxes(jacobian, 1, 2) @ weights
+        normal = (weighted @ jacobian).sum(0)
+        step = -np.linalg.solve(normal, (weighted @ residual[..., None]).sum(0)[:, 0])
+        turned = mount.rotation_matrix() @ Rotation.from_rotvec(step[3:6]).as_matrix()
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = turned, mount.translation_m + step[:3]
+        mount, scene = SE3.from_matrix(matrix), scene @ SE3.exp(step[6:])
+    return mount
+
+
+ORDERS: dict[str, Order] = {
+    "random": random_order,
+    "farthest in rotation": farthest_order,
+    "D-optimal": lambda draw: planned(draw, draw.planner, NextViewOptions(criterion="D")),
+    "A-optimal": lambda draw: planned(draw, draw.planner, NextViewOptions()),
+    "A-optimal, mount unknown": unaware_order,
+    "A-optimal, scene known": lambda draw: planned(draw, draw.aware, NextViewOptions()),
+}
+
+
+def learned_mm_deg(seed: int, poses: SE3) -> tuple[float, float]:
+    """Error of gripper_from_camera from images of the virtual cell at some poses."""
+    cell = VirtualCell(seed)
+    frames = []
+    for i, pose in enumerate(poses):
+        cell.robot.move_to(pose)
+        image = cell.wrist_camera.read()[1]
+        stated = cell.robot.base_from_gripper()
+        frames.append(Frame(f"{i:04d}", image, cell.intrinsics, None, stated))
+    with tempfile.TemporaryDirectory() as folder:
+        report = Map.open(folder, device="cpu").learn(Recording("wrist", tuple(frames), ()))
+    assert report.hand_eye is not None
+    estimate = report.hand_eye.gripper_from_camera.pose
+    return pose_distance_mm_deg(estimate, cell.truth.gripper_from_camera)
+
+
+def _print_images(cells: int, pool: int, count: int) -> None:
+    print(f"{cells} cells, {count} rendered images each; error of gripper_from_camera")
+    for name in ("random", "farthest in rotation", "A-optimal"):
+        errors, refused = [], 0
+        for seed in range(1, cells + 1):
+            draw = trial(seed, pool)
+            try:
+                errors.append(learned_mm_deg(seed, draw.reachable[ORDERS[name](draw)[:count]]))
+            except InputError as error:
+                print(f"  {name}, cell {seed}: {error}")
+                refused += 1
+        millimetres, degrees = np.array(errors).T
+        rms = np.sqrt(np.mean(millimetres**2)), np.sqrt(np.mean(degrees**2))
+        print(
+            f"| {name} | {rms[0]:.2f} mm, {rms[1]:.3f} deg (root mean square) |"
+            f" {millimetres.max():.2f} mm | {refused} refused |",
+            flush=True,
+        )
+
+
+def run(
+    draws: int = 10,
+    pool: int = 200,
+    sigmas_mm: tuple[float, ...] = (0.3, 0.2, 0.15),
+    noise_draws: int = 20,
+    at: int = 15,
+    images: int = 0,
+) -> None:
+    """Print the poses that each order needs.
+
+    Args:
+        draws: cells and mounts.
+        pool: reachable poses.
+        sigmas_mm: standard deviations per axis to reach.
+        noise_draws: draws of noise of the simulated estimates.
+        at: poses of the simulated estimates.
+        images: cells whose images are rendered and learned with `at` poses, instead of the above.
+    """
+    if images:
+        _print_images(images, pool, at)
+        return
+    print(f"{draws} draws, {pool} reachable poses; median (least to most) poses until sigma")
+    names = " | ".join(f"{sigma:g} mm" for sigma in sigmas_mm)
+    print(f"| order | {names} | sigma at {at} | simulated |")
+    rows: dict[str, list[list[float]]] = {name: [] for name in ORDERS}
+    for seed in range(draws):
+        draw = trial(seed, pool)
+        for name, order in ORDERS.items():
+            index = order(draw)
+            sigma = axis_deviation(covariances(draw, index)[at - 1])[0]
+            counts = [reached(draw, index, limit) for limit in sigmas_mm]
+            rows[name].append([*counts, sigma, simulated_mm(draw, index[:at], noise_draws)])
+    for name, values in rows.items():
+        low, middle, high = np.quantile(values, [0, 0.5, 1], axis=0)
+        cells = " | ".join(
+            f"{middle[i]:g} ({low[i]:g} to {high[i]:g})" for i in range(len(sigmas_mm))
+        )
+        print(f"| {name} | {cells} | {middle[-2]:.3f} mm | {middle[-1]:.3f} mm |", flush=True)

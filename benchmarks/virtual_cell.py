@@ -1,0 +1,55 @@
+"""The whole chain in virtual cells: record, learn, calibrate a tripod, compare with the truth."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from evercal.geometry import pose_distance_mm_deg
+from evercal.map import Map
+from evercal.simulation.cell_recording import WRIST_IMAGES, record_cell
+from evercal.simulation.virtual_cell import CellOptions, VirtualCell
+
+
+def errors_of(seed: int, images: int, options: CellOptions) -> tuple[float, float, float, float]:
+    """Errors of the mount and of the tripod, each in millimetres and degrees."""
+    truth = VirtualCell(seed, options).truth
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        for _ in record_cell(root / "cell", seed, images, options):
+            pass
+        learned = Map.open(root / "map", device="cpu")
+        report = learned.learn(root / "cell/wrist").hand_eye
+        tripod = learned.calibrate(root / "cell/tripod").parent_from_child
+    assert report is not None
+    mount = report.gripper_from_camera.pose
+    return (
+        *pose_distance_mm_deg(mount, truth.gripper_from_camera),
+        *pose_distance_mm_deg(tripod, truth.base_from_tripod),
+    )
+
+
+def run(
+    seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10),
+    images: int = WRIST_IMAGES,
+    size: tuple[int, int] = (640, 480),
+) -> None:
+    """Print the errors of every cell, their medians and the largest.
+
+    Args:
+        seeds: of the cells.
+        images: wrist images of each.
+        size: width and height, pixels.
+    """
+    options = CellOptions(width=size[0], height=size[1])
+    print("| cell | gripper_from_camera | base_from_tripod |\n|---|---:|---:|")
+    rows = []
+    for seed in seeds:
+        rows.append(errors_of(seed, images, options))
+        _print_row(str(seed), np.array(rows[-1]))
+    _print_row("median", np.median(rows, axis=0))
+    _print_row("largest", np.max(rows, axis=0))
+
+
+def _print_row(name: str, row: np.ndarray) -> None:
+    print(f"| {name} | {row[0]:.2f} mm, {row[1]:.3f} deg | {row[2]:.2f} mm, {row[3]:.3f} deg |")

@@ -1,0 +1,117 @@
+"""Images of a camera while it runs.
+
+A live camera is any object with `read()`. `StreamCamera` reads every source of `evercal track`.
+"""
+
+import threading
+import time
+from collections.abc import Iterator
+from typing import Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.errors import InputError
+from evercal.recordings.streams import StreamFrame, is_live, stream
+
+Image = NDArray[np.uint8]
+
+
+class LiveCamera(Protocol):
+    """A camera that states when each image was taken."""
+
+    def read(self) -> tuple[float, Image]:
+        """Take an image: time in seconds, and (H, W, 3) RGB."""
+        ...
+
+
+class StreamCamera:
+    """The frames of a camera, a network stream, a video or a folder, one for each `read`.
+
+    A thread empties the buffer of a live source, so that an image is never older than the call
+    that asks for it. A video or a folder gives its next frame.
+
+    Args:
+        source: number or device of a camera, address, video file or folder.
+        rate: frames per second of a folder whose file names hold no times.
+        timeout_s: longest time to wait for a live frame, seconds.
+
+    Raises:
+        InputError: The source does not exist or cannot be opened.
+    """
+
+    def __init__(self, source: str, rate: float = 15.0, timeout_s: float = 5.0):
+        self._source, self._timeout_s = source, timeout_s
+        self._frames = stream(source, rate)
+        self._newest: _Newest | None = _Newest(self._frames) if is_live(source) else None
+
+    def read(self) -> tuple[float, Image]:
+        """Take the next image.
+
+        Raises:
+            InputError: The source has ended, or no frame arrives in time.
+        """
+        if self._newest is None:
+            frame = next(self._frames, None)
+        else:
+            frame = self._newest.after(time.time(), self._timeout_s)
+        if frame is None:
+            raise InputError(f"{self._source}: no more frames; check the camera or give another")
+        return frame.stamp_s, frame.image
+
+    def close(self) -> None:
+        """Release the source."""
+        if self._newest is not None:
+            self._newest.stop()
+        elif (close := getattr(self._frames, "close", None)) is not None:
+            close()
+
+    def __enter__(self) -> Self:
+        """Return the camera itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Release the source."""
+        self.close()
+
+
+class _Newest:
+    """The newest frame of a stream, read by a thread."""
+
+    def __init__(self, frames: Iterator[StreamFrame]):
+        self._frames, self._frame = frames, None
+        self._changed, self._ended = threading.Condition(), False
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            for frame in self._frames:
+                with self._changed:
+                    self._frame = frame
+                    self._changed.notify_all()
+                    if self._ended:
+                        break
+        finally:
+            if (close := getattr(self._frames, "close", None)) is not None:
+                close()
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+
+    def after(self, stamp_s: float, timeout_s: float) -> StreamFrame | None:
+        """The first frame after a time; None if the stream ends or none arrives."""
+
+        def is_new() -> bool:
+            return self._ended or (self._frame is not None and self._frame.stamp_s >= stamp_s)
+
+        with self._changed:
+            self._changed.wait_for(is_new, timeout_s)
+            new = self._frame is not None and self._frame.stamp_s >= stamp_s
+            return self._frame if new else None
+
+    def stop(self) -> None:
+        """End the thread after its next frame."""
+        with self._changed:
+            self._ended = True
+        self._thread.join(1.0)

@@ -1,0 +1,110 @@
+"""A wrist recording that grows sample by sample, in the format `wrist`.
+
+    ROOT/images/0000.jpg, ...     one image of each sample
+    ROOT/base_from_gripper.csv    its gripper pose
+    ROOT/camera.json              intrinsics of the camera
+
+The table is replaced as a whole after every change, so that the folder is a valid recording at any
+time. A folder that was begun earlier is continued.
+"""
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.errors import InputError
+from evercal.geometry import SE3, Camera
+from evercal.recordings.formats import wrist
+from evercal.recordings.frame import Frame
+from evercal.storage import write_bytes, write_json
+
+POSES = "base_from_gripper.csv"
+JPEG_QUALITY = 95
+_HEADER = "image,x,y,z,qw,qx,qy,qz"
+
+
+class WristRecorder:
+    """Adds and removes samples of a wrist recording.
+
+    Args:
+        root: folder; created if missing, continued if it holds samples of the same camera.
+        camera: intrinsics at the size of the images.
+
+    Raises:
+        InputError: The folder holds samples of another camera, or another file of poses.
+    """
+
+    def __init__(self, root: Path, camera: Camera):
+        self._root, self._camera = Path(root), camera
+        self._frames: list[Frame] = []
+        (self._root / "images").mkdir(parents=True, exist_ok=True)
+        if wrist.detect(self._root):
+            if not (self._root / POSES).is_file():
+                raise InputError(f"{root}: holds gripper poses, but no {POSES}; use a new folder")
+            self._frames = list(wrist.load(self._root).train)
+            if any(frame.camera != camera for frame in self._frames):
+                raise InputError(f"{root}: was recorded with other intrinsics; use a new folder")
+        write_json(self._root / "camera.json", asdict(camera))
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """The samples in recorded order."""
+        return tuple(self._frames)
+
+    def add(self, image: NDArray[np.uint8], base_from_gripper: SE3) -> Frame:
+        """Write a sample and return it.
+
+        Raises:
+            InputError: The size of the image is not that of the camera.
+        """
+        import cv2
+
+        if image.shape != (self._camera.height, self._camera.width, 3):
+            raise InputError(
+                f"image of shape {image.shape}: the camera is {self._camera.width}x"
+                f"{self._camera.height}; give the intrinsics of this image size"
+            )
+        numbers = [int(Path(frame.name).stem) for frame in self._frames]
+        name = f"{max(numbers, default=-1) + 1:04d}.jpg"
+        bgr = np.ascontiguousarray(image[..., ::-1])
+        data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+        path = self._root / "images" / name
+        write_bytes(path, data.tobytes())
+        frame = Frame(name, path, self._camera, None, base_from_gripper)
+        self._frames.append(frame)
+        self._write_poses()
+        return frame
+
+    def remove(self, name: str) -> None:
+        """Remove a sample.
+
+        Raises:
+            InputError: No such sample.
+        """
+        left = [frame for frame in self._frames if frame.name != name]
+        if len(left) == len(self._frames):
+            raise InputError(f"{name}: no such sample in {self._root}")
+        self._frames = left
+        self._write_poses()
+        (self._root / "images" / name).unlink(missing_ok=True)
+
+    def _write_poses(self) -> None:
+        rows = {frame.name: frame.base_from_gripper for frame in self._frames}
+        path = self._root / POSES
+        if rows:
+            poses = SE3.stack([pose for pose in rows.values() if pose is not None])
+            write_bytes(path, pose_rows(poses, tuple(rows)).encode())
+        else:
+            path.unlink(missing_ok=True)
+
+
+def pose_rows(poses: SE3, names: tuple[str, ...] | None = None) -> str:
+    """A table of (n,) poses, with a column of (n,) image names if given."""
+    header = _HEADER if names is not None else _HEADER.partition(",")[2]
+    rows = [header]
+    for i, pose in enumerate(poses):
+        numbers = (f"{number:.8f}" for number in (*pose.translation_m, *pose.rotation_wxyz))
+        rows.append(",".join([*((names[i],) if names is not None else ()), *numbers]))
+    return "\n".join(rows) + "\n"

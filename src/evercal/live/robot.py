@@ -1,0 +1,79 @@
+"""Where gripper poses come from while a robot runs.
+
+A robot is any object with `base_from_gripper()`. One that can move on request also has `move_to`,
+one that states its joint angles has `joints_rad`. A robot of any maker is connected by a file that
+its own program appends poses to.
+"""
+
+import time
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from evercal.errors import InputError
+from evercal.geometry import SE3
+from evercal.recordings.poses.robot_poses import read_last_robot_pose
+
+
+@runtime_checkable
+class Robot(Protocol):
+    """A robot that states the pose of its gripper."""
+
+    def base_from_gripper(self) -> SE3:
+        """Current pose of the gripper in the base frame, a single transform, metres."""
+        ...
+
+
+@runtime_checkable
+class MovingRobot(Robot, Protocol):
+    """A robot that moves on request."""
+
+    def move_to(self, base_from_gripper: SE3) -> None:
+        """Move the gripper to a pose and return once it stands still.
+
+        Raises:
+            InputError: The pose is out of reach.
+        """
+        ...
+
+
+@runtime_checkable
+class JointRobot(Robot, Protocol):
+    """A robot that states its joint angles."""
+
+    def joints_rad(self) -> tuple[float, ...]:
+        """Current joint angles, radians."""
+        ...
+
+
+class PoseFileRobot:
+    """A robot read from a table (CSV, TUM) or JSON lines that another program appends to.
+
+    The last complete line counts. A line without its line break is still being written.
+
+    Args:
+        path: the file; it may appear later.
+        convention: convention of the numbers, such as `kuka`, where no header defines it.
+        most_age_s: age of the file's last change above which its pose is refused as stale;
+            None accepts any age. Seconds.
+    """
+
+    def __init__(
+        self, path: Path | str, convention: str | None = None, most_age_s: float | None = None
+    ):
+        self._path, self._convention, self._most_age_s = Path(path), convention, most_age_s
+
+    def base_from_gripper(self) -> SE3:
+        """Read the pose of the last complete line.
+
+        Raises:
+            InputError: The file is missing, holds no complete pose, or is too old.
+        """
+        pose = read_last_robot_pose(self._path, self._convention)
+        if self._most_age_s is not None:
+            age = time.time() - self._path.stat().st_mtime
+            if age > self._most_age_s:
+                raise InputError(
+                    f"{self._path}: last written {age:.1f} s ago, at most {self._most_age_s:g} s"
+                    " are allowed; check the program that writes it"
+                )
+        return pose

@@ -1,0 +1,67 @@
+"""Recordings of a virtual cell, for who has no robot.
+
+OUT/wrist/                    a recording of the camera on the gripper, see `live.recorder`
+OUT/tripod/0000.jpg, ...      images of the fixed camera while the arm moves
+OUT/reachable.csv             gripper poses that the arm can reach, for further views
+OUT/rough.txt                 gripper_from_camera as in the drawing of the cell, 4x4
+OUT/truth.json                true gripper_from_camera and base_from_tripod, and all settings
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+from evercal.errors import InputError
+from evercal.live.recorder import WristRecorder, pose_rows
+from evercal.mapping.selection import spread_poses
+from evercal.recordings import generic
+from evercal.simulation.cell import write_jpeg
+from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
+from evercal.storage import write_bytes, write_json
+
+WRIST_IMAGES, TRIPOD_IMAGES = 25, 8
+REACHABLE = 200
+JPEG_QUALITY = 95
+_PATH = "wrist"
+
+
+def record_cell(
+    out: Path, seed: int = 0, wrist_images: int = WRIST_IMAGES, options: CellOptions | None = None
+) -> Iterator[None]:
+    """Record a virtual cell into a new folder; yields after each image.
+
+    The wrist poses are spread over the reachable ones. The truth is in a file of its own, which no
+    other command reads.
+
+    Raises:
+        InputError: The folder exists, the seed is reserved, or the images are too small.
+    """
+    if out.exists() and any(out.iterdir()):
+        raise InputError(f"{out}: is not empty; give a new folder")
+    if wrist_images < 1:
+        raise InputError(f"frames {wrist_images}: at least 1")
+    cell = VirtualCell(seed, options)
+    out.mkdir(parents=True, exist_ok=True)
+    reachable = cell.reachable_poses(REACHABLE)
+    views = cell.reachable_poses(max(20 * wrist_images, REACHABLE), seed=1)
+    recorder = WristRecorder(out / _PATH, cell.intrinsics)
+    for i in spread_poses(views, wrist_images):
+        cell.robot.move_to(views[i])
+        recorder.add(cell.wrist_camera.read()[1], cell.robot.base_from_gripper())
+        yield
+    for i in range(TRIPOD_IMAGES):
+        cell.robot.move_to(reachable[i])
+        write_jpeg(out / f"tripod/{i:04d}.jpg", cell.tripod_camera.read()[1], JPEG_QUALITY)
+        yield
+    write_bytes(out / "reachable.csv", pose_rows(reachable).encode())
+    rough = "\n".join(" ".join(f"{x:.9g}" for x in row) for row in nominal_mount().matrix())
+    write_bytes(out / "rough.txt", (rough + "\n").encode())
+    write_json(
+        out / "truth.json",
+        {
+            "gripper_from_camera": generic.pose_to_dict(cell.truth.gripper_from_camera),
+            "base_from_tripod": generic.pose_to_dict(cell.truth.base_from_tripod),
+            "seed": seed,
+            "options": asdict(cell.options),
+        },
+    )

@@ -1,0 +1,102 @@
+"""Kinematics of a Panda-like arm without extras: forward, inverse, and random poses over a table.
+
+Link lengths and joint limits are those of Franka's documentation (Denavit-Hartenberg parameters in
+Craig's convention). The gripper frame is the flange.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.errors import InputError
+from evercal.geometry import SE3
+
+Array = NDArray[np.float64]
+
+LINKS = np.array(
+    [
+        (0.0, 0.333, 0.0),
+        (0.0, 0.0, -np.pi / 2),
+        (0.0, 0.316, np.pi / 2),
+        (0.0825, 0.0, np.pi / 2),
+        (-0.0825, 0.384, -np.pi / 2),
+        (0.0, 0.0, np.pi / 2),
+        (0.088, 0.0, np.pi / 2),
+        (0.0, 0.107, 0.0),
+    ]
+)
+"""(8, 3) a, d and alpha of each joint and of the flange, metres and radians."""
+LOW_RAD = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
+HIGH_RAD = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
+HOME_RAD = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+"""Franka's ready position."""
+
+_REACHED_M, _REACHED_RAD = 1e-6, 1e-6
+_STEPS, _STARTS = 60, 12
+
+
+def joint_frames(joints_rad: Array) -> Array:
+    """(8, 4, 4) frames of the seven joints and of the flange in the base, for joint angles (7,)."""
+    frames, current = np.zeros((8, 4, 4)), np.eye(4)
+    for i, (a, d, alpha) in enumerate(LINKS):
+        angle = joints_rad[i] if i < 7 else 0.0
+        c, s, ca, sa = np.cos(angle), np.sin(angle), np.cos(alpha), np.sin(alpha)
+        step = np.array(
+            [
+                [c, -s, 0, a],
+                [s * ca, c * ca, -sa, -d * sa],
+                [s * sa, c * sa, ca, d * ca],
+                [0, 0, 0, 1],
+            ]
+        )
+        current = current @ step
+        frames[i] = current
+    return frames
+
+
+def base_from_flange(joints_rad: Array) -> SE3:
+    """Pose of the flange for joint angles (7,)."""
+    return SE3.from_matrix(joint_frames(np.asarray(joints_rad, float))[-1])
+
+
+def joints_for(base_from_gripper: SE3, start_rad: Array, seed: int = 0) -> Array:
+    """Joint angles (7,) that bring the flange to a pose, near `start_rad` if possible.
+
+    Damped least squares (Nakamura and Hanafusa 1986) with random restarts.
+
+    Raises:
+        InputError: The pose is out of reach.
+    """
+    rng = np.random.default_rng(seed)
+    starts = [np.asarray(start_rad, float), HOME_RAD]
+    starts += list(rng.uniform(LOW_RAD, HIGH_RAD, (_STARTS - 2, 7)))
+    nearest = np.inf
+    for start in starts:
+        joints, metres, radians = _descend(base_from_gripper, start)
+        if metres < _REACHED_M and radians < _REACHED_RAD:
+            return joints
+        nearest = min(nearest, metres)
+    x, y, z = base_from_gripper.translation_m
+    raise InputError(
+        f"the arm does not reach x {x:.3f}, y {y:.3f}, z {z:.3f} m with this rotation (nearest"
+        f" {1000 * nearest:.0f} mm off); choose a pose nearer to the middle of its workspace"
+    )
+
+
+def _descend(target: SE3, start: Array) -> tuple[Array, float, float]:
+    """Joint angles, and the remaining distance in metres and radians."""
+    joints, error = start.copy(), np.full(6, np.inf)
+    for _ in range(_STEPS):
+        frames = joint_frames(joints)
+        flange = SE3.from_matrix(frames[-1])
+        turn = (target @ flange.inverse()).log()[3:]
+        error = np.concatenate([target.translation_m - flange.translation_m, turn])
+        if np.abs(error).max() < 1e-8:
+            break
+        axes = frames[:7, :3, 2]
+        levers = frames[-1, :3, 3] - frames[:7, :3, 3]
+        jacobian = np.concatenate([np.cross(axes, levers), axes], 1).T
+        damped = jacobian @ jacobian.T + 1e-6 * np.eye(6)
+        step = jacobian.T @ np.linalg.solve(damped, error)
+        step *= min(1.0, 0.5 / max(np.abs(step).max(), 1e-12))
+        joints = np.clip(joints + step, LOW_RAD, HIGH_RAD)
+    return joints, float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))

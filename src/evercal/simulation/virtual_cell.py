@@ -1,0 +1,171 @@
+"""A robot cell without a robot: an arm with a wrist camera, and a fixed camera on a tripod.
+
+The cell offers what a real one offers (`live.robot`, `live.camera`): stated gripper poses, motions
+that take time, and images. The truth is separate and serves tests.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evercal.errors import InputError
+from evercal.geometry import SE3, Camera
+from evercal.simulation.box_room import default_camera, look_at
+from evercal.simulation.cell_room import WORK_AREA_M, arm_surfaces, cell_room
+from evercal.simulation.panda_arm import base_from_flange
+from evercal.simulation.virtual_robot import Clock, SimulatedClock, VirtualRobot, WallClock
+
+RESERVED = 9000
+"""Seeds from here on are reserved for final evaluation."""
+NEAREST_M, FARTHEST_M, OFF_AXIS_DEG = 0.28, 0.75, 22.0
+"""Reachable views have the work area within these distances, and this near the optical axis."""
+LOWEST_M = 0.2
+"""Height of the flange over the table."""
+
+_CENTRE_RAD = np.array([0.0, -0.6, 0.0, -2.2, 0.0, 1.75, 0.785])
+_SPREAD_RAD = np.array([0.8, 0.6, 0.5, 0.5, 0.7, 0.55, 1.2])
+_BLUR_RAD, _MOST_BLUR_STEPS = 0.002, 16
+
+
+@dataclass(frozen=True)
+class CellOptions:
+    """Noise, image size and time of a virtual cell."""
+
+    width: int = 640
+    """Image width, pixels."""
+    height: int = 480
+    """Image height, pixels."""
+    arm_noise_mm: float = 0.1
+    """Standard deviation of the arm's true position about the stated one, per axis."""
+    arm_noise_deg: float = 0.02
+    """Standard deviation of its rotation, per axis."""
+    image_noise: float = 0.008
+    """Standard deviation of a pixel, as a fraction of full scale."""
+    exposure_s: float = 0.01
+    """Time over which a moving camera blurs its image."""
+    realtime: bool = False
+    """Whether motions take wall time; otherwise the time of the cell jumps."""
+    show_arm: bool = True
+    """Whether cameras see the arm."""
+
+
+@dataclass(frozen=True, eq=False)
+class CellTruth:
+    """What a calibration should find."""
+
+    gripper_from_camera: SE3
+    base_from_tripod: SE3
+
+
+class VirtualCamera:
+    """A camera of the cell: on the gripper, or fixed.
+
+    Args:
+        cell: the cell that it stands in.
+        mounted: gripper_from_camera, or base_from_camera if it is fixed.
+        on_gripper: whether it moves with the gripper.
+    """
+
+    def __init__(self, cell: "VirtualCell", mounted: SE3, on_gripper: bool):
+        self._cell, self._mounted, self._on_gripper = cell, mounted, on_gripper
+
+    @property
+    def intrinsics(self) -> Camera:
+        """Intrinsics, exact."""
+        return self._cell.intrinsics
+
+    def read(self) -> tuple[float, NDArray[np.uint8]]:
+        """Take an image: time in seconds, and (H, W, 3) RGB."""
+        options, stamp = self._cell.options, self._cell.clock.now()
+        ends = stamp - options.exposure_s / 2, stamp + options.exposure_s / 2
+        first, last = (self._cell.robot.true_state(time)[1] for time in ends)
+        # A joint step moves the image by about a pixel, so that copies join to a smear.
+        steps = int(min(np.ceil(np.abs(first - last).max() / _BLUR_RAD), _MOST_BLUR_STEPS))
+        times = np.linspace(*ends, steps + 1) if steps else [stamp]
+        images = [self._render(float(time)) for time in times]
+        mean = np.asarray(np.mean(images, axis=0), np.float32)
+        return stamp, self._cell.with_noise(mean)
+
+    def _render(self, now_s: float) -> NDArray[np.uint8]:
+        base_from_gripper, joints = self._cell.robot.true_state(now_s)
+        pose = base_from_gripper @ self._mounted if self._on_gripper else self._mounted
+        return self._cell.render(pose, joints)
+
+
+class VirtualCell:
+    """A cell generated from a seed.
+
+    Args:
+        seed: of room, mount, tripod and noise; below 9000.
+        options: noise, image size and time.
+
+    Raises:
+        InputError: The seed is reserved, or the images are too small.
+    """
+
+    def __init__(self, seed: int = 0, options: CellOptions | None = None):
+        self.options = options or CellOptions()
+        if not 0 <= seed < RESERVED:
+            raise InputError(f"seed {seed}: use 0 to {RESERVED - 1}; higher ones are reserved")
+        if min(self.options.width, self.options.height) < 64:
+            raise InputError(f"size {self.options.width}x{self.options.height}: at least 64x64")
+        rng = np.random.default_rng([seed, 33])
+        self.clock: Clock = WallClock() if self.options.realtime else SimulatedClock()
+        self.intrinsics = default_camera(self.options.width, self.options.height)
+        noise = self.options.arm_noise_mm / 1000, float(np.deg2rad(self.options.arm_noise_deg))
+        self.robot = VirtualRobot(self.clock, *noise, seed)
+        self.truth = CellTruth(_mount(rng), _tripod(rng))
+        self.wrist_camera = VirtualCamera(self, self.truth.gripper_from_camera, True)
+        self.tripod_camera = VirtualCamera(self, self.truth.base_from_tripod, False)
+        self._seed, self._noise = seed, np.random.default_rng([seed, 34])
+
+    def reachable_poses(self, count: int, seed: int = 0) -> SE3:
+        """Random gripper poses (count,) from which a wrist camera sees the work area.
+
+        They rely on the nominal mount (`nominal_mount`), not on the true one.
+        """
+        rng = np.random.default_rng([self._seed, 35, seed])
+        poses: list[SE3] = []
+        while len(poses) < count:
+            gripper = base_from_flange(_CENTRE_RAD + _SPREAD_RAD * rng.uniform(-1, 1, 7))
+            middle = (gripper @ nominal_mount()).inverse().apply(WORK_AREA_M)
+            distance = float(np.linalg.norm(middle))
+            ahead = middle[2] > np.cos(np.deg2rad(OFF_AXIS_DEG)) * distance
+            near = NEAREST_M < distance < FARTHEST_M
+            if ahead and near and gripper.translation_m[2] > LOWEST_M:
+                poses.append(gripper)
+        return SE3.stack(poses)
+
+    def render(self, base_from_camera: SE3, joints_rad: np.ndarray) -> NDArray[np.uint8]:
+        """An ideal image, (H, W, 3), of a camera at a pose while the arm has joint angles (7,)."""
+        room = cell_room(self._seed)
+        arm = arm_surfaces(joints_rad) if self.options.show_arm else []
+        return room.render(self.intrinsics, base_from_camera, arm)
+
+    def with_noise(self, image: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """An image with the noise of a sensor, (H, W, 3)."""
+        noise = self._noise.standard_normal(image.shape, np.float32)
+        noisy = image + 255 * self.options.image_noise * noise
+        return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+
+
+def nominal_mount() -> SE3:
+    """gripper_from_camera as in the drawing of the cell: beside the flange, along the fingers."""
+    turned = SE3.exp(np.array([0, 0, 0, 0, 0, np.pi / 4]))
+    return SE3.from_translation((0.05, -0.05, 0.03)) @ turned
+
+
+def _mount(rng: np.random.Generator) -> SE3:
+    """The true gripper_from_camera: the nominal one within 2 cm and some degrees."""
+    tangent = np.concatenate([rng.uniform(-0.02, 0.02, 3), rng.uniform(-0.1, 0.1, 3)])
+    return nominal_mount() @ SE3.exp(tangent)
+
+
+def _tripod(rng: np.random.Generator) -> SE3:
+    """The true base_from_tripod: beside the arm, looking over the table."""
+    side = 1.0 if rng.random() < 0.5 else -1.0
+    low, high = (-0.1, 0.4, 0.6), (0.2, 0.6, 0.8)
+    position = rng.uniform(low, high) * (1.0, side, 1.0)
+    target = WORK_AREA_M + rng.uniform(-1, 1, 3) * (0.08, 0.08, 0.02)
+    return look_at(position, target, float(rng.uniform(-0.05, 0.05)))

@@ -1,0 +1,128 @@
+"""The arm of the virtual cell: it states where it should be, and is nearly there."""
+
+import threading
+import time
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from evercal.geometry import SE3
+from evercal.simulation.panda_arm import HOME_RAD, base_from_flange, joints_for
+
+SPEED_RAD_S = 1.0
+"""Speed of the fastest joint."""
+_SETTLE_S = 0.1
+
+
+class Clock(Protocol):
+    """What time it is, and how to let it pass."""
+
+    def now(self) -> float:
+        """Seconds."""
+        ...
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+        ...
+
+
+class WallClock:
+    """Unix time."""
+
+    def now(self) -> float:
+        """Seconds since 1970."""
+        return time.time()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+        time.sleep(seconds)
+
+
+class SimulatedClock:
+    """A time that passes only by `sleep`, at once."""
+
+    def __init__(self) -> None:
+        self._now = 0.0
+
+    def now(self) -> float:
+        """Seconds since the start."""
+        return self._now
+
+    def sleep(self, seconds: float) -> None:
+        """Advance the time."""
+        self._now += seconds
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion of the joints from one pose to the next."""
+
+    start_rad: np.ndarray
+    end_rad: np.ndarray
+    start_s: float
+    end_s: float
+    start_error: SE3
+    """gripper_stated_from_gripper before the motion."""
+    end_error: SE3
+    """The same after it."""
+
+    def share(self, now_s: float) -> float:
+        """How much of the way is done: 0 to 1, smooth at both ends."""
+        t = np.clip((now_s - self.start_s) / max(self.end_s - self.start_s, 1e-9), 0.0, 1.0)
+        return float(t * t * (3 - 2 * t))
+
+    def joints_rad(self, now_s: float) -> np.ndarray:
+        """(7,) joint angles at a time."""
+        return self.start_rad + self.share(now_s) * (self.end_rad - self.start_rad)
+
+
+class VirtualRobot:
+    """An arm that moves in joint space and stops with a small error that it does not state.
+
+    Args:
+        clock: time of the cell.
+        noise_m: standard deviation of the true position about the stated one, per axis.
+        noise_rad: the same of the rotation.
+        seed: of the errors.
+    """
+
+    def __init__(self, clock: Clock, noise_m: float, noise_rad: float, seed: int):
+        self._clock, self._sigma = clock, np.repeat([noise_m, noise_rad], 3)
+        self._rng, self._lock = np.random.default_rng([seed, 32]), threading.Lock()
+        error, now = self._draw(), clock.now()
+        self._motion = Motion(HOME_RAD, HOME_RAD, now, now, error, error)
+
+    def base_from_gripper(self) -> SE3:
+        """The stated pose of the flange."""
+        return base_from_flange(self._motion.joints_rad(self._clock.now()))
+
+    def joints_rad(self) -> tuple[float, ...]:
+        """The seven stated joint angles, radians."""
+        return tuple(self._motion.joints_rad(self._clock.now()).tolist())
+
+    def move_to(self, base_from_gripper: SE3) -> None:
+        """Move and return when the arm stands still; a second caller waits for the first.
+
+        Raises:
+            InputError: The pose is out of reach.
+        """
+        with self._lock:
+            now = self._clock.now()
+            start = self._motion.joints_rad(now)
+            end = joints_for(base_from_gripper, start)
+            seconds = float(np.abs(end - start).max()) / SPEED_RAD_S
+            errors = self._motion.end_error, self._draw()
+            self._motion = Motion(start, end, now, now + seconds, *errors)
+            self._clock.sleep(seconds + _SETTLE_S)
+
+    def true_state(self, now_s: float) -> tuple[SE3, np.ndarray]:
+        """True base_from_gripper and joint angles (7,) at a time; for cameras and tests only."""
+        motion = self._motion
+        joints, share = motion.joints_rad(now_s), motion.share(now_s)
+        start = motion.start_error
+        error = start @ SE3.exp(share * (start.inverse() @ motion.end_error).log())
+        return base_from_flange(joints) @ error, joints
+
+    def _draw(self) -> SE3:
+        return SE3.exp(self._sigma * self._rng.standard_normal(6))

@@ -1,0 +1,55 @@
+"""Images of sources in order, and the newest image of a live one."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evercal.errors import InputError
+from evercal.live import camera
+from evercal.live.camera import StreamCamera
+from evercal.recordings.images import write_image
+from evercal.recordings.streams import StreamFrame
+
+
+def picture(value: int) -> np.ndarray:
+    return np.full((8, 8, 3), value, np.uint8)
+
+
+def test_a_folder_gives_its_images_in_order(tmp_path: Path) -> None:
+    for i in range(3):
+        write_image(tmp_path / f"{i}.png", picture(50 * i))
+    with StreamCamera(str(tmp_path), rate=10) as source:
+        reads = [source.read() for _ in range(3)]
+        assert [stamp for stamp, _ in reads] == pytest.approx([0, 0.1, 0.2])
+        assert [int(image[0, 0, 0]) for _, image in reads] == [0, 50, 100]
+        with pytest.raises(InputError, match="no more frames"):
+            source.read()
+
+
+def test_a_live_image_is_not_older_than_the_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed = []
+
+    def frames(source: str, rate: float) -> Iterator[StreamFrame]:
+        try:
+            for i in range(400):
+                yield StreamFrame(str(i), time.time(), picture(i % 250))
+                time.sleep(0.005)
+        finally:
+            closed.append(source)
+
+    monkeypatch.setattr(camera, "stream", frames)
+    with StreamCamera("0") as source:
+        for _ in range(2):
+            time.sleep(0.05)
+            before = time.time()
+            assert source.read()[0] >= before
+    assert closed == ["0"]
+
+
+def test_a_live_source_that_stops_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(camera, "stream", lambda source, rate: iter(()))
+    with StreamCamera("rtsp://cell") as source, pytest.raises(InputError, match="rtsp://cell"):
+        source.read()

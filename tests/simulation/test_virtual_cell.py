@@ -1,0 +1,168 @@
+"""The virtual cell: kinematics, time, noise, and that its truth explains what it states."""
+
+import json
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evercal.errors import InputError
+from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
+from evercal.live.coverage import sharpness
+from evercal.recordings import generic, load_recording, read_robot_poses
+from evercal.simulation.cell_recording import record_cell
+from evercal.simulation.cell_room import TABLE_M, cell_room
+from evercal.simulation.panda_arm import (
+    HIGH_RAD,
+    HOME_RAD,
+    LOW_RAD,
+    base_from_flange,
+    joint_frames,
+    joints_for,
+)
+from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
+from evercal.simulation.virtual_robot import SimulatedClock, VirtualRobot, WallClock
+
+SMALL = CellOptions(width=160, height=120)
+
+
+def test_the_arm_is_at_its_documented_place_when_stretched() -> None:
+    """All joints at zero: up 0.333 + 0.316 + 0.384 - 0.107 m, out 0.088 m."""
+    np.testing.assert_allclose(
+        base_from_flange(np.zeros(7)).translation_m, (0.088, 0, 0.926), atol=1e-12
+    )
+
+
+def test_forward_kinematics_are_those_of_the_urdf() -> None:
+    pytest.importorskip("yourdfpy", reason="the extra 'sim' is not installed")
+    from evercal.simulation.furnished.panda import Panda
+
+    panda = Panda(meshes=False)
+    for joints in np.random.default_rng(0).uniform(LOW_RAD, HIGH_RAD, (5, 7)):
+        expected = panda.base_from_flange(joints)
+        assert max(pose_distance(base_from_flange(joints), expected)) < 1e-9
+
+
+def test_inverse_kinematics_undo_forward_kinematics_within_limits() -> None:
+    rng = np.random.default_rng(1)
+    for joints in np.clip(HOME_RAD + rng.uniform(-0.8, 0.8, (20, 7)), LOW_RAD, HIGH_RAD):
+        pose = base_from_flange(joints)
+        found = joints_for(pose, HOME_RAD)
+        assert max(pose_distance(base_from_flange(found), pose)) < 3e-6
+        assert ((found >= LOW_RAD) & (found <= HIGH_RAD)).all()
+    with pytest.raises(InputError, match="does not reach"):
+        joints_for(SE3.from_translation((2.0, 0, 0.5)), HOME_RAD)
+
+
+def test_links_have_constant_lengths() -> None:
+    rng = np.random.default_rng(2)
+    for joints in rng.uniform(LOW_RAD, HIGH_RAD, (5, 7)):
+        steps = np.diff(joint_frames(joints)[:, :3, 3], axis=0)
+        np.testing.assert_allclose(np.linalg.norm(steps, axis=1)[[1, 4, 5]], (0.316, 0, 0.088))
+
+
+def test_motions_take_time_and_other_threads_see_them() -> None:
+    robot = VirtualRobot(WallClock(), 0.0, 0.0, 0)
+    target = base_from_flange(HOME_RAD + np.array([1.2, 0, 0, 0, 0, 0, 0]))
+    start = robot.base_from_gripper()
+    began = time.monotonic()
+    thread = threading.Thread(target=robot.move_to, args=(target,))
+    thread.start()
+    time.sleep(0.15)
+    between = robot.base_from_gripper()
+    thread.join()
+    assert time.monotonic() - began > 0.3
+    assert pose_distance(start, between)[1] > 0.01
+    assert pose_distance(between, target)[1] > 0.01
+    assert max(pose_distance(robot.base_from_gripper(), target)) < 1e-5
+
+
+def test_the_true_pose_differs_by_the_stated_noise_and_stays_while_the_arm_stands() -> None:
+    clock = SimulatedClock()
+    robot = VirtualRobot(clock, 1e-3, 2e-3, 5)
+    rng, errors = np.random.default_rng(3), []
+    for joints in HOME_RAD + rng.uniform(-0.3, 0.3, (150, 7)):
+        robot.move_to(base_from_flange(joints))
+        truth = robot.true_state(clock.now())[0]
+        errors.append((robot.base_from_gripper().inverse() @ truth).log())
+        assert max(pose_distance(truth, robot.true_state(clock.now() + 9)[0])) < 1e-12
+    sigma = np.std(errors, axis=0)
+    np.testing.assert_allclose(sigma, np.repeat([1e-3, 2e-3], 3), rtol=0.2)
+
+
+def test_images_follow_the_true_mount() -> None:
+    """Rendered from the stated pose and the true mount, an image differs by noise only."""
+    exact = CellOptions(width=160, height=120, arm_noise_mm=0, arm_noise_deg=0, show_arm=False)
+    cell = VirtualCell(4, exact)
+    pose = cell.reachable_poses(1)[0]
+    cell.robot.move_to(pose)
+    image = cell.wrist_camera.read()[1].astype(float)
+    at_truth = pose @ cell.truth.gripper_from_camera
+    difference = image - cell_room(4).render(cell.intrinsics, at_truth)
+    assert np.median(np.abs(difference)) < 3
+    elsewhere = cell_room(4).render(cell.intrinsics, pose @ nominal_mount())
+    assert np.abs(image - elsewhere).mean() > 4 * np.abs(difference).mean()
+
+
+def test_the_table_is_below_the_arm() -> None:
+    eye = np.array([0.5, 0.62, 0.3])
+    _, depth = cell_room(4).intersect(eye, np.array([[0.0, 0.0, -1.0]]))
+    assert depth[0] == pytest.approx(0.3, abs=1e-9)
+    outside = np.array([0.5, 0.8, 0.3])
+    _, depth = cell_room(4).intersect(outside, np.array([[0.0, 0.0, -1.0]]))
+    assert depth[0] <= TABLE_M + 0.3 + 1e-9
+
+
+def test_a_moving_camera_blurs() -> None:
+    cell = VirtualCell(4, CellOptions(exposure_s=0.02))
+    cell.robot.move_to(cell.reachable_poses(1)[0])
+    still = cell.wrist_camera.read()[1]
+    cell.clock.sleep(-cell.clock.now() / 2)  # back to the middle of the motion
+    moving = cell.wrist_camera.read()[1]
+    assert sharpness(moving) < 0.9 * sharpness(still)
+
+
+def test_a_recording_is_read_back_and_states_its_truth_apart(tmp_path: Path) -> None:
+    out = tmp_path / "cell"
+    assert len(list(record_cell(out, 6, 9, SMALL))) == 9 + 8
+    frames = load_recording(out / "wrist").train
+    assert len(frames) == 9
+    assert len(list((out / "tripod").glob("*.jpg"))) == 8
+    assert len(read_robot_poses(out / "reachable.csv").poses) == 200
+    truth = json.loads((out / "truth.json").read_text())
+    cell = VirtualCell(6, SMALL)
+    assert truth["gripper_from_camera"] == generic.pose_to_dict(cell.truth.gripper_from_camera)
+    mount = cell.truth.gripper_from_camera
+    millimetres, degrees = pose_distance_mm_deg(mount, nominal_mount())
+    assert 1 < millimetres < 40
+    assert 0.5 < degrees < 12
+    assert not any(path.name == "truth.json" for path in (out / "wrist").rglob("*"))
+    with pytest.raises(InputError, match="not empty"):
+        next(record_cell(out))
+
+
+def test_reserved_seeds_are_refused() -> None:
+    with pytest.raises(InputError, match="reserved"):
+        VirtualCell(9000)
+
+
+@pytest.mark.slow
+def test_the_whole_chain_finds_the_truth(tmp_path: Path) -> None:
+    """Wrist recording to mount and fixed camera: within 1 mm and 0.05 deg."""
+    from evercal import Map
+
+    list(record_cell(tmp_path / "cell", 3))
+    truth = VirtualCell(3).truth
+    learned = Map.open(tmp_path / "map", device="cpu")
+    report = learned.learn(tmp_path / "cell/wrist").hand_eye
+    assert report is not None
+    fixed = learned.calibrate(tmp_path / "cell/tripod").parent_from_child
+    for found, true in (
+        (report.gripper_from_camera.pose, truth.gripper_from_camera),
+        (fixed, truth.base_from_tripod),
+    ):
+        millimetres, degrees = pose_distance_mm_deg(found, true)
+        assert millimetres < 1
+        assert degrees < 0.05
