@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +17,21 @@ import pytest
 pytest.importorskip("viser")
 
 
-def started(store: Path, *words: str) -> tuple[subprocess.Popen[str], str]:
+@contextmanager
+def started(store: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     command = [sys.executable, "-m", "evercal", "view", str(store), "--port", "0", *words]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    return process, process.stdout.readline()
+    with process:
+        try:
+            yield process, process.stdout.readline()
+        finally:
+            process.kill()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_it_serves_a_page_and_ends_cleanly(number: signal.Signals, hall_store: Path) -> None:
-    process, line = started(hall_store, "--json")
-    with process:
+    with started(hall_store, "--json") as (process, line):
         url = json.loads(line)["url"]
         assert url.startswith("http://127.0.0.1:")
         with urllib.request.urlopen(url, timeout=60) as page:
@@ -38,11 +44,9 @@ def test_it_serves_a_page_and_ends_cleanly(number: signal.Signals, hall_store: P
 
 
 def test_the_line_has_the_address_and_the_tunnel(hall_store: Path) -> None:
-    process, line = started(hall_store)
-    with process:
+    with started(hall_store) as (_, line):
         port = line.partition("http://127.0.0.1:")[2].partition(" ")[0]
         assert f"ssh -L {port}:127.0.0.1:{port}" in line
-        process.terminate()
 
 
 @pytest.mark.parametrize(
@@ -64,7 +68,7 @@ def test_misuse_is_one_line(run: Any, hall_store: Path, words: list[str], messag
 def test_another_folder_is_refused(run: Any, still_images: Path) -> None:
     ran = run("view", still_images, "--port", "0")
     assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-    assert "is not an evercal store" in ran.err[0]
+    assert "no manifest.json in it, so it is not a store" in ran.err[0]
 
 
 def test_networks_are_refused(run: Any, network_store: Path) -> None:

@@ -98,15 +98,17 @@ class View:
 
 
 def _until_stopped(ready: Callable[[], object]) -> None:
-    """Call `ready` and return at SIGTERM; Ctrl-C raises KeyboardInterrupt."""
+    """Call `ready` and return at SIGTERM or Ctrl-C."""
     stopped = threading.Event()
 
     def stop(number: int, frame: FrameType | None) -> None:
         stopped.set()
 
-    before = signal.signal(signal.SIGTERM, stop)
+    ends = (signal.SIGTERM, signal.SIGINT)
+    before = [signal.signal(number, stop) for number in ends]
     try:
         ready()
         stopped.wait()
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in zip(ends, before, strict=True):
+            signal.signal(number, handler)
