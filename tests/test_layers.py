@@ -39,7 +39,7 @@ FOR_ALL = ("errors",)
 FACES = ("__init__", "__main__")
 """Modules of the root that may import everything."""
 PRODUCT = ORDER[: ORDER.index("simulation")]
-MOST_LOCALIZING, MOST_LEARNING = 42, 61
+MOST_LOCALIZING, MOST_LEARNING = 42, 62
 """Modules of evercal that a program loads, at most."""
 
 

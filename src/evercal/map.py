@@ -1,7 +1,7 @@
 """`Map`: scenes that a robot has learned, and everything that is asked of them.
 
-Learning a scene reads through three files: `Map.learn` here, `mapping.build.build_map`, and
-`mapping.store.MapStore.commit`. Methods import what they need, so that a robot that only locates
+Learning a scene reads through four files: `Map.learn` here, `learning.scene`,
+`mapping.build.build_map`, and `mapping.store.MapStore.commit`. Methods import what they need, so that a robot that only locates
 images loads no module that learns or calibrates.
 """
 

@@ -36,7 +36,9 @@ class Learn:
 
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the map; created if it is missing."""
-    recordings: Annotated[Positional[tuple[Path, ...]], arg(metavar="RECORDING")]
+    recordings: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="RECORDING...", help_behavior_hint="")
+    ] = ()
     """Folders of recordings, or files of bags."""
     name: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Name of the scene. Default: the recording's own name."""
@@ -64,7 +66,7 @@ class Learn:
     def run(self) -> int:
         """Learn and print a summary."""
         if not self.recordings:
-            raise InputError("no recording given; name one or more")
+            raise InputError("no RECORDING given; name the folder of one or more")
         if self.workers < 1:
             raise InputError(f"--workers {self.workers}: give a number >= 1")
         return self._run_one(self.recordings[0]) if len(self.recordings) == 1 else self._run_many()

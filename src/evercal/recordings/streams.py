@@ -58,11 +58,6 @@ def stream(source: str, rate: float = 15.0) -> Iterator[StreamFrame]:
     return _captured(source)
 
 
-def is_live(source: str) -> bool:
-    """Whether frames arrive in real time: a camera or a network stream."""
-    return bool(_LIVE.fullmatch(source))
-
-
 def _images(folder: Path, rate: float) -> Iterator[StreamFrame]:
     files = image_files([folder])
     stamps = times_in_names([path.name for path in files])
