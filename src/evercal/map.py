@@ -1,8 +1,8 @@
 """`Map`: scenes that a robot has learned, and everything that is asked of them.
 
 Learning a scene reads through four files: `Map.learn` here, `learning.scene`,
-`mapping.build.build_map`, and `mapping.store.MapStore.commit`. Methods import what they need, so that a robot that only locates
-images loads no module that learns or calibrates.
+`mapping.build.build_map`, and `mapping.store.MapStore.commit`. Methods import what they need, so
+that a robot that only locates images loads no module that learns or calibrates.
 """
 
 from __future__ import annotations

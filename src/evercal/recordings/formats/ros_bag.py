@@ -139,7 +139,7 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
 
 def _unsupported(bag: BagFile, topic: str) -> str | None:
     """Reason why the images of a topic cannot be read, if any."""
-    first = next(bag.messages([topic])).content
+    first = bag.first(topic)
     if bag.kinds[topic] == IMAGE:
         return ros_images.unsupported(first.encoding)
     return "holds depth" if "compressedDepth" in first.format else None
@@ -176,10 +176,7 @@ def _bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
             f"{bag.path}: no camera_info for {image_topic} ({beside} is expected, there is"
             f" {' and '.join(topics) or 'none'}); record it, or give the intrinsics with --camera"
         )
-    first = next(bag.messages([beside]), None)
-    if first is None:
-        raise InputError(f"{bag.path}: {beside} has no message, although the bag lists some")
-    message = first.content
+    message = bag.first(beside)
     try:
         return beside, _camera(message, image.rpartition("/")[2].startswith("image_rect"))
     except ValueError as error:

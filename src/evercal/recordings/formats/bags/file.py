@@ -98,6 +98,16 @@ class BagFile:
                 return
             yield message
 
+    def first(self, topic: str) -> Any:
+        """Content of the first message of a topic that holds some.
+
+        Raises:
+            InputError: The bag is damaged.
+        """
+        for message in self.messages([topic]):
+            return message.content
+        raise InputError(f"{self.path}: damaged: {topic} has no message, although some are listed")
+
     def message(self, topic: str, logged_ns: int, repeat: int) -> Message:
         """Read one message.
 
