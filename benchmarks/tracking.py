@@ -1,6 +1,7 @@
 """A stream of a moving camera in a box room: tracked, beside the location of single frames."""
 
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -91,8 +92,8 @@ def run(
             estimate = localizer.localize(image)
             singles.append((i, estimate, 1000 * (time.perf_counter() - began)))
     seen = [(i, f, ms) for i, f, ms in tracked if i not in dark]
-    errors = [_error(f.estimate, pose_at(places[i])) for i, f, _ in seen]
-    alone = [_error(e, pose_at(places[i])) for i, e, _ in singles]
+    errors = _errors((f.estimate, pose_at(places[i])) for i, f, _ in seen)
+    alone = _errors((e, pose_at(places[i])) for i, e, _ in singles)
     ms, single_ms = (np.array([row[2] for row in rows]) for rows in (seen, singles))
     near = np.array([row[2] for row in seen if row[1].state == "tracking"])
     row = {
@@ -104,7 +105,7 @@ def run(
         "lost": sum(f.state == "lost" for _, f, _ in seen),
         "found_while_covered": sum(f.state != "lost" for i, f, _ in tracked if i in dark),
         "frames_until_found": _recovery(tracked, dark),
-        "wrong_10_mm": int((np.array(errors) > 10).sum() - np.isinf(errors).sum()),
+        "wrong_10_mm": sum(error > 10 for error in errors),
         "median_mm": float(np.median(errors)),
         "p95_mm": float(np.quantile(errors, 0.95)),
         "single_median_mm": float(np.median(alone)),
@@ -135,10 +136,13 @@ def _learned(room: BoxRoom, lens: Camera) -> MapContents:
     return MapContents(encoder, 240, [scene])
 
 
-def _error(estimate: PoseEstimate, truth: SE3) -> float:
-    if estimate.status != "ok" or estimate.base_from_camera is None:
-        return float("inf")
-    return 1000 * float(pose_distance(estimate.base_from_camera, truth)[0])
+def _errors(answers: Iterable[tuple[PoseEstimate, SE3]]) -> list[float]:
+    """Millimetres of the answers that have a pose."""
+    return [
+        1000 * float(pose_distance(estimate.base_from_camera, truth)[0])
+        for estimate, truth in answers
+        if estimate.status == "ok" and estimate.base_from_camera is not None
+    ]
 
 
 def _recovery(tracked: list[tuple[int, TrackedFrame, float]], dark: set[int]) -> int:

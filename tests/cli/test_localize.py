@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -203,3 +206,32 @@ def test_missing_device_is_refused(run: Any, hall_store: Path, images: Path) -> 
     ran = run("localize", hall_store, images, "--device", "cuda")
     assert (ran.code, len(ran.err)) == (2, 1)
     assert ran.err[0].startswith("error: device 'cuda': ")
+
+
+def test_float32_gives_the_same_bytes_with_other_instructions(
+    hall_store: Path, hall: Recording, tmp_path: Path
+) -> None:
+    """Libraries choose kernels by the processor; older ones are emulated by their switches."""
+    write_image(tmp_path / "image.png", np.asarray(hall.test[7].read_image()))
+    older = {
+        "ATEN_CPU_CAPABILITY": "avx2",
+        "ONEDNN_MAX_CPU_ISA": "AVX2",
+        "MKL_ENABLE_INSTRUCTIONS": "AVX2",
+        "OPENCV_CPU_DISABLE": "AVX512_SKX",
+    }
+    command = [sys.executable, "-m", "evercal", "localize", str(hall_store)]
+    rows = []
+    for instructions in ({}, older):
+        set_to = {**os.environ, "EVERCAL_PRECISION": "float32", **instructions}
+        done = subprocess.run(
+            [*command, str(tmp_path / "image.png"), "--json"],
+            env=set_to,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        (row,) = json.loads(done.stdout)["images"]
+        del row["ms"]
+        rows.append(row)
+    assert rows[0]["status"] == "ok"
+    assert rows[0] == rows[1]

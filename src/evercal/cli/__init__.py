@@ -8,6 +8,7 @@ import contextlib
 import difflib
 import io
 import os
+import platform
 import shutil
 import sys
 import textwrap
@@ -38,6 +39,11 @@ _GROUPS = {
 """Verbs by purpose, in the order of the help."""
 
 
+_X86 = ("x86_64", "AMD64")
+_SAME_ARITHMETIC = {"OPENBLAS_CORETYPE": "Haswell", "MKL_CBWR": "COMPATIBLE"}
+"""Matrix products by kernels that every x86 processor with AVX2 has, for `EVERCAL_PRECISION`."""
+
+
 class Command(Protocol):
     """A verb with its arguments."""
 
@@ -60,6 +66,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Spinning threads of torch take up to ten times as long when other programs use the cores, and
     # save a tenth otherwise. Read once, when torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    if os.environ.get("EVERCAL_PRECISION") == "float32" and platform.machine() in _X86:
+        for name, value in _SAME_ARITHMETIC.items():
+            os.environ.setdefault(name, value)
     try:
         command = _parse(words, as_json)
         code = command if isinstance(command, int) else command.run()

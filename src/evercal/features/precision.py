@@ -2,7 +2,8 @@
 
 By default the hardware decides, so two machines can differ in the last digits of features, and
 thereby of poses. `EVERCAL_PRECISION` sets it: `float32` gives the same arithmetic on every machine,
-`bfloat16` is faster, `auto` is the default.
+`bfloat16` is faster, `auto` is the default. With `float32`, the command line also fixes the kernels
+of matrix products; a Python program sets OPENBLAS_CORETYPE=Haswell and MKL_CBWR=COMPATIBLE itself.
 """
 
 import os
