@@ -145,7 +145,7 @@ class Tracker:
         began = time.perf_counter()
         self._search = search = self._search or BackgroundSearch(self.localizer, self.camera)
         adopted = search.under_way and self._adopted(search, budget)
-        estimate = self._near_prediction(image, stamp, budget)
+        estimate = self._near_prediction(image, stamp, budget, adopted)
         if estimate is not None:
             estimate = replace(estimate, omitted=tuple(budget.omitted))
             return estimate, "relocalized" if adopted else "tracking"
@@ -175,9 +175,13 @@ class Tracker:
         return True
 
     def _near_prediction(
-        self, image: np.ndarray, stamp: float, budget: TimeBudget
+        self, image: np.ndarray, stamp: float, budget: TimeBudget, adopted: bool = False
     ) -> PoseEstimate | None:
-        """Align the landmarks around the predicted pose; None if that does not suffice."""
+        """Align the landmarks around the predicted pose; None if that does not suffice.
+
+        The pose of an earlier frame that is `adopted` is farther away and was not confirmed: the
+        search is coarse, and the pose needs the support of a settled one.
+        """
         began, predicted = time.perf_counter(), self._predicted(stamp)
         if predicted is None:
             return None
@@ -187,15 +191,20 @@ class Tracker:
         query = Query(image, torch.zeros(0), localizer.options.patches_short_side, priors)
         candidate = Candidate(self._scene, self._next_keyframes(predicted))
         change = np.zeros(5) if self._change is None else self._change
-        for coarse in (False, True):
+        for coarse in (True,) if adopted else (False, True):
             start = time.perf_counter()
-            if coarse and not budget.allows("coarse alignment", _MARGIN * self._alignment_s):
+            if (
+                coarse
+                and not adopted
+                and not budget.allows("coarse alignment", _MARGIN * self._alignment_s)
+            ):
                 return None
             found = localizer.aligned(
                 query, candidate, cameras[self._scene], predicted, change, coarse
             )
             self._alignment_s = time.perf_counter() - start
-            if found is not None and self._trusted(found, predicted):
+            times = self.options.settled if adopted else 1.0
+            if found is not None and self._trusted(found, predicted, times):
                 self._remember(found, stamp)
                 return localizer.answer(query, found, 1000 * (time.perf_counter() - began))
         return None
@@ -221,9 +230,9 @@ class Tracker:
         order = np.argsort(metres / spread + radians, kind="stable")
         return first + order[: self.options.keyframes]
 
-    def _trusted(self, found: Hypothesis, predicted: SE3) -> bool:
+    def _trusted(self, found: Hypothesis, predicted: SE3, times: float) -> bool:
         """Whether a pose is accepted and near its prediction."""
-        if found.pose is None or not self.localizer.accepts(found):
+        if found.pose is None or not self.localizer.accepts(found, times):
             return False
         metres, radians = pose_distance(found.pose.pose, predicted)
         frame = self.localizer.contents.scenes[self._scene].frame
