@@ -112,8 +112,9 @@ def test_opencv_storage_is_read(tmp_path: Path) -> None:
     stereo = old.replace("camera_matrix", "M1").replace("dist_coeffs", "D1")
     for text, expected in (
         (stereo, "'camera_matrix' is missing, there is M1, D1, fisheye_model"),
-        (old[:120], "OpenCV cannot read its storage"),
-        ("<opencv_storage><a>", "OpenCV cannot read its storage"),
+        (old[:120], "not valid YAML"),
+        ("<opencv_storage><a>", "not valid XML"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage/>', "declares XML entities"),
     ):
         with pytest.raises(InputError, match=expected) as caught:
             read_camera(written(tmp_path, text), (640, 480))

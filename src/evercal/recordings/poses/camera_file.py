@@ -148,23 +148,48 @@ def _fields_of(path: Path) -> Mapping[str, Any]:
 
 
 def _stored_by_opencv(text: str) -> dict[str, Any]:
-    """Values of a cv2.FileStorage."""
-    import cv2
+    """Matrices and numbers of a cv2.FileStorage.
 
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        nodes = {key: storage.getNode(key) for key in storage.root().keys()}  # noqa: SIM118
-        values: dict[str, Any] = {
-            key: node.mat().ravel().tolist() if node.isMap() else node.real()
-            for key, node in nodes.items()
-            if node.isMap() or node.isInt() or node.isReal()
-        }
-    except (cv2.error, SystemError, AttributeError) as error:
-        text = " ".join(str(error).split())[:100]
-        raise ValueError(f"OpenCV cannot read its storage ({text}); {_EXPECTED}") from None
+    Read without OpenCV, whose parser of such files can end the whole process on a damaged one.
+    """
+    if text.lstrip().startswith("{"):
+        found = json.loads(text)
+    elif "<opencv_storage" in text:
+        found = _xml_of_opencv(text)
+    else:
+        import yaml
+
+        lines = text.splitlines()  # the first one, %YAML:1.0, is not valid YAML
+        plain = "\n".join(line for line in lines if not line.startswith("%"))
+        found = yaml.safe_load(re.sub(r"!!opencv-[a-z-]+", "", plain))
+    if not isinstance(found, dict):
+        raise ValueError(f"no camera in it; {_EXPECTED}")
+    values = {
+        str(key): float(value) if isinstance(value, str) and is_number(value) else value
+        for key, value in found.items()
+        if isinstance(value, dict | int | float) or is_number(str(value))
+    }
     if values.get("fisheye_model"):
         raise ValueError("fisheye_model is set; rectify the images or calibrate without it")
     return values
+
+
+def _xml_of_opencv(text: str) -> dict[str, object]:
+    """Texts of the elements, and numbers of the matrices."""
+    from xml.etree import ElementTree
+
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can expand without bound
+        raise ValueError(f"it declares XML entities; {_EXPECTED}")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"not valid XML ({error}); {_EXPECTED}") from None
+    found: dict[str, object] = {}
+    for element in root:
+        data = element.find("data")
+        words = "" if data is None else data.text or ""
+        found[element.tag] = element.text if data is None else {"data": words.split()}
+    return found
 
 
 def _plain(key: object) -> str:
