@@ -198,7 +198,7 @@ def test_input_errors_are_not_retried(
 ) -> None:
     monkeypatch.setitem(sys.modules, "ray", InProcessRay())
     failing = [failing_once(scenes[0], tmp_path / "flag", InputError), scenes[1]]
-    with pytest.raises(InputError, match=r"1 of 1 runs failed: evercal-0 \(InputError: the disk"):
+    with pytest.raises(InputError, match=r"1 of 1 runs failed: evercal-0 \(InputError: first"):
         list(run_on_ray(failing, options, tmp_path / "out", "local"))
     assert "attempt 1 of 4" in capsys.readouterr().err
     # The same command resumes later.
