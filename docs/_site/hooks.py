@@ -49,7 +49,9 @@ def site_uri(path: str) -> str | None:
 def links(markdown: str, source: str) -> dict[str, str]:
     """Relative links of a page that lead to files: link to path in the repository."""
     folder = posixpath.dirname(source)
-    paths = {m[2]: posixpath.normpath(posixpath.join(folder, m[2])) for m in _LINK.finditer(markdown)}
+    paths = {
+        m[2]: posixpath.normpath(posixpath.join(folder, m[2])) for m in _LINK.finditer(markdown)
+    }
     return {link: path for link, path in paths.items() if site_uri(path)}
 
 
