@@ -33,7 +33,7 @@ class Step:
 
 def steps(page: str) -> Iterator[Step]:
     """Commands and blocks of a page, in its order."""
-    pattern = r"^```python *(\S*)\n(.*?)^```$|^    (\S.*)$"
+    pattern = r"^```python *(\S*)\n(.*?)^```$|^    (\S[^\n]*)$"
     for block in re.finditer(pattern, page, re.M | re.S):
         name, code, command = block.groups()
         if command is None:
