@@ -118,7 +118,7 @@ def test_a_fleet(tmp_path: Path) -> None:
     pytest.importorskip("urllib3")
     printed = run("fleet", tmp_path)
     assert '"status":"ok"' in printed.replace(" ", "")
-    assert printed.splitlines()[-1].startswith("kitchen [")
+    assert "kitchen [" in printed  # the answer of the client
 
 
 @pytest.mark.slow
