@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -11,7 +12,7 @@ from matplotlib.patches import Circle, Rectangle
 
 AXES = {"x": "#c0392b", "y": "#1e8449", "z": "#2874a6"}
 INK = "#555555"
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text
     "svg.hashsalt": "evercal",  # the same bytes each time
     "font.family": "sans-serif",
@@ -86,18 +87,21 @@ def _page(width: float, height: float) -> tuple[Figure, Axes]:
     return figure, axes
 
 
+def _xy(point: np.ndarray) -> tuple[float, float]:
+    return float(point[0]), float(point[1])
+
+
 def _triad(
     axes: Axes, origin: np.ndarray, ends: np.ndarray, name: str, above: bool = False
 ) -> None:
     """Three axes from an origin; ends (3, 2) are relative to it."""
     for (label, colour), end in zip(AXES.items(), ends, strict=True):
-        axes.annotate(
-            "", origin + end, origin, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.5}
-        )
-        axes.text(*(origin + 1.22 * end), label, color=colour, ha="center", va="center")
-    axes.text(
-        *(origin + ([0, 0.42] if above else [-0.32, -0.02])), name, ha="center", weight="bold"
-    )
+        style = {"arrowstyle": "-|>", "color": colour, "lw": 1.5}
+        axes.annotate("", _xy(origin + end), _xy(origin), arrowprops=style)
+        u, v = _xy(origin + 1.22 * end)
+        axes.text(u, v, label, color=colour, ha="center", va="center")
+    u, v = _xy(origin + np.array([0, 0.42] if above else [-0.32, -0.02]))
+    axes.text(u, v, name, ha="center", weight="bold")
 
 
 def _arrow(
@@ -105,7 +109,7 @@ def _arrow(
 ) -> None:
     """A dashed arrow between two frames with its name beside it."""
     style = {"arrowstyle": "->", "color": INK, "ls": "--", "shrinkA": 10, "shrinkB": 10}
-    axes.annotate("", end, start, arrowprops=style)
+    axes.annotate("", _xy(end), _xy(start), arrowprops=style)
     axes.text(*at, name, family="monospace", fontsize=8.5)
 
 
@@ -115,9 +119,9 @@ def _save(figure: Figure, path: Path) -> None:
 
 def main(folder: Path) -> None:
     """Write both drawings to a folder."""
-    with mpl.rc_context(_STYLE):
-        frames(folder / "frames.svg")
-        pixels(folder / "pixels.svg")
+    mpl.rcParams.update(_STYLE)
+    frames(folder / "frames.svg")
+    pixels(folder / "pixels.svg")
 
 
 if __name__ == "__main__":
