@@ -6,6 +6,7 @@ import ipaddress
 import socket
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import viser
 
@@ -102,10 +103,7 @@ class Page:
     @property
     def url(self) -> str:
         """Address of the page."""
-        host = self.server.get_host()
-        host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, host)
-        host = f"[{host}]" if ":" in host and not host.startswith("[") else host
-        return f"http://{host}:{self.server.get_port()}"
+        return address_of(self.server)
 
     def close(self) -> None:
         """Stop threads and server."""
@@ -145,8 +143,21 @@ def gripper_from_camera(calibrations: list[Calibration]) -> SE3 | None:
     return hands[0] if len(hands) == 1 else None
 
 
-def start_server(host: str, port: int) -> viser.ViserServer:
-    """An empty page with z up.
+def address_of(server: viser.ViserServer) -> str:
+    """Address that a browser on this machine opens."""
+    host = server.get_host()
+    host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, host)
+    host = f"[{host}]" if ":" in host and not host.startswith("[") else host
+    return f"http://{host}:{server.get_port()}"
+
+
+def start_server(
+    host: str,
+    port: int,
+    label: str = "evercal view",
+    layout: Literal["floating", "collapsible", "fixed"] = "floating",
+) -> viser.ViserServer:
+    """An empty page with z up; `layout` is that of the controls.
 
     Raises:
         InputError: The address cannot be used; viser alone would take the next free port.
@@ -164,7 +175,7 @@ def start_server(host: str, port: int) -> viser.ViserServer:
         reason = error.strerror or error
         raise InputError(f"--host {host} --port {port}: {reason}; give another one") from None
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints a frame with its address
-        server = _Server(host, port, label="evercal view", verbose=False)
+        server = _Server(host, port, label=label, verbose=False)
     if port and server.get_port() != port:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
@@ -173,6 +184,7 @@ def start_server(host: str, port: int) -> viser.ViserServer:
         dark_mode=True,
         show_logo=False,
         show_share_button=False,
+        control_layout=layout,
         control_width="large",
         brand_color=(37, 99, 235),
     )
