@@ -68,7 +68,7 @@ class FixedPanel:
             )
             self._calibrate = gui.add_button("Calibrate")
             self._check = gui.add_button("Check", hint="Has the camera moved since?")
-            self._clear = gui.add_button("Remove all images")
+            self._clear = gui.add_button("Remove all images", color="gray")
             self._rows = gui.add_html("")
             folders = studio.folders
             gui.add_html(command_html(folders.fixed_command(), folders.check_command()))

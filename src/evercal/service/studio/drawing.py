@@ -17,7 +17,7 @@ from evercal.service.viewer.frusta import Ellipsoid, Frustum, readable_scale
 from evercal.service.viewer.map_parts import THUMBNAIL_PX, resized
 from evercal.service.viewer.stage import Stage, add_frustum
 
-_SIZE_M = 0.06
+_SIZE_M = 0.045
 """Length of a drawn camera."""
 _POINT_MM = 3.0
 _ARM = (203, 213, 225)
@@ -123,6 +123,7 @@ class Drawing:
 
     def _draw_arm(self, points: np.ndarray) -> None:
         """Draw the arm as a line through its joints."""
+        points = np.concatenate([np.zeros((1, 3), np.float32), points])  # from the base
         pairs = np.stack([points[:-1], points[1:]], axis=1)
         if self._arm is None:
             colours = np.broadcast_to(np.array(_ARM, np.uint8), pairs.shape)
@@ -142,4 +143,4 @@ class Drawing:
     def _look(self) -> None:
         """Begin beside the arm, above the work area."""
         camera = self._server.initial_camera
-        camera.position, camera.look_at = (1.35, -1.05, 1.0), (0.3, 0.0, 0.25)
+        camera.position, camera.look_at = (1.15, -0.8, 0.85), (0.35, 0.0, 0.3)

@@ -18,7 +18,7 @@ _SMALL = "font-size:0.82em;line-height:1.4"
 _OF_STATUS = {"locked": GREY, "open": BLUE, "done": GREEN}
 _OF_KIND = {"good": GREEN, "working": BLUE, "error": RED}
 _MARKS = {"locked": "", "open": "", "done": "✓ "}
-_THUMBNAIL_PX = 56
+_THUMBNAIL_PX, _PICTURE_PX = 56, 400
 
 
 def block(*parts: str) -> str:
@@ -117,9 +117,19 @@ def rows_html(rows: Sequence[tuple[str, str]]) -> str:
     return block(table(rows)) if rows else ""
 
 
+def picture_html(image: Image) -> str:
+    """The live picture."""
+    style = "display:block;margin:0 auto;max-width:100%;max-height:200px;border-radius:4px"
+    return block(f'<img src="{_url(image, _PICTURE_PX)}" alt="live image" style="{style}">')
+
+
 def thumbnail_url(image: Image) -> str:
     """A small JPEG as the address of an HTML image."""
-    height = max(1, round(image.shape[0] * _THUMBNAIL_PX / image.shape[1]))
-    small = cv2.resize(image, (_THUMBNAIL_PX, height), interpolation=cv2.INTER_AREA)
+    return _url(image, _THUMBNAIL_PX)
+
+
+def _url(image: Image, width: int) -> str:
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     data = cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]))[1].tobytes()
     return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"

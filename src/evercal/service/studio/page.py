@@ -7,19 +7,17 @@ import time
 from collections.abc import Callable
 from typing import Any, Literal
 
-import numpy as np
 import viser
 
 from evercal.service.studio.calibrate_panels import ExportPanel, FixedPanel, LearnPanel
 from evercal.service.studio.devices import Seen
 from evercal.service.studio.drawing import Drawing
-from evercal.service.studio.html import message_html, step_label
+from evercal.service.studio.html import message_html, picture_html, step_label
 from evercal.service.studio.jobs import Jobs
 from evercal.service.studio.panels import ConnectPanel, Panel, RecordPanel, on_click
 from evercal.service.studio.rest import RestTrigger
 from evercal.service.studio.steps import STEPS, Step, StepState, current_step
 from evercal.service.studio.studio import Studio
-from evercal.service.viewer.map_parts import resized
 from evercal.service.viewer.page import address_of, start_server
 
 _SHORT: dict[Step, str] = {
@@ -29,7 +27,6 @@ _SHORT: dict[Step, str] = {
     "fixed": "Fixed",
     "export": "Export",
 }
-_PICTURE_PX = 480
 _LIVE_S, _REFRESH_S = 0.25, 0.2
 """Intervals between live images, and between reports of progress."""
 
@@ -136,12 +133,12 @@ class _Frame:
     def __init__(self, gui: viser.GuiApi, page: StudioPage):
         self.step: Step = "connect"
         self._gui, self._page = gui, page
-        self._steps = gui.add_button_group("Step", [_SHORT[step] for step in STEPS])
+        self._steps = gui.add_button_group("", [_SHORT[step] for step in STEPS])
         self._message = gui.add_html("")
         self._progress = gui.add_progress_bar(0.0, visible=False, animated=True)
         self._stop = gui.add_button("Stop", visible=False, color="red")
-        blank = np.full((120, 160, 3), 128, np.uint8)
-        self._picture = gui.add_image(blank, jpeg_quality=80)
+        # An image of viser that changes often asks the browser for addresses that are gone.
+        self._picture = gui.add_html("")
         self._next: viser.GuiButtonHandle | None = None
         self._steps.on_click(lambda _: self._chosen())
         on_click(self._stop, page.jobs.stop)
@@ -186,7 +183,7 @@ class _Frame:
         """Show the newest image of the camera of a step."""
         image = seen.fixed if step == "fixed" else seen.image
         if image is not None and step in _PICTURED:
-            self._picture.image = resized(image, _PICTURE_PX)
+            self._picture.content = picture_html(image)
 
     def _chosen(self) -> None:
         name = self._steps.value.split()[-1]

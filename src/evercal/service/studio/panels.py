@@ -20,6 +20,7 @@ from evercal.service.studio.html import (
 from evercal.service.studio.jobs import Jobs
 from evercal.service.studio.steps import StepState
 from evercal.service.studio.studio import Studio
+from evercal.service.viewer.answers import AMBER
 
 NO_SAMPLE = "-"
 
@@ -77,10 +78,16 @@ class RecordPanel:
             self._says = gui.add_html("")
             self._take = gui.add_button("Take sample", icon=viser.Icon.CAMERA, hint="Key T")
             self._move = gui.add_button(
-                "Move there", visible=moves, hint="The arm moves to the next view. Key M"
+                "Move there",
+                color=AMBER,
+                visible=moves,
+                hint="Moves the arm. Key M",
             )
             self._record = gui.add_button(
-                "Record by itself", visible=moves, hint="Moves and takes samples until complete"
+                "Record by itself",
+                color="gray",
+                visible=moves,
+                hint="Until complete",
             )
             self.auto = gui.add_checkbox(
                 "Sample when still", False, hint="Take a sample whenever the arm comes to rest"
@@ -90,8 +97,8 @@ class RecordPanel:
             self._list = gui.add_html("")
             names: list[str] = [NO_SAMPLE]
             self._sample = gui.add_dropdown("Sample", names)
-            self._remove = gui.add_button("Remove")
-            self._remove_bad = gui.add_button("Remove the bad ones")
+            self._remove = gui.add_button("Remove", color="gray")
+            self._remove_bad = gui.add_button("Remove the bad ones", color="gray")
             gui.add_html(command_html(studio.folders.record_command()))
         self._connect()
 
@@ -174,5 +181,5 @@ def _proposal_rows(proposal: Proposal | None) -> list[tuple[str, str]]:
     (now, then), (now_deg, then_deg) = proposal.sigma_mm, proposal.sigma_deg
     return [
         ("next view, gripper", f"{x:+.0f} {y:+.0f} {z:+.0f} mm (amber camera)"),
-        ("expected 1 sigma", f"{now:.2f} mm, {now_deg:.3f}° → {then:.2f} mm, {then_deg:.3f}°"),
+        ("expected 1 sigma", f"{now:.3f} mm, {now_deg:.3f}° → {then:.3f} mm, {then_deg:.3f}°"),
     ]
