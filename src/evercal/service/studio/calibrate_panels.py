@@ -31,7 +31,7 @@ class LearnPanel:
         self.folder = gui.add_folder(None)
         with self.folder:
             self._says = gui.add_html("")
-            self._learn = gui.add_button("Learn", icon=viser.Icon.BRAIN)
+            self._learn = gui.add_button("Learn the recording", icon=viser.Icon.BRAIN)
             self._rows = gui.add_html("")
             self._command = gui.add_html("")
         on_click(self._learn, lambda: jobs.start("learning", lambda: studio.learn(jobs.step)))
@@ -41,7 +41,7 @@ class LearnPanel:
         studio = self._studio
         self._says.content = step_html(state)
         self._learn.disabled = busy or state.status == "locked"
-        self._learn.label = "Learn again" if state.status == "done" else "Learn"
+        self._learn.label = "Learn again" if state.status == "done" else "Learn the recording"
         self._rows.content = rows_html(_rows(studio, "wrist"))
         self._command.content = command_html(studio.folders.learn_command(studio.scene))
 
@@ -120,7 +120,7 @@ class ExportPanel:
             self._which = gui.add_dropdown("Camera", tuple(_NAMES))
             self._format = gui.add_dropdown("Format", tuple(FORMATS))
             self._about = gui.add_html("")
-            self._export = gui.add_button("Export", icon=viser.Icon.FILE_EXPORT)
+            self._export = gui.add_button("Export file", icon=viser.Icon.FILE_EXPORT)
             self._report = gui.add_button("Write report")
             self._command = gui.add_html("")
         for choice in (self._which, self._format):

@@ -10,7 +10,7 @@ import numpy as np
 from evercal.live.coverage import AxisCoverage, Coverage
 from evercal.service.studio.devices import Image, Seen
 from evercal.service.studio.jobs import Message
-from evercal.service.studio.steps import StepState
+from evercal.service.studio.steps import TITLES, Step, StepState
 from evercal.service.viewer.answers import AMBER, BLUE, GREEN, GREY, RED
 from evercal.service.viewer.text import chip, table
 
@@ -34,9 +34,17 @@ def step_html(state: StepState) -> str:
     return block(f"<div>{title}</div>", f'<div style="{_SMALL}">{escape(state.says)}</div>')
 
 
-def step_label(state: StepState, short: str) -> str:
-    """Name of a step in the row of buttons."""
-    return f"{_MARKS[state.status]}{short}"
+def way_html(states: Sequence[StepState], shown: Step) -> str:
+    """All steps in a row; the one that is shown is underlined."""
+    parts = []
+    for state in states:
+        red, green, blue = _OF_STATUS[state.status]
+        line = f"2px solid rgb({red},{green},{blue})" if state.step == shown else "none"
+        weight = "font-weight:700;" if state.step == shown else ""
+        faint = "opacity:0.55;" if state.status == "locked" else ""
+        text = f"{_MARKS[state.status]}{TITLES[state.step]}"
+        parts.append(f'<span style="{weight}{faint}border-bottom:{line}">{escape(text)}</span>')
+    return block(f'<div style="{_SMALL};white-space:nowrap">{" → ".join(parts)}</div>')
 
 
 def message_html(message: Message) -> str:

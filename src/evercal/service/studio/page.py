@@ -12,7 +12,7 @@ import viser
 from evercal.service.studio.calibrate_panels import ExportPanel, FixedPanel, LearnPanel
 from evercal.service.studio.devices import Seen
 from evercal.service.studio.drawing import Drawing
-from evercal.service.studio.html import message_html, picture_html, step_label
+from evercal.service.studio.html import message_html, picture_html, way_html
 from evercal.service.studio.jobs import Jobs
 from evercal.service.studio.panels import ConnectPanel, Panel, RecordPanel, on_click
 from evercal.service.studio.rest import RestTrigger
@@ -20,13 +20,7 @@ from evercal.service.studio.steps import STEPS, Step, StepState, current_step
 from evercal.service.studio.studio import Studio
 from evercal.service.viewer.page import address_of, start_server
 
-_SHORT: dict[Step, str] = {
-    "connect": "Connect",
-    "record": "Record",
-    "learn": "Learn",
-    "fixed": "Fixed",
-    "export": "Export",
-}
+_NUMBERS = [str(number + 1) for number in range(len(STEPS))]
 _LIVE_S, _REFRESH_S = 0.25, 0.2
 """Intervals between live images, and between reports of progress."""
 
@@ -133,7 +127,8 @@ class _Frame:
     def __init__(self, gui: viser.GuiApi, page: StudioPage):
         self.step: Step = "connect"
         self._gui, self._page = gui, page
-        self._steps = gui.add_button_group("", [_SHORT[step] for step in STEPS])
+        self._way = gui.add_html("")
+        self._steps = gui.add_button_group("Step", _NUMBERS)
         self._message = gui.add_html("")
         self._progress = gui.add_progress_bar(0.0, visible=False, animated=True)
         self._stop = gui.add_button("Stop", visible=False, color="red")
@@ -167,9 +162,7 @@ class _Frame:
         self._progress.visible, self._progress.value = busy, 100 * jobs.progress
         self._stop.visible = busy and self.step == "record"
         self._picture.visible = self.step in _PICTURED
-        labels = tuple(step_label(by_step[step], _SHORT[step]) for step in STEPS)
-        if tuple(self._steps.options) != labels:
-            self._steps.options = labels
+        self._way.content = way_html(states, self.step)
         following = STEPS.index(self.step) + 1
         if self._next is not None:
             self._next.visible = following < len(STEPS)
@@ -186,8 +179,7 @@ class _Frame:
             self._picture.content = picture_html(image)
 
     def _chosen(self) -> None:
-        name = self._steps.value.split()[-1]
-        self._page.go(next(step for step in STEPS if _SHORT[step] == name))
+        self._page.go(STEPS[_NUMBERS.index(self._steps.value)])
 
     def _by(self, steps: int) -> None:
         number = STEPS.index(self.step) + steps

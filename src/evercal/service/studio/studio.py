@@ -11,6 +11,7 @@ from typing import Any
 from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.live.coverage import CoverageOptions
 from evercal.live.recorder import pose_rows
 from evercal.live.robot import MovingRobot
 from evercal.map import Map
@@ -132,7 +133,7 @@ class Studio:
 
     def record(self, on_step: OnStep, stopping: Callable[[], bool] = lambda: False) -> str:
         """Move from one best view to the next and take samples until nothing is missing."""
-        refused, wanted = 0, 25
+        refused, wanted = 0, CoverageOptions().images
         if not self.book.frames:
             self.take_sample()
         while not stopping():
