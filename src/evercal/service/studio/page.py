@@ -40,7 +40,8 @@ class StudioPage:
 
     def __init__(self, studio: Studio, host: str, port: int, command: str):
         self.studio, self.jobs = studio, Jobs(self._changed)
-        self.server = start_server(host, port, "evercal studio", "fixed")
+        self.server = start_server(host, port, "evercal studio")
+        self.server.gui.main_panel.dock_right()
         self._frame, self._closed = _Frame(self.server.gui, self), threading.Event()
         gui = self.server.gui
         connect = ConnectPanel(gui, command)

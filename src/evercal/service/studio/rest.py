@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from evercal.geometry import SE3, pose_distance_mm_deg
+from evercal.geometry import SE3, pose_distance
 from evercal.live.coverage import CoverageOptions
 from evercal.service.studio.book import SampleBook
 from evercal.service.studio.devices import Seen
@@ -36,6 +36,6 @@ def _known(pose: SE3, others: SE3) -> bool:
     options = CoverageOptions()
     if not len(others):
         return False
-    millimetres, degrees = pose_distance_mm_deg(pose, others)
-    near = np.less(millimetres, options.same_mm) & np.less(degrees, options.same_deg)
+    metres, radians = pose_distance(pose, others)
+    near = np.less(1000 * metres, options.same_mm) & np.less(np.rad2deg(radians), options.same_deg)
     return bool(np.any(near))

@@ -6,7 +6,6 @@ import ipaddress
 import socket
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import viser
 
@@ -151,13 +150,8 @@ def address_of(server: viser.ViserServer) -> str:
     return f"http://{host}:{server.get_port()}"
 
 
-def start_server(
-    host: str,
-    port: int,
-    label: str = "evercal view",
-    layout: Literal["floating", "collapsible", "fixed"] = "floating",
-) -> viser.ViserServer:
-    """An empty page with z up; `layout` is that of the controls.
+def start_server(host: str, port: int, label: str = "evercal view") -> viser.ViserServer:
+    """An empty page with z up.
 
     Raises:
         InputError: The address cannot be used; viser alone would take the next free port.
@@ -184,7 +178,6 @@ def start_server(
         dark_mode=True,
         show_logo=False,
         show_share_button=False,
-        control_layout=layout,
         control_width="large",
         brand_color=(37, 99, 235),
     )
