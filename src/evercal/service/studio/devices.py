@@ -93,7 +93,7 @@ class Connection:
         if which is not None:
             try:
                 self.image(which)
-            except InputError as error:
+            except (InputError, OSError) as error:
                 self._keep(camera_problem=str(error))
         return self.seen
 
@@ -132,7 +132,7 @@ class Connection:
     def _keep_pose(self) -> None:
         try:
             pose = self.devices.robot.base_from_gripper()
-        except InputError as error:
+        except (InputError, OSError) as error:
             self._keep(robot_problem=str(error))
             return
         last, now = self.seen.base_from_gripper, time.monotonic()

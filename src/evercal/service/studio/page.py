@@ -42,26 +42,14 @@ class StudioPage:
         self.studio, self.jobs = studio, Jobs(self._changed)
         self.server = start_server(host, port, "evercal studio")
         self.server.gui.main_panel.dock_right()
-        self._frame, self._closed = _Frame(self.server.gui, self), threading.Event()
-        gui = self.server.gui
-        connect = ConnectPanel(gui, command)
-        record = RecordPanel(gui, studio, self.jobs)
-        self.panels: dict[Step, Panel] = {
-            "connect": connect,
-            "record": record,
-            "learn": LearnPanel(gui, studio, self.jobs),
-            "fixed": FixedPanel(gui, studio, self.jobs),
-            "export": ExportPanel(gui, studio, self.jobs),
-        }
-        self._frame.add_next()
-        self._drawing = Drawing(self.server, studio, record.choose)
-        self._refresher = _Refresher(self, self._drawing, record)
-        self._refresher.refresh()
-        # A continued studio opens at the first step that is left to do.
-        states = studio.steps()[1:]
-        self.go("connect" if not studio.book.frames else current_step(states))
-        self._live = threading.Thread(target=self._run, args=(connect, record), daemon=True)
-        self._live.start()
+        self._closed = threading.Event()
+        self.panels: dict[Step, Panel] = {}
+        self._live: threading.Thread | None = None
+        try:
+            self._build(command)
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def url(self) -> str:
@@ -84,9 +72,30 @@ class StudioPage:
         """Stop threads and server."""
         self._closed.set()
         self.jobs.stop()
-        self._live.join(5)
+        if self._live is not None and self._live.is_alive():
+            self._live.join(5)
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
+
+    def _build(self, command: str) -> None:
+        gui, studio = self.server.gui, self.studio
+        self._frame = _Frame(gui, self)
+        connect, record = ConnectPanel(gui, command), RecordPanel(gui, studio, self.jobs)
+        self.panels |= {
+            "connect": connect,
+            "record": record,
+            "learn": LearnPanel(gui, studio, self.jobs),
+            "fixed": FixedPanel(gui, studio, self.jobs),
+            "export": ExportPanel(gui, studio, self.jobs),
+        }
+        self._frame.add_next()
+        self._drawing = Drawing(self.server, studio, record.choose)
+        self._refresher = _Refresher(self, self._drawing, record)
+        self._live = threading.Thread(target=self._run, args=(connect, record), daemon=True)
+        # A continued studio opens at the first step that is left to do.
+        left = current_step(studio.steps()[1:])
+        self.go(left if studio.book.frames else "connect")
+        self._live.start()
 
     def show_frame(self, states: tuple[StepState, ...]) -> None:
         """Show the row of steps and the last message."""

@@ -142,6 +142,7 @@ class RecordPanel:
         self._list.content = samples_html(covered, self._thumbnails)
         names = tuple(reversed(self._studio.book.names)) or (NO_SAMPLE,)
         self._sample.options = list(names)
+        self._sample.value = names[0]  # the one that was taken last
         self._next.content = rows_html(_proposal_rows(proposal))
 
     def _connect(self) -> None:
