@@ -14,6 +14,7 @@ from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.live.recorder import JPEG_QUALITY
 from evercal.map import Map
+from evercal.recordings.poses.camera_file import read_camera
 from evercal.service.studio.devices import Image
 from evercal.service.studio.folders import Folders
 from evercal.storage import write_bytes, write_json
@@ -28,9 +29,15 @@ class FixedCamera:
     """
 
     def __init__(self, folders: Folders, camera: Camera | None):
-        self._folders, self._camera = folders, camera
+        self._folders = folders
         if camera is not None:
             write_json(folders.fixed_camera, asdict(camera))
+        # Those of an earlier session hold until others are given.
+        self._camera = read_camera(folders.fixed_camera) if self._has_camera else None
+
+    @property
+    def _has_camera(self) -> bool:
+        return self._folders.fixed_camera.is_file()
 
     @property
     def files(self) -> list[Path]:
