@@ -28,7 +28,7 @@ VERBS = {
         "map",
         "serve",
     ],
-    "Calibrate": ["calibrate", "check", "watch", "audit", "align"],
+    "Calibrate": ["studio", "calibrate", "check", "watch", "audit", "align"],
     "Boards and pose pairs": ["detect", "solve"],
     "Results": ["export", "report"],
     "Recordings": ["inspect", "convert", "reconstruct", "simulate", "demo"],

@@ -30,7 +30,7 @@ _GROUPS = {
         "map",
         "serve",
     ),
-    "Calibrate": ("calibrate", "check", "watch", "audit", "align"),
+    "Calibrate": ("studio", "calibrate", "check", "watch", "audit", "align"),
     "Boards and pose pairs": ("detect", "solve"),
     "Results": ("export", "report"),
     "Recordings": ("inspect", "convert", "reconstruct", "simulate", "demo"),
@@ -134,6 +134,7 @@ def _verbs(first: str) -> dict[str, Any]:
     from evercal.cli.serve import Serve
     from evercal.cli.simulate import Simulate
     from evercal.cli.solve import Solve
+    from evercal.cli.studio import Studio
     from evercal.cli.track import Track
     from evercal.cli.verify import Verify
     from evercal.cli.view import View
@@ -143,6 +144,7 @@ def _verbs(first: str) -> dict[str, Any]:
         "demo": Demo,
         "learn": Learn,
         "localize": Localize,
+        "studio": Studio,
         "calibrate": Calibrate,
         "check": Check,
         "watch": Watch,

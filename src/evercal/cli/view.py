@@ -80,7 +80,7 @@ class View:
         try:
             page = Page(open_map(self.store, self.device), options)
             try:
-                _until_stopped(lambda: self._ready(page.url))
+                until_stopped(lambda: self._ready(page.url))
             finally:
                 page.close()
         except KeyboardInterrupt:
@@ -97,7 +97,7 @@ class View:
         sys.stdout.flush()
 
 
-def _until_stopped(ready: Callable[[], object]) -> None:
+def until_stopped(ready: Callable[[], object]) -> None:
     """Call `ready` and return at SIGTERM or Ctrl-C."""
     stopped = threading.Event()
 

@@ -102,10 +102,7 @@ class Page:
     @property
     def url(self) -> str:
         """Address of the page."""
-        host = self.server.get_host()
-        host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, host)
-        host = f"[{host}]" if ":" in host and not host.startswith("[") else host
-        return f"http://{host}:{self.server.get_port()}"
+        return address_of(self.server)
 
     def close(self) -> None:
         """Stop threads and server."""
@@ -145,7 +142,15 @@ def gripper_from_camera(calibrations: list[Calibration]) -> SE3 | None:
     return hands[0] if len(hands) == 1 else None
 
 
-def start_server(host: str, port: int) -> viser.ViserServer:
+def address_of(server: viser.ViserServer) -> str:
+    """Address that a browser on this machine opens."""
+    host = server.get_host()
+    host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, host)
+    host = f"[{host}]" if ":" in host and not host.startswith("[") else host
+    return f"http://{host}:{server.get_port()}"
+
+
+def start_server(host: str, port: int, label: str = "evercal view") -> viser.ViserServer:
     """An empty page with z up.
 
     Raises:
@@ -164,7 +169,7 @@ def start_server(host: str, port: int) -> viser.ViserServer:
         reason = error.strerror or error
         raise InputError(f"--host {host} --port {port}: {reason}; give another one") from None
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints a frame with its address
-        server = _Server(host, port, label="evercal view", verbose=False)
+        server = _Server(host, port, label=label, verbose=False)
     if port and server.get_port() != port:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()

@@ -1,0 +1,202 @@
+"""`evercal studio`: joins cameras and robot, real or virtual, with the page."""
+
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from evercal.cli.console import print_json
+from evercal.cli.device import Device
+from evercal.cli.view import until_stopped
+from evercal.errors import InputError
+
+if TYPE_CHECKING:
+    from evercal.geometry import Camera
+    from evercal.service.studio.devices import Devices
+
+_REACHABLE = 200
+"""Poses that the virtual arm can reach."""
+
+
+@dataclass(frozen=True)
+class Studio:
+    """Calibrate a wrist camera and a fixed camera in the browser, step by step.
+
+    Everything is written to --out as it is made; the same command continues there. With --virtual,
+    a virtual arm with two cameras stands in for yours.
+
+    Example: evercal studio --camera 0 --intrinsics camera.json --poses poses.csv
+    """
+
+    map: Annotated[Positional[Path | None], arg(metavar="MAP", help_behavior_hint="")] = None
+    """Folder of the map that learns the scene. Default: a new one in --out."""
+    camera: Annotated[str | None, arg(metavar="SOURCE", help_behavior_hint="")] = None
+    """Camera on the gripper: number (0) or device, address (rtsp://...), video or folder."""
+    intrinsics: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Intrinsics of --camera. Default: those in --out, where it was begun before."""
+    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Gripper poses: a table or JSON lines that your robot's program appends to."""
+    pose_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """Convention of --poses if its header does not state it: ur, kuka, fanuc, ..."""
+    reachable: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Gripper poses that the robot can reach, for the next best views. Default: near others."""
+    gripper_from_camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """A rough gripper_from_camera for the drawing and the next views: 4x4 matrix or calibration."""
+    fixed: Annotated[str | None, arg(metavar="SOURCE", help_behavior_hint="")] = None
+    """The fixed camera; sources as for --camera."""
+    fixed_intrinsics: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Intrinsics of --fixed. Default: those of the camera on the gripper."""
+    virtual: bool = False
+    """A virtual arm with a wrist camera and a tripod camera instead of yours."""
+    seed: Annotated[int, arg(metavar="I")] = 0
+    """Seed of the virtual cell."""
+    out: Annotated[Path, arg(metavar="DIR")] = Path("studio")
+    """Folder of the recording, images, calibrations, reports and exports."""
+    host: Annotated[str, arg(metavar="H")] = "127.0.0.1"
+    """Address to listen on."""
+    port: Annotated[int, arg(metavar="P")] = 8080
+    """Port to listen on; 0 for any free one."""
+    device: Device = "auto"
+    json: bool = False
+    """Print one JSON object when the page is ready."""
+
+    def run(self) -> int:
+        """Serve the page until Ctrl-C or SIGTERM."""
+        self._refuse()
+        try:
+            from evercal.service.studio.page import StudioPage
+            from evercal.service.viewer.page import is_local
+        except ImportError as error:
+            raise InputError(
+                f"the studio needs {error.name}; run: pip install 'evercal[view]'"
+            ) from None
+        from evercal.service.studio.folders import Folders
+        from evercal.service.studio.studio import Studio as Session
+
+        if not is_local(self.host):
+            print(
+                f"warning: --host {self.host}: the page has no password; whoever reaches this"
+                " machine can use the cameras and move the arm",
+                file=sys.stderr,
+            )
+        folders = Folders(self.out, self.map or self.out / "map")
+        devices = self._virtual() if self.virtual else self._real()
+        session = Session(devices, folders, self.device)
+        page = StudioPage(session, self.host, self.port, self._command())
+        try:
+            until_stopped(lambda: self._ready(page.url))
+        finally:
+            page.close()
+        return 0
+
+    def _refuse(self) -> None:
+        own = {
+            "--camera": self.camera,
+            "--intrinsics": self.intrinsics,
+            "--poses": self.poses,
+            "--fixed": self.fixed,
+            "--reachable": self.reachable,
+        }
+        if self.virtual:
+            given = next((name for name, value in own.items() if value is not None), None)
+            if given is not None:
+                raise InputError(f"{given}: the virtual cell has its own; omit it or --virtual")
+        elif self.camera is None or self.poses is None:
+            missing = "--camera SOURCE" if self.camera is None else "--poses FILE"
+            raise InputError(f"no {missing} given; give both, or --virtual to try it without")
+        if self.fixed_intrinsics is not None and self.fixed is None:
+            raise InputError("--fixed-intrinsics: is of --fixed, which is missing")
+
+    def _virtual(self) -> "Devices":
+        """Arm and cameras of the virtual cell, at the pace of a real one."""
+        import numpy as np
+
+        from evercal.service.studio.devices import Devices
+        from evercal.simulation.panda_arm import joint_frames
+        from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
+
+        cell = VirtualCell(self.seed, CellOptions(realtime=True))
+        return Devices(
+            wrist_camera=cell.wrist_camera,
+            intrinsics=cell.intrinsics,
+            robot=cell.robot,
+            fixed_camera=cell.tripod_camera,  # of the same make, so it has the same intrinsics
+            reachable=cell.reachable_poses(_REACHABLE),
+            rough=nominal_mount(),
+            arm=lambda: joint_frames(np.array(cell.robot.joints_rad()))[:, :3, 3],
+        )
+
+    def _real(self) -> "Devices":
+        """The cameras and the pose file that were named."""
+        from evercal.calibration.calibration import read_transform
+        from evercal.live.camera import StreamCamera
+        from evercal.live.robot import PoseFileRobot
+        from evercal.recordings import read_robot_poses
+        from evercal.recordings.streams import is_live
+        from evercal.service.studio.devices import Devices
+
+        assert self.camera is not None, "checked before"
+        assert self.poses is not None, "checked before"
+        rough, fixed = self.gripper_from_camera, self.fixed
+        reachable = None
+        if self.reachable is not None:
+            convention = self.pose_convention
+            reachable = read_robot_poses(
+                self.reachable, convention, option="--pose-convention"
+            ).poses
+        return Devices(
+            wrist_camera=StreamCamera(self.camera),
+            intrinsics=self._intrinsics(),
+            robot=PoseFileRobot(self.poses, self.pose_convention),
+            fixed_camera=None if fixed is None else StreamCamera(fixed),
+            fixed_intrinsics=_camera(self.fixed_intrinsics),
+            reachable=reachable,
+            rough=None if rough is None else read_transform(rough),
+            live=is_live(self.camera) and (fixed is None or is_live(fixed)),
+        )
+
+    def _intrinsics(self) -> "Camera":
+        before = self.out / "wrist" / "camera.json"
+        file = self.intrinsics or (before if before.is_file() else None)
+        camera = _camera(file)
+        if camera is None:
+            raise InputError("no --intrinsics FILE given: a new recording needs the intrinsics")
+        return camera
+
+    def _command(self) -> str:
+        words: list[object] = ["evercal", "studio", *([self.map] if self.map else [])]
+        options = {
+            "--camera": self.camera,
+            "--intrinsics": self.intrinsics,
+            "--poses": self.poses,
+            "--pose-convention": self.pose_convention,
+            "--reachable": self.reachable,
+            "--gripper-from-camera": self.gripper_from_camera,
+            "--fixed": self.fixed,
+            "--fixed-intrinsics": self.fixed_intrinsics,
+            "--seed": self.seed or None,
+            "--out": self.out,
+        }
+        words += ["--virtual"] if self.virtual else []
+        for name, value in options.items():
+            words += [] if value is None else [name, value]
+        return shlex.join(map(str, words))
+
+    def _ready(self, url: str) -> None:
+        if self.json:
+            print_json({"url": url})
+            return
+        print(f"studio in {self.out} at {url}; Ctrl-C ends it, the same command continues")
+        sys.stdout.flush()
+
+
+def _camera(file: Path | None) -> "Camera | None":
+    """The intrinsics in a file that states the size of the images."""
+    if file is None:
+        return None
+    from evercal.recordings.poses.camera_file import read_camera
+
+    return read_camera(file)

@@ -1,0 +1,146 @@
+"""The studio in 3D: arm, live camera, samples, the next view, map and calibrations."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+
+from evercal.geometry import SE3
+from evercal.service.studio.book import Proposal
+from evercal.service.studio.devices import Image, Seen
+from evercal.service.studio.studio import Studio
+from evercal.service.viewer.answers import AMBER, BLUE, GREEN, RED
+from evercal.service.viewer.calibrations import CalibrationView
+from evercal.service.viewer.drawn import DrawnCalibrations, place_frustum
+from evercal.service.viewer.frusta import Ellipsoid, Frustum, readable_scale
+from evercal.service.viewer.map_parts import THUMBNAIL_PX, resized
+from evercal.service.viewer.stage import Stage, add_frustum
+
+_SIZE_M = 0.045
+"""Length of a drawn camera."""
+_POINT_MM = 3.0
+_ARM = (203, 213, 225)
+
+
+class Drawing:
+    """The scene of the page.
+
+    Args:
+        server: the page.
+        studio: what is drawn.
+        on_sample: called with the name of a sample that is clicked.
+    """
+
+    def __init__(self, server: viser.ViserServer, studio: Studio, on_sample: Callable[[str], Any]):
+        self._server, self._studio, self._on_sample = server, studio, on_sample
+        self._samples: dict[str, viser.CameraFrustumHandle] = {}
+        self._calibrations: DrawnCalibrations | None = None
+        self._drawn: tuple[object, ...] = ()
+        self._arm: viser.LineSegmentsHandle | None = None
+        nowhere = Frustum.of(SE3.identity(), studio.devices.intrinsics)
+        self._live = add_frustum(server, "/live", nowhere, 1.3 * _SIZE_M, BLUE)
+        self._ghost = add_frustum(server, "/next", nowhere, 1.3 * _SIZE_M, AMBER)
+        self._label = server.scene.add_label("/next_label", "next view", anchor="bottom-center")
+        for node in (self._live, self._ghost, self._label):
+            node.visible = False
+        self._add_floor()
+
+    def show_live(self, seen: Seen, picture: Image | None) -> None:
+        """Draw arm and camera where they are."""
+        pose, mount = seen.base_from_gripper, self._studio.gripper_from_camera
+        if pose is None:
+            return
+        camera = pose @ (mount or SE3.identity())
+        with self._server.atomic():
+            frustum = Frustum.of(camera, self._studio.devices.intrinsics)
+            place_frustum(self._live, frustum)
+            if picture is not None:
+                self._live.image = resized(picture, THUMBNAIL_PX)
+            self._live.visible = True
+            if self._studio.devices.arm is not None:
+                self._draw_arm(np.asarray(self._studio.devices.arm(), np.float32))
+            if self._calibrations is not None:
+                self._calibrations.move(pose)
+
+    def show_proposal(self, proposal: Proposal | None) -> None:
+        """Draw the next view as a ghost."""
+        with self._server.atomic():
+            self._ghost.visible = self._label.visible = proposal is not None
+            if proposal is None:
+                return
+            frustum = Frustum.of(proposal.base_from_camera, self._studio.devices.intrinsics)
+            place_frustum(self._ghost, frustum)
+            x, y = proposal.base_from_camera.translation_m[:2]
+            self._label.position = (x, y, float(frustum.corners(_SIZE_M)[:, 2].max()))
+            self._label.text = "next view"
+
+    def show_samples(self, bad: set[str]) -> None:
+        """Draw the samples, the bad ones in red."""
+        mount = self._studio.gripper_from_camera or SE3.identity()
+        frames = {frame.name: frame for frame in self._studio.book.frames}
+        with self._server.atomic():
+            for name in [name for name in self._samples if name not in frames]:
+                self._samples.pop(name).remove()
+            for name, frame in frames.items():
+                if frame.base_from_gripper is None:
+                    continue
+                place = Frustum.of(frame.base_from_gripper @ mount, frame.camera)
+                if name not in self._samples:
+                    self._add_sample(name, place, resized(frame.read_image(), THUMBNAIL_PX))
+                place_frustum(self._samples[name], place)
+                self._samples[name].color = RED if name in bad else GREEN
+
+    def show_results(self) -> None:
+        """Draw the map and the calibrations, if they have changed."""
+        cell, found = self._studio.cell, self._studio.calibrations
+        drawn = (cell.scenes, self._studio.learned, *found.values())
+        if not cell.scenes or drawn == self._drawn:
+            return
+        self._drawn, scenes = drawn, cell.localizer.contents.scenes
+        with self._server.atomic():
+            for name in ("/scenes", "/calibrations"):
+                self._server.scene.remove_by_name(name)
+            stage = Stage(self._server, scenes)
+            stage.resize_points(_POINT_MM)
+            stage.show_keyframes(False)
+            stage.show(self._studio.scene if self._studio.scene in cell.scenes else None)
+            self._look()
+            default = scenes[0].adjusted_camera
+            views = [
+                CalibrationView(name, calibration, calibration.camera or default)
+                for name, calibration in found.items()
+            ]
+            ellipsoids = [Ellipsoid.of(view.calibration.uncertain_pose) for view in views]
+            drawn_views = DrawnCalibrations(stage, views, readable_scale(ellipsoids))
+            drawn_views.move(self._studio.connection.seen.base_from_gripper)
+            self._calibrations = drawn_views
+
+    def _add_sample(self, name: str, place: Frustum, thumbnail: Image) -> None:
+        node = add_frustum(self._server, f"/samples/{name}", place, _SIZE_M, GREEN, thumbnail)
+        self._samples[name] = node
+        node.on_click(lambda _: self._on_sample(name))
+
+    def _draw_arm(self, points: np.ndarray) -> None:
+        """Draw the arm as a line through its joints."""
+        points = np.concatenate([np.zeros((1, 3), np.float32), points])  # from the base
+        pairs = np.stack([points[:-1], points[1:]], axis=1)
+        if self._arm is None:
+            colours = np.broadcast_to(np.array(_ARM, np.uint8), pairs.shape)
+            self._arm = self._server.scene.add_line_segments(
+                "/arm", pairs, colours, thickness=8.0, thickness_units="screen"
+            )
+        self._arm.points = pairs
+
+    def _add_floor(self) -> None:
+        scene = self._server.scene
+        scene.add_frame("/base", axes_length=0.15, axes_radius=0.005)
+        scene.add_label("/base/label", "robot base", position=(0, 0, 0))
+        lines, sections = (52, 57, 66), (80, 87, 99)
+        scene.add_grid("/grid", 3, 3, cell_size=0.1, cell_color=lines, section_color=sections)
+        self._look()
+
+    def _look(self) -> None:
+        """Begin beside the arm, above the work area."""
+        camera = self._server.initial_camera
+        camera.position, camera.look_at = (1.15, -0.8, 0.85), (0.35, 0.0, 0.3)
