@@ -49,15 +49,23 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
         InputError: The extra `lerobot` is not installed, a file is missing or broken, the version
             is not supported, or the dataset has no gripper poses.
     """
-    root, options = Path(root), options or ReadOptions()
+    root = Path(root)
+    try:
+        return _load(root, options or ReadOptions())
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
+        # Features of many kinds are described in one file that other programs write.
+        reason = f"{type(error).__name__}: {error}"
+        raise InputError(f"{root / INFO}: does not describe the dataset ({reason})") from error
+
+
+def _load(root: Path, options: ReadOptions) -> Recording:
     info = _info(root)
     key = _camera_key(root, info, options.image_topic)
     if options.camera is None:
         raise InputError(
             f"{root}: LeRobot datasets hold no intrinsics; give them with --camera FILE"
         )
-    shape = [int(n) for n in info["features"][key]["shape"]]
-    height, width = shape[1:3] if shape[0] == 3 else shape[:2]  # some state channels first
+    width, height = _image_size(root, key, info["features"][key])
     camera = read_camera_of_size(options.camera, (width, height), key)
     column = pose_feature(root, info, options)
     rows, values = _rows(root, column)
@@ -102,6 +110,19 @@ def _camera_key(root: Path, info: Mapping[str, Any], wanted: str | None) -> str:
         return str(wanted)
     what = f"no camera {wanted!r}" if wanted else f"{len(keys)} cameras"
     raise InputError(f"{root}: {what}; name one with --image-topic: {', '.join(keys) or 'none'}")
+
+
+def _image_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int, int]:
+    """Width and height of the images of a camera."""
+    try:
+        shape = [int(n) for n in feature["shape"]]
+        height, width = shape[1:3] if shape[0] == 3 else shape[:2]  # some state channels first
+    except (KeyError, TypeError, ValueError, IndexError):
+        raise InputError(
+            f"{root / INFO}: {key}: 'shape' is height, width and channels, got"
+            f" {feature.get('shape')!r}"
+        ) from None
+    return width, height
 
 
 class _Row(NamedTuple):
