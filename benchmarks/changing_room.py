@@ -22,9 +22,9 @@ from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.recordings import Frame, Recording, generic, load_recording
 from evercal.recordings.held_out import split_held_out
+from evercal.recordings.images import write_jpeg
 from evercal.recordings.samples import sample_rooms
 from evercal.simulation.box_room import default_camera
-from evercal.simulation.cell import write_jpeg
 from evercal.simulation.cell_paths import sweep_shots
 from evercal.simulation.changed_room import moved_item, rearranged, relit
 from evercal.simulation.furnished.panda import Panda

@@ -18,8 +18,8 @@ import numpy as np
 
 from evercal.geometry import SE3
 from evercal.recordings import generic
+from evercal.recordings.images import write_jpeg
 from evercal.simulation.box_room import default_camera, look_at
-from evercal.simulation.cell import write_jpeg
 from evercal.simulation.furnished.panda import Panda
 from evercal.simulation.furnished.renderer import Renderer, RenderOptions, mitsuba
 from evercal.simulation.furnished.rooms import room

@@ -24,21 +24,8 @@ from evercal.service.studio.studio import Studio
 from evercal.simulation.panda_arm import joint_frames
 from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
 
-from .test_viewer_page import CHROMIUM, FLAGS
-
 SAMPLES = 15
 """Samples after which the whole way stops recording, to be fast."""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium")
-    with playwright.sync_playwright() as started:
-        chromium = started.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield chromium
-        chromium.close()
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import socket
 import time
 from collections.abc import Iterator
@@ -35,19 +34,6 @@ ARM = """<robot name="arm">
     <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/>
   </joint>
 </robot>"""
-NAMES = ("chromium", "chromium-browser", "google-chrome")
-CHROMIUM = next((path for path in map(shutil.which, NAMES) if path), None)
-FLAGS = [
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
 
 
 @pytest.fixture(scope="module")
@@ -146,18 +132,6 @@ def test_one_camera_on_the_gripper_is_used_and_of_two_none() -> None:
 def test_only_loopback_addresses_are_local() -> None:
     assert [is_local(host) for host in ("127.0.0.1", "::1", "localhost")] == [True] * 3
     assert [is_local(host) for host in ("0.0.0.0", "192.168.1.4", "robot")] == [False] * 3
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Chromium, rendering in software."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium")
-    with playwright.sync_playwright() as started:
-        chromium = started.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield chromium
-        chromium.close()
 
 
 def seen_until(page: Any, text: str, seconds: float = 120) -> None:

@@ -108,9 +108,7 @@ def _attempt(
                     running[pool.submit(_learn, *item)] = item
                 ready, _ = wait(running, return_when=FIRST_COMPLETED)
                 for future in ready:
-                    if future.exception() is None or not isinstance(
-                        future.exception(), BrokenProcessPool
-                    ):
+                    if not isinstance(future.exception(), BrokenProcessPool):
                         yield future.result()
                         del running[future]
                 if any(future in running for future in ready):

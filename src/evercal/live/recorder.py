@@ -18,6 +18,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.formats import wrist
 from evercal.recordings.frame import Frame
+from evercal.recordings.images import write_jpeg
 from evercal.storage import write_bytes, write_json
 
 POSES = "base_from_gripper.csv"
@@ -59,8 +60,6 @@ class WristRecorder:
         Raises:
             InputError: The size of the image is not that of the camera.
         """
-        import cv2
-
         if image.shape != (self._camera.height, self._camera.width, 3):
             raise InputError(
                 f"image of shape {image.shape}: the camera is {self._camera.width}x"
@@ -68,10 +67,8 @@ class WristRecorder:
             )
         numbers = [int(Path(frame.name).stem) for frame in self._frames]
         name = f"{max(numbers, default=-1) + 1:04d}.jpg"
-        bgr = np.ascontiguousarray(image[..., ::-1])
-        data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
         path = self._root / "images" / name
-        write_bytes(path, data.tobytes())
+        write_jpeg(path, image, JPEG_QUALITY)
         frame = Frame(name, path, self._camera, None, base_from_gripper)
         self._frames.append(frame)
         self._write_poses()

@@ -169,9 +169,7 @@ class Tracker:
         if earlier is None or earlier[1][0].status != "ok":
             return False
         stamp, (_, found) = earlier
-        assert found.pose is not None, "it was accepted"
-        self._scene, self._poses = found.scene, [(stamp, found.pose.pose)]
-        self._change = None if found.refined is None else found.refined.change
+        self._remember(found, stamp, settled=True)
         return True
 
     def _near_prediction(
@@ -240,13 +238,14 @@ class Tracker:
         near = float(metres) * scale < self.options.reach_m
         return near and float(radians) < np.deg2rad(self.options.reach_deg)
 
-    def _remember(self, found: Hypothesis, stamp: float) -> None:
-        """Keep what predicts the next frame."""
+    def _remember(self, found: Hypothesis, stamp: float, settled: bool = False) -> None:
+        """Keep what predicts the next frame, if it is settled."""
         if found.pose is None:
             return
         self._scene = found.scene
         self._change = None if found.refined is None else found.refined.change
-        settled = self.localizer.accepts(found, self.options.settled) or bool(self._poses)
+        settled = settled or bool(self._poses)
+        settled = settled or self.localizer.accepts(found, self.options.settled)
         self._poses = [*self._poses[-1:], (stamp, found.pose.pose)] if settled else []
 
     def _smooth(self, estimate: PoseEstimate, stamp: float) -> tuple[SE3 | None, bool]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evercal.errors import InputError
+from evercal.storage.atomic import write_bytes
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 """Endings of image files, in lower case."""
@@ -120,6 +121,16 @@ def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
     if not encoded:
         raise InputError(f"{path}: '{path.suffix}' is no image format; use .png or .jpg")
     path.write_bytes(data.tobytes())
+
+
+def write_jpeg(path: str | os.PathLike[str], image: NDArray[np.uint8], quality: int) -> None:
+    """Write (H, W, 3) uint8 RGB, whole or not at all; missing folders are created."""
+    import cv2
+
+    bgr = np.ascontiguousarray(image[..., ::-1])
+    data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, data.tobytes())
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:

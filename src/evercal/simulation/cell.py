@@ -19,6 +19,7 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings import Frame, generic
+from evercal.recordings.images import write_jpeg
 from evercal.simulation.box_room import default_camera
 from evercal.simulation.cell_paths import (
     Shot,
@@ -296,16 +297,6 @@ class _Writer:
             depth.parent.mkdir(parents=True, exist_ok=True)
             write_bytes(depth, cv2.imencode(".png", millimetres)[1].tobytes())
         write_jpeg(image, colour, self.suite.jpeg_quality)
-
-
-def write_jpeg(path: Path, image: np.ndarray, quality: int) -> None:
-    """Write a (H, W, 3) uint8 RGB image; missing folders are created."""
-    import cv2
-
-    bgr = np.ascontiguousarray(image[..., ::-1])
-    encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, encoded.tobytes())
 
 
 def _shutter(shot: Shot, following: Shot, steps: int) -> SE3:

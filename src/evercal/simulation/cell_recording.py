@@ -15,7 +15,7 @@ from evercal.errors import InputError
 from evercal.live.recorder import WristRecorder, pose_rows
 from evercal.mapping.selection import spread_poses
 from evercal.recordings import generic
-from evercal.simulation.cell import write_jpeg
+from evercal.recordings.images import write_jpeg
 from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
 from evercal.storage import write_bytes, write_json
 

@@ -10,7 +10,6 @@ the centre of the top-left pixel, and images are upright.
 import json
 import os
 import re
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -65,7 +64,7 @@ def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = Non
         raise InputError(f"{path}: camera file is missing; check the path") from None
     except OSError as error:
         raise InputError(f"{path}: camera file cannot be read ({error.strerror})") from None
-    except (ValueError, OverflowError, zipfile.BadZipFile) as error:
+    except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: {error}") from None
 
 

@@ -8,7 +8,6 @@ define the meaning of its numbers. docs/formats.md has examples.
 
 import json
 import os
-import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -114,7 +113,7 @@ def read_robot_poses(
         raise InputError(f"{path}: {what} cannot be read ({error.strerror})") from None
     except ConventionError as error:
         raise InputError(f"{path}: {error.naming(option)}") from None
-    except (ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
+    except (ValueError, EOFError, TypeError) as error:
         raise InputError(f"{path}: {error}") from None  # also invalid JSON and arrays of text
 
 

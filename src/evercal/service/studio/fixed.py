@@ -5,19 +5,17 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.drift import Shift
 from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.live.recorder import JPEG_QUALITY
 from evercal.map import Map
+from evercal.recordings.images import write_jpeg
 from evercal.recordings.poses.camera_file import read_camera
 from evercal.service.studio.devices import Image
 from evercal.service.studio.folders import Folders
-from evercal.storage import write_bytes, write_json
+from evercal.storage import write_json
 
 
 class FixedCamera:
@@ -49,7 +47,7 @@ class FixedCamera:
         self._folders.fixed.mkdir(parents=True, exist_ok=True)
         number = max((int(path.stem) for path in self.files), default=-1) + 1
         path = self._folders.fixed / f"{number:04d}.jpg"
-        write_jpeg(path, image)
+        write_jpeg(path, image, JPEG_QUALITY)
         return path
 
     def clear(self) -> None:
@@ -79,7 +77,7 @@ class FixedCamera:
             InputError: The image was not located.
         """
         path = self._folders.out / "check.jpg"
-        write_jpeg(path, image)
+        write_jpeg(path, image, JPEG_QUALITY)
         return cell.check([path], reference)
 
 
@@ -90,10 +88,3 @@ def shift_words(shift: Shift) -> str:
         sure = f"{100 * shift.confidence:.1f} %"
         return f"The camera has moved by {size} (confidence {sure}). Calibrate it again."
     return f"The camera has not moved: it is within {size} of its calibration."
-
-
-def write_jpeg(path: Path, image: Image) -> None:
-    """Write an image atomically with the quality of a recording."""
-    bgr = np.ascontiguousarray(image[..., ::-1])
-    data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
-    write_bytes(path, data.tobytes())
