@@ -4,12 +4,12 @@ import time
 from collections.abc import Callable
 
 import torch
+from evercal.continual.networks.muon import MUON_STEPS
 from tabulate import tabulate
 
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.descriptor import load_descriptor
 from evercal.continual.networks.head import Head, HeadOptions
-from evercal.continual.networks.muon import MUON_STEPS
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 from evercal.features.encoder import load_encoder
 from evercal.features.precision import fast_bfloat16

@@ -55,7 +55,7 @@ def test_description_includes_penalties() -> None:
     records = described(Replay("sars", Distillation(scale=3.0), 0.5))
     penalty = records["penalty"]
     assert isinstance(penalty, dict)
-    assert (records["selector"], records["weight"], records["every_scene"]) == ("sars", 0.5, True)
+    assert (records["selector"], records["weight"], records["every_scene"]) == ("sars", 0.5, False)
     assert (penalty["kind"], penalty["scale"]) == ("Distillation", 3.0)
     assert penalty["options"]["active_centres"] == 50
 

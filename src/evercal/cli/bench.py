@@ -35,8 +35,8 @@ class Bench:
     """
 
     suite: Annotated[Positional[str], arg(metavar="SUITE")]
-    """One of sim-mini (packaged), sim, sim-7, sim-12, sim-repeat, real2, i7s, i12s, custom,
-    regions."""
+    """One of sim-mini (packaged), sim, sim-7, sim-12, sim-tune, sim-unseen, sim-repeat,
+    real2, i7s, i12s, custom, regions."""
     recordings: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="")
     ] = ()
@@ -60,7 +60,7 @@ class Bench:
     original poses."""
     parts: int = 4
     """Stages that the suite regions splits a scene into."""
-    preset: Literal["fast", "demo", "bench", "paper"] = "bench"
+    preset: Literal["fast", "demo", "bench", "converged", "paper"] = "bench"
     """Training effort per stage."""
     backbone: Literal["evercal", "paper"] = "evercal"
     """Network: ours, or the paper's, with all centres given in advance and its training."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class NetworkOptions:
     """Options of strategies that train a network; a map refuses them."""
 
-    preset: Literal["fast", "demo", "bench", "paper"] = "fast"
+    preset: Literal["fast", "demo", "bench", "converged", "paper"] = "fast"
     """Amount of training: fast takes minutes on two cores, paper needs a GPU."""
     centres: Annotated[int | None, arg(metavar="M", help_behavior_hint="")] = None
     """Cluster centres that a scene adds to the network. Default: those of the preset."""

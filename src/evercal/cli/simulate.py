@@ -20,12 +20,24 @@ class Simulate:
     """
 
     suite: Annotated[
-        Positional[Literal["sim", "sim-7", "sim-12", "sim-mini", "sim-repeat", "cell"]],
+        Positional[
+            Literal[
+                "sim",
+                "sim-7",
+                "sim-12",
+                "sim-mini",
+                "sim-tune",
+                "sim-unseen",
+                "sim-repeat",
+                "cell",
+            ]
+        ],
         arg(name="SUITE"),
     ]
-    """Rooms to render: three (sim), seven, twelve, the three packaged ones (sim-mini), or three
-    with repeated textures and objects (sim-repeat). cell: a wrist recording and images of a fixed
-    camera, in seconds and without the extra."""
+    """Rooms to render: three (sim), seven, twelve, the three packaged ones (sim-mini), three for
+    tuning networks (sim-tune), three for confirming them (sim-unseen), or three with repeated
+    textures and objects (sim-repeat). cell: a wrist recording and images of a fixed camera, in
+    seconds and without the extra."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Output folder. The same command continues an interrupted run."""
     frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None

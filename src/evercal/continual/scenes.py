@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -78,6 +79,8 @@ class LearnedScenes:
     """Remembered keyframes of each scene; None for strategies without memory."""
     method_states: list[Mapping[str, Tensor]] = field(default_factory=list)
     """Named tensors that the method keeps of each scene."""
+    cache: Path | None = None
+    """Folder of depths that runs over the same frames share; not stored."""
 
     @property
     def device(self) -> torch.device:
@@ -134,6 +137,7 @@ class LearnedScenes:
             list(self.scenes),
             list(self.keyframes),
             list(self.method_states),
+            self.cache,
         )
 
 

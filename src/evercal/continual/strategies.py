@@ -105,6 +105,11 @@ _ALL = (
         source="Li et al., Continual Hand-Eye Calibration, arXiv 2604.15814, Algorithms 1 and 2",
     ),
     Strategy(
+        "sars_spdd_every_scene",
+        Replay("sars", Distillation(), every_scene=True),
+        source="the same with SPDD's weight multiplied by the number of old scenes",
+    ),
+    Strategy(
         "sars_spdd_filled",
         Replay("sars_filled", Distillation()),
         source="the same with the largest radius that fills the memory",

@@ -43,7 +43,7 @@ def test_packaged_sweep_of_spdd() -> None:
     # A mean over 50 active centres and 3 coordinates instead of a sum.
     offsets = SpddOptions(metric_weight=0.00667)
     expected["spdd_offsets_averaged"] = replace(paper, penalty=Distillation(offsets))
-    expected["spdd_together"] = replace(paper, every_scene=False)
+    expected["spdd_every_scene"] = replace(paper, every_scene=True)
     expected |= {
         f"points_only_{n}": replace(paper, penalty=Distillation(points, float(n))) for n in (10, 30)
     }

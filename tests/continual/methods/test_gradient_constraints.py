@@ -26,7 +26,7 @@ from evercal.continual.networks.trainer import FitOptions, HeadTrainer, one_cycl
 
 from .by_hand import flat, flat_of, head_output, off_by, rows, stage_start, wave_buffer, wave_head
 
-# Muon trains the square matrices, AdamW with decay the rest, both with momentum.
+# Shampoo trains the square matrices, AdamW with decay the rest, both with momentum.
 OPTIONS = FitOptions(iterations=14, batch=64, replay_batch=64, peak_rate=1e-2)
 
 

@@ -73,7 +73,7 @@ def test_teacher_bounds_only_a_worse_student() -> None:
 def test_stored_output_by_hand() -> None:
     # Two rows with errors of 3 px (6 cm). The stored point of the first is correct, the second has
     # no stored point and is excluded from the mean distance.
-    records = replace(rows(2), stored=torch.tensor([off_by(0.0), [math.nan] * 3]))
+    records = replace(rows(2), known=torch.tensor([off_by(0.0), [math.nan] * 3]))
     actual = cost(StoredOutput(), head_output([off_by(3.0)] * 2), None, records, 1.0)
     assert actual == pytest.approx(0.5 * math.tanh(3.0) + 0.5 * PX_PER_M * 0.06, rel=1e-5)
 
@@ -141,7 +141,7 @@ def test_teacher_behind_the_camera_is_ignored() -> None:
 
 @pytest.mark.parametrize("penalty", WITH_TRUTH, ids=lambda p: type(p).__name__)
 def test_accurate_student_has_no_loss(penalty: Penalty) -> None:
-    records = replace(rows(3), stored=torch.tensor([off_by(0.0)] * 3))
+    records = replace(rows(3), known=torch.tensor([off_by(0.0)] * 3))
     teacher, student = head_output([off_by(0.0)] * 3), head_output([off_by(1.0)] * 3)
     now = penalty(student, teacher, records, 0.3)
     now.backward()

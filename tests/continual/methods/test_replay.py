@@ -114,15 +114,13 @@ def test_stored_points_return_to_their_rows() -> None:
     start = stage_start(head, memories, states=states, replay_rows=400)
     parts = drawn(method.begin(start))
     for part, plain in zip(parts, (100, 150), strict=True):
-        assert part.stored is not None
+        assert part.known is not None
         with torch.no_grad():
             lines = head(part.features.float(), part.scene, part.descriptor).points
         learned_head = part.index < plain
         assert 0.3 < float(learned_head.float().mean()) < 0.9
-        torch.testing.assert_close(
-            part.stored[learned_head], lines[learned_head], atol=5e-3, rtol=0
-        )
-        assert bool(part.stored[~learned_head].isnan().all())
+        torch.testing.assert_close(part.known[learned_head], lines[learned_head], atol=5e-3, rtol=0)
+        assert bool(part.known[~learned_head].isnan().all())
     # An unchanged student has only the reprojection loss.
     replayed = join(parts)
     output = head(replayed.features.float(), replayed.scene, replayed.descriptor)

@@ -58,20 +58,20 @@ def buffer_of(device: torch.device, scene: int = 1) -> FeatureBuffer:
             "descriptors": torch.nn.functional.normalize(random(2, 4, seed=3)),
         }
     )
-    buffer.stored = random(30, 3, seed=4).half().to(device)
+    buffer.known = random(30, 3, seed=4).half().to(device)
     return buffer
 
 
 def drawn(buffers: list[FeatureBuffer]) -> Rows:
     generator = torch.Generator().manual_seed(1)
     plain = buffer_of(buffers[0].device)
-    plain.stored = None
+    plain.known = None
     return join([*(buffer.draw(16, generator) for buffer in buffers), plain.draw(8, generator)])
 
 
 def everything(rows: Rows) -> dict[str, Tensor]:
-    assert rows.stored is not None
-    fields = (rows.features, rows.scene, rows.descriptor, rows.index, rows.stored)
+    assert rows.known is not None
+    fields = (rows.features, rows.scene, rows.descriptor, rows.index, rows.known)
     names = ("features", "scene", "descriptor", "index", "stored")
     target = rows.target
     return dict(zip(names, fields, strict=True)) | {

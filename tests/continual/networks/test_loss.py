@@ -14,6 +14,7 @@ from evercal.continual.networks.loss import (
     clamp_px,
     reprojection_error,
     reprojection_loss,
+    surface_loss,
 )
 from evercal.geometry import SE3, Camera
 
@@ -143,3 +144,35 @@ def test_step_against_the_gradient_lowers_the_loss(kind: str) -> None:
     assert (after < loss).float().mean() > 0.98  # a step can cross a kink of the L1 norm
     truth = torch.from_numpy(atlas).float()
     assert float(reprojection_loss(truth, where, 50.0, OPTIONS)[0].max()) < 0.05
+
+
+def test_surface_loss_is_the_logarithm_of_the_distance_in_pixels() -> None:
+    matrix = torch.eye(4)[:3].repeat(3, 1, 1)
+    target = Target(torch.zeros(3, 2), torch.tensor([[200.0, 200.0, 0.0, 0.0]] * 3), matrix)
+    known = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 4.0], [torch.nan] * 3])
+    points = known.nan_to_num() + torch.tensor([[0.1, 0.0, 0.0], [0.1, 0.2, -0.3], [1.0] * 3])
+    points.requires_grad_()
+    loss = surface_loss(points, known, target, 20.0)
+    # 0.1 m at 2 m are 10 px, 0.6 m at 4 m are 30 px; a row without a known point has no loss.
+    expected = 20 * torch.log1p(torch.tensor([10.0, 30.0, 0.0]) / 20)
+    torch.testing.assert_close(loss, expected)
+    (gradient,) = torch.autograd.grad(loss.sum(), points)
+    assert bool(gradient.isfinite().all())
+    assert float(gradient[2].abs().max()) == 0
+    # The scale does not fall below that of swept depths.
+    torch.testing.assert_close(
+        surface_loss(points, known, target, 1.0)[0], 5 * torch.log1p(torch.tensor(10.0) / 5)
+    )
+
+
+def test_far_points_are_still_attracted() -> None:
+    """The clamp of the reprojection loss has no gradient there."""
+    matrix = torch.eye(4)[None, :3]
+    target = Target(torch.zeros(1, 2), torch.tensor([[200.0, 200.0, 0.0, 0.0]]), matrix)
+    points = torch.tensor([[3.0, 0.0, 2.0]], requires_grad=True)
+    known = torch.tensor([[0.0, 0.0, 2.0]])
+    (pull,) = torch.autograd.grad(surface_loss(points, known, target, 5.0).sum(), points)
+    clamped = reprojection_loss(points, target, 5.0, LossOptions())[0].sum()
+    (none,) = torch.autograd.grad(clamped, points)
+    assert float(pull[0, 0]) > 1
+    assert float(none.abs().max()) < 1e-6

@@ -278,7 +278,7 @@ class StepRecorder(Replayed):
 
 
 def test_proposed_changes_sum_to_the_change_of_the_weights(learnable: Learnable) -> None:
-    """Holds for AdamW with decay and Muon with momentum."""
+    """Holds for AdamW with decay and Shampoo with momentum."""
     buffers = [learnable(scene)[0] for scene in range(3)]
     head = head_for(buffers)
     first = {name: value.detach().clone() for name, value in head.named_parameters()}

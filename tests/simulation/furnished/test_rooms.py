@@ -54,7 +54,7 @@ def test_paths_keep_train_and_test_apart(furnished_room: Room) -> None:
 def test_bumps_have_their_documented_size(furnished_room: Room) -> None:
     for seed, metres, degrees in ((0, 0.005, 0.0), (1, 0.0, 0.5)):
         before, after, bump = fixed_shots(furnished_room, 25, seed)
-        assert len(before) == len(after) == 25
+        assert len(before) == len(after) == 31
         distance, angle = pose_distance(before[0].base_from_camera, after[-1].base_from_camera)
         assert distance == pytest.approx(metres, abs=1e-9)
         assert np.rad2deg(angle) == pytest.approx(degrees, abs=1e-6)
@@ -78,8 +78,8 @@ def test_reserved_seeds_and_unknown_kinds_are_refused() -> None:
         room("garage", 1)
     seeds = [
         seed
-        for suite in ("sim", "sim-7", "sim-12", "sim-repeat")
+        for suite in ("sim", "sim-7", "sim-12", "sim-tune", "sim-unseen", "sim-repeat")
         for *_, seed in SUITES[suite].rooms
     ]
-    assert len(set(seeds)) == len(seeds) == 25
+    assert len(set(seeds)) == len(seeds) == 31
     assert max(seeds) < rooms.RESERVED

@@ -1,6 +1,7 @@
 """The benchmark: strategies over a sequence of scenes. Complete runs are kept, others are run.
 
     OUT/settings.json             options that decide the results; other options are refused
+    OUT/environments.json         commit, versions and processor of the runs
     OUT/strategies.json           description of each strategy: method, hyper-parameters, map
     OUT/results.jsonl             see `benchmark.results`
     OUT/views/                    see `benchmark.scene_views`; of each strategy's first run

@@ -81,6 +81,8 @@ class PublishedScene:
     """Last stage: error of each frame in tenths of a millimetre, rounded down."""
     mdeg: tuple[int | None, ...] = ()
     """Last stage: error of each frame in thousandths of a degree, rounded down."""
+    environment: str = ""
+    """Key of the record in `Published.environments`."""
     state: str = ""
     """Last stage, a letter per frame: `w` wrong scene, `r` refused, `i` inside the ellipsoid, `o`
     outside, `p` a pose without covariance."""
@@ -125,7 +127,7 @@ class PublishedScene:
 
 _COMMON = (
     *("strategy", "seed", "stage", "scene", "seconds", "memory_bytes", "head_bytes"),
-    *("frames_kept", "covering_radius", "min_spacing"),
+    *("frames_kept", "covering_radius", "min_spacing", "environment"),
 )
 """Fields that `SceneResult` and `PublishedScene` share."""
 
@@ -148,6 +150,8 @@ class Published:
     """Kind `bench`: names of each scene's test frames in recorded order."""
     strategies: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
     """Kind `bench`: `Strategy.description` of each strategy."""
+    environments: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    """Commit, versions and processor of the runs, by key; empty if they were not recorded."""
     scenes: tuple[PublishedScene, ...] = ()
     """Lines of kind `bench`."""
     rows: tuple[Row, ...] = ()
@@ -181,6 +185,8 @@ def from_bench(folder: Path, name: str, note: str = "") -> Published:
         if line.frames != frames[line.scene]:
             raise InputError(f"{folder}: runs use different test frames of {line.scene}")
     names = {line.strategy.partition(":")[0] for line in lines}
+    keys = {line.environment for line in lines}
+    environments = {k: v for k, v in results.read_environments(folder).items() if k in keys}
     return Published(
         name,
         "bench",
@@ -188,6 +194,7 @@ def from_bench(folder: Path, name: str, note: str = "") -> Published:
         note,
         frames=frames,
         strategies={k: v for k, v in results.read_strategies(folder).items() if k in names},
+        environments=environments,
         scenes=tuple(_counted(line, line.stage == last) for line in lines),
     )
 
@@ -200,7 +207,7 @@ def write_published(folder: Path, published: Published) -> Path:
     """
     keys = ("name", "kind", "note", "settings_sha256", "settings")
     header = {key: getattr(published, key) for key in keys}
-    for key in ("groups", "frames", "strategies"):
+    for key in ("groups", "frames", "strategies", "environments"):
         if getattr(published, key):
             header[key] = getattr(published, key)
     if published.kind == "bench":

@@ -27,7 +27,7 @@ from evercal.continual.plugin import load_plugin
 from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
 from evercal.recordings import Recording
-from evercal.storage import write_bytes
+from evercal.storage import write_bytes, write_json
 
 TRIES = 4
 """Attempts before a run is given up."""
@@ -66,6 +66,8 @@ class Outcome:
     """All results of the run; empty if it failed."""
     views: dict[str, bytes] | None = None
     """Contents of its view files, by name."""
+    environments: dict[str, dict[str, str]] | None = None
+    """Where the results were measured, by key."""
     error: str = ""
     """Cause of the failure, in one line."""
     permanent: bool = False
@@ -210,7 +212,8 @@ def _one_run(scenes: list[Recording], job: Job) -> Outcome:
             for _ in run_bench(scenes, options, folder):
                 pass
             views = {path.name: path.read_bytes() for path in (folder / VIEWS).iterdir()}
-            return Outcome(tuple(results.read(folder)), views)
+            measured_on = results.read_environments(folder)
+            return Outcome(tuple(results.read(folder)), views, measured_on)
         except Exception as error:
             state = None if shared else _archive(folder)
             permanent = isinstance(error, InputError)
@@ -219,6 +222,8 @@ def _one_run(scenes: list[Recording], job: Job) -> Outcome:
 
 def _store(out: Path, outcome: Outcome) -> None:
     results.append(out, outcome.results)
+    known = results.read_environments(out)
+    write_json(out / results.ENVIRONMENTS, known | (outcome.environments or {}))
     (out / VIEWS).mkdir(exist_ok=True)
     for name, data in (outcome.views or {}).items():
         if not (out / VIEWS / name).exists():

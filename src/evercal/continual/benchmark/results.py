@@ -12,11 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
+from evercal.continual.benchmark.environment import environment, environment_key
 from evercal.errors import InputError
 from evercal.evaluation.metrics import COARSE, FrameResult
+from evercal.storage import write_json
 from evercal.storage.settings import read_settings
 
 RESULTS, SETTINGS, STRATEGIES = "results.jsonl", "settings.json", "strategies.json"
+ENVIRONMENTS = "environments.json"
 NETWORK, UNALIGNED = ":network", ":unaligned"
 """Suffixes of a strategy's name for additional results of the same run: by the network without the
 map, and by the first pose from matched keyframes, before landmarks are aligned."""
@@ -61,6 +64,8 @@ class SceneResult:
     squared_mahalanobis: tuple[float, ...] = ()
     """Squared error of each pose in units of its covariance. NaN without a pose in the right scene
     or without a covariance; empty if no frame has one."""
+    environment: str = ""
+    """Key of the record in environments.json: commit, versions, processor."""
 
     @property
     def refused(self) -> np.ndarray:
@@ -130,6 +135,26 @@ def read(folder: Path) -> list[SceneResult]:
         except (ValueError, TypeError, KeyError) as error:
             raise InputError(f"{path}: line {number} is not a result ({error!r})") from error
     return results
+
+
+def record_environment(folder: Path) -> str:
+    """Add the record of this process to environments.json and return its key."""
+    record = environment()
+    key = environment_key(record)
+    records = read_environments(folder)
+    if records.get(key) != record:
+        write_json(folder / ENVIRONMENTS, records | {key: record})
+    return key
+
+
+def read_environments(folder: Path) -> dict[str, dict[str, str]]:
+    """Read the records of a folder by key; empty without the file.
+
+    Raises:
+        InputError: The file is not JSON.
+    """
+    path = folder / ENVIRONMENTS
+    return read_settings(path) if path.exists() else {}  # pyright: ignore[reportReturnType]
 
 
 def read_strategies(folder: Path) -> dict[str, dict[str, object]]:

@@ -11,7 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evercal.continual.benchmark.results import NETWORK, UNALIGNED, SceneResult, scene_result
+from evercal.continual.benchmark.results import (
+    NETWORK,
+    UNALIGNED,
+    SceneResult,
+    record_environment,
+    scene_result,
+)
 from evercal.continual.benchmark.scene_views import keep_views
 from evercal.continual.learning.finish_scene import (
     Learned,
@@ -160,6 +166,7 @@ class _Run:
         """Move to the device of the run and share encoded views with other runs."""
         scenes.to(self.device)
         cache_features(scenes.encoder, self.options.features)  # pyright: ignore[reportArgumentType]
+        scenes.cache = self.options.features
         return scenes
 
     def _begin(self) -> None:
@@ -260,6 +267,7 @@ class _Run:
     ) -> tuple[SceneResult, ...]:
         scenes = self.scenes[: number + 1]
         frames = evaluate(localizer, {scene.name: scene for scene in scenes})
+        environment = record_environment(self.options.out)
         keyframes = learned.keyframes[number]
         return tuple(
             scene_result(
@@ -271,6 +279,7 @@ class _Run:
                 memory_bytes=memory_bytes(learned, self.strategy),
                 head_bytes=sum(head_bytes(head) for head in learned.heads),
                 frames_kept=len(keyframes.images) if keyframes else 0,
+                environment=environment,
                 **(_coverage(keyframes, scene) if scene is scenes[-1] else {}),
             )
             for scene in scenes

@@ -55,6 +55,8 @@ SUITES: dict[str, Suite] = {
     "sim-7": _rendered("sim-7"),
     "sim-12": _rendered("sim-12"),
     "sim-repeat": _rendered("sim-repeat"),
+    "sim-tune": _rendered("sim-tune"),
+    "sim-unseen": _rendered("sim-unseen"),
     "real2": Suite(
         ("redkitchen", "fr1_rpy"),
         "7-Scenes (Shotton et al., CVPR 2013) and TUM RGB-D (Sturm et al., IROS 2012)",

@@ -16,6 +16,7 @@ from evercal.continual.learning.stage import Event, Stage, StageOptions
 from evercal.continual.learning.stage_head import head_for_scene, whiten
 from evercal.continual.learning.stage_rows import (
     Pacer,
+    add_surfaces,
     encoded,
     remembered,
     scene_buffer,
@@ -67,6 +68,8 @@ def learn(
     buffer, pacer = scene_buffer(local, cell, frames, scenes.device), Pacer()
     plan = view_plan(options, scenes.short_side)
     yield from encoded(buffer, frames, plan, scenes, resume, pacer)
+    if options.fit.surface_weight > 0:
+        yield from add_surfaces(buffer, frames, scenes)
     if teacher is None:
         whiten(head, [buffer], options.seed)
     memories = (yield from remembered(scenes, options)) if method.replays else []

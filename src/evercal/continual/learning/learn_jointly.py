@@ -8,7 +8,7 @@ from evercal.continual.learning.finish_scene import Learned, finished_stage, tra
 from evercal.continual.learning.learn import adjusted_frames, build_scene_map
 from evercal.continual.learning.stage import Event, Stage, StageOptions
 from evercal.continual.learning.stage_head import head_for_all, whiten
-from evercal.continual.learning.stage_rows import encoded, scene_buffer, view_plan
+from evercal.continual.learning.stage_rows import add_surfaces, encoded, scene_buffer, view_plan
 from evercal.continual.methods.method import Method
 from evercal.continual.networks.trainer import HeadTrainer
 from evercal.continual.scenes import LearnedScenes
@@ -51,6 +51,8 @@ def learn_jointly(
         positions.append(cells[-1].atlas_from_base.apply(cameras))
         buffers.append(scene_buffer(number, cells[-1], frames, start.device))
         yield from encoded(buffers[-1], frames, plan, start)
+        if fit.surface_weight > 0:
+            yield from add_surfaces(buffers[-1], frames, start)
     head = head_for_all(after, options, positions)
     whiten(head, buffers, options.seed)
     rows = fit.batch + (fit.replay_batch if len(recordings) > 1 else 0)

@@ -121,6 +121,7 @@ def learn_networks(
         require_frames(recording)
         if options.cache is not None and isinstance(contents.encoder, nn.Module):
             cache_features(contents.encoder, options.cache)
+            contents.cache = options.cache
         split = split_held_out(recording.train)
         train = replace(recording, train=split.train)
         resume = opened.begin(_identity(opened, recording, strategy, stage))

@@ -12,21 +12,28 @@ PRESETS: dict[str, StageOptions] = {
     # At most 240 s per scene on two cores.
     "fast": StageOptions(
         head=HeadOptions(width=384),
-        fit=FitOptions(iterations=2400, batch=2048, replay_batch=1024),
+        fit=FitOptions(iterations=2400, batch=2048, replay_batch=1024, surface_weight=2.0),
         encode=EncodePlan(views_per_frame=4),
     ),
     # At most 45 s per scene of about 100 frames.
     "demo": StageOptions(
         head=HeadOptions(width=256),
-        fit=FitOptions(iterations=1000, batch=2048, replay_batch=1024),
+        fit=FitOptions(iterations=1000, batch=2048, replay_batch=1024, surface_weight=2.0),
         encode=EncodePlan(views_per_frame=3),
         replay_views_per_frame=4,
     ),
-    # At most 45 s per stage on one core. On held-out frames twice the rows are not more accurate,
-    # and half the steps are less accurate.
+    # For quick trials: 600 steps are too few to converge, see `converged`.
     "bench": StageOptions(
         head=HeadOptions(width=256),
-        fit=FitOptions(iterations=600, batch=1024, replay_batch=512),
+        fit=FitOptions(iterations=600, batch=512, replay_batch=256, surface_weight=2.0),
+        encode=EncodePlan(views_per_frame=1),
+        replay_views_per_frame=2,
+    ),
+    # Joint training has converged on held-out frames of `sim-tune`
+    # (docs/experiments/protocol.md).
+    "converged": StageOptions(
+        head=HeadOptions(width=256),
+        fit=FitOptions(iterations=1200, batch=512, replay_batch=256, surface_weight=2.0),
         encode=EncodePlan(views_per_frame=1),
         replay_views_per_frame=2,
     ),
@@ -46,7 +53,7 @@ PRESETS: dict[str, StageOptions] = {
             batch=40_960,
             replay_batch=40_960,
             peak_rate=5e-3,
-            muon_rate=0.0,
+            matrix_rate=0.0,
             intrinsics_rate=0.0,
             warm_share=0.3,
             loss=LossOptions(schedule="circle", clamp_start_px=50.0),

@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 
 from evercal.continual.learning.stage import Encoding, Event, StageOptions
+from evercal.continual.learning.surfaces import shared_depths, surface_points
 from evercal.continual.networks.atlas import Cell
 from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, encode_frames
 from evercal.continual.scenes import LearnedScenes
@@ -77,6 +78,16 @@ def encoded(
         new = buffer.take_new()
         if new:
             yield Checkpoint(new, {})
+
+
+def add_surfaces(
+    buffer: FeatureBuffer, frames: Sequence[Frame], scenes: LearnedScenes
+) -> Generator[Event, None, None]:
+    """Estimate the depths of frames, and set the known points of their rows in a full buffer."""
+    depths = shared_depths(scenes.cache, frames, scenes.encoder, scenes.short_side)
+    points = surface_points(buffer, frames, depths, scenes.encoder.stride)
+    buffer.known = points.to(buffer.device)
+    yield Encoding(buffer.views, buffer.views)
 
 
 def view_plan(options: StageOptions, short_side: int) -> EncodePlan:

@@ -1,6 +1,6 @@
 """GEM, A-GEM and GEC: steps that may not raise the losses of remembered scenes.
 
-The originals project the gradient, and plain SGD takes the step. AdamW and Muon can move against
+The originals project the gradient, and plain SGD takes the step. AdamW and Shampoo can move against
 the memory even if the gradient does not, because of their momentum, scales and decay. So the change
 of the weights is projected after the optimisers. To first order, a change u alters the loss of
 scene t by <g_t, u>, with g_t the gradient of that loss.

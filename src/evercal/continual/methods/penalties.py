@@ -101,9 +101,9 @@ class StoredOutput(Penalty):
     """Weight of the distance to the stored points, pixels per metre."""
 
     def _loss(self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
-        assert rows.stored is not None, "the method stores points when a scene is finished"
-        has_point = ~rows.stored[:, 0].isnan()
-        distance = (student.points[has_point] - rows.stored[has_point]).abs().sum(-1)
+        assert rows.known is not None, "the method stores points when a scene is finished"
+        has_point = ~rows.known[:, 0].isnan()
+        distance = (student.points[has_point] - rows.known[has_point]).abs().sum(-1)
         distance = distance.sum() / max(len(distance), 1)
         return 0.5 * _reprojection(student, rows, tau_px) + 0.5 * self.px_per_m * distance
 

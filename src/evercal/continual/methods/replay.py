@@ -55,9 +55,10 @@ class Replay(EpisodicMemory):
     penalty: Penalty = field(default_factory=Reprojection)
     """Loss of replayed rows."""
     weight: float = 1.0
-    """Weight of the penalty of each remembered scene."""
-    every_scene: bool = True
-    """Apply the weight to each remembered scene; if false, to all of them together."""
+    """Weight of the penalty, the mean over the rows of all remembered scenes."""
+    every_scene: bool = False
+    """Multiply the weight by the number of remembered scenes, so that each counts like the new one.
+    The paper has one weight for all of them together."""
 
     def begin(self, start: StageStart) -> TrainingHooks:
         """Replay from the stage's memories, from the second scene on."""
@@ -97,7 +98,7 @@ class DarkExperienceReplay(Replay):
         """Replay with the stored points of plain views."""
         for memory in start.memories:
             state = start.states[memory.scene]
-            memory.stored = (state["points"].float() + state["origin"]).to(memory.device)
+            memory.known = (state["points"].float() + state["origin"]).to(memory.device)
         return super().begin(start)
 
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:

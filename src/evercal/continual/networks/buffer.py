@@ -37,8 +37,9 @@ class Rows:
     """Observation of each row."""
     index: Tensor
     """(n,) position in the buffer."""
-    stored: Tensor | None = None
-    """(n, 3) stored output points of an earlier head; NaN for rows without one."""
+    known: Tensor | None = None
+    """(n, 3) points of the atlas that are known in advance, from depths or an earlier head; NaN for
+    rows without one."""
 
     def part(self, where: slice | Tensor) -> "Rows":
         """Return the rows of a slice, or at indices (m,)."""
@@ -59,8 +60,8 @@ def _combined(parts: Sequence[Rows], change: Callable[[list[Tensor]], Tensor]) -
     """Apply a function to each kind of tensor of some batches."""
     columns = zip(*map(_tensors, parts), strict=True)
     features, scene, descriptor, index, *target = (change(list(column)) for column in columns)
-    stored = [part.stored for part in parts if part.stored is not None]
-    points = change(stored) if stored else None
+    known = [part.known for part in parts if part.known is not None]
+    points = change(known) if known else None
     return Rows(features, scene, descriptor, Target(*target), index, points)
 
 
@@ -87,8 +88,8 @@ class FeatureBuffer:
         self.scene, self.atlas_from_base = scene, atlas_from_base
         self.correctable, self.device = correctable, torch.device(device)
         self.views = 0
-        self.stored: Tensor | None = None
-        """(m, 3) stored output points of the first m rows, on the buffer's device."""
+        self.known: Tensor | None = None
+        """(m, 3) known points of the first m rows, on the buffer's device, see `Rows.known`."""
         self._parts: list[dict[str, Tensor]] = []
         self._saved = 0  # leading parts that `take_new` has returned
         self._merged: dict[str, Tensor] | None = None
@@ -181,10 +182,10 @@ class FeatureBuffer:
         scene = torch.full((len(index),), self.scene, device=held)
         features, descriptors = at("features", index), at("descriptors", view)
         rows = Rows(features, scene, descriptors, target, index).to(self.device)
-        if self.stored is not None:
-            last = len(self.stored) - 1
-            points = self.stored[rows.index.clamp(max=last)].float()
-            rows.stored = torch.where((rows.index <= last)[:, None], points, torch.nan)
+        if self.known is not None:
+            last = len(self.known) - 1
+            points = self.known[rows.index.clamp(max=last)].float()
+            rows.known = torch.where((rows.index <= last)[:, None], points, torch.nan)
         return rows
 
 
@@ -221,10 +222,10 @@ def join(parts: Sequence[Rows]) -> Rows:
     """Concatenate batches."""
     if len(parts) == 1:
         return parts[0]
-    if any(part.stored is not None for part in parts):
+    if any(part.known is not None for part in parts):
         nan = torch.full((1, 3), torch.nan, device=parts[0].scene.device)
         parts = [
-            replace(part, stored=nan.expand(len(part.scene), 3)) if part.stored is None else part
+            replace(part, known=nan.expand(len(part.scene), 3)) if part.known is None else part
             for part in parts
         ]
     return _combined(parts, torch.cat)

@@ -114,6 +114,9 @@ class Head(nn.Module):
         self.register_buffer("feature_map", torch.eye(features))
         self.register_buffer("centres", torch.zeros(0, 3))
         self.register_buffer("centre_scene", torch.zeros(0, dtype=torch.long))
+        # Scene s owns the centres from _owned[s] to _owned[s + 1]. Numbers, so that no step waits
+        # for a GPU.
+        self._owned = [0]
 
     @classmethod
     def from_state(
@@ -127,6 +130,8 @@ class Head(nn.Module):
             setattr(head, name, nn.Parameter(state[name].clone()))
         head.centres, head.centre_scene = state["centres"].clone(), state["centre_scene"].clone()
         head.load_state_dict(state)
+        counts = torch.bincount(head.centre_scene, minlength=head.scenes)
+        head._owned = [0, *counts.cumsum(0).tolist()]
         return head
 
     def without_scenes(self) -> "Head":
@@ -205,6 +210,7 @@ class Head(nn.Module):
         scene = torch.full((count,), self.scenes - 1, device=self.device)
         self.centres = torch.cat([self.centres, centres.to(self.centres)])
         self.centre_scene = torch.cat([self.centre_scene, scene])
+        self._owned.append(len(self.centres))
 
     def forward(
         self, features: Tensor, scene: Tensor | int, descriptor: Tensor | None
@@ -229,26 +235,26 @@ class Head(nn.Module):
             # this factor biases dominate and training takes several times more steps.
             features = features * math.sqrt(self.features)
         if self.options.condition == "code":
-            return self._trunk(features, self._codes(scene))
+            return self._trunk(features, self._add_code(scene))
         assert descriptor is not None, "condition 'descriptor' needs the image descriptors"
         x = torch.cat([descriptor.to(features.dtype), features], dim=-1)
         return self._trunk(x, None)
 
-    def _codes(self, scene: Tensor | int) -> Callable[[int], Tensor]:
-        """Return the bias of a layer: (width,) for one scene, (n, width) for a scene per row."""
+    def _add_code(self, scene: Tensor | int) -> Callable[[Tensor, int], Tensor]:
+        """Return a function that adds the code of a layer to (n, width) activations in place."""
         if isinstance(scene, int):
-            return lambda layer: self.code[scene, layer]
+            return lambda z, layer: z.add_(self.code[scene, layer].to(z.dtype))
         # A product with one-hot rows, because the gradient of indexing is slow.
-        one_hot = F.one_hot(scene, self.scenes).to(self.code.dtype)
-        return lambda layer: one_hot @ self.code[:, layer]
+        one_hot = F.one_hot(scene, self.scenes)
+        return lambda z, layer: z.addmm_(one_hot.to(z.dtype), self.code[:, layer].to(z.dtype))
 
-    def _trunk(self, x: Tensor, code: Callable[[int], Tensor] | None) -> Tensor:
+    def _trunk(self, x: Tensor, add_code: Callable[[Tensor, int], Tensor] | None) -> Tensor:
         number = iter(range(self.layers))
         activation = F.gelu if self.options.activation == "gelu" else F.relu
 
         def layer(linear: nn.Module, y: Tensor) -> Tensor:
             z, i = linear(y), next(number)
-            return activation(z if code is None else z + code(i).to(z.dtype))
+            return activation(z if add_code is None else add_code(z, i))
 
         y = x
         for linear in self.first:
@@ -266,10 +272,10 @@ class Head(nn.Module):
     def decode(self, hidden: Tensor, scene: Tensor | int) -> HeadOutput:
         """Compute the output from (n, width) activations of the last hidden layer, fp32."""
         coded = self.options.condition == "code"
-        rows: slice | Tensor = slice(None)
+        rows = slice(None)
         if coded and isinstance(scene, int):
             # Shapes do not depend on later scenes, so the output stays equal to the last bit.
-            rows = torch.nonzero(self.centre_scene == scene)[:, 0]
+            rows = slice(*self._owned[scene : scene + 2])
         logits = F.linear(hidden, self.logit[rows], self.logit_bias[rows])
         if coded and not isinstance(scene, int):
             logits = logits.masked_fill(self.centre_scene != scene[:, None], -torch.inf)

@@ -11,6 +11,8 @@ MIN_DEPTH_M = 0.1
 MAX_DEPTH_M = 1000.0
 MAX_ERROR_PX = 1000.0
 FIXED_CLAMP_PX = 5.0
+SURFACE_PX = 5.0
+"""Least scale of the loss on known points, about the error of swept depths."""
 MAX_RADIUS2 = 1.0
 """Squared radius in the normalised image plane beyond which distortion is constant. A polynomial
 is not valid further out."""
@@ -112,6 +114,32 @@ def reprojection_loss(
     loss = torch.where(valid, robust, proxy)
     pixels = torch.where(valid, residual.detach().norm(dim=-1), torch.inf)
     return loss, pixels
+
+
+def surface_loss(points: Tensor, known: Tensor, target: Target, tau_px: float) -> Tensor:
+    """Compute the robust distance of points from known ones, in pixels at their depth.
+
+    With e the L1 distance along the axes of the camera, times the focal length over the known
+    depth, the loss is t ln(1 + e / t), t = max(tau, 5 px). To first order, the part of e across
+    the ray is the reprojection error. Unlike that of a clamp, the gradient of a far point does not
+    vanish, so every row is attracted from the first step.
+
+    Args:
+        points: (n, 3) in the atlas.
+        known: (n, 3) in the atlas; the loss is 0 where they are NaN.
+        target: Cameras of the rows.
+        tau_px: Soft clamp of the reprojection loss in this step.
+
+    Returns:
+        Loss (n,).
+    """
+    has_point = ~known[:, 0].isnan()
+    known = torch.where(has_point[:, None], known, points.detach())
+    matrix = target.camera_from_atlas
+    gap = _rotated(matrix[:, :, :3], points - known).abs().sum(-1)
+    depth = (_rotated(matrix[:, :, :3], known) + matrix[:, :, 3])[:, 2].clamp(min=MIN_DEPTH_M)
+    error, scale = gap * target.intrinsics[:, 0] / depth, max(tau_px, SURFACE_PX)
+    return torch.where(has_point, scale * torch.log1p(error / scale), 0.0)
 
 
 def fixed_clamp_loss(

@@ -11,8 +11,8 @@ from evercal.continual.networks.buffer import FeatureBuffer, Rows, diffused, joi
 from evercal.continual.networks.distributed import average, broadcast, processes
 from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
-from evercal.continual.networks.loss import LossOptions, clamp_px, reprojection_loss
-from evercal.continual.networks.muon import Muon
+from evercal.continual.networks.loss import LossOptions, clamp_px, reprojection_loss, surface_loss
+from evercal.continual.networks.shampoo import OneSidedShampoo
 from evercal.features.device import allow_tf32
 from evercal.features.precision import autocast
 
@@ -33,9 +33,9 @@ class FitOptions:
     """Replayed rows in a step, the same number from every remembered scene."""
     peak_rate: float = 4e-3
     """Peak of AdamW's one-cycle learning rate (cosine up and down)."""
-    muon_rate: float = 0.02
-    """Peak learning rate of the hidden matrices, trained by Muon (Jordan et al., 2024). With 0,
-    AdamW trains them too."""
+    matrix_rate: float = 0.04
+    """Peak learning rate of the hidden matrices, trained by one-sided Shampoo. With 0, AdamW trains
+    them too."""
     warm_share: float = 0.05
     """Share of the steps during which the rate rises."""
     weight_decay: float = 0.01
@@ -46,6 +46,9 @@ class FitOptions:
     """Learning rate of the camera correction (focal length, principal point, k1, k2), as a share of
     the head's. With 0, the given intrinsics are used. Cameras with known distortion are never
     corrected."""
+    surface_weight: float = 0.0
+    """Weight of the distance to points that are known from depths, beside the reprojection loss.
+    With 0, no depths are estimated."""
     loss: LossOptions = field(default_factory=LossOptions)
     """Reprojection loss on the scenes being learned."""
 
@@ -163,7 +166,12 @@ class HeadTrainer:
         if options.intrinsics_rate > 0 and tau_px < CORRECTION_FROM_PX:
             share = len(points) // len(self.buffers)
             correction = (self.correction * self._correctable).repeat_interleave(share, 0)
-        return reprojection_loss(points, rows.target, tau_px, options.loss, correction)
+        costs, errors = reprojection_loss(points, rows.target, tau_px, options.loss, correction)
+        if rows.known is not None:
+            costs = costs + options.surface_weight * surface_loss(
+                points, rows.known, rows.target, tau_px
+            )
+        return costs, errors
 
     def _gradients(self, loss: Tensor) -> dict[str, Tensor]:
         """Compute the gradient of a loss by parameter name, keeping the graph."""
@@ -231,12 +239,12 @@ def _without_prefix(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tenso
 def _optimisers(
     head: Head, correction: torch.nn.Parameter, options: FitOptions
 ) -> list[torch.optim.Optimizer]:
-    """Create AdamW, and Muon for the hidden matrices if it has a rate."""
+    """Create AdamW, and one-sided Shampoo for the hidden matrices if it has a rate."""
     hidden, decay, plain = [], [], []
     for name, parameter in head.named_parameters():
         if name.startswith(("code", "logit")):
             plain.append(parameter)
-        elif options.muon_rate > 0 and parameter.shape == (head.options.width,) * 2:
+        elif options.matrix_rate > 0 and parameter.shape == (head.options.width,) * 2:
             hidden.append(parameter)
         else:
             decay.append(parameter)
@@ -249,8 +257,8 @@ def _optimisers(
     adamw = torch.optim.AdamW(groups, lr=rate, weight_decay=weight_decay, fused=True)
     if not hidden:
         return [adamw]
-    matrices = [{"params": hidden, "share": options.muon_rate / rate}]
-    return [adamw, Muon(matrices, rate, weight_decay)]
+    matrices = [{"params": hidden, "share": options.matrix_rate / rate}]
+    return [adamw, OneSidedShampoo(matrices, rate, weight_decay)]
 
 
 def one_cycle(options: FitOptions, step: int) -> float:

@@ -1,0 +1,88 @@
+"""Scene points of feature rows from the depths of their frames."""
+
+import hashlib
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.features.encoder import Encoder
+from evercal.features.weights_file import network_bytes
+from evercal.geometry import SE3
+from evercal.mapping.frame_depths import frame_depths
+from evercal.recordings.frame import Frame, stated_poses
+from evercal.storage import write_bytes
+
+
+def shared_depths(
+    cache: Path | None, frames: Sequence[Frame], encoder: Encoder, short_side: int
+) -> list[NDArray[np.float64]]:
+    """Estimate the depths of frames, see `frame_depths`, or read those of an earlier run.
+
+    Args:
+        cache: Folder for the depths of all runs; None always estimates them.
+        frames: Posed frames.
+        encoder: Encoder of the cells.
+        short_side: Working size of the images, pixels.
+    """
+    if cache is None:
+        return frame_depths(frames, encoder, short_side)
+    key = hashlib.blake2b(digest_size=16)
+    for frame, pose in zip(frames, stated_poses(frames).matrix(), strict=True):
+        key.update(f"{frame.name} {frame.camera} {short_side}".encode() + pose.tobytes())
+    assert isinstance(encoder, torch.nn.Module)
+    key.update(network_bytes(encoder, "encoder"))
+    path = cache / f"depths-{key.hexdigest()}.npy"
+    if path.exists():
+        return list(np.load(path))
+    depths = frame_depths(frames, encoder, short_side)
+    if len({depth.shape for depth in depths}) == 1:
+        buffer = io.BytesIO()
+        np.save(buffer, np.stack(depths))
+        cache.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, buffer.getvalue())
+    return depths
+
+
+def surface_points(
+    buffer: FeatureBuffer,
+    frames: Sequence[Frame],
+    depths: Sequence[NDArray[np.float64]],
+    stride: int,
+) -> Tensor:
+    """Compute the scene points of all rows of a buffer from the depths of their frames.
+
+    A row takes the depth of the nearest cell of its frame, along its own ray.
+
+    Args:
+        buffer: Rows of plain and augmented views of the frames.
+        frames: Frames in the order in which they were encoded.
+        depths: Depths of each frame, see `mapping.frame_depths`.
+        stride: Pixels per cell.
+
+    Returns:
+        (rows, 3) in the atlas; NaN where the depth is unknown.
+    """
+    tensors = {name: value.cpu() for name, value in buffer.tensors.items()}
+    view, points = tensors["view"].long().numpy(), np.full((len(buffer), 3), np.nan)
+    atlas_from_base = buffer.atlas_from_base
+    for number, four in enumerate(tensors["intrinsics"].numpy()):
+        frame, depth = frames[number % len(frames)], depths[number % len(frames)]
+        assert frame.base_from_camera is not None, "training frames are posed"
+        where = np.flatnonzero(view == number)
+        pixels = tensors["pixels"][where].double().numpy()
+        ray = np.concatenate([(pixels - four[2:]) / four[:2], np.ones((len(where), 1))], 1)
+        camera = frame.camera.short_side_resized(stride * min(depth.shape))
+        cell = ((camera.project(ray) - (stride - 1) / 2) / stride).round()
+        column, row = np.nan_to_num(cell, nan=-1).astype(int).T
+        inside = (row >= 0) & (column >= 0) & (row < depth.shape[0]) & (column < depth.shape[1])
+        known = np.full(len(where), np.nan)
+        known[inside] = depth[row[inside], column[inside]]
+        pose: SE3 = atlas_from_base @ frame.base_from_camera
+        points[where] = pose.apply(ray * known[:, None])
+    return torch.from_numpy(points).float()

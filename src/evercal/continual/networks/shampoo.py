@@ -1,0 +1,68 @@
+"""One-sided Shampoo, the optimiser of the head's hidden matrices."""
+
+from collections.abc import Iterable, Mapping
+
+import torch
+from torch import Tensor
+
+MOMENTUM = 0.95
+DECAY = 0.9
+"""Decay of the second moment per step."""
+EVERY = 10
+"""Steps between two roots of the second moment."""
+FLOOR = 1e-6
+"""Least eigenvalue of the second moment, as a share of its largest."""
+
+
+class OneSidedShampoo(torch.optim.Optimizer):
+    """Shampoo (Gupta et al., ICML 2018) with one side and the root -1/2, for square matrices.
+
+    The step of a matrix is M C^(-1/2), where M is the gradient with Nesterov momentum and C the
+    running mean of M' M, as in ASGO (An et al., 2025). Its Frobenius norm is that of an orthogonal
+    matrix. If C were M' M, the step would be that of Muon (Jordan et al., 2024). Two products and
+    a tenth of an eigendecomposition replace the nine products of Muon.
+
+    Args:
+        groups: Each has `params`, square matrices of one size, all with gradients.
+        rate: Learning rate; the step of a matrix changes its singular values by about so much.
+        weight_decay: Decoupled weight decay, relative to the rate.
+    """
+
+    def __init__(self, groups: Iterable[Mapping[str, object]], rate: float, weight_decay: float):
+        super().__init__(map(dict, groups), {"lr": rate, "weight_decay": weight_decay})
+
+    @torch.no_grad()
+    def step(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Update all matrices."""
+        for group in self.param_groups:
+            matrices = group["params"]
+            gradients = torch.stack([matrix.grad for matrix in matrices])
+            # One product for all matrices of a group: their state is that of the first.
+            changes = self._changes(self.state[matrices[0]], gradients)
+            for matrix, change in zip(matrices, changes, strict=True):
+                matrix.mul_(1 - group["lr"] * group["weight_decay"])
+                matrix.add_(change, alpha=-group["lr"])
+
+    def _changes(self, state: dict[str, Tensor], gradients: Tensor) -> Tensor:
+        """Return the (n, w, w) steps at rate 1."""
+        if not state:
+            state["momentum"] = torch.zeros_like(gradients)
+            state["step"] = torch.zeros((), device=gradients.device)
+        state["momentum"].lerp_(gradients, 1 - MOMENTUM)
+        direction = gradients.lerp(state["momentum"], MOMENTUM)
+        moment = direction.mT @ direction
+        state["moment"] = state["moment"].lerp_(moment, 1 - DECAY) if "moment" in state else moment
+        if int(state["step"]) % EVERY == 0:
+            state["root"] = inverse_root(state["moment"])
+        state["step"] += 1
+        changes = direction @ state["root"]
+        norm = torch.linalg.matrix_norm(changes, keepdim=True).clamp(min=1e-12)
+        return changes * (gradients.shape[-1] ** 0.5 / norm)
+
+
+def inverse_root(moments: Tensor) -> Tensor:
+    """Return C^(-1/2) of symmetric positive semi-definite matrices (n, w, w)."""
+    values, vectors = torch.linalg.eigh(moments)
+    values = values.clamp(min=0)
+    floor = FLOOR * values.amax(-1, keepdim=True) + 1e-30
+    return (vectors * (values + floor).rsqrt()[..., None, :]) @ vectors.mT

@@ -1,0 +1,88 @@
+"""One-sided Shampoo against its definition, and against Muon in its limit."""
+
+import pytest
+import torch
+
+from evercal.continual.networks import shampoo
+from evercal.continual.networks.shampoo import (
+    DECAY,
+    EVERY,
+    FLOOR,
+    MOMENTUM,
+    OneSidedShampoo,
+    inverse_root,
+)
+
+
+def _gradients(steps: int, width: int = 24) -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return [torch.randn(width, width, generator=generator) for _ in range(steps)]
+
+
+def test_inverse_root_inverts_the_square() -> None:
+    a = torch.randn(2, 30, 16, generator=torch.Generator().manual_seed(1))
+    moment = a.mT @ a
+    root = inverse_root(moment)
+    torch.testing.assert_close(root @ moment @ root, torch.eye(16).expand(2, -1, -1), **NEAR)
+
+
+NEAR = {"atol": 2e-3, "rtol": 0.0}
+
+
+def test_rank_deficient_moments_stay_finite() -> None:
+    column = torch.ones(1, 8, 1)
+    assert bool(inverse_root(column @ column.mT).isfinite().all())
+    assert bool(inverse_root(torch.zeros(1, 8, 8)).isfinite().all())
+
+
+def test_steps_follow_the_definition() -> None:
+    steps = 2 * EVERY + 3
+    start = torch.eye(24)
+    matrix = torch.nn.Parameter(start.clone())
+    optimiser = OneSidedShampoo([{"params": [matrix]}], 0.05, 0.1)
+    expected, momentum, moment, root = start.double(), torch.zeros(24, 24).double(), None, None
+    for number, gradient in enumerate(_gradients(steps)):
+        matrix.grad = gradient
+        optimiser.step()
+        g = gradient.double()
+        momentum = MOMENTUM * momentum + (1 - MOMENTUM) * g
+        direction = (1 - MOMENTUM) * g + MOMENTUM * momentum
+        new = direction.T @ direction
+        moment = new if moment is None else DECAY * moment + (1 - DECAY) * new
+        if number % EVERY == 0:
+            values, vectors = torch.linalg.eigh(moment)
+            root = vectors @ torch.diag((values + FLOOR * values.max()) ** -0.5) @ vectors.T
+        change = direction @ root
+        change *= 24**0.5 / change.norm()
+        expected = expected * (1 - 0.05 * 0.1) - 0.05 * change
+    assert (matrix - expected).norm() < 1e-3 * (expected - start).norm()
+
+
+def test_a_repeated_gradient_gives_the_step_of_muon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If C is M' M, the step is the polar factor of M."""
+    monkeypatch.setattr(shampoo, "FLOOR", 0.0)
+    (gradient,) = _gradients(1)
+    matrix = torch.nn.Parameter(torch.zeros(24, 24))
+    optimiser = OneSidedShampoo([{"params": [matrix]}], 1.0, 0.0)
+    matrix.grad = gradient
+    optimiser.step()
+    u, _, v = torch.linalg.svd(gradient)
+    torch.testing.assert_close(-matrix.detach(), u @ v, **NEAR)
+
+
+def test_matrices_are_independent_and_checkpoints_resume() -> None:
+    gradients = _gradients(2 * EVERY)
+    matrices = [torch.nn.Parameter(torch.eye(24) * k) for k in (1.0, 2.0)]
+    alone = torch.nn.Parameter(torch.eye(24))
+    both = OneSidedShampoo([{"params": matrices}], 0.05, 0.1)
+    one = OneSidedShampoo([{"params": [alone]}], 0.05, 0.1)
+    for number, gradient in enumerate(gradients):
+        matrices[0].grad, matrices[1].grad, alone.grad = gradient, -gradient, gradient
+        if number == EVERY + 2:
+            again = OneSidedShampoo([{"params": [alone]}], 0.05, 0.1)
+            again.load_state_dict(one.state_dict())
+            one = again
+        both.step()
+        one.step()
+    torch.testing.assert_close(matrices[0], alone, atol=1e-6, rtol=1e-5)
+    assert not torch.allclose(matrices[1], alone, atol=0.1)
