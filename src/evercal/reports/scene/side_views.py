@@ -130,10 +130,10 @@ def calibrated_views(calibration: "Calibration", scene: Surroundings) -> tuple[l
     return pictures, f"ellipsoid {times} times as large" if times > 1 else "ellipsoid to scale"
 
 
-def set_plane(panel: "Axes", bounds: Array, plane: Plane, frame: str) -> None:
+def set_plane(panel: "Axes", bounds: Array, plane: Plane, frame: str, unit: str = "m") -> None:
     """Limit a panel to a box, at one scale, and name its axes."""
     (x0, y0), (x1, y1) = bounds[:, plane]
-    x, y = (plain(f"{'xyz'[axis]} of {frame[:24]} (m)") for axis in plane)
+    x, y = (plain(f"{'xyz'[axis]} of {frame[:24]} ({unit})") for axis in plane)
     panel.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel=x, ylabel=y)
     panel.locator_params(nbins=7)
     tidy(panel)
