@@ -200,10 +200,10 @@ class Animation:
             view = Frustum.of(path[-1].pose, camera)
             draw_frustum(panel, view, ABOVE, 0.08 * extent, COLOURS[1], 1.8)
         set_plane(panel, scene.bounds, ABOVE, "base", scene.unit)
-        words = f"{name[:30]} from above: keyframes blue, path orange, 95 % ellipsoids"
-        panel.set_title(
-            plain(f"{words} {scene.times} times as large"), fontsize=9, color=_QUIET, loc="left"
-        )
+        panel.set_adjustable("datalim")  # more of the map instead of white beside it
+        words = f"{name[:24]} from above: keyframes blue, path orange, 95 % ellipsoids"
+        words += f" {scene.times} times as large" if scene.times > 1 else ""
+        self._figure.text(0.52, 0.946, plain(words), fontsize=9, color=_QUIET)
 
 
 def _accepted(answer: Answer) -> UncertainPose | None:
@@ -224,7 +224,7 @@ def _write_words(figure: "Figure", answer: Answer) -> None:
     )
     words = [f"{estimate.scene or 'no scene'}"]
     if estimate.support:
-        words.append(f"support {estimate.support:.2f}")
+        words.append(f"support {estimate.support:.1f}")
     words.append(f"{estimate.inliers} inliers")
     if pose is not None and answer.unit_known:
         words.append(f"sigma {pose.sigma_mm:.2f} mm, {pose.sigma_deg:.3f} deg per axis")
