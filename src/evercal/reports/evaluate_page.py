@@ -40,7 +40,9 @@ def evaluation_page(
     return render(
         "evaluate.html",
         title=f"{store}: evaluation",
-        headline=f"{mm:.2f} mm and {deg:.3f} deg median error",
+        headline=f"{mm:.2f} mm and {deg:.3f} deg median error"
+        if math.isfinite(mm)
+        else "No right pose for half of the frames",
         level="",
         first=_tiles(summary),
         frames=len(results),

@@ -37,6 +37,8 @@ Image = NDArray[np.uint8]
 ENDING = ".mp4"
 FRAMES_A_SECOND = 10
 _SIZE_IN, _DPI = (12.8, 5.6), 100  # even numbers of pixels, as H.264 asks
+_MAP_PANEL = (0.56, 0.245, 0.43, 0.685)
+_MAP_ASPECT = (_MAP_PANEL[2] * _SIZE_IN[0]) / (_MAP_PANEL[3] * _SIZE_IN[1])
 _WIDTH_PX = 640
 """Width of the image in a frame."""
 _TRAIL = 25
@@ -158,7 +160,7 @@ class Animation:
         known = all(answer.unit_known for answer in here)
         return _Scene(
             around,
-            around.bounds(eyes if len(eyes) or around.keyframes else np.zeros((1, 3))),
+            _filling(around.bounds(eyes if len(eyes) or around.keyframes else np.zeros((1, 3)))),
             readable_scale(sizes[len(sizes) // 2 :][:1]),
             "m" if known else "unit unknown",
         )
@@ -186,7 +188,7 @@ class Animation:
 
     def _draw_map(self, name: str, path: list[UncertainPose], located: bool) -> None:
         scene = self._scenes[name]
-        panel = self._figure.add_axes((0.56, 0.245, 0.43, 0.685))
+        panel = self._figure.add_axes(_MAP_PANEL)
         extent = float(np.ptp(scene.bounds, axis=0).max())
         draw_surroundings(panel, scene.surroundings, ABOVE, 0.03 * extent)
         draw_frame(panel, ABOVE, 0.07 * extent, "base")
@@ -200,10 +202,17 @@ class Animation:
             view = Frustum.of(path[-1].pose, camera)
             draw_frustum(panel, view, ABOVE, 0.08 * extent, COLOURS[1], 1.8)
         set_plane(panel, scene.bounds, ABOVE, "base", scene.unit)
-        panel.set_adjustable("datalim")  # more of the map instead of white beside it
         words = f"{name[:24]} from above: keyframes blue, path orange, 95 % ellipsoids"
         words += f" {scene.times} times as large" if scene.times > 1 else ""
         self._figure.text(0.52, 0.946, plain(words), fontsize=9, color=_QUIET)
+
+
+def _filling(bounds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Bounds (2, 3), wider along x or y so that the panel shows more map and nothing white."""
+    middle, size = bounds.mean(0), np.ptp(bounds, axis=0)
+    x, y = size[:2]
+    size[:2] = max(x, y * _MAP_ASPECT), max(y, x / _MAP_ASPECT)
+    return np.stack([middle - size / 2, middle + size / 2])
 
 
 def _accepted(answer: Answer) -> UncertainPose | None:
