@@ -147,8 +147,9 @@ def _surroundings(calibration: Calibration, localizer: "LearnedLocalizer") -> Su
 
     name = calibration.source.get("scene")
     scene = next((s for s in localizer.contents.scenes if s.name == name), None)
-    fixed = calibration.mount == "eye_to_hand" and isinstance(scene, SceneMap)
-    return Surroundings.of(scene) if fixed and scene.unit_known else Surroundings()
+    if calibration.mount != "eye_to_hand" or not isinstance(scene, SceneMap):
+        return Surroundings()
+    return Surroundings.of(scene) if scene.unit_known else Surroundings()
 
 
 def select_images(
