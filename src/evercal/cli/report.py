@@ -109,6 +109,8 @@ class Report:
         if self.store is not None:
             localizer = open_localizer(self.store, self.device)
         before = None if older is None else older.calibration
+        if not files:
+            nothing = annotate_images(calibration, [], before, localizer, boards)
+            return replace(nothing, missing=(reason,))
         with progress_bar("drawing", len(files), "image") as bar:
-            drawn = annotate_images(calibration, files, before, localizer, boards, bar.update)
-        return replace(drawn, missing=(reason,)) if reason else drawn
+            return annotate_images(calibration, files, before, localizer, boards, bar.update)

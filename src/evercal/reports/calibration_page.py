@@ -135,18 +135,25 @@ def calibration_page(
         images=images,
         boards_drawn=bool(boards),
         store=store,
-        residuals=_residuals(calibration),
-        uses=_use_table(calibration),
-        ellipsoid=_ellipsoid(calibration) if _has_uncertainty(calibration) else None,
-        terms=_terms(calibration),
         board_scene=board_drawn,
-        estimates=estimates(calibration),
-        contributions=contributions(calibration),
+        **_evidence(calibration),
         checks=checks,
         source=Table(("property", "value"), _source_rows(file)),
         missing=missing,
     )
     return CalibrationPage(html, missing)
+
+
+def _evidence(calibration: Calibration) -> dict[str, Picture | Table | None]:
+    """What the template shows of the images and the uncertainty; None where it is not known."""
+    return {
+        "residuals": _residuals(calibration),
+        "uses": _use_table(calibration),
+        "ellipsoid": _ellipsoid(calibration) if _has_uncertainty(calibration) else None,
+        "terms": _terms(calibration),
+        "estimates": estimates(calibration),
+        "contributions": contributions(calibration),
+    }
 
 
 def _level(calibration: Calibration) -> Literal["good", "fair", "bad", ""]:
