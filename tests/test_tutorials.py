@@ -1,6 +1,10 @@
-"""Every command and every block of Python on a tutorial page runs as printed."""
+"""Every command and every block of Python on a tutorial page runs as printed.
+
+The two main tutorials run as the notebooks that are made from their pages.
+"""
 
 import contextlib
+import json
 import os
 import re
 import shutil
@@ -8,10 +12,11 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+
+from docs._site.notebooks import NOTEBOOKS, Step, notebook_of, parts
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "tutorials"
@@ -20,28 +25,9 @@ PORT = "8000"
 TIMEOUT_S = 1800
 
 
-@dataclass(frozen=True)
-class Step:
-    """A command, or a block of Python that is run or saved."""
-
-    kind: str
-    """`command`, `python`, or the name of the file that a block is saved as."""
-    text: str
-    code: int = 0
-    """Expected exit code."""
-
-
 def steps(page: str) -> Iterator[Step]:
     """Commands and blocks of a page, in its order."""
-    pattern = r"^```python *(\S*)\n(.*?)^```$|^    (\S[^\n]*)$"
-    for block in re.finditer(pattern, page, re.M | re.S):
-        name, code, command = block.groups()
-        if command is None:
-            yield Step(name or "python", code)
-            continue
-        line, _, comment = command.partition("  # ")
-        stated = re.match(r"\s*exit code (\d+)", comment)
-        yield Step("command", line.split("  # ")[0].strip(), int(stated[1]) if stated else 0)
+    return (part for part in parts(page) if part.kind != "text")
 
 
 def free_port() -> str:
@@ -102,9 +88,47 @@ def test_every_page_has_a_test() -> None:
     assert {path.stem for path in PAGES.glob("*.md")} == tested
 
 
+def run_notebook(name: str, folder: Path) -> str:
+    """Run a page's notebook in a folder; return what its cells print."""
+    nbformat = pytest.importorskip("nbformat", reason="nbclient is not installed")
+    nbclient = pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    notebook = nbformat.reads(notebook_of(name), as_version=4)
+    nbformat.validate(notebook)
+    for cell in notebook.cells:
+        if "exit_code" in cell.metadata:
+            cell.source += f"\nassert _exit_code == {cell.metadata.exit_code}, _exit_code"
+    (folder / "bin").mkdir()
+    program = folder / "bin" / "evercal"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m evercal "$@"\n', encoding="utf-8")
+    program.chmod(0o755)
+    environment = {
+        **os.environ,
+        "PATH": os.pathsep.join([str(program.parent), os.environ.get("PATH", "")]),
+        "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), os.environ.get("PYTHONPATH", "")]),
+    }
+    client = nbclient.NotebookClient(
+        notebook, timeout=TIMEOUT_S, resources={"metadata": {"path": str(folder)}}
+    )
+    client.execute(env=environment)
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    return "".join(output.get("text", "") for output in outputs)
+
+
+def test_notebooks_hold_all_that_their_pages_hold() -> None:
+    for name in NOTEBOOKS:
+        cells = json.loads(notebook_of(name))["cells"]
+        page = list(parts((PAGES / f"{name}.md").read_text(encoding="utf-8")))
+        assert len(cells) == len(page)
+        for cell, part in zip(cells, page, strict=True):
+            assert (cell["cell_type"] == "markdown") == (part.kind == "text")
+            if part.kind != "text":
+                assert part.text.strip() in cell["source"]
+
+
 @pytest.mark.slow
 def test_a_wrist_camera_from_nothing(tmp_path: Path) -> None:
-    printed = run("wrist-camera", tmp_path)
+    printed = run_notebook("wrist-camera", tmp_path)
     shift = re.search(r"moved by ([\d.]+) mm", printed)
     assert shift is not None
     assert 4 < float(shift[1]) < 6
@@ -124,7 +148,7 @@ def test_a_fleet(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_from_a_phone_video_to_a_calibrated_camera(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
-    printed = run("phone-video", tmp_path)
+    printed = run_notebook("phone-video", tmp_path)
     error = re.search(r"error ([\d.]+) mm, stated ([\d.]+) mm per axis", printed)
     assert error is not None
     assert float(error[1]) < 4 * float(error[2])

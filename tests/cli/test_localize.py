@@ -158,10 +158,23 @@ def test_camera_file_replaces_the_camera_of_the_scene(
     assert stated != pose("--camera", tmp_path / "longer.txt")
 
 
+def test_video_holds_every_image_and_json_only_its_object(
+    run: Any, hall_store: Path, images: Path, tmp_path: Path
+) -> None:
+    av = pytest.importorskip("av")
+    ran = run("localize", hall_store, images, "--video", tmp_path / "a.mp4", "--json")
+    rows = json.loads(ran.out)["images"]
+    assert (ran.code, ran.err) == (0, [])
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert len(frames) == len(rows)
+    assert frames[0].shape == (560, 1280, 3)
+
+
 @pytest.mark.parametrize("as_json", [False, True])
 @pytest.mark.parametrize(
     "kind",
-    ["missing", "unreadable", "none", "camera", "misfit", "overlay", "store", "empty"],
+    ["missing", "unreadable", "none", "camera", "misfit", "overlay", "video", "store", "empty"],
 )
 def test_bad_input_is_one_line(
     run: Any,
@@ -184,6 +197,7 @@ def test_bad_input_is_one_line(
         "camera": [hall_store, image, "--camera", broken],
         "misfit": [hall_store, image, "--camera", tmp_path / "tall.json"],
         "overlay": [hall_store, image, "--overlay", broken],
+        "video": [hall_store, image, "--video", tmp_path / "a.avi"],
         "store": [tmp_path, image],
         "empty": [hall_store, tmp_path / "empty"],
     }[kind]

@@ -47,7 +47,7 @@ class FixedLocalizer:
     scenes = ("room",)
 
     def __init__(self, pose: SE3 | None) -> None:
-        keyframes: Any = None
+        keyframes: Any = SimpleNamespace(landmarks=(), cameras=())
         scene = SceneMap("room", CAMERA, CAMERA, keyframes, MapFrame(), 10)
         self.contents = SimpleNamespace(scenes=[scene], short_side=60)
         self.pose = pose

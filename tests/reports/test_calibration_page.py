@@ -76,10 +76,10 @@ def read(
 
 def test_verdict_comes_first() -> None:
     reader, _ = read(full())
-    assert reader.strings[3] == ("strong", "Good enough for bin picking")  # after title and style
+    assert reader.strings[3] == ("h1", "Good enough for bin picking")  # after title and style
     assert reader.strings[4] == ("p", "Move closer.")
     # The uncertainty decides; the held-out error of 2.25 mm is that of one image.
-    assert "Expected error: 0.37 mm" in reader.text("p")
+    assert reader.strings[5] == ("strong", "0.37 mm")
     suitable = {row[0]: row[3] for row in reader.rows[1:4]}
     assert suitable == {"precision assembly": "yes", "bin picking": "yes", "tabletop tasks": "yes"}
 
@@ -94,8 +94,8 @@ def test_verdict_comes_first() -> None:
 )
 def test_verdict_has_its_colour(mm: float, level: str, headline: str) -> None:
     reader, page = read(full(checks={"repeatability_mm": 2 * mm}, verdict=""))
-    assert f'class="verdict {level}"' in page.html
-    assert reader.text("strong").startswith(headline)
+    assert f'<header class="{level}"' in page.html
+    assert reader.text("h1").startswith(headline)
 
 
 def test_point_of_the_camera_has_a_standard_deviation_along_each_axis() -> None:
@@ -162,7 +162,7 @@ def test_checks_ellipsoid_and_source_are_shown() -> None:
     ):
         assert reader.row(name)[1] == value
     assert page.missing == ()
-    assert len(reader.images) == 3
+    assert len(reader.images) == 5  # residuals, ellipsoid, budget, and the camera from two sides
 
 
 def test_missing_contents_are_listed() -> None:
@@ -178,7 +178,7 @@ def test_missing_contents_are_listed() -> None:
     }
     assert reader.text("li").splitlines() == list(page.missing)
     assert len(reader.images) == 1  # the ellipsoid
-    assert "Good for bin picking (within 3 mm" in reader.text("strong")
+    assert "Good for bin picking (within 3 mm" in reader.text("h1")
 
 
 def test_verdict_without_any_measure_has_no_basis() -> None:
@@ -204,7 +204,7 @@ def test_all_strings_are_escaped() -> None:
     )
     reader, _ = read(calibration, images, MARKUP, calibration, MARKUP)
     assert not {"script", "a", "link", "iframe", "object"} & set(reader.tags)
-    assert reader.text("strong") == MARKUP
+    assert reader.text("h1") == MARKUP
     assert [MARKUP, MARKUP] in reader.rows
 
 
@@ -223,7 +223,7 @@ def test_pictures_show_the_origin_and_the_landmarks() -> None:
     assert f"origin of panda_link0 projects to pixel ({x:.1f}, {y:.1f})" in reader.text("p")
     assert "a.png: used; 12 landmarks" in reader.text("figcaption")
     assert "landmarks of cell.evercal" in reader.text("p")
-    assert len(reader.images) == 6
+    assert len(reader.images) == 8
     behind = axes_in_view(CAMERA, pose([1.0, 0, 0, 0], [0, 0, -0.2]))
     reader, _ = read(full(), replace(images, axes=behind, other_map=True), "cell.evercal")
     assert "panda_link0 lies behind the camera, 200 mm" in reader.text("p")

@@ -22,6 +22,11 @@ def page(table: Table, picture: Picture, title: str = "title") -> str:
     return render(
         "benchmark.html",
         title=title,
+        headline=title,
+        level="",
+        first=[],
+        scenes=1,
+        runs=1,
         tables={"methods": table, **tables},
         scene_bars=picture,
         errors=picture,

@@ -24,21 +24,6 @@ if TYPE_CHECKING:
 Part = tuple[str, bytes] | str
 
 
-NAMES = ("chromium", "chromium-browser", "google-chrome")
-CHROMIUM = next((path for path in map(shutil.which, NAMES) if path), None)
-FLAGS = [
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
-
-
 @dataclass(frozen=True)
 class Answer:
     """What came back."""
@@ -159,15 +144,3 @@ def recording(rooms: tuple[Recording, ...], tmp_path_factory: pytest.TempPathFac
     root = tmp_path_factory.mktemp("recordings")
     generic.write(root / "alpha", replace(rooms[0], train=rooms[0].train[:16]))
     return root / "alpha"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Chromium, rendering in software."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium")
-    with playwright.sync_playwright() as started:
-        chromium = started.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield chromium
-        chromium.close()

@@ -10,8 +10,8 @@ import pytest
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.mapping.map_frame import Similarity
 from evercal.mapping.scene_map import MapContents, SceneMap
-from evercal.service.viewer.frusta import DRAWN_M, Ellipsoid, Frustum, readable_scale
-from evercal.service.viewer.map_parts import (
+from evercal.reports.scene.frusta import DRAWN_M, Ellipsoid, Frustum, readable_scale
+from evercal.reports.scene.map_parts import (
     Backdrop,
     KeyframeView,
     Landmarks3D,

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.cli.console import print_json, print_next, progress_bar, require_folder
+from evercal.cli.console import (
+    print_json,
+    print_next,
+    progress_bar,
+    require_folder,
+    require_writable,
+)
 from evercal.cli.device import Device
 from evercal.cli.image_words import camera_for
 from evercal.cli.point_words import Point, point_dict, point_of, point_text
@@ -41,6 +47,9 @@ class Localize:
     that recorded the scene."""
     overlay: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Output folder for copies of the images with their inliers."""
+    video: Annotated[Path | None, arg(metavar="FILE.mp4", help_behavior_hint="")] = None
+    """A video of the sequence: each image with its landmarks and residuals, beside the map seen
+    from above with the camera's path and its uncertainty (extra `video`)."""
     at: Annotated[str | None, arg(metavar="X,Y,Z", help_behavior_hint="")] = None
     """A point in the camera frame (x right, y down, z forward; metres), such as an object that the
     camera sees: print its standard deviation in the base frame."""
@@ -51,19 +60,26 @@ class Localize:
     def run(self) -> int:
         """Locate every image; nothing is printed before all of them were read."""
         from evercal.recordings.image_files import image_files
+        from evercal.reports.scene.animation import require_video
 
         point = point_of(self.at)
         files = image_files(self.images)
         camera = camera_for(self.camera, files)
         require_folder(self.overlay, "--overlay")
+        require_writable(self.video, "--video")
+        require_video(self.video)
         localizer = open_localizer(self.store, self.device)
         answers = self._answers(localizer, files, camera)
+        if self.video is not None:
+            self._animate(self.video, localizer, answers)
         located = sum(answer.estimate.status == "ok" for answer in answers)
         if self.json:
             print_json({"images": [as_dict(answer, point) for answer in answers]})
         else:
             for answer in answers:
                 print(as_text(answer, point))
+            if self.video is not None:
+                print(f"wrote {self.video}")
             self._next(files, located)
         return 0 if located else 1
 
@@ -93,6 +109,18 @@ class Localize:
                 answers.append(item)
                 bar.update()
         return answers
+
+    def _animate(self, path: Path, localizer: "LearnedLocalizer", answers: list[Answer]) -> None:
+        from evercal.recordings import read_image
+        from evercal.reports.scene.animation import Animation, write_video
+
+        with progress_bar("drawing", len(answers), "image") as bar:
+
+            def read(file: Path) -> "np.ndarray":
+                bar.update()
+                return read_image(file)
+
+            write_video(path, iter(Animation(answers, localizer, read)))
 
     def _next(self, files: list[Path], located: int) -> None:
         if not located:

@@ -1,6 +1,6 @@
 """`evercal report`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -98,22 +98,19 @@ class Report:
         boards: "dict[str, BoardSeen]",
     ) -> "AnnotatedImages":
         from evercal.recordings.image_files import image_files
-        from evercal.reports.calibration_images import (
-            AnnotatedImages,
-            annotate_images,
-            select_images,
-        )
+        from evercal.reports.calibration_images import annotate_images, select_images
 
         calibration = file.calibration
         given = image_files(self.images) if self.images else []
         if calibration.camera is None:
             return annotate_images(calibration, [])
         files, reason = select_images(calibration, self.calibration.parent, given)
-        if not files:
-            return AnnotatedImages(missing=(reason,))
         localizer = None
         if self.store is not None:
             localizer = open_localizer(self.store, self.device)
         before = None if older is None else older.calibration
+        if not files:
+            nothing = annotate_images(calibration, [], before, localizer, boards)
+            return replace(nothing, missing=(reason,))
         with progress_bar("drawing", len(files), "image") as bar:
             return annotate_images(calibration, files, before, localizer, boards, bar.update)

@@ -1,7 +1,7 @@
 """Images of a calibrated camera with the axes of the parent frame and the landmarks drawn in."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +23,7 @@ from evercal.reports.frame_axes import (
 )
 from evercal.reports.overlay import overlay_points, overlay_vectors
 from evercal.reports.pictures import draw_residuals, landmark_errors
+from evercal.reports.scene.side_views import Surroundings
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import LearnedLocalizer
@@ -76,6 +77,8 @@ class AnnotatedImages:
     """Sentences about overlays that are not possible."""
     other_map: bool = False
     """Whether the map in the store differs from the map of the calibration."""
+    surroundings: Surroundings = field(default_factory=Surroundings)
+    """The map around a fixed camera; empty without a store."""
 
     @property
     def landmarks(self) -> bool:
@@ -127,7 +130,26 @@ def annotate_images(
     if annotated and localizer is None and not boards:
         missing.append("No landmarks: pass --store to draw them.")
     other_map = localizer is not None and _is_other_map(calibration, localizer)
-    return AnnotatedImages(tuple(annotated), axes, older_axes, detail, tuple(missing), other_map)
+    return AnnotatedImages(
+        tuple(annotated),
+        axes,
+        older_axes,
+        detail,
+        tuple(missing),
+        other_map,
+        Surroundings() if localizer is None else _surroundings(calibration, localizer),
+    )
+
+
+def _surroundings(calibration: Calibration, localizer: "LearnedLocalizer") -> Surroundings:
+    """Return the map that a fixed camera was calibrated in; empty for other cameras and maps."""
+    from evercal.mapping.scene_map import SceneMap
+
+    name = calibration.source.get("scene")
+    scene = next((s for s in localizer.contents.scenes if s.name == name), None)
+    if calibration.mount != "eye_to_hand" or not isinstance(scene, SceneMap):
+        return Surroundings()
+    return Surroundings.of(scene) if scene.unit_known else Surroundings()
 
 
 def select_images(

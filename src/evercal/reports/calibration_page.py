@@ -17,7 +17,8 @@ from evercal.reports.board_views import BoardSeen, board_scene, contributions, e
 from evercal.reports.calibration_charts import ellipsoid_projections, error_terms, residual_bars
 from evercal.reports.calibration_images import AnnotatedImages
 from evercal.reports.overlay import encode_image
-from evercal.reports.page import Picture, Table, render
+from evercal.reports.page import Picture, Table, Tile, render
+from evercal.reports.scene.side_views import calibrated_views
 
 _CHECKS = {
     "repeatability": "difference between two halves of the data",
@@ -107,6 +108,7 @@ def calibration_page(
     text = calibration.verdict or verdict(calibration)
     headline, _, details = text.partition(". ")
     sigma = np.sqrt(np.clip(np.diag(calibration.covariance), 0.0, None))
+    board_drawn = board_scene(calibration, boards) if boards else None
     html = render(
         "calibration.html",
         title=f"{file.name}: {calibration.parent_frame}_from_{calibration.child_frame}",
@@ -116,7 +118,7 @@ def calibration_page(
         level=_level(calibration),
         headline=headline,
         details=details,
-        expected_error=expected_error(calibration),
+        first=_tiles(calibration),
         tiers=TIERS,
         best=tier(calibration),
         matrix=calibration.parent_from_child.matrix(),
@@ -128,22 +130,30 @@ def calibration_page(
         difference=None if older is None else difference(calibration, older.calibration),
         pixel_shift=_pixel_shift(images),
         same_map=older is not None and _same_map(calibration, older.calibration),
+        views=_views(calibration, images) if board_drawn is None else [],
         pictures=_pictures(images, calibration.parent_frame),
         images=images,
         boards_drawn=bool(boards),
         store=store,
-        residuals=_residuals(calibration),
-        uses=_use_table(calibration),
-        ellipsoid=_ellipsoid(calibration) if _has_uncertainty(calibration) else None,
-        terms=_terms(calibration),
-        board_scene=board_scene(calibration, boards) if boards else None,
-        estimates=estimates(calibration),
-        contributions=contributions(calibration),
+        board_scene=board_drawn,
+        **_evidence(calibration),
         checks=checks,
         source=Table(("property", "value"), _source_rows(file)),
         missing=missing,
     )
     return CalibrationPage(html, missing)
+
+
+def _evidence(calibration: Calibration) -> dict[str, Picture | Table | None]:
+    """What the template shows of the images and the uncertainty; None where it is not known."""
+    return {
+        "residuals": _residuals(calibration),
+        "uses": _use_table(calibration),
+        "ellipsoid": _ellipsoid(calibration) if _has_uncertainty(calibration) else None,
+        "terms": _terms(calibration),
+        "estimates": estimates(calibration),
+        "contributions": contributions(calibration),
+    }
 
 
 def _level(calibration: Calibration) -> Literal["good", "fair", "bad", ""]:
@@ -152,6 +162,32 @@ def _level(calibration: Calibration) -> Literal["good", "fair", "bad", ""]:
         return ""
     best = tier(calibration)
     return "bad" if best is None else "fair" if best is TIERS[-1] else "good"
+
+
+def _tiles(calibration: Calibration) -> list[Tile]:
+    """The expected error first, then what supports it."""
+    tiles = []
+    if _level(calibration):
+        mm, deg = expected_error(calibration)
+        rule = "the larger of √3 standard deviations per axis and half the repeatability error"
+        tiles = [
+            Tile(f"{mm:.2f} mm", f"expected position error, at the target: {rule}"),
+            Tile(f"{deg:.3f} deg", "expected rotation error, by the same rule"),
+        ]
+    if images := calibration.images:
+        used = sum(image.used for image in images)
+        tiles.append(Tile(f"{used} of {len(images)}", "images used; the others were rejected"))
+    halves = _check_value(calibration, "repeatability_mm")
+    if halves is not None:
+        words = "repeatability: difference between the positions from two halves of the data"
+        tiles.append(Tile(f"{halves:.2f} mm", words))
+    return tiles
+
+
+def _views(calibration: Calibration, images: AnnotatedImages) -> list[Picture]:
+    drawn, scale = calibrated_views(calibration, images.surroundings)
+    captions = (f"From above: x and y of {calibration.parent_frame}; {scale}", "From the side")
+    return [Picture(data, caption) for data, caption in zip(drawn, captions, strict=False)]
 
 
 class _Point(NamedTuple):

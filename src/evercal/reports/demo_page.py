@@ -7,7 +7,7 @@ from statistics import median
 
 from evercal.evaluation import FrameResult, scores
 from evercal.reports.charts import error_histogram
-from evercal.reports.page import Picture, Table, render
+from evercal.reports.page import Picture, Table, Tile, render
 
 
 @dataclass(frozen=True)
@@ -108,11 +108,14 @@ def demo_page(result: DemoResult, pictures: Sequence[Picture]) -> str:
     errors: dict[str, list[float]] = {}
     for row in result.test:
         errors.setdefault(row.scene, []).append(row.translation_error_m)
+    (number, meaning), *others = result.headlines().items()
     return render(
         "demo.html",
         title="evercal demo",
+        headline=f"{number} {meaning}",
+        level="",
+        first=[Tile(*item) for item in others],
         result=result,
-        headlines=result.headlines(),
         histogram=Picture(error_histogram(errors), "Position errors of the test images"),
         pictures=pictures,
         scores={"": scores(result.test), "after a change": scores(result.changed)},

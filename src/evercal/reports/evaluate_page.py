@@ -10,11 +10,12 @@ from evercal.evaluation import scores
 from evercal.evaluation.tables import SCENE_HEADER, scene_rows
 from evercal.reports.charts import error_curve, trajectory
 from evercal.reports.overlay import encode_image
-from evercal.reports.page import Picture, Table, render
+from evercal.reports.page import Picture, Table, Tile, render
 from evercal.reports.pictures import draw_estimate
 
 if TYPE_CHECKING:
     from evercal.evaluation import FrameResult
+    from evercal.evaluation.metrics import Scores
     from evercal.localization.localizer import LearnedLocalizer
     from evercal.recordings import Recording
 
@@ -34,18 +35,37 @@ def evaluation_page(
     """
     summary = scores(results)
     by_scene = {name: [r for r in results if r.scene == name] for name in summary.scenes}
+    mm = 1000 * float(np.median([r.translation_error_m for r in results]))
+    deg = math.degrees(float(np.median([r.rotation_error_rad for r in results])))
     return render(
         "evaluate.html",
         title=f"{store}: evaluation",
+        headline=f"{mm:.2f} mm and {deg:.3f} deg median error"
+        if math.isfinite(mm)
+        else "No right pose for half of the frames",
+        level="",
+        first=_tiles(summary),
         frames=len(results),
         summary=summary,
-        median_mm=1000 * float(np.median([r.translation_error_m for r in results])),
-        median_deg=math.degrees(float(np.median([r.rotation_error_rad for r in results]))),
         scores=Table(SCENE_HEADER, scene_rows(summary)),
         curve=_curve(by_scene),
         trajectories=[_trajectory(scenes[name], rows) for name, rows in by_scene.items()],
         worst=_worst(localizer, scenes, results),
     )
+
+
+def _tiles(summary: "Scores") -> list[Tile]:
+    shares = {
+        "10 mm and 1 deg": summary.mean_accuracy_1cm_1deg,
+        "50 mm and 5 deg": summary.mean_accuracy_5cm_5deg,
+    }
+    return [
+        *(
+            Tile(f"{share:.1f} %", f"of frames within {b}, mean of scenes")
+            for b, share in shares.items()
+        ),
+        Tile(f"{summary.ms_per_image:.0f} ms", "per image, one at a time, decoding included"),
+    ]
 
 
 def _curve(by_scene: "Mapping[str, Sequence[FrameResult]]") -> Picture:

@@ -5,7 +5,7 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -60,6 +60,15 @@ class Table:
     def numeric(self) -> set[int]:
         """Indices of the columns that hold only numbers and blanks."""
         return {i for i in self.columns if self.rows and all(_number(row[i]) for row in self.rows)}
+
+
+class Tile(NamedTuple):
+    """A number that comes first, and what it measures."""
+
+    number: str
+    """With its unit."""
+    meaning: str
+    """Definition of the measure."""
 
 
 def render(template: str, **values: object) -> str:

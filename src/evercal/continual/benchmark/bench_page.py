@@ -13,7 +13,10 @@ from evercal.continual.benchmark.bench_charts import (
 from evercal.continual.benchmark.comparison import Run, TableRows, by_strategy
 from evercal.continual.benchmark.report_data import TITLES, Report
 from evercal.reports.charts import error_curve
-from evercal.reports.page import Picture, Table, render
+from evercal.reports.page import Picture, Table, Tile, render
+
+_TILES = 4
+"""Strategies whose accuracy stands beside that of the first."""
 
 
 def bench_page(
@@ -42,9 +45,18 @@ def bench_page(
         name: np.concatenate([end.translation_m for run in group for end in run.last])
         for name, group in plotted.items()
     }
+    final = {
+        n: f"{np.mean([r.scores().final_accuracy for r in plotted[n]]):.1f} %" for n in plotted
+    }
+    (name, accuracy), *others = final.items()
     return render(
         "benchmark.html",
         title="evercal bench",
+        headline=f"{name}: {accuracy} final accuracy",
+        level="",
+        first=[Tile(number, f"final accuracy of {other}") for other, number in others[:_TILES]],
+        scenes=len(scenes),
+        runs=len(plotted[name]),
         tables=dict.fromkeys(TITLES)
         | {name: Table(rows[0], rows[1:]) for name, rows in tables.items()},
         scene_bars=Picture(scene_bars(ends, scenes), f"Final accuracy on each scene{caption}"),

@@ -7,14 +7,14 @@ import numpy as np
 import viser
 
 from evercal.geometry import SE3
+from evercal.reports.scene.frusta import Ellipsoid, Frustum, readable_scale
+from evercal.reports.scene.map_parts import THUMBNAIL_PX, resized
 from evercal.service.studio.book import Proposal
 from evercal.service.studio.devices import Image, Seen
 from evercal.service.studio.studio import Studio
 from evercal.service.viewer.answers import AMBER, BLUE, GREEN, RED
 from evercal.service.viewer.calibrations import CalibrationView
 from evercal.service.viewer.drawn import DrawnCalibrations, place_frustum
-from evercal.service.viewer.frusta import Ellipsoid, Frustum, readable_scale
-from evercal.service.viewer.map_parts import THUMBNAIL_PX, resized
 from evercal.service.viewer.stage import Stage, add_frustum
 
 _SIZE_M = 0.045

@@ -11,8 +11,8 @@ from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.reports.answers import finite_pose, unit_known
 from evercal.reports.pictures import draw_residuals, landmark_errors
-from evercal.service.viewer.frusta import Ellipsoid, Frustum
-from evercal.service.viewer.map_parts import resized
+from evercal.reports.scene.frusta import Ellipsoid, Frustum
+from evercal.reports.scene.map_parts import resized
 
 Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]

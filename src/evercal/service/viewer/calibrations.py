@@ -6,7 +6,7 @@ from pathlib import Path
 
 from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.geometry import SE3, Camera, UncertainPose
-from evercal.service.viewer.frusta import Ellipsoid, Frustum
+from evercal.reports.scene.frusta import Ellipsoid, Frustum
 
 
 @dataclass(frozen=True, eq=False)

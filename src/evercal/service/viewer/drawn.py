@@ -6,10 +6,10 @@ import numpy as np
 import viser
 
 from evercal.geometry import SE3
+from evercal.reports.scene.frusta import Ellipsoid, Frustum
+from evercal.reports.scene.map_parts import THUMBNAIL_PX, resized
 from evercal.service.viewer.answers import BLUE, GREEN, GREY, AnswerView
 from evercal.service.viewer.calibrations import CalibrationView
-from evercal.service.viewer.frusta import Ellipsoid, Frustum
-from evercal.service.viewer.map_parts import THUMBNAIL_PX, resized
 from evercal.service.viewer.stage import Stage, add_frustum
 
 CALIBRATION_COLOUR = (192, 38, 211)

@@ -17,9 +17,9 @@ from evercal.localization.tracking import Tracker
 from evercal.recordings import load_recording
 from evercal.recordings.frame import Frame
 from evercal.recordings.poses.camera_file import read_camera
+from evercal.reports.scene.frusta import Ellipsoid, readable_scale
 from evercal.service.viewer.calibrations import read_views
 from evercal.service.viewer.drawn import DrawnCalibrations
-from evercal.service.viewer.frusta import Ellipsoid, readable_scale
 from evercal.service.viewer.live import Live, open_source
 from evercal.service.viewer.panel import CalibrationPanel, KeyframePanel, MapPanel
 from evercal.service.viewer.playback import Playback

@@ -5,8 +5,8 @@ from typing import Any
 
 import viser
 
+from evercal.reports.scene.map_parts import ColourBy, KeyframeView
 from evercal.service.viewer.drawn import CALIBRATION_COLOUR, DrawnCalibrations
-from evercal.service.viewer.map_parts import ColourBy, KeyframeView
 from evercal.service.viewer.stage import Stage
 from evercal.service.viewer.text import chip, note_html, rows_html
 

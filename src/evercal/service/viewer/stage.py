@@ -8,8 +8,8 @@ import viser
 
 from evercal.geometry import SE3
 from evercal.mapping.scene_map import SceneMap
-from evercal.service.viewer.frusta import Frustum
-from evercal.service.viewer.map_parts import (
+from evercal.reports.scene.frusta import Frustum
+from evercal.reports.scene.map_parts import (
     ColourBy,
     KeyframeView,
     Landmarks3D,

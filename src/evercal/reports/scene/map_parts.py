@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from evercal.geometry import Camera, resize_pixels
 from evercal.mapping.scene_map import SceneMap
 from evercal.reports.overlay import colour_map, overlay_points
-from evercal.service.viewer.frusta import Frustum
+from evercal.reports.scene.frusta import Frustum
 
 Array = NDArray[np.floating]
 Image = NDArray[np.uint8]

@@ -1,0 +1,27 @@
+"""Draw README's picture, a located image: python docs/_site/located.py cell.evercal IMAGE.
+
+The map is that of docs/tutorials/wrist-camera.md, the image samples/cell/tripod/0004.jpg.
+"""
+
+import sys
+from pathlib import Path
+
+import evercal
+from evercal.recordings import write_image
+from evercal.reports.answers import Answer
+from evercal.reports.scene.animation import Animation
+
+OUT = Path(__file__).parents[1] / "located.jpg"
+
+
+def main(store: Path, image: Path) -> None:
+    """Locate an image and write a frame of `evercal localize --video`."""
+    localizer = evercal.Map.open(store).localizer
+    estimate = localizer.localize(evercal.read_image(image))
+    answer = Answer(image, estimate, estimate.milliseconds)
+    [frame] = Animation([answer], localizer, evercal.read_image)
+    write_image(OUT, frame)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

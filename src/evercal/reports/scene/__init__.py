@@ -1,0 +1,1 @@
+"""A scene in space: what is drawn of its map, cameras and their uncertainty."""
