@@ -12,10 +12,11 @@ from evercal.service.studio.devices import Image, Seen
 from evercal.service.studio.studio import Studio
 from evercal.service.viewer.answers import AMBER, BLUE, GREEN, RED
 from evercal.service.viewer.calibrations import CalibrationView
+from evercal.service.viewer.camera_set import CameraSet
 from evercal.service.viewer.drawn import DrawnCalibrations, place_frustum
 from evercal.service.viewer.frusta import Ellipsoid, Frustum, readable_scale
 from evercal.service.viewer.map_parts import THUMBNAIL_PX, resized
-from evercal.service.viewer.stage import Stage, add_frustum
+from evercal.service.viewer.stage import Stage, add_floor, add_frustum
 
 _SIZE_M = 0.045
 """Length of a drawn camera."""
@@ -34,7 +35,9 @@ class Drawing:
 
     def __init__(self, server: viser.ViserServer, studio: Studio, on_sample: Callable[[str], Any]):
         self._server, self._studio, self._on_sample = server, studio, on_sample
-        self._samples: dict[str, viser.CameraFrustumHandle] = {}
+        self._samples: CameraSet | None = None
+        self._names: tuple[str, ...] = ()
+        self._thumbnails: dict[str, Image] = {}
         self._calibrations: DrawnCalibrations | None = None
         self._drawn: tuple[object, ...] = ()
         self._arm: viser.LineSegmentsHandle | None = None
@@ -44,6 +47,7 @@ class Drawing:
         self._label = server.scene.add_label("/next_label", "next view", anchor="bottom-center")
         for node in (self._live, self._ghost, self._label):
             node.visible = False
+        server.scene.on_click()(self._clicked)
         self._add_floor()
 
     def show_live(self, seen: Seen, picture: Image | None) -> None:
@@ -78,18 +82,24 @@ class Drawing:
     def show_samples(self, bad: set[str]) -> None:
         """Draw the samples, the bad ones in red."""
         mount = self._studio.gripper_from_camera or SE3.identity()
-        frames = {frame.name: frame for frame in self._studio.book.frames}
-        with self._server.atomic():
-            for name in [name for name in self._samples if name not in frames]:
-                self._samples.pop(name).remove()
-            for name, frame in frames.items():
-                if frame.base_from_gripper is None:
-                    continue
+        frusta: dict[str, Frustum] = {}
+        for frame in self._studio.book.frames:
+            if frame.base_from_gripper is not None:
                 place = Frustum.of(frame.base_from_gripper @ mount, frame.camera)
-                if name not in self._samples:
-                    self._add_sample(name, place, resized(frame.read_image(), THUMBNAIL_PX))
-                place_frustum(self._samples[name], place)
-                self._samples[name].color = RED if name in bad else GREEN
+                frusta[frame.name] = place
+                if frame.name not in self._thumbnails:
+                    self._thumbnails[frame.name] = resized(frame.read_image(), THUMBNAIL_PX)
+        with self._server.atomic():
+            if self._samples is not None:
+                self._samples.remove()
+                self._samples = None
+            self._names = tuple(frusta)
+            if frusta:
+                images = [self._thumbnails[name] for name in frusta]
+                self._samples = CameraSet(
+                    self._server, "/samples", list(frusta.values()), images, _SIZE_M
+                )
+                self._samples.colour([RED if name in bad else GREEN for name in frusta])
 
     def show_results(self) -> None:
         """Draw the map and the calibrations, if they have changed."""
@@ -116,10 +126,11 @@ class Drawing:
             drawn_views.move(self._studio.connection.seen.base_from_gripper)
             self._calibrations = drawn_views
 
-    def _add_sample(self, name: str, place: Frustum, thumbnail: Image) -> None:
-        node = add_frustum(self._server, f"/samples/{name}", place, _SIZE_M, GREEN, thumbnail)
-        self._samples[name] = node
-        node.on_click(lambda _: self._on_sample(name))
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        """Choose the sample that was clicked."""
+        hit = self._samples and self._samples.hit(event.ray_origin, event.ray_direction)
+        if hit:
+            self._on_sample(self._names[hit[1]])
 
     def _draw_arm(self, points: np.ndarray) -> None:
         """Draw the arm as a line through its joints."""
@@ -136,8 +147,7 @@ class Drawing:
         scene = self._server.scene
         scene.add_frame("/base", axes_length=0.15, axes_radius=0.005)
         scene.add_label("/base/label", "robot base", position=(0, 0, 0))
-        lines, sections = (52, 57, 66), (80, 87, 99)
-        scene.add_grid("/grid", 3, 3, cell_size=0.1, cell_color=lines, section_color=sections)
+        add_floor(self._server, 3.0, 0.1)
         self._look()
 
     def _look(self) -> None:

@@ -12,18 +12,13 @@ from evercal.service.studio.devices import Image, Seen
 from evercal.service.studio.jobs import Message
 from evercal.service.studio.steps import TITLES, Step, StepState
 from evercal.service.viewer.answers import AMBER, BLUE, GREEN, GREY, RED
-from evercal.service.viewer.text import chip, table
+from evercal.service.viewer.text import FAINT, block, chip, table
 
 _SMALL = "font-size:0.82em;line-height:1.4"
 _OF_STATUS = {"locked": GREY, "open": BLUE, "done": GREEN}
 _OF_KIND = {"good": GREEN, "working": BLUE, "error": RED}
 _MARKS = {"locked": "", "open": "", "done": "✓ "}
 _THUMBNAIL_PX, _PICTURE_PX = 56, 400
-
-
-def block(*parts: str) -> str:
-    """Parts one below the other."""
-    return f'<div style="padding:2px 12px 6px">{"".join(parts)}</div>'
 
 
 def step_html(state: StepState) -> str:
@@ -63,10 +58,10 @@ def command_html(*commands: str) -> str:
     """The equal command lines."""
     style = (
         "display:block;white-space:pre-wrap;overflow-wrap:anywhere;user-select:all;"
-        "font-size:0.75em;opacity:0.8;padding:3px 0"
+        f"font-size:0.75em;opacity:{FAINT};padding:3px 0"
     )
     lines = [f'<code style="{style}">{escape(command)}</code>' for command in commands]
-    heading = f'<div style="{_SMALL};opacity:0.65">The same on the command line:</div>'
+    heading = f'<div style="{_SMALL};opacity:{FAINT}">The same on the command line:</div>'
     return block(heading, *lines)
 
 
@@ -97,7 +92,7 @@ def _bar(axis: AxisCoverage, unit: str, limit: float) -> str:
     inner = f"width:{share:.0f}%;height:6px;border-radius:3px;background:rgb({red},{green},{blue})"
     bar = f'<div style="background:rgba(128,128,128,0.25);border-radius:3px"><div style="{inner}">'
     return (
-        f'<tr><td style="opacity:0.65;width:46%">{escape(axis.name)}</td>'
+        f'<tr><td style="opacity:{FAINT};width:46%">{escape(axis.name)}</td>'
         f'<td style="width:34%">{bar}</div></div></td>'
         f'<td style="text-align:right">{axis.spread:.0f}{unit}</td></tr>'
     )
@@ -118,11 +113,6 @@ def samples_html(covered: Coverage, thumbnails: Mapping[str, str]) -> str:
         return ""
     style = f"max-height:190px;overflow-y:auto;{_SMALL}"
     return block(f'<div style="{style}"><table style="width:100%">{"".join(rows)}</table></div>')
-
-
-def rows_html(rows: Sequence[tuple[str, str]]) -> str:
-    """A table of names and values."""
-    return block(table(rows)) if rows else ""
 
 
 def picture_html(image: Image) -> str:

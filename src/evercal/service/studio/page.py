@@ -80,7 +80,8 @@ class StudioPage:
     def _build(self, command: str) -> None:
         gui, studio = self.server.gui, self.studio
         self._frame = _Frame(gui, self)
-        connect, record = ConnectPanel(gui, command), RecordPanel(gui, studio, self.jobs)
+        connect = ConnectPanel(gui, studio, self.jobs, command)
+        record = RecordPanel(gui, studio, self.jobs)
         self.panels |= {
             "connect": connect,
             "record": record,

@@ -124,6 +124,7 @@ class KeyframePanel:
                 camera = client.camera
                 camera.position, camera.look_at, camera.up_direction, camera.fov = before
         self._map.inspect(False)
+        self._stage.mark(None)
         self._back.visible = False
 
 

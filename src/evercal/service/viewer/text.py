@@ -6,6 +6,10 @@ from html import escape
 from evercal.service.viewer.answers import AnswerView
 
 Rows = Sequence[tuple[str, str]]
+OWN = "evercal"
+"""Class of all HTML that is not of viser."""
+FAINT = 0.8
+"""Opacity of secondary text; less is hard to read on a dark ground."""
 _CELL = "padding:1px 8px 1px 0;vertical-align:top"
 
 
@@ -22,7 +26,7 @@ def chip(text: str, colour: tuple[int, int, int]) -> str:
 def table(rows: Rows) -> str:
     """Names and values, one pair a line."""
     lines = [
-        f'<tr><td style="{_CELL};opacity:0.65;width:38%">{escape(name)}</td>'
+        f'<tr><td style="{_CELL};opacity:{FAINT};width:38%">{escape(name)}</td>'
         f'<td style="{_CELL};overflow-wrap:anywhere">{escape(value)}</td></tr>'
         for name, value in rows
     ]
@@ -31,18 +35,19 @@ def table(rows: Rows) -> str:
 
 def answer_html(view: AnswerView, more: Rows = ()) -> str:
     """State and numbers of an answer; `more` are further rows."""
-    return _block(chip(view.state, view.colour) + table([*view.rows, *more]))
+    return block(chip(view.state, view.colour), table([*view.rows, *more]))
 
 
 def rows_html(rows: Rows) -> str:
-    """A table alone."""
-    return _block(table(rows))
+    """A table alone; nothing without rows."""
+    return block(table(rows)) if rows else ""
 
 
 def note_html(text: str) -> str:
     """A sentence."""
-    return _block(f'<span style="font-size:0.82em;opacity:0.75">{escape(text)}</span>')
+    return block(f'<span style="font-size:0.82em;opacity:{FAINT}">{escape(text)}</span>')
 
 
-def _block(inner: str) -> str:
-    return f'<div style="padding:2px 12px 6px">{inner}</div>'
+def block(*parts: str) -> str:
+    """Parts one below the other."""
+    return f'<div class="{OWN}" style="padding:2px 12px 6px">{"".join(parts)}</div>'
