@@ -12,7 +12,7 @@ from evercal.service.studio.devices import Image, Seen
 from evercal.service.studio.studio import Studio
 from evercal.service.viewer.answers import AMBER, BLUE, GREEN, RED
 from evercal.service.viewer.calibrations import CalibrationView
-from evercal.service.viewer.camera_set import CameraSet
+from evercal.service.viewer.camera_set import CameraSet, linear
 from evercal.service.viewer.drawn import DrawnCalibrations, place_frustum
 from evercal.service.viewer.frusta import Ellipsoid, Frustum, readable_scale
 from evercal.service.viewer.map_parts import THUMBNAIL_PX, resized
@@ -137,7 +137,7 @@ class Drawing:
         points = np.concatenate([np.zeros((1, 3), np.float32), points])  # from the base
         pairs = np.stack([points[:-1], points[1:]], axis=1)
         if self._arm is None:
-            colours = np.broadcast_to(np.array(_ARM, np.uint8), pairs.shape)
+            colours = np.broadcast_to(linear(np.array(_ARM)), pairs.shape)
             self._arm = self._server.scene.add_line_segments(
                 "/arm", pairs, colours, thickness=8.0, thickness_units="screen"
             )

@@ -36,10 +36,11 @@ def way_html(states: Sequence[StepState], shown: Step) -> str:
         red, green, blue = _OF_STATUS[state.status]
         line = f"2px solid rgb({red},{green},{blue})" if state.step == shown else "none"
         weight = "font-weight:700;" if state.step == shown else ""
-        faint = "opacity:0.55;" if state.status == "locked" else ""
+        faint = f"opacity:{FAINT};" if state.status == "locked" else ""
         text = f"{_MARKS[state.status]}{TITLES[state.step]}"
-        parts.append(f'<span style="{weight}{faint}border-bottom:{line}">{escape(text)}</span>')
-    return block(f'<div style="{_SMALL};white-space:nowrap">{" → ".join(parts)}</div>')
+        style = f"white-space:nowrap;{weight}{faint}border-bottom:{line}"
+        parts.append(f'<span style="{style}">{escape(text)}</span>')
+    return block(f'<div style="{_SMALL}">{" → ".join(parts)}</div>')
 
 
 def message_html(message: Message) -> str:
@@ -83,7 +84,8 @@ def coverage_html(covered: Coverage, limits: tuple[float, float]) -> str:
     """Bars of rotations (degrees) and positions (millimetres) up to their limits."""
     rows = [_bar(axis, "°", limits[0]) for axis in covered.rotations]
     rows += [_bar(axis, " mm", limits[1]) for axis in covered.positions]
-    return block(f'<table style="width:100%;{_SMALL}">{"".join(rows)}</table>')
+    heading = f'<div style="{_SMALL};opacity:{FAINT}">Spread of the good samples; full is enough:</div>'
+    return block(heading, f'<table style="width:100%;{_SMALL}">{"".join(rows)}</table>')
 
 
 def _bar(axis: AxisCoverage, unit: str, limit: float) -> str:

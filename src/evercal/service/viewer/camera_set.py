@@ -19,7 +19,7 @@ Colour = tuple[int, int, int]
 
 _LINE_PX = 2.0
 _EDGES = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 0], [4, 1], [4, 2], [4, 3], [5, 6]])
-"""Pairs of points of `_points`."""
+"""Pairs of points of `pyramid`."""
 _FACES = np.array([[4, 0, 1], [4, 1, 2], [4, 2, 3], [4, 3, 0], [0, 1, 2], [0, 2, 3]])
 _NEAREST = 1e-9
 
@@ -43,7 +43,7 @@ class CameraSet:
         images: Sequence[NDArray[np.uint8]],
         size_m: float,
     ):
-        self._points = np.stack([_points(frustum, size_m) for frustum in frusta])
+        self._points = np.stack([pyramid(frustum, size_m) for frustum in frusta])
         scene = server.scene
         self._lines = scene.add_line_segments(
             f"{name}/lines",
@@ -70,7 +70,7 @@ class CameraSet:
 
     def colour(self, colours: Sequence[Colour]) -> None:
         """Draw the lines of each camera in a colour."""
-        own = np.array(colours, np.uint8)[:, None, None]
+        own = linear(np.array(colours))[:, None, None]
         whole = np.broadcast_to(own, (len(colours), len(_EDGES), 2, 3))
         self._lines.colors = np.ascontiguousarray(whole.reshape(-1, 2, 3))
 
@@ -86,6 +86,13 @@ class CameraSet:
         """Remove them from the scene."""
         self._lines.remove()
         self._images.remove()
+
+
+def linear(colours: NDArray[np.integer]) -> NDArray[np.uint8]:
+    """Colours as viser's lines expect them: it encodes them as sRGB once more."""
+    shares = np.asarray(colours, np.float64) / 255
+    low, high = shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4
+    return np.round(255 * np.where(shares <= 0.04045, low, high)).astype(np.uint8)
 
 
 def first_hit(points_m: Array, origin_m: Array, direction: Array) -> tuple[float, int] | None:
@@ -106,7 +113,7 @@ def first_hit(points_m: Array, origin_m: Array, direction: Array) -> tuple[float
     return (float(distance[nearest]), nearest) if np.isfinite(distance[nearest]) else None
 
 
-def _points(frustum: Frustum, size_m: float) -> Array:
+def pyramid(frustum: Frustum, size_m: float) -> Array:
     """(7, 3) corners of the image, the centre, and two points that mark its upper side."""
     depth = frustum.depth_of(size_m)
     corners = frustum.corners(depth)

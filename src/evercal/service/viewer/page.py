@@ -74,7 +74,7 @@ class Page:
         self.server = start_server(options.host, options.port)
         try:
             self._robot = None if options.urdf is None else Robot(self.server, options.urdf)
-            stage = Stage(self.server, scenes)
+            self.stage = stage = Stage(self.server, scenes)
             scale = readable_scale([Ellipsoid.of(v.calibration.uncertain_pose) for v in views])
             self._calibrations = DrawnCalibrations(stage, views, scale)
             self._parts: list[Playback | Live] = []

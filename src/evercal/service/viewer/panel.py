@@ -13,6 +13,7 @@ from evercal.service.viewer.text import chip, note_html, rows_html
 ALL = "all scenes"
 COLOURINGS: tuple[ColourBy, ...] = ("image", "height", "uncertainty")
 _THROUGH = "/through"
+_HINT = "Click a keyframe to look through it."
 
 
 class MapPanel:
@@ -72,12 +73,12 @@ class KeyframePanel:
         self._stage, self._map, gui = stage, map_panel, stage.server.gui
         self._before: dict[int, tuple[Any, ...]] = {}
         with gui.add_folder("Keyframe"):
-            self._text = gui.add_html(note_html("Click a keyframe to look through it."))
+            self._text = gui.add_html(note_html(_HINT))
             first = stage.keyframes[0][0]
             self._image = gui.add_image(first.picture, jpeg_quality=85, visible=False)
             self._back = gui.add_button("Back to the overview", visible=False)
         stage.on_keyframe(self.look_through)
-        self._back.on_click(self._return)
+        self._back.on_click(lambda _: self._return())
         stage.server.on_client_disconnect(self._forget)
 
     def look_through(self, view: KeyframeView, client: viser.ClientHandle) -> None:
@@ -114,18 +115,21 @@ class KeyframePanel:
     def _forget(self, client: viser.ClientHandle) -> None:
         self._before.pop(client.client_id, None)
 
-    def _return(self, event: viser.GuiEvent[Any]) -> None:
-        """Look from where this visitor looked before."""
-        client = event.client
-        before = None if client is None else self._before.pop(client.client_id, None)
-        if client is not None and before is not None:
+    def _return(self) -> None:
+        """Let every visitor look from where they looked before, as all share the panel."""
+        clients = self._stage.server.get_clients()
+        while self._before:
+            number, before = self._before.popitem()
+            if number not in clients:
+                continue
+            client, camera = clients[number], clients[number].camera
             with client.atomic():
                 client.scene.remove_by_name(_THROUGH)
-                camera = client.camera
                 camera.position, camera.look_at, camera.up_direction, camera.fov = before
         self._map.inspect(False)
         self._stage.mark(None)
-        self._back.visible = False
+        self._image.visible = self._back.visible = False
+        self._text.content = note_html(_HINT)
 
 
 class CalibrationPanel:

@@ -8,7 +8,7 @@ import viser
 
 from evercal.geometry import SE3
 from evercal.mapping.scene_map import SceneMap
-from evercal.service.viewer.camera_set import CameraSet
+from evercal.service.viewer.camera_set import CameraSet, linear
 from evercal.service.viewer.frusta import Frustum
 from evercal.service.viewer.map_parts import (
     ColourBy,
@@ -179,7 +179,7 @@ def add_floor(server: viser.ViserServer, side_m: float, cell_m: float) -> None:
     lines[0, :, :, 0], lines[0, :, :, 1] = places[:, None], ends
     lines[1] = lines[0][..., [1, 0, 2]]
     whole = np.abs(places - np.round(places)) < 1e-6
-    colours = np.where(whole[:, None], _SECTION_COLOUR, _CELL_COLOUR).astype(np.uint8)
+    colours = linear(np.where(whole[:, None], _SECTION_COLOUR, _CELL_COLOUR))
     colours = np.broadcast_to(colours[None, :, None], lines.shape)
     server.scene.add_line_segments(
         "/grid",

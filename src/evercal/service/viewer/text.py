@@ -17,10 +17,20 @@ def chip(text: str, colour: tuple[int, int, int]) -> str:
     """A word on a coloured ground."""
     red, green, blue = colour
     style = (
-        f"background:rgb({red},{green},{blue});color:white;border-radius:4px;padding:2px 8px;"
-        "font-weight:600"
+        f"background:rgb({red},{green},{blue});color:{_legible_on(colour)};border-radius:4px;"
+        "padding:2px 8px;font-weight:600"
     )
     return f'<span style="{style}">{escape(text)}</span>'
+
+
+def _legible_on(colour: tuple[int, int, int]) -> str:
+    """Black or white, whichever has more contrast (relative luminance of WCAG 2.2)."""
+    red, green, blue = (
+        c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4
+        for c in (channel / 255 for channel in colour)
+    )
+    luminance = 0.2126 * red + 0.7152 * green + 0.0722 * blue
+    return "black" if (luminance + 0.05) ** 2 > 1.05 * 0.05 else "white"
 
 
 def table(rows: Rows) -> str:
