@@ -44,7 +44,7 @@ def studio_of(root: Path, cell: VirtualCell | None = None) -> Iterator[StudioPag
         cell.intrinsics,
         cell.robot,
         cell.tripod_camera,
-        cell.intrinsics,
+        None,
         cell.reachable_poses(120),
         nominal_mount(),
         lambda: joint_frames(np.array(cell.robot.joints_rad()))[:, :3, 3],

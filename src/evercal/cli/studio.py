@@ -123,8 +123,7 @@ class Studio:
             wrist_camera=cell.wrist_camera,
             intrinsics=cell.intrinsics,
             robot=cell.robot,
-            fixed_camera=cell.tripod_camera,
-            fixed_intrinsics=cell.intrinsics,
+            fixed_camera=cell.tripod_camera,  # of the same make, so it has the same intrinsics
             reachable=cell.reachable_poses(_REACHABLE),
             rough=nominal_mount(),
             arm=lambda: joint_frames(np.array(cell.robot.joints_rad()))[:, :3, 3],

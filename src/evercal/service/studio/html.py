@@ -1,18 +1,14 @@
 """HTML of the studio's panel; all texts are escaped."""
 
-import base64
 from collections.abc import Mapping, Sequence
 from html import escape
-
-import cv2
-import numpy as np
 
 from evercal.live.coverage import AxisCoverage, Coverage
 from evercal.service.studio.devices import Image, Seen
 from evercal.service.studio.jobs import Message
 from evercal.service.studio.steps import TITLES, Step, StepState
 from evercal.service.viewer.answers import AMBER, BLUE, GREEN, GREY, RED
-from evercal.service.viewer.text import FAINT, block, chip, table
+from evercal.service.viewer.text import FAINT, block, chip, jpeg_url, picture_html, table
 
 _SMALL = "font-size:0.82em;line-height:1.4"
 _OF_STATUS = {"locked": GREY, "open": BLUE, "done": GREEN}
@@ -84,7 +80,8 @@ def coverage_html(covered: Coverage, limits: tuple[float, float]) -> str:
     """Bars of rotations (degrees) and positions (millimetres) up to their limits."""
     rows = [_bar(axis, "°", limits[0]) for axis in covered.rotations]
     rows += [_bar(axis, " mm", limits[1]) for axis in covered.positions]
-    heading = f'<div style="{_SMALL};opacity:{FAINT}">Spread of the good samples; full is enough:</div>'
+    words = "Spread of the good samples; full is enough:"
+    heading = f'<div style="{_SMALL};opacity:{FAINT}">{words}</div>'
     return block(heading, f'<table style="width:100%;{_SMALL}">{"".join(rows)}</table>')
 
 
@@ -117,19 +114,11 @@ def samples_html(covered: Coverage, thumbnails: Mapping[str, str]) -> str:
     return block(f'<div style="{style}"><table style="width:100%">{"".join(rows)}</table></div>')
 
 
-def picture_html(image: Image) -> str:
+def live_html(image: Image) -> str:
     """The live picture."""
-    style = "display:block;margin:0 auto;max-width:100%;max-height:200px;border-radius:4px"
-    return block(f'<img src="{_url(image, _PICTURE_PX)}" alt="live image" style="{style}">')
+    return picture_html(image, "live image", _PICTURE_PX, "max-height:200px")
 
 
 def thumbnail_url(image: Image) -> str:
     """A small JPEG as the address of an HTML image."""
-    return _url(image, _THUMBNAIL_PX)
-
-
-def _url(image: Image, width: int) -> str:
-    height = max(1, round(image.shape[0] * width / image.shape[1]))
-    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]))[1].tobytes()
-    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+    return jpeg_url(image, _THUMBNAIL_PX)

@@ -12,7 +12,7 @@ import viser
 from evercal.service.studio.calibrate_panels import ExportPanel, FixedPanel, LearnPanel
 from evercal.service.studio.devices import Seen
 from evercal.service.studio.drawing import Drawing
-from evercal.service.studio.html import message_html, picture_html, way_html
+from evercal.service.studio.html import live_html, message_html, way_html
 from evercal.service.studio.jobs import Jobs
 from evercal.service.studio.panels import ConnectPanel, Panel, RecordPanel, on_click
 from evercal.service.studio.rest import RestTrigger
@@ -185,7 +185,7 @@ class _Frame:
         """Show the newest image of the camera of a step."""
         image = seen.fixed if step == "fixed" else seen.image
         if image is not None and step in _PICTURED:
-            self._picture.content = picture_html(image)
+            self._picture.content = live_html(image)
 
     def _chosen(self) -> None:
         self._page.go(STEPS[_NUMBERS.index(self._steps.value)])

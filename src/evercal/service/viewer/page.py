@@ -21,6 +21,7 @@ from evercal.service.viewer.calibrations import read_views
 from evercal.service.viewer.drawn import DrawnCalibrations
 from evercal.service.viewer.frusta import Ellipsoid, readable_scale
 from evercal.service.viewer.live import Live, open_source
+from evercal.service.viewer.names import add_names
 from evercal.service.viewer.panel import CalibrationPanel, KeyframePanel, MapPanel
 from evercal.service.viewer.playback import Playback
 from evercal.service.viewer.robot import Robot
@@ -181,6 +182,7 @@ def start_server(host: str, port: int, label: str = "evercal view") -> viser.Vis
         control_width="large",
         brand_color=(37, 99, 235),
     )
+    add_names(server, label)
     return server
 
 

@@ -8,7 +8,7 @@ import viser
 from evercal.service.viewer.drawn import CALIBRATION_COLOUR, DrawnCalibrations
 from evercal.service.viewer.map_parts import ColourBy, KeyframeView
 from evercal.service.viewer.stage import Stage
-from evercal.service.viewer.text import chip, note_html, rows_html
+from evercal.service.viewer.text import block, chip, note_html, picture_html, rows_html
 
 ALL = "all scenes"
 COLOURINGS: tuple[ColourBy, ...] = ("image", "height", "uncertainty")
@@ -74,8 +74,7 @@ class KeyframePanel:
         self._before: dict[int, tuple[Any, ...]] = {}
         with gui.add_folder("Keyframe"):
             self._text = gui.add_html(note_html(_HINT))
-            first = stage.keyframes[0][0]
-            self._image = gui.add_image(first.picture, jpeg_quality=85, visible=False)
+            self._image = gui.add_html("", visible=False)
             self._back = gui.add_button("Back to the overview", visible=False)
         stage.on_keyframe(self.look_through)
         self._back.on_click(lambda _: self._return())
@@ -109,7 +108,8 @@ class KeyframePanel:
             ("landmarks", str(len(view.pixels))),
         ]
         self._text.content = rows_html(rows)
-        self._image.image = view.picture
+        words = f"keyframe {view.number} with its landmarks, coloured by depth"
+        self._image.content = picture_html(view.picture, words)
         self._image.visible = self._back.visible = True
 
     def _forget(self, client: viser.ClientHandle) -> None:
@@ -150,9 +150,6 @@ class CalibrationPanel:
             if not drawn.views:
                 gui.add_html(note_html("None was given."))
             for view in drawn.views:
-                gui.add_html(
-                    f'<div style="padding:2px 12px">{chip(view.name, CALIBRATION_COLOUR)}</div>'
-                    + rows_html(view.rows())
-                )
+                gui.add_html(block(chip(view.name, CALIBRATION_COLOUR)) + rows_html(view.rows()))
             slider = gui.add_slider("Ellipsoids x", 1, 500, 1, round(scale))
         slider.on_update(lambda _: on_scale(slider.value))

@@ -1,11 +1,19 @@
 """HTML of the panel; names of files and scenes are escaped."""
 
+import base64
 from collections.abc import Sequence
 from html import escape
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from evercal.service.viewer.answers import AnswerView
+from evercal.service.viewer.map_parts import resized
 
 Rows = Sequence[tuple[str, str]]
+PICTURE_PX = 640
+"""Width of a picture; the panel may show it smaller."""
 OWN = "evercal"
 """Class of all HTML that is not of viser."""
 FAINT = 0.8
@@ -56,6 +64,24 @@ def rows_html(rows: Rows) -> str:
 def note_html(text: str) -> str:
     """A sentence."""
     return block(f'<span style="font-size:0.82em;opacity:{FAINT}">{escape(text)}</span>')
+
+
+def picture_html(
+    image: NDArray[np.uint8], words: str, width: int = PICTURE_PX, style: str = ""
+) -> str:
+    """A picture that says in words what it shows.
+
+    Images of viser have no words, and ask the browser for addresses that are gone when they change.
+    """
+    style = f"display:block;margin:0 auto;max-width:100%;border-radius:4px;{style}"
+    return block(f'<img src="{jpeg_url(image, width)}" alt="{escape(words)}" style="{style}">')
+
+
+def jpeg_url(image: NDArray[np.uint8], width: int) -> str:
+    """A JPEG as the address of an HTML image."""
+    small = np.ascontiguousarray(resized(image, width)[..., ::-1])
+    data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
+    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
 
 
 def block(*parts: str) -> str:
