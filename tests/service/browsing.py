@@ -20,6 +20,8 @@ from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mo
 
 PHONE = 390
 """Width of a small screen, pixels."""
+SHOT_MS = 120_000
+"""Time for a picture of a page that is rendered in software on a busy machine."""
 
 
 @contextmanager
@@ -29,10 +31,12 @@ def visited(browser: Any, url: str, width: int = 1200) -> Iterator[tuple[Any, li
     visit = browser.new_page(viewport={"width": width, "height": 800})
     visit.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
     visit.on("pageerror", lambda error: errors.append(str(error)))
-    visit.goto(url)
-    visit.wait_for_selector("canvas", timeout=120_000)
-    yield visit, errors
-    visit.close()
+    try:
+        visit.goto(url)
+        visit.wait_for_selector("canvas", timeout=120_000)
+        yield visit, errors
+    finally:  # a page that stays open takes the processor from the next one
+        visit.close()
 
 
 @contextmanager
@@ -70,4 +74,4 @@ def shot(visit: Any, name: str) -> None:
     folder = os.environ.get("STUDIO_SCREENSHOTS")
     if folder is not None:
         time.sleep(2)
-        visit.screenshot(path=Path(folder) / f"{name}.png")
+        visit.screenshot(path=Path(folder) / f"{name}.png", timeout=SHOT_MS)

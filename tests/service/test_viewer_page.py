@@ -21,7 +21,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.service.viewer.page import Page, ViewOptions, gripper_from_camera, is_local
 
-from .browsing import click, seen_until, visited
+from .browsing import SHOT_MS, click, seen_until, visited
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
@@ -145,25 +145,23 @@ def test_a_browser_shows_the_map(
         "recording": files / "hall",
         "urdf": files / "arm.urdf",
     }
-    with page_of(localizer, **options) as page:
-        visit = browser.new_page(viewport={"width": 900, "height": 600})
-        errors: list[str] = []
-        elsewhere: list[str] = []
-        visit.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
-        visit.on("pageerror", lambda error: errors.append(str(error)))
+    elsewhere: list[str] = []
+    with (
+        page_of(localizer, **options) as page,
+        visited(browser, page.url) as (visit, errors),
+    ):
         own = (page.url, "data:", "blob:")
         visit.on("request", lambda r: None if r.url.startswith(own) else elsewhere.append(r.url))
-        visit.goto(page.url)
-        visit.wait_for_selector("canvas", timeout=120_000)
+        visit.reload()
         # The second calibration, the recording's frame and the keyframes are there.
         for text in ("located", "on the gripper", "3 / 2 / 1 mm", "Click a keyframe"):
             seen_until(visit, text)
         time.sleep(2)
-        picture = visit.screenshot(path=os.environ.get("VIEW_SCREENSHOT", tmp_path / "view.png"))
+        path = os.environ.get("VIEW_SCREENSHOT", tmp_path / "view.png")
+        picture = visit.screenshot(path=path, timeout=SHOT_MS)
         assert len(np.unique(pixels(picture))) > 50, "a canvas that shows something"
         assert errors == []
         assert elsewhere == [], "the page needs nothing from the internet"
-        visit.close()
 
 
 def test_a_stream_is_tracked_while_a_browser_looks(
@@ -175,12 +173,9 @@ def test_a_stream_is_tracked_while_a_browser_looks(
         write_image(tmp_path / f"{i}.png", hall.test[7 + i].read_image())
     rng = np.random.default_rng(0)
     write_image(tmp_path / "2.png", rng.integers(0, 256, (240, 320, 3)).astype(np.uint8))
-    with page_of(localizer, live=str(tmp_path)) as page:
-        visit = browser.new_page(viewport={"width": 900, "height": 600})
-        visit.goto(page.url)
+    with page_of(localizer, live=str(tmp_path)) as page, visited(browser, page.url) as (visit, _):
         seen_until(visit, "the stream has ended")
         seen_until(visit, "lost")
-        visit.close()
 
 
 def test_play_goes_on_until_it_is_unchecked(
@@ -215,11 +210,11 @@ def test_a_paused_camera_goes_on_with_what_it_sees_now(
     def camera(source: str) -> Iterator[StreamFrame]:
         while True:
             given[0] += 1
-            yield StreamFrame(f"frame {given[0]}", time.time(), image)
+            yield StreamFrame(f"shot-{given[0]}", time.time(), image)
             time.sleep(0.05)
 
     def shown(visit: Any) -> int:
-        return int(visit.get_by_text("frame ", exact=False).first.inner_text().split()[-1])
+        return int(visit.get_by_text("shot-").first.inner_text().split("-")[-1])
 
     monkeypatch.setattr(live, "stream", camera)
     with page_of(localizer, live="0") as page, visited(browser, page.url) as (visit, errors):
