@@ -1,5 +1,6 @@
 """The studio in 3D: arm, live camera, samples, the next view, map and calibrations."""
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -35,6 +36,8 @@ class Drawing:
 
     def __init__(self, server: viser.ViserServer, studio: Studio, on_sample: Callable[[str], Any]):
         self._server, self._studio, self._on_sample = server, studio, on_sample
+        # The live image, tasks and clicks come in threads of their own, and nodes are replaced.
+        self._lock = threading.RLock()
         self._samples: CameraSet | None = None
         self._names: tuple[str, ...] = ()
         self._thumbnails: dict[str, Image] = {}
@@ -56,7 +59,7 @@ class Drawing:
         if pose is None:
             return
         camera = pose @ (mount or SE3.identity())
-        with self._server.atomic():
+        with self._server.atomic(), self._lock:
             frustum = Frustum.of(camera, self._studio.devices.intrinsics)
             place_frustum(self._live, frustum)
             if picture is not None:
@@ -69,7 +72,7 @@ class Drawing:
 
     def show_proposal(self, proposal: Proposal | None) -> None:
         """Draw the next view as a ghost."""
-        with self._server.atomic():
+        with self._server.atomic(), self._lock:
             self._ghost.visible = self._label.visible = proposal is not None
             if proposal is None:
                 return
@@ -89,7 +92,7 @@ class Drawing:
                 frusta[frame.name] = place
                 if frame.name not in self._thumbnails:
                     self._thumbnails[frame.name] = resized(frame.read_image(), THUMBNAIL_PX)
-        with self._server.atomic():
+        with self._server.atomic(), self._lock:
             if self._samples is not None:
                 self._samples.remove()
                 self._samples = None
@@ -108,7 +111,7 @@ class Drawing:
         if not cell.scenes or drawn == self._drawn:
             return
         self._drawn, scenes = drawn, cell.localizer.contents.scenes
-        with self._server.atomic():
+        with self._server.atomic(), self._lock:
             for name in ("/scenes", "/calibrations"):
                 self._server.scene.remove_by_name(name)
             stage = Stage(self._server, scenes)
@@ -128,9 +131,11 @@ class Drawing:
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         """Choose the sample that was clicked."""
-        hit = self._samples and self._samples.hit(event.ray_origin, event.ray_direction)
-        if hit:
-            self._on_sample(self._names[hit[1]])
+        with self._lock:
+            hit = self._samples and self._samples.hit(event.ray_origin, event.ray_direction)
+            name = self._names[hit[1]] if hit else None
+        if name is not None:
+            self._on_sample(name)
 
     def _draw_arm(self, points: np.ndarray) -> None:
         """Draw the arm as a line through its joints."""
