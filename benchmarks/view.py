@@ -10,21 +10,12 @@ from typing import Any
 import numpy as np
 from tabulate import tabulate
 
+from benchmarks.browser import CHROMIUM, chromium
 from evercal import SE3, Map
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_map import SceneMap
 from evercal.service.viewer.page import Page, ViewOptions
 
-FLAGS = [
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
-"""Chromium without a GPU: WebGL is rendered in software."""
 _COUNT = "window.drawn = 0; (function next() { window.drawn++; requestAnimationFrame(next) })()"
 
 
@@ -32,7 +23,7 @@ def run(
     store: Path,
     keyframes: int = 100,
     seconds: float = 20.0,
-    chromium: Path = Path("/usr/bin/chromium"),
+    browser: str | None = CHROMIUM,
     out: Path = Path("runs/view.json"),
 ) -> None:
     """Show a map whose keyframes are repeated at other places.
@@ -41,11 +32,9 @@ def run(
         store: A learned map; its first scene is enlarged.
         keyframes: Keyframes of the large map.
         seconds: Time in which frames are counted while the view is turned.
-        chromium: The browser.
+        browser: Path of a Chromium.
         out: File for the numbers, JSON.
     """
-    from playwright.sync_api import sync_playwright
-
     opened = Map.open(store).localizer
     scene = enlarged(opened.contents.scenes[0], keyframes)
     began = time.perf_counter()
@@ -53,10 +42,8 @@ def run(
     row: dict[str, Any] = {"keyframes": keyframes, "landmarks": scene.landmarks}
     row["page made, s"] = time.perf_counter() - began
     try:
-        with sync_playwright() as playwright:
-            browser = playwright.chromium.launch(executable_path=str(chromium), args=FLAGS)
-            row |= _visited(browser, page.url, seconds)
-            browser.close()
+        with chromium(browser) as started:
+            row |= _visited(started, page.url, seconds)
     finally:
         page.close()
     row["load average"] = os.getloadavg()[0]

@@ -21,6 +21,8 @@ import pytest
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
+from benchmarks.browser import CHROMIUM, chromium
+
 if TYPE_CHECKING:
     import torch
     from matplotlib.figure import Figure
@@ -30,21 +32,6 @@ if TYPE_CHECKING:
     from evercal.mapping.scene_map import MapContents
     from evercal.recordings.frame import Recording
     from evercal.simulation.box_room import BoxRoom
-
-
-NAMES = ("chromium", "chromium-browser", "google-chrome")
-CHROMIUM = next((path for path in map(shutil.which, NAMES) if path), None)
-FLAGS = [
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
 
 
 def _room(
@@ -265,10 +252,8 @@ def figures_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[ModuleType], list[F
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     """Chromium, rendering in software."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     if CHROMIUM is None:
         pytest.skip("there is no Chromium")
-    with playwright.sync_playwright() as started:
-        chromium = started.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield chromium
-        chromium.close()
+    with chromium() as started:
+        yield started

@@ -1,5 +1,6 @@
 """Images of sources in order, and the newest image of a live one."""
 
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.live import camera
-from evercal.live.camera import StreamCamera
+from evercal.live.camera import NewestFrame, StreamCamera
 from evercal.recordings.images import write_image
 from evercal.recordings.streams import StreamFrame
 
@@ -53,3 +54,33 @@ def test_a_live_source_that_stops_is_named(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(camera, "stream", lambda source, rate: iter(()))
     with StreamCamera("rtsp://cell") as source, pytest.raises(InputError, match="rtsp://cell"):
         source.read()
+
+
+def test_a_live_source_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    def frames(source: str, rate: float) -> Iterator[StreamFrame]:
+        raise InputError("unplugged")
+        yield
+
+    monkeypatch.setattr(camera, "stream", frames)
+    with StreamCamera("0") as source, pytest.raises(InputError, match="unplugged"):
+        source.read()
+
+
+def test_frames_that_arrive_meanwhile_are_left_out() -> None:
+    first, rest = threading.Event(), threading.Event()
+
+    def frames() -> Iterator[StreamFrame]:
+        yield StreamFrame("0", 0.0, picture(0))
+        assert first.wait(10)
+        for i in range(1, 5):
+            yield StreamFrame(str(i), float(i), picture(i))
+        rest.set()
+        raise InputError("unplugged")
+
+    stream = iter(NewestFrame(frames()))
+    assert next(stream).name == "0"
+    first.set()
+    assert rest.wait(10)
+    assert next(stream).name == "4"
+    with pytest.raises(InputError, match="unplugged"):
+        next(stream)

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,64 +13,13 @@ pytest.importorskip("viser")
 from evercal.calibration.calibration import read_calibration
 from evercal.geometry import SE3, pose_distance_mm_deg
 from evercal.recordings import load_recording
-from evercal.service.studio.devices import Devices
-from evercal.service.studio.folders import Folders
-from evercal.service.studio.page import StudioPage
-from evercal.service.studio.studio import Studio
-from evercal.simulation.panda_arm import joint_frames
-from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
+from evercal.simulation.virtual_cell import CellOptions, VirtualCell
 
-SAMPLES = 15
-"""Samples after which the whole way stops recording, to be fast."""
-
-
-@contextmanager
-def opened(browser: Any, root: Path, cell: VirtualCell) -> Iterator[tuple[Any, list[str]]]:
-    """A visit of the page of a studio, and the errors in its console."""
-    devices = Devices(
-        cell.wrist_camera,
-        cell.intrinsics,
-        cell.robot,
-        cell.tripod_camera,
-        None,
-        cell.reachable_poses(120),
-        nominal_mount(),
-        lambda: joint_frames(np.array(cell.robot.joints_rad()))[:, :3, 3],
-    )
-    studio = Studio(devices, Folders(root, root / "map"), "cpu")
-    page = StudioPage(studio, "127.0.0.1", 0, "evercal studio --virtual")
-    errors: list[str] = []
-    try:
-        visit = browser.new_page(viewport={"width": 1200, "height": 800})
-        visit.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
-        visit.on("pageerror", lambda error: errors.append(str(error)))
-        visit.goto(page.url)
-        visit.wait_for_selector("canvas", timeout=120_000)
-        yield visit, errors
-        visit.close()
-    finally:
-        page.close()
-
-
-def seen_until(visit: Any, text: str, seconds: float = 300) -> None:
-    visit.get_by_text(text).first.wait_for(timeout=1000 * seconds)
-
-
-def click(visit: Any, name: str) -> None:
-    visit.get_by_role("button", name=name, exact=True).click(timeout=300_000)
-
-
-def shot(visit: Any, name: str) -> None:
-    """Keep a picture where the environment asks for it."""
-    folder = os.environ.get("STUDIO_SCREENSHOTS")
-    if folder is not None:
-        time.sleep(2)
-        visit.screenshot(path=Path(folder) / f"{name}.png")
+from .browsing import click, seen_until, shot, studio_of, visited
 
 
 def test_samples_are_taken_by_button_and_key_and_removed(browser: Any, tmp_path: Path) -> None:
-    cell = VirtualCell(3, CellOptions(width=160, height=120))
-    with opened(browser, tmp_path, cell) as (visit, errors):
+    with studio_of(tmp_path) as page, visited(browser, page.url) as (visit, errors):
         seen_until(visit, "Images and gripper poses arrive.")
         click(visit, "Next: Record")
         click(visit, "Take sample")
@@ -94,18 +39,12 @@ def test_samples_are_taken_by_button_and_key_and_removed(browser: Any, tmp_path:
 def test_from_an_empty_folder_to_both_calibrations(browser: Any, tmp_path: Path) -> None:
     """The exported mount and tripod are within 1 mm and 0.05 deg of the truth."""
     cell = VirtualCell(3, CellOptions(width=320, height=240))
-    with opened(browser, tmp_path, cell) as (visit, errors):
+    with studio_of(tmp_path, cell) as page, visited(browser, page.url) as (visit, errors):
         seen_until(visit, "Images and gripper poses arrive.")
         shot(visit, "connect")
         click(visit, "Next: Record")
         click(visit, "Record by itself")
-        seen_until(visit, f"recording, {SAMPLES - 1} good images", 600)
-        # It may have recorded the last sample before the button is pressed.
-        from playwright.sync_api import TimeoutError as NotThereError
-
-        with suppress(NotThereError):
-            visit.get_by_role("button", name="Stop", exact=True).click(timeout=5000)
-        seen_until(visit, "samples are recorded.")
+        seen_until(visit, "samples are recorded.", 900)
         shot(visit, "record")
         click(visit, "Next: Learn")
         click(visit, "Learn the recording")

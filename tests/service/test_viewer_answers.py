@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -215,23 +214,3 @@ def test_frames_of_a_file_come_at_their_times() -> None:
     assert names == list("0123")
     # Frame 2 comes late and at once, and frame 3 a step after it.
     np.testing.assert_allclose(slept, [0.07, 0.07])
-
-
-def test_only_the_newest_frame_of_a_camera_is_located() -> None:
-    pytest.importorskip("viser")
-    from evercal.service.viewer.live import newest
-
-    passed = threading.Event()
-
-    def camera() -> Iterator[StreamFrame]:
-        for frame in frames(5):
-            yield frame
-            if frame.name == "0":
-                assert passed.wait(10)
-        raise InputError("unplugged")
-
-    stream = newest(camera())
-    assert next(stream).name == "0"
-    passed.set()
-    with pytest.raises(InputError, match="unplugged"):
-        assert [int(frame.name) for frame in stream] == []

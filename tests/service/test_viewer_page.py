@@ -21,6 +21,8 @@ from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.service.viewer.page import Page, ViewOptions, gripper_from_camera, is_local
 
+from .browsing import SHOT_MS, click, seen_until, visited
+
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
     from evercal.mapping.scene_map import MapContents
@@ -134,10 +136,6 @@ def test_only_loopback_addresses_are_local() -> None:
     assert [is_local(host) for host in ("0.0.0.0", "192.168.1.4", "robot")] == [False] * 3
 
 
-def seen_until(page: Any, text: str, seconds: float = 120) -> None:
-    page.get_by_text(text).first.wait_for(timeout=1000 * seconds)
-
-
 def test_a_browser_shows_the_map(
     localizer: Localizer, files: Path, browser: Any, tmp_path: Path
 ) -> None:
@@ -147,25 +145,23 @@ def test_a_browser_shows_the_map(
         "recording": files / "hall",
         "urdf": files / "arm.urdf",
     }
-    with page_of(localizer, **options) as page:
-        visit = browser.new_page(viewport={"width": 900, "height": 600})
-        errors: list[str] = []
-        elsewhere: list[str] = []
-        visit.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
-        visit.on("pageerror", lambda error: errors.append(str(error)))
+    elsewhere: list[str] = []
+    with (
+        page_of(localizer, **options) as page,
+        visited(browser, page.url) as (visit, errors),
+    ):
         own = (page.url, "data:", "blob:")
         visit.on("request", lambda r: None if r.url.startswith(own) else elsewhere.append(r.url))
-        visit.goto(page.url)
-        visit.wait_for_selector("canvas", timeout=120_000)
+        visit.reload()
         # The second calibration, the recording's frame and the keyframes are there.
         for text in ("located", "on the gripper", "3 / 2 / 1 mm", "Click a keyframe"):
             seen_until(visit, text)
         time.sleep(2)
-        picture = visit.screenshot(path=os.environ.get("VIEW_SCREENSHOT", tmp_path / "view.png"))
+        path = os.environ.get("VIEW_SCREENSHOT", tmp_path / "view.png")
+        picture = visit.screenshot(path=path, timeout=SHOT_MS)
         assert len(np.unique(pixels(picture))) > 50, "a canvas that shows something"
         assert errors == []
         assert elsewhere == [], "the page needs nothing from the internet"
-        visit.close()
 
 
 def test_a_stream_is_tracked_while_a_browser_looks(
@@ -177,12 +173,107 @@ def test_a_stream_is_tracked_while_a_browser_looks(
         write_image(tmp_path / f"{i}.png", hall.test[7 + i].read_image())
     rng = np.random.default_rng(0)
     write_image(tmp_path / "2.png", rng.integers(0, 256, (240, 320, 3)).astype(np.uint8))
-    with page_of(localizer, live=str(tmp_path)) as page:
-        visit = browser.new_page(viewport={"width": 900, "height": 600})
-        visit.goto(page.url)
+    with page_of(localizer, live=str(tmp_path)) as page, visited(browser, page.url) as (visit, _):
         seen_until(visit, "the stream has ended")
         seen_until(visit, "lost")
-        visit.close()
+
+
+def test_play_goes_on_until_it_is_unchecked(
+    localizer: Localizer, hall: Recording, files: Path, browser: Any
+) -> None:
+    first, second = (frame.name for frame in hall.test[7:9])
+    with (
+        page_of(localizer, recording=files / "hall") as page,
+        visited(browser, page.url) as (visit, errors),
+    ):
+        seen_until(visit, first)
+        visit.get_by_label("Play").check()
+        for name in (second, first, second):
+            seen_until(visit, name)
+        visit.get_by_label("Play").uncheck()
+        visit.wait_for_timeout(3000)
+        stays = [visit.get_by_text(name).count() for name in (first, second)]
+        visit.wait_for_timeout(3000)
+        assert [visit.get_by_text(name).count() for name in (first, second)] == stays
+        assert sorted(stays) == [0, 1]
+        assert errors == []
+
+
+def test_a_paused_camera_goes_on_with_what_it_sees_now(
+    localizer: Localizer, hall: Recording, browser: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from evercal.recordings.streams import StreamFrame
+    from evercal.service.viewer import live
+
+    image, given = hall.test[7].read_image(), [0]
+
+    def camera(source: str) -> Iterator[StreamFrame]:
+        while True:
+            given[0] += 1
+            yield StreamFrame(f"shot-{given[0]}", time.time(), image)
+            time.sleep(0.05)
+
+    def shown(visit: Any) -> int:
+        return int(visit.get_by_text("shot-").first.inner_text().split("-")[-1])
+
+    monkeypatch.setattr(live, "stream", camera)
+    with page_of(localizer, live="0") as page, visited(browser, page.url) as (visit, errors):
+        seen_until(visit, "tracking")
+        visit.get_by_label("Pause").check()
+        visit.wait_for_timeout(4000)
+        paused, meanwhile = shown(visit), given[0]
+        visit.wait_for_timeout(2000)
+        assert shown(visit) == paused
+        assert given[0] > meanwhile, "the buffer of the camera is emptied"
+        now = given[0]
+        visit.get_by_label("Pause").uncheck()
+        visit.wait_for_timeout(4000)
+        assert shown(visit) >= now
+        assert errors == []
+
+
+def test_a_clicked_keyframe_is_looked_through_until_back(
+    localizer: Localizer, browser: Any
+) -> None:
+    with page_of(localizer) as page, visited(browser, page.url) as (visit, errors):
+        seen_until(visit, "Click a keyframe")
+        visit.wait_for_timeout(3000)
+        (client,) = page.server.get_clients().values()
+        before = np.array(client.camera.position)
+        view, place = next(
+            (view, place)
+            for view in page.stage.keyframes[0]
+            if (place := on_screen(client.camera, view.frustum.corners(0.01).mean(0), (1200, 800)))
+            and place[0] < 600
+            and page.stage.keyframe_at(*ray(client.camera, place, (1200, 800))) is view
+        )
+        visit.mouse.click(*place)
+        seen_until(visit, f"{view.number} of {view.scene}")
+        visit.wait_for_timeout(3000)
+        pose = view.frustum.base_from_camera
+        np.testing.assert_allclose(client.camera.position, pose.translation_m, atol=0.01)
+        click(visit, "Back to the overview")
+        seen_until(visit, "Click a keyframe")
+        visit.wait_for_timeout(3000)
+        np.testing.assert_allclose(client.camera.position, before, atol=0.01)
+        assert errors == []
+
+
+def on_screen(camera: Any, point: np.ndarray, size: tuple[int, int]) -> tuple[float, float] | None:
+    """Pixel of a point for a visitor's camera; None outside of the window."""
+    x, y, z = SE3(np.array(camera.wxyz), np.array(camera.position)).inverse().apply(point)
+    focal = size[1] / 2 / np.tan(camera.fov / 2)
+    place = float(size[0] / 2 + focal * x / z), float(size[1] / 2 + focal * y / z)
+    inside = z > 0 and all(0 < p < s for p, s in zip(place, size, strict=True))
+    return place if inside else None
+
+
+def ray(camera: Any, place: tuple[float, float], size: tuple[int, int]) -> tuple[Any, Any]:
+    """Origin and direction of a pixel for a visitor's camera."""
+    pose = SE3(np.array(camera.wxyz), np.array(camera.position))
+    focal = size[1] / 2 / np.tan(camera.fov / 2)
+    ahead = np.array([(place[0] - size[0] / 2) / focal, (place[1] - size[1] / 2) / focal, 1.0])
+    return pose.translation_m, pose.rotation_matrix() @ ahead
 
 
 def pixels(picture: bytes) -> np.ndarray:

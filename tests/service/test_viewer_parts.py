@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -140,3 +142,40 @@ def test_the_scale_is_round_and_draws_at_most_five_centimetres(mm: float, scale:
 def test_resizing_keeps_the_aspect_ratio() -> None:
     assert resized(np.zeros((48, 64, 3), np.uint8), 640).shape == (480, 640, 3)
     assert resized(np.zeros((480, 640, 3), np.uint8), 160).shape == (120, 160, 3)
+
+
+def test_the_nearest_camera_on_a_ray_is_chosen() -> None:
+    pytest.importorskip("viser")
+    from evercal.service.viewer.camera_set import first_hit, pyramid
+
+    ahead = [Frustum(SE3.from_translation((0, 0, z)), 1.0, 1.3) for z in (2.0, 1.0, 3.0)]
+    points = np.stack([pyramid(frustum, 0.1) for frustum in ahead])
+    hit = first_hit(points, np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    assert hit is not None
+    assert hit[1] == 1
+    np.testing.assert_allclose(hit[0], 1.0, atol=1e-6)
+    assert first_hit(points, np.zeros(3), np.array([0.0, 1.0, 0.0])) is None
+
+
+def test_images_of_one_texture_keep_their_places() -> None:
+    from evercal.service.viewer.glb import MOST_PX, atlas, images_glb
+
+    colours = [(250, 0, 0), (0, 250, 0), (0, 0, 250), (90, 90, 90), (250, 250, 0)]
+    images = [np.full((60, 80, 3), colour, np.uint8) for colour in colours]
+    whole, places = atlas(images, 40)
+    assert whole.shape == (60, 120, 3)
+    for colour, corners in zip(colours, places, strict=True):
+        left, top = corners[0] * whole.shape[1::-1]
+        right, bottom = corners[2] * whole.shape[1::-1]
+        part = whole[int(top) : int(bottom), int(left) : int(right)]
+        assert (part == colour).all()
+    many, _ = atlas([np.zeros((3, 4, 3), np.uint8)] * 1000, 160)
+    assert max(many.shape) <= MOST_PX
+    trimesh: Any = pytest.importorskip("trimesh")
+
+    corners_m = np.random.default_rng(0).normal(size=(5, 4, 3)).astype(np.float32)
+    file = io.BytesIO(images_glb(corners_m, images, 40))
+    (mesh,) = trimesh.load_scene(file, file_type="glb").geometry.values()
+    np.testing.assert_array_equal(mesh.vertices, corners_m.reshape(-1, 3))
+    assert mesh.faces.shape == (10, 3)
+    np.testing.assert_allclose(mesh.visual.uv[:, 0], places.reshape(-1, 2)[:, 0], atol=1e-6)

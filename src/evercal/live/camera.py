@@ -43,7 +43,7 @@ class StreamCamera:
     def __init__(self, source: str, rate: float = 15.0, timeout_s: float = 5.0):
         self._source, self._timeout_s = source, timeout_s
         self._frames = stream(source, rate)
-        self._newest: _Newest | None = _Newest(self._frames) if is_live(source) else None
+        self._newest = NewestFrame(self._frames) if is_live(source) else None
 
     def read(self) -> tuple[float, Image]:
         """Take the next image.
@@ -62,7 +62,7 @@ class StreamCamera:
     def close(self) -> None:
         """Release the source."""
         if self._newest is not None:
-            self._newest.stop()
+            self._newest.close()
         elif (close := getattr(self._frames, "close", None)) is not None:
             close()
 
@@ -75,23 +75,78 @@ class StreamCamera:
         self.close()
 
 
-class _Newest:
-    """The newest frame of a stream, read by a thread."""
+class NewestFrame:
+    """The newest frame of a stream, read by a thread that empties the buffer of its source.
+
+    Iterating gives the newest frame each time and leaves out those that arrived meanwhile. An
+    error of the source is raised where the frames are used, after the frames before it.
+
+    Args:
+        frames: the stream.
+    """
 
     def __init__(self, frames: Iterator[StreamFrame]):
         self._frames, self._frame = frames, None
+        self._error: Exception | None = None
         self._changed, self._ended = threading.Condition(), False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
+
+    def __iter__(self) -> Iterator[StreamFrame]:
+        """Return frames until the stream ends.
+
+        Raises:
+            Exception: As the stream.
+        """
+        last: StreamFrame | None = None
+        try:
+            while (frame := self._other_than(last)) is not None:
+                yield frame
+                last = frame
+        finally:
+            self.close()
+        self._raise_error()
+
+    def after(self, stamp_s: float, timeout_s: float) -> StreamFrame | None:
+        """Return the first frame at or after a time; None if the stream ends or none arrives.
+
+        Raises:
+            Exception: As the stream.
+        """
+
+        def is_new() -> bool:
+            return self._frame is not None and self._frame.stamp_s >= stamp_s
+
+        with self._changed:
+            self._changed.wait_for(lambda: self._ended or is_new(), timeout_s)
+            if is_new():
+                return self._frame
+        self._raise_error()
+        return None
+
+    def close(self) -> None:
+        """End the thread after its next frame."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+        self._thread.join(1.0)
+
+    def _other_than(self, last: StreamFrame | None) -> StreamFrame | None:
+        """The newest frame once it is not `last` any more; None if the stream ends before."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._ended or self._frame is not last)
+            return None if self._frame is last else self._frame
 
     def _run(self) -> None:
         try:
             for frame in self._frames:
                 with self._changed:
-                    self._frame = frame
-                    self._changed.notify_all()
                     if self._ended:
                         break
+                    self._frame = frame
+                    self._changed.notify_all()
+        except Exception as error:  # raised where the frames are used
+            self._error = error
         finally:
             if (close := getattr(self._frames, "close", None)) is not None:
                 close()
@@ -99,19 +154,6 @@ class _Newest:
                 self._ended = True
                 self._changed.notify_all()
 
-    def after(self, stamp_s: float, timeout_s: float) -> StreamFrame | None:
-        """The first frame after a time; None if the stream ends or none arrives."""
-
-        def is_new() -> bool:
-            return self._ended or (self._frame is not None and self._frame.stamp_s >= stamp_s)
-
-        with self._changed:
-            self._changed.wait_for(is_new, timeout_s)
-            new = self._frame is not None and self._frame.stamp_s >= stamp_s
-            return self._frame if new else None
-
-    def stop(self) -> None:
-        """End the thread after its next frame."""
-        with self._changed:
-            self._ended = True
-        self._thread.join(1.0)
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            raise self._error

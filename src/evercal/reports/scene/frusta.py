@@ -32,6 +32,11 @@ class Frustum:
         aspect = (camera.width / camera.fx) / (camera.height / camera.fy)
         return cls(base_from_camera, float(fov), float(aspect))
 
+    def depth_of(self, size_m: float) -> float:
+        """Depth at which a drawn camera ends whose pyramid has the volume of `size_m` cubed."""
+        high = np.tan(self.fov_rad / 2)
+        return size_m / float(np.cbrt(high * high * self.aspect / 3))
+
     def corners(self, depth_m: float) -> Array:
         """(4, 3) corners of the view at a depth, in the base frame, metres."""
         high = np.tan(self.fov_rad / 2)

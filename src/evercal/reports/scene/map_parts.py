@@ -101,11 +101,6 @@ class KeyframeView:
     """(n,) their depths along the optical axis."""
 
     @property
-    def thumbnail(self) -> Image:
-        """The image, `THUMBNAIL_PX` wide."""
-        return resized(self.image, THUMBNAIL_PX)
-
-    @property
     def picture(self) -> Image:
         """The image with its landmarks, coloured by depth."""
         large = resized(self.image, _PICTURE_PX)

@@ -1,5 +1,6 @@
 """The studio in 3D: arm, live camera, samples, the next view, map and calibrations."""
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -14,8 +15,9 @@ from evercal.service.studio.devices import Image, Seen
 from evercal.service.studio.studio import Studio
 from evercal.service.viewer.answers import AMBER, BLUE, GREEN, RED
 from evercal.service.viewer.calibrations import CalibrationView
+from evercal.service.viewer.camera_set import CameraSet, linear
 from evercal.service.viewer.drawn import DrawnCalibrations, place_frustum
-from evercal.service.viewer.stage import Stage, add_frustum
+from evercal.service.viewer.stage import Stage, add_floor, add_frustum
 
 _SIZE_M = 0.045
 """Length of a drawn camera."""
@@ -34,7 +36,11 @@ class Drawing:
 
     def __init__(self, server: viser.ViserServer, studio: Studio, on_sample: Callable[[str], Any]):
         self._server, self._studio, self._on_sample = server, studio, on_sample
-        self._samples: dict[str, viser.CameraFrustumHandle] = {}
+        # The live image, tasks and clicks come in threads of their own, and nodes are replaced.
+        self._lock = threading.RLock()
+        self._samples: CameraSet | None = None
+        self._names: tuple[str, ...] = ()
+        self._thumbnails: dict[str, Image] = {}
         self._calibrations: DrawnCalibrations | None = None
         self._drawn: tuple[object, ...] = ()
         self._arm: viser.LineSegmentsHandle | None = None
@@ -44,6 +50,7 @@ class Drawing:
         self._label = server.scene.add_label("/next_label", "next view", anchor="bottom-center")
         for node in (self._live, self._ghost, self._label):
             node.visible = False
+        server.scene.on_click()(self._clicked)
         self._add_floor()
 
     def show_live(self, seen: Seen, picture: Image | None) -> None:
@@ -52,7 +59,7 @@ class Drawing:
         if pose is None:
             return
         camera = pose @ (mount or SE3.identity())
-        with self._server.atomic():
+        with self._server.atomic(), self._lock:
             frustum = Frustum.of(camera, self._studio.devices.intrinsics)
             place_frustum(self._live, frustum)
             if picture is not None:
@@ -65,7 +72,7 @@ class Drawing:
 
     def show_proposal(self, proposal: Proposal | None) -> None:
         """Draw the next view as a ghost."""
-        with self._server.atomic():
+        with self._server.atomic(), self._lock:
             self._ghost.visible = self._label.visible = proposal is not None
             if proposal is None:
                 return
@@ -78,18 +85,24 @@ class Drawing:
     def show_samples(self, bad: set[str]) -> None:
         """Draw the samples, the bad ones in red."""
         mount = self._studio.gripper_from_camera or SE3.identity()
-        frames = {frame.name: frame for frame in self._studio.book.frames}
-        with self._server.atomic():
-            for name in [name for name in self._samples if name not in frames]:
-                self._samples.pop(name).remove()
-            for name, frame in frames.items():
-                if frame.base_from_gripper is None:
-                    continue
+        frusta: dict[str, Frustum] = {}
+        for frame in self._studio.book.frames:
+            if frame.base_from_gripper is not None:
                 place = Frustum.of(frame.base_from_gripper @ mount, frame.camera)
-                if name not in self._samples:
-                    self._add_sample(name, place, resized(frame.read_image(), THUMBNAIL_PX))
-                place_frustum(self._samples[name], place)
-                self._samples[name].color = RED if name in bad else GREEN
+                frusta[frame.name] = place
+                if frame.name not in self._thumbnails:
+                    self._thumbnails[frame.name] = resized(frame.read_image(), THUMBNAIL_PX)
+        with self._server.atomic(), self._lock:
+            if self._samples is not None:
+                self._samples.remove()
+                self._samples = None
+            self._names = tuple(frusta)
+            if frusta:
+                images = [self._thumbnails[name] for name in frusta]
+                self._samples = CameraSet(
+                    self._server, "/samples", list(frusta.values()), images, _SIZE_M
+                )
+                self._samples.colour([RED if name in bad else GREEN for name in frusta])
 
     def show_results(self) -> None:
         """Draw the map and the calibrations, if they have changed."""
@@ -98,7 +111,7 @@ class Drawing:
         if not cell.scenes or drawn == self._drawn:
             return
         self._drawn, scenes = drawn, cell.localizer.contents.scenes
-        with self._server.atomic():
+        with self._server.atomic(), self._lock:
             for name in ("/scenes", "/calibrations"):
                 self._server.scene.remove_by_name(name)
             stage = Stage(self._server, scenes)
@@ -116,17 +129,20 @@ class Drawing:
             drawn_views.move(self._studio.connection.seen.base_from_gripper)
             self._calibrations = drawn_views
 
-    def _add_sample(self, name: str, place: Frustum, thumbnail: Image) -> None:
-        node = add_frustum(self._server, f"/samples/{name}", place, _SIZE_M, GREEN, thumbnail)
-        self._samples[name] = node
-        node.on_click(lambda _: self._on_sample(name))
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        """Choose the sample that was clicked."""
+        with self._lock:
+            hit = self._samples and self._samples.hit(event.ray_origin, event.ray_direction)
+            name = self._names[hit[1]] if hit else None
+        if name is not None:
+            self._on_sample(name)
 
     def _draw_arm(self, points: np.ndarray) -> None:
         """Draw the arm as a line through its joints."""
         points = np.concatenate([np.zeros((1, 3), np.float32), points])  # from the base
         pairs = np.stack([points[:-1], points[1:]], axis=1)
         if self._arm is None:
-            colours = np.broadcast_to(np.array(_ARM, np.uint8), pairs.shape)
+            colours = np.broadcast_to(linear(np.array(_ARM)), pairs.shape)
             self._arm = self._server.scene.add_line_segments(
                 "/arm", pairs, colours, thickness=8.0, thickness_units="screen"
             )
@@ -136,8 +152,7 @@ class Drawing:
         scene = self._server.scene
         scene.add_frame("/base", axes_length=0.15, axes_radius=0.005)
         scene.add_label("/base/label", "robot base", position=(0, 0, 0))
-        lines, sections = (52, 57, 66), (80, 87, 99)
-        scene.add_grid("/grid", 3, 3, cell_size=0.1, cell_color=lines, section_color=sections)
+        add_floor(self._server, 3.0, 0.1)
         self._look()
 
     def _look(self) -> None:

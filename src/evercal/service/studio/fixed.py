@@ -88,3 +88,8 @@ def shift_words(shift: Shift) -> str:
         sure = f"{100 * shift.confidence:.1f} %"
         return f"The camera has moved by {size} (confidence {sure}). Calibrate it again."
     return f"The camera has not moved: it is within {size} of its calibration."
+
+
+def option_of_studio(verdict: str | None) -> str | None:
+    """A verdict that names the option of the studio instead of that of `evercal calibrate`."""
+    return verdict and verdict.replace("--camera", "--fixed-intrinsics")

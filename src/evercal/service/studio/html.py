@@ -1,29 +1,20 @@
 """HTML of the studio's panel; all texts are escaped."""
 
-import base64
 from collections.abc import Mapping, Sequence
 from html import escape
-
-import cv2
-import numpy as np
 
 from evercal.live.coverage import AxisCoverage, Coverage
 from evercal.service.studio.devices import Image, Seen
 from evercal.service.studio.jobs import Message
 from evercal.service.studio.steps import TITLES, Step, StepState
 from evercal.service.viewer.answers import AMBER, BLUE, GREEN, GREY, RED
-from evercal.service.viewer.text import chip, table
+from evercal.service.viewer.text import FAINT, block, chip, jpeg_url, picture_html, table
 
 _SMALL = "font-size:0.82em;line-height:1.4"
 _OF_STATUS = {"locked": GREY, "open": BLUE, "done": GREEN}
 _OF_KIND = {"good": GREEN, "working": BLUE, "error": RED}
 _MARKS = {"locked": "", "open": "", "done": "✓ "}
 _THUMBNAIL_PX, _PICTURE_PX = 56, 400
-
-
-def block(*parts: str) -> str:
-    """Parts one below the other."""
-    return f'<div style="padding:2px 12px 6px">{"".join(parts)}</div>'
 
 
 def step_html(state: StepState) -> str:
@@ -41,10 +32,11 @@ def way_html(states: Sequence[StepState], shown: Step) -> str:
         red, green, blue = _OF_STATUS[state.status]
         line = f"2px solid rgb({red},{green},{blue})" if state.step == shown else "none"
         weight = "font-weight:700;" if state.step == shown else ""
-        faint = "opacity:0.55;" if state.status == "locked" else ""
+        faint = f"opacity:{FAINT};" if state.status == "locked" else ""
         text = f"{_MARKS[state.status]}{TITLES[state.step]}"
-        parts.append(f'<span style="{weight}{faint}border-bottom:{line}">{escape(text)}</span>')
-    return block(f'<div style="{_SMALL};white-space:nowrap">{" → ".join(parts)}</div>')
+        style = f"white-space:nowrap;{weight}{faint}border-bottom:{line}"
+        parts.append(f'<span style="{style}">{escape(text)}</span>')
+    return block(f'<div style="{_SMALL}">{" → ".join(parts)}</div>')
 
 
 def message_html(message: Message) -> str:
@@ -63,10 +55,10 @@ def command_html(*commands: str) -> str:
     """The equal command lines."""
     style = (
         "display:block;white-space:pre-wrap;overflow-wrap:anywhere;user-select:all;"
-        "font-size:0.75em;opacity:0.8;padding:3px 0"
+        f"font-size:0.75em;opacity:{FAINT};padding:3px 0"
     )
     lines = [f'<code style="{style}">{escape(command)}</code>' for command in commands]
-    heading = f'<div style="{_SMALL};opacity:0.65">The same on the command line:</div>'
+    heading = f'<div style="{_SMALL};opacity:{FAINT}">The same on the command line:</div>'
     return block(heading, *lines)
 
 
@@ -88,7 +80,9 @@ def coverage_html(covered: Coverage, limits: tuple[float, float]) -> str:
     """Bars of rotations (degrees) and positions (millimetres) up to their limits."""
     rows = [_bar(axis, "°", limits[0]) for axis in covered.rotations]
     rows += [_bar(axis, " mm", limits[1]) for axis in covered.positions]
-    return block(f'<table style="width:100%;{_SMALL}">{"".join(rows)}</table>')
+    words = "Spread of the good samples; full is enough:"
+    heading = f'<div style="{_SMALL};opacity:{FAINT}">{words}</div>'
+    return block(heading, f'<table style="width:100%;{_SMALL}">{"".join(rows)}</table>')
 
 
 def _bar(axis: AxisCoverage, unit: str, limit: float) -> str:
@@ -97,7 +91,7 @@ def _bar(axis: AxisCoverage, unit: str, limit: float) -> str:
     inner = f"width:{share:.0f}%;height:6px;border-radius:3px;background:rgb({red},{green},{blue})"
     bar = f'<div style="background:rgba(128,128,128,0.25);border-radius:3px"><div style="{inner}">'
     return (
-        f'<tr><td style="opacity:0.65;width:46%">{escape(axis.name)}</td>'
+        f'<tr><td style="opacity:{FAINT};width:46%">{escape(axis.name)}</td>'
         f'<td style="width:34%">{bar}</div></div></td>'
         f'<td style="text-align:right">{axis.spread:.0f}{unit}</td></tr>'
     )
@@ -120,24 +114,11 @@ def samples_html(covered: Coverage, thumbnails: Mapping[str, str]) -> str:
     return block(f'<div style="{style}"><table style="width:100%">{"".join(rows)}</table></div>')
 
 
-def rows_html(rows: Sequence[tuple[str, str]]) -> str:
-    """A table of names and values."""
-    return block(table(rows)) if rows else ""
-
-
-def picture_html(image: Image) -> str:
+def live_html(image: Image) -> str:
     """The live picture."""
-    style = "display:block;margin:0 auto;max-width:100%;max-height:200px;border-radius:4px"
-    return block(f'<img src="{_url(image, _PICTURE_PX)}" alt="live image" style="{style}">')
+    return picture_html(image, "live image", _PICTURE_PX, "max-height:200px")
 
 
 def thumbnail_url(image: Image) -> str:
     """A small JPEG as the address of an HTML image."""
-    return _url(image, _THUMBNAIL_PX)
-
-
-def _url(image: Image, width: int) -> str:
-    height = max(1, round(image.shape[0] * width / image.shape[1]))
-    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]))[1].tobytes()
-    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+    return jpeg_url(image, _THUMBNAIL_PX)

@@ -12,7 +12,7 @@ import viser
 from evercal.service.studio.calibrate_panels import ExportPanel, FixedPanel, LearnPanel
 from evercal.service.studio.devices import Seen
 from evercal.service.studio.drawing import Drawing
-from evercal.service.studio.html import message_html, picture_html, way_html
+from evercal.service.studio.html import live_html, message_html, way_html
 from evercal.service.studio.jobs import Jobs
 from evercal.service.studio.panels import ConnectPanel, Panel, RecordPanel, on_click
 from evercal.service.studio.rest import RestTrigger
@@ -80,7 +80,8 @@ class StudioPage:
     def _build(self, command: str) -> None:
         gui, studio = self.server.gui, self.studio
         self._frame = _Frame(gui, self)
-        connect, record = ConnectPanel(gui, command), RecordPanel(gui, studio, self.jobs)
+        connect = ConnectPanel(gui, studio, self.jobs, command)
+        record = RecordPanel(gui, studio, self.jobs)
         self.panels |= {
             "connect": connect,
             "record": record,
@@ -88,7 +89,7 @@ class StudioPage:
             "fixed": FixedPanel(gui, studio, self.jobs),
             "export": ExportPanel(gui, studio, self.jobs),
         }
-        self._frame.add_next()
+        self._frame.add_keys()
         self._drawing = Drawing(self.server, studio, record.choose)
         self._refresher = _Refresher(self, self._drawing, record)
         self._live = threading.Thread(target=self._run, args=(connect, record), daemon=True)
@@ -142,17 +143,17 @@ class _Frame:
         self._message = gui.add_html("")
         self._progress = gui.add_progress_bar(0.0, visible=False, animated=True)
         self._stop = gui.add_button("Stop", visible=False, color="red")
+        # Above the controls of a step, so that it is seen without scrolling.
+        self._next = gui.add_button("Next", color="teal", icon=viser.Icon.ARROW_RIGHT)
         # An image of viser that changes often asks the browser for addresses that are gone.
         self._picture = gui.add_html("")
-        self._next: viser.GuiButtonHandle | None = None
         self._steps.on_click(lambda _: self._chosen())
         on_click(self._stop, page.jobs.stop)
-
-    def add_next(self) -> None:
-        """Add the button below the panels, and the keys."""
-        gui = self._gui
-        self._next = gui.add_button("Next", color="blue", icon=viser.Icon.ARROW_RIGHT)
         on_click(self._next, lambda: self._by(1))
+
+    def add_keys(self) -> None:
+        """Add the keys, once the panels are there."""
+        gui = self._gui
         record: Any = self._page.panels["record"]
         keys: tuple[tuple[str, Literal["N", "B", "T"], Callable[[], None]], ...] = (
             ("Next step", "N", lambda: self._by(1)),
@@ -173,20 +174,18 @@ class _Frame:
         self._stop.visible = busy and self.step == "record"
         self._picture.visible = self.step in _PICTURED
         self._way.content = way_html(states, self.step)
-        following = STEPS.index(self.step) + 1
-        if self._next is not None:
-            self._next.visible = following < len(STEPS)
-            if following < len(STEPS):
-                self._next.label = f"Next: {by_step[STEPS[following]].title[2:]}"
-            self._next.disabled = all(
-                by_step[step].status == "locked" for step in STEPS[following:]
-            )
+        following = STEPS[STEPS.index(self.step) + 1 :]
+        open_ones = [step for step in following if by_step[step].status != "locked"]
+        self._next.visible = bool(following)
+        if following:
+            self._next.label = f"Next: {by_step[following[0]].title[2:]}"
+            self._next.disabled = not open_ones
 
     def show_picture(self, seen: Seen, step: Step) -> None:
         """Show the newest image of the camera of a step."""
         image = seen.fixed if step == "fixed" else seen.image
         if image is not None and step in _PICTURED:
-            self._picture.content = picture_html(image)
+            self._picture.content = live_html(image)
 
     def _chosen(self) -> None:
         self._page.go(STEPS[_NUMBERS.index(self._steps.value)])

@@ -1,7 +1,7 @@
 """The panels of the steps Connect and Record."""
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import viser
 
@@ -11,96 +11,105 @@ from evercal.service.studio.devices import Seen
 from evercal.service.studio.html import (
     command_html,
     coverage_html,
-    rows_html,
     samples_html,
     seen_html,
     step_html,
     thumbnail_url,
 )
-from evercal.service.studio.jobs import Jobs
+from evercal.service.studio.jobs import Jobs, Task
 from evercal.service.studio.steps import StepState
 from evercal.service.studio.studio import Studio
 from evercal.service.viewer.answers import AMBER
+from evercal.service.viewer.text import rows_html
 
 NO_SAMPLE = "-"
 
 
-class Panel(Protocol):
-    """The controls of one step."""
+class Panel:
+    """The controls of one step, below its title and status.
 
-    folder: viser.GuiFolderHandle
+    Args:
+        gui: controls of the page.
+        studio: what is done.
+        jobs: where tasks run.
+    """
+
+    def __init__(self, gui: viser.GuiApi, studio: Studio, jobs: Jobs):
+        self._studio, self._jobs = studio, jobs
+        self.folder = gui.add_folder(None)
+        with self.folder:
+            self._says = gui.add_html("")
+            self._add(gui)
 
     def show(self, state: StepState, busy: bool) -> None:
         """Show the state; controls are disabled while a task runs."""
-        ...
+        self._says.content = step_html(state)
+        self._update(state, busy)
+
+    def _add(self, gui: viser.GuiApi) -> None:
+        """Add the controls."""
+        raise NotImplementedError
+
+    def _update(self, state: StepState, busy: bool) -> None:
+        """Show what has changed."""
+
+    def _runs(self, button: viser.GuiButtonHandle, what: str, task: Task) -> None:
+        """Run a task when a button is clicked."""
+        on_click(button, lambda: self._jobs.start(what, task))
 
 
-class ConnectPanel:
+class ConnectPanel(Panel):
     """What arrives from camera and robot.
 
     Args:
         gui: controls of the page.
+        studio: what is connected.
+        jobs: where tasks run.
         command: the command that started the studio.
     """
 
-    def __init__(self, gui: viser.GuiApi, command: str):
-        self.folder = gui.add_folder(None)
-        with self.folder:
-            self._says = gui.add_html("")
-            self._seen = gui.add_html("")
-            gui.add_html(command_html(command))
+    def __init__(self, gui: viser.GuiApi, studio: Studio, jobs: Jobs, command: str):
+        self._command = command
+        super().__init__(gui, studio, jobs)
 
-    def show(self, state: StepState, busy: bool) -> None:
-        """Show the state."""
-        self._says.content = step_html(state)
+    def _add(self, gui: viser.GuiApi) -> None:
+        self._seen = gui.add_html("")
+        gui.add_html(command_html(self._command))
 
     def show_seen(self, seen: Seen) -> None:
         """Show what has arrived."""
         self._seen.content = seen_html(seen)
 
 
-class RecordPanel:
-    """Samples, what they cover, and where to go next.
-
-    Args:
-        gui: controls of the page.
-        studio: what is recorded.
-        jobs: where tasks run.
-    """
+class RecordPanel(Panel):
+    """Samples, what they cover, and where to go next."""
 
     def __init__(self, gui: viser.GuiApi, studio: Studio, jobs: Jobs):
-        self._studio, self._jobs = studio, jobs
         self._thumbnails: dict[str, str] = {}
         self._proposal: Proposal | None = None
-        self.folder = gui.add_folder(None)
-        moves = studio.devices.can_move
-        with self.folder:
-            self._says = gui.add_html("")
-            self._take = gui.add_button("Take sample", icon=viser.Icon.CAMERA, hint="Key T")
-            self._move = gui.add_button(
-                "Move there",
-                color=AMBER,
-                visible=moves,
-                hint="Moves the arm. Key M",
-            )
-            self._record = gui.add_button(
-                "Record by itself",
-                color="gray",
-                visible=moves,
-                hint="Until complete",
-            )
-            self.auto = gui.add_checkbox(
-                "Sample when still", False, hint="Take a sample whenever the arm comes to rest"
-            )
-            self._next = gui.add_html("")
-            self._coverage = gui.add_html("")
-            self._list = gui.add_html("")
-            names: list[str] = [NO_SAMPLE]
-            self._sample = gui.add_dropdown("Sample", names)
-            self._remove = gui.add_button("Remove", color="gray")
-            self._remove_bad = gui.add_button("Remove the bad ones", color="gray")
-            gui.add_html(command_html(studio.folders.record_command()))
+        super().__init__(gui, studio, jobs)
         self._connect()
+
+    def _add(self, gui: viser.GuiApi) -> None:
+        moves = self._studio.devices.can_move
+        self._take = gui.add_button("Take sample", icon=viser.Icon.CAMERA, hint="Key T")
+        self._move = gui.add_button(
+            "Move there", color=AMBER, visible=moves, hint="Moves the arm. Key M"
+        )
+        self._record = gui.add_button(
+            "Record by itself", color="gray", visible=moves, hint="Until complete"
+        )
+        self.auto = gui.add_checkbox(
+            "Sample when still", False, hint="Take a sample whenever the arm comes to rest"
+        )
+        self._next = gui.add_html("")
+        self._coverage = gui.add_html("")
+        self._list = gui.add_html("")
+        names: list[str] = [NO_SAMPLE]
+        self._sample = gui.add_dropdown("Sample", names)
+        self._remove = gui.add_button("Remove", color="gray")
+        self._remove_bad = gui.add_button("Remove the bad ones", color="gray")
+        gui.add_html(command_html(self._studio.folders.record_command()))
 
     @property
     def proposal(self) -> Proposal | None:
@@ -123,9 +132,7 @@ class RecordPanel:
         if name in self._sample.options:
             self._sample.value = name
 
-    def show(self, state: StepState, busy: bool) -> None:
-        """Show samples, coverage and the next view."""
-        self._says.content = step_html(state)
+    def _update(self, state: StepState, busy: bool) -> None:
         has_samples = bool(self._studio.book.frames)
         self._take.disabled = self._record.disabled = busy
         self._move.disabled = busy or self._proposal is None
@@ -156,14 +163,11 @@ class RecordPanel:
             if name != NO_SAMPLE:
                 jobs.start("removing", lambda: studio.remove(name))
 
-        def remove_bad() -> None:
-            jobs.start("removing", lambda: studio.remove(*studio.book.bad()))
-
         on_click(self._take, self.take)
         on_click(self._move, self.move)
-        on_click(self._record, lambda: jobs.start("recording", record))
+        self._runs(self._record, "recording", record)
         on_click(self._remove, remove)
-        on_click(self._remove_bad, remove_bad)
+        self._runs(self._remove_bad, "removing", lambda: studio.remove(*studio.book.bad()))
 
 
 def on_click(button: viser.GuiButtonHandle, action: Callable[[], Any]) -> None:

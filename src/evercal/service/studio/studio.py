@@ -18,7 +18,7 @@ from evercal.map import Map
 from evercal.service.studio import results
 from evercal.service.studio.book import Proposal, SampleBook
 from evercal.service.studio.devices import Connection, Devices, Which
-from evercal.service.studio.fixed import FixedCamera, shift_words
+from evercal.service.studio.fixed import FixedCamera, option_of_studio, shift_words
 from evercal.service.studio.folders import Folders
 from evercal.service.studio.steps import Facts, StepState, step_states
 from evercal.service.studio.wrist import LearnedSamples, OnStep, learn_mount, read_learned
@@ -85,7 +85,7 @@ class Studio:
             scenes=len(self.cell.scenes),
             has_fixed=self.devices.fixed_camera is not None,
             fixed_images=len(self.fixed.files),
-            fixed_verdict=verdicts.get("fixed"),
+            fixed_verdict=option_of_studio(verdicts.get("fixed")),
             exported=len(list((self.folders.out / "export").glob("*"))),
         )
 

@@ -4,14 +4,11 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from evercal.localization.localizer import Localizer
 from evercal.service.viewer.answers import AnswerView, LocatedImage, answer_view
 from evercal.service.viewer.drawn import DrawnAnswer
 from evercal.service.viewer.stage import Stage
-from evercal.service.viewer.text import Rows, answer_html, note_html
+from evercal.service.viewer.text import Rows, answer_html, note_html, picture_html
 
 
 class AnswerPanel:
@@ -38,8 +35,7 @@ class AnswerPanel:
         self._lock = threading.Lock()  # the scene is chosen in another thread than answers come
         self._last: AnswerView | None = None
         self._scale = 1.0
-        blank: NDArray[np.uint8] = np.full((240, 320, 3), 240, np.uint8)
-        self._image = gui.add_image(blank, jpeg_quality=80)
+        self._image = gui.add_html("")
         self._text = gui.add_html(note_html("No image yet."))
 
     def show(self, located: LocatedImage, more: Rows = (), at_stated: bool = False) -> None:
@@ -48,7 +44,8 @@ class AnswerPanel:
         self._follow(view.scene)
         with self._lock:
             self._last = view
-            self._image.image = view.picture
+            words = f"{located.name}, {view.state}, with landmarks and residuals"
+            self._image.content = picture_html(view.picture, words)
             self._text.content = answer_html(view, more)
             self._drawn.show(view, self._scale)
             if self._trail:

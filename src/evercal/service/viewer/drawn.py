@@ -10,6 +10,7 @@ from evercal.reports.scene.frusta import Ellipsoid, Frustum
 from evercal.reports.scene.map_parts import THUMBNAIL_PX, resized
 from evercal.service.viewer.answers import BLUE, GREEN, GREY, AnswerView
 from evercal.service.viewer.calibrations import CalibrationView
+from evercal.service.viewer.camera_set import linear
 from evercal.service.viewer.stage import Stage, add_frustum
 
 CALIBRATION_COLOUR = (192, 38, 211)
@@ -151,7 +152,7 @@ class DrawnAnswer:
         self._way = self._way[-_TRAIL:]
         points = np.array([place for place, _ in self._way])
         pairs = np.stack([points[:-1], points[1:]], axis=1)
-        colours = np.array([colour for _, colour in self._way[1:]], np.uint8).reshape(-1, 1, 3)
+        colours = linear(np.array([colour for _, colour in self._way[1:]])).reshape(-1, 1, 3)
         whole = np.isfinite(pairs).all((1, 2))
         self._trail.points = pairs[whole].astype(np.float32)
         self._trail.colors = np.repeat(colours, 2, axis=1)[whole]

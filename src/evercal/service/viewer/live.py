@@ -3,11 +3,10 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
-from itertools import chain
-from queue import Empty, Queue
 from typing import Any
 
 from evercal.errors import InputError
+from evercal.live.camera import NewestFrame
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker
 from evercal.recordings.streams import StreamFrame, is_live, stream
@@ -30,9 +29,14 @@ def open_source(source: str) -> tuple[Iterator[StreamFrame], tuple[int, int]]:
     first = next(frames, None)
     if first is None:
         raise InputError(f"{source}: no frame could be read")
-    whole = chain([first], frames)
     size = first.image.shape[1], first.image.shape[0]
-    return newest(whole) if is_live(source) else paced(whole), size
+
+    def begun() -> Iterator[StreamFrame]:
+        yield first
+        yield from frames
+
+    whole = begun()  # closing it closes the source, which `itertools.chain` would not
+    return iter(NewestFrame(whole)) if is_live(source) else paced(whole), size
 
 
 def paced(
@@ -49,42 +53,6 @@ def paced(
                 sleep(ahead)
         offset = clock() - frame.stamp_s
         yield frame
-
-
-def newest(frames: Iterator[StreamFrame]) -> Iterator[StreamFrame]:
-    """Frames of a camera without the ones that arrived while another was located.
-
-    A thread empties the camera's buffer, which would let answers fall behind.
-    """
-    slot: Queue[StreamFrame | Exception | None] = Queue(maxsize=1)
-    stopped = threading.Event()
-
-    def put(item: StreamFrame | Exception | None) -> None:
-        while True:
-            try:
-                slot.get_nowait()
-            except Empty:
-                break
-        slot.put(item)
-
-    def read() -> None:
-        try:
-            for frame in frames:
-                if stopped.is_set():
-                    return
-                put(frame)
-            put(None)
-        except Exception as error:  # shown where the frames are used
-            put(error)
-
-    threading.Thread(target=read, daemon=True).start()
-    try:
-        while (item := slot.get()) is not None:
-            if isinstance(item, Exception):
-                raise item
-            yield item
-    finally:
-        stopped.set()
 
 
 class Live:
@@ -126,27 +94,49 @@ class Live:
             self._thread.join(5)
 
     def _run(self) -> None:
-        last, interval = None, None
+        rate = _Rate()
         try:
-            for frame in self._frames:
-                while self._idle() and not self._closed.is_set():
-                    time.sleep(_IDLE_S)
-                    last = None
-                if self._closed.is_set():
+            while self._wait_until_wanted(rate):
+                # Taken after the wait, so that a camera that rested goes on with what it sees now.
+                frame = next(self._frames, None)
+                if frame is None:
+                    self.panel.say(f"{self._source}: the stream has ended.")
+                    self._pause.disabled = True
                     return
                 tracked = self._tracker.track(frame.image, frame.stamp_s)
-                now = time.monotonic()
-                if last is not None:
-                    passed = now - last
-                    weight = _SMOOTH if interval is not None else 0.0
-                    interval = weight * (interval or 0.0) + (1 - weight) * passed
-                last = now
-                rate = "" if interval is None else f"{1 / max(interval, 1e-3):.1f} Hz"
                 located = LocatedImage(frame.name, frame.image, tracked.estimate, tracked.state)
-                self.panel.show(located, [("frame rate", rate)])
-            self.panel.say(f"{self._source}: the stream has ended.")
+                self.panel.show(located, [("frame rate", rate.text(time.monotonic()))])
         except InputError as error:
             self.panel.say(str(error))
+        finally:
+            if (close := getattr(self._frames, "close", None)) is not None:
+                close()
 
-    def _idle(self) -> bool:
-        return self._pause.value or not self._server.get_clients()
+    def _wait_until_wanted(self, rate: "_Rate") -> bool:
+        """Wait while nobody looks, or on request; False once the page is closed."""
+        while self._pause.value or not self._server.get_clients():
+            rate.rest()
+            if self._closed.wait(_IDLE_S):
+                break
+        return not self._closed.is_set()
+
+
+class _Rate:
+    """Frames per second, smoothed."""
+
+    def __init__(self) -> None:
+        self._last: float | None = None
+        self._interval: float | None = None
+
+    def rest(self) -> None:
+        """Leave out the time until the next frame."""
+        self._last = None
+
+    def text(self, now_s: float) -> str:
+        """Count a frame and return the rate; empty after the first one."""
+        if self._last is not None:
+            weight = _SMOOTH if self._interval is not None else 0.0
+            passed = now_s - self._last
+            self._interval = weight * (self._interval or 0.0) + (1 - weight) * passed
+        self._last = now_s
+        return "" if self._interval is None else f"{1 / max(self._interval, 1e-3):.1f} Hz"

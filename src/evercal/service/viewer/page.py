@@ -21,6 +21,7 @@ from evercal.reports.scene.frusta import Ellipsoid, readable_scale
 from evercal.service.viewer.calibrations import read_views
 from evercal.service.viewer.drawn import DrawnCalibrations
 from evercal.service.viewer.live import Live, open_source
+from evercal.service.viewer.names import add_names
 from evercal.service.viewer.panel import CalibrationPanel, KeyframePanel, MapPanel
 from evercal.service.viewer.playback import Playback
 from evercal.service.viewer.robot import Robot
@@ -74,7 +75,7 @@ class Page:
         self.server = start_server(options.host, options.port)
         try:
             self._robot = None if options.urdf is None else Robot(self.server, options.urdf)
-            stage = Stage(self.server, scenes)
+            self.stage = stage = Stage(self.server, scenes)
             scale = readable_scale([Ellipsoid.of(v.calibration.uncertain_pose) for v in views])
             self._calibrations = DrawnCalibrations(stage, views, scale)
             self._parts: list[Playback | Live] = []
@@ -181,6 +182,7 @@ def start_server(host: str, port: int, label: str = "evercal view") -> viser.Vis
         control_width="large",
         brand_color=(37, 99, 235),
     )
+    add_names(server, label)
     return server
 
 

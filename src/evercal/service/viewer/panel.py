@@ -8,11 +8,12 @@ import viser
 from evercal.reports.scene.map_parts import ColourBy, KeyframeView
 from evercal.service.viewer.drawn import CALIBRATION_COLOUR, DrawnCalibrations
 from evercal.service.viewer.stage import Stage
-from evercal.service.viewer.text import chip, note_html, rows_html
+from evercal.service.viewer.text import block, chip, note_html, picture_html, rows_html
 
 ALL = "all scenes"
 COLOURINGS: tuple[ColourBy, ...] = ("image", "height", "uncertainty")
 _THROUGH = "/through"
+_HINT = "Click a keyframe to look through it."
 
 
 class MapPanel:
@@ -72,12 +73,11 @@ class KeyframePanel:
         self._stage, self._map, gui = stage, map_panel, stage.server.gui
         self._before: dict[int, tuple[Any, ...]] = {}
         with gui.add_folder("Keyframe"):
-            self._text = gui.add_html(note_html("Click a keyframe to look through it."))
-            first = stage.keyframes[0][0]
-            self._image = gui.add_image(first.picture, jpeg_quality=85, visible=False)
+            self._text = gui.add_html(note_html(_HINT))
+            self._image = gui.add_html("", visible=False)
             self._back = gui.add_button("Back to the overview", visible=False)
         stage.on_keyframe(self.look_through)
-        self._back.on_click(self._return)
+        self._back.on_click(lambda _: self._return())
         stage.server.on_client_disconnect(self._forget)
 
     def look_through(self, view: KeyframeView, client: viser.ClientHandle) -> None:
@@ -108,23 +108,28 @@ class KeyframePanel:
             ("landmarks", str(len(view.pixels))),
         ]
         self._text.content = rows_html(rows)
-        self._image.image = view.picture
+        words = f"keyframe {view.number} with its landmarks, coloured by depth"
+        self._image.content = picture_html(view.picture, words)
         self._image.visible = self._back.visible = True
 
     def _forget(self, client: viser.ClientHandle) -> None:
         self._before.pop(client.client_id, None)
 
-    def _return(self, event: viser.GuiEvent[Any]) -> None:
-        """Look from where this visitor looked before."""
-        client = event.client
-        before = None if client is None else self._before.pop(client.client_id, None)
-        if client is not None and before is not None:
+    def _return(self) -> None:
+        """Let every visitor look from where they looked before, as all share the panel."""
+        clients = self._stage.server.get_clients()
+        while self._before:
+            number, before = self._before.popitem()
+            if number not in clients:
+                continue
+            client, camera = clients[number], clients[number].camera
             with client.atomic():
                 client.scene.remove_by_name(_THROUGH)
-                camera = client.camera
                 camera.position, camera.look_at, camera.up_direction, camera.fov = before
         self._map.inspect(False)
-        self._back.visible = False
+        self._stage.mark(None)
+        self._image.visible = self._back.visible = False
+        self._text.content = note_html(_HINT)
 
 
 class CalibrationPanel:
@@ -145,9 +150,6 @@ class CalibrationPanel:
             if not drawn.views:
                 gui.add_html(note_html("None was given."))
             for view in drawn.views:
-                gui.add_html(
-                    f'<div style="padding:2px 12px">{chip(view.name, CALIBRATION_COLOUR)}</div>'
-                    + rows_html(view.rows())
-                )
+                gui.add_html(block(chip(view.name, CALIBRATION_COLOUR)) + rows_html(view.rows()))
             slider = gui.add_slider("Ellipsoids x", 1, 500, 1, round(scale))
         slider.on_update(lambda _: on_scale(slider.value))

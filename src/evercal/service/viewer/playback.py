@@ -53,7 +53,7 @@ class Playback:
         self._localizer, self._on_frame = localizer, on_frame
         self._gripper_from_camera = gripper_from_camera
         self._wake, self._closed = threading.Event(), threading.Event()
-        gui = stage.server.gui
+        self._server, gui = stage.server, stage.server.gui
         with gui.add_folder("Recording"):
             self._slider = gui.add_slider("Frame", 0, max(len(self.frames) - 1, 1), 1, 0)
             self._play = gui.add_checkbox("Play", False)
@@ -88,7 +88,7 @@ class Playback:
                 shown = wanted
             if not self._play.value:
                 self._wake.wait()
-            elif not self._wake.wait(_PLAY_S):
+            elif not self._wake.wait(_PLAY_S) and self._server.get_clients():
                 self._slider.value = (wanted[0] + 1) % len(self.frames)
             self._wake.clear()
 

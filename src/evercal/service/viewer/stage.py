@@ -16,9 +16,11 @@ from evercal.reports.scene.map_parts import (
     keyframe_views,
     shares,
 )
+from evercal.service.viewer.camera_set import CameraSet, linear
 
 KEYFRAME_COLOUR = (120, 144, 180)
 CHOSEN_COLOUR = (236, 72, 153)
+_CELL_COLOUR, _SECTION_COLOUR = (44, 48, 56), (80, 87, 99)
 _FRUSTUM = (0.02, 0.05)
 """Least and largest size of a frustum as a share of the extent of the map."""
 
@@ -41,7 +43,7 @@ class Stage:
         self.extent_m = _extent(self.landmarks[0])
         self.frustum_m = _frustum_size(self.keyframes[0], self.extent_m)
         self._frames, self._clouds = [], []
-        self._frusta: dict[tuple[str, int], viser.CameraFrustumHandle] = {}
+        self._cameras: list[CameraSet] = []
         with server.atomic():
             self._add_base()
             for i in range(len(scenes)):
@@ -78,26 +80,40 @@ class Stage:
     def show_keyframes(self, visible: bool) -> None:
         """Show or hide the keyframes."""
         with self.server.atomic():
-            for frustum in self._frusta.values():
-                frustum.visible = visible
+            for cameras in self._cameras:
+                cameras.visible = visible
 
-    def mark(self, chosen: KeyframeView) -> None:
-        """Colour the keyframe that was chosen last."""
+    def mark(self, chosen: KeyframeView | None) -> None:
+        """Colour the keyframe that was chosen last, or none."""
         with self.server.atomic():
-            for name, frustum in self._frusta.items():
-                own = name == (chosen.scene, chosen.number)
-                frustum.color = CHOSEN_COLOUR if own else KEYFRAME_COLOUR
+            for views, cameras in zip(self.keyframes, self._cameras, strict=True):
+                cameras.colour(
+                    [CHOSEN_COLOUR if view is chosen else KEYFRAME_COLOUR for view in views]
+                )
 
     def on_keyframe(self, chosen: Callable[[KeyframeView, viser.ClientHandle], Any]) -> None:
         """Call a function when a keyframe is clicked."""
-        for views in self.keyframes:
-            for view in views:
-                frustum = self._frusta[view.scene, view.number]
 
-                def clicked(event: viser.SceneNodePointerEvent[Any], view: KeyframeView = view):
-                    chosen(view, event.client)
+        def clicked(event: viser.SceneClickEvent) -> None:
+            view = self.keyframe_at(event.ray_origin, event.ray_direction)
+            if view is not None:
+                chosen(view, event.client)
 
-                frustum.on_click(clicked)
+        self.server.scene.on_click()(clicked)
+
+    def keyframe_at(
+        self, origin_m: Sequence[float], direction: Sequence[float]
+    ) -> KeyframeView | None:
+        """The first visible keyframe on a ray."""
+        hits: list[tuple[float, int, int]] = []
+        for i, cameras in enumerate(self._cameras):
+            hit = cameras.hit(origin_m, direction) if self.shows(self._names[i]) else None
+            if hit is not None:
+                hits.append((hit[0], i, hit[1]))
+        if not hits:
+            return None
+        _, scene, number = min(hits)
+        return self.keyframes[scene][number]
 
     def _add_scene(self, i: int) -> None:
         """Add a scene; nodes are numbered, since names of scenes may hold a slash."""
@@ -115,27 +131,24 @@ class Stage:
                 point_shading="flat",
             )
         )
-        for view in self.keyframes[i]:
-            name = f"/scenes/{i}/keyframes/{view.number}"
-            self._frusta[view.scene, view.number] = add_frustum(
-                self.server, name, view.frustum, self.frustum_m, KEYFRAME_COLOUR, view.thumbnail
-            )
+        views = self.keyframes[i]
+        cameras = CameraSet(
+            self.server,
+            f"/scenes/{i}/keyframes",
+            [view.frustum for view in views],
+            [view.image for view in views],
+            self.frustum_m,
+        )
+        cameras.colour([KEYFRAME_COLOUR] * len(views))
+        self._cameras.append(cameras)
 
     def _add_base(self) -> None:
         """Axes and floor of the robot base."""
         scene, length = self.server.scene, 0.12 * self.extent_m
         scene.add_frame("/base", axes_length=length, axes_radius=0.03 * length)
         scene.add_label("/base/label", "robot base", position=(0, 0, 0))
-        side = 2 * float(np.ceil(1.5 * self.extent_m))
-        scene.add_grid(
-            "/grid",
-            side,
-            side,
-            cell_size=0.1 if self.extent_m < 1.5 else 0.5,
-            section_size=1.0,
-            cell_color=(52, 57, 66),
-            section_color=(80, 87, 99),
-        )
+        cell = 0.1 if self.extent_m < 1.5 else 0.5
+        add_floor(self.server, 2 * float(np.ceil(1.5 * self.extent_m)), cell)
 
     def _look_from_behind(self) -> None:
         """Begin above and behind the keyframes of the first scene, beside the panel."""
@@ -152,6 +165,29 @@ class Stage:
         camera = self.server.initial_camera
         camera.position = (float(eye[0]), float(eye[1]), float(eye[2]))
         camera.look_at = (float(target[0]), float(target[1]), float(target[2]))
+
+
+def add_floor(server: viser.ViserServer, side_m: float, cell_m: float) -> None:
+    """Lines at z = 0, stronger every metre.
+
+    The grid of viser colours every pixel of the floor, which takes longer than all else without
+    a GPU.
+    """
+    places = np.arange(-round(side_m / 2 / cell_m), round(side_m / 2 / cell_m) + 1) * cell_m
+    ends = np.array([-side_m / 2, side_m / 2])
+    lines = np.zeros((2, len(places), 2, 3), np.float32)
+    lines[0, :, :, 0], lines[0, :, :, 1] = places[:, None], ends
+    lines[1] = lines[0][..., [1, 0, 2]]
+    whole = np.abs(places - np.round(places)) < 1e-6
+    colours = linear(np.where(whole[:, None], _SECTION_COLOUR, _CELL_COLOUR))
+    colours = np.broadcast_to(colours[None, :, None], lines.shape)
+    server.scene.add_line_segments(
+        "/grid",
+        lines.reshape(-1, 2, 3),
+        np.ascontiguousarray(colours).reshape(-1, 2, 3),
+        thickness=1.0,
+        thickness_units="screen",
+    )
 
 
 def add_frustum(
