@@ -21,6 +21,7 @@ from evercal.continual.benchmark.comparison import (
     Run,
     TableRows,
     by_strategy,
+    contrast_rows,
     difference_rows,
     method_rows,
     number,
@@ -138,6 +139,23 @@ def _differences(sources: Sequence[Published], reference: str) -> str:
         rows = difference_rows(group, reference)
         parts += [markdown(rows)] if len(rows) > 1 else []
     return f"\n\n{ONE_RUN}\n\n".join(parts)
+
+
+def _contrasts(sources: Sequence[Published], pairs: str) -> str:
+    """Tabulate the contrasts `A-B,C-D`, corrected for their number."""
+    split = [pair.partition("-") for pair in pairs.split(",")]
+    return markdown(contrast_rows(_runs(sources), [(ours, theirs) for ours, _, theirs in split]))
+
+
+def _environments(sources: Sequence[Published], _: str) -> str:
+    """Tabulate where the runs were measured: a row per commit and machine."""
+    table = [["commit", "processor", "instructions", "torch", "threads", "runs"]]
+    for source in sources:
+        for key, record in source.environments.items():
+            runs = {(s.strategy, s.seed) for s in source.scenes if s.environment == key}
+            cells = [record[name] for name in ("commit", "processor", "instructions", "torch")]
+            table.append([*cells, record["threads"], str(len(runs))])
+    return markdown(table)
 
 
 def _ablation(sources: Sequence[Published], suite: str) -> str:
@@ -344,6 +362,8 @@ KINDS: dict[str, Callable[[Sequence[Published], str], str]] = {
     "scenes": _bench(scene_rows),
     "selectors": _bench(selector_rows),
     "differences": _differences,
+    "contrasts": _contrasts,
+    "environments": _environments,
     "ablation": _ablation,
     "memory": _memory,
     "accuracy": _accuracy,

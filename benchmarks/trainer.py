@@ -4,12 +4,12 @@ import time
 from collections.abc import Callable
 
 import torch
-from evercal.continual.networks.muon import MUON_STEPS
 from tabulate import tabulate
 
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.descriptor import load_descriptor
 from evercal.continual.networks.head import Head, HeadOptions
+from evercal.continual.networks.shampoo import EVERY, inverse_root
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 from evercal.features.encoder import load_encoder
 from evercal.features.precision import fast_bfloat16
@@ -30,12 +30,12 @@ def run(widths: tuple[int, ...] = (256, 384), batch: int = 2048, repeat: int = 3
     for width in widths:
         trainer = _trainer(width, batch)
         step = _milliseconds(trainer._train_step, repeat)
-        forward_backward, muon = _products(trainer.head, batch, repeat)
-        share = 100 * (forward_backward + muon) / step
-        rows.append([width, batch, step, forward_backward, muon, f"{share:.0f} %"])
+        forward_backward, optimiser = _products(trainer.head, batch, repeat)
+        share = 100 * (forward_backward + optimiser) / step
+        rows.append([width, batch, step, forward_backward, optimiser, f"{share:.0f} %"])
     kind = "bfloat16" if fast_bfloat16() else "float32"
     print(f"{kind}, {torch.get_num_threads()} threads, processor time")
-    heads = ["width", "rows", "step ms", "products of the head ms", "of Muon ms", "share"]
+    heads = ["width", "rows", "step ms", "products of the head ms", "of Shampoo ms", "share"]
     print(tabulate(rows, heads, floatfmt=".1f"))
 
 
@@ -62,12 +62,12 @@ def _trainer(width: int, batch: int) -> HeadTrainer:
 
 
 def _products(head: Head, batch: int, repeat: int) -> tuple[float, float]:
-    """Return milliseconds of the products of one step: forward and backward, and Muon's."""
+    """Return milliseconds of the products of one step: forward and backward, and Shampoo's."""
     kind = torch.bfloat16 if fast_bfloat16() else torch.float32
     width, hidden = head.options.width, head.layers - 1
     x, w = torch.randn(batch, width, dtype=kind), torch.randn(width, width, dtype=kind)
     first, w0 = torch.randn(batch, head.features, dtype=kind), w[: head.features]
-    small = torch.randn(width, width, dtype=kind)
+    small = torch.randn(hidden, width, width)
 
     def layers() -> None:
         for inputs, weights in [(first, w0)] * 2 + [(x, w)] * hidden:
@@ -76,11 +76,13 @@ def _products(head: Head, batch: int, repeat: int) -> tuple[float, float]:
             if inputs is x:
                 torch.mm(y, weights.T)
 
-    def newton_schulz() -> None:
-        for _ in range(hidden * MUON_STEPS * 3):
-            torch.mm(small, small)
+    def shampoo() -> None:
+        for _ in range(EVERY):
+            torch.bmm(small.mT, small)
+            torch.bmm(small, small)
+        inverse_root(torch.bmm(small.mT, small))
 
-    return _milliseconds(layers, repeat), _milliseconds(newton_schulz, repeat)
+    return _milliseconds(layers, repeat), _milliseconds(shampoo, 3) / EVERY
 
 
 def _milliseconds(work: Callable[[], object], repeat: int) -> float:

@@ -14,6 +14,7 @@ import pytest
 
 from evercal.continual.benchmark.bench import BenchOptions, Step, begin_bench, in_order, run_bench
 from evercal.continual.benchmark.comparison import runs_of
+from evercal.continual.benchmark.environment import environment
 from evercal.continual.benchmark.results import (
     NETWORK,
     RESULTS,
@@ -21,6 +22,7 @@ from evercal.continual.benchmark.results import (
     STRATEGIES,
     SceneResult,
     read,
+    read_environments,
     read_strategies,
 )
 from evercal.continual.benchmark.suites import SUITES, load_suite, regions, tuning_split
@@ -108,6 +110,27 @@ def test_complete_runs_are_not_repeated(
     before = (complete[0] / RESULTS).read_bytes()
     assert list(run_bench(arcs, options, complete[0])) == []
     assert (complete[0] / RESULTS).read_bytes() == before
+
+
+def test_processes_share_the_runs(
+    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[Step]], tmp_path: Path
+) -> None:
+    """While one process has a run, another takes the others; together they have all."""
+    first = run_bench(arcs, options, tmp_path)
+    assert next(first).strategy == "er"
+    second = run_bench(arcs, options, tmp_path)
+    assert next(second).strategy == "finetune"
+    assert [step.strategy for step in first] == ["er", "joint", "joint"]
+    assert [step.strategy for step in second] == ["finetune"]
+    assert comparable(read(tmp_path)) == comparable(read(complete[0]))
+
+
+def test_every_line_names_commit_and_machine(complete: tuple[Path, list[Step]]) -> None:
+    out, _ = complete
+    records = read_environments(out)
+    assert {line.environment for line in read(out)} == set(records)
+    (record,) = records.values()
+    assert record == environment()
 
 
 def test_options_that_decide_a_result_are_recorded(complete: tuple[Path, list[Step]]) -> None:
@@ -350,4 +373,4 @@ def test_thresholds_of_a_network_beside_a_map_are_fitted_once(
     assert list(steps) == []
     assert {r.strategy for r in read(tmp_path)} == {"a", "a" + NETWORK}
     # Beside a map, the first scene is not shared with other strategies.
-    assert list((tmp_path / "runs").iterdir()) == []
+    assert [path for path in (tmp_path / "runs").iterdir() if path.is_dir()] == []

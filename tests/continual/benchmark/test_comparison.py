@@ -10,6 +10,7 @@ import pytest
 from evercal.continual.benchmark.comparison import (
     Run,
     as_text,
+    contrast_rows,
     difference,
     difference_rows,
     method_rows,
@@ -188,3 +189,15 @@ def test_summary_has_whole_matrices_and_no_nan() -> None:
     assert strategies["joint"][0]["accuracy_5cm_5deg"] == [[None, None], [90.0, 90.0]]
     assert strategies["joint"][0]["total_forgetting"] is None
     assert [run["seed"] for run in strategies["ours"]] == [0, 1]
+
+
+def test_contrasts_pair_seeds_and_name_missing_runs() -> None:
+    """Ours ends at 65 and 70 %, theirs at 45 and 55 %: 20 and 15 points; t(1) = 25.452 at 99 %."""
+    theirs = THEIRS + lines("theirs", 1, [[16], [10, 12]])
+    header, row, none = contrast_rows(
+        runs_of(OURS + theirs), [("ours", "theirs"), ("ours", "joint")]
+    )
+    assert header == ["contrast, points", "runs", "mean", "low", "high"]
+    half = 25.452 * 2.5
+    assert row == ["ours - theirs", "2", "+17.5", f"{17.5 - half:+.1f}", f"{17.5 + half:+.1f}"]
+    assert none == ["ours - joint", "0", "-", "-", "-"]

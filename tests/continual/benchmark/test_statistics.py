@@ -11,6 +11,7 @@ from evercal.continual.benchmark.statistics import (
     blocks,
     frame_pieces,
     mean_interval,
+    seeds_interval,
 )
 
 
@@ -152,3 +153,21 @@ def test_unusable_scenes_are_refused() -> None:
         mean_interval([np.zeros((2, 1))])
     with pytest.raises(ValueError, match="shape"):
         mean_interval([np.zeros((2, 30)), np.zeros((3, 30))])
+
+
+def test_seeds_interval_is_students() -> None:
+    """By hand: mean 2, deviation 1, t(2) = 4.3027 at 97.5 %."""
+    interval = seeds_interval([1.0, 2.0, 3.0])
+    half = 4.3027 / 3**0.5
+    assert interval == pytest.approx((2.0, 2.0 - half, 2.0 + half), abs=1e-4)
+
+
+def test_seeds_interval_is_corrected_for_comparisons() -> None:
+    values = np.random.default_rng(1).normal(size=(4000, 4, 5))
+    covers = [
+        all(low <= 0 <= high for _, low, high in (seeds_interval(each, 4) for each in trial))
+        for trial in values
+    ]
+    assert 0.94 < np.mean(covers) < 0.965
+    with pytest.raises(ValueError, match="two or more"):
+        seeds_interval([1.0])

@@ -10,17 +10,20 @@
     OUT/runs/STRATEGY-SEED.network.json    thresholds of its network, if it also builds a map
     OUT/runs/first-SCENE-SEED/    the first scene, shared by strategies that learn it alike
 
-An interrupted run resumes from the checkpoint inside its stage, as `evercal learn` does.
+An interrupted run resumes from the checkpoint inside its stage, as `evercal learn` does. Several
+processes may work in one folder: each takes runs that no other has.
 """
 
 import json
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from evercal.continual.benchmark import results
 from evercal.continual.benchmark.results import SceneResult
@@ -104,12 +107,29 @@ def run_bench(
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
         how = RunOptions(options.stage(seed), options.short_side, features, out, options.device)
-        for stage, these in run_strategy(strategy, ordered, how, on_event):
-            # An interrupted call may have stored some of the lines of a stage.
-            new = [r for r in these if (r.strategy, seed, stage, r.scene) not in stored]
-            results.append(out, new)
-            yield Step(strategy.name, seed, these, done + stage + 1, total)
-        done += len(scenes)
+        with _claimed(out, strategy, seed) as free:
+            if not free or _complete((seed, strategy), results.read(out), len(scenes)):
+                continue
+            for stage, these in run_strategy(strategy, ordered, how, on_event):
+                # An interrupted call may have stored some of the lines of a stage.
+                new = [r for r in these if (r.strategy, seed, stage, r.scene) not in stored]
+                results.append(out, new)
+                yield Step(strategy.name, seed, these, done + stage + 1, total)
+            done += len(scenes)
+
+
+@contextmanager
+def _claimed(out: Path, strategy: Strategy, seed: int) -> Iterator[bool]:
+    """Claim a run; yields whether no other process has it."""
+    path = out / "runs" / f"{strategy.name}-{seed}.claim"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        claim = FileLock(path).acquire(blocking=False)
+    except Timeout:
+        yield False
+        return
+    with claim:
+        yield True
 
 
 def begin_bench(
@@ -125,8 +145,9 @@ def begin_bench(
     """
     if len(scenes) < 2:
         raise InputError(f"{len(scenes)} scene: give two or more to measure forgetting")
-    lock_settings(out / results.SETTINGS, _settings(scenes, options))
-    _record_strategies(out, options.strategies)
+    with results.locked(out):
+        lock_settings(out / results.SETTINGS, _settings(scenes, options))
+        _record_strategies(out, options.strategies)
     stored = results.read(out)
     runs = [(seed, strategy) for seed in options.seeds for strategy in options.strategies]
     return [run for run in runs if not _complete(run, stored, len(scenes))]

@@ -9,7 +9,12 @@ import numpy as np
 
 from evercal.continual.benchmark.published import LOOSE, PublishedScene
 from evercal.continual.benchmark.results import NETWORK, SceneResult
-from evercal.continual.benchmark.statistics import Interval, frame_pieces, mean_interval
+from evercal.continual.benchmark.statistics import (
+    Interval,
+    frame_pieces,
+    mean_interval,
+    seeds_interval,
+)
 from evercal.errors import InputError
 from evercal.evaluation.metrics import (
     COARSE,
@@ -318,6 +323,27 @@ def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
     ]
     interval = mean_interval(gains, pieces)
     return Interval(interval.mean, max(interval.low, -1.0), min(interval.high, 1.0))
+
+
+def contrast_rows(runs: Sequence[Run], pairs: Sequence[tuple[str, str]]) -> TableRows:
+    """Tabulate differences of final accuracy that were named before the runs, on common seeds.
+
+    The intervals are `seeds_interval`, corrected for the number of pairs.
+    """
+    grouped = by_strategy(runs)
+    rows = [["contrast, points", "runs", "mean", "low", "high"]]
+    for ours, theirs in pairs:
+        of_seed = {run.seed: run for run in grouped.get(theirs, [])}
+        gains = [
+            run.scores().final_accuracy - of_seed[run.seed].scores().final_accuracy
+            for run in grouped.get(ours, [])
+            if run.seed in of_seed
+        ]
+        cells = ["-"] * 3
+        if len(gains) > 1:
+            cells = [f"{value:+.1f}" for value in seeds_interval(gains, len(pairs))]
+        rows.append([f"{ours} - {theirs}", str(len(gains)), *cells])
+    return rows
 
 
 def summary(runs: Sequence[Run]) -> dict[str, list[dict[str, object]]]:

@@ -11,6 +11,7 @@ from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
+from filelock import FileLock
 
 from evercal.continual.benchmark.environment import environment, environment_key
 from evercal.errors import InputError
@@ -105,10 +106,16 @@ def scene_result(results: Sequence[FrameResult], **run: object) -> SceneResult:
     )
 
 
+def locked(folder: Path) -> FileLock:
+    """Return a lock of the results of a folder, which several processes may write."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return FileLock(folder / ".results.lock")
+
+
 def append(folder: Path, results: Iterable[SceneResult]) -> None:
     """Append lines to the results of a folder and flush them to disk."""
     lines = [json.dumps(_to_record(result), allow_nan=False) + "\n" for result in results]
-    with open(folder / RESULTS, "a", encoding="utf-8") as file:
+    with locked(folder), open(folder / RESULTS, "a", encoding="utf-8") as file:
         file.write("".join(lines))
         file.flush()
         os.fsync(file.fileno())
@@ -123,11 +130,12 @@ def read(folder: Path) -> list[SceneResult]:
     path = folder / RESULTS
     if not path.exists():
         return []
-    data = path.read_bytes()
-    complete = data.rfind(b"\n") + 1
-    if complete < len(data):
-        with open(path, "r+b") as file:
-            file.truncate(complete)
+    with locked(folder):
+        data = path.read_bytes()
+        complete = data.rfind(b"\n") + 1
+        if complete < len(data):
+            with open(path, "r+b") as file:
+                file.truncate(complete)
     results = []
     for number, line in enumerate(data[:complete].splitlines(), start=1):
         try:
@@ -141,9 +149,10 @@ def record_environment(folder: Path) -> str:
     """Add the record of this process to environments.json and return its key."""
     record = environment()
     key = environment_key(record)
-    records = read_environments(folder)
-    if records.get(key) != record:
-        write_json(folder / ENVIRONMENTS, records | {key: record})
+    with locked(folder):
+        records = read_environments(folder)
+        if records.get(key) != record:
+            write_json(folder / ENVIRONMENTS, records | {key: record})
     return key
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from filelock import FileLock
 
 from evercal.continual.benchmark.results import (
     NETWORK,
@@ -184,8 +185,10 @@ class _Run:
             self._learn(self.store, scene, self.strategy)
             return
         shared = self.store.with_name(f"first-{scene.name}-{self.stage.seed}")
-        if not is_store(shared):
-            self._learn(shared, scene, STRATEGIES["finetune"])
+        # Another process may be learning it.
+        with FileLock(shared.with_name(f"{shared.name}.claim")):
+            if not is_store(shared) or not NetworkStore.open(shared).stages:
+                self._learn(shared, scene, STRATEGIES["finetune"])
         first = NetworkStore.open(shared)
         began = time.perf_counter()
         scenes = self._prepared(first.contents.copy_for_training())

@@ -10,8 +10,8 @@ DECAY = 0.9
 """Decay of the second moment per step."""
 EVERY = 10
 """Steps between two roots of the second moment."""
-FLOOR = 1e-6
-"""Least eigenvalue of the second moment, as a share of its largest."""
+FLOOR = 1e-4
+"""Added to the eigenvalues of the second moment, as a share of their mean."""
 
 
 class OneSidedShampoo(torch.optim.Optimizer):
@@ -61,8 +61,15 @@ class OneSidedShampoo(torch.optim.Optimizer):
 
 
 def inverse_root(moments: Tensor) -> Tensor:
-    """Return C^(-1/2) of symmetric positive semi-definite matrices (n, w, w)."""
-    values, vectors = torch.linalg.eigh(moments)
-    values = values.clamp(min=0)
-    floor = FLOOR * values.amax(-1, keepdim=True) + 1e-30
-    return (vectors * (values + floor).rsqrt()[..., None, :]) @ vectors.mT
+    """Return (C / c + floor)^(-1/2) of positive semi-definite matrices C (n, w, w).
+
+    c is the mean eigenvalue; steps do not depend on it.
+    """
+    mean = moments.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None].clamp(min=1e-30)
+    scaled = moments / mean + FLOOR * torch.eye(moments.shape[-1], device=moments.device)
+    try:
+        values, vectors = torch.linalg.eigh(scaled)
+    except torch.linalg.LinAlgError:
+        # LAPACK's divide and conquer sometimes does not converge in single precision.
+        values, vectors = (part.float() for part in torch.linalg.eigh(scaled.double()))
+    return (vectors * values.clamp(min=FLOOR).rsqrt()[..., None, :]) @ vectors.mT

@@ -17,6 +17,7 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from evercal.continual.pretraining.furnished import cached_furnished_views
 from evercal.continual.pretraining.pairs import (
+    END_ROOM_SEED,
     FIRST_ROOM_SEED,
     HEIGHT,
     PER_ANCHOR,
@@ -112,7 +113,7 @@ def make_data(options: PretrainOptions, folder: Path) -> PretrainData:
         raise InputError(
             f"--furnished-pairs {options.furnished_pairs} needs --furnished of at least 1"
         )
-    limit = VALIDATION_ROOM_SEED - FIRST_ROOM_SEED
+    limit = END_ROOM_SEED - FIRST_ROOM_SEED
     if max(options.furnished, options.rooms) > limit:
         raise InputError(
             f"--rooms {options.rooms}, --furnished {options.furnished}: at most {limit} of a kind;"

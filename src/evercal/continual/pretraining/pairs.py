@@ -13,7 +13,9 @@ from evercal.simulation.furnished.textures import dead_leaves
 HEIGHT, WIDTH = 192, 256
 PER_ANCHOR = 4
 FIRST_ROOM_SEED = 1_000
-"""First seed of pretraining rooms; tests, demos and benchmarks use lower seeds."""
+"""First seed of pretraining rooms; tests and demos use lower seeds."""
+END_ROOM_SEED = FIRST_ROOM_SEED + 3_000
+"""Seeds from here to the held-out rooms are free for rooms of benchmarks."""
 VALIDATION_ROOM_SEED = FIRST_ROOM_SEED + 7_000
 """First seed of held-out rooms."""
 
