@@ -73,5 +73,7 @@ def shot(visit: Any, name: str) -> None:
     """Keep a picture where the environment asks for it."""
     folder = os.environ.get("STUDIO_SCREENSHOTS")
     if folder is not None:
+        # viser's notice that WebGL runs in software
+        visit.add_style_tag(content=".mantine-Notifications-root {display: none}")
         time.sleep(2)
         visit.screenshot(path=Path(folder) / f"{name}.png", timeout=SHOT_MS)

@@ -26,6 +26,7 @@ class PreconditionedReplay(Replay):
     selector: str = "sars_filled"
     penalty: Penalty = field(default_factory=AnchoredReprojection)
     weight: float = 0.5
+    every_scene: bool = True
     strength: float = 0.5
     """Damping of a step along the inputs of each remembered scene; 0 disables it."""
 

@@ -1,0 +1,40 @@
+"""Draw the picture of docs/view.md: python docs/_site/view.py cell.evercal tripod.json RECORDING.
+
+Map, calibration and recording are those of the README: samples/cell/tripod is located frame by
+frame. Needs Chromium and the extras `view` and `dev`.
+"""
+
+import io
+import sys
+import time
+from pathlib import Path
+
+from PIL import Image
+
+import evercal
+from benchmarks.browser import chromium
+from evercal.service.viewer.page import Page, ViewOptions
+
+OUT = Path(__file__).parents[1] / "view.jpg"
+
+
+def main(store: Path, calibration: Path, recording: Path) -> None:
+    """Open the page and keep what it shows."""
+    options = ViewOptions(port=0, calibrations=(calibration,), recording=recording)
+    page = Page(evercal.Map.open(store).localizer, options)
+    try:
+        with chromium() as browser:
+            visit = browser.new_page(viewport={"width": 1200, "height": 720})
+            visit.goto(page.url)
+            visit.wait_for_selector("canvas", timeout=120_000)
+            # viser's notice that WebGL runs in software
+            visit.add_style_tag(content=".mantine-Notifications-root {display: none}")
+            time.sleep(20)  # all parts have arrived
+            shot = Image.open(io.BytesIO(visit.screenshot(timeout=120_000)))
+            shot.convert("RGB").save(OUT, quality=80)
+    finally:
+        page.close()
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:4]))
