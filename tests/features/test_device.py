@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from evercal.errors import InputError
-from evercal.features.device import allow_tf32, device_of, device_of_network
+from evercal.features.device import device_of, device_of_network, tf32
 
 from ..one_device import META
 
@@ -58,7 +58,11 @@ def test_device_of_a_network_is_that_of_its_weights_or_buffers() -> None:
     assert device_of_network(lambda grey: grey) == torch.device("cpu")
 
 
-def test_tf32_changes_nothing_on_the_cpu() -> None:
-    before = torch.get_float32_matmul_precision()
-    allow_tf32(torch.device("cpu"))
-    assert torch.get_float32_matmul_precision() == before
+def test_tf32_is_set_on_a_gpu_only_and_restored() -> None:
+    kinds = torch.backends.cuda.matmul, torch.backends.cudnn
+    before = [kind.allow_tf32 for kind in kinds]
+    with tf32(torch.device("cpu")):
+        assert [kind.allow_tf32 for kind in kinds] == before
+    with tf32(torch.device("cuda", 0)):
+        assert all(kind.allow_tf32 for kind in kinds)
+    assert [kind.allow_tf32 for kind in kinds] == before

@@ -1,5 +1,7 @@
 """The device that the networks run on."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import chain
 
 import torch
@@ -49,12 +51,23 @@ def device_of_network(network: object) -> torch.device:
     return torch.device("cpu")
 
 
-def allow_tf32(device: torch.device) -> None:
+@contextmanager
+def tf32(device: torch.device) -> Iterator[None]:
     """Let fp32 matrix products on a CUDA device round their factors to 10 bits, which is faster.
 
     For training: weights are stored with 10 bits, too. Products that need all bits, such as points
-    in a camera, are written as sums. On the CPU nothing changes.
+    in a camera, are written as sums. The setting is that of the process, so it is restored. On the
+    CPU nothing changes.
     """
-    if device.type == "cuda":
-        torch.backends.cuda.matmul.allow_tf32 = True
-        torch.backends.cudnn.allow_tf32 = True
+    if device.type != "cuda":
+        yield
+        return
+    kinds = torch.backends.cuda.matmul, torch.backends.cudnn
+    before = [kind.allow_tf32 for kind in kinds]
+    try:
+        for kind in kinds:
+            kind.allow_tf32 = True
+        yield
+    finally:
+        for kind, value in zip(kinds, before, strict=True):
+            kind.allow_tf32 = value

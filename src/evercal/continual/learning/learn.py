@@ -23,6 +23,7 @@ from evercal.continual.learning.stage_rows import (
     view_plan,
 )
 from evercal.continual.methods.method import StageStart
+from evercal.continual.networks.distributed import broadcast
 from evercal.continual.networks.trainer import HeadTrainer
 from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.continual.store import Checkpoint, Resume
@@ -74,6 +75,8 @@ def learn(
         whiten(head, [buffer], options.seed)
     memories = (yield from remembered(scenes, options)) if method.replays else []
     rows, states = options.fit.replay_batch, scenes.method_states
+    # Hooks may derive values from the weights, which must be equal in all processes.
+    broadcast([*head.parameters(), *head.buffers()])
     hooks = method.begin(StageStart(head, teacher, memories, states, rows, options.seed))
     fit = options.fit if built is None else options.fit.with_known_lens()
     trainer = HeadTrainer(head, [buffer], fit, options.seed, hooks)

@@ -8,6 +8,7 @@ Processes on GPUs communicate by NCCL, which sends CUDA tensors, the others by g
 tensors. Tensors elsewhere are copied.
 """
 
+import atexit
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TypeVar
@@ -59,7 +60,14 @@ def join_processes(device: str | torch.device = "auto") -> torch.device:
             distributed.init_process_group("nccl", device_id=own)
         else:
             distributed.init_process_group("gloo")
+        atexit.register(_leave)
     return own
+
+
+def _leave() -> None:
+    """Leave the group at the end of the process: NCCL warns about groups that are left open."""
+    if _initialized():
+        distributed.destroy_process_group()
 
 
 @torch.no_grad()

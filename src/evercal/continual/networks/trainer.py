@@ -13,7 +13,7 @@ from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
 from evercal.continual.networks.loss import LossOptions, clamp_px, reprojection_loss, surface_loss
 from evercal.continual.networks.shampoo import OneSidedShampoo
-from evercal.features.device import allow_tf32
+from evercal.features.device import tf32
 from evercal.features.precision import autocast
 
 INLIER_PX = 5.0
@@ -101,7 +101,6 @@ class HeadTrainer:
         self.head, self.buffers = head, buffers
         self.options, self.seed, self.step = options, seed, 0
         self.hooks = TrainingHooks() if hooks is None else hooks
-        allow_tf32(head.device)
         broadcast([*head.parameters(), *head.buffers()])
         self.correction = torch.nn.Parameter(torch.zeros(len(buffers), 5, device=head.device))
         correctable = [[float(buffer.correctable)] for buffer in buffers]
@@ -112,7 +111,9 @@ class HeadTrainer:
         """Train to the end, yielding after every step."""
         self.head.train()
         while self.step < self.options.iterations:
-            yield self._train_step()
+            with tf32(self.head.device):
+                progress = self._train_step()
+            yield progress
         self.head.eval()
 
     def _train_step(self) -> Progress:
