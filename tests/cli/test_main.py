@@ -37,6 +37,7 @@ VERBS = {
 ALL = [verb for verbs in VERBS.values() for verb in verbs]
 OTHER_PROGRAMS = {"--once", "--frame-id", "--child-frame-id", "--qw", "--qx", "--qy", "--qz"}
 OTHER_PROGRAMS |= {"--nproc-per-node", "--tyro-print-completion", "--version"}
+OTHER_PROGRAMS |= {"--mantine-color-dimmed"}  # a colour of the viewer
 """Options in messages that are not those of a verb."""
 SOLVE = ("--robot-poses", "R", "--camera-poses", "C", "--mount", "eye_in_hand")
 
@@ -84,7 +85,7 @@ def test_help_of_a_verb_fits_and_has_an_example(
     assert "--no-" not in ran.out
     assert "--json" in ran.out
     if verb == "learn":
-        assert "--preset {fast,demo,bench,paper}" in ran.out
+        assert "--preset {fast,demo,bench,converged,paper}" in ran.out
 
 
 def test_messages_name_existing_options(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:

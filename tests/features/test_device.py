@@ -59,10 +59,12 @@ def test_device_of_a_network_is_that_of_its_weights_or_buffers() -> None:
 
 
 def test_tf32_is_set_on_a_gpu_only_and_restored() -> None:
-    kinds = torch.backends.cuda.matmul, torch.backends.cudnn
-    before = [kind.allow_tf32 for kind in kinds]
+    def now() -> tuple[bool, bool]:
+        return torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
+
+    before = now()
     with tf32(torch.device("cpu")):
-        assert [kind.allow_tf32 for kind in kinds] == before
+        assert now() == before
     with tf32(torch.device("cuda", 0)):
-        assert all(kind.allow_tf32 for kind in kinds)
-    assert [kind.allow_tf32 for kind in kinds] == before
+        assert now() == (True, True)
+    assert now() == before

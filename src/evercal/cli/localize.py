@@ -60,14 +60,16 @@ class Localize:
     def run(self) -> int:
         """Locate every image; nothing is printed before all of them were read."""
         from evercal.recordings.image_files import image_files
-        from evercal.reports.scene.animation import require_video
 
         point = point_of(self.at)
         files = image_files(self.images)
         camera = camera_for(self.camera, files)
         require_folder(self.overlay, "--overlay")
-        require_writable(self.video, "--video")
-        require_video(self.video)
+        if self.video is not None:
+            from evercal.reports.scene.animation import require_video
+
+            require_writable(self.video, "--video")
+            require_video(self.video)
         localizer = open_localizer(self.store, self.device)
         answers = self._answers(localizer, files, camera)
         if self.video is not None:

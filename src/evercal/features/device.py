@@ -62,12 +62,10 @@ def tf32(device: torch.device) -> Iterator[None]:
     if device.type != "cuda":
         yield
         return
-    kinds = torch.backends.cuda.matmul, torch.backends.cudnn
-    before = [kind.allow_tf32 for kind in kinds]
+    products, convolutions = torch.backends.cuda.matmul, torch.backends.cudnn
+    before = products.allow_tf32, convolutions.allow_tf32
     try:
-        for kind in kinds:
-            kind.allow_tf32 = True
+        products.allow_tf32 = convolutions.allow_tf32 = True
         yield
     finally:
-        for kind, value in zip(kinds, before, strict=True):
-            kind.allow_tf32 = value
+        products.allow_tf32, convolutions.allow_tf32 = before

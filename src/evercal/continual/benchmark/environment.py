@@ -13,8 +13,8 @@ from pathlib import Path
 def environment() -> dict[str, str]:
     """Describe code, libraries and machine of this process.
 
-    Keys: `commit` (`git describe`, with `-dirty` for changed files; the version of an installed
-    package), `python`, `torch`, `numpy`, `processor`, `instructions`, `threads`, `gpu`.
+    Keys: `commit` (with `-dirty` for changed files; the version of an installed package), `python`,
+    `torch`, `numpy`, `processor`, `instructions`, `threads`, `gpu`.
     """
     import numpy as np
     import torch
@@ -38,13 +38,17 @@ def environment_key(record: dict[str, str]) -> str:
 
 
 def _commit() -> str:
-    folder = Path(__file__).parent
-    command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=12"]
-    try:
-        # Only a checkout that tracks this file has its commit.
-        tracked = ["git", "-C", str(folder), "ls-files", "--error-unmatch", Path(__file__).name]
-        subprocess.run(tracked, check=True, capture_output=True)
+    """Return the commit of the checkout that tracks this file, or the version of the package."""
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(Path(__file__).parent), *words]
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    try:
+        if not git("ls-files", Path(__file__).name):
+            raise FileNotFoundError(__file__)
+        changed = git("diff", "HEAD")
+        return git("rev-parse", "HEAD")[:12] + ("-dirty" if changed else "")
     except (OSError, subprocess.CalledProcessError):
         return f"evercal {version('evercal')}"
 

@@ -69,7 +69,7 @@ def inverse_root(moments: Tensor) -> Tensor:
     scaled = moments / mean + FLOOR * torch.eye(moments.shape[-1], device=moments.device)
     try:
         values, vectors = torch.linalg.eigh(scaled)
-    except torch.linalg.LinAlgError:
+    except RuntimeError:  # LinAlgError, which torch does not export
         # LAPACK's divide and conquer sometimes does not converge in single precision.
         values, vectors = (part.float() for part in torch.linalg.eigh(scaled.double()))
     return (vectors * values.clamp(min=FLOOR).rsqrt()[..., None, :]) @ vectors.mT

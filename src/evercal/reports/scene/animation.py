@@ -48,14 +48,12 @@ _REFUSED = "#cf222e"
 _QUIET = "#59636e"
 
 
-def require_video(path: Path | None) -> None:
+def require_video(path: Path) -> None:
     """Check that a video can be written, before the images are located.
 
     Raises:
         InputError: Another ending, or the extra `video` is not installed.
     """
-    if path is None:
-        return
     if path.suffix.lower() != ENDING:
         raise InputError(
             f"--video {path}: not a video format of evercal; help: end it with {ENDING}"
