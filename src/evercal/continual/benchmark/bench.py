@@ -145,8 +145,9 @@ def begin_bench(
     """
     if len(scenes) < 2:
         raise InputError(f"{len(scenes)} scene: give two or more to measure forgetting")
+    settings = _settings(scenes, options)  # bad options leave no folder behind
     with results.locked(out):
-        lock_settings(out / results.SETTINGS, _settings(scenes, options))
+        lock_settings(out / results.SETTINGS, settings)
         _record_strategies(out, options.strategies)
     stored = results.read(out)
     runs = [(seed, strategy) for seed in options.seeds for strategy in options.strategies]
