@@ -21,6 +21,8 @@ from evercal.reports.page import Picture, Table
 from .test_calibration_page import CAMERA, GREY, full, read, solved
 from .test_page import PNG, page
 
+pytestmark = pytest.mark.slow
+
 CONTRAST = """() => {
   const levels = c => c.match(/[\\d.]+/g).map(Number);
   const light = ([r, g, b]) => [r, g, b].map(v => v / 255).map(
