@@ -54,7 +54,7 @@ def test_paths_keep_train_and_test_apart(furnished_room: Room) -> None:
 def test_bumps_have_their_documented_size(furnished_room: Room) -> None:
     for seed, metres, degrees in ((0, 0.005, 0.0), (1, 0.0, 0.5)):
         before, after, bump = fixed_shots(furnished_room, 25, seed)
-        assert len(before) == len(after) == 31
+        assert len(before) == len(after) == 25
         distance, angle = pose_distance(before[0].base_from_camera, after[-1].base_from_camera)
         assert distance == pytest.approx(metres, abs=1e-9)
         assert np.rad2deg(angle) == pytest.approx(degrees, abs=1e-6)
