@@ -101,15 +101,16 @@ def run_bench(
     """
     total = len(options.seeds) * len(options.strategies) * len(scenes)
     missing = begin_bench(scenes, options, out)
-    stored = {(r.strategy, r.seed, r.stage, r.scene) for r in results.read(out)}
     done = total - len(missing) * len(scenes)
     features = options.features or out / "features"
     for seed, strategy in missing:
         ordered = in_order(scenes, options.order, seed)
         how = RunOptions(options.stage(seed), options.short_side, features, out, options.device)
         with _claimed(out, strategy, seed) as free:
-            if not free or _complete((seed, strategy), results.read(out), len(scenes)):
+            lines = results.read(out)  # another process may have added some
+            if not free or _complete((seed, strategy), lines, len(scenes)):
                 continue
+            stored = {(r.strategy, r.seed, r.stage, r.scene) for r in lines}
             for stage, these in run_strategy(strategy, ordered, how, on_event):
                 # An interrupted call may have stored some of the lines of a stage.
                 new = [r for r in these if (r.strategy, seed, stage, r.scene) not in stored]

@@ -310,7 +310,7 @@ def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
         Mean and 95 % interval over runs of frames and seeds (`mean_interval`). None without a
         common seed, or if a scene has a single test frame.
     """
-    pairs = [(a, b) for a in ours for b in theirs if a.seed == b.seed]
+    pairs = _on_common_seeds(ours, theirs)
     if not pairs:
         return None
     names = sorted(pairs[0][0].scenes)
@@ -325,6 +325,10 @@ def difference(ours: Sequence[Run], theirs: Sequence[Run]) -> Interval | None:
     return Interval(interval.mean, max(interval.low, -1.0), min(interval.high, 1.0))
 
 
+def _on_common_seeds(ours: Sequence[Run], theirs: Sequence[Run]) -> list[tuple[Run, Run]]:
+    return [(a, b) for a in ours for b in theirs if a.seed == b.seed]
+
+
 def contrast_rows(runs: Sequence[Run], pairs: Sequence[tuple[str, str]]) -> TableRows:
     """Tabulate differences of final accuracy that were named before the runs, on common seeds.
 
@@ -333,11 +337,9 @@ def contrast_rows(runs: Sequence[Run], pairs: Sequence[tuple[str, str]]) -> Tabl
     grouped = by_strategy(runs)
     rows = [["contrast, points", "runs", "mean", "low", "high"]]
     for ours, theirs in pairs:
-        of_seed = {run.seed: run for run in grouped.get(theirs, [])}
         gains = [
-            run.scores().final_accuracy - of_seed[run.seed].scores().final_accuracy
-            for run in grouped.get(ours, [])
-            if run.seed in of_seed
+            a.scores().final_accuracy - b.scores().final_accuracy
+            for a, b in _on_common_seeds(grouped.get(ours, []), grouped.get(theirs, []))
         ]
         cells = ["-"] * 3
         if len(gains) > 1:

@@ -27,7 +27,7 @@ from evercal.continual.plugin import load_plugin
 from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
 from evercal.recordings import Recording
-from evercal.storage import write_bytes, write_json
+from evercal.storage import write_bytes
 
 TRIES = 4
 """Attempts before a run is given up."""
@@ -222,8 +222,7 @@ def _one_run(scenes: list[Recording], job: Job) -> Outcome:
 
 def _store(out: Path, outcome: Outcome) -> None:
     results.append(out, outcome.results)
-    known = results.read_environments(out)
-    write_json(out / results.ENVIRONMENTS, known | (outcome.environments or {}))
+    results.add_environments(out, outcome.environments or {})
     (out / VIEWS).mkdir(exist_ok=True)
     for name, data in (outcome.views or {}).items():
         if not (out / VIEWS / name).exists():

@@ -6,7 +6,7 @@ Accuracy matrices, forgetting, tables and intervals are derived from these lines
 import json
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 
@@ -149,11 +149,17 @@ def record_environment(folder: Path) -> str:
     """Add the record of this process to environments.json and return its key."""
     record = environment()
     key = environment_key(record)
-    with locked(folder):
-        records = read_environments(folder)
-        if records.get(key) != record:
-            write_json(folder / ENVIRONMENTS, records | {key: record})
+    add_environments(folder, {key: record})
     return key
+
+
+def add_environments(folder: Path, records: Mapping[str, dict[str, str]]) -> None:
+    """Add records by key to environments.json, unless it has all of them."""
+    with locked(folder):
+        before = read_environments(folder)
+        after = before | dict(records)
+        if after != before:
+            write_json(folder / ENVIRONMENTS, after)
 
 
 def read_environments(folder: Path) -> dict[str, dict[str, str]]:

@@ -71,17 +71,18 @@ def surface_points(
     tensors = {name: value.cpu() for name, value in buffer.tensors.items()}
     view, points = tensors["view"].long().numpy(), np.full((len(buffer), 3), np.nan)
     atlas_from_base = buffer.atlas_from_base
+    first = np.searchsorted(view, np.arange(buffer.views + 1))  # rows are ordered by view
     for number, four in enumerate(tensors["intrinsics"].numpy()):
         frame, depth = frames[number % len(frames)], depths[number % len(frames)]
         assert frame.base_from_camera is not None, "training frames are posed"
-        where = np.flatnonzero(view == number)
+        where = slice(first[number], first[number + 1])
         pixels = tensors["pixels"][where].double().numpy()
-        ray = np.concatenate([(pixels - four[2:]) / four[:2], np.ones((len(where), 1))], 1)
+        ray = np.concatenate([(pixels - four[2:]) / four[:2], np.ones((len(pixels), 1))], 1)
         camera = frame.camera.short_side_resized(stride * min(depth.shape))
         cell = ((camera.project(ray) - (stride - 1) / 2) / stride).round()
         column, row = np.nan_to_num(cell, nan=-1).astype(int).T
         inside = (row >= 0) & (column >= 0) & (row < depth.shape[0]) & (column < depth.shape[1])
-        known = np.full(len(where), np.nan)
+        known = np.full(len(pixels), np.nan)
         known[inside] = depth[row[inside], column[inside]]
         pose: SE3 = atlas_from_base @ frame.base_from_camera
         points[where] = pose.apply(ray * known[:, None])

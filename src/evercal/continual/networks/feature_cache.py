@@ -1,4 +1,4 @@
-"""A cache on disk of encoded views and depths, for many runs over the same frames."""
+"""A cache of encoded images on disk, for runs that encode the same views repeatedly."""
 
 import contextlib
 import hashlib

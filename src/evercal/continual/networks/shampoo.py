@@ -47,7 +47,8 @@ class OneSidedShampoo(torch.optim.Optimizer):
         """Return the (n, w, w) steps at rate 1."""
         if not state:
             state["momentum"] = torch.zeros_like(gradients)
-            state["step"] = torch.zeros((), device=gradients.device)
+            # On the CPU, so that no step waits for a GPU.
+            state["step"] = torch.zeros((), device="cpu")
         state["momentum"].lerp_(gradients, 1 - MOMENTUM)
         direction = gradients.lerp(state["momentum"], MOMENTUM)
         moment = direction.mT @ direction
