@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.features.encoder import Encoder
-from evercal.mapping.plane_sweep import inverse_depths, select_source_views
+from evercal.features.vlad import vlad_for
 from evercal.mapping.pose_check import depth_scale, matched_pairs
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
 from evercal.recordings.frame import Frame
@@ -42,30 +42,17 @@ def frame_depths(
         For each frame, (rows, columns) depths along the optical axis in metres; NaN where frames
         disagree.
     """
-    from evercal.features.vlad import vlad_for
-
     prepared = PreparedFrames(frames, encoder, WorkingSize(short_side, short_side))
     features = [prepared.features(i) for i in range(len(prepared))]
-    scale = depth_scale(prepared, matched_pairs(prepared, vlad_for(encoder, features)))
+    pairs = matched_pairs(prepared, vlad_for(encoder, features))
+    prepared.depth_scale = depth_scale(prepared, pairs)
     swept, sources = [], []
     for i in range(len(prepared)):
-        depth, near = _swept(prepared, i, scale)
-        swept.append(depth)
+        inverse, near = prepared.swept(i, SOURCE_VIEWS)
+        swept.append(1 / inverse.double().numpy())
         sources.append(near)
         on_progress(i + 1, len(prepared))
     return [_agreed(prepared, i, swept, sources[i]) for i in range(len(prepared))]
-
-
-def _swept(prepared: PreparedFrames, i: int, scale: float) -> tuple[Array, list[int]]:
-    """Depths (cells,) of a frame, and the frames that they were swept over."""
-    from evercal.mapping.plane_sweep import USUAL_M
-
-    view, poses = prepared.posed_cells(i), prepared.poses
-    cameras = [prepared.cell_camera(j) for j in range(len(prepared))]
-    depth = np.full(len(view.features), scale * USUAL_M)
-    near = select_source_views(depth, view, poses, cameras, SOURCE_VIEWS)
-    others = [prepared.posed_cells(j) for j in near]
-    return 1 / inverse_depths(view, others, depth, scale).double().numpy(), near
 
 
 def _agreed(prepared: PreparedFrames, i: int, swept: list[Array], near: list[int]) -> Array:

@@ -14,7 +14,12 @@ from evercal.features.encoder import Encoder
 from evercal.features.views import View, ViewOptions, plain_view, working_image
 from evercal.geometry import SE3, Camera
 from evercal.mapping.patches import image_pyramid
-from evercal.mapping.plane_sweep import PosedCells
+from evercal.mapping.plane_sweep import (
+    USUAL_M,
+    PosedCells,
+    inverse_depths,
+    select_source_views,
+)
 from evercal.recordings.frame import Frame, stated_poses
 
 PYRAMID_LEVELS = 3
@@ -96,6 +101,22 @@ class PreparedFrames:
         """The encoded cells of a frame with its pose and camera."""
         camera, stride = self.cell_camera(i), self.encoder.stride
         return PosedCells(self.features(i), camera, self.poses[i], stride)
+
+    def swept(self, i: int, source_views: int) -> tuple[Tensor, list[int]]:
+        """Inverse depths (cells,) of a frame by a plane sweep, and the frames it was swept over.
+
+        At most `source_views` frames are used, selected at the usual depth of the recording.
+        """
+        view = self.posed_cells(i)
+        guess = np.full(len(view.features), self.depth_scale * USUAL_M)
+        near = self.source_views(guess, view, source_views)
+        others = [self.posed_cells(j) for j in near]
+        return inverse_depths(view, others, guess, self.depth_scale), near
+
+    def source_views(self, depth_m: NDArray[np.float64], view: PosedCells, count: int) -> list[int]:
+        """Frames that show the surfaces of a view, see `plane_sweep.select_source_views`."""
+        cameras = [self.cell_camera(j) for j in range(len(self))]
+        return select_source_views(depth_m, view, self.poses, cameras, count)
 
     def pyramid(self, i: int) -> list[np.ndarray]:
         """Image pyramid of a frame."""

@@ -13,9 +13,6 @@ from evercal.mapping.patches import Patches, align_down, cut_patches, to_level, 
 from evercal.mapping.plane_sweep import (
     FAR_M,
     NEAR_M,
-    USUAL_M,
-    inverse_depths,
-    select_source_views,
 )
 from evercal.mapping.prepared_frames import PYRAMID_LEVELS, PreparedFrames
 
@@ -97,15 +94,10 @@ class Observations(NamedTuple):
 
 def open_keyframe(recording: PreparedFrames, frame: int) -> KeyframeTracks:
     """Landmarks of a keyframe, with depths from a plane sweep over other frames."""
-    view, poses = recording.posed_cells(frame), recording.poses
-    cameras = [recording.cell_camera(i) for i in range(len(recording))]
-    scale = recording.depth_scale
-    guess = np.full(len(view.features), scale * USUAL_M)
-    near = select_source_views(guess, view, poses, cameras, SOURCE_VIEWS)
-    others = [recording.posed_cells(i) for i in near]
-    swept = inverse_depths(view, others, guess, scale)
+    view = recording.posed_cells(frame)
+    swept, _ = recording.swept(frame, SOURCE_VIEWS)
     inverse = swept.double().numpy()
-    near = select_source_views(1 / inverse, view, poses, cameras, SOURCE_VIEWS)
+    near = recording.source_views(1 / inverse, view, SOURCE_VIEWS)
     cell_px = recording.cell_px(frame)
     pixels, cells = detect(recording.grey[frame], view.grid, cell_px)
     has_ray = np.isfinite(recording.cameras[frame].unproject(pixels)).all(1)

@@ -17,6 +17,7 @@ from evercal.reports.answers import Answer
 from evercal.reports.charts import COLOURS, plain
 from evercal.reports.pictures import draw_residuals, landmark_errors, scene_camera
 from evercal.reports.scene.frusta import Ellipsoid, Frustum, readable_scale
+from evercal.reports.scene.map_parts import resized
 from evercal.reports.scene.side_views import (
     ABOVE,
     Surroundings,
@@ -164,11 +165,8 @@ class Animation:
         )
 
     def _draw_image(self, answer: Answer) -> None:
-        import cv2
-
         image, estimate = self._read(answer.path), answer.estimate
-        height = max(1, round(image.shape[0] * _WIDTH_PX / image.shape[1]))
-        large = np.asarray(cv2.resize(image, (_WIDTH_PX, height)), np.uint8)
+        large = resized(image, _WIDTH_PX)
         words = "no pose"
         errors = None
         if _accepted(answer) is not None:

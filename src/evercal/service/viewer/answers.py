@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg
 from evercal.localization.estimate import PoseEstimate
@@ -39,6 +39,12 @@ _OF_STATUS: dict[str, State] = {
 _PICTURE_PX = 640
 _BAR_PX = 8
 """Width of the coloured border around a picture."""
+
+
+def shares_of_light(colours: ArrayLike) -> NDArray[np.float64]:
+    """Shares of light, 0 to 1, of sRGB values from 0 to 255 (IEC 61966-2-1)."""
+    shares = np.asarray(colours, np.float64) / 255
+    return np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from evercal.reports.scene.frusta import Frustum
 from evercal.reports.scene.map_parts import THUMBNAIL_PX
+from evercal.service.viewer.answers import shares_of_light
 from evercal.service.viewer.glb import images_glb
 
 Array = NDArray[np.floating]
@@ -90,9 +91,7 @@ class CameraSet:
 
 def linear(colours: NDArray[np.integer]) -> NDArray[np.uint8]:
     """Colours as viser's lines expect them: it encodes them as sRGB once more."""
-    shares = np.asarray(colours, np.float64) / 255
-    low, high = shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4
-    return np.round(255 * np.where(shares <= 0.04045, low, high)).astype(np.uint8)
+    return np.round(255 * shares_of_light(colours)).astype(np.uint8)
 
 
 def first_hit(points_m: Array, origin_m: Array, direction: Array) -> tuple[float, int] | None:

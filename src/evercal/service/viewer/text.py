@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.reports.scene.map_parts import resized
-from evercal.service.viewer.answers import AnswerView
+from evercal.service.viewer.answers import AnswerView, shares_of_light
 
 Rows = Sequence[tuple[str, str]]
 PICTURE_PX = 640
@@ -33,11 +33,7 @@ def chip(text: str, colour: tuple[int, int, int]) -> str:
 
 def _legible_on(colour: tuple[int, int, int]) -> str:
     """Black or white, whichever has more contrast (relative luminance of WCAG 2.2)."""
-    red, green, blue = (
-        c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4
-        for c in (channel / 255 for channel in colour)
-    )
-    luminance = 0.2126 * red + 0.7152 * green + 0.0722 * blue
+    luminance = float(shares_of_light(colour) @ [0.2126, 0.7152, 0.0722])
     return "black" if (luminance + 0.05) ** 2 > 1.05 * 0.05 else "white"
 
 
