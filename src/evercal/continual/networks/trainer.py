@@ -33,7 +33,7 @@ class FitOptions:
     """Replayed rows in a step, the same number from every remembered scene."""
     peak_rate: float = 4e-3
     """Peak of AdamW's one-cycle learning rate (cosine up and down)."""
-    matrix_rate: float = 0.04
+    matrix_rate: float = 0.02
     """Peak learning rate of the hidden matrices, trained by one-sided Shampoo. With 0, AdamW trains
     them too."""
     warm_share: float = 0.05
