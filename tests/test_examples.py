@@ -41,13 +41,14 @@ def test_python_of_the_readme_runs(tmp_path: Path) -> None:
 def test_commands_of_the_readme_run_on_the_packaged_cell(tmp_path: Path) -> None:
     section = README.split("## Command line")[1].split("##")[0]
     commands = [line.strip() for line in section.splitlines() if line.startswith("    evercal ")]
-    assert len(commands) == 6
+    assert len(commands) == 7
     for command in commands:
         words = shlex.split(command, comments=True)[1:]
         moved = words[0] == "check"
         run(["-m", "evercal", *words], tmp_path, code=1 if moved else 0)
     assert (tmp_path / "wrist.json").is_file()
     assert (tmp_path / "report.html").is_file()
+    assert (tmp_path / "located.mp4").is_file()
 
 
 def test_first_example_locates_the_camera(tmp_path: Path) -> None:

@@ -75,13 +75,26 @@ def test_best_trial_and_rows_derived_from_it_are_written(
     outcomes = json.loads(file.with_suffix(".outcomes.json").read_text())
     assert outcomes["settings"]["suite"] == "arcs"
     trials = [(row["method"], row["setting"], row["value"]) for row in outcomes["rows"]]
-    assert trials == [("er", "weight", value) for value in (0.1, 0.3, 1.0, 3.0)]
+    values = [value for _, _, value in trials]
+    assert {(method, setting) for method, setting, _ in trials} == {("er", "weight")}
+    assert values == sorted(values)
+    assert set(values) >= {0.1, 0.3, 1.0, 3.0, 10.0}
+    assert len(values) in (5, 7)
     best = max(outcomes["rows"], key=lambda row: row["auc_20cm"])["value"]
     assert json.loads(file.read_text()) == [
         {"name": "er", "of": "er", "with": {"weight": best}},
         {"name": "sars_reprojection", "of": "er", "with": {"weight": best, "selector": "sars"}},
     ]
     assert [strategy.name for strategy in load_rows(str(file))] == ["er", "sars_reprojection"]
+
+
+def test_a_best_trial_at_the_end_of_a_range_has_more_beyond_it() -> None:
+    weights = [{"weight": w} for w in (0.1, 0.3, 1.0)]
+    assert tuning.beyond(weights, 1) == []
+    assert tuning.beyond(weights, 0) == [{"weight": 0.033}, {"weight": 0.011}]
+    scales = [{"penalty": {"scale": s}} for s in (1.0, 3.0)]
+    assert tuning.beyond(scales, 1) == [{"penalty": {"scale": 9.0}}, {"penalty": {"scale": 27.0}}]
+    assert tuning.beyond([{"kept_share": k} for k in (0.9, 0.97)], 1) == []
 
 
 def test_unusable_arguments_are_refused(options: BenchOptions, tmp_path: Path) -> None:

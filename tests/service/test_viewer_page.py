@@ -164,6 +164,7 @@ def test_a_browser_shows_the_map(
         assert elsewhere == [], "the page needs nothing from the internet"
 
 
+@pytest.mark.slow
 def test_a_stream_is_tracked_while_a_browser_looks(
     localizer: Localizer, hall: Recording, browser: Any, tmp_path: Path
 ) -> None:
@@ -178,6 +179,7 @@ def test_a_stream_is_tracked_while_a_browser_looks(
         seen_until(visit, "lost")
 
 
+@pytest.mark.slow
 def test_play_goes_on_until_it_is_unchecked(
     localizer: Localizer, hall: Recording, files: Path, browser: Any
 ) -> None:
@@ -199,6 +201,7 @@ def test_play_goes_on_until_it_is_unchecked(
         assert errors == []
 
 
+@pytest.mark.slow
 def test_a_paused_camera_goes_on_with_what_it_sees_now(
     localizer: Localizer, hall: Recording, browser: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -232,6 +235,7 @@ def test_a_paused_camera_goes_on_with_what_it_sees_now(
         assert errors == []
 
 
+@pytest.mark.slow
 def test_a_clicked_keyframe_is_looked_through_until_back(
     localizer: Localizer, browser: Any
 ) -> None:
