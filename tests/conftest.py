@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 os.environ["OMP_NUM_THREADS"] = "1"
+# The same arithmetic on every machine, so that a bound holds on all of them.
+os.environ |= {"EVERCAL_PRECISION": "float32", "OPENBLAS_CORETYPE": "Haswell"}
 
 from benchmarks.browser import CHROMIUM, chromium
 

@@ -221,3 +221,11 @@ def test_no_pixels_give_no_patches() -> None:
     empty = cut_patches(np.zeros((40, 40), np.float32), np.zeros((0, 2)))
     assert len(empty.intensity) == 0
     assert Patches.joined([empty, empty]).intensity.shape == empty.intensity.shape
+
+
+def test_a_flat_patch_beside_a_corner_has_a_hessian() -> None:
+    """The slopes of its first pixel are parallel and 10^5 times as large as the damping."""
+    flat = np.zeros((40, 40), np.float32)
+    flat[14, 15] = flat[15, 14] = 200
+    patches = cut_patches(flat, np.array([[20.0, 20.0]]))
+    assert np.isfinite(patches.inverse_hessian).all()

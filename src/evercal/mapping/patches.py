@@ -89,8 +89,9 @@ def cut_patches(image: Array, pixels: Array) -> Patches:
     deviation = np.sqrt((patch * patch).mean(1, keepdims=True)) + _FLAT
     gradient = np.stack([slope_u.reshape(patch.shape), slope_v.reshape(patch.shape)], -1)
     gradient /= deviation[..., None]
-    hessian = gradient.transpose(0, 2, 1) @ gradient + _DAMPING * np.eye(2, dtype=np.float32)
-    inverse = np.linalg.inv(hessian)
+    hessian = gradient.transpose(0, 2, 1) @ gradient
+    # Beside a flat patch the slopes are so large that the damping needs double precision.
+    inverse = np.linalg.inv(hessian + _DAMPING * np.eye(2)).astype(np.float32)
     descent = np.ascontiguousarray((gradient @ inverse).transpose(0, 2, 1))
     intensity = patch / deviation
     return Patches(intensity, descent, inverse, np.einsum("nkp,np->nk", descent, intensity))
