@@ -159,8 +159,8 @@ def _as_before(mode: Any, *_: object) -> None:
 
 def register() -> torch.device:
     """Register the device, once a process, and return it."""
-    torch.inference_mode.__enter__ = _without_gradients
-    torch.inference_mode.__exit__ = _as_before
+    setattr(torch.inference_mode, "__enter__", _without_gradients)  # noqa: B010
+    setattr(torch.inference_mode, "__exit__", _as_before)  # noqa: B010
     backend_registration._setup_privateuseone_for_python_backend(NAME, _Module())
     _library.fallback(_run, "PrivateUse1")
     torch.Generator = _Generator

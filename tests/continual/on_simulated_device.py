@@ -6,7 +6,7 @@ Run by `test_simulated_device.py` in a process of its own.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import pytest
@@ -45,7 +45,7 @@ def gpu() -> torch.device:
     return register()
 
 
-def same(there: dict[str, torch.Tensor], here: dict[str, torch.Tensor]) -> None:
+def same(there: Mapping[str, torch.Tensor], here: Mapping[str, torch.Tensor]) -> None:
     """Assert that the numbers on the device are those on the CPU, bit for bit."""
     assert there.keys() == here.keys()
     for name, value in here.items():

@@ -97,7 +97,7 @@ class Bench:
             load_plugin(self.plugin)
         # Workers of a cluster have GPUs of their own.
         device = self.device if self.ray else str(join_processes(self.device))
-        out = self.out if rank() == 0 else _mirror(self.out)
+        out = _own_folder(self.out)
         wait_for_all()
         options = BenchOptions(
             self._stage,
@@ -197,17 +197,32 @@ def _progress(step: "Step") -> str:
     return f"[{step.done}/{step.total}] {text} % within 5 cm, 5 deg{seconds}"
 
 
-def _mirror(out: Path) -> Path:
-    """Create the folder of a process that trains along with the first; its results are not used.
+def _own_folder(out: Path) -> Path:
+    """Return the folder in which this process works.
 
-    It starts with a copy of what is complete, so that all processes run the same.
+    The first process works in `out`. A process that trains along has a folder whose results are not
+    used. It starts with a copy of what is complete, so that all processes run the same.
+
+    Raises:
+        InputError: The process does not see the files of the first one.
     """
     import atexit
     import shutil
+    import socket
     import tempfile
 
     from evercal.continual.benchmark.results import RESULTS, SETTINGS
+    from evercal.continual.networks.distributed import of_first, rank
 
+    files = [out / SETTINGS, out / RESULTS, *(out / "runs").rglob("*")]
+    seen = sorted(str(file.relative_to(out)) for file in files if file.is_file())
+    if of_first(seen) != seen:
+        raise InputError(
+            f"{out}: process {rank()} on {socket.gethostname()} sees other files than the first"
+            " process; give --out on a file system that all machines share"
+        )
+    if rank() == 0:
+        return out
     folder = Path(tempfile.mkdtemp(prefix="evercal-bench-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     for name in (SETTINGS, RESULTS):

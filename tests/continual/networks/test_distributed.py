@@ -5,6 +5,7 @@ They start with the weights of the first, and encode each view once between them
 
 import os
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from torch import Tensor, distributed
 from torch.multiprocessing import spawn  # pyright: ignore[reportPrivateImportUsage]
 
+from evercal.cli.bench import _own_folder
 from evercal.continual.networks import buffer as buffer_module
 from evercal.continual.networks.buffer import (
     EncodePlan,
@@ -28,6 +30,7 @@ from evercal.continual.networks.distributed import (
     broadcast,
     gather,
     join_processes,
+    of_first,
     processes,
     rank,
     shared_out,
@@ -124,9 +127,32 @@ def _worker(number: int, folder: str) -> None:
     assert (processes(), rank()) == (2, number)
     context = {f"gradients {rule}": gradients(rule) for rule in RULES}
     context |= {f"encoded {stop}": encoded(stop) for stop in STOPS}
-    torch.save(context | {"exchanged": exchanged()}, f"{folder}/{number}.pt")
+    context |= {"exchanged": exchanged(), "folder": seen_folders(Path(folder), number)}
+    torch.save(context, f"{folder}/{number}.pt")
     wait_for_all()
     distributed.destroy_process_group()
+
+
+def seen_folders(folder: Path, number: int) -> dict[str, Tensor]:
+    """Whether a process works in the folder of a benchmark, and refuses one that it cannot see."""
+    shared, own = folder / "shared", folder / f"node-{number}"
+    if number == 0:
+        for out in (shared, own):
+            (out / "runs" / "er-0").mkdir(parents=True)
+            (out / "runs" / "er-0" / "manifest.json").write_text("{}")
+    wait_for_all()
+    mine = _own_folder(shared)
+    try:
+        refused = _own_folder(own) != own
+    except InputError as error:
+        refused = "sees other files" in str(error)
+    found = {
+        "in shared": mine == shared,
+        "complete": (mine / "runs" / "er-0" / "manifest.json").is_file(),
+        "refused": refused,
+        "first": of_first(number == 0),
+    }
+    return {name: torch.tensor(value) for name, value in found.items()}
 
 
 @pytest.fixture(scope="module")
@@ -194,6 +220,15 @@ def test_tensors_are_averaged_broadcast_and_gathered_exactly(by_two: Made) -> No
             assert torch.equal(actual[f"{number}.a"], expected)
             assert actual[f"{number}.b"].tolist() == [number == 1]
         assert torch.equal(actual["last"], torch.ones(4, 2).half())
+
+
+def test_processes_run_what_the_first_runs(by_two: Made) -> None:
+    for number, context in enumerate(by_two):
+        folder = context["folder"]
+        assert bool(folder["in shared"]) == (number == 0), "a copy keeps results apart"
+        assert folder["complete"]
+        assert bool(folder["refused"]) == (number == 1)
+        assert folder["first"]
 
 
 def frames_of(sizes: Sequence[tuple[int, int]]) -> list[Frame]:

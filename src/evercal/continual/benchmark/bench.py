@@ -31,6 +31,7 @@ from evercal.continual.benchmark.strategy_run import RunOptions, run_strategy
 from evercal.continual.learning.learn_scene import OnEvent
 from evercal.continual.learning.stage import StageOptions
 from evercal.continual.networks.descriptor import DESCRIPTOR_FILE
+from evercal.continual.networks.distributed import of_first
 from evercal.continual.strategies import Strategy
 from evercal.errors import InputError
 from evercal.features.encoder import ENCODER_FILE
@@ -101,6 +102,10 @@ def run_bench(
     """
     total = len(options.seeds) * len(options.strategies) * len(scenes)
     missing = begin_bench(scenes, options, out)
+    # Processes that train together run the same, whatever their own folders hold.
+    to_run = of_first([(seed, strategy.name) for seed, strategy in missing])
+    named = {strategy.name: strategy for strategy in options.strategies}
+    missing = [(seed, named[name]) for seed, name in to_run]
     done = total - len(missing) * len(scenes)
     features = options.features or out / "features"
     for seed, strategy in missing:
@@ -108,7 +113,7 @@ def run_bench(
         how = RunOptions(options.stage(seed), options.short_side, features, out, options.device)
         with _claimed(out, strategy, seed) as free:
             lines = results.read(out)  # another process may have added some
-            if not free or _complete((seed, strategy), lines, len(scenes)):
+            if not of_first(free and not _complete((seed, strategy), lines, len(scenes))):
                 continue
             stored = {(r.strategy, r.seed, r.stage, r.scene) for r in lines}
             for stage, these in run_strategy(strategy, ordered, how, on_event):

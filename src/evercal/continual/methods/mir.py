@@ -11,6 +11,7 @@ from torch import Tensor
 from evercal.continual.methods.method import StageStart
 from evercal.continual.methods.replay import Replay, ReplayHooks
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
+from evercal.continual.networks.distributed import broadcast
 from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.networks.loss import fixed_clamp_loss
@@ -55,6 +56,9 @@ class _MirHooks(ReplayHooks):
                 interfered_views(self._options, self._head, fresh, memory, rate, generator)
                 for memory in self.memories
             ]
+            broadcast(
+                self._views
+            )  # losses that are equal but for rounding may be ordered otherwise
         rows = []
         for memory, views in zip(self.memories, self._views, strict=True):
             view = memory.tensors["view"]

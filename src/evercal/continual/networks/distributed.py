@@ -20,6 +20,7 @@ from evercal.errors import InputError
 from evercal.features.device import device_of
 
 Work = TypeVar("Work")
+Value = TypeVar("Value")
 
 
 def processes() -> int:
@@ -119,6 +120,15 @@ def gather(part: Mapping[str, Tensor] | None) -> list[dict[str, Tensor]]:
     received: list[dict[str, Tensor] | None] = [None] * processes()
     distributed.all_gather_object(received, part)
     return [tensors for tensors in received if tensors is not None]
+
+
+def of_first(value: Value) -> Value:
+    """Return the first process's value in all of them."""
+    if processes() == 1:
+        return value
+    received: list[Value | None] = [None] * processes()
+    distributed.all_gather_object(received, value if rank() == 0 else None)
+    return received[0]  # pyright: ignore[reportReturnType]  # a list of one type
 
 
 def wait_for_all() -> None:
