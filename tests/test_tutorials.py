@@ -126,7 +126,6 @@ def test_notebooks_hold_all_that_their_pages_hold() -> None:
                 assert part.text.strip() in cell["source"]
 
 
-@pytest.mark.slow
 def test_a_wrist_camera_from_nothing(tmp_path: Path) -> None:
     printed = run_notebook("wrist-camera", tmp_path)
     shift = re.search(r"moved by ([\d.]+) mm", printed)
@@ -145,7 +144,6 @@ def test_a_fleet(tmp_path: Path) -> None:
     assert "kitchen [" in printed  # the answer of the client
 
 
-@pytest.mark.slow
 def test_from_a_phone_video_to_a_calibrated_camera(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     printed = run_notebook("phone-video", tmp_path)
