@@ -21,6 +21,7 @@ VERBS = {
     "many-keyframes": "localization among thousands of keyframes of other rooms",
     "peers": "SIFT and XFeat on the same frames",
     "tune": "the setting of every continual method, on held-out training frames",
+    "networks": "the experiments on networks: tuning, tables, figure; the paper's table on a GPU",
     "paper": "the first steps of preset paper",
     "trainer": "time of a training step",
     "speed": "time of localization and SARS",

@@ -163,13 +163,19 @@ def _ablation(sources: Sequence[Published], suite: str) -> str:
     return markdown(ablation_rows(_runs(sources), suite))
 
 
-def _memory(sources: Sequence[Published], _: str) -> str:
-    """Tabulate the same scenes with several shares of keyframes, means over runs."""
+def _memory(sources: Sequence[Published], names: str) -> str:
+    """Tabulate the same scenes with several shares of keyframes, means over runs.
+
+    The argument is a list of strategies; without it all are tabulated.
+    """
+    wanted = names.split(",") if names else []
     bounds = {"5 cm/5 deg": COARSE, "1 cm/1 deg": FINE, "5 mm/0.5 deg": FINEST}
     rows = [["keyframes", "strategy", *bounds, "median mm", "wrong scene", "MB"]]
     for source in sources:
         label = f"{100 * float(str(source.settings['memory_share'])):.0f} %"
         for name, runs in by_strategy(_runs([source])).items():
+            if wanted and name not in wanted:
+                continue
             ends = [result for run in runs for result in run.last]
             shares = [np.mean([r.scores(b).final_accuracy for r in runs]) for b in bounds.values()]
             median = 1000 * float(np.median(np.concatenate([run.errors_m() for run in runs])))

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from tabulate import tabulate
@@ -11,6 +12,7 @@ from evercal.continual.networks.descriptor import load_descriptor
 from evercal.continual.networks.head import Head, HeadOptions
 from evercal.continual.networks.shampoo import EVERY, inverse_root
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer
+from evercal.features.device import device_of
 from evercal.features.encoder import load_encoder
 from evercal.features.precision import fast_bfloat16
 from evercal.geometry import SE3
@@ -28,7 +30,8 @@ def run(widths: tuple[int, ...] = (256, 384), batch: int = 2048, repeat: int = 3
     """
     rows = []
     for width in widths:
-        trainer = _trainer(width, batch)
+        fit = FitOptions(iterations=10_000, batch=batch)
+        trainer = _trainer(HeadOptions(width=width), fit, torch.device("cpu"))
         step = _milliseconds(trainer._train_step, repeat)
         forward_backward, optimiser = _products(trainer.head, batch, repeat)
         share = 100 * (forward_backward + optimiser) / step
@@ -39,10 +42,21 @@ def run(widths: tuple[int, ...] = (256, 384), batch: int = 2048, repeat: int = 3
     print(tabulate(rows, heads, floatfmt=".1f"))
 
 
-def _trainer(width: int, batch: int) -> HeadTrainer:
+def step_seconds(head: HeadOptions, fit: FitOptions, repeat: int = 2, device: str = "cpu") -> float:
+    """Time a training step with random rows, the replayed ones included, in seconds."""
+    rows = fit.batch + fit.replay_batch
+    trainer = _trainer(head, replace(fit, batch=rows), device_of(device))
+    trainer._train_step()
+    began = time.perf_counter()
+    for _ in range(repeat):
+        float(trainer._train_step().costs.mean())
+    return (time.perf_counter() - began) / repeat
+
+
+def _trainer(options: HeadOptions, fit: FitOptions, device: torch.device) -> HeadTrainer:
     encoder, descriptor = load_encoder(), load_descriptor()
     generator = torch.Generator().manual_seed(0)
-    buffer = FeatureBuffer(0, SE3.identity())
+    buffer = FeatureBuffer(0, SE3.identity(), device=device)
     pose = torch.eye(4)[:3].clone()
     pose[2, 3] = 3.0
     descriptors = torch.randn(VIEWS, descriptor.width, generator=generator)
@@ -56,9 +70,9 @@ def _trainer(width: int, batch: int) -> HeadTrainer:
             "descriptors": torch.nn.functional.normalize(descriptors, dim=-1),
         }
     )
-    head = Head(encoder.width, descriptor.width, HeadOptions(width=width))
-    head.grow(torch.zeros(4, 3), 0)
-    return HeadTrainer(head, [buffer], FitOptions(iterations=10_000, batch=batch), 0)
+    head = Head(encoder.width, descriptor.width, options)
+    head.grow(torch.zeros(options.centres_per_scene, 3), 0)
+    return HeadTrainer(head.to(device), [buffer], fit, 0)
 
 
 def _products(head: Head, batch: int, repeat: int) -> tuple[float, float]:

@@ -62,6 +62,7 @@ def run(
     scenes: int = 3,
     seed: int = 100,
     methods: tuple[str, ...] = (),
+    rows: tuple[str, ...] = (),
     backbone: Literal["evercal", "paper"] = "evercal",
     preset: str = "converged",
     steps: int | None = None,
@@ -78,6 +79,7 @@ def run(
         scenes: Number of its scenes.
         seed: Seed of all trials; not one of the table.
         methods: Methods to tune. Defaults to all.
+        rows: Rows to write. Defaults to those of all tuned methods and their variants.
         backbone: Network to train: ours, or the paper's.
         preset: Preset of the training effort.
         steps: Optimiser steps of a stage. Defaults to those of the preset.
@@ -95,7 +97,7 @@ def run(
     settings: dict[str, object] = {"suite": suite, "judged": "held-out training frames"}
     options = BenchOptions(stage, (), (seed,), settings=settings)
     split = [tuning_split(scene) for scene in load_suite(suite, data)[:scenes]]
-    tune(split, options, methods, file, out / suite)
+    tune(split, options, methods, file, out / suite, rows)
 
 
 def tune(
@@ -104,6 +106,7 @@ def tune(
     methods: Sequence[str],
     file: Path,
     out: Path,
+    wanted: Sequence[str] = (),
 ) -> None:
     """Run the trials, and write the best row of every method.
 
@@ -113,6 +116,7 @@ def tune(
         methods: Keys of `TRIALS`. Defaults to all.
         file: File for the best rows; `.outcomes.json` beside it gets all trials.
         out: Folder for runs and results.
+        wanted: Rows to write. Defaults to those of all tuned methods and their variants.
 
     Raises:
         InputError: A method without trials.
@@ -136,6 +140,7 @@ def tune(
     for row in read_rows("table4"):
         if row["of"] in best and row["name"] not in best:
             chosen.append({**row, "with": {**best[row["of"]], **row["with"]}})
+    chosen = [row for row in chosen if not wanted or row["name"] in wanted]
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text("[\n" + ",\n".join(f"  {json.dumps(row)}" for row in chosen) + "\n]\n")
     outcomes = [

@@ -1,0 +1,162 @@
+"""The experiments of docs/experiments/protocol.md, from rendering to tables and figure.
+
+Every command resumes where it was interrupted. The same call in a second terminal shares the runs.
+"""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from benchmarks.trainer import step_seconds
+from evercal.continual.benchmark.rows import read_rows
+from evercal.continual.learning.presets import PAPER_SIM_STEPS, preset
+from evercal.errors import InputError
+from evercal.storage import write_json
+
+ROOT = Path(__file__).resolve().parent.parent
+ROWS = "results/tuned-converged.json"
+CONTROLS = "evercal,evercal_network,joint,isolation,finetune"
+SELECTED = ("er", "sars_reprojection", "reservoir_spdd", "sars_spdd")
+SELECTION = "networks-rows.json"
+"""File of the rows `SELECTED`, in the folder of runs."""
+SEEDS = "0,1,2,3,4"
+SHARES = (1, 3, 30)
+"""Memory, per cent of the frames; `a` has 10."""
+PAPER_STAGES = 15
+"""Stages of three rooms: joint training counts three, the first room is shared."""
+
+Command = Sequence[str]
+
+
+def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
+    """Return the commands of every experiment, in order."""
+
+    def rooms(suite: str) -> Command:
+        return "evercal", "simulate", suite, "--out", str(data / suite)
+
+    def bench(suite: str, name: str, *options: str) -> Command:
+        folders = ("--data", str(data / suite), "--out", str(out / name))
+        return "evercal", "bench", suite, *folders, *options
+
+    def publish(name: str) -> Command:
+        return "benchmarks", "publish", str(out / name), name
+
+    tuned = ("--preset", "converged", "--order", "shuffled")
+    methods = ("er", "icarl", "buff_cs", "sars_spdd", "gec")
+    rows = (*methods, "sars_reprojection", "reservoir_spdd")
+    return {
+        "tune": [
+            rooms("sim-tune"),
+            (
+                *("benchmarks", "tune", "sim-tune", "--data", str(data / "sim-tune")),
+                *("--methods", *methods, "--rows", *rows),
+                *("--file", ROWS, "--out", str(out / "tune")),
+            ),
+            (
+                *("benchmarks", "publish", ROWS.replace(".json", ".outcomes.json")),
+                "tuned-converged",
+            ),
+        ],
+        "a": [
+            rooms("sim-mini"),
+            bench(
+                *("sim-mini", "networks-a", *tuned, "--rows", ROWS),
+                *("--strategies", CONTROLS, "--seeds", SEEDS),
+            ),
+            publish("networks-a"),
+        ],
+        "memory": [
+            rooms("sim-mini"),
+            *(
+                command
+                for share in SHARES
+                for name in [f"networks-memory-{share}"]
+                for command in (
+                    bench(
+                        *("sim-mini", name, *tuned, "--rows", str(out / SELECTION)),
+                        *("--memory", f"{share}%", "--seeds", "0,1,2"),
+                    ),
+                    publish(name),
+                )
+            ),
+        ],
+        "c": [
+            rooms("sim-unseen"),
+            bench(
+                *("sim-unseen", "networks-c", *tuned, "--rows", str(out / SELECTION)),
+                *("--strategies", "joint,finetune", "--seeds", SEEDS),
+            ),
+            publish("networks-c"),
+        ],
+        "paper": [
+            rooms("sim"),
+            bench(
+                *("sim", "networks-paper", "--preset", "paper", "--steps", str(PAPER_SIM_STEPS)),
+                *("--strategies", "joint,finetune,icarl,buff_cs,gec,sars_spdd", "--seeds", "0"),
+            ),
+            publish("networks-paper"),
+        ],
+        "tables": [("benchmarks", "tables"), ("docs/_site/networks.py", "networks-a")],
+    }
+
+
+def run(
+    experiments: Positional[tuple[str, ...]],
+    data: Path = Path("runs"),
+    out: Path = Path("runs"),
+    dry: bool = False,
+    device: str = "auto",
+) -> int:
+    """Run experiments of docs/experiments/protocol.md; each resumes.
+
+    Args:
+        experiments: tune, a, memory, c, paper (needs a GPU) and tables, in this order.
+        data: Folder of the rendered rooms.
+        out: Folder of runs and results.
+        dry: Print the commands, and for `paper` the estimated hours, and run nothing.
+        device: Device of the networks: auto, cpu or cuda.
+    """
+    known = commands(data, out)
+    unknown = [name for name in experiments if name not in known]
+    if unknown or not experiments:
+        raise InputError(f"{' '.join(unknown) or 'no experiment'}: choose of {', '.join(known)}")
+    if "paper" in experiments:
+        print(f"paper: about {paper_hours(device):.0f} hours of training on this machine")
+    if not dry and (ROOT / ROWS).is_file():
+        rows = [row for row in read_rows(str(ROOT / ROWS)) if row["name"] in SELECTED]
+        write_json(out / SELECTION, rows)
+    # The same arithmetic on every processor.
+    environment = {"EVERCAL_PRECISION": "float32"} if "paper" not in experiments else {}
+    for command in (command for name in experiments for command in known[name]):
+        print(" ".join(command), flush=True)
+        if dry:
+            continue
+        began = time.perf_counter()
+        code = subprocess.run(
+            _words(command, device), cwd=ROOT, env={**os.environ, **environment}, check=False
+        ).returncode
+        print(f"{time.perf_counter() - began:.0f} s", flush=True)
+        if code:
+            return code
+    return 0
+
+
+def paper_hours(device: str) -> float:
+    """Estimate the hours of training of `paper`, from some steps with random rows."""
+    options = preset("paper")
+    seconds = step_seconds(options.head, options.fit, device=device)
+    return seconds * PAPER_SIM_STEPS * PAPER_STAGES / 3600
+
+
+def _words(command: Command, device: str) -> list[str]:
+    """Return the words of a process."""
+    first, *rest = command
+    if first.endswith(".py"):
+        return [sys.executable, *command]
+    chosen = ("--device", device) if rest[0] == "bench" else ()
+    return [sys.executable, "-m", first, *rest, *chosen]
