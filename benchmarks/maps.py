@@ -19,7 +19,8 @@ from evercal.errors import InputError
 from evercal.evaluation import evaluate
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.learning.scene import LearnReport
-from evercal.localization.localizer import LocalizeOptions, Localizer
+from evercal.localization.localizer import Localizer
+from evercal.localization.query import LocalizeOptions
 from evercal.map import Map
 from evercal.mapping.build import MapOptions
 from evercal.mapping.memory_budget import MemoryBudget

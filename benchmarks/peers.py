@@ -27,7 +27,7 @@ from benchmarks.peer_map import GlobalDescriber, PeerLocalizer, QueryOptions, bu
 from benchmarks.peer_triangulation import TriangulationOptions
 from evercal.errors import InputError
 from evercal.evaluation import evaluate
-from evercal.localization.localizer import SceneLocalizer
+from evercal.localization.learned import SceneLocalizer
 from evercal.map import Map
 from evercal.mapping.selection import SarsOptions, select_sars
 from evercal.recordings import (

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from evercal.geometry import Camera
     from evercal.localization.estimate import PoseEstimate
-    from evercal.localization.localizer import LearnedLocalizer
+    from evercal.localization.learned import LearnedLocalizer
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
-    from evercal.localization.localizer import LearnedLocalizer, Localizer
+    from evercal.localization.learned import LearnedLocalizer
+    from evercal.localization.localizer import Localizer
 
 MAP = "evercal"
 """The strategy of a map."""

@@ -12,16 +12,13 @@ from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.continual.store import NetworkStore
 from evercal.errors import InputError
 from evercal.features.device import device_of
+from evercal.features.encode import encode_image
 from evercal.features.precision import autocast
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.localizer import (
-    LearnedLocalizer,
-    Localizer,
-    cameras_in_scenes,
-    encode_image,
-    own_or_stated,
-)
+from evercal.localization.image_camera import cameras_in_scenes, own_or_stated
+from evercal.localization.learned import LearnedLocalizer
+from evercal.localization.localizer import Localizer
 from evercal.localization.matching import strided_patches
 from evercal.localization.parallel import in_parallel
 from evercal.localization.pnp import PnpOptions, PnpResult, solve_pnp
@@ -37,8 +34,8 @@ class NetworkLocalizeOptions:
     """Scenes that are tried per image, at most."""
     margin: float = 0.15
     """Scenes whose best prototype is less similar than the best scene's by more are not tried."""
-    pnp: PnpOptions = field(default_factory=PnpOptions)
-    """RANSAC settings."""
+    pnp: PnpOptions = field(default_factory=lambda: PnpOptions(threshold_px=8.0))
+    """RANSAC settings. Points of a network scatter more than landmarks, so the radius is wider."""
     patches_short_side: int = 480
     """Short side of the image in a query, pixels."""
 

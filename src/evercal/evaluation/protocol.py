@@ -9,7 +9,7 @@ from evercal.errors import InputError
 from evercal.evaluation.metrics import FrameResult
 from evercal.geometry import pose_distance
 from evercal.geometry.near import near_training
-from evercal.localization.localizer import SceneLocalizer
+from evercal.localization.learned import SceneLocalizer
 from evercal.recordings import Frame, Recording, posed_frames, stated_poses
 
 

@@ -9,17 +9,15 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
 from evercal.errors import InputError
 from evercal.features.device import device_of
-from evercal.features.encode import encode_features
-from evercal.features.encoder import Encoder
-from evercal.features.views import ViewOptions, plain_view
+from evercal.features.encode import encode_image
 from evercal.geometry import (
     SE3,
     Camera,
@@ -37,10 +35,9 @@ from evercal.localization.acceptance import (
 )
 from evercal.localization.alignment import align_pose
 from evercal.localization.estimate import PoseEstimate
+from evercal.localization.image_camera import cameras_in_scenes, own_or_stated, prior_of
 from evercal.localization.intrinsics import (
     FOCAL_FACTORS,
-    OWN,
-    STATED,
     UNKNOWN,
     IntrinsicsPrior,
     Prior,
@@ -59,7 +56,6 @@ from evercal.localization.query import (
     TimeBudget,
 )
 from evercal.localization.repetition import displaced, pattern_steps
-from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
 from evercal.recordings.images import as_rgb
@@ -67,69 +63,6 @@ from evercal.recordings.images import as_rgb
 _ALONG_FOCAL = np.eye(INTRINSICS)[0]
 _THOROUGH = 3.0
 """Usual duration of a thorough attempt, in quick ones."""
-
-
-class LearnedScene(Protocol):
-    """A scene of either kind of store."""
-
-    @property
-    def name(self) -> str:
-        """Name of the scene."""
-        ...
-
-    @property
-    def camera(self) -> Camera:
-        """Intrinsics that its recording states."""
-        ...
-
-    @property
-    def adjusted_camera(self) -> Camera:
-        """The same camera after learning."""
-        ...
-
-    @property
-    def frame(self) -> MapFrame:
-        """Relation of its scene points to the base frame."""
-        ...
-
-
-class LearnedContents(Protocol):
-    """The scenes of either kind of store."""
-
-    @property
-    def short_side(self) -> int:
-        """Shorter image side that the encoder works on, pixels."""
-        ...
-
-    @property
-    def scenes(self) -> Sequence[LearnedScene]:
-        """In order of learning."""
-        ...
-
-
-class SceneLocalizer(Protocol):
-    """What both kinds of store answer with: a map's `Localizer`, and that of networks."""
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        """Names of the scenes, in order of learning."""
-        ...
-
-    def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
-        """Estimate the camera pose of one image."""
-        ...
-
-    def camera_for(self, stated: Camera) -> Camera | None:
-        """The `camera` argument for an image with these stated intrinsics."""
-
-
-class LearnedLocalizer(SceneLocalizer, Protocol):
-    """A localizer whose scenes can be inspected."""
-
-    @property
-    def contents(self) -> LearnedContents:
-        """The scenes."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -565,57 +498,3 @@ class Localizer:
 def _rival_reason(mm: float, deg: float, unit_known: bool) -> str:
     away = f"{mm:.0f} mm and {deg:.1f} deg away" if unit_known else f"{deg:.1f} deg away"
     return f"another pose, {away}, explains it as well"
-
-
-def own_or_stated(stated: Camera, recorded: Sequence[Camera]) -> Camera | None:
-    """None for intrinsics that a scene's recording states, else the stated ones."""
-    return None if stated in recorded else stated
-
-
-def cameras_in_scenes(
-    camera: Camera | None, image: np.ndarray, scenes: Sequence[LearnedScene]
-) -> list[Camera]:
-    """Intrinsics of an image in each scene; a guess where none are given and no aspect ratio fits.
-
-    Raises:
-        InputError: A camera with another aspect ratio than the image's.
-    """
-    height, width = image.shape[:2]
-    if camera is not None:
-        if not camera.fits(width, height):
-            raise InputError(
-                f"camera {camera.width}x{camera.height} does not fit the image {width}x{height}:"
-                " give intrinsics of the same aspect ratio"
-            )
-        return [camera.resized(width, height)] * len(scenes)
-    return [_own(scene.adjusted_camera, width, height) for scene in scenes]
-
-
-def _own(recorded: Camera, width: int, height: int) -> Camera:
-    """The camera of a recording for an image of another size."""
-    if recorded.fits(width, height):
-        return recorded.resized(width, height)
-    scale = max(width, height) / max(recorded.width, recorded.height)
-    middle = (width - 1) / 2, (height - 1) / 2
-    return Camera(width, height, scale * recorded.fx, scale * recorded.fy, *middle)
-
-
-def prior_of(camera: Camera | None, image: np.ndarray, recorded: Camera) -> IntrinsicsPrior:
-    """Prior of the intrinsics of an image: stated, the recording's, or unknown."""
-    if camera is not None:
-        return STATED
-    height, width = image.shape[:2]
-    if (width, height) == (recorded.width, recorded.height):
-        return OWN
-    larger, smaller = max(width, recorded.width), min(width, recorded.width)
-    whole = larger % smaller == 0 and recorded.width * height == recorded.height * width
-    # An image of half the size is probably resized; other sizes may be cropped.
-    return STATED if whole else UNKNOWN
-
-
-def encode_image(image: np.ndarray, encoder: Encoder, short_side: int) -> Tensor:
-    """(channels, rows, columns) features of an image, on the encoder's device."""
-    height, width = image.shape[:2]
-    plain = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
-    view = plain_view(image, plain, encoder.stride, ViewOptions(short_side=short_side))
-    return encode_features([view], encoder)[0]

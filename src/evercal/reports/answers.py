@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from evercal.calibration.drift import Shift
     from evercal.geometry import UncertainPose
     from evercal.localization.estimate import PoseEstimate
-    from evercal.localization.localizer import LearnedLocalizer
+    from evercal.localization.learned import LearnedLocalizer
 
 
 @dataclass(frozen=True, eq=False)

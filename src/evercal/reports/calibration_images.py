@@ -26,7 +26,7 @@ from evercal.reports.pictures import draw_residuals, landmark_errors
 from evercal.reports.scene.side_views import Surroundings
 
 if TYPE_CHECKING:
-    from evercal.localization.localizer import LearnedLocalizer
+    from evercal.localization.learned import LearnedLocalizer
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]

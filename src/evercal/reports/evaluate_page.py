@@ -16,7 +16,7 @@ from evercal.reports.pictures import draw_estimate
 if TYPE_CHECKING:
     from evercal.evaluation import FrameResult
     from evercal.evaluation.metrics import Scores
-    from evercal.localization.localizer import LearnedLocalizer
+    from evercal.localization.learned import LearnedLocalizer
     from evercal.recordings import Recording
 
 _WORST = 12

@@ -15,7 +15,7 @@ MAX_RESIDUAL_PX = 2.0
 if TYPE_CHECKING:
     from evercal.geometry import SE3, Camera
     from evercal.localization.estimate import PoseEstimate
-    from evercal.localization.localizer import LearnedLocalizer, LearnedScene
+    from evercal.localization.learned import LearnedLocalizer, LearnedScene
 
 
 def scene_camera(localizer: "LearnedLocalizer", scene: str) -> "Camera":

@@ -13,7 +13,7 @@ from evercal.continual.benchmark.bench_views import view_pictures
 from evercal.continual.benchmark.scene_views import keep_views
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.localizer import LearnedLocalizer
+from evercal.localization.learned import LearnedLocalizer
 from evercal.recordings import Frame, Recording
 from evercal.reports.page import Picture
 from evercal.simulation import untextured

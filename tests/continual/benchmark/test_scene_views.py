@@ -13,7 +13,7 @@ import pytest
 from evercal.continual.benchmark.scene_views import keep_views, read_views
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.localizer import LearnedLocalizer
+from evercal.localization.learned import LearnedLocalizer
 from evercal.recordings import Frame, Recording
 
 CAMERA = Camera(32, 24, 30.0, 30.0, 15.5, 11.5)

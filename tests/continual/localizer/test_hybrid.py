@@ -19,7 +19,7 @@ from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.continual.strategies import STRATEGIES
 from evercal.features.encoder import load_encoder
 from evercal.geometry import SE3, pose_distance
-from evercal.localization.localizer import SceneLocalizer
+from evercal.localization.learned import SceneLocalizer
 from evercal.mapping.build import BuiltMap
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.recordings.frame import Frame, Recording, stated_poses

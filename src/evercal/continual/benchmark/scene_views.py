@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, pose_distance, resize_pixels
-from evercal.localization.localizer import LearnedLocalizer
+from evercal.localization.learned import LearnedLocalizer
 from evercal.recordings import Frame, Recording, posed_frames
 from evercal.storage import write_bytes
 

@@ -45,7 +45,8 @@ from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.continual.threshold import fit_threshold
 from evercal.evaluation.protocol import evaluate
 from evercal.features.device import device_of
-from evercal.localization.localizer import LearnedLocalizer, Localizer
+from evercal.localization.learned import LearnedLocalizer
+from evercal.localization.localizer import Localizer
 from evercal.localization.query import LocalizeOptions
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.selection import PoseSpace

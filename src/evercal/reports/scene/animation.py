@@ -31,7 +31,7 @@ from evercal.reports.scene.side_views import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evercal.localization.localizer import LearnedLocalizer
+    from evercal.localization.learned import LearnedLocalizer
 
 Image = NDArray[np.uint8]
 
