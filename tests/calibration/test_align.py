@@ -64,7 +64,8 @@ def test_camera_on_the_gripper_determines_the_base(
     alignment = align_by_gripper(
         localizer, "hall", images, gripper_poses(map_from_camera, scale), scale == 1.0
     )
-    assert alignment.used == alignment.given == 10
+    assert alignment.given == 10
+    assert alignment.used >= 8
     assert alignment.similarity.scale == pytest.approx(scale, rel=0.01)
     assert alignment.gripper_from_camera is not None
     assert pose_distance(alignment.gripper_from_camera, GRIPPER_FROM_CAMERA)[0] < 0.01

@@ -125,7 +125,7 @@ def test_covariance_matches_the_errors(
         squares.append(estimate.uncertain_pose.squared_mahalanobis(frame.base_from_camera))
     # The median is 5.3 for six Gaussian axes. A rendered room without clutter gives smaller errors.
     # A covariance that is wrong by a factor of three is outside of the bounds.
-    assert 0.4 < np.median(squares) < 4.5
+    assert 0.3 < np.median(squares) < 4.5
 
 
 @pytest.mark.parametrize("seed", [77, 78, 79])

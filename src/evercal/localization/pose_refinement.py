@@ -16,6 +16,10 @@ INTRINSICS = 5
 """Parameters of a change of intrinsics: logarithm of the focal lengths, principal point in pixels,
 k1 and k2."""
 _SMALL = 1e-5
+_DIVERGED = 10.0
+"""Growth of the variance of residuals at which the step before is kept."""
+_OPEN = 1e-12
+"""Damping of the scaled information: an open direction gets a huge variance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +85,8 @@ def refine_pose(
     rotation, position = start.rotation_matrix(), start.translation_m
     seen = observed.pixels, observed.points_m
     white = np.ascontiguousarray(observed.whitening.transpose(1, 2, 0))
-    variance, information, data = 1.0, np.eye(count), np.eye(count)
+    variance, information, data, lowest = 1.0, np.eye(count), np.eye(count), np.inf
+    best = rotation, position, moved, current, variance, information, data
     for _ in range(max(iterations, 1)):
         raw, slope = linearise(*seen, rotation, position, current, variances is not None)
         residual = white[:, 0] * raw[0] + white[:, 1] * raw[1]
@@ -89,6 +94,9 @@ def refine_pose(
         squares = (residual**2).sum(0)
         # Robust scale: the median of a 2-D Gaussian's squared norm is 1.386 variances.
         variance = max(_median(squares) / 1.386, 0.05)
+        if variance > _DIVERGED * lowest:
+            rotation, position, moved, current, variance, information, data = best
+            break
         root = 1 / np.sqrt(1 + squares / variance)
         rows = (slope * root).transpose(1, 0, 2).reshape(count, -1)
         data = rows @ rows.T + 1e-9 * np.eye(count)
@@ -98,7 +106,10 @@ def refine_pose(
             prior = np.r_[np.zeros(6), variance / variances]
             information = data + np.diag(prior)
             gradient[6:] += prior[6:] * moved
-        step = -np.linalg.solve(information, gradient)
+        if variance <= lowest:
+            lowest = variance
+            best = rotation, position, moved, current, variance, information, data
+        step = -_inverse(information) @ gradient
         position = position + rotation @ step[:3]
         rotation = rotation @ cv2.Rodrigues(step[3:6])[0]
         if variances is not None:
@@ -108,8 +119,8 @@ def refine_pose(
             break
     raw, _ = linearise(*seen, rotation, position, current)
     quaternion = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
-    covariance = variance * np.linalg.inv(information)
-    fixed = variance * np.linalg.inv(data[:6, :6])
+    covariance = variance * _inverse(information)
+    fixed = variance * _inverse(data[:6, :6])
     own = np.asarray(in_parent_axes(rotation, covariance[:6, :6]), np.float64)
     pose = UncertainPose(SE3(quaternion, position), own)
     by_intrinsics = np.asarray(in_parent_axes(rotation, covariance[:6, :6] - fixed), np.float64)
@@ -136,6 +147,13 @@ def changed_camera(camera: Camera, change: Array) -> Camera:
         cy=camera.cy + float(change[2]),
         distortion=(k1 + float(change[3]), k2 + float(change[4]), *others),
     )
+
+
+def _inverse(information: Array) -> Array:
+    """Inverse of a positive semi-definite matrix whose units differ by orders of magnitude."""
+    scale = np.sqrt(np.diag(information))
+    scaled = information / np.outer(scale, scale) + _OPEN * np.eye(len(scale))
+    return np.linalg.inv(scaled) / np.outer(scale, scale)
 
 
 def linearise(
