@@ -123,3 +123,16 @@ def test_derivatives_equal_finite_differences() -> None:
         step = 1e-6 * np.eye(6)[column]
         numeric = (residual(step) - residual(-step)) / 2e-6
         np.testing.assert_allclose(slope[:, column], numeric, rtol=1e-4, atol=1e-3)
+
+
+def test_matches_without_a_common_pose_do_not_diverge() -> None:
+    """Ten steps with free intrinsics lead nowhere, and not out of the world."""
+    variances = np.array([2e-8, 5e-3, 5e-3, 6e-7, 6e-7])
+    white = np.tile(np.eye(2) / 0.1, (28, 1, 1))
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        pixels, points_m = rng.uniform(0, [640, 480], (28, 2)), points(28, seed)
+        result = refine_pose(Observed(pixels, points_m, white), CAMERA, POSE, 10, variances)
+        assert pose_distance(result.pose.pose, POSE)[0] < 100
+        assert np.isfinite(result.pose.covariance).all()
+        assert 100 < result.camera.fx < 2000

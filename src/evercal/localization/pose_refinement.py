@@ -1,5 +1,6 @@
 """Robust Gauss-Newton refinement of a camera's pose and intrinsics, with their covariance."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -18,6 +19,8 @@ k1 and k2."""
 _SMALL = 1e-5
 _DIVERGED = 10.0
 """Growth of the variance of residuals at which the step before is kept."""
+_FOCAL_CHANGE = 1.0
+"""Largest change of the logarithm of the focal lengths."""
 _OPEN = 1e-12
 """Damping of the scaled information: an open direction gets a huge variance."""
 
@@ -89,11 +92,10 @@ def refine_pose(
     best = rotation, position, moved, current, variance, information, data
     for _ in range(max(iterations, 1)):
         raw, slope = linearise(*seen, rotation, position, current, variances is not None)
-        residual = white[:, 0] * raw[0] + white[:, 1] * raw[1]
+        residual = _whitened(white, raw)
         slope = white[:, 0, None] * slope[0] + white[:, 1, None] * slope[1]
         squares = (residual**2).sum(0)
-        # Robust scale: the median of a 2-D Gaussian's squared norm is 1.386 variances.
-        variance = max(_median(squares) / 1.386, 0.05)
+        variance = _robust_variance(squares)
         if variance > _DIVERGED * lowest:
             rotation, position, moved, current, variance, information, data = best
             break
@@ -114,10 +116,14 @@ def refine_pose(
         rotation = rotation @ cv2.Rodrigues(step[3:6])[0]
         if variances is not None:
             moved = moved + step[6:]
+            moved[0] = np.clip(moved[0], -_FOCAL_CHANGE, _FOCAL_CHANGE)
             current = changed_camera(camera, moved)
         if np.abs(step[:6]).max() < _SMALL:
             break
     raw, _ = linearise(*seen, rotation, position, current)
+    if _robust_variance((_whitened(white, raw) ** 2).sum(0)) > _DIVERGED * lowest:
+        rotation, position, moved, current, variance, information, data = best
+        raw, _ = linearise(*seen, rotation, position, current)
     quaternion = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
     covariance = variance * _inverse(information)
     fixed = variance * _inverse(data[:6, :6])
@@ -147,6 +153,17 @@ def changed_camera(camera: Camera, change: Array) -> Camera:
         cy=camera.cy + float(change[2]),
         distortion=(k1 + float(change[3]), k2 + float(change[4]), *others),
     )
+
+
+def _whitened(white: Array, raw: Sequence[Array]) -> Array:
+    """(2, n) residuals of unit variance."""
+    return white[:, 0] * raw[0] + white[:, 1] * raw[1]
+
+
+def _robust_variance(squares: Array) -> float:
+    """Variance of residuals from their squared norms (n,), at least 0.05."""
+    # The median of a 2-D Gaussian's squared norm is 1.386 variances.
+    return max(_median(squares) / 1.386, 0.05)
 
 
 def _inverse(information: Array) -> Array:
