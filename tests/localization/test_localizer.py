@@ -13,7 +13,7 @@ from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.image_camera import cameras_in_scenes
+from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.localization.localizer import Localizer
 from evercal.localization.pnp import PnpOptions
 from evercal.localization.query import Attempt, LocalizeOptions

@@ -30,8 +30,7 @@ from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.estimate import Cause
-from evercal.localization.image_camera import cameras_in_scenes
-from evercal.localization.intrinsics import STATED
+from evercal.localization.intrinsics import STATED, cameras_in_scenes
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings import read_image
 from evercal.recordings.image_files import image_files

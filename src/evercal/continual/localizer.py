@@ -16,7 +16,7 @@ from evercal.features.encode import encode_image
 from evercal.features.precision import autocast
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.image_camera import cameras_in_scenes, own_or_stated
+from evercal.localization.intrinsics import cameras_in_scenes, own_or_stated
 from evercal.localization.learned import LearnedLocalizer
 from evercal.localization.localizer import Localizer
 from evercal.localization.matching import strided_patches

@@ -35,12 +35,14 @@ from evercal.localization.acceptance import (
 )
 from evercal.localization.alignment import align_pose
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.image_camera import cameras_in_scenes, own_or_stated, prior_of
 from evercal.localization.intrinsics import (
     FOCAL_FACTORS,
     UNKNOWN,
     IntrinsicsPrior,
     Prior,
+    cameras_in_scenes,
+    own_or_stated,
+    prior_of,
 )
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.matching import Matcher

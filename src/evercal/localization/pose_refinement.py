@@ -1,6 +1,5 @@
 """Robust Gauss-Newton refinement of a camera's pose and intrinsics, with their covariance."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -155,7 +154,7 @@ def changed_camera(camera: Camera, change: Array) -> Camera:
     )
 
 
-def _whitened(white: Array, raw: Sequence[Array]) -> Array:
+def _whitened(white: Array, raw: Array) -> Array:
     """(2, n) residuals of unit variance."""
     return white[:, 0] * raw[0] + white[:, 1] * raw[1]
 

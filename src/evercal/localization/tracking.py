@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.background_search import BackgroundSearch
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.image_camera import cameras_in_scenes, prior_of
+from evercal.localization.intrinsics import cameras_in_scenes, prior_of
 from evercal.localization.localizer import Localizer
 from evercal.localization.query import Candidate, Hypothesis, Query, TimeBudget
 from evercal.recordings.images import as_rgb

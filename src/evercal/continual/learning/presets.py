@@ -33,7 +33,7 @@ PRESETS: dict[str, StageOptions] = {
     # (docs/experiments/protocol.md).
     "converged": StageOptions(
         head=HeadOptions(width=256),
-        fit=FitOptions(iterations=600, batch=1536, replay_batch=768, surface_weight=2.0),
+        fit=FitOptions(iterations=1200, batch=1536, replay_batch=768, surface_weight=2.0),
         encode=EncodePlan(views_per_frame=1),
         replay_views_per_frame=2,
     ),
