@@ -18,6 +18,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from hypothesis import settings
 
 os.environ["OMP_NUM_THREADS"] = "1"
 # The same arithmetic on every machine, so that a bound holds on all of them.
@@ -34,6 +35,10 @@ if TYPE_CHECKING:
     from evercal.mapping.scene_map import MapContents
     from evercal.recordings.frame import Recording
     from evercal.simulation.box_room import BoxRoom
+
+# An example takes longer on a busy machine.
+settings.register_profile("busy", deadline=None)
+settings.load_profile("busy")
 
 
 def _room(
