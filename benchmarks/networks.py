@@ -62,6 +62,10 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
                 "tuned-converged",
             ),
         ],
+        "gate": [
+            rooms("sim-mini"),
+            bench("sim-mini", "networks-a", *tuned, "--strategies", "joint", "--seeds", SEEDS),
+        ],
         "a": [
             rooms("sim-mini"),
             bench(
@@ -115,7 +119,8 @@ def run(
     """Run experiments of docs/experiments/protocol.md; each resumes.
 
     Args:
-        experiments: tune, a, memory, c, paper (needs a GPU) and tables, in this order.
+        experiments: gate (joint training of `a`, whose accuracy decides whether the others are
+            run), tune, a, memory, c, paper (needs a GPU) and tables, in this order.
         data: Folder of the rendered rooms.
         out: Folder of runs and results.
         dry: Print the commands, and for `paper` the estimated hours, and run nothing.
@@ -127,15 +132,15 @@ def run(
         raise InputError(f"{' '.join(unknown) or 'no experiment'}: choose of {', '.join(known)}")
     if "paper" in experiments:
         print(f"paper: about {paper_hours(device):.0f} hours of training on this machine")
-    if not dry and (ROOT / ROWS).is_file():
-        rows = [row for row in read_rows(str(ROOT / ROWS)) if row["name"] in SELECTED]
-        write_json(out / SELECTION, rows)
     # The same arithmetic on every processor.
     environment = {"EVERCAL_PRECISION": "float32"} if "paper" not in experiments else {}
     for command in (command for name in experiments for command in known[name]):
         print(" ".join(command), flush=True)
         if dry:
             continue
+        if str(out / SELECTION) in command:
+            rows = [row for row in read_rows(str(ROOT / ROWS)) if row["name"] in SELECTED]
+            write_json(out / SELECTION, rows)
         began = time.perf_counter()
         code = subprocess.run(
             _words(command, device), cwd=ROOT, env={**os.environ, **environment}, check=False
