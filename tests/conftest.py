@@ -71,6 +71,14 @@ def _room(
     return Recording(name, train, tuple(f for i, f in enumerate(frames) if i % every))
 
 
+@pytest.fixture(autouse=True)
+def kernels_of_this_process() -> Iterator[None]:
+    """Child processes have the kernels of the tests: the command line fixes others for its own."""
+    yield
+    for name in ("OPENBLAS_CORETYPE", "MKL_CBWR"):
+        os.environ.pop(name, None)
+
+
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request: pytest.FixtureRequest) -> torch.device:
     """The CPU, and with `-m gpu` a CUDA device; the test is skipped without one."""
