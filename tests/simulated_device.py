@@ -89,12 +89,11 @@ def _run(func: Any, *args: Any, **kwargs: Any) -> Any:
 
     args, kwargs = tree_map(unwrapped, (args, kwargs))
     result = func(*args, **kwargs)
-    if packet is torch.ops.aten._to_copy and asked is None:
-        here = mine
-    elif packet in (torch.ops.aten.copy_, torch.ops.aten._copy_from):
-        return tensors[0] if packet is torch.ops.aten.copy_ else tensors[1]
-    else:
-        here = asked.type == NAME if asked is not None else mine
+    if packet is torch.ops.aten.copy_:
+        return tensors[0]
+    if packet is torch.ops.aten._copy_from:
+        return tensors[1]
+    here = asked.type == NAME if asked is not None else mine
     return tree_map(rewrapped, result) if here else result
 
 

@@ -45,7 +45,7 @@ def test_unproject_inverts_project_over_the_whole_image(distortion: tuple[float,
     new=st.tuples(st.integers(8, 4000), st.integers(8, 4000)),
     lens=st.sampled_from(LENSES),
 )
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 def test_resized_camera_projects_points_to_the_same_part_of_the_image(
     size: tuple[int, int], new: tuple[int, int], lens: tuple[float, ...]
 ) -> None:

@@ -34,7 +34,7 @@ cases = st.tuples(st.integers(0, 2**32 - 1), st.sampled_from(["any", "tiny", "ha
 
 
 @given(cases)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_group_axioms(case: tuple[int, str]) -> None:
     seed, angle = case
     rng = np.random.default_rng(seed)
@@ -47,7 +47,7 @@ def test_group_axioms(case: tuple[int, str]) -> None:
 
 
 @given(cases)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_agrees_with_matrices(case: tuple[int, str]) -> None:
     seed, angle = case
     rng = np.random.default_rng(seed)
@@ -63,7 +63,7 @@ def test_agrees_with_matrices(case: tuple[int, str]) -> None:
 
 
 @given(cases)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_log_inverts_exp(case: tuple[int, str]) -> None:
     seed, angle = case
     pose = random_poses(np.random.default_rng(seed), (3,), angle)

@@ -40,7 +40,7 @@ def random_correction(seed: int) -> FrameCorrection:
     return FrameCorrection(poses, rng.normal(0, 0.004, (12, 6)), (0.2, 0.26))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10_000), corrected=st.booleans(), scaled=st.booleans())
 def test_landmarks_project_to_the_same_pixels_in_both_frames(
     seed: int, corrected: bool, scaled: bool

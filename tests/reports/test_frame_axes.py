@@ -21,7 +21,7 @@ AHEAD = SE3.exp([0.05, -0.02, 1.0, 0.3, -0.4, 0.2])
 GREY = np.full((480, 640, 3), 128, np.uint8)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=st.integers(0, 10_000), camera=st.sampled_from([PINHOLE, DISTORTED]))
 def test_projections_agree_with_opencv(seed: int, camera: Camera) -> None:
     rng = np.random.default_rng(seed)

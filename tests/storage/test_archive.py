@@ -128,9 +128,7 @@ def whole() -> bytes:
     return file.getvalue()
 
 
-@settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_changed_bytes_are_refused_or_change_nothing_outside(
     data: st.DataObject, tmp_path: Path

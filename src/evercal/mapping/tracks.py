@@ -10,10 +10,7 @@ from numpy.typing import NDArray
 from evercal.mapping.bundle_equations import BundleTracks
 from evercal.mapping.landmarks import Landmarks, detect, project_surface, slopes
 from evercal.mapping.patches import Patches, align_down, cut_patches, to_level, whitening
-from evercal.mapping.plane_sweep import (
-    FAR_M,
-    NEAR_M,
-)
+from evercal.mapping.plane_sweep import FAR_M, NEAR_M
 from evercal.mapping.prepared_frames import PYRAMID_LEVELS, PreparedFrames
 
 Array = NDArray[np.floating]

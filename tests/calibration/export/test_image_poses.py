@@ -18,7 +18,7 @@ from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 
 from .random_poses import CAMERA, calibration_of, poses, quaternion_matrix, random_poses
 
-few = settings(deadline=None, max_examples=20)
+few = settings(max_examples=20)
 DISTORTIONS = [(), (0.1, -0.2, 0.001, 0.002), CAMERA.distortion]
 RATIONAL = (0.1, -0.2, 0.001, 0.002, 0.03, 0.01, 0.02, 0.03)
 ON_ARM = calibration_of(SE3.exp([0.05, -0.03, 0.1, 0.1, 0.2, 1.5]), "eye_in_hand")

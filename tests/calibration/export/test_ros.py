@@ -25,7 +25,7 @@ from evercal.recordings.poses.camera_file import read_camera
 from .random_poses import calibration_of, poses, quaternion_matrix
 
 poses_and_mounts = given(poses(), st.sampled_from(["eye_to_hand", "eye_in_hand"]))
-few = settings(deadline=None, max_examples=40)
+few = settings(max_examples=40)
 CHILD = "cam/optical-frame"
 
 

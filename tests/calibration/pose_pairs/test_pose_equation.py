@@ -36,7 +36,7 @@ def test_true_transforms_have_zero_residuals(mount: Mount) -> None:
     assert np.abs(equation_of(simulated.pairs, mount).residuals(at)).max() < 1e-12
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.sampled_from(MOUNTS), st.integers(0, 1000), st.booleans())
 def test_derivatives_match_finite_differences(mount: Mount, seed: int, moving: bool) -> None:
     simulated, rng = exact(mount, seed), np.random.default_rng(seed)

@@ -29,7 +29,7 @@ MOUNTS: tuple[Mount, ...] = ("eye_in_hand", "eye_to_hand")
 EXACT = Setting(noise_mm=0, noise_deg=0)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(
     st.sampled_from(MOUNTS),
     st.integers(0, 10**6),

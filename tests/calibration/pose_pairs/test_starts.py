@@ -28,7 +28,7 @@ def close(a: SE3, b: SE3, tolerance: float = 1e-6) -> bool:
     return bool(np.max(pose_distance(a, b)) < tolerance)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 10**6), st.sampled_from([None, 0.01, 0.3, 7.0, 100.0]))
 def test_exact_poses_give_the_exact_solution(seed: int, unit: float | None) -> None:
     rng, (x, z) = np.random.default_rng(seed + 1), transforms(seed)

@@ -72,7 +72,7 @@ def test_earlier_stages_are_counts(tmp_path: Path) -> None:
 ERRORS = st.floats(0, 0.12) | st.sampled_from([0.005, 0.01, 0.02, 0.05, 0.1, math.inf])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(
         st.tuples(ERRORS, ERRORS.map(lambda v: math.radians(100 * v)), st.booleans()),

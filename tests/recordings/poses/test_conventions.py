@@ -73,7 +73,7 @@ names = st.sampled_from(sorted(CONVENTIONS))
 
 
 @given(st.sampled_from(sorted(ROTATIONS)), seeds)
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 def test_read_poses_agree_with_their_numbers(name: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     convention = CONVENTIONS[name]
@@ -94,7 +94,7 @@ def test_read_poses_agree_with_their_numbers(name: str, seed: int) -> None:
     st.sampled_from(["", ":inverse"]),
     st.sampled_from(["", ":opengl"]),
 )
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 def test_modifiers_change_unit_direction_and_axes(
     name: str, seed: int, unit: str, inverse: str, opengl: str
 ) -> None:

@@ -85,7 +85,7 @@ def test_headers_define_columns(
 
 
 @given(st.permutations(range(9)), st.integers(0, 1000))
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_columns_may_be_in_any_order(
     tmp_path_factory: pytest.TempPathFactory, order: list[int], seed: int
 ) -> None:

@@ -29,7 +29,7 @@ PRESETS: dict[str, StageOptions] = {
         encode=EncodePlan(views_per_frame=1),
         replay_views_per_frame=2,
     ),
-    # Doubling the steps gains joint training little on held-out frames of `sim-tune`
+    # Chosen on held-out frames of `sim-tune`; joint training still gains from more steps
     # (docs/experiments/protocol.md).
     "converged": StageOptions(
         head=HeadOptions(width=256),

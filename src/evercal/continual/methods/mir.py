@@ -56,9 +56,8 @@ class _MirHooks(ReplayHooks):
                 interfered_views(self._options, self._head, fresh, memory, rate, generator)
                 for memory in self.memories
             ]
-            broadcast(
-                self._views
-            )  # losses that are equal but for rounding may be ordered otherwise
+            # Rounding may order equal losses otherwise in another process.
+            broadcast(self._views)
         rows = []
         for memory, views in zip(self.memories, self._views, strict=True):
             view = memory.tensors["view"]
