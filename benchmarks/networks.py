@@ -3,7 +3,6 @@
 Every command resumes where it was interrupted. The same call in a second terminal shares the runs.
 """
 
-import os
 import subprocess
 import sys
 import time
@@ -24,6 +23,8 @@ CONTROLS = "evercal,evercal_network,joint,isolation,finetune"
 SELECTED = ("er", "sars_reprojection", "reservoir_spdd", "sars_spdd")
 SELECTION = "networks-rows.json"
 """File of the rows `SELECTED`, in the folder of runs."""
+TUNING_STEPS = "600"
+"""Steps a room of the trials, half of those of the experiments."""
 SEEDS = "0,1,2,3,4"
 SHARES = (1, 3, 30)
 """Memory, per cent of the frames; `a` has 10."""
@@ -55,7 +56,7 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
             (
                 *("benchmarks", "tune", "sim-tune", "--data", str(data / "sim-tune")),
                 *("--methods", *methods, "--rows", *rows),
-                *("--file", ROWS, "--out", str(out / "tune")),
+                *("--steps", TUNING_STEPS, "--file", ROWS, "--out", str(out / "tune")),
             ),
             (
                 *("benchmarks", "publish", ROWS.replace(".json", ".outcomes.json")),
@@ -132,8 +133,6 @@ def run(
         raise InputError(f"{' '.join(unknown) or 'no experiment'}: choose of {', '.join(known)}")
     if "paper" in experiments:
         print(f"paper: about {paper_hours(device):.0f} hours of training on this machine")
-    # The same arithmetic on every processor.
-    environment = {"EVERCAL_PRECISION": "float32"} if "paper" not in experiments else {}
     for command in (command for name in experiments for command in known[name]):
         print(" ".join(command), flush=True)
         if dry:
@@ -142,9 +141,7 @@ def run(
             rows = [row for row in read_rows(str(ROOT / ROWS)) if row["name"] in SELECTED]
             write_json(out / SELECTION, rows)
         began = time.perf_counter()
-        code = subprocess.run(
-            _words(command, device), cwd=ROOT, env={**os.environ, **environment}, check=False
-        ).returncode
+        code = subprocess.run(_words(command, device), cwd=ROOT, check=False).returncode
         print(f"{time.perf_counter() - began:.0f} s", flush=True)
         if code:
             return code

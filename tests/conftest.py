@@ -23,6 +23,9 @@ from hypothesis import settings
 os.environ["OMP_NUM_THREADS"] = "1"
 # The same precision on every machine, so that a bound holds on all of them.
 os.environ["EVERCAL_PRECISION"] = "float32"
+# Empty: the processor's kernels. The command line would choose others for all tests after it, but
+# not for the products of numpy or of child processes.
+os.environ |= {"OPENBLAS_CORETYPE": "", "MKL_CBWR": ""}
 
 from benchmarks.browser import CHROMIUM, chromium
 
@@ -69,14 +72,6 @@ def _room(
         frames.append(Frame(f"{name}-{i:03d}", room.render(camera, pose), camera, pose))
     train = tuple(frames[::every])
     return Recording(name, train, tuple(f for i, f in enumerate(frames) if i % every))
-
-
-@pytest.fixture(autouse=True)
-def kernels_of_this_process() -> Iterator[None]:
-    """Child processes have the kernels of the tests: the command line fixes others for its own."""
-    yield
-    for name in ("OPENBLAS_CORETYPE", "MKL_CBWR"):
-        os.environ.pop(name, None)
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])

@@ -14,12 +14,14 @@ def environment() -> dict[str, str]:
     """Describe code, libraries and machine of this process.
 
     Keys: `commit` (with `-dirty` for changed files; the version of an installed package), `python`,
-    `torch`, `numpy`, `processor`, `instructions`, `threads`, `gpu`.
+    `torch`, `numpy`, `processor`, `instructions`, `precision` (of the networks), `threads`, `gpu`.
     """
     import numpy as np
     import torch
 
-    cuda = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
+    from evercal.features.precision import BFLOAT16, FLOAT32, fast_bfloat16
+
+    gpu = torch.cuda.is_available()
     return {
         "commit": _commit(),
         "python": platform.python_version(),
@@ -27,8 +29,9 @@ def environment() -> dict[str, str]:
         "numpy": np.__version__,
         "processor": _processor(),
         "instructions": torch.backends.cpu.get_cpu_capability(),
+        "precision": BFLOAT16 if fast_bfloat16("cuda" if gpu else "cpu") else FLOAT32,
         "threads": str(torch.get_num_threads()),
-        "gpu": cuda,
+        "gpu": torch.cuda.get_device_name() if gpu else "none",
     }
 
 

@@ -34,8 +34,7 @@ PRESETS: dict[str, StageOptions] = {
     "converged": StageOptions(
         head=HeadOptions(width=256),
         fit=FitOptions(iterations=1200, batch=1536, replay_batch=768, surface_weight=2.0),
-        encode=EncodePlan(views_per_frame=1),
-        replay_views_per_frame=2,
+        encode=EncodePlan(views_per_frame=4),
     ),
     # The paper's settings, for a GPU: AdamW at 0.005 and 15,000 steps per scene. The rows of a step
     # are GLACE's. The paper does not state the number of replayed rows; here it is the same. The
