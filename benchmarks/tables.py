@@ -149,12 +149,12 @@ def _contrasts(sources: Sequence[Published], pairs: str) -> str:
 
 def _environments(sources: Sequence[Published], _: str) -> str:
     """Tabulate where the runs were measured: a row per commit and machine."""
-    table = [["commit", "processor", "instructions", "torch", "threads", "runs"]]
+    names = ["commit", "processor", "instructions", "precision", "torch", "threads"]
+    table = [[*names, "runs"]]
     for source in sources:
         for key, record in source.environments.items():
             runs = {(s.strategy, s.seed) for s in source.scenes if s.environment == key}
-            cells = [record[name] for name in ("commit", "processor", "instructions", "torch")]
-            table.append([*cells, record["threads"], str(len(runs))])
+            table.append([*(record[name] for name in names), str(len(runs))])
     return markdown(table)
 
 

@@ -1,6 +1,6 @@
 """Robust Gauss-Newton refinement of a camera's pose and intrinsics, with their covariance."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import cv2
@@ -63,6 +63,26 @@ class RefinedPose:
     """(6, 6) share of the pose's covariance that is due to the intrinsics."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Iterate:
+    """Pose and intrinsics of an iteration, and the normal equations that led to them."""
+
+    rotation: Array
+    """(3, 3) of points_from_camera."""
+    position: Array
+    """(3,)."""
+    change: Array
+    """(5,) of the intrinsics."""
+    camera: Camera
+    """With the change."""
+    variance: float = 1.0
+    """Robust variance of the whitened errors."""
+    information: Array = field(default_factory=lambda: np.eye(6 + INTRINSICS))
+    """(6, 6) or (11, 11), with the prior."""
+    data: Array = field(default_factory=lambda: np.eye(6 + INTRINSICS))
+    """The same without the prior."""
+
+
 def refine_pose(
     observed: Observed,
     camera: Camera,
@@ -84,19 +104,18 @@ def refine_pose(
     count = 6 if variances is None else 6 + INTRINSICS
     moved: Array = np.zeros(INTRINSICS) if change is None else change
     current = camera if variances is None else changed_camera(camera, moved)
-    rotation, position = start.rotation_matrix(), start.translation_m
     seen = observed.pixels, observed.points_m
     white = np.ascontiguousarray(observed.whitening.transpose(1, 2, 0))
-    variance, information, data, lowest = 1.0, np.eye(count), np.eye(count), np.inf
-    best = rotation, position, moved, current, variance, information, data
+    at = _Iterate(start.rotation_matrix(), start.translation_m, moved, current)
+    best, lowest = at, np.inf
     for _ in range(max(iterations, 1)):
-        raw, slope = linearise(*seen, rotation, position, current, variances is not None)
+        raw, slope = linearise(*seen, at.rotation, at.position, at.camera, variances is not None)
         residual = _whitened(white, raw)
         slope = white[:, 0, None] * slope[0] + white[:, 1, None] * slope[1]
         squares = (residual**2).sum(0)
         variance = _robust_variance(squares)
         if variance > _DIVERGED * lowest:
-            rotation, position, moved, current, variance, information, data = best
+            at = best
             break
         root = 1 / np.sqrt(1 + squares / variance)
         rows = (slope * root).transpose(1, 0, 2).reshape(count, -1)
@@ -106,31 +125,31 @@ def refine_pose(
         if variances is not None:
             prior = np.r_[np.zeros(6), variance / variances]
             information = data + np.diag(prior)
-            gradient[6:] += prior[6:] * moved
+            gradient[6:] += prior[6:] * at.change
+        at = replace(at, variance=variance, information=information, data=data)
         if variance <= lowest:
-            lowest = variance
-            best = rotation, position, moved, current, variance, information, data
+            best, lowest = at, variance
         step = -_inverse(information) @ gradient
-        position = position + rotation @ step[:3]
-        rotation = rotation @ cv2.Rodrigues(step[3:6])[0]
         if variances is not None:
-            moved = moved + step[6:]
+            moved = at.change + step[6:]
             moved[0] = np.clip(moved[0], -_FOCAL_CHANGE, _FOCAL_CHANGE)
-            current = changed_camera(camera, moved)
+            at = replace(at, change=moved, camera=changed_camera(camera, moved))
+        position = at.position + at.rotation @ step[:3]
+        at = replace(at, rotation=at.rotation @ cv2.Rodrigues(step[3:6])[0], position=position)
         if np.abs(step[:6]).max() < _SMALL:
             break
-    raw, _ = linearise(*seen, rotation, position, current)
+    raw, _ = linearise(*seen, at.rotation, at.position, at.camera)
     if _robust_variance((_whitened(white, raw) ** 2).sum(0)) > _DIVERGED * lowest:
-        rotation, position, moved, current, variance, information, data = best
-        raw, _ = linearise(*seen, rotation, position, current)
-    quaternion = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
-    covariance = variance * _inverse(information)
-    fixed = variance * _inverse(data[:6, :6])
-    own = np.asarray(in_parent_axes(rotation, covariance[:6, :6]), np.float64)
-    pose = UncertainPose(SE3(quaternion, position), own)
-    by_intrinsics = np.asarray(in_parent_axes(rotation, covariance[:6, :6] - fixed), np.float64)
+        at = best
+        raw, _ = linearise(*seen, at.rotation, at.position, at.camera)
+    quaternion = Rotation.from_matrix(at.rotation).as_quat(scalar_first=True)
+    covariance = at.variance * _inverse(at.information)
+    fixed = at.variance * _inverse(at.data[:6, :6])
+    own = np.asarray(in_parent_axes(at.rotation, covariance[:6, :6]), np.float64)
+    pose = UncertainPose(SE3(quaternion, at.position), own)
+    by_intrinsics = np.asarray(in_parent_axes(at.rotation, covariance[:6, :6] - fixed), np.float64)
     return RefinedPose(
-        pose, np.hypot(*raw), current, moved, covariance[6:, 6:], variance, by_intrinsics
+        pose, np.hypot(*raw), at.camera, at.change, covariance[6:, 6:], at.variance, by_intrinsics
     )
 
 
