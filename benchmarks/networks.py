@@ -24,7 +24,7 @@ SELECTED = ("er", "sars_reprojection", "reservoir_spdd", "sars_spdd")
 SELECTION = "networks-rows.json"
 """File of the rows `SELECTED`, in the folder of runs."""
 TUNING_STEPS = "600"
-"""Steps a room of the trials, half of those of the experiments."""
+"""Steps a room of the trials; the experiments have twice as many."""
 SEEDS = "0,1,2,3,4"
 SHARES = (1, 3, 30)
 """Memory, per cent of the frames; `a` has 10."""

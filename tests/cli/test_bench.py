@@ -30,7 +30,7 @@ def test_bench_and_its_report(
     folders = []
     for scene in arcs:
         folders.append(tmp_path / scene.name)
-        generic.write(folders[-1], replace(scene, train=scene.train[:20], test=scene.test[:20]))
+        generic.write(folders[-1], replace(scene, train=scene.train[:20], test=scene.test[:8]))
     words = ["custom", *folders, "--strategies", "evercal,finetune", "--seeds", "0"]
     first = run("bench", *words, "--out", tmp_path / "out")
     assert first.code == 0, first.err
