@@ -67,9 +67,9 @@ class RefinedPose:
 class _Iterate:
     """Pose and intrinsics of an iteration, and the normal equations that led to them."""
 
-    rotation: Array
+    rotation: NDArray[np.float64]
     """(3, 3) of points_from_camera."""
-    position: Array
+    position: NDArray[np.float64]
     """(3,)."""
     change: Array
     """(5,) of the intrinsics."""
