@@ -106,7 +106,7 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
             ),
             publish("networks-paper"),
         ],
-        "tables": [("benchmarks", "tables"), ("docs/_site/networks.py", "networks-a")],
+        "tables": [("benchmarks", "tables"), ("benchmarks", "network-figure", "networks-a")],
     }
 
 
@@ -158,7 +158,5 @@ def paper_hours(device: str) -> float:
 def _words(command: Command, device: str) -> list[str]:
     """Return the words of a process."""
     first, *rest = command
-    if first.endswith(".py"):
-        return [sys.executable, *command]
     chosen = ("--device", device) if rest[0] == "bench" else ()
     return [sys.executable, "-m", first, *rest, *chosen]

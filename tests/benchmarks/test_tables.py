@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import tables
+from benchmarks import network_figure, tables
 from benchmarks.publish import FOLDER, groups_of, publish
 from evercal.continual.benchmark import results
 from evercal.continual.benchmark.published import read_published
@@ -91,6 +91,19 @@ def test_strategies_with_one_run_form_a_second_table(tmp_path: Path) -> None:
     assert "| ours | 2 | 66.2 ± 1.8 |" in methods
     assert "| ours - theirs | +21.2 |" in differences
     assert tables.regenerated(page, tmp_path) == page
+
+
+def test_figure_has_the_methods_with_several_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "runs").mkdir()
+    publish(bench(tmp_path / "runs"), "two", {}, out=tmp_path)
+    monkeypatch.setattr(network_figure, "FOLDER", tmp_path)
+    network_figure.run(("two",), tmp_path / "figure.svg")
+    drawn = (tmp_path / "figure.svg").read_text()
+    assert "ours  66" in drawn
+    assert "theirs  45" in drawn
+    assert "single" not in drawn
 
 
 def test_single_runs_alone_form_one_table(tmp_path: Path) -> None:
