@@ -121,8 +121,8 @@ SUMMARY = ("strategy", "runs", "final %", "1 cm 1 deg %", "last scene %", "TFR",
 
 
 def _summary_rows(runs: Sequence[Run]) -> TableRows:
-    """Tabulate the main columns of `method_rows`."""
-    rows = method_rows(runs)
+    """Tabulate the main columns of `method_rows`, without parts of strategies (`NAME:PART`)."""
+    rows = method_rows([run for run in runs if ":" not in run.strategy])
     return [[row[rows[0].index(column)] for column in SUMMARY] for row in rows]
 
 
