@@ -6,7 +6,8 @@ import numpy as np
 from tyro.conf import Positional
 
 from benchmarks.publish import FOLDER
-from evercal.continual.benchmark.comparison import by_strategy, runs_of
+from benchmarks.tables import published_runs
+from evercal.continual.benchmark.comparison import by_strategy
 from evercal.continual.benchmark.published import read_published
 from evercal.continual.benchmark.statistics import seeds_interval
 from evercal.reports.charts import COLOURS, new_figure, tidy
@@ -22,8 +23,7 @@ def run(names: Positional[tuple[str, ...]], out: Path = OUT) -> None:
         names: Files of `results/`, without their suffix.
         out: SVG to write.
     """
-    published = [read_published(FOLDER / f"{name}.jsonl") for name in names]
-    runs = runs_of([result for part in published for result in part.results()], {})
+    runs = published_runs([read_published(FOLDER / f"{name}.jsonl") for name in names])
     points = []
     for name, group in by_strategy(runs).items():
         if len(group) > 1 and ":" not in name:

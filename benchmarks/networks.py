@@ -23,7 +23,7 @@ CONTROLS = "evercal,evercal_network,joint,isolation,finetune"
 SELECTED = ("er", "sars_reprojection", "reservoir_spdd", "sars_spdd")
 SELECTION = "networks-rows.json"
 """File of the rows `SELECTED`, in the folder of runs."""
-TUNING_STEPS = "600"
+TUNING_STEPS = preset("converged").fit.iterations // 2
 """Steps a room of the trials; the experiments have twice as many."""
 SEEDS = "0,1,2,3,4"
 SHARES = (1, 3, 30)
@@ -56,7 +56,7 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
             (
                 *("benchmarks", "tune", "sim-tune", "--data", str(data / "sim-tune")),
                 *("--methods", *methods, "--rows", *rows),
-                *("--steps", TUNING_STEPS, "--file", ROWS, "--out", str(out / "tune")),
+                *("--steps", str(TUNING_STEPS), "--file", ROWS, "--out", str(out / "tune")),
             ),
             (
                 *("benchmarks", "publish", ROWS.replace(".json", ".outcomes.json")),

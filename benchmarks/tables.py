@@ -93,7 +93,8 @@ def markdown(rows: TableRows) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _runs(sources: Sequence[Published]) -> list[Run]:
+def published_runs(sources: Sequence[Published]) -> list[Run]:
+    """Return the complete runs of several files, with the description of each strategy."""
     strategies = {k: v for source in sources for k, v in source.strategies.items()}
     return runs_of([result for source in sources for result in source.results()], strategies)
 
@@ -107,7 +108,7 @@ def _bench(rows_of: Callable[[Sequence[Run]], TableRows]) -> Callable[..., str]:
     """Return a table of strategies; strategies with one run form a second table."""
 
     def generated(sources: Sequence[Published], _: str) -> str:
-        groups = by_strategy(_runs(sources)).values()
+        groups = by_strategy(published_runs(sources)).values()
         several = [run for group in groups if len(group) > 1 for run in group]
         single = [run for group in groups if len(group) == 1 for run in group]
         parts = [markdown(rows_of(runs)) for runs in (several, single) if runs]
@@ -128,7 +129,7 @@ def _summary_rows(runs: Sequence[Run]) -> TableRows:
 
 def _differences(sources: Sequence[Published], reference: str) -> str:
     """Tabulate differences; strategies with one common seed form a second table."""
-    runs = _runs(sources)
+    runs = published_runs(sources)
     seeds = {name: {run.seed for run in group} for name, group in by_strategy(runs).items()}
     if reference not in seeds:
         raise InputError(f"differences: no strategy {reference!r}; there are {', '.join(seeds)}")
@@ -144,7 +145,8 @@ def _differences(sources: Sequence[Published], reference: str) -> str:
 def _contrasts(sources: Sequence[Published], pairs: str) -> str:
     """Tabulate the contrasts `A-B,C-D`, corrected for their number."""
     split = [pair.partition("-") for pair in pairs.split(",")]
-    return markdown(contrast_rows(_runs(sources), [(ours, theirs) for ours, _, theirs in split]))
+    named = [(ours, theirs) for ours, _, theirs in split]
+    return markdown(contrast_rows(published_runs(sources), named))
 
 
 def _environments(sources: Sequence[Published], _: str) -> str:
@@ -160,7 +162,7 @@ def _environments(sources: Sequence[Published], _: str) -> str:
 
 def _ablation(sources: Sequence[Published], suite: str) -> str:
     """Tabulate the paper's Table 4, with its numbers if the suite is one of its own."""
-    return markdown(ablation_rows(_runs(sources), suite))
+    return markdown(ablation_rows(published_runs(sources), suite))
 
 
 def _memory(sources: Sequence[Published], names: str) -> str:
@@ -173,7 +175,7 @@ def _memory(sources: Sequence[Published], names: str) -> str:
     rows = [["keyframes", "strategy", *bounds, "median mm", "wrong scene", "MB"]]
     for source in sources:
         label = f"{100 * float(str(source.settings['memory_share'])):.0f} %"
-        for name, runs in by_strategy(_runs([source])).items():
+        for name, runs in by_strategy(published_runs([source])).items():
             if wanted and name not in wanted:
                 continue
             ends = [result for run in runs for result in run.last]

@@ -1,6 +1,6 @@
 """Robust Gauss-Newton refinement of a camera's pose and intrinsics, with their covariance."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Self
 
 import cv2
@@ -75,11 +75,11 @@ class _Iterate:
     """(5,) of the intrinsics."""
     camera: Camera
     """With the change."""
-    variance: float = 1.0
-    """Robust variance of the whitened errors."""
-    information: Array = field(default_factory=lambda: np.eye(6 + INTRINSICS))
+    variance: float
+    """Robust variance of the whitened errors; infinite before the first iteration."""
+    information: Array
     """(6, 6) or (11, 11), with the prior."""
-    data: Array = field(default_factory=lambda: np.eye(6 + INTRINSICS))
+    data: Array
     """The same without the prior."""
 
 
@@ -106,15 +106,15 @@ def refine_pose(
     current = camera if variances is None else changed_camera(camera, moved)
     seen = observed.pixels, observed.points_m
     white = np.ascontiguousarray(observed.whitening.transpose(1, 2, 0))
-    at = _Iterate(start.rotation_matrix(), start.translation_m, moved, current)
-    best, lowest = at, np.inf
+    nothing = np.inf, np.eye(count), np.eye(count)
+    best = at = _Iterate(start.rotation_matrix(), start.translation_m, moved, current, *nothing)
     for _ in range(max(iterations, 1)):
         raw, slope = linearise(*seen, at.rotation, at.position, at.camera, variances is not None)
         residual = _whitened(white, raw)
         slope = white[:, 0, None] * slope[0] + white[:, 1, None] * slope[1]
         squares = (residual**2).sum(0)
         variance = _robust_variance(squares)
-        if variance > _DIVERGED * lowest:
+        if variance > _DIVERGED * best.variance:
             at = best
             break
         root = 1 / np.sqrt(1 + squares / variance)
@@ -127,8 +127,8 @@ def refine_pose(
             information = data + np.diag(prior)
             gradient[6:] += prior[6:] * at.change
         at = replace(at, variance=variance, information=information, data=data)
-        if variance <= lowest:
-            best, lowest = at, variance
+        if variance <= best.variance:
+            best = at
         step = -_inverse(information) @ gradient
         if variances is not None:
             moved = at.change + step[6:]
@@ -139,7 +139,7 @@ def refine_pose(
         if np.abs(step[:6]).max() < _SMALL:
             break
     raw, _ = linearise(*seen, at.rotation, at.position, at.camera)
-    if _robust_variance((_whitened(white, raw) ** 2).sum(0)) > _DIVERGED * lowest:
+    if _robust_variance((_whitened(white, raw) ** 2).sum(0)) > _DIVERGED * best.variance:
         at = best
         raw, _ = linearise(*seen, at.rotation, at.position, at.camera)
     quaternion = Rotation.from_matrix(at.rotation).as_quat(scalar_first=True)
