@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import cv2
 import numpy as np
 from tabulate import tabulate
 from tqdm import tqdm
 
 from evercal import InputError, Map, load_recording
+from evercal.recordings.images import encode_jpeg
 from evercal.storage import write_json
 
 
@@ -44,8 +44,7 @@ def run(
 def _service(store: Path, images: list[np.ndarray], count: int, clients: int) -> dict[str, object]:
     import urllib3
 
-    quality = [cv2.IMWRITE_JPEG_QUALITY, 90]
-    files = [cv2.imencode(".jpg", image[:, :, ::-1], quality)[1].tobytes() for image in images]
+    files = [encode_jpeg(image, quality=90) for image in images]
     command = [sys.executable, "-m", "evercal", "serve", str(store), "--port", "0", "--json"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:

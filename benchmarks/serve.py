@@ -14,7 +14,7 @@ import numpy as np
 from tabulate import tabulate
 
 from evercal import Client, InputError, Map, Recording, load_recording
-from evercal.recordings.images import decode_image
+from evercal.recordings.images import decode_image, encode_jpeg
 
 
 def run(
@@ -72,7 +72,7 @@ def _decoded(data: bytes) -> np.ndarray:
 
 def _jpeg(image: np.ndarray) -> bytes:
     resized = cv2.resize(image, (640, 480), interpolation=cv2.INTER_CUBIC)
-    return cv2.imencode(".jpg", resized[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
+    return encode_jpeg(np.asarray(resized, np.uint8), quality=90)
 
 
 def _measured(

@@ -18,6 +18,7 @@ from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.mapping.landmarks import Landmarks
 from evercal.recordings.frame import Frame
+from evercal.recordings.images import encode_jpeg
 
 JPEG_QUALITY = 95
 _LANDMARK_FIELDS = {
@@ -159,9 +160,5 @@ def store_keyframes(frames: Sequence[Frame], short_side: int) -> Keyframes:
 
 
 def jpeg(grey: np.ndarray) -> bytes:
-    """Encode a (h, w) uint8 image as a JPEG file."""
-    import cv2
-
-    encoded, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    assert encoded, "OpenCV encodes any uint8 image"
-    return data.tobytes()
+    """Encode a (h, w) uint8 image of a keyframe."""
+    return encode_jpeg(grey, JPEG_QUALITY)

@@ -125,12 +125,16 @@ def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
 
 def write_jpeg(path: str | os.PathLike[str], image: NDArray[np.uint8], quality: int) -> None:
     """Write (H, W, 3) uint8 RGB, whole or not at all; missing folders are created."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, encode_jpeg(image, quality))
+
+
+def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
+    """Encode (H, W) grey or (H, W, 3) RGB uint8 as a JPEG file."""
     import cv2
 
-    bgr = np.ascontiguousarray(image[..., ::-1])
-    data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, data.tobytes())
+    bgr = np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:

@@ -5,10 +5,10 @@ import math
 import struct
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.recordings.images import encode_jpeg
 from evercal.reports.scene.map_parts import resized
 
 Array = NDArray[np.floating]
@@ -33,14 +33,11 @@ def images_glb(corners_m: Array, images: Sequence[Image], width: int) -> bytes:
     count = len(images)
     faces = 4 * np.arange(count)[:, None, None] + np.array([[0, 2, 1], [0, 3, 2]])
     points = np.ascontiguousarray(corners_m, np.float32).reshape(-1, 3)
-    data = cv2.imencode(
-        ".jpg", np.ascontiguousarray(texture[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-    )[1]
     parts = [
         points.tobytes(),
         places.astype(np.float32).tobytes(),
         faces.astype(np.uint32).tobytes(),
-        data.tobytes(),
+        encode_jpeg(texture, _JPEG_QUALITY),
     ]
     views, binary = [], b""
     for part in parts:

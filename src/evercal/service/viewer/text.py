@@ -4,10 +4,10 @@ import base64
 from collections.abc import Sequence
 from html import escape
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.recordings.images import encode_jpeg
 from evercal.reports.scene.map_parts import resized
 from evercal.service.viewer.answers import AnswerView, shares_of_light
 
@@ -75,8 +75,7 @@ def picture_html(
 
 def jpeg_url(image: NDArray[np.uint8], width: int) -> str:
     """A JPEG as the address of an HTML image."""
-    small = np.ascontiguousarray(resized(image, width)[..., ::-1])
-    data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
+    data = encode_jpeg(resized(image, width), quality=85)
     return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
 
 
