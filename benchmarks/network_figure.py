@@ -42,6 +42,8 @@ def run(names: Positional[tuple[str, ...]], out: Path = OUT) -> None:
             yerr=accuracy.mean - accuracy.low,
             fmt=MARKERS[number % len(MARKERS)],
             color=COLOURS[number % len(COLOURS)],
+            # Colours repeat; the second time the markers are open.
+            markerfacecolor="white" if number >= len(COLOURS) else None,
             elinewidth=0.7,
             label=f"{name}  {accuracy.mean:.0f}",
         )

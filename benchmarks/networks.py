@@ -19,6 +19,7 @@ from evercal.storage import write_json
 
 ROOT = Path(__file__).resolve().parent.parent
 ROWS = "results/tuned-converged.json"
+PAPER_HEAD_ROWS = "results/tuned-paper-head.json"
 CONTROLS = "evercal,evercal_network,joint,isolation,finetune"
 SELECTED = ("er", "sars_reprojection", "reservoir_spdd", "sars_spdd")
 SELECTION = "networks-rows.json"
@@ -44,6 +45,16 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
         folders = ("--data", str(data / suite), "--out", str(out / name))
         return "evercal", "bench", suite, *folders, *options
 
+    def tune(file: str, methods: Command, rows: Command, *options: str) -> Command:
+        return (
+            *("benchmarks", "tune", "sim-tune", "--data", str(data / "sim-tune")),
+            *("--methods", *methods, "--rows", *rows, "--steps", str(TUNING_STEPS)),
+            *("--file", file, *options),
+        )
+
+    def outcomes(file: str) -> str:
+        return file.replace(".json", ".outcomes.json")
+
     def publish(name: str) -> Command:
         return "benchmarks", "publish", str(out / name), name
 
@@ -53,15 +64,8 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
     return {
         "tune": [
             rooms("sim-tune"),
-            (
-                *("benchmarks", "tune", "sim-tune", "--data", str(data / "sim-tune")),
-                *("--methods", *methods, "--rows", *rows),
-                *("--steps", str(TUNING_STEPS), "--file", ROWS, "--out", str(out / "tune")),
-            ),
-            (
-                *("benchmarks", "publish", ROWS.replace(".json", ".outcomes.json")),
-                "tuned-converged",
-            ),
+            tune(ROWS, methods, rows, "--out", str(out / "tune")),
+            ("benchmarks", "publish", outcomes(ROWS), "tuned-converged"),
         ],
         "gate": [
             rooms("sim-mini"),
@@ -89,6 +93,22 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
                     publish(name),
                 )
             ),
+        ],
+        "b": [
+            rooms("sim-tune"),
+            rooms("sim-mini"),
+            tune(
+                PAPER_HEAD_ROWS,
+                ("er", "sars_spdd"),
+                SELECTED,
+                *("--backbone", "paper_head", "--out", str(out / "tune-paper-head")),
+            ),
+            ("benchmarks", "publish", outcomes(PAPER_HEAD_ROWS), "tuned-paper-head"),
+            bench(
+                *("sim-mini", "networks-b", *tuned, "--backbone", "paper_head"),
+                *("--rows", PAPER_HEAD_ROWS, "--strategies", "joint,finetune", "--seeds", "0,1,2"),
+            ),
+            publish("networks-b"),
         ],
         "c": [
             rooms("sim-unseen"),
@@ -121,7 +141,7 @@ def run(
 
     Args:
         experiments: gate (joint training of `a`, whose accuracy decides whether the others are
-            run), tune, a, memory, c, paper (needs a GPU) and tables, in this order.
+            run), tune, a, memory, b, c, paper (needs a GPU) and tables, in this order.
         data: Folder of the rendered rooms.
         out: Folder of runs and results.
         dry: Print the commands, and for `paper` the estimated hours, and run nothing.

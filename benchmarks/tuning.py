@@ -10,7 +10,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from tabulate import tabulate
@@ -20,7 +19,7 @@ from evercal.continual.benchmark import results
 from evercal.continual.benchmark.bench import BenchOptions, begin_bench, run_bench
 from evercal.continual.benchmark.rows import read_rows, strategy_from_row
 from evercal.continual.benchmark.suites import load_suite, tuning_split
-from evercal.continual.learning.presets import on_paper_backbone
+from evercal.continual.learning.presets import BACKBONES, Backbone
 from evercal.continual.learning.presets import preset as preset_named
 from evercal.continual.learning.stage import StageOptions
 from evercal.continual.strategies import Strategy
@@ -63,7 +62,7 @@ def run(
     seed: int = 100,
     methods: tuple[str, ...] = (),
     rows: tuple[str, ...] = (),
-    backbone: Literal["evercal", "paper"] = "evercal",
+    backbone: Backbone = "evercal",
     preset: str = "converged",
     steps: int | None = None,
     out: Path = Path("runs/tune"),
@@ -80,7 +79,7 @@ def run(
         seed: Seed of all trials; not one of the table.
         methods: Methods to tune. Defaults to all.
         rows: Rows to write. Defaults to those of all tuned methods and their variants.
-        backbone: Network to train: ours, or the paper's.
+        backbone: Network to train, see `BACKBONES`.
         preset: Preset of the training effort.
         steps: Optimiser steps of a stage. Defaults to those of the preset.
         out: Folder for runs and results.
@@ -90,7 +89,7 @@ def run(
 
     def stage(seed: int) -> StageOptions:
         options = preset_named(preset, seed)
-        options = on_paper_backbone(options) if backbone == "paper" else options
+        options = BACKBONES[backbone](options)
         iterations = options.fit.iterations if steps is None else steps
         return replace(options, fit=replace(options.fit, iterations=iterations))
 

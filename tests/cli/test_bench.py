@@ -138,6 +138,8 @@ def test_options_of_the_backbone_of_the_paper() -> None:
     assert stage.head.centres == "fixed"
     assert stage.head.width == ours._stage(3).head.width
     assert ours._stage(3).head.condition == "code"
+    head = verb.Bench("sim-mini", backbone="paper_head", steps=7)._stage(3)
+    assert (head.head, head.fit) == (stage.head, ours._stage(3).fit)
     whole, part = (verb.Bench("sim", preset="paper", batch=n)._stage(0) for n in (None, 2048))
     assert (whole.fit.batch, whole.fit.replay_batch) == (40_960, 40_960)
     changed = replace(whole.fit, batch=2048, replay_batch=2048)

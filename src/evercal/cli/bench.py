@@ -62,8 +62,9 @@ class Bench:
     """Stages that the suite regions splits a scene into."""
     preset: Literal["fast", "demo", "bench", "converged", "paper"] = "bench"
     """Training effort per stage."""
-    backbone: Literal["evercal", "paper"] = "evercal"
-    """Network: ours, or the paper's, with all centres given in advance and its training."""
+    backbone: Literal["evercal", "paper", "paper_head"] = "evercal"
+    """Network: ours, or the paper's with all centres given in advance, trained by its optimiser
+    and loss (paper) or by ours (paper_head)."""
     offsets: Literal["per_centre", "shared"] = "per_centre"
     """One offset and scale per centre (the paper), or one for all centres (GLACE)."""
     steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
@@ -161,14 +162,13 @@ class Bench:
         return load_suite(self.suite, self.data, _words(self.scenes), self.poses)
 
     def _stage(self, seed: int) -> "StageOptions":
-        from evercal.continual.learning.presets import PAPER_SIM_STEPS, on_paper_backbone, preset
+        from evercal.continual.learning.presets import BACKBONES, PAPER_SIM_STEPS, preset
 
         try:
             stage = preset(self.preset, seed).with_memory(self.memory)
         except InputError as error:
             raise InputError(f"--{error}") from None
-        if "paper" in (self.backbone, self.preset):
-            stage = on_paper_backbone(stage)
+        stage = BACKBONES["paper" if self.preset == "paper" else self.backbone](stage)
         preset_steps = stage.fit.iterations
         if self.preset == "paper" and self.suite.startswith("sim"):
             preset_steps = PAPER_SIM_STEPS

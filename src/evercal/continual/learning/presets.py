@@ -1,6 +1,8 @@
 """Presets of the training effort per scene."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 from evercal.continual.learning.stage import StageOptions
 from evercal.continual.networks.buffer import EncodePlan
@@ -78,17 +80,32 @@ def short_side(name: str) -> int:
 
 
 def on_paper_backbone(options: StageOptions) -> StageOptions:
-    """Replace network and optimiser by the paper's; width, steps and rows of a step stay.
+    """Replace network and training by the paper's; width, steps and rows of a step stay.
 
-    The head reads the descriptor, has fixed centres (`fixed_centres_m`) and no whitening. Every
-    stage has the full peak rate.
+    Training is by AdamW and reprojection alone. Every stage has the full peak rate.
     """
-    paper = PRESETS["paper"]
-    head = replace(paper.head, width=options.head.width, centres="fixed")
     fit = replace(
-        paper.fit,
+        PRESETS["paper"].fit,
         iterations=options.fit.iterations,
         batch=options.fit.batch,
         replay_batch=options.fit.replay_batch,
     )
-    return replace(options, head=head, fit=fit)
+    return replace(with_paper_head(options), fit=fit)
+
+
+def with_paper_head(options: StageOptions) -> StageOptions:
+    """Replace the network by the paper's, trained as before; its width stays.
+
+    The head reads the descriptor, has fixed centres (`fixed_centres_m`) and no whitening.
+    """
+    head = replace(PRESETS["paper"].head, width=options.head.width, centres="fixed")
+    return replace(options, head=head)
+
+
+Backbone = Literal["evercal", "paper", "paper_head"]
+BACKBONES: dict[str, Callable[[StageOptions], StageOptions]] = {
+    "evercal": lambda options: options,
+    "paper": on_paper_backbone,
+    "paper_head": with_paper_head,
+}
+"""Network of a stage: ours, the paper's with its training, or the paper's trained as ours."""
