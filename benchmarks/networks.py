@@ -26,8 +26,8 @@ SELECTION = "networks-rows.json"
 """File of the rows `SELECTED`, in the folder of runs."""
 TUNING_STEPS = preset("converged").fit.iterations // 2
 """Steps a room of the trials; the experiments have twice as many."""
-UNSEEN_STEPS = 2 * preset("converged").fit.iterations
-"""Steps a room on the unseen rooms, which have ten times the frames."""
+DOUBLED_STEPS = 2 * preset("converged").fit.iterations
+"""Steps a room of `b` and `c`, where joint training needs more."""
 SEEDS = "0,1,2,3,4"
 SHARES = (1, 3, 30)
 """Memory, per cent of the frames; `a` has 10."""
@@ -61,7 +61,7 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
         return "benchmarks", "publish", str(out / name), name
 
     tuned = ("--preset", "converged", "--order", "shuffled")
-    unseen = (*tuned, "--steps", str(UNSEEN_STEPS))
+    doubled = (*tuned, "--steps", str(DOUBLED_STEPS))
     methods = ("er", "icarl", "buff_cs", "sars_spdd", "gec")
     rows = (*methods, "sars_reprojection", "reservoir_spdd")
     return {
@@ -108,7 +108,7 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
             ),
             ("benchmarks", "publish", outcomes(PAPER_HEAD_ROWS), "tuned-paper-head"),
             bench(
-                *("sim-mini", "networks-b", *tuned, "--backbone", "paper_head"),
+                *("sim-mini", "networks-b", *doubled, "--backbone", "paper_head"),
                 *("--rows", PAPER_HEAD_ROWS, "--strategies", "joint,finetune", "--seeds", "0,1,2"),
             ),
             publish("networks-b"),
@@ -116,11 +116,11 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
         "c": [
             rooms("sim-unseen"),
             bench(
-                *("sim-unseen", "networks-c", *unseen, "--rows", str(out / SELECTION)),
+                *("sim-unseen", "networks-c", *doubled, "--rows", str(out / SELECTION)),
                 *("--strategies", "joint,finetune", "--seeds", SEEDS),
             ),
             bench(
-                *("sim-unseen", "networks-c", *unseen, "--strategies", "evercal", "--seeds", "0")
+                *("sim-unseen", "networks-c", *doubled, "--strategies", "evercal", "--seeds", "0")
             ),
             publish("networks-c"),
         ],
