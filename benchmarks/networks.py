@@ -25,7 +25,7 @@ SELECTED = ("er", "sars_reprojection", "reservoir_spdd", "sars_spdd")
 SELECTION = "networks-rows.json"
 """File of the rows `SELECTED`, in the folder of runs."""
 TUNING_STEPS = preset("converged").fit.iterations // 2
-"""Steps a room of the trials; the experiments have twice as many."""
+"""Steps a room of the trials: half of those of `a`."""
 DOUBLED_STEPS = 2 * preset("converged").fit.iterations
 """Steps a room of `b` and `c`, where joint training needs more."""
 SEEDS = "0,1,2,3,4"
@@ -47,29 +47,27 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
         folders = ("--data", str(data / suite), "--out", str(out / name))
         return "evercal", "bench", suite, *folders, *options
 
-    def tune(file: str, methods: Command, rows: Command, *options: str) -> Command:
-        return (
+    def tune(
+        file: str, folder: str, methods: Command, rows: Command, *options: str
+    ) -> Sequence[Command]:
+        trials = (
             *("benchmarks", "tune", "sim-tune", "--data", str(data / "sim-tune")),
             *("--methods", *methods, "--rows", *rows, "--steps", str(TUNING_STEPS)),
-            *("--file", file, *options),
+            *("--file", file, "--out", str(out / folder), *options),
         )
-
-    def outcomes(file: str) -> str:
-        return file.replace(".json", ".outcomes.json")
+        outcomes = file.replace(".json", ".outcomes.json")
+        return [rooms("sim-tune"), trials, ("benchmarks", "publish", outcomes, Path(file).stem)]
 
     def publish(name: str) -> Command:
         return "benchmarks", "publish", str(out / name), name
 
     tuned = ("--preset", "converged", "--order", "shuffled")
     doubled = (*tuned, "--steps", str(DOUBLED_STEPS))
+    head = ("--backbone", "paper_head")
     methods = ("er", "icarl", "buff_cs", "sars_spdd", "gec")
     rows = (*methods, "sars_reprojection", "reservoir_spdd")
     return {
-        "tune": [
-            rooms("sim-tune"),
-            tune(ROWS, methods, rows, "--out", str(out / "tune")),
-            ("benchmarks", "publish", outcomes(ROWS), "tuned-converged"),
-        ],
+        "tune": tune(ROWS, "tune", methods, rows),
         "gate": [
             rooms("sim-mini"),
             bench("sim-mini", "networks-a", *tuned, "--strategies", "joint", "--seeds", SEEDS),
@@ -98,17 +96,10 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
             ),
         ],
         "b": [
-            rooms("sim-tune"),
+            *tune(PAPER_HEAD_ROWS, "tune-paper-head", ("er", "sars_spdd"), SELECTED, *head),
             rooms("sim-mini"),
-            tune(
-                PAPER_HEAD_ROWS,
-                ("er", "sars_spdd"),
-                SELECTED,
-                *("--backbone", "paper_head", "--out", str(out / "tune-paper-head")),
-            ),
-            ("benchmarks", "publish", outcomes(PAPER_HEAD_ROWS), "tuned-paper-head"),
             bench(
-                *("sim-mini", "networks-b", *doubled, "--backbone", "paper_head"),
+                *("sim-mini", "networks-b", *doubled, *head),
                 *("--rows", PAPER_HEAD_ROWS, "--strategies", "joint,finetune", "--seeds", "0,1,2"),
             ),
             publish("networks-b"),

@@ -125,8 +125,9 @@ def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
 
 def write_jpeg(path: str | os.PathLike[str], image: NDArray[np.uint8], quality: int) -> None:
     """Write (H, W, 3) uint8 RGB, whole or not at all; missing folders are created."""
+    data = encode_jpeg(image, quality)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, encode_jpeg(image, quality))
+    write_bytes(path, data)
 
 
 def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:

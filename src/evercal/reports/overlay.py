@@ -6,6 +6,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evercal.recordings.images import encode_jpeg
+
 Image = NDArray[np.uint8]
 
 _NAN_COLOUR = (160, 160, 160)
@@ -107,9 +109,9 @@ def encode_image(image: Image, kind: Literal["png", "jpg"] = "png") -> bytes:
     """Encode an image as PNG, or as JPEG, which is smaller but lossy."""
     import cv2
 
-    parameters = [cv2.IMWRITE_JPEG_QUALITY, 88] if kind == "jpg" else []
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(f".{kind}", bgr, parameters)[1].tobytes()
+    if kind == "jpg":
+        return encode_jpeg(image, quality=88)
+    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
 
 
 def _finite_pieces(points: NDArray[np.float64]) -> list[NDArray[np.float64]]:

@@ -103,7 +103,7 @@ def with_paper_head(options: StageOptions) -> StageOptions:
 
 
 Backbone = Literal["evercal", "paper", "paper_head"]
-BACKBONES: dict[str, Callable[[StageOptions], StageOptions]] = {
+BACKBONES: dict[Backbone, Callable[[StageOptions], StageOptions]] = {
     "evercal": lambda options: options,
     "paper": on_paper_backbone,
     "paper_head": with_paper_head,

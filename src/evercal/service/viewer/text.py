@@ -65,7 +65,7 @@ def note_html(text: str) -> str:
 def picture_html(
     image: NDArray[np.uint8], words: str, width: int = PICTURE_PX, style: str = ""
 ) -> str:
-    """A picture that says in words what it shows.
+    """A picture with a text alternative.
 
     Images of viser have no words, and ask the browser for addresses that are gone when they change.
     """
