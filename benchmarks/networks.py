@@ -24,6 +24,8 @@ CONTROLS = "evercal,evercal_network,joint,isolation,finetune"
 SELECTED = ("er", "sars_reprojection", "reservoir_spdd", "sars_spdd")
 SELECTION = "networks-rows.json"
 """File of the rows `SELECTED`, in the folder of runs."""
+FILLED = "networks-rows-filled.json"
+"""File of the rows `SELECTED` and `sars_spdd_filled`, which has the setting of `sars_spdd`."""
 TUNING_STEPS = preset("converged").fit.iterations // 2
 """Steps a room of the trials: half of those of `a`."""
 DOUBLED_STEPS = 2 * preset("converged").fit.iterations
@@ -107,7 +109,7 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
         "c": [
             rooms("sim-unseen"),
             bench(
-                *("sim-unseen", "networks-c", *doubled, "--rows", str(out / SELECTION)),
+                *("sim-unseen", "networks-c", *doubled, "--rows", str(out / FILLED)),
                 *("--strategies", "joint,finetune", "--seeds", SEEDS),
             ),
             bench(
@@ -154,9 +156,9 @@ def run(
         print(" ".join(command), flush=True)
         if dry:
             continue
-        if str(out / SELECTION) in command:
-            rows = [row for row in read_rows(str(ROOT / ROWS)) if row["name"] in SELECTED]
-            write_json(out / SELECTION, rows)
+        for name in (SELECTION, FILLED):
+            if str(out / name) in command:
+                write_json(out / name, _rows(filled=name == FILLED))
         began = time.perf_counter()
         code = subprocess.run(_words(command, device), cwd=ROOT, check=False).returncode
         print(f"{time.perf_counter() - began:.0f} s", flush=True)
@@ -170,6 +172,14 @@ def paper_hours(device: str) -> float:
     options = preset("paper")
     seconds = step_seconds(options.head, options.fit, device=device)
     return seconds * PAPER_SIM_STEPS * PAPER_STAGES / 3600
+
+
+def _rows(*, filled: bool) -> list[dict]:
+    """Return the tuned rows `SELECTED`, and `sars_spdd_filled` if asked for."""
+    rows = [row for row in read_rows(str(ROOT / ROWS)) if row["name"] in SELECTED]
+    like = next(row for row in rows if row["name"] == "sars_spdd")
+    name = "sars_spdd_filled"
+    return [*rows, *([{**like, "name": name, "of": name}] if filled else [])]
 
 
 def _words(command: Command, device: str) -> list[str]:

@@ -40,6 +40,13 @@ def test_a_dry_run_prints_the_commands_and_runs_nothing(
     assert not list(tmp_path.iterdir())
 
 
+def test_filled_sars_has_the_setting_of_sars_spdd() -> None:
+    rows = {row["name"]: row for row in networks._rows(filled=True)}
+    assert rows["sars_spdd_filled"]["with"] == rows["sars_spdd"]["with"]
+    assert rows["sars_spdd_filled"]["of"] == "sars_spdd_filled"
+    assert set(rows) - {row["name"] for row in networks._rows(filled=False)} == {"sars_spdd_filled"}
+
+
 def test_an_unknown_experiment_is_refused() -> None:
     known = "choose of tune, gate, a, memory, b, c, paper, tables"
     for names in ((), ("d",)):
