@@ -29,7 +29,7 @@ FILLED = "networks-rows-filled.json"
 TUNING_STEPS = preset("converged").fit.iterations // 2
 """Steps a room of the trials: half of those of `a`."""
 DOUBLED_STEPS = 2 * preset("converged").fit.iterations
-"""Steps a room of `b` and `c`, where joint training needs more."""
+"""Steps a room of `b`, `c` and `real`, where joint training needs more."""
 SEEDS = "0,1,2,3,4"
 SHARES = (1, 3, 30)
 """Memory, per cent of the frames; `a` has 10."""
@@ -43,7 +43,7 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
     """Return the commands of every experiment, in order."""
 
     def rooms(suite: str) -> Command:
-        return "evercal", "simulate", suite, "--out", str(data / suite)
+        return "evercal", "simulate", suite, "--sweep-only", "--out", str(data / suite)
 
     def bench(suite: str, name: str, *options: str) -> Command:
         folders = ("--data", str(data / suite), "--out", str(out / name))
@@ -117,6 +117,13 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
             ),
             publish("networks-c"),
         ],
+        "real": [
+            bench(
+                *("real2", "networks-real", *doubled, "--rows", str(out / FILLED)),
+                *("--strategies", "joint,finetune", "--seeds", "0,1,2"),
+            ),
+            publish("networks-real"),
+        ],
         "paper": [
             rooms("sim"),
             bench(
@@ -140,7 +147,8 @@ def run(
 
     Args:
         experiments: gate (joint training of `a`, whose accuracy decides whether the others are
-            run), tune, a, memory, b, c, paper (needs a GPU) and tables, in this order.
+            run), tune, a, memory, b, c, real (needs the recordings), paper (needs a GPU) and
+            tables, in this order.
         data: Folder of the rendered rooms.
         out: Folder of runs and results.
         dry: Print the commands, and for `paper` the estimated hours, and run nothing.

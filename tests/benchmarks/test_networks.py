@@ -20,14 +20,14 @@ def test_all_commands_are_valid_and_resume_in_folders_of_their_own() -> None:
         for command in commands
         if command[:2] == ("evercal", "bench")
     ]
-    assert len(benches) == 9
+    assert len(benches) == 10
     folders = set()
     for command in benches:
         parsed = _parse(list(command[1:]), as_json=False)
         assert isinstance(parsed, Bench)
         assert parsed.data == Path("rooms") / parsed.suite
         folders.add(parsed.out)
-    assert len(folders) == 7, "the gate is a part of experiment A"
+    assert len(folders) == 8, "the gate is a part of experiment A"
 
 
 def test_a_dry_run_prints_the_commands_and_runs_nothing(
@@ -35,7 +35,7 @@ def test_a_dry_run_prints_the_commands_and_runs_nothing(
 ) -> None:
     assert networks.run(("a", "memory"), tmp_path, tmp_path, dry=True) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == f"evercal simulate sim-mini --out {tmp_path}/sim-mini"
+    assert lines[0] == f"evercal simulate sim-mini --sweep-only --out {tmp_path}/sim-mini"
     assert len(lines) == 10
     assert not list(tmp_path.iterdir())
 
@@ -48,7 +48,7 @@ def test_filled_sars_has_the_setting_of_sars_spdd() -> None:
 
 
 def test_an_unknown_experiment_is_refused() -> None:
-    known = "choose of tune, gate, a, memory, b, c, paper, tables"
+    known = "choose of tune, gate, a, memory, b, c, real, paper, tables"
     for names in ((), ("d",)):
         with pytest.raises(InputError, match=known):
             networks.run(names)

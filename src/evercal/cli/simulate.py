@@ -55,6 +55,9 @@ class Simulate:
     """Sensor noise as a fraction of full scale; a good camera has 0.01. Default: 0, cell 0.008."""
     blur_steps: int = 1
     """Camera poses per exposure; 1 disables motion blur."""
+    sweep_only: bool = False
+    """Render training and test frames only, without calibration recordings and changed frames. The
+    same command without this option adds them."""
     json: bool = False
     """Print one JSON object."""
 
@@ -73,6 +76,7 @@ class Simulate:
             exposure_ev=self.exposure_ev,
             noise=self.noise or 0.0,
             blur_steps=self.blur_steps,
+            sweep_only=self.sweep_only,
         )
         with progress_bar("rendering", 0, "frame") as bar:
             for progress in simulate(self.suite, self.out, options):
@@ -89,8 +93,10 @@ class Simulate:
         return 0
 
     def _record_cell(self) -> int:
-        if self.samples is not None or self.exposure_ev or self.blur_steps != 1:
-            raise InputError("cell: takes no --samples, --exposure-ev and --blur-steps; omit them")
+        if self.samples is not None or self.exposure_ev or self.blur_steps != 1 or self.sweep_only:
+            raise InputError(
+                "cell: takes no --samples, --exposure-ev, --blur-steps and --sweep-only; omit them"
+            )
         from evercal.simulation.cell_recording import TRIPOD_IMAGES, WRIST_IMAGES, record_cell
         from evercal.simulation.virtual_cell import CellOptions
 

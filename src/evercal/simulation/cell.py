@@ -105,6 +105,8 @@ class SimulateOptions:
     """Standard deviation of sensor noise at mid grey, as a fraction of full scale."""
     blur_steps: int = 1
     """Poses per exposure; 1 disables motion blur."""
+    sweep_only: bool = False
+    """Whether calibration recordings and changed frames are left for a later run."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,8 @@ def simulate(
     suite = _checked(name, options)
     frames = options.frames or suite.frames
     width, height = options.size or suite.size
-    total = (frames + 3 * CALIBRATION_FRAMES + suite.changed) * len(suite.rooms)
+    others = 0 if options.sweep_only else 3 * CALIBRATION_FRAMES + suite.changed
+    total = (frames + others) * len(suite.rooms)
     render = RenderOptions(
         samples=suite.samples if options.samples is None else options.samples,
         exposure_ev=options.exposure_ev,
@@ -160,10 +163,13 @@ def simulate(
     panda, done = Panda(), 0
     for scene, kind, room_seed in suite.rooms:
         before = room(kind, room_seed)
-        recordings = _recordings(before, panda, frames, options.seed, out / scene)
+        sweep = sweep_shots(before, frames, options.seed)
+        recordings = [(out / scene, sweep)]
+        if not options.sweep_only:
+            recordings += _calibrations(before, panda, options.seed, out / scene / "calibration")
         plans = [(before, recordings)]
-        if suite.changed:
-            after, sweep = changed_room(before, options.seed), recordings[0][1]
+        if suite.changed and not options.sweep_only:
+            after = changed_room(before, options.seed)
             train = SE3.stack([shot.base_from_camera for shot in sweep if shot.split == "train"])
             shots = changed_shots(after, suite.changed, train, options.seed)
             plans.append((after, [(out / scene / "changed", shots)]))
@@ -206,20 +212,18 @@ def _refuse_full_disk(out: Path, needed: int) -> None:
         )
 
 
-def _recordings(
-    before: Room, panda: Panda, frames: int, seed: int, root: Path
+def _calibrations(
+    before: Room, panda: Panda, seed: int, folder: Path
 ) -> list[tuple[Path, list[Shot]]]:
-    """Plan all recordings of a room and write the true calibration."""
+    """Plan the calibration recordings of a room and write the true calibration."""
     fixed, bumped, bump = fixed_shots(before, CALIBRATION_FRAMES, seed)
     gripper_from_camera = hand_camera(seed)
-    folder = root / "calibration"
     hand = _hand_shots(before, panda, gripper_from_camera, seed)
     folder.mkdir(parents=True, exist_ok=True)
     truth = {"gripper_from_camera": gripper_from_camera, "fixed_camera_from_bumped_camera": bump}
     poses = {name: generic.pose_to_dict(pose) for name, pose in truth.items()}
     write_json(folder / "truth.json", poses)
     return [
-        (root, sweep_shots(before, frames, seed)),
         (folder / "fixed", fixed),
         (folder / "bumped", bumped),
         (folder / "hand", hand),
