@@ -22,15 +22,20 @@ ROWS = "results/tuned-converged.json"
 PAPER_HEAD_ROWS = "results/tuned-paper-head.json"
 CONTROLS = "evercal,evercal_network,joint,isolation,finetune"
 SELECTED = ("er", "sars_reprojection", "reservoir_spdd", "sars_spdd")
-SELECTION = "networks-rows.json"
-"""File of the rows `SELECTED`, in the folder of runs."""
-FILLED = "networks-rows-filled.json"
-"""File of the rows `SELECTED` and `sars_spdd_filled`, which has the setting of `sars_spdd`."""
-TUNING_STEPS = preset("converged").fit.iterations // 2
-"""Steps a room of the trials: half of those of `a`."""
+SELECTIONS: Mapping[str, Sequence[str]] = {
+    "networks-contrasts.json": (*SELECTED, "icarl", "buff_cs", "sars_old_output"),
+    "networks-filled.json": (*SELECTED, "sars_spdd_filled"),
+}
+"""Files of some tuned rows, in the folder of runs. `sars_spdd_filled` has the setting of
+`sars_spdd`."""
+CONTRASTS, FILLED = SELECTIONS
+HALF_STEPS = preset("converged").fit.iterations // 2
+"""Steps a room of the trials of `b`."""
 DOUBLED_STEPS = 2 * preset("converged").fit.iterations
 """Steps a room of `b`, `c` and `real`, where joint training needs more."""
-SEEDS = "0,1,2,3,4"
+SEEDS = "0,1,2,3,4,5"
+"""All orders of three rooms (`--order balanced`)."""
+MORE_SEEDS = "0,1,2,3,4,5,6,7,8,9,10,11"
 SHARES = (1, 3, 30)
 """Memory, per cent of the frames; `a` has 10."""
 PAPER_STAGES = 15
@@ -54,7 +59,7 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
     ) -> Sequence[Command]:
         trials = (
             *("benchmarks", "tune", "sim-tune", "--data", str(data / "sim-tune")),
-            *("--methods", *methods, "--rows", *rows, "--steps", str(TUNING_STEPS)),
+            *("--methods", *methods, "--rows", *rows),
             *("--file", file, "--out", str(out / folder), *options),
         )
         outcomes = file.replace(".json", ".outcomes.json")
@@ -63,11 +68,11 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
     def publish(name: str) -> Command:
         return "benchmarks", "publish", str(out / name), name
 
-    tuned = ("--preset", "converged", "--order", "shuffled")
+    tuned = ("--preset", "converged", "--order", "balanced")
     doubled = (*tuned, "--steps", str(DOUBLED_STEPS))
     head = ("--backbone", "paper_head")
     methods = ("er", "icarl", "buff_cs", "sars_spdd", "gec")
-    rows = (*methods, "sars_reprojection", "reservoir_spdd")
+    rows = (*methods, "sars_old_output", "sars_reprojection", "reservoir_spdd")
     return {
         "tune": tune(ROWS, "tune", methods, rows),
         "gate": [
@@ -80,6 +85,10 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
                 *("sim-mini", "networks-a", *tuned, "--rows", ROWS),
                 *("--strategies", CONTROLS, "--seeds", SEEDS),
             ),
+            bench(
+                *("sim-mini", "networks-a", *tuned, "--rows", str(out / CONTRASTS)),
+                *("--seeds", MORE_SEEDS),
+            ),
             publish("networks-a"),
         ],
         "memory": [
@@ -90,7 +99,7 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
                 for name in [f"networks-memory-{share}"]
                 for command in (
                     bench(
-                        *("sim-mini", name, *tuned, "--rows", str(out / SELECTION)),
+                        *("sim-mini", name, *tuned, "--rows", str(out / FILLED)),
                         *("--memory", f"{share}%", "--seeds", "0,1,2"),
                     ),
                     publish(name),
@@ -98,7 +107,10 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
             ),
         ],
         "b": [
-            *tune(PAPER_HEAD_ROWS, "tune-paper-head", ("er", "sars_spdd"), SELECTED, *head),
+            *tune(
+                *(PAPER_HEAD_ROWS, "tune-paper-head", ("er", "sars_spdd"), SELECTED, *head),
+                *("--steps", str(HALF_STEPS)),
+            ),
             rooms("sim-mini"),
             bench(
                 *("sim-mini", "networks-b", *doubled, *head),
@@ -164,9 +176,9 @@ def run(
         print(" ".join(command), flush=True)
         if dry:
             continue
-        for name in (SELECTION, FILLED):
+        for name, rows in SELECTIONS.items():
             if str(out / name) in command:
-                write_json(out / name, _rows(filled=name == FILLED))
+                write_json(out / name, _tuned(rows))
         began = time.perf_counter()
         code = subprocess.run(_words(command, device), cwd=ROOT, check=False).returncode
         print(f"{time.perf_counter() - began:.0f} s", flush=True)
@@ -182,12 +194,12 @@ def paper_hours(device: str) -> float:
     return seconds * PAPER_SIM_STEPS * PAPER_STAGES / 3600
 
 
-def _rows(*, filled: bool) -> list[dict]:
-    """Return the tuned rows `SELECTED`, and `sars_spdd_filled` if asked for."""
-    rows = [row for row in read_rows(str(ROOT / ROWS)) if row["name"] in SELECTED]
-    like = next(row for row in rows if row["name"] == "sars_spdd")
-    name = "sars_spdd_filled"
-    return [*rows, *([{**like, "name": name, "of": name}] if filled else [])]
+def _tuned(names: Sequence[str]) -> list[dict]:
+    """Return tuned rows by name."""
+    rows = {row["name"]: row for row in read_rows(str(ROOT / ROWS))}
+    filled = "sars_spdd_filled"
+    rows[filled] = {**rows["sars_spdd"], "name": filled, "of": filled}
+    return [rows[name] for name in names]
 
 
 def _words(command: Command, device: str) -> list[str]:

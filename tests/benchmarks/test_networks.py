@@ -20,7 +20,7 @@ def test_all_commands_are_valid_and_resume_in_folders_of_their_own() -> None:
         for command in commands
         if command[:2] == ("evercal", "bench")
     ]
-    assert len(benches) == 10
+    assert len(benches) == 11
     folders = set()
     for command in benches:
         parsed = _parse(list(command[1:]), as_json=False)
@@ -36,15 +36,15 @@ def test_a_dry_run_prints_the_commands_and_runs_nothing(
     assert networks.run(("a", "memory"), tmp_path, tmp_path, dry=True) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"evercal simulate sim-mini --sweep-only --out {tmp_path}/sim-mini"
-    assert len(lines) == 10
+    assert len(lines) == 11
     assert not list(tmp_path.iterdir())
 
 
 def test_filled_sars_has_the_setting_of_sars_spdd() -> None:
-    rows = {row["name"]: row for row in networks._rows(filled=True)}
+    rows = {row["name"]: row for row in networks._tuned(networks.SELECTIONS[networks.FILLED])}
     assert rows["sars_spdd_filled"]["with"] == rows["sars_spdd"]["with"]
     assert rows["sars_spdd_filled"]["of"] == "sars_spdd_filled"
-    assert set(rows) - {row["name"] for row in networks._rows(filled=False)} == {"sars_spdd_filled"}
+    assert set(rows) - set(networks.SELECTED) == {"sars_spdd_filled"}
 
 
 def test_an_unknown_experiment_is_refused() -> None:

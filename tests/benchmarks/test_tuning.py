@@ -17,11 +17,13 @@ from evercal.errors import InputError
 from evercal.recordings import Recording
 
 
-def result(strategy: str, stage: int, scene: str, errors_m: tuple[float, ...]) -> SceneResult:
+def result(
+    strategy: str, stage: int, scene: str, errors_m: tuple[float, ...], seed: int = 0
+) -> SceneResult:
     n = len(errors_m)
     return SceneResult(
         strategy=strategy,
-        seed=0,
+        seed=seed,
         stage=stage,
         scene=scene,
         frames=tuple(map(str, range(n))),
@@ -43,15 +45,19 @@ def test_final_scores_use_the_last_stage(tmp_path: Path) -> None:
             result("er_0.1", 0, "a", (0.0, 0.0)),
             result("er_0.1", 1, "a", (0.1, math.inf)),
             result("er_0.1", 1, "b", (0.04, 0.0)),
+            # The second seed learns the scenes in the other order.
+            result("er_0.1", 0, "b", (0.0, 0.0), 1),
+            result("er_0.1", 1, "b", (0.0, 0.0), 1),
+            result("er_0.1", 1, "a", (0.0, math.inf), 1),
         ],
     )
     row = {"name": "er_0.1", "of": "er", "with": {"weight": 0.1}}
     assert tuning.final_scores(tmp_path, [strategy_from_row("t", row)], 2) == {
         "er_0.1": {
-            "auc_20cm": 57.5,
-            "auc_earlier": 25.0,
-            "auc_newest": 90.0,
-            "accuracy_5cm_5deg": 50.0,
+            "auc_20cm": 66.25,
+            "auc_earlier": 62.5,
+            "auc_newest": 70.0,
+            "accuracy_5cm_5deg": 62.5,
         }
     }
 

@@ -49,8 +49,9 @@ class Bench:
     `evercal.continual.benchmark.rows`)."""
     seeds: Annotated[str, arg(metavar="0,1")] = "0,1,2"
     """Comma-separated seeds; every strategy runs once with each."""
-    order: Literal["given", "reversed", "shuffled"] = "given"
-    """Order in which the scenes are learned."""
+    order: Literal["given", "reversed", "shuffled", "balanced"] = "given"
+    """Order in which the scenes are learned. shuffled draws one for each seed. balanced turns the
+    given order by one place for each seed, and reverses it in every second round."""
     scenes: Annotated[str, arg(metavar="A,B", help_behavior_hint="")] = ""
     """Comma-separated scenes of the suite. Defaults to all."""
     data: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None

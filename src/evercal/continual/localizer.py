@@ -38,6 +38,9 @@ class NetworkLocalizeOptions:
     """RANSAC settings. Points of a network scatter more than landmarks, so the radius is wider."""
     patches_short_side: int = 480
     """Short side of the image in a query, pixels."""
+    refuses: bool = True
+    """Whether a pose with too few inliers is refused. A comparison with published methods, which
+    answer for every image, scores all poses."""
 
 
 def open_networks(path: Path, device: str = "auto") -> LearnedLocalizer:
@@ -57,13 +60,20 @@ def open_networks(path: Path, device: str = "auto") -> LearnedLocalizer:
     return localizer_of(scenes.to(where))
 
 
-def localizer_of(scenes: LearnedScenes) -> LearnedLocalizer:
-    """The localizer for what a strategy learns: a map, networks, or both."""
+def localizer_of(
+    scenes: LearnedScenes, options: NetworkLocalizeOptions | None = None
+) -> LearnedLocalizer:
+    """The localizer for what a strategy learns: a map, networks, or both.
+
+    Args:
+        scenes: networks and scenes.
+        options: of networks without a map.
+    """
     if not scenes.heads:
         return Localizer(scenes.map_contents())
     if scenes.scenes[-1].map is not None:
         return HybridLocalizer(scenes)
-    return NetworkLocalizer(scenes)
+    return NetworkLocalizer(scenes, options)
 
 
 class NetworkLocalizer:
@@ -187,7 +197,7 @@ class NetworkLocalizer:
         position = record.cell.atlas_from_base.apply(best.pose.pose.translation_m)
         if self.contents.atlas().scene_at(position) != best.scene:
             return "failed", "the pose lies outside the cell of its scene"
-        if best.inlier_ratio < record.inlier_threshold:
+        if self.options.refuses and best.inlier_ratio < record.inlier_threshold:
             need = f"{100 * record.inlier_threshold:.0f} %"
             share = f"{100 * best.inlier_ratio:.0f} %"
             return (

@@ -256,6 +256,14 @@ def test_orders() -> None:
     assert all(sorted(order) == [s.name for s in scenes] for order in drawn)
     assert len({tuple(order) for order in drawn}) > 15
     assert drawn[3] == [s.name for s in in_order(scenes, "shuffled", 3)]
+    for count in (3, 5):
+        orders = [in_order(scenes[:count], "balanced", seed) for seed in range(2 * count)]
+        assert orders[0] == scenes[:count]
+        assert len({tuple(scene.name for scene in order) for order in orders}) == 2 * count
+        for begun in (0, count):
+            for place in range(count):
+                learned = {order[place].name for order in orders[begun : begun + count]}
+                assert len(learned) == count, "each scene once in each place"
 
 
 def test_suites_load_their_scenes_in_order() -> None:

@@ -143,6 +143,8 @@ def test_scenes_have_their_own_threshold(correct: float, status: str) -> None:
     assert (estimate.base_from_camera is None) == (status != "ok")
     if status == "unknown_scene":
         assert "scene-0 needs 50 %" in estimate.reason
+    every = NetworkLocalizer(world.scenes, NetworkLocalizeOptions(refuses=False))
+    assert every.localize(world.view(0, correct=correct)).status == "ok"
     records = world.scenes.scenes
     records[0] = replace(records[0], inlier_threshold=0.25)
     assert NetworkLocalizer(world.scenes).localize(world.view(0, correct=correct)).status == "ok"

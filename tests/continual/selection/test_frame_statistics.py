@@ -125,7 +125,6 @@ def test_poses_match_the_frames_and_draws_are_reproducible(rooms: Rooms) -> None
         assert pose is not None
         np.testing.assert_allclose(poses[i].matrix(), pose.matrix(), atol=1e-12)
     assert candidates.rng().random() == candidates.rng().random()
-    assert (
-        FrameStatistics(frames, Head(4, 4, HeadOptions()), never, 8).rng().random()
-        != candidates.rng().random()
-    )
+    for other in ((8, 0), (9, 1)):
+        drawn = FrameStatistics(frames, Head(4, 4, HeadOptions()), never, *other).rng().random()
+        assert drawn != candidates.rng().random(), other

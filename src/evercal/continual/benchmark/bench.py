@@ -27,7 +27,7 @@ from filelock import FileLock, Timeout
 
 from evercal.continual.benchmark import results
 from evercal.continual.benchmark.results import SceneResult
-from evercal.continual.benchmark.strategy_run import RunOptions, run_strategy
+from evercal.continual.benchmark.strategy_run import NETWORK_LOCALIZE, RunOptions, run_strategy
 from evercal.continual.learning.learn_scene import OnEvent
 from evercal.continual.learning.stage import StageOptions
 from evercal.continual.networks.descriptor import DESCRIPTOR_FILE
@@ -41,7 +41,7 @@ from evercal.recordings import Recording
 from evercal.storage import sha256_file, write_json
 from evercal.storage.settings import lock_settings
 
-Order = Literal["given", "reversed", "shuffled"]
+Order = Literal["given", "reversed", "shuffled", "balanced"]
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class BenchOptions:
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds; every strategy runs once with each."""
     order: Order = "given"
-    """Order of the scenes; `shuffled` depends on the seed."""
+    """Order of the scenes; `shuffled` and `balanced` depend on the seed."""
     short_side: int = 240
     """Working size of images, pixels."""
     settings: dict[str, object] = field(default_factory=dict)
@@ -186,6 +186,11 @@ def in_order(scenes: Sequence[Recording], order: Order, seed: int) -> list[Recor
     """Return the scenes in order of learning."""
     if order == "reversed":
         return list(scenes)[::-1]
+    if order == "balanced":
+        # Over N seeds each scene is learned in each place once. Six seeds are all orders of three.
+        rounds, places = divmod(seed, len(scenes))
+        turned = [scenes[(i + places) % len(scenes)] for i in range(len(scenes))]
+        return turned[::-1] if rounds % 2 else turned
     if order == "shuffled":
         return [scenes[i] for i in np.random.default_rng([seed, 11]).permutation(len(scenes))]
     return list(scenes)
@@ -197,6 +202,7 @@ def _settings(scenes: Sequence[Recording], options: BenchOptions) -> dict[str, o
         **asdict(replace(stage, seed=0, encode=replace(stage.encode, seed=0))),
         "networks": [sha256_file(file)[:12] for file in (ENCODER_FILE, DESCRIPTOR_FILE)],
         "localize": asdict(LocalizeOptions()),
+        "localize_networks": asdict(NETWORK_LOCALIZE),
         "acceptance": {k: v for k, v in vars(acceptance).items() if isinstance(v, float)},
         "order": options.order,
         "short_side": options.short_side,

@@ -35,7 +35,7 @@ from evercal.continual.learning.learn_scene import (
 )
 from evercal.continual.learning.stage import Stage, StageOptions
 from evercal.continual.learning.stage_rows import encoded, scene_buffer, view_plan
-from evercal.continual.localizer import NetworkLocalizer, localizer_of
+from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer, localizer_of
 from evercal.continual.networks.atlas import combined_centres
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.feature_cache import cache_features
@@ -54,6 +54,10 @@ from evercal.recordings import Frame, Recording, stated_poses
 from evercal.recordings.held_out import split_held_out
 from evercal.storage import write_json
 from evercal.storage.stages import is_store
+
+NETWORK_LOCALIZE = NetworkLocalizeOptions(refuses=False)
+"""Networks answer for every image, as published methods do. A refusal rule would favour methods
+whose inliers stay above the threshold that was fitted when a scene was learned."""
 
 
 @dataclass(frozen=True)
@@ -222,7 +226,7 @@ class _Run:
 
         A map is also evaluated without alignment. A network beside a map is also evaluated alone.
         """
-        name, localizer = self.strategy.name, localizer_of(scenes)
+        name, localizer = self.strategy.name, localizer_of(scenes, NETWORK_LOCALIZE)
         results = self._results(name, localizer, scenes, number, seconds)
         if number == len(self.scenes) - 1:
             keep_views(self.options.out, name, localizer, self.scenes)
@@ -232,7 +236,7 @@ class _Run:
             unaligned = Localizer(scenes.map_contents(), LocalizeOptions(align=False))
             return results + self._results(name + UNALIGNED, unaligned, scenes, number, seconds)
         network = self._without_map(scenes, self.strategy.method.replays)
-        alone = NetworkLocalizer(network)
+        alone = NetworkLocalizer(network, NETWORK_LOCALIZE)
         return results + self._results(name + NETWORK, alone, network, number, seconds)
 
     def _without_map(self, scenes: LearnedScenes, replays: bool) -> LearnedScenes:

@@ -67,8 +67,9 @@ def _keyframes(
     """Keyframes of the map; without a map, the selection of the method."""
     if scene.built is not None:
         return scene.built.scene.keyframes
-    head, _ = scenes.head_for(len(scenes.scenes) - 1)
-    statistics = FrameStatistics(scene.frames, head, scene.rows, options.seed)
+    newest = len(scenes.scenes) - 1
+    head, _ = scenes.head_for(newest)
+    statistics = FrameStatistics(scene.frames, head, scene.rows, options.seed, newest)
     capacity = options.memory.capacity(scene.frames, scenes.short_side)
     selected = method.select(statistics, capacity)
     if selected is None:

@@ -45,7 +45,7 @@ def _reprojection(student: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Reprojection(Penalty):
-    """The loss of new rows, with the same schedule of the clamp."""
+    """The reprojection loss of new rows, with the same schedule of the clamp."""
 
     needs_teacher: ClassVar[bool] = False
 

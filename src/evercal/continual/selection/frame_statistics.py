@@ -27,21 +27,29 @@ class FrameStatistics:
     """
 
     def __init__(
-        self, frames: Sequence[Frame], head: Head, rows: Callable[[], FeatureBuffer], seed: int
+        self,
+        frames: Sequence[Frame],
+        head: Head,
+        rows: Callable[[], FeatureBuffer],
+        seed: int,
+        scene: int = 0,
     ):
         poses = stated_poses(frames)
         self.positions_m = poses.translation_m
         """(n, 3) camera positions in the base frame."""
         self.quaternions_wxyz = poses.rotation_wxyz
         """(n, 4) camera orientations."""
-        self._head, self._rows, self._seed = head, rows, seed
+        self._head, self._rows, self._seed = head, rows, (seed, 31, scene)
 
     def __len__(self) -> int:
         return len(self.positions_m)
 
     def rng(self) -> np.random.Generator:
-        """Create the generator of a selector, with the same state at every call."""
-        return np.random.default_rng([self._seed, 31])
+        """Create the generator of a selector, with the same state at every call.
+
+        Each scene of a run has its own, so that scenes of equal length keep different frames.
+        """
+        return np.random.default_rng(self._seed)
 
     @cached_property
     def _buffer(self) -> FeatureBuffer:
