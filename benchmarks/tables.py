@@ -18,6 +18,7 @@ import pandas as pd
 from benchmarks.publish import FOLDER
 from evercal.continual.benchmark.ablation import ablation_rows
 from evercal.continual.benchmark.comparison import (
+    AREA,
     Run,
     TableRows,
     by_strategy,
@@ -117,7 +118,10 @@ def _bench(rows_of: Callable[[Sequence[Run]], TableRows]) -> Callable[..., str]:
     return generated
 
 
-SUMMARY = ("strategy", "runs", "final %", "1 cm 1 deg %", "last scene %", "TFR", "memory MB", "s")
+SUMMARY = (
+    *("strategy", "runs", "final %", "1 cm 1 deg %", AREA, "last scene %", "TFR"),
+    *("memory MB", "s"),
+)
 """Columns of the kind `summary`."""
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from evercal.continual.benchmark.comparison import (
+    AREA,
     Run,
     as_text,
     contrast_rows,
@@ -84,19 +85,21 @@ def test_joint_training_has_no_forgetting() -> None:
     assert run.scores().final_accuracy == pytest.approx(90)
     assert math.isnan(run.scores().total_forgetting)
     _, row = method_rows([run])
-    assert row[:8] == ["joint", "1", "90.0", "0.0", "-", "90.0", "-", "-"]
+    assert [*row[:4], *row[5:9]] == ["joint", "1", "90.0", "0.0", "-", "90.0", "-", "-"]
 
 
 def test_method_table_shows_means_and_spread() -> None:
     header, ours, theirs = method_rows(runs_of(OURS + THEIRS))
     # Finals 65 and 70; last scene 60 and 50; forgetting 10 and 0;
     # ACC (80 + 70 + 60) / 3 and (90 + 90 + 50) / 3.
-    assert ours[:7] == ["ours", "2", "67.5 ± 3.5", "0.0", "73.3", "55.0", "5.0"]
+    assert [*ours[:4], *ours[5:8]] == ["ours", "2", "67.5 ± 3.5", "0.0", "73.3", "55.0", "5.0"]
+    # A frame off by 2 cm has 90 % of the area to 20 cm, others have none.
+    assert float(ours[4]) == pytest.approx(0.9 * 67.5, abs=0.06)
     # One of 20 frames is in the wrong scene. Of the other 38, 26 and 28 are correct.
-    assert ours[9:] == ["5.0", "0.0", "-", "2.0", "71.1", "2.0", "3.0", "21.0"]
+    assert ours[10:] == ["5.0", "0.0", "-", "2.0", "71.1", "2.0", "3.0", "21.0"]
     assert theirs[2] == "45.0"
     text = as_text([header, ours, theirs], "markdown")
-    assert [line.count("|") for line in text.splitlines()] == [18] * 4
+    assert [line.count("|") for line in text.splitlines()] == [19] * 4
 
 
 def test_refused_frames_and_ellipsoids_are_counted() -> None:
@@ -197,7 +200,11 @@ def test_contrasts_pair_seeds_and_name_missing_runs() -> None:
     header, row, none = contrast_rows(
         runs_of(OURS + theirs), [("ours", "theirs"), ("ours", "joint")]
     )
-    assert header == ["contrast, points", "runs", "mean", "low", "high"]
+    scores = [head for name in ("final %", AREA) for head in (name, "bounds", "better in")]
+    assert header == ["contrast, points", "runs", *scores]
     half = 25.452 * 2.5
-    assert row == ["ours - theirs", "2", "+17.5", f"{17.5 - half:+.1f}", f"{17.5 + half:+.1f}"]
-    assert none == ["ours - joint", "0", "-", "-", "-"]
+    bounds = f"{17.5 - half:+.1f} to {17.5 + half:+.1f}"
+    assert row[:5] == ["ours - theirs", "2", "+17.5", bounds, "2"]
+    assert float(row[5]) == pytest.approx(0.9 * 17.5, abs=0.06)
+    assert row[7] == "2"
+    assert none == ["ours - joint", "0", *["-"] * 6]

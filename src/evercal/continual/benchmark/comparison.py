@@ -154,9 +154,11 @@ def _accuracy_in_right_scene(run: Run) -> float:
     return 100 * float(correct[in_right_scene].mean()) if in_right_scene.any() else math.nan
 
 
+AREA = "area to 20 cm"
 METHOD_MEASURES: Measures = {
     "final %": lambda run: run.scores().final_accuracy,
     "1 cm 1 deg %": lambda run: run.scores(FINE).final_accuracy,
+    AREA: lambda run: float(np.mean([recall_area(r.translation_m) for r in run.last])),
     "ACC": lambda run: run.scores().accuracy_along,
     "last scene %": lambda run: run.scores().last_scene_accuracy,
     "TFR": lambda run: run.scores().total_forgetting,
@@ -176,6 +178,7 @@ METHOD_MEASURES: Measures = {
 LEGEND = """\
 Accuracy: share of all test frames strictly below 5 cm and 5 deg, mean over scenes.
 final: accuracy after the last stage. last scene: accuracy on the scene learned last.
+area to 20 cm: area under the curve of recall over position error, up to 20 cm, per cent.
 ACC: mean accuracy over all stages and the scenes learned by then.
 TFR (total forgetting rate): mean drop from the best accuracy of a scene to its final one.
 forgetting: the same drop, with the best taken before the last stage; negative is a gain.
@@ -191,7 +194,7 @@ def _threshold_measure(thresholds: tuple[float, float]) -> Callable[[Run], float
 
 
 THRESHOLD_MEASURES: Measures = {
-    "area to 20 cm": lambda run: float(np.mean([recall_area(r.translation_m) for r in run.last])),
+    AREA: METHOD_MEASURES[AREA],
     **{
         f"{100 * metres:.0f} cm {np.rad2deg(radians):.0f} deg": _threshold_measure(
             (metres, radians)
@@ -330,21 +333,27 @@ def _on_common_seeds(ours: Sequence[Run], theirs: Sequence[Run]) -> list[tuple[R
 
 
 def contrast_rows(runs: Sequence[Run], pairs: Sequence[tuple[str, str]]) -> TableRows:
-    """Tabulate differences of final accuracy that were named before the runs, on common seeds.
+    """Tabulate differences that were named before the runs, on common seeds.
 
-    The intervals are `seeds_interval`, corrected for the number of pairs.
+    Final accuracy and `recall_area`, each with the number of runs in which the first is better. The
+    intervals are `seeds_interval`, corrected for the number of pairs.
     """
     grouped = by_strategy(runs)
-    rows = [["contrast, points", "runs", "mean", "low", "high"]]
+    scores = {name: METHOD_MEASURES[name] for name in ("final %", AREA)}
+    heads = [head for score in scores for head in (score, "bounds", "better in")]
+    rows = [["contrast, points", "runs", *heads]]
     for ours, theirs in pairs:
-        gains = [
-            a.scores().final_accuracy - b.scores().final_accuracy
-            for a, b in _on_common_seeds(grouped.get(ours, []), grouped.get(theirs, []))
-        ]
-        cells = ["-"] * 3
-        if len(gains) > 1:
-            cells = [f"{value:+.1f}" for value in seeds_interval(gains, len(pairs))]
-        rows.append([f"{ours} - {theirs}", str(len(gains)), *cells])
+        common = list(_on_common_seeds(grouped.get(ours, []), grouped.get(theirs, [])))
+        row = [f"{ours} - {theirs}", str(len(common))]
+        for score in scores.values():
+            gains = [score(a) - score(b) for a, b in common]
+            if len(gains) < 2:
+                row += ["-"] * 3
+                continue
+            mean, low, high = seeds_interval(gains, len(pairs))
+            better = sum(gain > 0 for gain in gains)
+            row += [f"{mean:+.1f}", f"{low:+.1f} to {high:+.1f}", str(better)]
+        rows.append(row)
     return rows
 
 
