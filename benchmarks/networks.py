@@ -29,10 +29,9 @@ SELECTIONS: Mapping[str, Sequence[str]] = {
 """Files of some tuned rows, in the folder of runs. `sars_spdd_filled` has the setting of
 `sars_spdd`."""
 CONTRASTS, FILLED = SELECTIONS
-HALF_STEPS = preset("converged").fit.iterations // 2
-"""Steps a room of the trials of `b`."""
-DOUBLED_STEPS = 2 * preset("converged").fit.iterations
-"""Steps a room of `b`, `c` and `real`, where joint training needs more."""
+STEPS = preset("converged").fit.iterations
+"""Steps a room of `a`. Joint training needs twice as many in `c` and `real`, and four times as many
+with the paper's head."""
 SEEDS = "0,1,2,3,4,5"
 """All orders of three rooms (`--order balanced`)."""
 MORE_SEEDS = "0,1,2,3,4,5,6,7,8,9,10,11"
@@ -69,7 +68,7 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
         return "benchmarks", "publish", str(out / name), name
 
     tuned = ("--preset", "converged", "--order", "balanced")
-    doubled = (*tuned, "--steps", str(DOUBLED_STEPS))
+    doubled = (*tuned, "--steps", str(2 * STEPS))
     head = ("--backbone", "paper_head")
     methods = ("er", "icarl", "buff_cs", "sars_spdd", "gec")
     rows = (*methods, "sars_old_output", "sars_reprojection", "reservoir_spdd")
@@ -109,11 +108,11 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
         "b": [
             *tune(
                 *(PAPER_HEAD_ROWS, "tune-paper-head", ("er", "sars_spdd"), SELECTED, *head),
-                *("--steps", str(HALF_STEPS)),
+                *("--steps", str(STEPS // 2)),
             ),
             rooms("sim-mini"),
             bench(
-                *("sim-mini", "networks-b", *doubled, *head),
+                *("sim-mini", "networks-b", *tuned, "--steps", str(4 * STEPS), *head),
                 *("--rows", PAPER_HEAD_ROWS, "--strategies", "joint,finetune", "--seeds", "0,1,2"),
             ),
             publish("networks-b"),
