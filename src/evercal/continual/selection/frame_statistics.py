@@ -39,7 +39,7 @@ class FrameStatistics:
         """(n, 3) camera positions in the base frame."""
         self.quaternions_wxyz = poses.rotation_wxyz
         """(n, 4) camera orientations."""
-        self._head, self._rows, self._seed = head, rows, (seed, 31, scene)
+        self._head, self._rows, self._seed, self._scene = head, rows, seed, scene
 
     def __len__(self) -> int:
         return len(self.positions_m)
@@ -49,7 +49,7 @@ class FrameStatistics:
 
         Each scene of a run has its own, so that scenes of equal length keep different frames.
         """
-        return np.random.default_rng(self._seed)
+        return np.random.default_rng([self._seed, 31, self._scene])
 
     @cached_property
     def _buffer(self) -> FeatureBuffer:
