@@ -12,6 +12,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from benchmarks.trainer import step_seconds
+from benchmarks.tuning import DERIVED
 from evercal.continual.benchmark.rows import read_rows
 from evercal.continual.learning.presets import PAPER_SIM_STEPS, preset
 from evercal.errors import InputError
@@ -26,8 +27,7 @@ SELECTIONS: Mapping[str, Sequence[str]] = {
     "networks-contrasts.json": (*SELECTED, "icarl", "buff_cs", "sars_old_output"),
     "networks-filled.json": (*SELECTED, "sars_spdd_filled"),
 }
-"""Files of some tuned rows, in the folder of runs. `sars_spdd_filled` has the setting of
-`sars_spdd`."""
+"""Files of some tuned rows, in the folder of runs."""
 CONTRASTS, FILLED = SELECTIONS
 STEPS = preset("converged").fit.iterations
 """Steps a room of `a`. Joint training needs twice as many in `c` and `real`, and four times as many
@@ -194,11 +194,9 @@ def paper_hours(device: str) -> float:
 
 
 def _tuned(names: Sequence[str]) -> list[dict]:
-    """Return tuned rows by name."""
+    """Return tuned rows by name; `DERIVED` ones take the setting of another."""
     rows = {row["name"]: row for row in read_rows(str(ROOT / ROWS))}
-    filled = "sars_spdd_filled"
-    rows[filled] = {**rows["sars_spdd"], "name": filled, "of": filled}
-    return [rows[name] for name in names]
+    return [{**rows[DERIVED[n]], "name": n, "of": n} if n in DERIVED else rows[n] for n in names]
 
 
 def _words(command: Command, device: str) -> list[str]:

@@ -17,6 +17,7 @@ from tyro.conf import Positional
 
 from evercal.continual.benchmark import results
 from evercal.continual.benchmark.bench import BenchOptions, begin_bench, run_bench
+from evercal.continual.benchmark.comparison import by_strategy, runs_of
 from evercal.continual.benchmark.rows import read_rows, strategy_from_row
 from evercal.continual.benchmark.suites import load_suite, tuning_split
 from evercal.continual.learning.presets import BACKBONES, Backbone
@@ -76,7 +77,7 @@ def run(
         file: File for the best rows, for `evercal bench --rows`. All trials are written beside it.
         data: Folder of the suite's recordings.
         scenes: Number of its scenes.
-        seeds: Seeds of every trial, none of a table. They decide the order of the scenes, as
+        seeds: Seeds of every trial; tables use others. They decide the order of the scenes, as
             `evercal bench --order balanced` does: 102 keeps the order of three, 105 reverses it.
         methods: Methods to tune. Defaults to all.
         rows: Rows to write. Defaults to those of all tuned methods and their variants.
@@ -172,7 +173,7 @@ def _run_trials(
         for step in run_bench(scenes, options, out):
             print(f"[{step.done}/{step.total}] {step.strategy}", flush=True)
         time.sleep(1)  # another process may still have a run
-    return final_scores(out, strategies, len(scenes))
+    return final_scores(out, strategies)
 
 
 def beyond(tried: Trials, best: int) -> list[Mapping[str, object]]:
@@ -209,29 +210,31 @@ def _name(method: str, changes: Mapping[str, object]) -> str:
     return f"{method}_{_setting(changes)[1]:g}"
 
 
-def final_scores(
-    out: Path, strategies: Sequence[Strategy], stages: int
-) -> dict[str, dict[str, float]]:
+def final_scores(out: Path, strategies: Sequence[Strategy]) -> dict[str, dict[str, float]]:
     """Summarize each strategy after the last stage.
 
     Returns:
-        By name, per cent, means over seeds: area under the recall curve up to 20 cm as the mean
-        over scenes (`auc_20cm`), over earlier scenes (`auc_earlier`) and for the newest
-        (`auc_newest`), and the accuracy at 5 cm and 5 deg (`accuracy_5cm_5deg`).
+        By name, per cent, means over seeds. `auc_20cm` is the area under the recall curve up to
+        20 cm, `auc_earlier` that of earlier scenes and `auc_newest` that of the newest.
+        `accuracy_5cm_5deg` is the final accuracy.
     """
-    # The lines of a run are in the order of learning.
-    runs: dict[str, dict[int, list[tuple[float, float]]]] = {s.name: {} for s in strategies}
-    for result in results.read(out):
-        if result.stage == stages - 1 and result.strategy in runs:
-            scores = recall_area(result.translation_m), 100 * result.accuracy()
-            runs[result.strategy].setdefault(result.seed, []).append(scores)
-    scored = {name: np.array(list(of.values())) for name, of in runs.items()}  # (seeds, scenes, 2)
+    names = {strategy.name for strategy in strategies}
+    lines = [result for result in results.read(out) if result.strategy in names]
+    groups = by_strategy(runs_of(lines))
+    areas = {  # (seeds, scenes in the order of learning)
+        name: np.array([[recall_area(end.translation_m) for end in run.last] for run in group])
+        for name, group in groups.items()
+    }
+    finals = {
+        name: np.mean([run.scores().final_accuracy for run in group])
+        for name, group in groups.items()
+    }
     return {
         name: {
-            "auc_20cm": round(float(scores[:, :, 0].mean()), 2),
-            "auc_earlier": round(float(scores[:, :-1, 0].mean()), 2),
-            "auc_newest": round(float(scores[:, -1, 0].mean()), 2),
-            "accuracy_5cm_5deg": round(float(scores[:, :, 1].mean()), 2),
+            "auc_20cm": round(float(area.mean()), 2),
+            "auc_earlier": round(float(area[:, :-1].mean()), 2),
+            "auc_newest": round(float(area[:, -1].mean()), 2),
+            "accuracy_5cm_5deg": round(float(finals[name]), 2),
         }
-        for name, scores in scored.items()
+        for name, area in areas.items()
     }

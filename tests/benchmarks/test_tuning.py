@@ -52,7 +52,7 @@ def test_final_scores_use_the_last_stage(tmp_path: Path) -> None:
         ],
     )
     row = {"name": "er_0.1", "of": "er", "with": {"weight": 0.1}}
-    assert tuning.final_scores(tmp_path, [strategy_from_row("t", row)], 2) == {
+    assert tuning.final_scores(tmp_path, [strategy_from_row("t", row)]) == {
         "er_0.1": {
             "auc_20cm": 66.25,
             "auc_earlier": 62.5,

@@ -93,7 +93,7 @@ def test_method_table_shows_means_and_spread() -> None:
     # Finals 65 and 70; last scene 60 and 50; forgetting 10 and 0;
     # ACC (80 + 70 + 60) / 3 and (90 + 90 + 50) / 3.
     assert [*ours[:4], *ours[5:8]] == ["ours", "2", "67.5 ± 3.5", "0.0", "73.3", "55.0", "5.0"]
-    # A frame off by 2 cm has 90 % of the area to 20 cm, others have none.
+    # A frame off by 2 cm has 90 % of the area to 20 cm, other frames nothing.
     assert float(ours[4]) == pytest.approx(0.9 * 67.5, abs=0.06)
     # One of 20 frames is in the wrong scene. Of the other 38, 26 and 28 are correct.
     assert ours[10:] == ["5.0", "0.0", "-", "2.0", "71.1", "2.0", "3.0", "21.0"]
