@@ -25,7 +25,7 @@ VERBS = {
     "network-figure": "final accuracy over forgetting, a point for each method",
     "paper": "the first steps of preset paper",
     "trainer": "time of a training step",
-    "speed": "time of localization and SARS",
+    "speed": "time of learning, localization and SARS",
     "serve": "latency of the HTTP service, alone and while a scene is learned",
     "memory": "memory of a service and of a tracker over many images",
     "many-recordings": "recordings learned at once, beside one after the other",
@@ -34,7 +34,6 @@ VERBS = {
     "intervals": "coverage of confidence intervals",
     "publish": "write results to results/NAME.jsonl",
     "tables": "generate the tables of the docs from results/",
-    "gate": "check accuracy, speed and size against the committed baseline",
 }
 MODULES = {
     "handeye": "hand_eye",
@@ -51,11 +50,10 @@ MODULES = {
 
 
 def main(args: list[str]) -> int:
-    """Run one measurement and return its exit code; `--gate` is short for `gate`."""
+    """Run one measurement and return its exit code."""
     from evercal.errors import InputError
 
     verb, *rest = args or ["--help"]
-    verb = "gate" if verb == "--gate" else verb
     if verb not in VERBS:
         print("usage: python -m benchmarks VERB [--help]\n")
         print("\n".join(f"  {name:15} {summary}" for name, summary in VERBS.items()))

@@ -1,59 +1,79 @@
-"""Time of localization, SARS and import."""
+"""Time of learning, of localization, of SARS and of import."""
 
+import json
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
+from tabulate import tabulate
 
-from evercal.features.encode import encode_features
-from evercal.features.views import ViewOptions, plain_view
-from evercal.localization.localizer import Localizer
 from evercal.localization.parallel import in_parallel
+from evercal.map import Map
 from evercal.mapping.selection import SarsOptions, select_sars
-from evercal.recordings.images import read_image
-from evercal.simulation.box_room import default_camera
+from evercal.recordings.samples import sample_rooms
+
+_WARM = 5
+"""Images located before the first one that counts."""
 
 
-def run(store: Path, image: Path, repeat: int = 50) -> None:
-    """Time localization of one image, alone and in a batch, SARS, and import.
+def run(out: Path = Path("runs/speed.json"), repeat: int = 3) -> None:
+    """Time learning of the packaged rooms and localization of their test images.
+
+    Images are decoded before. Also timed: SARS on 10,000 poses, and import.
 
     Args:
-        store: A store.
-        image: An image of one of its scenes.
-        repeat: Repetitions.
+        out: File of rows to write.
+        repeat: Times that a room is learned; the median counts.
     """
-    localizer = Localizer.open(store)
+    rooms = [room.scene for room in sample_rooms()]
+    learned: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        for room in rooms:
+            seconds = []
+            for attempt in range(repeat):
+                fresh = Map.open(Path(scratch) / f"{room.name}-{attempt}")
+                seconds.append(_milliseconds(lambda r=room, m=fresh: m.learn(r), 1)[0] / 1000)
+            learned[room.name] = float(np.median(seconds))
+        cell = Map.open(Path(scratch) / "all")
+        for room in rooms:
+            cell.learn(room)
+        rows = []
+        for room in rooms:
+            images = [frame.read_image() for frame in room.test]
+            for image in images[:_WARM]:
+                cell.localizer.localize(image)
+            began = time.process_time()
+            times = [
+                _milliseconds(lambda i=image: cell.localizer.localize(i), 1) for image in images
+            ]
+            busy = 1000 * (time.process_time() - began) / len(images)
+            (whole,) = _milliseconds(
+                lambda many=images: list(in_parallel(cell.localizer.localize, many)), 1
+            )
+            rows.append(
+                {
+                    "room": room.name,
+                    "learn_s": learned[room.name],
+                    "locate_ms": float(np.median(times)),
+                    "locate_90_%_ms": float(np.percentile(times, 90)),
+                    "processor_ms": busy,
+                    "batch_images_per_s": 1000 * len(images) / whole,
+                }
+            )
+    settings = {"threads": torch.get_num_threads(), "scenes": len(rooms), "repeat": repeat}
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(json.dumps({"rows": rows, "settings": settings}, indent=1))
+    print(tabulate(rows, "keys", floatfmt=".3g"))
+    _others()
 
-    def localize(path: Path = image) -> None:
-        localizer.localize(read_image(path))
 
-    _milliseconds(localize, 5)
-    began = time.process_time()
-    one = _milliseconds(localize, repeat)
-    busy = 1000 * (time.process_time() - began) / repeat
-    print(
-        f"localize, decoding included: median {np.median(one):.1f} ms, worst {max(one):.1f} ms,"
-        f" {busy:.1f} ms of processor time on {torch.get_num_threads()} threads"
-    )
-    encoder, short_side = localizer.contents.encoder, localizer.contents.short_side
-    pixels = read_image(image)
-    height, width = pixels.shape[:2]
-    camera, options = default_camera(width, height), ViewOptions(short_side)
-    view = plain_view(pixels, camera, encoder.stride, options)
-    features = _milliseconds(lambda: encode_features([view], encoder), repeat)
-    print(f"features of one image: median {np.median(features):.1f} ms, worst {max(features):.1f}")
-    list(in_parallel(localize, [image] * 8))
-    began, cpu = time.perf_counter(), time.process_time()
-    list(in_parallel(localize, [image] * repeat))
-    seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
-    print(
-        f"batch, decoding included: {repeat / seconds:.1f} images per second,"
-        f" {1000 * cpu / repeat:.1f} ms of processor time each"
-    )
+def _others() -> None:
+    """Print the time of SARS and of import."""
     rng = np.random.default_rng(0)
     positions = np.cumsum(rng.normal(0, 0.01, (10_000, 3)), 0)
     quaternions = rng.normal(size=(10_000, 4))

@@ -87,6 +87,18 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 
 
 @pytest.fixture
+def cuda() -> torch.device:
+    """A CUDA device, for tests marked `gpu`; the test is skipped without one."""
+    import torch
+
+    from evercal.features.device import device_of
+
+    if not torch.cuda.is_available():
+        pytest.skip("this machine has no CUDA device")
+    return device_of("cuda")
+
+
+@pytest.fixture
 def two_threads() -> Iterator[None]:
     """torch with two threads, whatever the machine has."""
     import torch

@@ -43,6 +43,8 @@ def test_it_serves_a_page_and_ends_cleanly(tmp_path: Path) -> None:
         (["--camera", "GONE", "--poses", "p.csv"], "GONE: no such folder or video"),
         (["--camera", "DIR", "--poses", "p.csv"], "no --intrinsics FILE given"),
         (["--virtual", "--camera", "0"], "--camera: the virtual cell has its own"),
+        (["--virtual", "--most-age", "5"], "--most-age: the virtual cell has its own"),
+        (["--virtual", "--pose-convention", "ur"], "--pose-convention: the virtual cell has"),
         (["--virtual", "--fixed-intrinsics", "c.json"], "--fixed-intrinsics: is of --fixed"),
         (["--virtual", "--seed", "9000"], "seed 9000"),
         (["--virtual", "--port", "99999"], "--port 99999: give 0 to 65535"),

@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 
 from evercal.errors import InputError
+from evercal.features.encoder import load_encoder
 from evercal.learning.many import LearnTask, learn_scenes
 from evercal.map import Map
+from evercal.mapping.scene_map import MapContents
 from evercal.recordings import Recording
 from evercal.recordings.images import StoredImage
 
@@ -91,6 +93,21 @@ def test_a_killed_worker_is_replaced(rooms: tuple[Recording, ...], tmp_path: Pat
     assert len(list((tmp_path / "marks").iterdir())) == 1
 
 
+def test_a_worker_killed_while_the_caller_writes_a_scene_is_replaced(
+    rooms: tuple[Recording, ...],
+) -> None:
+    many = [replace(rooms[0], name=f"{i}") for i in range(3)]
+    outcomes = learn_scenes(LearnTask(MapContents(load_encoder(), 240)), many, 2)
+    first = next(iter(outcomes))
+    for child in children_of(os.getpid()):
+        if is_worker(child):
+            os.kill(child, signal.SIGKILL)
+    time.sleep(2.0)  # until the pool has noticed
+    rest = list(outcomes)
+    assert sorted(outcome.number for outcome in (first, *rest)) == [0, 1, 2]
+    assert all(outcome.scene is not None for outcome in (first, *rest))
+
+
 def test_a_recording_that_always_kills_is_given_up(
     rooms: tuple[Recording, ...], tmp_path: Path
 ) -> None:
@@ -153,9 +170,6 @@ def wait_for(condition):
 
 
 def test_stopping_early_ends_the_workers(rooms: tuple[Recording, ...]) -> None:
-    from evercal.features.encoder import load_encoder
-    from evercal.mapping.scene_map import MapContents
-
     many = [replace(rooms[0], name=f"{i}") for i in range(4)]
     outcomes = learn_scenes(LearnTask(MapContents(load_encoder(), 240)), many, 1)
     assert next(iter(outcomes)).scene is not None

@@ -101,35 +101,17 @@ def test_foreign_folders_are_refused(tmp_path: Path, tree: Tree) -> None:
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"schema": 1}, "schema 1 is of an earlier evercal; learn the scenes again into a new"),
-        ({"schema": 99}, "schema 99 .*update evercal"),
-        ({"kind": "networks", "strategy": "sars"}, "holds networks of strategy 'sars'"),
-        ({"networks": ["../secret.safetensors"]}, "network '../secret.safetensors' is not in"),
-        ({"stages": ["../0001-alpha"]}, "stage '../0001-alpha' is not a stage's name"),
-        ({"stages": ["/etc"]}, "stage '/etc' is not a stage's name"),
-    ],
-)
-def test_foreign_manifests_are_refused(
-    change: dict[str, object],
-    message: str,
-    scenes: list[SceneMap],
-    tmp_path: Path,
-    make: Make,
-    tree: Tree,
+def test_stores_of_networks_are_refused(
+    scenes: list[SceneMap], tmp_path: Path, make: Make, tree: Tree
 ) -> None:
     root = tmp_path / "store"
     make(root, scenes[:1])
-    (tmp_path / "secret.safetensors").write_bytes(b"x")
+    change = {"kind": "networks", "strategy": "sars"}
     manifest = json.loads((root / MANIFEST).read_text())
     write_manifest(root, manifest["payload"] | change, list(manifest["files"]))
     before = tree(root)
-    with pytest.raises(InputError, match=message) as refused:
+    with pytest.raises(InputError, match=f"{root}.*: holds networks of strategy 'sars'"):
         MapStore.open(root)
-    assert str(root) in str(refused.value)
-    assert "\n" not in str(refused.value)
     assert tree(root) == before
 
 

@@ -30,6 +30,7 @@ def test_estimates_are_those_of_the_map(
     for given, camera in ((image, None), (pixels, None), (str(image), hall.test[7].camera)):
         got, expected = client.localize(given, camera), opened.localize(pixels, camera)
         assert (got.status, got.scene, got.inliers) == ("ok", "hall", expected.inliers)
+        assert got.support == expected.support > 0
         assert got.base_from_camera is not None
         assert expected.base_from_camera is not None
         assert pose_distance(got.base_from_camera, expected.base_from_camera)[0] < 1e-12

@@ -17,14 +17,16 @@ from evercal.geometry import SE3, UncertainPose, pose_distance
 from evercal.live.camera import StreamCamera
 from evercal.live.coverage import coverage
 from evercal.live.robot import PoseFileRobot
-from evercal.recordings import load_recording
+from evercal.map import Map
+from evercal.recordings import Recording, load_recording
+from evercal.recordings.formats import generic
 from evercal.service.studio.devices import Devices, Seen, moved
 from evercal.service.studio.folders import Folders
 from evercal.service.studio.jobs import Jobs
 from evercal.service.studio.rest import RestTrigger
 from evercal.service.studio.steps import Facts, current_step, step_states
 from evercal.service.studio.studio import Studio
-from evercal.service.studio.wrist import LearnedSamples, free_name, read_learned
+from evercal.service.studio.wrist import LearnedSamples, free_name, learned_again, read_learned
 from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
 
 SMALL = CellOptions(width=160, height=120)
@@ -220,6 +222,42 @@ def test_devices_that_give_nothing_are_named(cell: VirtualCell, tmp_path: Path) 
         studio.take_fixed()
     with pytest.raises(InputError, match="not calibrated yet"):
         studio.export("wrist", "urdf")
+
+
+def test_each_camera_has_its_own_problem(cell: VirtualCell, tmp_path: Path) -> None:
+    class Unplugged:
+        def read(self) -> tuple[float, np.ndarray]:
+            raise InputError("unplugged")
+
+    devices = replace(devices_of(cell), fixed_camera=Unplugged())
+    studio = Studio(devices, Folders(tmp_path, tmp_path / "map"), "cpu")
+    studio.connection.look("wrist")
+    seen = studio.connection.look("fixed")
+    assert seen.fixed_problem == "unplugged"
+    assert seen.complete
+
+
+def test_samples_learned_again_replace_their_scene_in_one_step(
+    rooms: tuple[Recording, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = Folders(tmp_path, tmp_path / "map")
+    generic.write(folders.wrist, replace(rooms[0], train=rooms[0].train[:16]))
+    opened = Map.open(folders.map, device="cpu")
+    opened.learn(folders.wrist, name="own")
+    before = sorted(path.name for path in tmp_path.iterdir())
+
+    def killed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(opened, "merge", killed)
+        with pytest.raises(KeyboardInterrupt):
+            learned_again(opened, folders, "own", silent)
+    assert Map.open(folders.map, device="cpu").scenes == ("own",)
+    report = learned_again(opened, folders, "own", silent)
+    assert report.scene == "own"
+    assert opened.scenes == ("own",)
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
 def test_an_image_of_a_moving_arm_is_refused(cell: VirtualCell, tmp_path: Path) -> None:

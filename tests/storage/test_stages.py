@@ -15,6 +15,7 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.storage import MANIFEST, Manifest, verify, write_manifest
+from evercal.storage import manifest as module
 from evercal.storage.stages import SCHEMA, StageStore, is_store, read_store
 
 Tree = Callable[[Path], dict[str, str]]
@@ -272,6 +273,21 @@ def test_a_reader_starts_over_if_a_writer_replaces_files(root: Path) -> None:
 
     assert read_store(root, read) == '"new"'
     assert len(attempts) == 2
+
+
+def test_verify_starts_over_if_a_writer_was_faster(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer, writes, read = opened(root), iter("w"), module.sha256_file
+
+    def interrupted(path: Path) -> str:
+        for _ in writes:
+            writer.replace(0, lambda f: (f / "scene.json").write_text('"new"'), PAYLOAD)  # type: ignore[arg-type, return-value]
+        return read(path)
+
+    monkeypatch.setattr(module, "sha256_file", interrupted)
+    assert verify(root) == []
+    assert texts(root) == ["new", "hall"]
 
 
 @pytest.mark.parametrize("file", ["encoder-1.bin", "stages/0001-kitchen/head.bin"])

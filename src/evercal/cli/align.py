@@ -33,7 +33,7 @@ class Align:
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
     """Name of the scene."""
     images: Annotated[
-        Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")
+        Positional[tuple[Path, ...]], arg(metavar="[IMAGE...]", help_behavior_hint="")
     ] = ()
     """Images of a camera on the gripper, or a folder of them."""
     robot_poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -59,6 +59,12 @@ class Align:
         by_points = self.points is not None or self.picks is not None
         if by_points == (self.robot_poses is not None):
             raise InputError("give either images with --robot-poses, or --points with --picks")
+        others = (bool(self.images), self.convention is not None, self.board_poses is not None)
+        if by_points and any(others):
+            raise InputError(
+                "--points: images, --convention and --board-poses belong to --robot-poses; omit"
+                " them"
+            )
         from evercal.calibration.from_images import scene_named
         from evercal.features.device import device_of
         from evercal.localization.localizer import Localizer

@@ -38,7 +38,7 @@ class Bench:
     """One of sim-mini (packaged), sim, sim-7, sim-12, sim-tune, sim-unseen, sim-repeat,
     real2, i7s, i12s, custom, regions."""
     recordings: Annotated[
-        Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="")
+        Positional[tuple[Path, ...]], arg(metavar="[DIR...]", help_behavior_hint="")
     ] = ()
     """Recordings of the suite custom, in order of learning; one recording for regions."""
     strategies: Annotated[str | None, arg(metavar="A,B", help_behavior_hint="")] = None

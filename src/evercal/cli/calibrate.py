@@ -41,9 +41,10 @@ class Calibrate:
     """base_from_gripper of every image: a pose table, JSON, NPY or NPZ."""
     convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Format of the robot poses, if the file does not state it."""
-    mount: Annotated[Literal["eye_to_hand", "eye_in_hand"] | None, arg(help_behavior_hint="")] = (
-        None
-    )
+    mount: Annotated[
+        Literal["eye_to_hand", "eye_in_hand"] | None,
+        arg(metavar="eye_to_hand|eye_in_hand", help_behavior_hint=""),
+    ] = None
     """eye_to_hand for a fixed camera, eye_in_hand for one on the gripper. Default: decided from
     the camera's motion."""
     camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None

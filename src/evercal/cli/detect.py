@@ -32,7 +32,7 @@ class Detect:
     board: Literal["chessboard", "charuco", "apriltag"]
     """Printed board."""
     images: Annotated[
-        Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")
+        Positional[tuple[Path, ...]], arg(metavar="[IMAGE...]", help_behavior_hint="")
     ] = ()
     """Image files of one camera, or a folder of them."""
     size: Annotated[str | None, arg(metavar="CxR", help_behavior_hint="")] = None

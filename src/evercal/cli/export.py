@@ -25,7 +25,7 @@ class ExportCalibration:
     """
 
     calibration: Annotated[
-        Positional[Path | None], arg(metavar="CALIBRATION.json", help_behavior_hint="")
+        Positional[Path | None], arg(metavar="[CALIBRATION.json]", help_behavior_hint="")
     ] = None
     """Calibration file."""
     format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None

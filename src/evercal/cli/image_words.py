@@ -22,6 +22,14 @@ def camera_for(file: Path | None, images: Sequence[Path]) -> "Camera | None":
     if file is None:
         return None
     from evercal.recordings import image_size
+
+    return stated_camera(file, image_size(images[0]))
+
+
+def stated_camera(file: Path | None, size: tuple[int, int]) -> "Camera | None":
+    """The camera in the file of --camera, for images of (width, height)."""
+    if file is None:
+        return None
     from evercal.recordings.poses.camera_file import read_camera
 
-    return read_camera(file, image_size(images[0]))
+    return read_camera(file, size)

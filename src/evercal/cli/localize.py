@@ -43,8 +43,8 @@ class Localize:
     images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...", help_behavior_hint="")]
     """Image files or folders of them."""
     camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Intrinsics: 3x3 matrix as text, JSON, or ROS camera_info YAML. Default: those of the camera
-    that recorded the scene."""
+    """Intrinsics: 3x3 matrix as text, JSON, YAML, NPZ, ROS camera_info or OpenCV's storage.
+    Default: those of the camera that recorded the scene."""
     overlay: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Output folder for copies of the images with their inliers."""
     video: Annotated[Path | None, arg(metavar="FILE.mp4", help_behavior_hint="")] = None

@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from evercal.cli.console import print_json, print_next, size
 from evercal.cli.device import Device
-from evercal.cli.image_words import camera_for
+from evercal.cli.image_words import camera_for, stated_camera
 from evercal.cli.networks import Bars
 from evercal.errors import InputError
 
@@ -35,7 +35,7 @@ class Refresh:
     store: Annotated[Positional[Path], arg(metavar="STORE")]
     """Folder of the map."""
     images: Annotated[
-        Positional[tuple[Path, ...]], arg(metavar="RECORDING|IMAGE...", help_behavior_hint="")
+        Positional[tuple[Path, ...]], arg(metavar="[RECORDING|IMAGE...]", help_behavior_hint="")
     ] = ()
     """Images of one camera, a folder of them, or a recording."""
     camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -66,7 +66,9 @@ class Refresh:
         stream = sys.stderr if self.json else sys.stdout
         with Bars("", stream) as bars:
             if recording is not None:
-                report = cell.refresh(recording, on_progress=bars.step)
+                first = recording.train[0].camera
+                camera = stated_camera(self.camera, (first.width, first.height))
+                report = cell.refresh(recording, camera=camera, on_progress=bars.step)
             else:
                 from evercal.recordings.image_files import image_files
 

@@ -41,7 +41,8 @@ class Solve:
     camera_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Pose convention of camera poses without a header."""
     invert: Annotated[
-        Literal["robot", "camera", "both"] | None, arg(metavar="FILE", help_behavior_hint="")
+        Literal["robot", "camera", "both"] | None,
+        arg(metavar="robot|camera|both", help_behavior_hint=""),
     ] = None
     """Invert the poses of a file: robot, camera or both."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("calibration.json")

@@ -31,7 +31,7 @@ class Studio:
     Example: evercal studio --camera 0 --intrinsics camera.json --poses poses.csv
     """
 
-    map: Annotated[Positional[Path | None], arg(metavar="MAP", help_behavior_hint="")] = None
+    map: Annotated[Positional[Path | None], arg(metavar="[MAP]", help_behavior_hint="")] = None
     """Folder of the map that learns the scene. Default: a new one in --out."""
     camera: Annotated[str | None, arg(metavar="SOURCE", help_behavior_hint="")] = None
     """Camera on the gripper: number (0) or device, address (rtsp://...), video or folder."""
@@ -41,6 +41,9 @@ class Studio:
     """Gripper poses: a table or JSON lines that your robot's program appends to."""
     pose_convention: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Convention of --poses if its header does not state it: ur, kuka, fanuc, ..."""
+    most_age: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
+    """Refuse the last pose of --poses if the file was written more seconds ago. Default: any age,
+    for programs that write only when the arm has moved."""
     reachable: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Gripper poses that the robot can reach, for the next best views. Default: near others."""
     gripper_from_camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -99,6 +102,9 @@ class Studio:
             "--poses": self.poses,
             "--fixed": self.fixed,
             "--reachable": self.reachable,
+            "--gripper-from-camera": self.gripper_from_camera,
+            "--pose-convention": self.pose_convention,
+            "--most-age": self.most_age,
         }
         if self.virtual:
             given = next((name for name, value in own.items() if value is not None), None)
@@ -150,7 +156,7 @@ class Studio:
         return Devices(
             wrist_camera=StreamCamera(self.camera),
             intrinsics=self._intrinsics(),
-            robot=PoseFileRobot(self.poses, self.pose_convention),
+            robot=PoseFileRobot(self.poses, self.pose_convention, self.most_age),
             fixed_camera=None if fixed is None else StreamCamera(fixed),
             fixed_intrinsics=_camera(self.fixed_intrinsics),
             reachable=reachable,

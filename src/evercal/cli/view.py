@@ -33,7 +33,7 @@ class View:
     """Folder of the map."""
     calibrations: Annotated[
         Positional[tuple[Path, ...]],
-        arg(metavar="CALIBRATION.json...", help_behavior_hint="(default: none)"),
+        arg(metavar="[CALIBRATION.json...]", help_behavior_hint="(default: none)"),
     ] = ()
     """Calibration files to draw."""
     live: Annotated[str | None, arg(metavar="SOURCE", help_behavior_hint="")] = None

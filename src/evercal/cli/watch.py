@@ -16,7 +16,7 @@ from tyro.conf import Positional, arg
 from evercal.cli.check import shift_line
 from evercal.cli.console import print_json
 from evercal.cli.device import Device
-from evercal.cli.image_words import camera_for
+from evercal.cli.image_words import stated_camera
 from evercal.cli.stores import open_map
 from evercal.errors import InputError
 from evercal.reports.answers import shift_dict
@@ -73,7 +73,8 @@ class Watch:
         tests, last = 0, time.monotonic()
         while self.idle is None or time.monotonic() - last < self.idle:
             for path, pixels in arrivals.scan():
-                camera = camera_for(self.camera, [path]) or reference.camera
+                height, width = pixels.shape[:2]
+                camera = stated_camera(self.camera, (width, height)) or reference.camera
                 recent.extend(locate(localizer, [(path.name, pixels)], camera))
                 last = time.monotonic()
                 if not any(item.is_located for item in recent):

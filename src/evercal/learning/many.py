@@ -104,8 +104,11 @@ def _attempt(
         try:
             while waiting or running:
                 while waiting and len(running) < workers:
-                    item = waiting.pop(0)
-                    running[pool.submit(_learn, *item)] = item
+                    try:
+                        future = pool.submit(_learn, *waiting[0])
+                    except BrokenProcessPool:  # killed while the caller used a result
+                        return list(running.values()), waiting
+                    running[future] = waiting.pop(0)
                 ready, _ = wait(running, return_when=FIRST_COMPLETED)
                 for future in ready:
                     if not isinstance(future.exception(), BrokenProcessPool):

@@ -137,6 +137,8 @@ def _chosen(source: str, root: Path, options: ReconstructOptions, on_step: OnSte
     names = []
     for frame in stream(source) if images else _moving(stream(source), options.motion):
         name = Path(frame.name).stem + ".jpg" if images else f"{int(frame.name):06d}.jpg"
+        if name in names:
+            raise InputError(f"{source}: has two images called {Path(name).stem}; rename one")
         (root / "images").mkdir(parents=True, exist_ok=True)
         write_image(root / "images" / name, frame.image)
         names.append(name)
@@ -235,6 +237,7 @@ def _mapped(pycolmap: Any, root: Path, count: int, on_step: OnStep) -> list[Any]
     on_step("mapping", count, count)
     models = sorted(found.values(), key=lambda m: -m.num_reg_images())
     shutil.rmtree(working)
+    shutil.rmtree(root / f".{_MODEL}", ignore_errors=True)  # of an interrupted call
     for number, item in enumerate(models):
         folder = root / f".{_MODEL}" / str(number)
         folder.mkdir(parents=True, exist_ok=True)

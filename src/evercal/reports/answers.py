@@ -57,6 +57,7 @@ def answer_row(answer: Answer) -> dict[str, object]:
         "error_terms": terms,
         "inliers": int(estimate.inliers),
         "inlier_ratio": float(estimate.inlier_ratio),
+        "support": float(estimate.support),
         "ms": answer.milliseconds,
     }
 

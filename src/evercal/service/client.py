@@ -286,6 +286,7 @@ def _estimate(row: Mapping[str, Any]) -> "PoseEstimate":
         covariance=None if covariance is None else np.array(covariance),
         inliers=row["inliers"],
         inlier_ratio=row["inlier_ratio"],
+        support=row["support"],
         milliseconds=row["ms"],
         alternatives=tuple(p for p in map(_pose, row["alternatives"]) if p is not None),
     )

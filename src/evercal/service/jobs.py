@@ -1,5 +1,6 @@
 """Recordings that wait to be learned, one after the other, each in a new process."""
 
+import logging
 import multiprocessing
 import queue
 import secrets
@@ -86,8 +87,9 @@ class Jobs:
     def close(self) -> None:
         """End the process at work and forget the queue; the map keeps its last complete state."""
         self._closed = True
-        if self._process is not None:
-            self._process.kill()
+        process = self._process
+        if process is not None:
+            process.kill()
         while True:
             try:
                 self._drop(self._waiting.get_nowait())
@@ -104,9 +106,13 @@ class Jobs:
                 continue
             try:
                 self._learn(key, request)
+            except Exception as error:  # the jobs that wait do not fail with it
+                logging.getLogger(__name__).exception("job %s", key)
+                self._set(key, status=FAILED, error=" ".join(f"internal error: {error}".split()))
             finally:
                 self._drop(item)
-            finished = [k for k, j in self._jobs.items() if j.status in ("done", "failed")]
+            jobs = list(self._jobs.items())
+            finished = [k for k, j in jobs if j.status in ("done", "failed")]
             for old in finished[:-_KEPT]:
                 del self._jobs[old]
 
@@ -135,7 +141,7 @@ class Jobs:
                     break
                 step, done, total = content
                 self._set(key, step=step, done=done, total=total)
-        except EOFError:  # it was killed
+        except (EOFError, OSError):  # it was killed, perhaps in the middle of a message
             pass
         process.join()
         self._process = None

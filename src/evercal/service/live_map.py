@@ -53,7 +53,9 @@ class LiveMap:
                 return False
             try:
                 self.current = self._opened()
-            except InputError as error:
+            except Exception as error:
+                if not isinstance(error, InputError):  # perhaps for a moment only: try again
+                    self._stamp = None
                 logging.getLogger(__name__).warning("%s; the last state is served", error)
             return True
 

@@ -82,10 +82,12 @@ def make_app(options: ServeOptions) -> FastAPI:
                 yield
             finally:
                 polling.cancel()
-                with suppress(asyncio.CancelledError):
-                    await polling
-                service.jobs.close()
-                service.desk.close()
+                try:
+                    with suppress(asyncio.CancelledError):
+                        await polling
+                finally:
+                    service.jobs.close()
+                    service.desk.close()
 
     app = FastAPI(title="evercal", version="1", redoc_url=None, lifespan=lifespan)
     app.state.live = live

@@ -184,20 +184,30 @@ def test_interruption_inside_a_stage_does_not_change_results(
     assert comparable(read(tmp_path)) == comparable(expected)
 
 
-@pytest.mark.parametrize("cut", [1, 3])
-def test_missing_lines_of_a_stage_are_added(
-    cut: int, arcs: Arcs, options: BenchOptions, tmp_path: Path
-) -> None:
-    one = replace(options, strategies=named("evercal"))
-    steps = run_bench(arcs, one, tmp_path)
+@pytest.fixture(scope="module")
+def two_stages(
+    arcs: Arcs, options: BenchOptions, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, BenchOptions]:
+    """The folder of a map's benchmark, stopped after its last stage, and the options."""
+    one, out = replace(options, strategies=named("evercal")), tmp_path_factory.mktemp("stages")
+    steps = run_bench(arcs, one, out)
     next(steps)
     next(steps)
     steps.close()
-    whole = comparable(read(tmp_path))
-    path = tmp_path / RESULTS
+    return out, one
+
+
+@pytest.mark.parametrize("cut", [1, 3])
+def test_missing_lines_of_a_stage_are_added(
+    cut: int, arcs: Arcs, two_stages: tuple[Path, BenchOptions], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(two_stages[0], out)
+    whole = comparable(read(out))
+    path = out / RESULTS
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:-cut]))
-    list(run_bench(arcs, one, tmp_path))
-    assert comparable(read(tmp_path)) == whole
+    list(run_bench(arcs, two_stages[1], out))
+    assert comparable(read(out)) == whole
     assert len(whole) == 6
 
 

@@ -1,19 +1,17 @@
-"""Networks on any device locate as on the CPU, and create no tensor on another device."""
+"""Networks on a GPU locate as on the CPU."""
 
 from __future__ import annotations
 
 import copy
 from dataclasses import replace
 
+import pytest
 import torch
 
 from evercal.continual.localizer import NetworkLocalizer
 from evercal.continual.scenes import LearnedScenes
 from evercal.geometry import pose_distance
 from evercal.recordings.frame import Recording
-
-from ...one_device import tensors_stay_on_their_device
-from .world import everything
 
 Arcs = tuple[Recording, Recording]
 
@@ -27,14 +25,15 @@ def on_device(scenes: LearnedScenes, device: torch.device) -> LearnedScenes:
     return moved
 
 
+@pytest.mark.gpu
 def test_poses_are_those_of_the_cpu(
-    arc_scenes: tuple[LearnedScenes, LearnedScenes], arcs: Arcs, device: torch.device
+    arc_scenes: tuple[LearnedScenes, LearnedScenes], arcs: Arcs, cuda: torch.device
 ) -> None:
     """Features are rounded differently, so poses differ by less than their errors."""
     frames = arcs[0].test[2:20:4]
     images, cameras = [f.read_image() for f in frames], [f.camera for f in frames]
     cpu = NetworkLocalizer(arc_scenes[1])
-    other = NetworkLocalizer(on_device(arc_scenes[1], device))
+    other = NetworkLocalizer(on_device(arc_scenes[1], cuda))
     batch = other.localize_batch(images, cameras)
     for image, camera, from_batch in zip(images, cameras, batch, strict=True):
         expected = cpu.localize(image, camera)
@@ -44,13 +43,3 @@ def test_poses_are_those_of_the_cpu(
             assert estimate.base_from_camera is not None
             metres, _ = pose_distance(estimate.base_from_camera, expected.base_from_camera)
             assert metres < 0.05
-
-
-def test_no_tensor_is_created_on_the_default_device(
-    arc_scenes: tuple[LearnedScenes, LearnedScenes], arcs: Arcs
-) -> None:
-    scenes, frame = arc_scenes[1], arcs[0].test[7]
-    expected = everything(NetworkLocalizer(scenes).localize(frame.read_image(), frame.camera))
-    with tensors_stay_on_their_device():
-        localizer = NetworkLocalizer(on_device(scenes, torch.device("cpu")))
-        assert everything(localizer.localize(frame.read_image(), frame.camera)) == expected

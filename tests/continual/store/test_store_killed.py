@@ -10,7 +10,6 @@ import torch
 
 from evercal.continual.scenes import LearnedScenes
 from evercal.continual.store import Checkpoint, NetworkStore
-from evercal.storage.stages import is_store
 
 from ..stages import Estimates, MakeStore, Tree
 
@@ -72,33 +71,6 @@ def test_second_stage(
         store.begin({"scene": "gamma"})
         store.commit(stages[2], {})
         assert tree(store.root).keys() == without_kill.keys()
-
-
-def test_first_stage(
-    three_stages: Stages,
-    tmp_path: Path,
-    every_step: Record,
-    make_store: MakeStore,
-    tree: Tree,
-    estimates: Estimates,
-) -> None:
-    stages, root = three_stages["evercal_network"], tmp_path / "store"
-    snapshots = every_step(root, lambda: make_store(root, stages[:1]))
-    expected, opened = estimates(NetworkStore.open(root).contents), 0
-    for i, snapshot in enumerate(snapshots):
-        if is_store(snapshot):
-            assert estimates(NetworkStore.open(snapshot).contents) == expected
-            opened += 1
-            continue
-        again = tmp_path / f"again-{i}"
-        if snapshot.exists():
-            copied(snapshot, again)
-        store = NetworkStore.create(again, "evercal_network")
-        resume = store.begin({"scene": "alpha"})
-        assert (resume is not None) == any(again.glob("learning/rows-*.safetensors"))
-        store.commit(stages[0], {"scene": "alpha", "seconds": 1.5})
-        assert tree(again) == tree(root)
-    assert 0 < opened < len(snapshots) - 10
 
 
 def test_checkpoints_of_an_abandoned_stage_are_never_resumed_in_part(

@@ -27,33 +27,59 @@ class Format:
     """Writer."""
     description: str
     """One line for `--format list`."""
+    ending: str = ".txt"
+    """Usual ending of the file; empty for a folder."""
+    per_image: bool = False
+    """Whether a camera on the arm needs the robot's pose of every image."""
 
 
 FORMATS = {
-    "easy_handeye2": Format("tf", ros.easy_handeye2, "for ~/.ros2/easy_handeye2/calibrations"),
-    "easy_handeye": Format("tf", ros.easy_handeye, "easy_handeye of ROS 1, ~/.ros/easy_handeye"),
+    "easy_handeye2": Format(
+        "tf", ros.easy_handeye2, "for ~/.ros2/easy_handeye2/calibrations", ".calib"
+    ),
+    "easy_handeye": Format(
+        "tf", ros.easy_handeye, "easy_handeye of ROS 1, ~/.ros/easy_handeye", ".yaml"
+    ),
     "moveit_samples": Format(
         "optical",
         image_poses.moveit_samples,
         "MoveIt Calibration's pose pairs (with --robot-poses and --target-poses)",
+        ".yaml",
+        per_image=True,
     ),
     "static_transform_publisher": Format(
-        "tf", ros.publisher_command, "shell command that publishes the transform in ROS 2"
+        "tf", ros.publisher_command, "shell command that publishes the transform in ROS 2", ".sh"
     ),
-    "launch_py": Format("tf", ros.launch_py, "ROS 2 launch file with a tf publisher"),
-    "ros1_launch": Format("tf", ros.ros1_launch, "ROS 1 launch file, like MoveIt Calibration"),
-    "transform_stamped": Format("tf", ros.transform_stamped, "geometry_msgs/TransformStamped"),
-    "camera_info": Format("optical", ros.camera_info, "intrinsics for ROS"),
-    "urdf": Format("tf", ros.urdf, "fixed joint for a URDF, rpy about fixed axes"),
-    "opencv": Format("optical", numbers.opencv, "rvec, tvec (parent to camera), FileStorage"),
-    "csv": Format("any", numbers.csv, "4x4 matrix, metres, one matrix row per line"),
-    "npy": Format("any", numbers.npy, "4x4 matrix, metres, for numpy"),
-    "json": Format("any", numbers.as_json, "matrix, quaternion w x y z, covariance, frames"),
-    "tum": Format("optical", image_poses.tum, "stamp, translation, quaternion x y z w"),
+    "launch_py": Format("tf", ros.launch_py, "ROS 2 launch file with a tf publisher", ".launch.py"),
+    "ros1_launch": Format(
+        "tf", ros.ros1_launch, "ROS 1 launch file, like MoveIt Calibration", ".launch"
+    ),
+    "transform_stamped": Format(
+        "tf", ros.transform_stamped, "geometry_msgs/TransformStamped", ".yaml"
+    ),
+    "camera_info": Format("optical", ros.camera_info, "intrinsics for ROS", ".yaml"),
+    "urdf": Format("tf", ros.urdf, "fixed joint for a URDF, rpy about fixed axes", ".urdf"),
+    "opencv": Format(
+        "optical", numbers.opencv, "rvec, tvec (parent to camera), FileStorage", ".yml"
+    ),
+    "csv": Format("any", numbers.csv, "4x4 matrix, metres, one matrix row per line", ".csv"),
+    "npy": Format("any", numbers.npy, "4x4 matrix, metres, for numpy", ".npy"),
+    "json": Format(
+        "any", numbers.as_json, "matrix, quaternion w x y z, covariance, frames", ".json"
+    ),
+    "tum": Format(
+        "optical", image_poses.tum, "stamp, translation, quaternion x y z w", ".tum", per_image=True
+    ),
     "colmap": Format(
-        "optical", image_poses.colmap, "cameras.txt, images.txt, points3D.txt (folder)"
+        "optical",
+        image_poses.colmap,
+        "cameras.txt, images.txt, points3D.txt (folder)",
+        "",
+        per_image=True,
     ),
-    "nerfstudio": Format("optical", image_poses.nerfstudio, "transforms.json, OpenGL axes"),
+    "nerfstudio": Format(
+        "optical", image_poses.nerfstudio, "transforms.json, OpenGL axes", ".json", per_image=True
+    ),
     "zivid": Format("any", numbers.zivid, "4x4 matrix in millimetres for Zivid's SDK"),
     "ur": Format("any", numbers.ur, "Universal Robots: p[x, y, z, rx, ry, rz]"),
     "kuka": Format("any", numbers.kuka, "KUKA: {X, Y, Z, A, B, C}, mm and degrees"),

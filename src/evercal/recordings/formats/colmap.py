@@ -143,7 +143,8 @@ def _require_ends(folder: Path) -> None:
     files = sorted(folder.glob("*.bin"))
     for file in files:
         size = file.stat().st_size
-        count = int.from_bytes(file.read_bytes()[:8], "little")
+        with file.open("rb") as stream:
+            count = int.from_bytes(stream.read(8), "little")
         if size < 8 or count > (size - 8) / _LEAST_BYTES:
             raise InputError(f"{file}: {size} bytes, too few for what it lists; copy it again")
     seconds = _LEAST_S + sum(file.stat().st_size for file in files) / _SLOWEST_BYTES_PER_S

@@ -46,6 +46,7 @@ class SampleBook:
     def __init__(self, root: Path, devices: Devices):
         self.root, self._devices = root, devices
         self._recorder = WristRecorder(root, devices.intrinsics)
+        # Replaced as a whole: threads that draw read it while another one takes a sample.
         self._samples = {frame.name: Sample.of(frame) for frame in self._recorder.frames}
         self._refused: list[SE3] = []
 
@@ -57,16 +58,16 @@ class SampleBook:
     @property
     def names(self) -> tuple[str, ...]:
         """Their names."""
-        return tuple(frame.name for frame in self.frames)
+        return tuple(self._samples)
 
     @property
     def poses(self) -> SE3:
         """(n,) base_from_gripper."""
-        return SE3.stack([self._samples[name].base_from_gripper for name in self.names])
+        return SE3.stack([sample.base_from_gripper for sample in self._samples.values()])
 
     def coverage(self, gripper_from_camera: SE3 | None = None) -> Coverage:
         """What the samples cover, for a mount that is known roughly or not at all."""
-        samples = [self._samples[name] for name in self.names]
+        samples = tuple(self._samples.values())
         return coverage(samples, gripper_from_camera or self._devices.rough)
 
     def add(self, image: NDArray[np.uint8], base_from_gripper: SE3) -> Frame:
@@ -76,7 +77,7 @@ class SampleBook:
             InputError: The image has another size than the intrinsics.
         """
         frame = self._recorder.add(image, base_from_gripper)
-        self._samples[frame.name] = Sample.of(frame)
+        self._samples = {**self._samples, frame.name: Sample.of(frame)}
         return frame
 
     def remove(self, name: str) -> None:
@@ -86,7 +87,7 @@ class SampleBook:
             InputError: No such sample.
         """
         self._recorder.remove(name)
-        self._samples.pop(name, None)
+        self._samples = {key: value for key, value in self._samples.items() if key != name}
 
     def bad(self) -> list[str]:
         """Names of the samples with problems."""
@@ -99,7 +100,7 @@ class SampleBook:
     def proposal(self, gripper_from_camera: SE3 | None = None) -> Proposal | None:
         """The view that would lower the uncertainty most; None before the first sample."""
         bad = set(self.bad())
-        good = [self._samples[name] for name in self.names if name not in bad]
+        good = [sample for name, sample in self._samples.items() if name not in bad]
         if not good:
             return None
         mount = gripper_from_camera or self._devices.rough

@@ -60,7 +60,9 @@ class Seen:
     still_since: float = 0.0
     """Time of the last change of the pose, seconds of the monotonic clock."""
     camera_problem: str = ""
-    """Reason why there is no image; empty if there is one."""
+    """Reason why there is no image of the camera on the gripper; empty if there is one."""
+    fixed_problem: str = ""
+    """The same for the fixed camera."""
     robot_problem: str = ""
     """The same for the pose."""
 
@@ -94,7 +96,8 @@ class Connection:
             try:
                 self.image(which)
             except (InputError, OSError) as error:
-                self._keep(camera_problem=str(error))
+                problem = "camera_problem" if which == "wrist" else "fixed_problem"
+                self._keep(**{problem: str(error)})
         return self.seen
 
     def image(self, which: Which) -> Image:
@@ -112,7 +115,7 @@ class Connection:
         if which == "wrist":
             self._keep(image=image, camera_problem="")
         else:
-            self._keep(fixed=image, camera_problem="")
+            self._keep(fixed=image, fixed_problem="")
         return image
 
     def sample(self) -> tuple[Image, SE3]:

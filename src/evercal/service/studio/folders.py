@@ -4,27 +4,8 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+from evercal.calibration.export.formats import FORMATS
 from evercal.service.studio.devices import Which
-
-_ENDINGS = {
-    "easy_handeye2": ".calib",
-    "easy_handeye": ".yaml",
-    "moveit_samples": ".yaml",
-    "static_transform_publisher": ".sh",
-    "launch_py": ".launch.py",
-    "ros1_launch": ".launch",
-    "transform_stamped": ".yaml",
-    "camera_info": ".yaml",
-    "urdf": ".urdf",
-    "opencv": ".yml",
-    "csv": ".csv",
-    "npy": ".npy",
-    "json": ".json",
-    "tum": ".tum",
-    "colmap": "",
-    "nerfstudio": ".json",
-}
-"""Endings of exported files; `.txt` where none is listed."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +50,7 @@ class Folders:
         """File of an export; camera and format are in its name, as formats share endings."""
         # easy_handeye2 looks files up by their name.
         name = which if format == "easy_handeye2" else f"{which}_{format}"
-        return self.out / "export" / f"{name}{_ENDINGS.get(format, '.txt')}"
+        return self.out / "export" / f"{name}{FORMATS[format].ending}"
 
     def report(self, which: Which) -> Path:
         """Report about a calibration."""
@@ -118,7 +99,7 @@ class Folders:
 
 def needs_robot_poses(which: Which, format: str) -> bool:
     """Whether an export states a pose for every image of the camera on the gripper."""
-    return which == "wrist" and format in ("tum", "colmap", "nerfstudio", "moveit_samples")
+    return which == "wrist" and FORMATS[format].per_image
 
 
 def line(*words: object) -> str:

@@ -66,6 +66,8 @@ def seen_html(seen: Seen) -> str:
     """What arrives from camera and robot."""
     image = "nothing yet" if seen.image is None else f"{seen.image.shape[1]}x{seen.image.shape[0]}"
     rows = [("camera", seen.camera_problem or image)]
+    if seen.fixed_problem:
+        rows.append(("fixed camera", seen.fixed_problem))
     if seen.base_from_gripper is None:
         rows.append(("gripper pose", seen.robot_problem or "nothing yet"))
     else:

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -109,23 +110,33 @@ class StudioPage:
 
     def _run(self, connect: ConnectPanel, record: RecordPanel) -> None:
         """Show live images while the page is open somewhere; take samples at rest if wanted."""
-        rest, connection, was = RestTrigger(), self.studio.connection, False
+        rest, was = RestTrigger(), False
         while not self._closed.wait(_LIVE_S):
             # Learning needs the processor more than the picture does.
             if not self.server.get_clients() or (self.jobs.busy and self.step == "learn"):
                 continue
-            first = connection.seen.image is None
-            reads = self.studio.devices.live or first
-            which = "fixed" if self.step == "fixed" else "wrist"
-            seen = connection.look(which if reads and self.step in _PICTURED else None)
-            self._frame.show_picture(seen, self.step)
-            connect.show_seen(seen)
-            self._drawing.show_live(seen, seen.image)
-            if seen.complete != was:
-                was = seen.complete
-                self._refresher.refresh()
-            if record.auto.value and not self.jobs.busy and rest.fires(seen, self.studio.book):
-                record.take()
+            try:
+                seen = self._look()
+                connect.show_seen(seen)
+                if seen.complete != was:
+                    was = seen.complete
+                    self._refresher.refresh()
+                if record.auto.value and not self.jobs.busy and rest.fires(seen, self.studio.book):
+                    record.take()
+            except Exception:  # the next image may be better
+                logging.getLogger(__name__).exception("a live image was not shown")
+
+    def _look(self) -> Seen:
+        """Read an image where one is shown, and show it."""
+        connection, devices = self.studio.connection, self.studio.devices
+        which = "wrist"
+        if self.step == "fixed" and devices.fixed_camera is not None:
+            which = "fixed"
+        reads = devices.live or connection.seen.image is None
+        seen = connection.look(which if reads and self.step in _PICTURED else None)
+        self._frame.show_picture(seen, self.step)
+        self._drawing.show_live(seen, seen.image)
+        return seen
 
 
 _PICTURED: tuple[Step, ...] = ("connect", "record", "fixed")

@@ -1,6 +1,7 @@
 """Learning the recording: the scene of the map, and the mount of the camera."""
 
 import json
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 
 from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
+from evercal.learning.scene import LearnReport
 from evercal.map import Map
 from evercal.service.studio.folders import Folders
 from evercal.storage import write_json
@@ -52,6 +54,16 @@ def free_name(name: str, taken: Sequence[str]) -> str:
     return free
 
 
+def learned_again(cell: Map, folders: Folders, name: str, on_step: OnStep) -> LearnReport:
+    """Learn the recording in a map of its own, then exchange the scene in one step."""
+    old = cell.localizer.contents
+    with tempfile.TemporaryDirectory(prefix=".learning-", dir=folders.out) as scratch:
+        fresh = Map.open(Path(scratch) / "map", device=old.device.type, encoder=old.encoder)
+        report = fresh.learn(folders.wrist, name=name, on_progress=on_step)
+        cell.merge(fresh.path, on_clash="replace")
+    return report
+
+
 def learn_mount(
     cell: Map, folders: Folders, before: LearnedSamples | None, on_step: OnStep
 ) -> tuple[Calibration, str]:
@@ -62,13 +74,18 @@ def learn_mount(
     Raises:
         InputError: The recording cannot be used; the map is unchanged.
     """
-    own = before.scene if before is not None and before.scene in cell.scenes else None
-    name = free_name(folders.wrist.name, cell.scenes)
-    report = cell.learn(folders.wrist, name=name, on_progress=on_step)
-    if own is not None:
-        cell.remove(own)
-        cell.rename(name, own)
-        name = own
+    if before is not None and before.scene in cell.scenes:
+        name = before.scene
+        report = learned_again(cell, folders, name, on_step)
+    else:
+        name = free_name(folders.wrist.name, cell.scenes)
+        # Written first: after a crash, the scene in the map is the studio's own.
+        LearnedSamples(name, ()).write(folders.settings)
+        try:
+            report = cell.learn(folders.wrist, name=name, on_progress=on_step)
+        except InputError:
+            folders.settings.unlink()
+            raise
     if report.hand_eye is None:
         raise InputError(f"{folders.wrist}: states camera poses, so there is no mount to estimate")
     scenes = cell.localizer.contents.scenes

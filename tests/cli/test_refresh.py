@@ -1,0 +1,49 @@
+"""`evercal refresh`: the stated camera is used, and misuse is one line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from evercal.recordings import generic
+
+if TYPE_CHECKING:
+    from evercal.recordings import Recording
+
+
+@pytest.mark.parametrize("form", ["recording", "images"])
+def test_the_stated_camera_is_used(
+    run: Any,
+    hall_store: Path,
+    hall: Recording,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    form: str,
+) -> None:
+    from evercal.errors import InputError
+    from evercal.map import Map
+
+    generic.write(tmp_path / "now", replace(hall, train=hall.train[:6], test=()))
+    (tmp_path / "camera.txt").write_text("250 0 160\n0 250 120\n0 0 1\n")
+    given = []
+
+    def refresh(self: Map, images: object, *, camera: Any = None, **_: object) -> None:
+        given.append(camera)
+        raise InputError("seen")
+
+    monkeypatch.setattr(Map, "refresh", refresh)
+    source = tmp_path / "now" / ("" if form == "recording" else "images")
+    run("refresh", hall_store, source, "--camera", tmp_path / "camera.txt")
+    run("refresh", hall_store, source)
+    assert given[0].fx == 250
+    assert (given[0].width, given[0].height) == (320, 240)
+    assert given[1] is None
+
+
+@pytest.mark.parametrize("words", [[], ["images/", "--undo", "hall"]])
+def test_images_or_undo(run: Any, hall_store: Path, words: list[str]) -> None:
+    ran = run("refresh", hall_store, *words)
+    assert (ran.code, ran.err) == (2, ["error: give images of the changed room, or --undo SCENE"])
