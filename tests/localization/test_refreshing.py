@@ -6,12 +6,14 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from evercal import InputError, Map, Recording
 from evercal.geometry import SE3, pose_distance
+from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.localization.refreshing import RefreshReport, refresh_scene
 from evercal.mapping.scene_map import MapContents, SceneMap
@@ -135,6 +137,22 @@ def test_wrong_images_are_left_out(
     assert {name for name, _ in wrong} <= set(report.left_out)
     assert report.located == after[1].located
     assert np.array_equal(points_of(scene), points_of(after[0]))
+
+
+def test_a_refresh_that_loses_its_only_image_outside_is_refused(
+    hall_map: MapContents, images: list[tuple[str, np.ndarray]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without an image outside the map, the shift of the base frame is unknown, not zero."""
+    few, localize = images[:5], Localizer.localize
+
+    def blind(self: Localizer, image: np.ndarray, *given: Any) -> PoseEstimate:
+        estimate = localize(self, image, *given)
+        refreshed = self.contents is not hall_map
+        return replace(estimate, status="failed", reason="weak") if refreshed else estimate
+
+    monkeypatch.setattr(Localizer, "localize", blind)
+    with pytest.raises(InputError, match=r"locates 0 of 1 images .*unchanged"):
+        refresh_scene(Localizer(hall_map), few)
 
 
 def test_a_refresh_is_refused_or_undone_as_a_whole(

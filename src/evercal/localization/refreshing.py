@@ -192,13 +192,11 @@ def _verified(
         if estimate.status == "ok" and estimate.scene == scene and estimate.base_from_camera:
             moves.append(estimate.base_from_camera @ item.answer.pose.inverse())
     lost = len(check) - len(moves)
-    if lost > max(1, WORSE * len(check)):
+    if not moves or lost > max(1, WORSE * len(check)):
         raise InputError(
             f"the refreshed map locates {len(moves)} of {len(check)} images that the map located;"
             f" record more images of the changed places. The map is unchanged"
         )
-    if not moves:
-        return SE3.identity(), np.zeros(2), 0
     poses = SE3.stack(moves)
     shift = average_poses(poses)
     off = (shift.inverse() @ poses).log().reshape(-1, 2, 3)
