@@ -79,6 +79,41 @@ def test_camera_on_the_gripper_determines_the_base(
     assert metres < 4 * np.sqrt(np.trace(estimate.covariance[:3, :3]))
 
 
+def test_a_scale_that_the_arm_contradicts_is_estimated_and_named(
+    arm_views: tuple[NamedImages, SE3], localizer: Localizer
+) -> None:
+    images, map_from_camera = arm_views
+    alignment = align_by_gripper(localizer, "hall", images, gripper_poses(map_from_camera, 1.05))
+    assert alignment.similarity.scale == pytest.approx(1.05, rel=0.01)
+    (warning,) = alignment.warnings
+    assert "too short, by the robot's motions" in warning
+    frame = alignment.applied_to(localizer.contents.scenes[0]).frame
+    exact = replace(frame, pose_sigma=(0.0, 0.0))
+    for pose in map_from_camera[::3]:
+        truth = Similarity(BASE_FROM_MAP, 1.05).pose(pose)
+        estimate = exact.to_base(UncertainPose.exact(pose))
+        metres, _ = pose_distance(estimate.pose, truth)
+        assert metres < 4 * np.sqrt(np.trace(estimate.covariance[:3, :3]))
+    plain = align_by_gripper(localizer, "hall", images, gripper_poses(map_from_camera))
+    assert plain.warnings == ()
+
+
+def test_the_frame_of_the_recording_no_longer_counts(
+    arm_views: tuple[NamedImages, SE3], hall_map: MapContents
+) -> None:
+    """Landmarks tie the base frame; what the recording's poses were off is not added to answers."""
+    images, map_from_camera = arm_views
+    scene = hall_map.scenes[0]
+    off = replace(scene.frame, common=SE3.exp([0.02, -0.01, 0.01, 0.01, 0, 0]))
+    contents = MapContents(hall_map.encoder, hall_map.short_side, [replace(scene, frame=off)])
+    localizer = Localizer(contents)
+    alignment = align_by_gripper(localizer, "hall", images, gripper_poses(map_from_camera))
+    estimate = Localizer(aligned(contents, alignment)).localize(images[4][1])
+    assert estimate.base_from_camera is not None
+    truth = BASE_FROM_MAP @ map_from_camera[4]
+    assert pose_distance(estimate.base_from_camera, truth)[0] < 0.006
+
+
 def test_board_in_the_gripper_determines_the_base(
     arm_views: tuple[NamedImages, SE3], localizer: Localizer
 ) -> None:
@@ -96,12 +131,20 @@ def test_board_in_the_gripper_determines_the_base(
         align_by_gripper(localizer, "hall", images, grippers, False, board_poses)
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.4])
+@pytest.mark.parametrize(("scale", "longer"), [(1.0, 1.0), (0.4, 1.0), (1.0, 1.1)])
 def test_touched_points_determine_the_base(
-    scale: float, arm_views: tuple[NamedImages, SE3], localizer: Localizer, hall_room: BoxRoom
+    scale: float,
+    longer: float,
+    arm_views: tuple[NamedImages, SE3],
+    localizer: Localizer,
+    hall_room: BoxRoom,
 ) -> None:
+    """Also by images of another camera, whose focal length is longer than that of the map."""
     images, map_from_camera = arm_views
     similarity, camera = Similarity(BASE_FROM_MAP, scale), localizer.contents.scenes[0].camera
+    if longer != 1:
+        camera = replace(camera, fx=longer * camera.fx, fy=longer * camera.fy)
+        images = [(f"{i}.png", hall_room.render(camera, p)) for i, p in enumerate(map_from_camera)]
     eye, rotation = map_from_camera[5].translation_m, map_from_camera[5].rotation_matrix()
     corners = np.array([[80, 60], [240, 60], [80, 180], [240, 180], [160, 120]], float)
     in_map, _ = hall_room.intersect(eye, camera.unproject(corners) @ rotation.T)

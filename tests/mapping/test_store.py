@@ -155,6 +155,20 @@ def test_update_replaces_one_scene(
     assert len(list((root / "stages").iterdir())) == 3
 
 
+def test_undo_does_not_bring_back_an_earlier_base_frame(
+    scenes: list[SceneMap], tmp_path: Path, make: Make
+) -> None:
+    store = make(tmp_path / "store", scenes[:1])
+    store.refresh(scenes[0], {})
+    frame = replace(scenes[0].frame, base_covariance=1e-6 * np.eye(6))
+    store.update(replace(scenes[0], frame=frame))  # aligned after the refresh
+    with pytest.raises(InputError, match="no refresh to undo"):
+        store.undo(scenes[0].name)
+    (stored,) = MapStore.open(tmp_path / "store").contents.scenes
+    assert stored.frame.base_covariance is not None
+    assert verify(tmp_path / "store") == []
+
+
 def test_centroids_of_another_encoder_are_stored(
     scenes: list[SceneMap], tmp_path: Path, make: Make
 ) -> None:

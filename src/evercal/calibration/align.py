@@ -22,7 +22,8 @@ from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve_pairs
 from evercal.errors import InputError
 from evercal.geometry import SE3, axis_deviation, cross_matrix
-from evercal.mapping.map_frame import Similarity
+from evercal.localization.intrinsics import cameras_in_scenes
+from evercal.mapping.map_frame import MapFrame, Similarity
 from evercal.mapping.scene_map import MapContents, SceneMap
 
 if TYPE_CHECKING:
@@ -49,22 +50,29 @@ class MapAlignment:
     """Estimated pose of the camera on the gripper, or of the board that it holds."""
     sigma: tuple[float, float] = (0.0, 0.0)
     """Standard deviation per axis in the middle of the scene, millimetres and degrees."""
+    warnings: tuple[str, ...] = ()
+    """What the robot's motions contradict."""
 
     def applied_to(self, scene: SceneMap) -> SceneMap:
-        """Return the scene with answers in the base frame."""
-        frame = replace(
-            scene.frame, similarity=self.similarity, base_covariance=self.base_covariance
+        """Return the scene with answers in the base frame.
+
+        The robot ties the landmarks to the base, so the frame that the recording stated, and its
+        corrections, no longer count.
+        """
+        frame = MapFrame(
+            pose_sigma=scene.frame.pose_sigma,
+            similarity=self.similarity,
+            base_covariance=self.base_covariance,
         )
         return replace(scene, frame=frame)
 
 
 def _in_own_frame(localizer: "Localizer", name: str) -> "Localizer":
-    """Return a localizer that answers in the frame that a scene was learned in."""
+    """Return a localizer that answers in the frame of a scene's landmarks."""
     from evercal.localization.localizer import Localizer
 
     scene, contents = scene_named(localizer, name), localizer.contents
-    frame = replace(scene.frame, similarity=None, base_covariance=None)
-    own = replace(scene, frame=frame)
+    own = replace(scene, frame=MapFrame(pose_sigma=scene.frame.pose_sigma))
     scenes = [own if other.name == name else other for other in contents.scenes]
     own_contents = MapContents(contents.encoder, contents.short_side, scenes)
     return Localizer(own_contents, localizer.options)
@@ -120,9 +128,9 @@ def align_by_gripper(
     pairs = PosePairs(names, base_from_gripper, map_from_camera.inverse())
     solution = solve_pairs(pairs, "eye_in_hand", scale_known, of_board=False)
     fit = solution.fit
-    scale = solution.scale * (1 + float(fit.at.extras[-1]) if not scale_known else 1.0)
-    similarity = Similarity(fit.at.fixed_from_board, scale)
-    covariance, sigma = _frame_covariance(fit, similarity, map_from_camera, scale_known)
+    similarity = Similarity(fit.at.fixed_from_board, solution.board_scale)
+    size = 12 + solution.equation.extras.names.index("size")
+    covariance, sigma = _frame_covariance(fit, similarity, map_from_camera, size)
     rms = np.sqrt((fit.residual[fit.inliers].reshape(-1, 2, 3) ** 2).sum(2).mean(0))
     return MapAlignment(
         similarity,
@@ -132,15 +140,19 @@ def align_by_gripper(
         f"{1000 * rms[0]:.1f} mm and {np.rad2deg(rms[1]):.2f} deg root mean square",
         fit.at.parent_from_camera,
         sigma,
+        solution.warnings,
     )
 
 
 def _frame_covariance(
-    fit: HandEyeFit, similarity: Similarity, map_from_camera: SE3, scale_known: bool
+    fit: HandEyeFit, similarity: Similarity, map_from_camera: SE3, size: int
 ) -> tuple[Array, tuple[float, float]]:
-    """Covariance of the base frame as one motion of it, and sigmas in the middle of the cameras."""
+    """Covariance of the base frame as one motion of it, and sigmas in the middle of the cameras.
+
+    `size` is the column of the scale in the covariance of the fit.
+    """
     whole = fit.factor * fit.covariance
-    picked = np.r_[6:12] if scale_known else np.r_[6:12, len(whole) - 1]
+    picked = np.r_[6:12, size]
     own = whole[np.ix_(picked, picked)]
     rotation = similarity.base_from_map.rotation_matrix()
     centre = map_from_camera.translation_m.mean(0)
@@ -149,13 +161,11 @@ def _frame_covariance(
     slope[:3, :3] = np.eye(3)
     slope[:3, 3:6] = -cross_matrix(arm) @ rotation
     slope[3:, 3:6] = rotation
-    if not scale_known:
-        slope[:3, 6] = arm
+    slope[:3, 6] = arm
     middle = slope @ own @ slope.T
-    if not scale_known:
-        # Away from the middle of the cameras, an error of scale is an error of position.
-        radius = np.sqrt(((map_from_camera.translation_m - centre) ** 2).sum(1).mean() / 3)
-        middle[:3, :3] += np.eye(3) * own[6, 6] * (similarity.scale * radius) ** 2
+    # Away from the middle of the cameras, an error of scale is an error of position.
+    radius = np.sqrt(((map_from_camera.translation_m - centre) ** 2).sum(1).mean() / 3)
+    middle[:3, :3] += np.eye(3) * own[6, 6] * (similarity.scale * radius) ** 2
     origin = arm + similarity.base_from_map.translation_m
     return _about(origin, middle), axis_deviation(middle)
 
@@ -185,11 +195,10 @@ def aligned_by_points(
         [item] = locate(localizer, [(name, image)])
         if not item.is_located or item.estimate.scene != scene:
             continue
-        camera = own.adjusted_camera.resized(image.shape[1], image.shape[0])
+        # The pose holds for the intrinsics that were estimated with it.
+        camera = item.estimate.camera or cameras_in_scenes(None, image, [own])[0]
         touched, picked = np.stack([points[key] for key in pixels]), np.stack([*pixels.values()])
-        # Picks are triangulated from the pose that observes the landmarks.
-        map_from_camera = own.frame.from_base(item.pose)
-        images.append(Picks(map_from_camera, camera, touched, tuple(pixels), picked))
+        images.append(Picks(item.pose, camera, touched, tuple(pixels), picked))
     if len(images) < 2:
         raise InputError(
             f"{len(images)} of {len(picks)} images with picks were located in {scene}; at least"

@@ -28,7 +28,7 @@ from evercal.calibration.located import (
 )
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry import SE3, Camera, cross_matrix, pose_distance
 from evercal.localization.estimate import Cause
 from evercal.localization.intrinsics import STATED, cameras_in_scenes
 from evercal.mapping.scene_map import SceneMap
@@ -147,7 +147,9 @@ def calibrate(
     if mount == "eye_to_hand":
         covariance, terms = _from_one_spot(moved, fused)
     else:
-        covariance, terms = _from_many_spots(located, moved, fused)
+        assert grippers is not None, "checked before"
+        base = scene.frame.base_covariance
+        covariance, terms = _from_many_spots(located, moved, fused, grippers, base)
     source = {
         "command": "calibrate",
         "scene": fused.scene,
@@ -252,15 +254,27 @@ def _from_one_spot(located: Sequence[Located], fused: Fused) -> tuple[Array, tup
 
 
 def _from_many_spots(
-    located: Sequence[Located], moved: Sequence[Located], fused: Fused
+    located: Sequence[Located],
+    moved: Sequence[Located],
+    fused: Fused,
+    base_from_gripper: SE3,
+    base_covariance: Array | None,
 ) -> tuple[Array, tuple[ErrorTerm, ...]]:
-    """Covariance of a camera on the gripper: the scatter among spots, and that of one spot."""
+    """Covariance of a camera on the gripper: the scatter among spots, and that of one spot.
+
+    An error of the base frame is common to all spots, so it does not average out.
+    """
     from scipy import stats
 
-    used = fused.select(moved)
-    spots = _spots([item.pose for item in fused.select(located)])
+    used, cameras = fused.select(moved), [item.pose for item in fused.select(located)]
+    spots = _spots(cameras)
     count = int(spots.max()) + 1
-    own = np.mean([item.covariance for item in used], axis=0) / count
+    base = np.zeros((6, 6)) if base_covariance is None else base_covariance
+    grippers = fused.select(list(base_from_gripper))
+    slopes = np.stack([_by_base_motion(g, c) for g, c in zip(grippers, cameras, strict=True)])
+    shared = slopes.mean(0) @ base @ slopes.mean(0).T
+    whole = np.mean([item.covariance for item in used], axis=0)
+    own = (whole - (slopes @ base @ slopes.transpose(0, 2, 1)).mean(0)) / count
     off = deviations(SE3.stack([item.pose for item in used]), fused.pose)
     means = np.stack([off[spots == spot].mean(0) for spot in range(count)])
     freedom = max(count - 1, 1)
@@ -271,8 +285,23 @@ def _from_many_spots(
     # Student factor of a covariance that was estimated from few spots.
     student = float((stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975)) ** 2)
     covariance = own * np.outer(scale, scale) * student
+    terms = [term for term in _by_cause(used, count) if term.name != "base frame"]
     name = f"arm, and scatter among {count} spots"
-    return covariance, (*_by_cause(used, count), ErrorTerm.of(name, covariance - own))
+    return covariance + shared, (
+        *terms,
+        ErrorTerm.of("base frame", shared),
+        ErrorTerm.of(name, covariance - own),
+    )
+
+
+def _by_base_motion(base_from_gripper: SE3, base_from_camera: SE3) -> Array:
+    """(6, 6) change of `gripper_from_camera` by a small motion (v, w) of the base frame."""
+    inverse = base_from_gripper.rotation_matrix().T
+    slope = np.zeros((6, 6))
+    slope[:3, :3] = inverse
+    slope[:3, 3:] = -inverse @ cross_matrix(base_from_camera.translation_m)
+    slope[3:, 3:] = base_from_camera.rotation_matrix().T
+    return slope
 
 
 def _by_cause(used: Sequence[Located], spots: int = 1) -> tuple[ErrorTerm, ...]:

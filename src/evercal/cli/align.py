@@ -134,6 +134,7 @@ class Align:
                     "used": alignment.used,
                     "given": alignment.given,
                     "gripper_from_camera": None if gripper is None else gripper.matrix().tolist(),
+                    "warnings": alignment.warnings,
                 }
             )
             return
@@ -142,6 +143,8 @@ class Align:
             f" the middle of the scene; scale {similarity.scale:.5f}; {alignment.used} of"
             f" {alignment.given} are inliers, residual {alignment.residual}"
         )
+        for warning in alignment.warnings:
+            print(f"warning: {warning}")
         print_next("evercal", "calibrate", self.store, "IMAGE...")
 
 

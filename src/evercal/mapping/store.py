@@ -141,12 +141,19 @@ class MapStore(StageStore):
     def update(self, scene: SceneMap) -> None:
         """Replace what is stored of a scene beside its keyframes: whole, or not at all.
 
-        It replaces the scene of the same name.
+        It replaces the scene of the same name. The state before a refresh was in another base
+        frame, so it is dropped, and `undo` refuses.
 
         Raises:
             InputError: As `commit`, and where a file of the store is missing or was changed.
         """
-        self._exchange(scene, lambda folder: write_scene(folder, scene))
+
+        def write(folder: Path) -> None:
+            write_scene(folder, scene)
+            for part in _STATE:
+                (folder / f"{_PREVIOUS}{part}").unlink(missing_ok=True)
+
+        self._exchange(scene, write)
 
     def refresh(self, scene: SceneMap, report: Mapping[str, object]) -> None:
         """Replace a scene of the same name by its refreshed map: whole, or not at all.

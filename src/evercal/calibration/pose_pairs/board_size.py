@@ -18,9 +18,9 @@ factor."""
 
 
 def with_tested_size(
-    equation: PoseEquation, fit: HandEyeFit, corners: BoardCorners | None
+    equation: PoseEquation, fit: HandEyeFit, corners: BoardCorners | None, of_board: bool = True
 ) -> tuple[PoseEquation, HandEyeFit, list[str]]:
-    """Free the size of the squares if the robot's motions contradict what was stated.
+    """Free the size of the squares, or of a map, if the robot's motions contradict it.
 
     The noise is estimated again with the free size: a wrong size looks like noise otherwise.
     """
@@ -35,10 +35,18 @@ def with_tested_size(
     larger = "larger" if off > 0 else "smaller"
     if abs(off) > _LARGE_SIZE and better < _MUCH_BETTER:
         warning = (
-            f"a board {100 * abs(off):.0f} % {larger} than stated would fit the robot's motions"
-            f" better, but not well: check its size, the robot poses and the intrinsics"
+            f"a {'board' if of_board else 'map'} {100 * abs(off):.0f} % {larger} than stated would"
+            f" fit the robot's motions better, but not well: check its size, the robot poses and"
+            f" the intrinsics"
         )
         return equation, fit, [warning]
+    if not of_board:
+        warning = (
+            f"the lengths of the map are {100 * abs(off):.2f} +- {100 * sigma:.2f} % too"
+            f" {'short' if off > 0 else 'long'}, by the robot's motions"
+            f" ({abs(off) / sigma:.0f} standard deviations): the estimated scale is used"
+        )
+        return free, freed, [warning]
     stated = None if corners is None else corners.size_m
     size = f"a square or tag of 24 mm would measure {24 * (1 + off):.2f} mm"
     if stated is not None:

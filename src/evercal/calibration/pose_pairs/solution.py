@@ -68,12 +68,12 @@ class PairSolution:
     @property
     def fixed_from_board(self) -> SE3:
         """Estimated pose of the board."""
-        middle = self._board_scale * middle_of(self.corners)
+        middle = self.board_scale * middle_of(self.corners)
         return self.fit.at.fixed_from_board @ SE3.from_translation(-middle)
 
     @property
-    def _board_scale(self) -> float:
-        """Metres per unit of the board's lengths."""
+    def board_scale(self) -> float:
+        """Metres per unit of the lengths of the board, or of the map."""
         size = self.fit.at.extras[self.equation.extras.indices("size")]
         return self.scale * (1 + float(size[0]))
 
@@ -127,7 +127,7 @@ class PairSolution:
         if "clock" in sigma:
             offset = value["clock"] if time_offset_s is None else time_offset_s
             checks |= {"time_offset_s": offset, "time_offset_sigma_s": sigma["clock"]}
-        checks |= {"scale": self._board_scale, "scale_sigma": sigma["size"]}
+        checks |= {"scale": self.board_scale, "scale_sigma": sigma["size"]}
         if self.lens is not None:
             checks["corner_sigma_px"] = self.lens.sigma_px
             lens = [name for name, g in zip(extras.names, extras.groups, strict=True)

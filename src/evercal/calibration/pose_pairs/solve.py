@@ -100,11 +100,11 @@ def solve_pairs(
         predicted = _predicted(robot if mount == "eye_in_hand" else robot.inverse(), start, scale)
         corners, poses = _other_board_poses(corners, lens, rows, ~start.inliers, predicted)
         lens = measured(corners, corners.camera, poses)
-    problem = _Problem(mount, scale, scale_known, corners)
+    problem = _Problem(mount, scale, scale_known, corners, of_board)
     equation, fit, lens = problem.fitted(pairs, rows, start.at, lens)
     warnings: list[str] = []
     if scale_known:
-        equation, fit, warnings = with_tested_size(equation, fit, corners)
+        equation, fit, warnings = with_tested_size(equation, fit, corners, of_board)
     else:
         fit = widened(equation, fit)
     warnings += _lens_warnings(fit, equation, corners, lens)
@@ -123,6 +123,7 @@ class _Problem:
     """Metres per unit of the camera's lengths, roughly if it is unknown."""
     scale_known: bool
     corners: BoardCorners | None
+    of_board: bool
 
     def fitted(
         self, pairs: PosePairs, rows: NDArray[np.int64], start: Unknowns, lens: Measured | None
@@ -170,7 +171,7 @@ class _Problem:
             spread = lever @ pairs.camera_covariance @ lever.transpose(0, 2, 1)
             moved = replace(moved, camera_covariance=spread)
         length = moved.camera_from_board.translation_m
-        if lens is None and self.scale_known:
+        if lens is None and self.scale_known and self.of_board:
             depth = np.pad(length[:, 2:], ((0, 0), (2, 3)))
             extras = extras.with_one("shared depth", depth, SIZE_SIGMA)
         size = np.pad(length, ((0, 0), (0, 3)))

@@ -74,9 +74,10 @@ def solve_with_offset(
             the offset.
     """
     offset = _coarse_offset(robot, camera, largest_s)
-    solution, correction = None, 0.0
+    solution, correction, used = None, 0.0, offset
     for _ in range(6):
-        pairs, overlapping = _pairs_at(robot, camera, offset)
+        used = offset
+        pairs, overlapping = _pairs_at(robot, camera, used)
         solution = solve_pairs(pairs, mount, scale_known, overlapping.corners)
         correction = float(solution.fit.at.extras[-1])
         if abs(correction) < 1e-4:
@@ -90,7 +91,7 @@ def solve_with_offset(
             f" images show the robot in motion; move it while recording, or pair images and poses"
             f" of a still robot and omit --time-offset"
         )
-    return solution.calibration(offset + correction)
+    return solution.calibration(used + correction)
 
 
 def interpolated_pairs(robot: PoseTrack, camera: CameraTrack) -> tuple[PosePairs, CameraTrack]:
