@@ -13,14 +13,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
+from evercal.features.weights_file import network_bytes
 from evercal.learning.many import LearnTask, learn_scenes
 from evercal.map import Map
 from evercal.mapping.scene_map import MapContents
 from evercal.recordings import Recording
 from evercal.recordings.images import StoredImage
+from evercal.storage.atomic import write_bytes
 
 
 class Deadly(StoredImage):
@@ -63,6 +66,27 @@ def test_the_map_is_that_of_learning_in_turn(rooms: tuple[Recording, ...], tmp_p
         for name in ("keyframes.safetensors", "scene.json"):
             one, other = (tmp_path / root / "stages" / stage / name for root in ("turn", "many"))
             assert one.read_bytes() == other.read_bytes()
+
+
+def test_scenes_of_another_encoder_share_their_centroids(
+    rooms: tuple[Recording, ...], tmp_path: Path
+) -> None:
+    encoder = load_encoder()
+    with torch.no_grad():
+        next(encoder.parameters()).mul_(1.001)  # pyright: ignore[reportAttributeAccessIssue]
+    write_bytes(tmp_path / "own.safetensors", network_bytes(encoder, "encoder"))
+    turn, many = (
+        Map.open(tmp_path / name, encoder=tmp_path / "own.safetensors") for name in ("turn", "many")
+    )
+    for recording in rooms[:2]:
+        turn.learn(recording)
+    many.learn_many(rooms[:2], workers=1)
+    for stage in ("0001-alpha", "0002-beta"):
+        one, other = (
+            tmp_path / root / "stages" / stage / "keyframes.safetensors"
+            for root in ("turn", "many")
+        )
+        assert one.read_bytes() == other.read_bytes()
 
 
 def test_an_unusable_recording_does_not_stop_the_others(

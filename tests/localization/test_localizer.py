@@ -290,6 +290,18 @@ def test_recording_camera_selects_the_adjusted_one(localizer: Localizer) -> None
     assert localizer.camera_for(other) is other
 
 
+def test_without_one_common_camera_the_adjusted_one_is_stated(localizer: Localizer) -> None:
+    """An own camera of one scene is not that of another one: no camera would mean it is."""
+    contents, scene = localizer.contents, localizer.contents.scenes[0]
+    longer = replace(scene.camera, fx=1.1 * scene.camera.fx)
+    adjusted = replace(scene.camera, cx=scene.camera.cx + 1)
+    first = replace(scene, name="first", adjusted_camera=adjusted)
+    second = replace(scene, name="second", camera=longer, adjusted_camera=longer)
+    both = Localizer(replace(contents, scenes=[first, second]))
+    assert both.camera_for(scene.camera) == adjusted
+    assert both.camera_for(longer) == longer
+
+
 @pytest.mark.parametrize("size", [(640, 480), (200, 150)])
 def test_images_and_cameras_have_any_size(
     size: tuple[int, int], localizer: Localizer, views: tuple[Frame, ...]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from evercal.geometry import SE3, UncertainPose, pose_distance
+from evercal.localization import tracking
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker, TrackOptions
@@ -70,6 +72,34 @@ def test_a_jump_is_located_from_nothing(
     assert frame.estimate.base_from_camera is not None
     assert far.base_from_camera is not None
     assert pose_distance(frame.estimate.base_from_camera, far.base_from_camera)[0] < 0.01
+
+
+def test_where_a_period_of_texture_is_in_reach_the_frame_is_located_from_nothing(
+    hall_map: MapContents, views: list[tuple[np.ndarray, SE3]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = np.array([[0.05, 0.0, 0.0]])
+    monkeypatch.setattr(tracking, "pattern_steps", lambda *_: step)
+    tracker, image = Tracker(Localizer(hall_map)), views[0][0]
+    # Without a known motion 0.05 m are possible in a fifteenth of a second, with one in 0.2 s.
+    stamps = np.cumsum([0, 1 / 15, 1 / 15, 1 / 15, 0.2, 1 / 15])
+    states = [tracker.track(image, float(stamp)).state for stamp in stamps]
+    assert states == [*["relocalized"] * 2, *["tracking"] * 2, "relocalized", "tracking"]
+
+
+def test_a_pose_that_is_too_uncertain_is_not_tracked(
+    hall_map: MapContents, views: list[tuple[np.ndarray, SE3]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tracker = Tracker(Localizer(hall_map))
+    for image, _ in views[:3]:
+        tracker.track(image)
+    answer = Localizer.answer
+
+    def useless(self: Localizer, *given: Any) -> PoseEstimate:
+        return replace(answer(self, *given), status="unknown_scene", base_from_camera=None)
+
+    monkeypatch.setattr(Localizer, "answer", useless)
+    frame = tracker.track(views[3][0])
+    assert (frame.state, frame.estimate.status) == ("relocalized", "ok")
 
 
 def test_a_long_gap_and_time_that_runs_backwards_are_no_prediction(

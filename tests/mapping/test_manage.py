@@ -104,6 +104,14 @@ def test_a_renamed_scene_keeps_its_place_and_content(
     assert content(MapStore.open(root).contents) == content(before)
 
 
+def test_undo_keeps_a_later_name(root: Path, scenes: list[SceneMap]) -> None:
+    store = MapStore.open(root)
+    store.refresh(scenes[0], {})
+    rename_scene(store, "alpha", "lobby")
+    store.undo("lobby")
+    assert MapStore.open(root).contents.scenes[0].name == "lobby"
+
+
 def test_misuse_is_refused_by_name_and_changes_nothing(root: Path, tree: Tree) -> None:
     before, store = tree(root), MapStore.open(root)
     attempts: list[tuple[Callable[[], object], str]] = [

@@ -97,7 +97,7 @@ class NetworkLocalizer:
 
     def camera_for(self, stated: Camera) -> Camera | None:
         """The `camera` argument for an image with these stated intrinsics."""
-        return own_or_stated(stated, [record.camera for record in self.contents.scenes])
+        return own_or_stated(stated, self.contents.scenes)
 
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         """Estimate the camera pose of one image; see `Localizer.localize`."""

@@ -78,6 +78,21 @@ def vlad_for(encoder: Encoder, features: Sequence[Tensor] = ()) -> Vlad:
     return _by_encoder[encoder]
 
 
+def lacks_centroids(encoder: Encoder) -> bool:
+    """Whether centroids are still to be fitted."""
+    return encoder not in _by_encoder and shipped_centroids(encoder) is None
+
+
+def known_centroids(encoder: Encoder) -> Tensor | None:
+    """(k, channels) centroids that were fitted or loaded in this process; None without any."""
+    return _by_encoder[encoder].centroids if encoder in _by_encoder else None
+
+
+def keep_centroids(encoder: Encoder, centroids: Tensor) -> None:
+    """Use centroids (k, channels) of another process."""
+    _by_encoder[encoder] = _projected(centroids)
+
+
 def shipped_centroids(encoder: Encoder) -> Tensor | None:
     """(k, channels) centroids of the shipped encoder; None for another encoder."""
     if isinstance(encoder, nn.Module) and VLAD_FILE.exists():
@@ -99,7 +114,7 @@ def save_centroids(encoder: Encoder, path: Path) -> None:
 def load_centroids(encoder: Encoder, path: Path) -> None:
     """Load the centroids of an encoder from a file of `save_centroids`."""
     with safe_open(path, "pt") as file:
-        _by_encoder[encoder] = _projected(file.get_tensor("centroids").float())
+        keep_centroids(encoder, file.get_tensor("centroids").float())
 
 
 def fit_centroids(features: Sequence[Tensor]) -> Tensor:

@@ -17,6 +17,7 @@ from multiprocessing.synchronize import Event
 import torch
 
 from evercal.errors import InputError
+from evercal.features.vlad import keep_centroids, known_centroids, lacks_centroids
 from evercal.learning.scene import LearnReport, learn_scene
 from evercal.mapping.build import MapOptions
 from evercal.mapping.scene_map import MapContents, SceneMap
@@ -81,6 +82,9 @@ def learn_scenes(
     if workers < 1:
         raise InputError(f"workers {workers}: give a number >= 1")
     waiting = list(enumerate(recordings))
+    # All scenes share the centroids, which the first recording of another encoder determines.
+    while waiting and lacks_centroids(task.contents.encoder):
+        yield task.learn(*waiting.pop(0))
     while waiting:
         killed, waiting = yield from _attempt(task, waiting, workers)
         for item in killed:
@@ -134,7 +138,7 @@ def _pool(task: LearnTask, workers: int, stop: Event) -> Iterator[ProcessPoolExe
             workers,
             multiprocessing.get_context("spawn"),  # threads of torch do not survive a fork
             _begin,
-            (task, threads, stop),
+            (task, threads, stop, known_centroids(task.contents.encoder)),
         ) as pool:
             yield pool
     finally:
@@ -149,12 +153,14 @@ _task: LearnTask | None = None
 """In a worker process: its task."""
 
 
-def _begin(task: LearnTask, threads: int, stop: Event) -> None:
+def _begin(task: LearnTask, threads: int, stop: Event, centroids: torch.Tensor | None) -> None:
     """Prepare a worker process."""
     import cv2
 
     global _task
     _task = task
+    if centroids is not None:  # they do not travel with the encoder
+        keep_centroids(task.contents.encoder, centroids)
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent ends it

@@ -84,9 +84,16 @@ class Prior:
         return (tight + np.maximum(excess, 0)) / self.scale
 
 
-def own_or_stated(stated: Camera, recorded: Sequence[Camera]) -> Camera | None:
-    """None for intrinsics that a scene's recording states, else the stated ones."""
-    return None if stated in recorded else stated
+def own_or_stated(stated: Camera, scenes: "Sequence[LearnedScene]") -> Camera | None:
+    """The `camera` argument for an image with stated intrinsics.
+
+    None if every scene was recorded by this camera: each has adjusted it. Without a camera, every
+    scene supposes its own, so where cameras differ, the adjusted one is stated.
+    """
+    own = [scene for scene in scenes if scene.camera == stated]
+    if own and len(own) == len(scenes):
+        return None
+    return own[0].adjusted_camera if own else stated
 
 
 def cameras_in_scenes(

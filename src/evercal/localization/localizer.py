@@ -132,9 +132,9 @@ class Localizer:
     def camera_for(self, stated: Camera) -> Camera | None:
         """The `camera` argument for an image with these stated intrinsics.
 
-        None for the stated intrinsics of a scene's own recording: the map has adjusted them.
+        None, or adjusted intrinsics, for those that a scene's own recording states.
         """
-        return own_or_stated(stated, [scene.camera for scene in self.contents.scenes])
+        return own_or_stated(stated, self.contents.scenes)
 
     def localize(
         self, image: np.ndarray, camera: Camera | None = None, at_most_ms: float | None = None
@@ -153,8 +153,7 @@ class Localizer:
             Pose in the base frame with its covariance, or the reason for rejecting the image.
 
         Raises:
-            InputError: Not an image, a camera with another aspect ratio than the image's, or no
-                camera given and no scene was recorded at this aspect ratio.
+            InputError: Not an image, or a camera with another aspect ratio than the image's.
         """
         return self.located(image, camera, at_most_ms)[0]
 

@@ -202,5 +202,5 @@ def _verified(
     off = (shift.inverse() @ poses).log().reshape(-1, 2, 3)
     count = max(len(moves) - 1, 1)
     own = np.sqrt((off**2).mean((0, 2)) / count)
-    size = np.abs(shift.log().reshape(2, 3)).mean(1)
+    size = np.sqrt((shift.log().reshape(2, 3) ** 2).mean(1))
     return shift, np.maximum(own, size), len(moves)

@@ -2,7 +2,8 @@
 
 A tracked frame is not encoded and not matched: landmarks of the keyframes next to the predicted
 pose are aligned at once. The pose must pass the same acceptance as that of a single image. A frame
-that does not is located from nothing.
+that does not is located from nothing, and so is one before repeated texture whose prediction leaves
+several periods open.
 """
 
 import time
@@ -20,6 +21,7 @@ from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import cameras_in_scenes, prior_of
 from evercal.localization.localizer import Localizer
 from evercal.localization.query import Candidate, Hypothesis, Query, TimeBudget
+from evercal.localization.repetition import pattern_steps
 from evercal.recordings.images import as_rgb
 
 TrackState = Literal["tracking", "relocalized", "lost"]
@@ -28,6 +30,10 @@ _MARGIN = 1.3
 """An alignment may take so many times as long as the last one."""
 _ANSWER_S = 0.002
 """Time to answer after waiting."""
+
+
+MOST_SPEED_M_S, MOST_ACCELERATION_M_S2 = 1.0, 10.0
+"""Motions of a camera that a prediction allows for; faster ones are rare on arms and in hands."""
 
 
 @dataclass(frozen=True)
@@ -132,11 +138,15 @@ class Tracker:
         estimate = self._near_prediction(image, stamp, TimeBudget())
         if estimate is not None:
             return estimate, "tracking"
+        before, predicted, scene = self._poses[-1:], self._predicted(stamp), self._scene
         estimate, found = self.localizer.located(image, self.camera)
         self._poses.clear()
         if estimate.status != "ok":
             return estimate, "lost"
         self._remember(found, stamp)
+        same = predicted is not None and bool(self._poses) and self._scene == scene
+        if same and self._trusted(found, predicted, 1.0):
+            self._poses = [*before, *self._poses]  # the motion goes on
         return estimate, "relocalized"
 
     def _located_in_time(
@@ -204,9 +214,38 @@ class Tracker:
             self._alignment_s = time.perf_counter() - start
             times = self.options.settled if adopted else 1.0
             if found is not None and self._trusted(found, predicted, times):
+                if self._may_have_slipped(found, predicted, stamp):
+                    return None
+                answer = localizer.answer(query, found, 1000 * (time.perf_counter() - began))
+                if answer.status != "ok":  # too uncertain to be useful
+                    return None
                 self._remember(found, stamp)
-                return localizer.answer(query, found, 1000 * (time.perf_counter() - began))
+                return answer
         return None
+
+    def _may_have_slipped(self, found: Hypothesis, predicted: SE3, stamp: float) -> bool:
+        """Whether a pose that lies a period of repeated texture away is as near the prediction.
+
+        Then the frame is located from nothing, which compares such poses.
+        """
+        assert found.pose is not None, "a trusted pose"
+        if found.points_m is None or found.templates is None:
+            return False
+        steps = pattern_steps(found.points_m, found.templates, found.pose.pose.translation_m)
+        if not len(steps):
+            return False
+        elapsed = stamp - self._poses[-1][0]
+        unsure = MOST_SPEED_M_S * elapsed
+        if len(self._poses) > 1:
+            unsure = min(unsure, MOST_ACCELERATION_M_S2 / 2 * elapsed**2)
+        off, _ = pose_distance(found.pose.pose, predicted)
+        scale = self._metres_per_unit
+        return float(np.linalg.norm(steps[0]) - off) * scale < unsure
+
+    @property
+    def _metres_per_unit(self) -> float:
+        similarity = self.localizer.contents.scenes[self._scene].frame.similarity
+        return 1.0 if similarity is None else similarity.scale
 
     def _predicted(self, stamp: float) -> SE3 | None:
         """Pose of the next frame at constant velocity."""
@@ -234,9 +273,7 @@ class Tracker:
         if found.pose is None or not self.localizer.accepts(found, times):
             return False
         metres, radians = pose_distance(found.pose.pose, predicted)
-        frame = self.localizer.contents.scenes[self._scene].frame
-        scale = 1.0 if frame.similarity is None else frame.similarity.scale
-        near = float(metres) * scale < self.options.reach_m
+        near = float(metres) * self._metres_per_unit < self.options.reach_m
         return near and float(radians) < np.deg2rad(self.options.reach_deg)
 
     def _remember(self, found: Hypothesis, stamp: float, settled: bool = False) -> None:

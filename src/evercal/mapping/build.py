@@ -351,7 +351,9 @@ def _finish(
     if adjustment is not None:
         block = np.einsum("nii->ni", adjustment.covariance[numbers])
         common = adjustment.common
-        stated = adjustment.poses @ common.inverse()
+        # Corrections are looked up at poses without what `common` undoes.
+        undone = common if options.bundle.common_stated else SE3.identity()
+        stated = adjustment.poses @ undone.inverse()
         correction = fit_correction(stated, adjustment.correction)
         frame = MapFrame(
             common=common,

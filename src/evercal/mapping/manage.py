@@ -16,7 +16,7 @@ from typing import Literal, get_args
 
 from evercal.errors import InputError
 from evercal.mapping.scene_map import SceneMap
-from evercal.mapping.store import SCENE, MapStore, read_scene, require_map
+from evercal.mapping.store import PREVIOUS, SCENE, MapStore, read_scene, require_map
 from evercal.recordings.held_out import checked_name
 from evercal.storage.archive import ArchiveLimits, check_archive, extract_archive, write_archive
 from evercal.storage.atomic import replace_folder, write_bytes, write_json
@@ -199,7 +199,9 @@ def _index(store: MapStore, name: str) -> int:
 
 def _write_name(folder: Path, name: str) -> None:
     """Replace the name in the files of a scene."""
-    for file, key in ((SCENE, "name"), (REPORT, "scene")):
+    for file, key in ((SCENE, "name"), (REPORT, "scene"), (f"{PREVIOUS}{SCENE}", "name")):
+        if file.startswith(PREVIOUS) and not (folder / file).exists():
+            continue
         content = json.loads((folder / file).read_text(encoding="utf-8"))
         write_json(folder / file, {**content, key: name})
 

@@ -36,7 +36,7 @@ KIND, STRATEGY = "map", "evercal"
 """Kind of store in its manifest, and its name among the strategies of `evercal learn`."""
 SCENE, KEYFRAMES, CORRECTION = "scene.json", "keyframes.safetensors", "correction.safetensors"
 REFRESHES = "refreshes.json"
-_STATE, _PREVIOUS = (SCENE, KEYFRAMES, CORRECTION), "previous-"
+_STATE, PREVIOUS = (SCENE, KEYFRAMES, CORRECTION), "previous-"
 """Files that a refresh replaces, and the prefix of their state before."""
 
 _FIELDS = (
@@ -151,7 +151,7 @@ class MapStore(StageStore):
         def write(folder: Path) -> None:
             write_scene(folder, scene)
             for part in _STATE:
-                (folder / f"{_PREVIOUS}{part}").unlink(missing_ok=True)
+                (folder / f"{PREVIOUS}{part}").unlink(missing_ok=True)
 
         self._exchange(scene, write)
 
@@ -166,7 +166,7 @@ class MapStore(StageStore):
 
         def write(folder: Path) -> None:
             for name in _STATE:
-                _move(folder / name, folder / f"{_PREVIOUS}{name}")
+                _move(folder / name, folder / f"{PREVIOUS}{name}")
             write_scene(folder, scene)
             save_tensors(folder / KEYFRAMES, scene.keyframes.to_tensors())
             write_json(folder / REFRESHES, {"refreshes": [*refreshes(folder), dict(report)]})
@@ -183,13 +183,13 @@ class MapStore(StageStore):
         if name not in names:
             raise InputError(f"scene {name!r}: store {self.root} has {', '.join(names) or 'none'}")
         before = self.folder(self.stages[names.index(name)])
-        if not (before / f"{_PREVIOUS}{SCENE}").exists():
+        if not (before / f"{PREVIOUS}{SCENE}").exists():
             raise InputError(f"scene {name!r}: no refresh to undo")
 
         def write(folder: Path) -> None:
             for part in _STATE:
                 (folder / part).unlink(missing_ok=True)
-                _move(folder / f"{_PREVIOUS}{part}", folder / part)
+                _move(folder / f"{PREVIOUS}{part}", folder / part)
             write_json(folder / REFRESHES, {"refreshes": refreshes(folder)[:-1]})
 
         self.replace(names.index(name), write, self.payload)
