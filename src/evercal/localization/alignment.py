@@ -33,6 +33,10 @@ _HOPELESS = 0.08
 """They are not searched again if a smaller share of them are inliers."""
 _FAR_PX = 1.0
 """They are searched in all rounds, coarse to fine, if it was more than this."""
+_CONTRADICTED = 1.25
+"""Growth of the median residual by a prior, above which the prior does not hold."""
+_FAR_FROM_PRIOR = 50.0
+"""Squared deviations of five intrinsics from their prior that no estimate with that prior has."""
 
 
 @dataclass(frozen=True)
@@ -202,6 +206,12 @@ def _self_calibrated(
     prior = replace(prior, scale=shared * prior.scale)
     variances = prior.tested(camera, free.change, np.diag(free.change_covariance))
     refined = refine_pose(observed, camera, free.pose.pose, _STEPS, variances, free.change)
+    worse = np.median(refined.residual_px) > _CONTRADICTED * np.median(free.residual_px)
+    if worse or (refined.change**2 / variances).sum() > _FAR_FROM_PRIOR:
+        # Before a flat scene no parameter contradicts the prior alone, but all together do.
+        refined = refine_pose(
+            observed, camera, free.pose.pose, _STEPS, prior.free(camera), free.change
+        )
     doubt = np.zeros((6, 6))
     if prior.sigma.gain > 1:
         kept = refine_pose(observed, camera, pose, _STEPS, prior.tight(camera))

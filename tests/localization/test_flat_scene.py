@@ -1,0 +1,49 @@
+"""Before a flat scene the intrinsics are hardly measured; a wrong camera gives no precise answer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evercal.geometry import SE3, Camera
+from evercal.localization.alignment import _self_calibrated as self_calibrated
+from evercal.localization.intrinsics import OWN, STATED, IntrinsicsPrior, Prior
+from evercal.localization.pose_refinement import Observed
+
+CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)
+
+
+def answer(prior: IntrinsicsPrior, longer: float, tilt: float) -> tuple[float, float]:
+    """Error and standard deviation, metres, of a camera before a wall at 2 m.
+
+    It has another focal length than is supposed.
+    """
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform((5, 5), (634, 474), (400, 2))
+    camera = CAMERA.zoomed(longer)
+    rays, normal = camera.unproject(pixels), np.array([np.sin(tilt), 0, np.cos(tilt)])
+    points = rays * (2 / (rays @ normal))[:, None]
+    seen = Observed(
+        pixels + rng.normal(0, 0.05, pixels.shape), points, np.tile(10 * np.eye(2), (400, 1, 1))
+    )
+    pose, change = SE3.identity(), np.zeros(5)
+    for _ in range(4):
+        refined = self_calibrated(seen, CAMERA, pose, change, Prior(prior, 1.6))
+        pose, change = refined.pose.pose, refined.change
+    sigma = float(np.sqrt(np.trace(refined.pose.covariance[:3, :3]) / 3))
+    return float(np.linalg.norm(pose.translation_m)), sigma
+
+
+@pytest.mark.parametrize("prior", [OWN, STATED])
+@pytest.mark.parametrize("longer", [1.02, 1.05, 1.15])
+@pytest.mark.parametrize("tilt", [0.4, 0.6])
+def test_a_wrong_focal_length_is_wide(prior: IntrinsicsPrior, longer: float, tilt: float) -> None:
+    error, sigma = answer(prior, longer, tilt)
+    assert error < 0.01 or sigma > 0.05 or error < 4 * sigma
+
+
+@pytest.mark.parametrize("prior", [OWN, STATED])
+def test_the_right_one_is_precise(prior: IntrinsicsPrior) -> None:
+    error, sigma = answer(prior, 1.0, 0.4)
+    assert error < 0.002
+    assert sigma < 0.01
