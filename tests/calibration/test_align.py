@@ -145,22 +145,25 @@ def test_touched_points_determine_the_base(
     if longer != 1:
         camera = replace(camera, fx=longer * camera.fx, fy=longer * camera.fy)
         images = [(f"{i}.png", hall_room.render(camera, p)) for i, p in enumerate(map_from_camera)]
-    eye, rotation = map_from_camera[5].translation_m, map_from_camera[5].rotation_matrix()
+    # A flat wall leaves another focal length open, so the later images are refused then.
+    some, seen_from = (slice(2, 9, 2), 5) if longer == 1 else (slice(0, 5), 2)
+    eye = map_from_camera[seen_from].translation_m
+    rotation = map_from_camera[seen_from].rotation_matrix()
     corners = np.array([[80, 60], [240, 60], [80, 180], [240, 180], [160, 120]], float)
     in_map, _ = hall_room.intersect(eye, camera.unproject(corners) @ rotation.T)
     points = {f"p{i}": similarity.points(point) for i, point in enumerate(in_map)}
     picks = []
-    for (name, image), pose in list(zip(images, map_from_camera, strict=True))[2:9:2]:
+    for (name, image), pose in list(zip(images, map_from_camera, strict=True))[some]:
         pixels = camera.project(pose.inverse().apply(in_map))
         inside = ((pixels > 0) & (pixels < [319, 239])).all(1)
         visible = {f"p{i}": pixels[i] for i in np.flatnonzero(inside)}
-        picks.append((name, image, visible))
+        picks += [(name, image, visible)] if visible else []
     alignment = aligned_by_points(localizer, "hall", points, picks, scale_known=scale == 1.0)
     assert alignment.similarity.scale == pytest.approx(scale, rel=0.01)
     np.testing.assert_allclose(
         alignment.similarity.points(in_map), list(points.values()), atol=0.01
     )
-    with pytest.raises(InputError, match="1 of 1 images with picks"):
+    with pytest.raises(InputError, match="of 1 images with picks"):
         aligned_by_points(localizer, "hall", points, picks[:1])
 
 

@@ -1,4 +1,4 @@
-"""Before a flat scene the intrinsics are hardly measured; a wrong camera gives no precise answer."""
+"""Before a flat scene a wrong camera gives no precise answer."""
 
 from __future__ import annotations
 

@@ -196,6 +196,24 @@ def test_refused_recordings_leave_nothing(
     assert list(small.service.uploads.iterdir()) == []
 
 
+def test_an_archive_cannot_ask_for_files_elsewhere(serve: Any, copy: Path) -> None:
+    pose = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    transforms = {
+        "fl_x": 300, "fl_y": 300, "cx": 160, "cy": 120, "w": 320, "h": 240,
+        "frames": [{"file_path": "/etc/hostname", "transform_matrix": pose}],
+    }  # fmt: skip
+    with serve(copy) as service:
+        body = entries(**{"transforms.json": json.dumps(transforms).encode()})
+        got = service.ask("POST", "/scenes", body=body, headers=ZIP)
+        while (job := service.ask("GET", f"/jobs/{got.json['id']}").json)["status"] in (
+            "queued",
+            "learning",
+        ):
+            time.sleep(0.1)
+        assert job["status"] == "failed"
+        assert "transforms.json: image /etc/hostname lies outside the recording" in job["error"]
+
+
 @pytest.fixture(scope="module")
 def small(hall_store: Path) -> Any:
     from .conftest import running

@@ -41,6 +41,7 @@ def devices_of(cell: VirtualCell) -> Devices:
         cell.intrinsics,
         cell.reachable_poses(60),
         nominal_mount(),
+        settle_s=0.0,
     )
 
 

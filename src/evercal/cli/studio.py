@@ -132,6 +132,7 @@ class Studio:
             fixed_camera=cell.tripod_camera,  # of the same make, so it has the same intrinsics
             reachable=cell.reachable_poses(_REACHABLE),
             rough=nominal_mount(),
+            settle_s=0.0,
             arm=lambda: joint_frames(np.array(cell.robot.joints_rad()))[:, :3, 3],
         )
 

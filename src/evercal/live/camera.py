@@ -28,8 +28,9 @@ class LiveCamera(Protocol):
 class StreamCamera:
     """The frames of a camera, a network stream, a video or a folder, one for each `read`.
 
-    A thread empties the buffer of a live source, so that an image is never older than the call
-    that asks for it. A video or a folder gives its next frame.
+    A thread empties the buffer of a live source, so that an image arrived after the call that asks
+    for it. It was taken earlier by the delay of the source. A video or a folder gives its next
+    frame.
 
     Args:
         source: number or device of a camera, address, video file or folder.

@@ -1,5 +1,6 @@
 """Learning a scene in a process of its own, so that the service answers meanwhile."""
 
+import json
 import os
 import signal
 import time
@@ -84,6 +85,7 @@ def _learned(request: Request, on_progress: Callable[[str, int, int], None]) -> 
         on_progress("extracting", 0, 1)
         extract_archive(root, request.extracted, ArchiveLimits(request.unpacked_bytes))
         root = _inside(request.extracted)
+        _require_paths_inside(root)
     try:
         recording = load_recording(root, name=request.name)
     except InputError as error:
@@ -92,6 +94,20 @@ def _learned(request: Request, on_progress: Callable[[str, int, int], None]) -> 
     opened = Map.open(request.map, device=request.device)
     report = opened.learn(recording, memory=request.memory, on_progress=on_progress)
     return asdict(report)
+
+
+def _require_paths_inside(root: Path) -> None:
+    """Refuse a sent nerfstudio recording that names files elsewhere, before one is opened."""
+    folder = root if root.is_dir() else root.parent
+    for file in folder.rglob("*.json"):
+        with suppress(ValueError, OSError):
+            content = json.loads(file.read_text(encoding="utf-8"))
+            frames = content.get("frames") if isinstance(content, dict) else None
+            for frame in frames if isinstance(frames, list) else []:
+                name = frame.get("file_path") if isinstance(frame, dict) else None
+                path = (file.parent / str(name)).resolve()
+                if name and not path.is_relative_to(folder.resolve()):
+                    raise InputError(f"{file.name}: image {name} lies outside the recording")
 
 
 def _inside(folder: Path) -> Path:

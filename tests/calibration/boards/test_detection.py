@@ -86,6 +86,8 @@ def test_only_chessboards_of_even_sum_look_the_same_after_half_a_turn() -> None:
     assert Board("chessboard", 0.03, 8, 6).half_turn
     assert Board("chessboard", 0.03, 9, 7).half_turn
     assert not CHARUCO.half_turn
+    assert Board("chessboard", 0.03, 7, 7).quarter_turn
+    assert not Board("chessboard", 0.03, 9, 7).quarter_turn
 
 
 def simulated(
@@ -153,6 +155,17 @@ def test_distortion_is_estimated() -> None:
 def test_intrinsics_require_five_tilted_views() -> None:
     with pytest.raises(InputError, match="detected in 3 images, intrinsics take at least 5"):
         calibrate_camera(simulated(3)[0], 640, 480)
+
+
+def test_false_detections_do_not_count() -> None:
+    views, _ = simulated(10, 0.1)
+    plain, rng = calibrate_camera(views, 640, 480).camera, np.random.default_rng(0)
+    for _ in range(4):
+        false = BoardView(views[0].points_m, rng.uniform(0, 480, views[0].pixels.shape))
+        found = calibrate_camera([*views, false], 640, 480).camera
+        assert found.fx == pytest.approx(plain.fx, 0.01)
+        with pytest.raises(InputError, match="those of a flat board"):
+            calibrate_camera([*views[:4], false], 640, 480)
     points, rng = grid(9, 6), np.random.default_rng(0)
     exact = CAMERA.project(points + np.array([-0.12, -0.075, 0.5]))
     frontal = [BoardView(points, exact + rng.normal(0, 0.2, (54, 2))) for _ in range(8)]

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.hand_eye import Setting, error, recording, trials
 from evercal.calibration.boards.board_poses import board_poses
-from evercal.calibration.boards.corners import BoardView
+from evercal.calibration.boards.corners import BoardView, board_pose
 from evercal.calibration.boards.detection import Board, find_board
 from evercal.calibration.boards.intrinsics import calibrate_camera
 from evercal.calibration.calibration import Mount
@@ -204,6 +204,22 @@ def test_reversed_corners_of_a_symmetric_board_are_corrected() -> None:
         poses[i] = poses[i] @ half_turn
     pairs = replace(truth.pairs, camera_from_board=SE3.stack(poses))
     corners = BoardCorners(truth.camera, tuple(views), half_turn=True)
+    calibration = solve(pairs, "eye_in_hand", corners=corners)
+    assert all(image.used for image in calibration.images)
+    assert np.abs(error(calibration.parent_from_child, truth.parent_from_camera)).max() < 1e-4
+
+
+@pytest.mark.parametrize("side", [7, 8])
+def test_turned_corners_of_a_square_board_are_corrected(side: int) -> None:
+    truth, points = photographed("eye_in_hand", 1), grid(side, side)
+    views = list(truth.views(points, 0.0, 0))
+    poses = [board_pose(view, truth.camera).camera_from_board for view in views]
+    for i in range(1, len(views), 3):
+        order = np.rot90(np.arange(side * side).reshape(side, side), 1 + i % 3).ravel()
+        views[i] = BoardView(points, views[i].pixels[order])
+        poses[i] = board_pose(views[i], truth.camera).camera_from_board
+    pairs = replace(truth.pairs, camera_from_board=SE3.stack(poses))
+    corners = BoardCorners(truth.camera, tuple(views), quarter_turn=True)
     calibration = solve(pairs, "eye_in_hand", corners=corners)
     assert all(image.used for image in calibration.images)
     assert np.abs(error(calibration.parent_from_child, truth.parent_from_camera)).max() < 1e-4

@@ -175,6 +175,7 @@ def test_ros_numbers_in_any_notation_are_exact(
     ("text", "expected"),
     [
         ("1 2 3", "3 numbers, a 3x3 matrix has 9"),
+        ("1: 2\nfx: 5\n", "camera 'fy' is missing"),
         ("", "0 numbers"),
         ("1 2 3 4 5 6 7 8 9", "fx 0 cx"),
         ("nan 0 0 0 1 0 0 0 1", "finite"),
@@ -203,6 +204,15 @@ def test_broken_files_are_refused_in_one_line(tmp_path: Path, text: str, expecte
     assert message.startswith(f"{path}: ")
     assert expected in message
     assert "\n" not in message
+
+
+def test_a_single_number_called_size_is_no_image_size(tmp_path: Path) -> None:
+    matrix = [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]
+    np.savez(tmp_path / "camera.npz", K=matrix, dist=np.zeros(5), size=0.025)
+    camera = read_camera(tmp_path / "camera.npz", (640, 480))
+    assert (camera.fx, camera.width, camera.height) == (500, 640, 480)
+    with pytest.raises(InputError, match="no image size"):
+        read_camera(tmp_path / "camera.npz")
 
 
 def test_missing_camera_file_is_refused(tmp_path: Path) -> None:

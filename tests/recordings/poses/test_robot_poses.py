@@ -233,6 +233,7 @@ REFUSED = [
         "rows have 7 numbers; ur takes 6 .* stamp that increases",
     ),
     ("# nothing\n", None, "no line of numbers"),
+    (",,,\n", None, "no line of numbers"),
     ("x,y,z,qw,qx,qy,qz\n", None, "no line of numbers"),
     (Q, "quaternion", "'quaternion' is not known"),
 ]

@@ -86,6 +86,11 @@ class Board:
         """Whether the board looks the same after a rotation by 180 degrees."""
         return self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0
 
+    @property
+    def quarter_turn(self) -> bool:
+        """Whether the corners look the same after a rotation by 90 degrees."""
+        return self.kind == "chessboard" and self.columns == self.rows
+
     def to_dict(self) -> dict[str, object]:
         """Return JSON values."""
         return dict(vars(self))

@@ -1,6 +1,7 @@
 """Estimate intrinsics from views of a board."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,6 +16,8 @@ MIN_VIEWS = 5
 """Minimum number of views of a flat board."""
 _FOCAL_SIGMA = 0.1
 """Maximum relative standard deviation of the focal length."""
+_FALSE = 10.0
+"""Residual of a false detection, in medians of all views."""
 _ROUNDS = 25
 
 
@@ -42,9 +45,18 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
     open_focal = "the images leave the focal length open{}; tilt the board by 20 to 45 deg in" + (
         " several directions, or give --camera"
     )
+    views = _consistent(views, _rough(views, width, height))
+    if len(views) < MIN_VIEWS:
+        raise InputError(
+            f"the corners of {len(views)} images are those of a flat board, intrinsics take at"
+            f" least {MIN_VIEWS}; check --size, or give --camera"
+        )
     camera = _rough(views, width, height)
     prior = LensPrior.usual(camera)
-    poses, estimate = [board_pose(view, camera) for view in views], None
+    try:
+        poses, estimate = [board_pose(view, camera) for view in views], None
+    except ValueError:
+        raise InputError(open_focal.format("")) from None
     for _ in range(_ROUNDS):
         sigma = pixel_sigma(poses)
         estimate = lens_estimate(poses, sigma, camera, prior)
@@ -63,6 +75,16 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Int
     if not focal < _FOCAL_SIGMA * camera.fx:
         raise InputError(open_focal.format(f" ({camera.fx:.0f} +- {focal:.0f} px)"))
     return Intrinsics(camera, focal)
+
+
+def _consistent(views: Sequence[BoardView], camera: Camera) -> list[BoardView]:
+    """Leave out false detections: views without a pose, or with much larger residuals."""
+    rms = np.full(len(views), np.inf)
+    for i, view in enumerate(views):
+        with suppress(ValueError):
+            rms[i] = board_pose(view, camera).rms_px
+    most = _FALSE * np.median(rms)
+    return [view for view, error in zip(views, rms, strict=True) if error <= most < np.inf]
 
 
 def _rough(views: Sequence[BoardView], width: int, height: int) -> Camera:

@@ -6,6 +6,7 @@ the intrinsics (the Schur complement of bundle adjustment), and the derivative o
 The hand-eye equation with the intrinsics as extras is then the full reprojection problem.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -32,11 +33,21 @@ class BoardCorners:
     half_turn: bool = False
     """Whether the board looks the same after half a turn, so that its corners may be in reverse
     order."""
+    quarter_turn: bool = False
+    """Whether the corners are a square grid, which may be turned by 90 degrees."""
     stated: bool = False
     """Whether the intrinsics are stated, for example by the maker; else they were estimated from
     these corners."""
     size_m: float | None = None
     """Stated side of a square, or of a tag, for messages."""
+
+    def orders(self, count: int) -> list[NDArray[np.int64]]:
+        """Other orders in which the corners of a view may be, as indices of them."""
+        if self.quarter_turn:
+            side = math.isqrt(count)
+            grid = np.arange(side * side).reshape(side, side)
+            return [np.rot90(grid, turns).ravel() for turns in (1, 2, 3)]
+        return [np.arange(count)[::-1]] if self.half_turn else []
 
     @property
     def prior(self) -> LensPrior:

@@ -226,4 +226,5 @@ def _corners(board: BoardPoses | None, rows: list[int]) -> BoardCorners | None:
     views = tuple(view for i in rows if (view := board.images[i].view) is not None)
     stated = board.camera_from == "file"
     printed = board.board
-    return BoardCorners(board.camera, views, printed.half_turn, stated, printed.size_m)
+    turns = printed.half_turn, printed.quarter_turn
+    return BoardCorners(board.camera, views, *turns, stated, printed.size_m)

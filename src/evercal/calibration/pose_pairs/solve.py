@@ -24,7 +24,7 @@ from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation, Unknowns
 from evercal.calibration.pose_pairs.solution import PairSolution
 from evercal.errors import InputError
-from evercal.geometry import SE3, cross_matrix
+from evercal.geometry import SE3, cross_matrix, pose_distance
 
 Array = NDArray[np.floating]
 
@@ -229,13 +229,15 @@ def _other_board_poses(
     for row in np.flatnonzero(outliers):
         i = int(rows[row])
         view, old = corners.views[i], lens.poses[i]
-        candidates = [view]
-        if corners.half_turn:
-            candidates.append(BoardView(view.points_m, view.pixels[::-1]))
+        orders = corners.orders(len(view.pixels))
+        candidates = [view, *(BoardView(view.points_m, view.pixels[order]) for order in orders)]
+        nearest = np.inf
         for candidate in candidates:
             pose = board_pose(candidate, lens.camera, predicted[row])
-            if pose.squared_px < 4 * old.squared_px + 0.1 * old.corners:
-                views[i], poses[i] = candidate, pose.camera_from_board
+            # All orders of a symmetric board fit; the other poses decide between them.
+            _, turn = pose_distance(pose.camera_from_board, predicted[row])
+            if pose.squared_px < 4 * old.squared_px + 0.1 * old.corners and turn < nearest:
+                views[i], poses[i], nearest = candidate, pose.camera_from_board, float(turn)
     return replace(corners, views=tuple(views)), SE3.stack(poses)
 
 

@@ -242,8 +242,8 @@ def _distortion(fields: Mapping[str, Any], data: Mapping[str, Any], ros: bool) -
         other = [key for key in data if "dist" in _plain(key) and _plain(key) not in _MODEL_KEYS]
         if ros or other:
             raise ValueError(
-                f"{name!r} is missing, there is {', '.join(other or data)}; write four zeros if"
-                f" images have no lens distortion"
+                f"{name!r} is missing, there is {', '.join(map(str, other or data))}; write four"
+                f" zeros if images have no lens distortion"
             )
         numbers = []
     # Longer models add terms that are mostly zero and can then be dropped.
@@ -259,13 +259,16 @@ def _size(
     names = ("image_width", "image_height")
     stated: Any = [fields[name] for name in names if name in fields]
     if len(stated) < 2:
-        stated = fields.get("image_size", None if stated else size)
+        given = None if stated else size
+        stated = fields.get("image_size", given)
+        if not isinstance(stated, Mapping | list | tuple):
+            stated = given  # a single number called `size` is that of something else
     if isinstance(stated, Mapping):
         return _size(_fields(stated), stated, None)
     if stated is None:
         missing = next(name for name in names if name not in fields)
         raise ValueError(
-            f"{missing!r} is missing, so it has no image size, there is {', '.join(data)}"
+            f"{missing!r} is missing, so it has no image size, there is {', '.join(map(str, data))}"
         )
     numbers = _numbers(list(stated), "image size")
     if len(numbers) != 2:

@@ -105,6 +105,8 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
     comments = lines[: lines.index(plain[0])]
     plain, given = _without_brackets(plain, given)
     cells = table_cells(plain)
+    if not len(cells):  # separators only
+        raise ValueError("no line of numbers in it")
     words, rows = cells[0].tolist(), cells[1:]
     if not _is_header(words):
         words, rows = table_cells([c.lstrip("# ") for c in comments[-1:]]).ravel().tolist(), cells

@@ -39,6 +39,9 @@ class Devices:
     """A rough gripper_from_camera."""
     arm: Callable[[], NDArray[np.floating]] | None = None
     """Points (k, 3) along the arm in the base frame, for the drawing."""
+    settle_s: float = 0.8
+    """Time from a motion on request to a sample, seconds: images arrive late from networks and USB,
+    and would show the arm on its way."""
     live: bool = True
     """Whether images are shown all the time; those of a file are read for samples only."""
 

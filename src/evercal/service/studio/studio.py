@@ -4,6 +4,7 @@ Samples, images and results are written when they are made. A studio that is ope
 folder continues with them.
 """
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -128,6 +129,7 @@ class Studio:
         except InputError:
             self.book.refuse(base_from_gripper)
             raise
+        time.sleep(self.devices.settle_s)
         self.connection.look(None)
         return "The arm is there."
 
