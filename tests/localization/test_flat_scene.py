@@ -26,12 +26,12 @@ def answer(prior: IntrinsicsPrior, longer: float, tilt: float) -> tuple[float, f
     seen = Observed(
         pixels + rng.normal(0, 0.05, pixels.shape), points, np.tile(10 * np.eye(2), (400, 1, 1))
     )
-    pose, change = SE3.identity(), np.zeros(5)
-    for _ in range(4):
-        refined = self_calibrated(seen, CAMERA, pose, change, Prior(prior, 1.6))
-        pose, change = refined.pose.pose, refined.change
+    own = Prior(prior, 1.6)
+    refined = self_calibrated(seen, CAMERA, SE3.identity(), np.zeros(5), own)
+    for _ in range(3):
+        refined = self_calibrated(seen, CAMERA, refined.pose.pose, refined.change, own)
     sigma = float(np.sqrt(np.trace(refined.pose.covariance[:3, :3]) / 3))
-    return float(np.linalg.norm(pose.translation_m)), sigma
+    return float(np.linalg.norm(refined.pose.pose.translation_m)), sigma
 
 
 @pytest.mark.parametrize("prior", [OWN, STATED])

@@ -144,8 +144,8 @@ class Tracker:
         if estimate.status != "ok":
             return estimate, "lost"
         self._remember(found, stamp)
-        same = predicted is not None and bool(self._poses) and self._scene == scene
-        if same and self._trusted(found, predicted, 1.0):
+        same = bool(self._poses) and self._scene == scene
+        if predicted is not None and same and self._trusted(found, predicted, 1.0):
             self._poses = [*before, *self._poses]  # the motion goes on
         return estimate, "relocalized"
 

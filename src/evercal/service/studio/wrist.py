@@ -56,7 +56,10 @@ def free_name(name: str, taken: Sequence[str]) -> str:
 
 def learned_again(cell: Map, folders: Folders, name: str, on_step: OnStep) -> LearnReport:
     """Learn the recording in a map of its own, then exchange the scene in one step."""
+    from torch import nn
+
     old = cell.localizer.contents
+    assert isinstance(old.encoder, nn.Module), "stored with the map"
     with tempfile.TemporaryDirectory(prefix=".learning-", dir=folders.out) as scratch:
         fresh = Map.open(Path(scratch) / "map", device=old.device.type, encoder=old.encoder)
         report = fresh.learn(folders.wrist, name=name, on_progress=on_step)
