@@ -73,8 +73,7 @@ def vlad_for(encoder: Encoder, features: Sequence[Tensor] = ()) -> Vlad:
         centroids = shipped_centroids(encoder)
         if centroids is None and not features:
             raise InputError("the encoder has no VLAD centroids; learn a recording with it first")
-        centroids = fit_centroids(features) if centroids is None else centroids
-        _by_encoder[encoder] = _projected(centroids)
+        keep_centroids(encoder, fit_centroids(features) if centroids is None else centroids)
     return _by_encoder[encoder]
 
 
@@ -89,7 +88,7 @@ def known_centroids(encoder: Encoder) -> Tensor | None:
 
 
 def keep_centroids(encoder: Encoder, centroids: Tensor) -> None:
-    """Use centroids (k, channels) of another process."""
+    """Use centroids (k, channels), fitted or loaded here or in another process."""
     _by_encoder[encoder] = _projected(centroids)
 
 
