@@ -35,6 +35,8 @@ with the paper's head."""
 SEEDS = "0,1,2,3,4,5"
 """All orders of three rooms (`--order balanced`)."""
 MORE_SEEDS = "0,1,2,3,4,5,6,7,8,9,10,11"
+FEW_SEEDS = "0,1,2"
+"""Three orders: each room is first, second and last once."""
 SHARES = (1, 3, 30)
 """Memory, per cent of the frames; `a` has 10."""
 PAPER_STAGES = 15
@@ -63,6 +65,11 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
         )
         outcomes = file.replace(".json", ".outcomes.json")
         return [rooms("sim-tune"), trials, ("benchmarks", "publish", outcomes, Path(file).stem)]
+
+    def gated(suite: str, name: str, rows: Command, *options: str) -> Sequence[Command]:
+        joint = ("--strategies", "joint", "--seeds", FEW_SEEDS)
+        others = (*rows, "--strategies", "joint,finetune", "--seeds", FEW_SEEDS)
+        return [bench(suite, name, *options, *joint), bench(suite, name, *options, *others)]
 
     def publish(name: str) -> Command:
         return "benchmarks", "publish", str(out / name), name
@@ -99,7 +106,7 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
                 for command in (
                     bench(
                         *("sim-mini", name, *tuned, "--rows", str(out / FILLED)),
-                        *("--memory", f"{share}%", "--seeds", "0,1,2"),
+                        *("--memory", f"{share}%", "--seeds", FEW_SEEDS),
                     ),
                     publish(name),
                 )
@@ -111,18 +118,15 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
                 *("--steps", str(STEPS // 2)),
             ),
             rooms("sim-mini"),
-            bench(
-                *("sim-mini", "networks-b", *tuned, "--steps", str(4 * STEPS), *head),
-                *("--rows", PAPER_HEAD_ROWS, "--strategies", "joint,finetune", "--seeds", "0,1,2"),
+            *gated(
+                *("sim-mini", "networks-b", ("--rows", PAPER_HEAD_ROWS)),
+                *(*tuned, "--steps", str(4 * STEPS), *head),
             ),
             publish("networks-b"),
         ],
         "c": [
             rooms("sim-unseen"),
-            bench(
-                *("sim-unseen", "networks-c", *doubled, "--rows", str(out / FILLED)),
-                *("--strategies", "joint,finetune", "--seeds", SEEDS),
-            ),
+            *gated("sim-unseen", "networks-c", ("--rows", str(out / FILLED)), *doubled),
             bench(
                 *("sim-unseen", "networks-c", *doubled, "--strategies", "evercal", "--seeds", "0")
             ),
@@ -131,7 +135,7 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
         "real": [
             bench(
                 *("real2", "networks-real", *doubled, "--rows", str(out / FILLED)),
-                *("--strategies", "joint,finetune", "--seeds", "0,1,2"),
+                *("--strategies", "joint,finetune", "--seeds", FEW_SEEDS),
             ),
             publish("networks-real"),
         ],
