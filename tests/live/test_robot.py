@@ -9,7 +9,7 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
-from evercal.live.robot import JointRobot, MovingRobot, PoseFileRobot, Robot
+from evercal.live.robot import MovingRobot, PoseFileRobot, Robot
 from evercal.simulation.virtual_robot import SimulatedClock, VirtualRobot
 
 HEADER = "stamp_s,x,y,z,qw,qx,qy,qz\n"
@@ -88,4 +88,3 @@ def test_what_a_robot_offers_is_visible() -> None:
     assert isinstance(file, Robot)
     assert not isinstance(file, MovingRobot)
     assert isinstance(arm, MovingRobot)
-    assert isinstance(arm, JointRobot)

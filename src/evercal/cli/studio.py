@@ -12,6 +12,7 @@ from evercal.cli.console import print_json
 from evercal.cli.device import Device
 from evercal.cli.view import until_stopped
 from evercal.errors import InputError
+from evercal.service.hosts import is_local
 
 if TYPE_CHECKING:
     from evercal.geometry import Camera
@@ -71,7 +72,6 @@ class Studio:
         self._refuse()
         try:
             from evercal.service.studio.page import StudioPage
-            from evercal.service.viewer.page import is_local
         except ImportError as error:
             raise InputError(
                 f"the studio needs {error.name}; run: pip install 'evercal[view]'"

@@ -17,6 +17,7 @@ from evercal.cli.console import print_json
 from evercal.cli.device import Device
 from evercal.cli.stores import open_map
 from evercal.errors import InputError
+from evercal.service.hosts import is_local
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class View:
         if self.camera is not None and self.live is None:
             raise InputError("--camera: is that of --live, which is missing")
         try:
-            from evercal.service.viewer.page import Page, ViewOptions, is_local
+            from evercal.service.viewer.page import Page, ViewOptions
         except ImportError as error:
             raise InputError(
                 f"the view needs {error.name}; run: pip install 'evercal[view]'"

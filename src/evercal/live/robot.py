@@ -1,8 +1,7 @@
 """Where gripper poses come from while a robot runs.
 
-A robot is any object with `base_from_gripper()`. One that can move on request also has `move_to`,
-one that states its joint angles has `joints_rad`. A robot of any maker is connected by a file that
-its own program appends poses to.
+A robot is any object with `base_from_gripper()`. One that can move on request also has `move_to`. A
+robot of any maker is connected by a file that its own program appends poses to.
 """
 
 import time
@@ -33,15 +32,6 @@ class MovingRobot(Robot, Protocol):
         Raises:
             InputError: The pose is out of reach.
         """
-        ...
-
-
-@runtime_checkable
-class JointRobot(Robot, Protocol):
-    """A robot that states its joint angles."""
-
-    def joints_rad(self) -> tuple[float, ...]:
-        """Current joint angles, radians."""
         ...
 
 

@@ -1,7 +1,6 @@
 """The HTTP service: the application, and the process that serves it."""
 
 import asyncio
-import ipaddress
 import os
 import signal
 import socket
@@ -23,6 +22,7 @@ from evercal.errors import InputError
 from evercal.service import routes, scene_routes
 from evercal.service.desk import Desk
 from evercal.service.guard import Guard, Metrics
+from evercal.service.hosts import is_local
 from evercal.service.jobs import Jobs, QueueFullError
 from evercal.service.limits import Limits, TooLargeError
 from evercal.service.live_map import LiveMap
@@ -175,7 +175,7 @@ def bound_socket(options: ServeOptions) -> socket.socket:
             that cannot be used.
     """
     token = options.token
-    if token is None and not _is_loopback(options.host):
+    if token is None and not is_local(options.host):
         raise InputError(
             f"--host {options.host}: other machines could use the map; give --token, or set"
             " EVERCAL_TOKEN"
@@ -199,13 +199,6 @@ def bound_socket(options: ServeOptions) -> socket.socket:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"--host {options.host} --port {options.port}: {reason}") from None
     return listener
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def url_of(listener: socket.socket) -> str:

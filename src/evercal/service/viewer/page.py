@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import ipaddress
 import socket
 from dataclasses import dataclass
 from pathlib import Path
@@ -184,11 +183,3 @@ def start_server(host: str, port: int, label: str = "evercal view") -> viser.Vis
     )
     add_names(server, label)
     return server
-
-
-def is_local(host: str) -> bool:
-    """Whether an address is reached from this machine only."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
