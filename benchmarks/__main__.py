@@ -9,6 +9,7 @@ VERBS = {
     "maps": "accuracy of maps: degraded images, fixed cameras, wrong poses, sequences of scenes",
     "calibration": "cameras calibrated from images, compared with the simulator's truth",
     "trust": "other lenses, few images, an inaccurate arm: errors and their stated deviations",
+    "same-model": "images of other cameras of the recording's model",
     "repeat": "a wrist camera before a chessboard, in three folds",
     "handeye": "pose pairs: errors, ellipsoids, outliers, scale, time",
     "boards": "detection of rendered boards, beside the finders of OpenCV",
@@ -44,6 +45,7 @@ MODULES = {
     "next-views": "next_views",
     "virtual-cell": "virtual_cell",
     "refresh": "changing_room",
+    "same-model": "same_model",
     "tune": "tuning",
 }
 """Modules whose names differ from their verbs."""

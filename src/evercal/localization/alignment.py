@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, UncertainPose
-from evercal.localization.intrinsics import SHARED_PX, Prior
+from evercal.localization.intrinsics import OWN, SAME_MODEL, UNKNOWN, Prior
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import (
     INTRINSICS,
+    MeasuredIntrinsics,
     Observed,
     RefinedPose,
     changed_camera,
@@ -35,8 +36,6 @@ _FAR_PX = 1.0
 """They are searched in all rounds, coarse to fine, if it was more than this."""
 _CONTRADICTED = 1.25
 """Growth of the median residual by a prior, above which the prior does not hold."""
-_FAR_FROM_PRIOR = 50.0
-"""Squared deviations of five intrinsics from their prior that no estimate with that prior has."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +171,7 @@ def align_pose(
         if (refined.residual_px < options.inlier_px).sum() < _HOPELESS * found.expected:
             break  # other intrinsics do not make it the right place
         if again == _MOST_AGAIN:
-            if prior.sigma.gain > 1:
+            if prior.sigma is OWN:
                 break  # both are good, and it is undecided between them
             return None  # the intrinsics do not converge
         pose, change, again = refined.pose.pose, refined.change, again + 1
@@ -202,34 +201,59 @@ def _self_calibrated(
     """Pose and intrinsics; the prior gives way where the image contradicts it."""
     free = refine_pose(observed, camera, pose, _STEPS, prior.free(camera), change)
     # Errors that neighbouring landmarks share do not average out.
-    shared = 1 + (SHARED_PX**2 / free.variance) * float((observed.whitening**2).sum()) / 2
+    by_shared = float((observed.whitening**2).sum()) / (2 * free.variance)
+    shared = 1 + prior.shared_px**2 * by_shared
     prior = replace(prior, scale=shared * prior.scale)
-    variances = prior.tested(camera, free.change, np.diag(free.change_covariance))
-    refined = refine_pose(observed, camera, free.pose.pose, _STEPS, variances, free.change)
-    worse = np.median(refined.residual_px) > _CONTRADICTED * np.median(free.residual_px)
-    if worse or (refined.change**2 / variances).sum() > _FAR_FROM_PRIOR:
-        # Before a flat scene no parameter contradicts the prior alone, but all together do.
-        refined = refine_pose(
-            observed, camera, free.pose.pose, _STEPS, prior.free(camera), free.change
-        )
-    doubt = np.zeros((6, 6))
-    if prior.sigma.gain > 1:
-        kept = refine_pose(observed, camera, pose, _STEPS, prior.tight(camera))
-        before, after = (np.median(each.residual_px) for each in (kept, refined))
-        if before < prior.sigma.gain * after:
-            doubt = _apart(kept.pose.pose, refined.pose.pose)
-            refined = kept
-    wider = refined.pose.covariance + (shared - 1) * refined.by_intrinsics + doubt
+    if prior.sigma is OWN:
+        refined = _own_or_other(observed, camera, pose, free, prior)
+    else:
+        refined = _contradictable(observed, camera, free, prior)
+    squares = free.change @ np.linalg.solve(free.change_covariance, free.change)
+    wider = refined.pose.covariance + (shared - 1) * refined.by_intrinsics
     return replace(
         refined,
         pose=UncertainPose(refined.pose.pose, wider),
-        by_intrinsics=shared * refined.by_intrinsics + doubt,
+        by_intrinsics=shared * refined.by_intrinsics,
         change_covariance=shared * refined.change_covariance,
+        measured=MeasuredIntrinsics(float(squares), by_shared),
+    )
+
+
+def _contradictable(
+    observed: Observed, camera: Camera, free: RefinedPose, prior: Prior
+) -> RefinedPose:
+    """Pose and intrinsics under a prior that gives way."""
+    start, change = free.pose.pose, free.change
+    variances = prior.tested(camera, change, free.change_covariance)
+    refined = refine_pose(observed, camera, start, _STEPS, variances, change)
+    if np.median(refined.residual_px) > _CONTRADICTED * np.median(free.residual_px):
+        return refine_pose(observed, camera, start, _STEPS, prior.free(camera), change)
+    return refined
+
+
+def _own_or_other(
+    observed: Observed, camera: Camera, pose: SE3, free: RefinedPose, prior: Prior
+) -> RefinedPose:
+    """Pose for the recording's camera; for any camera if another one is more probable.
+
+    A less probable camera widens the covariance, to the second moment about the answer.
+    """
+    doubt = prior.other_camera(camera, free.change, free.change_covariance)
+    if doubt > 0.5:
+        return _contradictable(observed, camera, free, replace(prior, sigma=UNKNOWN))
+    own = refine_pose(observed, camera, pose, _STEPS, prior.tight(camera))
+    other = _contradictable(observed, camera, free, replace(prior, sigma=SAME_MODEL))
+    apart = _apart(own.pose.pose, other.pose.pose)
+    more = doubt * (other.by_intrinsics - own.by_intrinsics + apart)
+    return replace(
+        own,
+        pose=UncertainPose(own.pose.pose, own.pose.covariance + more),
+        by_intrinsics=own.by_intrinsics + more,
     )
 
 
 def _apart(kept: SE3, other: SE3) -> Array:
-    """(6, 6) covariance whose deviation reaches from one pose to that for other intrinsics."""
+    """(6, 6) covariance whose deviation reaches from one pose to another."""
     turn = (kept.inverse() @ other).log()[3:]
     off = np.r_[other.translation_m - kept.translation_m, turn]
     return np.outer(off, off)

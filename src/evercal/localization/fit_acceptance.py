@@ -9,9 +9,14 @@ import numpy as np
 from evercal.geometry.near import NEAR_M, NEAR_RAD
 from evercal.localization.acceptance import COVARIANCE_SCALE, MAX_SUPPORT, MIN_SUPPORT
 from evercal.localization.localizer import Localizer
-from evercal.mapping.scene_map import LeftOut, MapContents, SceneMap
+from evercal.localization.pose_refinement import MeasuredIntrinsics
+from evercal.mapping.scene_map import SHARED_PX, LeftOut, MapContents, SceneMap
 from evercal.recordings.frame import Frame
 
+AGREE_SQUARES = 7.29
+"""80 % quantile of the squared deviation of five intrinsics (chi-squared)."""
+LEAST_SHARED_PX = 0.01
+"""Frames near the recorded path agree better than others, so no map counts as more exact."""
 LEAST_ANSWERS, WRONG_PLACE_M = 8, 0.5
 """The scatter is fitted to so many answers, at least. Answers farther from their stated pose are
 wrong, or the pose is, and say nothing about its scatter."""
@@ -64,7 +69,12 @@ def fit_acceptance(
             for known, part in zip(shared, (slice(0, 3), slice(3, 6)), strict=True)
         )
         shared = metres, radians
-    return replace(scene, frame=replace(bare, frame_sigma=shared), min_support=threshold)
+    return replace(
+        scene,
+        frame=replace(bare, frame_sigma=shared),
+        min_support=threshold,
+        shared_px=shared_px([answer.measured for answer in answers if answer.measured]),
+    )
 
 
 class _Answer(NamedTuple):
@@ -75,6 +85,8 @@ class _Answer(NamedTuple):
     """(6,) translation in the base frame, metres, and rotation about camera axes, radians."""
     covariance: np.ndarray
     """(6, 6)."""
+    measured: MeasuredIntrinsics | None
+    """Its intrinsics without a prior."""
 
     def near(self, metric: bool) -> bool:
         """Whether the frame is well located; by its rotation where the unit is unknown."""
@@ -86,15 +98,30 @@ def _located(contents: MapContents, frames: Sequence[Frame], scene: str) -> list
     """Answers in one scene, with finite covariances."""
     localizer, answers = Localizer(contents), []
     for frame in frames:
-        estimate = localizer.localize(frame.read_image(), localizer.camera_for(frame.camera))
+        camera = localizer.camera_for(frame.camera)
+        estimate, found = localizer.located(frame.read_image(), camera)
         pose, stated = estimate.uncertain_pose, frame.base_from_camera
         if pose is None or stated is None or estimate.scene != scene:
             continue
         if np.isfinite(pose.covariance).all():
             turn = (pose.pose.inverse() @ stated).log()[3:]
             off = np.r_[stated.translation_m - pose.pose.translation_m, turn]
-            answers.append(_Answer(estimate.support, off, pose.covariance))
+            measured = None if found.refined is None else found.refined.measured
+            answers.append(_Answer(estimate.support, off, pose.covariance, measured))
     return answers
+
+
+def shared_px(measured: Sequence[MeasuredIntrinsics]) -> float:
+    """Errors that landmarks share, from frames of the recording's own camera.
+
+    With them, the intrinsics of 80 % of the frames agree with those of the recording as well as
+    80 % of draws from their distribution.
+    """
+    if len(measured) < LEAST_ANSWERS:
+        return SHARED_PX
+    squares, by_shared = np.array([(m.squares, m.by_shared) for m in measured]).T
+    needed = (squares / (COVARIANCE_SCALE * AGREE_SQUARES) - 1) / by_shared
+    return float(np.sqrt(max(np.quantile(needed, 0.8), LEAST_SHARED_PX**2)))
 
 
 def scatter(errors: np.ndarray, covariances: np.ndarray) -> float:

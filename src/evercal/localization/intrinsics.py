@@ -10,18 +10,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit, logit
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
+from evercal.mapping.scene_map import SHARED_PX
 
 if TYPE_CHECKING:
     from evercal.localization.learned import LearnedScene
 
 Array = NDArray[np.floating]
 
-SHARED_PX = 0.02
-"""Errors that landmarks share, pixels: they bound how well many landmarks measure the intrinsics. A
-flat wall seen from the front would otherwise seem to measure the focal length."""
+CONTRADICTED = 15.1
+"""Squared deviation of all five, above which no prior holds: the 99 % quantile (chi-squared)."""
+OTHER_CAMERA = 0.3
+"""Prior probability that an image of the recording's size is of another camera of that model."""
 DOUBT = 3.0
 """Squared deviations from the prior, in standard deviations, from which it gives way."""
 
@@ -38,8 +41,6 @@ class IntrinsicsPrior:
     """Of the first radial distortion coefficient."""
     k2: float
     """Of the second one."""
-    gain: float = 1.0
-    """Factor by which other intrinsics must lower the median residual."""
 
     def variances(self, camera: Camera) -> Array:
         """(5,) variances of a change of intrinsics, see `pose_refinement.changed_camera`."""
@@ -47,10 +48,10 @@ class IntrinsicsPrior:
         return np.square([self.focal, centre, centre, self.k1, self.k2])
 
 
-OWN = IntrinsicsPrior(focal=2e-4, centre=3e-4, k1=1e-3, k2=1e-3, gain=1.1)
-"""The camera that recorded the scene: its error is in the landmarks, too, and cancels. Where a map
-is inexact, every image fits slightly better with other intrinsics. To follow it without a clear
-gain costs precision on a real recording (docs/experiments/intrinsics.md)."""
+OWN = IntrinsicsPrior(focal=2e-4, centre=3e-4, k1=1e-3, k2=1e-3)
+"""The camera that recorded the scene: its error is in the landmarks, too, and cancels."""
+SAME_MODEL = IntrinsicsPrior(focal=0.007, centre=0.007, k1=0.01, k2=0.01)
+"""Another camera of the same model and image size."""
 STATED = IntrinsicsPrior(focal=2e-3, centre=2e-3, k1=5e-3, k2=5e-3)
 """Intrinsics that the user states."""
 UNKNOWN = IntrinsicsPrior(focal=0.3, centre=0.05, k1=0.1, k2=0.05)
@@ -68,6 +69,8 @@ class Prior:
     sigma: IntrinsicsPrior = OWN
     scale: float = 1.0
     """Factor on the covariance of landmarks."""
+    shared_px: float = SHARED_PX
+    """See `SceneMap.shared_px`."""
 
     def free(self, camera: Camera) -> Array:
         """(5,) variances that hardly bind."""
@@ -77,11 +80,35 @@ class Prior:
         """(5,) variances of the prior itself."""
         return self.sigma.variances(camera) / self.scale
 
-    def tested(self, camera: Camera, change: Array, variance: Array) -> Array:
-        """(5,) variances: those of the prior, wider where an estimate contradicts it."""
-        tight = self.sigma.variances(camera)
-        excess = change**2 - DOUBT * (self.scale * variance + tight)
-        return (tight + np.maximum(excess, 0)) / self.scale
+    def tested(self, camera: Camera, change: Array, covariance: Array) -> Array:
+        """(5,) variances: those of the prior, wider where an estimate contradicts it.
+
+        The change (5,) and its covariance (5, 5) were estimated without a prior. Before a flat
+        scene no parameter contradicts the prior alone, but all together may.
+        """
+        tight, measured = self.sigma.variances(camera), self.scale * covariance
+        excess = change**2 - DOUBT * (np.diag(measured) + tight)
+        variances = tight + np.maximum(excess, 0)
+        squares = change @ np.linalg.solve(measured + np.diag(variances), change)
+        return self.free(camera) if squares > CONTRADICTED else variances / self.scale
+
+    def other_camera(self, camera: Camera, change: Array, covariance: Array) -> float:
+        """Probability that an image is of another camera of the model, by estimated intrinsics.
+
+        The change (5,) and its covariance (5, 5) were estimated without a prior. Each hypothesis
+        is a Gaussian about the intrinsics of the recording, see `OWN` and `SAME_MODEL`.
+        """
+        own, other = (
+            _log_density(change, self.scale * covariance + np.diag(sigma.variances(camera)))
+            for sigma in (OWN, SAME_MODEL)
+        )
+        return float(expit(logit(OTHER_CAMERA) + other - own))
+
+
+def _log_density(change: Array, covariance: Array) -> float:
+    """Logarithm of a Gaussian density about zero, without its constant."""
+    squares = change @ np.linalg.solve(covariance, change)
+    return float(-(squares + np.linalg.slogdet(covariance)[1]) / 2)
 
 
 def own_or_stated(stated: Camera, scenes: "Sequence[LearnedScene]") -> Camera | None:

@@ -314,7 +314,7 @@ class Localizer:
             [self._bank.load(int(index)).landmarks for index in candidate.keyframes],
             start,
             self.options.alignment,
-            Prior(self._prior(query, candidate), scene.covariance_scale),
+            Prior(self._prior(query, candidate), scene.covariance_scale, scene.shared_px),
             change,
             coarse,
         )

@@ -44,6 +44,17 @@ class Observed:
 
 
 @dataclass(frozen=True, eq=False)
+class MeasuredIntrinsics:
+    """Intrinsics that landmarks measure without a prior."""
+
+    squares: float
+    """Squared change from the stated intrinsics, in standard deviations of independent errors of
+    the landmarks."""
+    by_shared: float
+    """Factor on the variance is 1 + `by_shared` s^2, if landmarks share errors of s pixels."""
+
+
+@dataclass(frozen=True, eq=False)
 class RefinedPose:
     """A pose, intrinsics and the residuals of the observations."""
 
@@ -61,6 +72,8 @@ class RefinedPose:
     """Robust variance of the whitened errors."""
     by_intrinsics: Array
     """(6, 6) share of the pose's covariance that is due to the intrinsics."""
+    measured: MeasuredIntrinsics | None = None
+    """Intrinsics without a prior, where they were estimated."""
 
 
 @dataclass(frozen=True, eq=False)

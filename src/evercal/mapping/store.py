@@ -40,8 +40,8 @@ _STATE, PREVIOUS = (SCENE, KEYFRAMES, CORRECTION), "previous-"
 """Files that a refresh replaces, and the prefix of their state before."""
 
 _FIELDS = (
-    "name", "camera", "adjusted_camera", "train_frames", "min_support", "covariance_scale",
-    "metric",
+    "name", "camera", "adjusted_camera", "train_frames", "min_support", "shared_px",
+    "covariance_scale", "metric",
 )  # fmt: skip
 """Fields of `SceneMap` in scene.json, beside `frame`."""
 
