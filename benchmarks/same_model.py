@@ -16,8 +16,8 @@ import numpy as np
 from tabulate import tabulate
 
 from benchmarks.lenses import View, cropped
+from evercal.geometry import UncertainPose
 from evercal.localization import intrinsics
-from evercal.localization.estimate import PoseEstimate
 from evercal.localization.parallel import in_parallel
 from evercal.map import Map
 from evercal.recordings.frame import Frame
@@ -30,6 +30,8 @@ SPREAD = {"focal": 0.005, "centre": 0.006, "k1": 0.005}
 of the width, first distortion coefficient."""
 WRONG_MM, WRONG_SIGMAS = 10.0, 5.0
 """A wrong answer is so far off, and more than so many of its own standard deviations."""
+FIXED_IMAGES = 12
+"""Images of a fixed camera."""
 INSIDE_95 = 7.815
 """95 % quantile of a squared deviation in three dimensions (chi-squared)."""
 
@@ -38,7 +40,8 @@ def run(out: Path = Path("runs/same-model.json"), cameras: int = 8, every: int =
     """Locate test images of the packaged rooms as other cameras of the same model see them.
 
     The images are of the recording's own camera, of others, and of others with stated intrinsics.
-    The rows `own` leave out the possibility of another camera.
+    The rows `own` leave out the possibility of another camera. Fixed cameras are calibrated in the
+    same way.
 
     Args:
         out: File of rows to write.
@@ -51,16 +54,23 @@ def run(out: Path = Path("runs/same-model.json"), cameras: int = 8, every: int =
     with tempfile.TemporaryDirectory() as scratch:
         learned = Map.open(Path(scratch) / "rooms")
         frames: list[Frame] = []
+        fixed: list[Sequence[Frame]] = []
         for room in sample_rooms():
             middle = tuple(_seen(frame, np.zeros(4)) for frame in room.scene.train)
             learned.learn(replace(room.scene, train=middle, test=()))
             frames += room.scene.test[::every]
+            fixed += [room.fixed.test[:FIXED_IMAGES]] if room.fixed else []
         for name, changes in (("own", np.zeros((1, 4))), ("another", draws)):
             images = [_seen(frame, change) for change in changes for frame in frames]
+            views = [[_seen(frame, change) for frame in of] for change in changes for of in fixed]
             for supposed in ("own or another", "own", "as stated")[: 2 if name == "own" else 3]:
+                stated, what = supposed == "as stated", {"camera": name, "supposed": supposed}
                 with _without_others(supposed == "own"):
-                    answers = _answers(learned, images, supposed == "as stated")
-                rows.append({"camera": name, "supposed": supposed, **_summary(answers, images)})
+                    poses = [_calibrated(learned, of, stated) for of in views]
+                    answers = _answers(learned, images, stated)
+                rows.append({"answer": "image", **what, **_summary(answers, images)})
+                first = [of[0] for of in views]
+                rows.append({"answer": "fixed camera", **what, **_summary(poses, first)})
     settings = {"cameras": cameras, "every": every, "draws": draws.round(5).tolist()}
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps({"rows": rows, "settings": settings}, indent=1))
@@ -90,20 +100,28 @@ def _without_others(without: bool) -> Iterator[None]:
         intrinsics.OTHER_CAMERA = before
 
 
-def _answers(learned: Map, frames: Sequence[Frame], stated: bool) -> list[PoseEstimate]:
-    return list(
-        in_parallel(
-            lambda f: learned.localize(f.read_image(), f.camera if stated else None), frames
-        )
-    )
+def _answers(learned: Map, frames: Sequence[Frame], stated: bool) -> list[UncertainPose | None]:
+    def located(frame: Frame) -> UncertainPose | None:
+        answer = learned.localize(frame.read_image(), frame.camera if stated else None)
+        return answer.uncertain_pose if answer.status == "ok" else None
+
+    return list(in_parallel(located, frames))
 
 
-def _summary(answers: Sequence[PoseEstimate], frames: Sequence[Frame]) -> Mapping[str, object]:
+def _calibrated(learned: Map, frames: Sequence[Frame], stated: bool) -> UncertainPose | None:
+    camera = frames[0].camera if stated else None
+    found = learned.calibrate([frame.read_image() for frame in frames], camera=camera)
+    return UncertainPose(found.parent_from_child, found.covariance)
+
+
+def _summary(
+    answers: Sequence[UncertainPose | None], frames: Sequence[Frame]
+) -> Mapping[str, object]:
     """Errors in millimetres, and whether the covariance contains them."""
     errors, deviations, sigmas = [], [], []
-    for answer, frame in zip(answers, frames, strict=True):
-        pose, truth = answer.uncertain_pose, frame.base_from_camera
-        if answer.status == "ok" and pose is not None and truth is not None:
+    for pose, frame in zip(answers, frames, strict=True):
+        truth = frame.base_from_camera
+        if pose is not None and truth is not None:
             off = pose.pose.translation_m - truth.translation_m
             covariance = pose.covariance[:3, :3]
             errors.append(1000 * np.linalg.norm(off))
@@ -111,7 +129,7 @@ def _summary(answers: Sequence[PoseEstimate], frames: Sequence[Frame]) -> Mappin
             sigmas.append(1000 * np.sqrt(np.trace(covariance) / 3))
     wrong = (np.array(errors) > WRONG_MM) & (np.array(deviations) > WRONG_SIGMAS**2)
     return {
-        "images": len(frames),
+        "answers": len(frames),
         "located": len(errors),
         "median_mm": float(np.median(errors)),
         "95_%_mm": float(np.percentile(errors, 95)),

@@ -386,7 +386,7 @@ def test_archives_that_are_no_complete_map_are_refused(
         (lambda e: e.update({MANIFEST: e[MANIFEST][:-9]}), "broken"),
         (lambda e: e.update({"extra.sh": b"x"}), "extra.sh is not in its manifest"),
         (lambda e: e.update({"../evil": b"x"}), "leaves the folder"),
-        (of(schema), "schema 99 is not 5; update evercal"),
+        (of(schema), "schema 99 is not 6; update evercal"),
         (of(foreign), "not a scene that evercal wrote"),
     ]
     before = tree(tmp_path)

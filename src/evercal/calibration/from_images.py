@@ -60,7 +60,7 @@ class Images:
     images: Sequence[tuple[str, NDArray[np.uint8]]]
     """(name, (h, w, 3) uint8 RGB)."""
     camera: Camera | None = None
-    """Intrinsics. None: those of the camera that recorded the scene."""
+    """Intrinsics. None: those of the camera that recorded the scene, or of another of its model."""
     base_from_gripper: SE3 | None = None
     """(n,) gripper pose at each image."""
 

@@ -34,8 +34,10 @@ _HOPELESS = 0.08
 """They are not searched again if a smaller share of them are inliers."""
 _FAR_PX = 1.0
 """They are searched in all rounds, coarse to fine, if it was more than this."""
-_CONTRADICTED = 1.25
-"""Growth of the median residual by a prior, above which the prior does not hold."""
+
+_REACHED = 0.05 * 7.815
+"""Probability of another camera from which the covariance has a deviation as large as the distance
+to its pose. That pose is inside the 95 % ellipsoid (chi-squared) where its probability is 5 %."""
 
 
 @dataclass(frozen=True)
@@ -223,12 +225,8 @@ def _contradictable(
     observed: Observed, camera: Camera, free: RefinedPose, prior: Prior
 ) -> RefinedPose:
     """Pose and intrinsics under a prior that gives way."""
-    start, change = free.pose.pose, free.change
-    variances = prior.tested(camera, change, free.change_covariance)
-    refined = refine_pose(observed, camera, start, _STEPS, variances, change)
-    if np.median(refined.residual_px) > _CONTRADICTED * np.median(free.residual_px):
-        return refine_pose(observed, camera, start, _STEPS, prior.free(camera), change)
-    return refined
+    variances = prior.tested(camera, free.change, free.change_covariance)
+    return refine_pose(observed, camera, free.pose.pose, _STEPS, variances, free.change)
 
 
 def _own_or_other(
@@ -236,15 +234,16 @@ def _own_or_other(
 ) -> RefinedPose:
     """Pose for the recording's camera; for any camera if another one is more probable.
 
-    A less probable camera widens the covariance, to the second moment about the answer.
+    A less probable camera widens the covariance, see `_REACHED`.
     """
     doubt = prior.other_camera(camera, free.change, free.change_covariance)
     if doubt > 0.5:
         return _contradictable(observed, camera, free, replace(prior, sigma=UNKNOWN))
     own = refine_pose(observed, camera, pose, _STEPS, prior.tight(camera))
     other = _contradictable(observed, camera, free, replace(prior, sigma=SAME_MODEL))
-    apart = _apart(own.pose.pose, other.pose.pose)
-    more = doubt * (other.by_intrinsics - own.by_intrinsics + apart)
+    # Covariances are scaled by the caller, distances are not.
+    apart = _apart(own.pose.pose, other.pose.pose) / prior.scale
+    more = min(1.0, doubt / _REACHED) * (other.by_intrinsics - own.by_intrinsics + apart)
     return replace(
         own,
         pose=UncertainPose(own.pose.pose, own.pose.covariance + more),

@@ -24,7 +24,7 @@ from evercal.errors import InputError
 from evercal.storage.atomic import replace_folder, write_json
 from evercal.storage.manifest import MANIFEST, Manifest, write_manifest
 
-SCHEMA = 5
+SCHEMA = 6
 STAGES = "stages"
 REPORT = "report.json"
 _STAGE = re.compile(r"\d{4,}-[\w.~-]*")
