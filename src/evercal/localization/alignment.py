@@ -34,7 +34,6 @@ _HOPELESS = 0.08
 """They are not searched again if a smaller share of them are inliers."""
 _FAR_PX = 1.0
 """They are searched in all rounds, coarse to fine, if it was more than this."""
-
 _REACHED = 0.05 * 7.815
 """Probability of another camera from which the covariance has a deviation as large as the distance
 to its pose. That pose is inside the 95 % ellipsoid (chi-squared) where its probability is 5 %."""

@@ -33,7 +33,8 @@ def fit_acceptance(
 
     The threshold is half of the 5 % quantile of the support of well-located frames, between
     `MIN_SUPPORT` and `MAX_SUPPORT`. The scatter of the stated frame is as large as the errors of
-    all given frames ask for.
+    all given frames ask for. The errors that landmarks share explain the intrinsics of these
+    frames, see `shared_px`.
 
     Args:
         contents: The map.
