@@ -285,9 +285,7 @@ def unknown_images(out: Path, scenes: Sequence[Recording], memory: float) -> lis
 
 
 def _accepted(localizer: Localizer, name: str, images: Iterable[tuple[Image, Camera]]) -> Row:
-    estimates = [
-        localizer.localize(image, localizer.camera_for(camera)) for image, camera in images
-    ]
+    estimates = [localizer.localize(image, camera) for image, camera in images]
     return {
         "images": name,
         "count": len(estimates),

@@ -7,8 +7,7 @@ cameras fit into it.
 
 import json
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +15,7 @@ import numpy as np
 from tabulate import tabulate
 
 from benchmarks.lenses import View, cropped
-from evercal.geometry import UncertainPose
-from evercal.localization import intrinsics
+from evercal.geometry import Camera, UncertainPose
 from evercal.localization.parallel import in_parallel
 from evercal.map import Map
 from evercal.recordings.frame import Frame
@@ -39,9 +37,8 @@ INSIDE_95 = 7.815
 def run(out: Path = Path("runs/same-model.json"), cameras: int = 8, every: int = 3) -> None:
     """Locate test images of the packaged rooms as other cameras of the same model see them.
 
-    The images are of the recording's own camera, of others, and of others with stated intrinsics.
-    The rows `own` leave out the possibility of another camera. Fixed cameras are calibrated in the
-    same way.
+    The images are of the recording's own camera and of others. No camera is stated, or the
+    recording's, or the right one. Fixed cameras are calibrated in the same way.
 
     Args:
         out: File of rows to write.
@@ -55,7 +52,9 @@ def run(out: Path = Path("runs/same-model.json"), cameras: int = 8, every: int =
         learned = Map.open(Path(scratch) / "rooms")
         frames: list[Frame] = []
         fixed: list[Sequence[Frame]] = []
-        for room in sample_rooms():
+        rooms = sample_rooms()
+        recorded = _seen(rooms[0].scene.train[0], np.zeros(4)).camera
+        for room in rooms:
             middle = tuple(_seen(frame, np.zeros(4)) for frame in room.scene.train)
             learned.learn(replace(room.scene, train=middle, test=()))
             frames += room.scene.test[::every]
@@ -63,11 +62,15 @@ def run(out: Path = Path("runs/same-model.json"), cameras: int = 8, every: int =
         for name, changes in (("own", np.zeros((1, 4))), ("another", draws)):
             images = [_seen(frame, change) for change in changes for frame in frames]
             views = [[_seen(frame, change) for frame in of] for change in changes for of in fixed]
-            for supposed in ("own or another", "own", "as stated")[: 2 if name == "own" else 3]:
-                stated, what = supposed == "as stated", {"camera": name, "supposed": supposed}
-                with _without_others(supposed == "own"):
-                    poses = [_calibrated(learned, of, stated) for of in views]
-                    answers = _answers(learned, images, stated)
+            choices: dict[str, Callable[[Frame], Camera | None]] = {
+                "none": lambda _: None,
+                "the recording's": lambda _: recorded,
+                "the right one": lambda frame: frame.camera,
+            }
+            for stated, given in list(choices.items())[: 2 if name == "own" else 3]:
+                what = {"camera": name, "stated": stated}
+                poses = [_calibrated(learned, of, given(of[0])) for of in views]
+                answers = _answers(learned, images, given)
                 rows.append({"answer": "image", **what, **_summary(answers, images)})
                 first = [of[0] for of in views]
                 rows.append({"answer": "fixed camera", **what, **_summary(poses, first)})
@@ -89,27 +92,17 @@ def _seen(frame: Frame, change: np.ndarray) -> Frame:
     return replace(frame, image=View(camera).render(frame.read_image(), own), camera=camera)
 
 
-@contextmanager
-def _without_others(without: bool) -> Iterator[None]:
-    """Suppose that no image is of another camera than its size suggests."""
-    before = intrinsics.OTHER_CAMERA
-    intrinsics.OTHER_CAMERA = 0.0 if without else before
-    try:
-        yield
-    finally:
-        intrinsics.OTHER_CAMERA = before
-
-
-def _answers(learned: Map, frames: Sequence[Frame], stated: bool) -> list[UncertainPose | None]:
+def _answers(
+    learned: Map, frames: Sequence[Frame], given: Callable[[Frame], Camera | None]
+) -> list[UncertainPose | None]:
     def located(frame: Frame) -> UncertainPose | None:
-        answer = learned.localize(frame.read_image(), frame.camera if stated else None)
+        answer = learned.localize(frame.read_image(), given(frame))
         return answer.uncertain_pose if answer.status == "ok" else None
 
     return list(in_parallel(located, frames))
 
 
-def _calibrated(learned: Map, frames: Sequence[Frame], stated: bool) -> UncertainPose | None:
-    camera = frames[0].camera if stated else None
+def _calibrated(learned: Map, frames: Sequence[Frame], camera: Camera | None) -> UncertainPose:
     found = learned.calibrate([frame.read_image() for frame in frames], camera=camera)
     return UncertainPose(found.parent_from_child, found.covariance)
 

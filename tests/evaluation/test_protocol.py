@@ -36,9 +36,6 @@ class Fake:
     scenes: tuple[str, ...] = ("a", "b")
     calls: list[int] = field(default_factory=list)
 
-    def camera_for(self, stated: Camera) -> Camera | None:
-        return stated
-
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         assert image.shape == (3, 4, 3)
         assert camera == CAMERA

@@ -6,7 +6,7 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.evaluation.score_scenes import evaluate
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3
 from evercal.localization.estimate import PoseEstimate
 from evercal.recordings import generic
 
@@ -20,9 +20,6 @@ class Shifted:
 
     def __init__(self, name: str = "box-room-7"):
         self.scene, self.name = box_room_scene(7, 2, 3), name
-
-    def camera_for(self, stated: Camera) -> Camera | None:
-        return stated
 
     def localize(self, image: object, camera: object = None) -> PoseEstimate:
         frame = next(f for f in self.scene.test if (f.read_image() == image).all())

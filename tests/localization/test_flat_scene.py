@@ -10,7 +10,7 @@ import pytest
 from evercal.geometry import SE3, Camera
 from evercal.localization.alignment import _self_calibrated as self_calibrated
 from evercal.localization.fit_acceptance import LEAST_SHARED_PX
-from evercal.localization.intrinsics import OWN, STATED, IntrinsicsPrior, Prior
+from evercal.localization.intrinsics import NOT_STATED, STATED, IntrinsicsPrior, Prior
 from evercal.localization.pose_refinement import Observed
 
 CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)
@@ -40,7 +40,7 @@ def answer(prior: IntrinsicsPrior, longer: float, tilt: float) -> tuple[float, f
 @pytest.mark.parametrize(
     ("prior", "longer", "tilt"),
     [
-        *product([OWN], [1.02, 1.05, 1.15], [0.2, 0.4, 0.6]),
+        *product([NOT_STATED], [1.02, 1.05, 1.15], [0.2, 0.4, 0.6]),
         *product([STATED], [1.05, 1.15], [0.4, 0.6]),
         (STATED, 1.02, 0.6),
     ],
@@ -50,7 +50,7 @@ def test_a_wrong_focal_length_is_wide(prior: IntrinsicsPrior, longer: float, til
     assert error < 0.01 or sigma > 0.05 or error < 4 * sigma
 
 
-@pytest.mark.parametrize("prior", [OWN, STATED])
+@pytest.mark.parametrize("prior", [NOT_STATED, STATED])
 def test_the_right_one_is_precise(prior: IntrinsicsPrior) -> None:
     error, sigma = answer(prior, 1.0, 0.4)
     assert error < 0.002

@@ -13,7 +13,13 @@ from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.intrinsics import cameras_in_scenes
+from evercal.localization.intrinsics import (
+    NOT_STATED,
+    OWN,
+    STATED,
+    cameras_in_scenes,
+    prior_of,
+)
 from evercal.localization.localizer import Localizer
 from evercal.localization.pnp import PnpOptions
 from evercal.localization.query import Attempt, LocalizeOptions
@@ -245,7 +251,8 @@ def test_default_camera_is_the_adjusted_one(
     localizer = Localizer(with_scene(hall_map, replace(scene, adjusted_camera=longer)))
     asked = cameras_in_scenes(None, views[0].read_image(), localizer.contents.scenes)
     assert asked == [longer]
-    assert cameras_in_scenes(camera, views[0].read_image(), localizer.contents.scenes) == [camera]
+    assert cameras_in_scenes(camera, views[0].read_image(), localizer.contents.scenes) == [longer]
+    assert cameras_in_scenes(longer, views[0].read_image(), localizer.contents.scenes) == [longer]
 
 
 @pytest.mark.parametrize("factor", [0.95, 0.995, 1.02])
@@ -283,23 +290,22 @@ def test_turned_images_are_located(
     assert error(localizer.localize(image), turned)[0] < 0.02
 
 
-def test_recording_camera_selects_the_adjusted_one(localizer: Localizer) -> None:
-    scene = localizer.contents.scenes[0]
-    assert localizer.camera_for(scene.camera) is None
-    other = replace(scene.camera, fx=1.0005 * scene.camera.fx)
-    assert localizer.camera_for(other) is other
+def test_prior_of_a_stated_camera(localizer: Localizer, views: tuple[Frame, ...]) -> None:
+    recorded, image = localizer.contents.scenes[0].camera, views[0].read_image()
+    other = replace(recorded, fx=1.0005 * recorded.fx)
+    cameras = (recorded, other, None)
+    priors = [prior_of(camera, image, recorded) for camera in cameras]
+    assert priors == [OWN, STATED, NOT_STATED]
 
 
-def test_without_one_common_camera_the_adjusted_one_is_stated(localizer: Localizer) -> None:
-    """An own camera of one scene is not that of another one: no camera would mean it is."""
-    contents, scene = localizer.contents, localizer.contents.scenes[0]
+def test_each_scene_has_its_own_camera(localizer: Localizer, views: tuple[Frame, ...]) -> None:
+    scene, image = localizer.contents.scenes[0], views[0].read_image()
     longer = replace(scene.camera, fx=1.1 * scene.camera.fx)
     adjusted = replace(scene.camera, cx=scene.camera.cx + 1)
     first = replace(scene, name="first", adjusted_camera=adjusted)
     second = replace(scene, name="second", camera=longer, adjusted_camera=longer)
-    both = Localizer(replace(contents, scenes=[first, second]))
-    assert both.camera_for(scene.camera) == adjusted
-    assert both.camera_for(longer) == longer
+    assert cameras_in_scenes(scene.camera, image, [first, second]) == [adjusted, scene.camera]
+    assert cameras_in_scenes(longer, image, [first, second]) == [longer, longer]
 
 
 @pytest.mark.parametrize("size", [(640, 480), (200, 150)])

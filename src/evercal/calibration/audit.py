@@ -106,8 +106,7 @@ def _audited(
     chosen = np.unique(np.linspace(0, len(shots) - 1, options.images).round().astype(int))
     differences, reason = [], ""
     for shot in (shots[i] for i in chosen):
-        camera = None if shot.camera is None else localizer.camera_for(shot.camera)
-        [item] = locate(localizer, [(shot.name, shot.read())], camera)
+        [item] = locate(localizer, [(shot.name, shot.read())], shot.camera)
         if item.is_located:
             in_stated = shot.base_from_camera.inverse() @ item.pose
             differences.append(Located(shot.name, item.estimate, in_stated, item.covariance))

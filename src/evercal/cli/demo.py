@@ -169,8 +169,7 @@ def _localize_unknown(localizer: "Localizer", scene: "Recording", result: "DemoR
     frames = _spread(scene.test, UNKNOWN_IMAGES)
     with progress_bar(f"images of unknown room {scene.name}", len(frames), "image") as bar:
         for frame in frames:
-            camera = localizer.camera_for(frame.camera)
-            estimate = localizer.localize(frame.read_image(), camera)
+            estimate = localizer.localize(frame.read_image(), frame.camera)
             result.unknown_images += 1
             result.unknown_refused += estimate.status != "ok"
             bar.update()
@@ -239,7 +238,7 @@ def _pictures(localizer: "Localizer", scene: "Recording") -> "list[Picture]":
     pictures = []
     for frame in _spread(scene.test, PICTURES):
         image = frame.read_image()
-        estimate = localizer.localize(image, localizer.camera_for(frame.camera))
+        estimate = localizer.localize(image, frame.camera)
         drawn = draw_landmarks(image, estimate, localizer)
         caption = f"{estimate.scene or estimate.status}: {estimate.inliers} landmarks"
         pictures.append(Picture(encode_image(drawn, "jpg"), caption))

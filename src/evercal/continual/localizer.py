@@ -16,7 +16,7 @@ from evercal.features.encode import encode_image
 from evercal.features.precision import autocast
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.intrinsics import cameras_in_scenes, own_or_stated
+from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.localization.learned import LearnedLocalizer
 from evercal.localization.localizer import Localizer
 from evercal.localization.matching import strided_patches
@@ -94,10 +94,6 @@ class NetworkLocalizer:
     def scenes(self) -> tuple[str, ...]:
         """Names of the scenes, in order of learning."""
         return tuple(record.name for record in self.contents.scenes)
-
-    def camera_for(self, stated: Camera) -> Camera | None:
-        """The `camera` argument for an image with these stated intrinsics."""
-        return own_or_stated(stated, self.contents.scenes)
 
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         """Estimate the camera pose of one image; see `Localizer.localize`."""

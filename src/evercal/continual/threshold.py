@@ -41,7 +41,7 @@ def fit_threshold(scenes: LearnedScenes, held_out: Sequence[Frame], index: int =
     localizer = NetworkLocalizer(replace(scenes, scenes=records))
     squared, ratios = [], []
     for frame in held_out:
-        camera = localizer.camera_for(frame.camera)
+        camera = frame.camera
         estimate = localizer.localize(frame.read_image(), camera)
         ratios.append(estimate.inlier_ratio)
         pose = estimate.uncertain_pose

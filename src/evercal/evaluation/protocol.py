@@ -78,7 +78,7 @@ def _result(
     localizer: SceneLocalizer, name: str, frame: Frame, near: bool, accepted: set[str]
 ) -> FrameResult:
     start = time.perf_counter()
-    estimate = localizer.localize(frame.read_image(), localizer.camera_for(frame.camera))
+    estimate = localizer.localize(frame.read_image(), frame.camera)
     milliseconds = 1e3 * (time.perf_counter() - start)
     metres = radians = np.inf
     squared = np.nan

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3, Camera, UncertainPose
-from evercal.localization.intrinsics import OWN, SAME_MODEL, UNKNOWN, Prior
+from evercal.localization.intrinsics import SAME_MODEL, UNKNOWN, Prior
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import (
@@ -172,7 +172,7 @@ def align_pose(
         if (refined.residual_px < options.inlier_px).sum() < _HOPELESS * found.expected:
             break  # other intrinsics do not make it the right place
         if again == _MOST_AGAIN:
-            if prior.sigma is OWN:
+            if prior.sigma.other_camera:
                 break  # both are good, and it is undecided between them
             return None  # the intrinsics do not converge
         pose, change, again = refined.pose.pose, refined.change, again + 1
@@ -205,7 +205,7 @@ def _self_calibrated(
     by_shared = float((observed.whitening**2).sum()) / (2 * free.variance)
     shared = 1 + prior.shared_px**2 * by_shared
     prior = replace(prior, scale=shared * prior.scale)
-    if prior.sigma is OWN:
+    if prior.sigma.other_camera:
         refined = _own_or_other(observed, camera, pose, free, prior)
     else:
         refined = _contradictable(observed, camera, free, prior)

@@ -66,10 +66,7 @@ def _located(
     """Poses of frames, located by a subset of the keyframes alone."""
     scene = replace(built.take(selected).scene, min_support=MAX_SUPPORT)
     localizer = Localizer(MapContents(contents.encoder, contents.short_side, [scene]))
-    return [
-        localizer.localize(f.read_image(), localizer.camera_for(f.camera)).base_from_camera
-        for f in frames
-    ]
+    return [localizer.localize(f.read_image(), f.camera).base_from_camera for f in frames]
 
 
 def _close(pose: SE3 | None, reference: SE3) -> bool:

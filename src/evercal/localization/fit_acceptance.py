@@ -99,8 +99,7 @@ def _located(contents: MapContents, frames: Sequence[Frame], scene: str) -> list
     """Answers in one scene, with finite covariances."""
     localizer, answers = Localizer(contents), []
     for frame in frames:
-        camera = localizer.camera_for(frame.camera)
-        estimate, found = localizer.located(frame.read_image(), camera)
+        estimate, found = localizer.located(frame.read_image(), frame.camera)
         pose, stated = estimate.uncertain_pose, frame.base_from_camera
         if pose is None or stated is None or estimate.scene != scene:
             continue

@@ -5,7 +5,7 @@ together with the pose, to a thousandth. Where they contradict the prior, the pr
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,8 +23,6 @@ Array = NDArray[np.floating]
 
 CONTRADICTED = 15.1
 """Squared deviation of all five, above which no prior holds: the 99 % quantile (chi-squared)."""
-OTHER_CAMERA = 0.3
-"""Prior probability that an image of the recording's size is of another camera of that model."""
 DOUBT = 3.0
 """Squared deviations from the prior, in standard deviations, from which it gives way."""
 
@@ -41,6 +39,8 @@ class IntrinsicsPrior:
     """Of the first radial distortion coefficient."""
     k2: float
     """Of the second one."""
+    other_camera: float = 0.0
+    """Probability that the image is of another camera of the same model, see `SAME_MODEL`."""
 
     def variances(self, camera: Camera) -> Array:
         """(5,) variances of a change of intrinsics, see `pose_refinement.changed_camera`."""
@@ -48,8 +48,10 @@ class IntrinsicsPrior:
         return np.square([self.focal, centre, centre, self.k1, self.k2])
 
 
-OWN = IntrinsicsPrior(focal=2e-4, centre=3e-4, k1=1e-3, k2=1e-3)
+OWN = IntrinsicsPrior(focal=2e-4, centre=3e-4, k1=1e-3, k2=1e-3, other_camera=0.01)
 """The camera that recorded the scene: its error is in the landmarks, too, and cancels."""
+NOT_STATED = replace(OWN, other_camera=0.3)
+"""No camera is stated, and the image has the size of the recording."""
 SAME_MODEL = IntrinsicsPrior(focal=0.007, centre=0.007, k1=0.01, k2=0.01)
 """Another camera of the same model and image size."""
 STATED = IntrinsicsPrior(focal=2e-3, centre=2e-3, k1=5e-3, k2=5e-3)
@@ -66,7 +68,7 @@ FOCAL_FACTORS = (0.7, 0.84, 1.0, 1.2, 1.44)
 class Prior:
     """The prior of one image."""
 
-    sigma: IntrinsicsPrior = OWN
+    sigma: IntrinsicsPrior = NOT_STATED
     scale: float = 1.0
     """Factor on the covariance of landmarks."""
     shared_px: float = SHARED_PX
@@ -96,13 +98,13 @@ class Prior:
         """Probability that an image is of another camera of the model, by estimated intrinsics.
 
         The change (5,) and its covariance (5, 5) were estimated without a prior. Each hypothesis
-        is a Gaussian about the intrinsics of the recording, see `OWN` and `SAME_MODEL`.
+        is a Gaussian about the intrinsics of the recording.
         """
         own, other = (
             _log_density(change, self.scale * covariance + np.diag(sigma.variances(camera)))
-            for sigma in (OWN, SAME_MODEL)
+            for sigma in (self.sigma, SAME_MODEL)
         )
-        return float(expit(logit(OTHER_CAMERA) + other - own))
+        return float(expit(logit(self.sigma.other_camera) + other - own))
 
 
 def _log_density(change: Array, covariance: Array) -> float:
@@ -111,35 +113,28 @@ def _log_density(change: Array, covariance: Array) -> float:
     return float(-(squares + np.linalg.slogdet(covariance)[1]) / 2)
 
 
-def own_or_stated(stated: Camera, scenes: "Sequence[LearnedScene]") -> Camera | None:
-    """The `camera` argument for an image with stated intrinsics.
-
-    None if every scene was recorded by this camera: each has adjusted it. Without a camera, every
-    scene supposes its own, so where cameras differ, the adjusted one is stated.
-    """
-    own = [scene for scene in scenes if scene.camera == stated]
-    if own and len(own) == len(scenes):
-        return None
-    return own[0].adjusted_camera if own else stated
-
-
 def cameras_in_scenes(
     camera: Camera | None, image: np.ndarray, scenes: "Sequence[LearnedScene]"
 ) -> list[Camera]:
     """Intrinsics of an image in each scene; a guess where none are given and no aspect ratio fits.
 
+    Those of the recording are replaced by the adjusted ones.
+
     Raises:
         InputError: A camera with another aspect ratio than the image's.
     """
     height, width = image.shape[:2]
-    if camera is not None:
-        if not camera.fits(width, height):
-            raise InputError(
-                f"camera {camera.width}x{camera.height} does not fit the image {width}x{height}:"
-                " give intrinsics of the same aspect ratio"
-            )
-        return [camera.resized(width, height)] * len(scenes)
-    return [_own(scene.adjusted_camera, width, height) for scene in scenes]
+    if camera is not None and not camera.fits(width, height):
+        raise InputError(
+            f"camera {camera.width}x{camera.height} does not fit the image {width}x{height}:"
+            " give intrinsics of the same aspect ratio"
+        )
+    return [
+        _own(scene.adjusted_camera, width, height)
+        if camera is None or camera == scene.camera
+        else camera.resized(width, height)
+        for scene in scenes
+    ]
 
 
 def _own(recorded: Camera, width: int, height: int) -> Camera:
@@ -154,10 +149,10 @@ def _own(recorded: Camera, width: int, height: int) -> Camera:
 def prior_of(camera: Camera | None, image: np.ndarray, recorded: Camera) -> IntrinsicsPrior:
     """Prior of the intrinsics of an image: stated, the recording's, or unknown."""
     if camera is not None:
-        return STATED
+        return OWN if camera == recorded else STATED
     height, width = image.shape[:2]
     if (width, height) == (recorded.width, recorded.height):
-        return OWN
+        return NOT_STATED
     larger, smaller = max(width, recorded.width), min(width, recorded.width)
     whole = larger % smaller == 0 and recorded.width * height == recorded.height * width
     # An image of half the size is probably resized; other sizes may be cropped.

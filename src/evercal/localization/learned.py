@@ -60,9 +60,6 @@ class SceneLocalizer(Protocol):
         """Estimate the camera pose of one image."""
         ...
 
-    def camera_for(self, stated: Camera) -> Camera | None:
-        """The `camera` argument for an image with these stated intrinsics."""
-
 
 class LearnedLocalizer(SceneLocalizer, Protocol):
     """A localizer whose scenes can be inspected."""

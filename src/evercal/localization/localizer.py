@@ -41,7 +41,6 @@ from evercal.localization.intrinsics import (
     IntrinsicsPrior,
     Prior,
     cameras_in_scenes,
-    own_or_stated,
     prior_of,
 )
 from evercal.localization.keyframe_bank import KeyframeBank
@@ -128,13 +127,6 @@ class Localizer:
     def scenes(self) -> tuple[str, ...]:
         """Names of the scenes, in order of learning."""
         return tuple(scene.name for scene in self.contents.scenes)
-
-    def camera_for(self, stated: Camera) -> Camera | None:
-        """The `camera` argument for an image with these stated intrinsics.
-
-        None, or adjusted intrinsics, for those that a scene's own recording states.
-        """
-        return own_or_stated(stated, self.contents.scenes)
 
     def localize(
         self, image: np.ndarray, camera: Camera | None = None, at_most_ms: float | None = None

@@ -100,7 +100,7 @@ def _worst(
     for result in sorted(results, key=lambda r: (-r.translation_error_m, r.inlier_ratio))[:_WORST]:
         frame = next(f for f in scenes[result.scene].test if f.name == result.frame)
         image = frame.read_image()
-        estimate = localizer.localize(image, localizer.camera_for(frame.camera))
+        estimate = localizer.localize(image, frame.camera)
         drawn = encode_image(draw_estimate(image, estimate, frame.camera), "jpg")
         pictures.append(Picture(drawn, f"{result.scene} {result.frame}: {_outcome(result)}"))
     return pictures

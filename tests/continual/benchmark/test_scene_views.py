@@ -39,9 +39,6 @@ class FakeLocalizer:
     calls: list[int] = field(default_factory=list)
     contents = type("", (), {"short_side": 12})
 
-    def camera_for(self, stated: Camera) -> Camera | None:
-        return stated
-
     def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
         self.calls.append(int(image[0, 0, 0]))
         name, pose, points = self.estimates[self.calls[-1]]

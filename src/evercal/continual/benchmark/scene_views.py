@@ -69,7 +69,7 @@ def keep_views(
             continue
         tests = posed_frames(scene.test)
         frame = tests[len(tests) // 2]
-        estimate = localizer.localize(frame.read_image(), localizer.camera_for(frame.camera))
+        estimate = localizer.localize(frame.read_image(), frame.camera)
         points, grey = _points(localizer, [s for s in scenes if s.name == estimate.scene])
         header = {
             "strategy": strategy,
@@ -141,7 +141,7 @@ def _from_estimate(
     localizer: LearnedLocalizer, scene: str, frame: Frame, image: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return inlier points (n, 3) of a frame in the base frame and their pixels (n, 2)."""
-    estimate = localizer.localize(image, localizer.camera_for(frame.camera))
+    estimate = localizer.localize(image, frame.camera)
     if estimate.scene != scene or estimate.points_m is None or estimate.pixels is None:
         return np.zeros((0, 3)), np.zeros((0, 2))
     scale = min(image.shape[:2]) / localizer.contents.short_side

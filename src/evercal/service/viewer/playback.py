@@ -96,7 +96,7 @@ class Playback:
         frame = self.frames[number]
         try:
             image = frame.read_image()
-            estimate = self._localizer.localize(image, self._localizer.camera_for(frame.camera))
+            estimate = self._localizer.localize(image, frame.camera)
             self._on_frame(frame)
         except InputError as error:
             self.panel.say(f"{frame.name}: {error}")
