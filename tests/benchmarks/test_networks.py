@@ -20,7 +20,7 @@ def test_all_commands_are_valid_and_resume_in_folders_of_their_own() -> None:
         for command in commands
         if command[:2] == ("evercal", "bench")
     ]
-    assert len(benches) == 11
+    assert len(benches) == 13
     folders = set()
     for command in benches:
         parsed = _parse(list(command[1:]), as_json=False)

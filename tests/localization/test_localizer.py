@@ -291,11 +291,12 @@ def test_turned_images_are_located(
 
 
 def test_prior_of_a_stated_camera(localizer: Localizer, views: tuple[Frame, ...]) -> None:
-    recorded, image = localizer.contents.scenes[0].camera, views[0].read_image()
+    scene, image = localizer.contents.scenes[0], views[0].read_image()
+    recorded = scene.camera
     other = replace(recorded, fx=1.0005 * recorded.fx)
-    cameras = (recorded, other, None)
-    priors = [prior_of(camera, image, recorded) for camera in cameras]
-    assert priors == [OWN, STATED, NOT_STATED]
+    cameras = (recorded, scene.adjusted_camera, other, None)
+    priors = [prior_of(camera, image, scene) for camera in cameras]
+    assert priors == [OWN, OWN, STATED, NOT_STATED]
 
 
 def test_each_scene_has_its_own_camera(localizer: Localizer, views: tuple[Frame, ...]) -> None:
@@ -340,7 +341,8 @@ def test_portrait_image_of_an_unknown_camera(
 
 def test_terms_sum_to_the_covariance(localizer: Localizer, views: tuple[Frame, ...]) -> None:
     image, camera = views[1].read_image(), views[1].camera
-    own, stated = localizer.localize(image), localizer.localize(image, camera)
+    own = localizer.localize(image, camera)
+    stated = localizer.localize(image, replace(camera, fx=1.0001 * camera.fx))
     for estimate in (own, stated):
         names = [term.name for term in estimate.terms]
         assert names == ["view", "lens", "map", "stated poses", "base frame"]

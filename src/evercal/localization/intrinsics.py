@@ -131,7 +131,7 @@ def cameras_in_scenes(
         )
     return [
         _own(scene.adjusted_camera, width, height)
-        if camera is None or camera == scene.camera
+        if camera is None or _is_own(camera, scene)
         else camera.resized(width, height)
         for scene in scenes
     ]
@@ -146,10 +146,16 @@ def _own(recorded: Camera, width: int, height: int) -> Camera:
     return Camera(width, height, scale * recorded.fx, scale * recorded.fy, *middle)
 
 
-def prior_of(camera: Camera | None, image: np.ndarray, recorded: Camera) -> IntrinsicsPrior:
+def _is_own(camera: Camera, scene: "LearnedScene") -> bool:
+    """Whether a stated camera is that of a recording, as stated there or as adjusted."""
+    return camera in (scene.camera, scene.adjusted_camera)
+
+
+def prior_of(camera: Camera | None, image: np.ndarray, scene: "LearnedScene") -> IntrinsicsPrior:
     """Prior of the intrinsics of an image: stated, the recording's, or unknown."""
     if camera is not None:
-        return OWN if camera == recorded else STATED
+        return OWN if _is_own(camera, scene) else STATED
+    recorded = scene.camera
     height, width = image.shape[:2]
     if (width, height) == (recorded.width, recorded.height):
         return NOT_STATED

@@ -156,12 +156,11 @@ class Localizer:
         began = time.perf_counter()
         image, contents = as_rgb(image), self.contents
         cameras = cameras_in_scenes(camera, image, contents.scenes)
-        recorded = [scene.camera for scene in contents.scenes]
         query = Query(
             image,
             encode_image(image, contents.encoder, contents.short_side),
             self.options.patches_short_side,
-            tuple(prior_of(camera, image, stated) for stated in recorded),
+            tuple(prior_of(camera, image, scene) for scene in contents.scenes),
             budget=TimeBudget(began + (np.inf if at_most_ms is None else at_most_ms / 1000)),
         )
         best = self._best_hypothesis(query, cameras)

@@ -196,7 +196,7 @@ class Tracker:
             return None
         localizer, contents = self.localizer, self.localizer.contents
         cameras = cameras_in_scenes(self.camera, image, contents.scenes)
-        priors = tuple(prior_of(self.camera, image, scene.camera) for scene in contents.scenes)
+        priors = tuple(prior_of(self.camera, image, scene) for scene in contents.scenes)
         query = Query(image, torch.zeros(0), localizer.options.patches_short_side, priors)
         candidate = Candidate(self._scene, self._next_keyframes(predicted))
         change = np.zeros(5) if self._change is None else self._change
