@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from tabulate import tabulate
 
+from benchmarks.accuracy import wrong
 from benchmarks.lenses import View, cropped
 from evercal.geometry import Camera, UncertainPose
 from evercal.localization.parallel import in_parallel
@@ -26,8 +27,6 @@ MARGIN = 0.0375
 SPREAD = {"focal": 0.005, "centre": 0.006, "k1": 0.005}
 """Standard deviations among cameras of a model: focal length as a share, principal point as a share
 of the width, first distortion coefficient."""
-WRONG_MM, WRONG_SIGMAS = 10.0, 5.0
-"""A wrong answer is so far off, and more than so many of its own standard deviations."""
 FIXED_IMAGES = 12
 """Images of a fixed camera."""
 INSIDE_95 = 7.815
@@ -120,13 +119,13 @@ def _summary(
             errors.append(1000 * np.linalg.norm(off))
             deviations.append(off @ np.linalg.solve(covariance, off))
             sigmas.append(1000 * np.sqrt(np.trace(covariance) / 3))
-    wrong = (np.array(errors) > WRONG_MM) & (np.array(deviations) > WRONG_SIGMAS**2)
+    mm, squared = np.array(errors), np.array(deviations)
     return {
         "answers": len(frames),
         "located": len(errors),
-        "median_mm": float(np.median(errors)),
-        "95_%_mm": float(np.percentile(errors, 95)),
+        "median_mm": float(np.median(mm)),
+        "95_%_mm": float(np.percentile(mm, 95)),
         "sigma_mm": float(np.median(sigmas)),
-        "inside_95_%": 100 * float(np.mean(np.array(deviations) < INSIDE_95)),
-        "wrong": int(wrong.sum()),
+        "inside_95_%": 100 * float((squared < INSIDE_95).mean()),
+        "wrong": int(wrong(mm, squared).sum()),
     }

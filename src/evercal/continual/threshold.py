@@ -41,8 +41,7 @@ def fit_threshold(scenes: LearnedScenes, held_out: Sequence[Frame], index: int =
     localizer = NetworkLocalizer(replace(scenes, scenes=records))
     squared, ratios = [], []
     for frame in held_out:
-        camera = frame.camera
-        estimate = localizer.localize(frame.read_image(), camera)
+        estimate = localizer.localize(frame.read_image(), frame.camera)
         ratios.append(estimate.inlier_ratio)
         pose = estimate.uncertain_pose
         if pose is None or frame.base_from_camera is None:
