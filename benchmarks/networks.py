@@ -140,9 +140,9 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
             publish("networks-real"),
         ],
         "paper": [
-            rooms("sim"),
+            rooms("sim-unseen"),
             bench(
-                *("sim", "networks-paper", "--preset", "paper", "--steps", str(PAPER_SIM_STEPS)),
+                *("sim-unseen", "networks-paper", "--preset", "paper"),
                 *("--strategies", "joint,finetune,icarl,buff_cs,gec,sars_spdd", "--seeds", "0"),
             ),
             publish("networks-paper"),

@@ -101,12 +101,15 @@ class Bench:
         device = self.device if self.ray else str(join_processes(self.device))
         out = _own_folder(self.out)
         wait_for_all()
+        scenes = self._scenes()
+        # Larger than the recorded images, working images would show nothing more.
+        sides = (min(f.camera.width, f.camera.height) for s in scenes for f in s.train)
         options = BenchOptions(
             self._stage,
             self._strategies(),
             seeds,
             self.order,
-            short_side(self.preset),
+            min(short_side(self.preset), *sides),
             settings={
                 "suite": self.suite,
                 "poses": "sfm" if self.poses else "original",
@@ -115,7 +118,7 @@ class Bench:
             device=device,
             features=self.out.absolute() / "features",
         )
-        for step in self._steps(options, out):
+        for step in self._steps(scenes, options, out):
             if rank() == 0:
                 print(_progress(step), file=sys.stderr if self.json else sys.stdout, flush=True)
         return 0 if rank() else show_report(self.out, options.strategies[0].name, self.json)
@@ -131,13 +134,15 @@ class Bench:
         # Equal strategies run once. Different strategies of one name are refused later.
         return tuple(dict.fromkeys((*named, *(load_rows(self.rows) if self.rows else ()))))
 
-    def _steps(self, options: "BenchOptions", out: Path) -> "Iterator[Step]":
+    def _steps(
+        self, scenes: "list[Recording]", options: "BenchOptions", out: Path
+    ) -> "Iterator[Step]":
         from evercal.continual.benchmark.bench import run_bench
         from evercal.continual.benchmark.ray_runs import run_on_ray
 
         if self.ray is None:
-            return run_bench(self._scenes(), options, out)
-        return run_on_ray(self._scenes(), options, out, self.ray, self.plugin)
+            return run_bench(scenes, options, out)
+        return run_on_ray(scenes, options, out, self.ray, self.plugin)
 
     def _scenes(self) -> "list[Recording]":
         from evercal.continual.benchmark.suites import tuning_split
