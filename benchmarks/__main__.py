@@ -24,7 +24,6 @@ VERBS = {
     "tune": "the setting of every continual method, on held-out training frames",
     "networks": "the experiments on networks: tuning, tables, figure; the paper's table on a GPU",
     "network-figure": "final accuracy over forgetting, a point for each method",
-    "paper": "the first steps of preset paper",
     "trainer": "time of a training step",
     "speed": "time of learning, localization and SARS",
     "serve": "latency of the HTTP service, alone and while a scene is learned",

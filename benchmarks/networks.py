@@ -39,7 +39,7 @@ FEW_SEEDS = "0,1,2"
 """Three orders: each room is first, second and last once."""
 SHARES = (1, 3, 30)
 """Memory, per cent of the frames; `a` has 10."""
-PAPER_STAGES = 15
+PAPER_STAGES = 14
 """Stages of three rooms: joint training counts three, the first room is shared."""
 
 Command = Sequence[str]
@@ -174,7 +174,7 @@ def run(
     if unknown or not experiments:
         raise InputError(f"{' '.join(unknown) or 'no experiment'}: choose of {', '.join(known)}")
     if "paper" in experiments:
-        print(f"paper: about {paper_hours(device):.0f} hours of training on this machine")
+        print(f"paper: about {paper_hours(device):.1f} hours of training on this machine")
     for command in (command for name in experiments for command in known[name]):
         print(" ".join(command), flush=True)
         if dry:

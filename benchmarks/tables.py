@@ -9,6 +9,7 @@ NAME is a file of `results/`, or several joined by `+`. KIND is a key of `KINDS`
 """
 
 import re
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -126,9 +127,20 @@ SUMMARY = (
 
 
 def _summary_rows(runs: Sequence[Run]) -> TableRows:
-    """Tabulate the main columns of `method_rows`, without parts of strategies (`NAME:PART`)."""
-    rows = method_rows([run for run in runs if ":" not in run.strategy])
-    return [[row[rows[0].index(column)] for column in SUMMARY] for row in rows]
+    """Tabulate the main columns of `method_rows`, without parts of strategies (`NAME:PART`).
+
+    Seconds are those on the machine that most runs used.
+    """
+    runs = [run for run in runs if ":" not in run.strategy]
+    rows = method_rows(runs)
+    places = Counter(run.last[0].environment for run in runs)
+    common = places.most_common(1)[0][0]
+    timed = method_rows([run for run in runs if run.last[0].environment == common])
+    seconds = {row[0]: row[timed[0].index("s")] for row in timed}
+    return [
+        [seconds.get(row[0], "-") if name == "s" else row[rows[0].index(name)] for name in SUMMARY]
+        for row in rows
+    ]
 
 
 def _differences(sources: Sequence[Published], reference: str) -> str:
@@ -155,7 +167,7 @@ def _contrasts(sources: Sequence[Published], pairs: str) -> str:
 
 def _environments(sources: Sequence[Published], _: str) -> str:
     """Tabulate where the runs were measured: a row per commit and machine."""
-    names = ["commit", "processor", "instructions", "precision", "torch", "threads"]
+    names = ["commit", "processor", "gpu", "precision", "torch", "threads"]
     table = [[*names, "runs"]]
     for source in sources:
         for key, record in source.environments.items():
@@ -178,7 +190,9 @@ def _memory(sources: Sequence[Published], names: str) -> str:
     bounds = {"5 cm/5 deg": COARSE, "1 cm/1 deg": FINE, "5 mm/0.5 deg": FINEST}
     rows = [["keyframes", "strategy", *bounds, "median mm", "wrong scene", "MB"]]
     for source in sources:
-        label = f"{100 * float(str(source.settings['memory_share'])):.0f} %"
+        memory = source.settings["memory"]
+        assert isinstance(memory, dict), "settings of `evercal bench`"
+        label = f"{100 * memory['share']:.0f} %"
         for name, runs in by_strategy(published_runs([source])).items():
             if wanted and name not in wanted:
                 continue
