@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -104,6 +105,23 @@ def test_figure_has_the_methods_with_several_runs(
     assert "ours  66" in drawn
     assert "theirs  45" in drawn
     assert "single" not in drawn
+
+
+def test_seconds_are_those_of_the_machine_with_most_runs(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    write_json(folder / results.SETTINGS, {})
+    places = [("ours", 10.0, "cpu"), ("ours", 20.0, "cpu")] * 2 + [("ours", 90.0, "gpu")]
+    for seed, (name, seconds, place) in enumerate([*places, *[("theirs", 5.0, "gpu")] * 2]):
+        run = lines(name, seed, [[16], [14, 12]])
+        results.append(folder, [replace(r, seconds=seconds, environment=place) for r in run])
+    publish(folder, "mixed", {}, out=tmp_path)
+    page = tables.regenerated("<!-- table: mixed summary -->\n<!-- end -->\n", tmp_path)
+    ours, theirs = (
+        next(x for x in page.splitlines() if f"| {n} |" in x) for n in ("ours", "theirs")
+    )
+    assert ours.endswith("| 30.0 |")  # two stages of 15 s
+    assert theirs.endswith("| - |")
 
 
 def test_single_runs_alone_form_one_table(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from evercal.cli import bench as verb
 from evercal.continual.benchmark.results import RESULTS, STRATEGIES
+from evercal.continual.learning.presets import short_side
 from evercal.recordings import generic
 
 if TYPE_CHECKING:
@@ -147,3 +148,16 @@ def test_options_of_the_backbone_of_the_paper() -> None:
     assert verb.Bench("sim-mini", batch=512)._stage(0).fit.replay_batch == 256
     shared = verb.Bench("sim-mini", backbone="paper", offsets="shared")._stage(0)
     assert (shared.head.offsets, shared.head.centres) == ("shared", "fixed")
+
+
+def test_the_papers_working_images_are_not_larger_than_the_recorded(hall: Recording) -> None:
+    def sides(factor: float) -> tuple[int, int]:
+        frames = [
+            replace(frame, camera=frame.camera.resized(round(320 * factor), round(240 * factor)))
+            for frame in hall.train[:2]
+        ]
+        return short_side("paper", frames), short_side("fast", frames)
+
+    assert [sides(factor) for factor in (0.5, 1, 1.5, 3)] == [
+        (s, 240) for s in (240, 240, 360, 480)
+    ]

@@ -102,14 +102,12 @@ class Bench:
         out = _own_folder(self.out)
         wait_for_all()
         scenes = self._scenes()
-        # Larger than the recorded images, working images would show nothing more.
-        sides = (min(f.camera.width, f.camera.height) for s in scenes for f in s.train)
         options = BenchOptions(
             self._stage,
             self._strategies(),
             seeds,
             self.order,
-            min(short_side(self.preset), *sides),
+            short_side(self.preset, (frame for scene in scenes for frame in scene.train)),
             settings={
                 "suite": self.suite,
                 "poses": "sfm" if self.poses else "original",

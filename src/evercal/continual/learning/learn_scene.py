@@ -107,7 +107,7 @@ def learn_networks(
     began = time.perf_counter()
     named, stage = options.strategy, options.stage_options()
     strategy = named if isinstance(named, Strategy) else strategy_named(named)
-    opened = _opened(store, strategy, stage, options)
+    opened = _opened(store, strategy, stage, options, recording.train)
     with opened.writing():
         contents = opened.contents.to(device_of(options.device))
         names = [record.name for record in contents.scenes]
@@ -194,7 +194,11 @@ def _on_map(on_event: OnEvent) -> Callable[[str, int, int], object]:
 
 
 def _opened(
-    store: Path, strategy: Strategy, stage: StageOptions, options: NetworkLearnOptions
+    store: Path,
+    strategy: Strategy,
+    stage: StageOptions,
+    options: NetworkLearnOptions,
+    frames: Sequence[Frame],
 ) -> NetworkStore:
     """The store, checked against the options."""
     if strategy.jointly:
@@ -205,7 +209,7 @@ def _opened(
     if stage.memory.auto:
         raise InputError("memory auto: only a map selects its keyframes; give a share or bytes")
     if not is_store(store):
-        side = options.short_side or short_side(options.preset)
+        side = options.short_side or short_side(options.preset, frames)
         return NetworkStore.create(store, strategy.name, side, options.encoder)
     if isinstance(options.encoder, Path):
         raise InputError(

@@ -1,6 +1,6 @@
 """Presets of the training effort per scene."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Literal
 
@@ -9,6 +9,7 @@ from evercal.continual.networks.buffer import EncodePlan
 from evercal.continual.networks.head import HeadOptions
 from evercal.continual.networks.loss import LossOptions
 from evercal.continual.networks.trainer import FitOptions
+from evercal.recordings import Frame
 
 PRESETS: dict[str, StageOptions] = {
     # At most 240 s per scene on two cores.
@@ -70,13 +71,22 @@ def preset(name: str, seed: int = 0) -> StageOptions:
     return replace(options, seed=seed, encode=replace(options.encode, seed=seed))
 
 
+SHORT_SIDE, PAPER_SHORT_SIDE = 240, 480
+"""Short side of the working images, pixels."""
 PAPER_SIM_STEPS = 5_000
 """Steps per scene of preset `paper` on the paper's simulation."""
 
 
-def short_side(name: str) -> int:
-    """Return the short side of the working images, pixels; 480 for the paper."""
-    return 480 if name == "paper" else 240
+def short_side(name: str, frames: Iterable[Frame]) -> int:
+    """Return the short side of the working images, pixels: 240, for the paper up to 480.
+
+    The paper's are not larger than the frames, which would show nothing more.
+    """
+    if name != "paper":
+        return SHORT_SIDE
+    sides = (min(frame.camera.width, frame.camera.height) for frame in frames)
+    recorded = min(sides, default=SHORT_SIDE)
+    return max(SHORT_SIDE, min(PAPER_SHORT_SIDE, recorded))
 
 
 def on_paper_backbone(options: StageOptions) -> StageOptions:
