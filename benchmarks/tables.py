@@ -129,7 +129,7 @@ SUMMARY = (
 def _summary_rows(runs: Sequence[Run]) -> TableRows:
     """Tabulate the main columns of `method_rows`, without parts of strategies (`NAME:PART`).
 
-    Seconds are those on the machine that most runs used.
+    Seconds are means over the runs of one machine, the one with most runs.
     """
     runs = [run for run in runs if ":" not in run.strategy]
     rows = method_rows(runs)

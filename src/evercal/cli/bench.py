@@ -101,10 +101,11 @@ class Bench:
         device = self.device if self.ray else str(join_processes(self.device))
         out = _own_folder(self.out)
         wait_for_all()
+        strategies = self._strategies()  # refused before recordings are read
         scenes = self._scenes()
         options = BenchOptions(
             self._stage,
-            self._strategies(),
+            strategies,
             seeds,
             self.order,
             short_side(self.preset, (frame for scene in scenes for frame in scene.train)),

@@ -118,7 +118,7 @@ def cameras_in_scenes(
 ) -> list[Camera]:
     """Intrinsics of an image in each scene; a guess where none are given and no aspect ratio fits.
 
-    Those of the recording are replaced by the adjusted ones.
+    The recording's intrinsics are replaced by the adjusted ones.
 
     Raises:
         InputError: A camera with another aspect ratio than the image's.

@@ -72,7 +72,7 @@ def preset(name: str, seed: int = 0) -> StageOptions:
 
 
 SHORT_SIDE, PAPER_SHORT_SIDE = 240, 480
-"""Short side of the working images, pixels."""
+"""Short side of the working images, pixels: ours, and at most the paper's."""
 PAPER_SIM_STEPS = 5_000
 """Steps per scene of preset `paper` on the paper's simulation."""
 
