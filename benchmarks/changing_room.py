@@ -25,12 +25,12 @@ from evercal.recordings.held_out import split_held_out
 from evercal.recordings.images import write_jpeg
 from evercal.recordings.samples import sample_rooms
 from evercal.simulation.box_room import default_camera
-from evercal.simulation.cell_paths import sweep_shots
-from evercal.simulation.changed_room import moved_item, rearranged, relit
-from evercal.simulation.furnished.panda import Panda
-from evercal.simulation.furnished.renderer import Renderer, RenderOptions
-from evercal.simulation.furnished.rooms import Room, room
 from evercal.storage import write_json
+from rooms.changed import moved_item, rearranged, relit
+from rooms.panda import panda_meshes
+from rooms.paths import sweep_shots
+from rooms.renderer import Renderer, RenderOptions
+from rooms.room import Room, room
 
 FURNITURE_ROUND = 5
 MOVABLE = ("armchair", "floor lamp", "side table", "chair", "stool")
@@ -79,7 +79,7 @@ def render(
         frames: Frames of each round, 70 % of them for training.
         samples: Light paths per pixel.
     """
-    camera, panda, done = default_camera(320, 240), Panda(), []
+    camera, done = default_camera(320, 240), []
     plans = [(state, sweep_shots(state, frames if i else first, 20 + i))
              for i, state in enumerate(states(kind, seed, rounds))]  # fmt: skip
     with tqdm(total=sum(len(shots) for _, shots in plans), unit="frame") as bar:
@@ -91,7 +91,7 @@ def render(
             for i, shot in enumerate(shots):
                 file = root / f"images/{i:06d}.jpg"
                 if not file.exists():
-                    arm = panda.meshes(shot.joints_rad)
+                    arm = panda_meshes(shot.joints_rad)
                     if renderer is None:
                         renderer = Renderer(state.meshes() + arm)
                     renderer.move({mesh.name: mesh for mesh, _ in arm})

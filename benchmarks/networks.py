@@ -49,7 +49,7 @@ def commands(data: Path, out: Path) -> Mapping[str, Sequence[Command]]:
     """Return the commands of every experiment, in order."""
 
     def rooms(suite: str) -> Command:
-        return "evercal", "simulate", suite, "--sweep-only", "--out", str(data / suite)
+        return "rooms", suite, "--sweep-only", "--out", str(data / suite)
 
     def bench(suite: str, name: str, *options: str) -> Command:
         folders = ("--data", str(data / suite), "--out", str(out / name))

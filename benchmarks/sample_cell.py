@@ -7,7 +7,7 @@
     DIR/bumped.jpg                     the fixed camera after a small bump
     DIR/truth.json                     true poses, noise and settings
 
-Render it with `python benchmarks/sample_cell.py DIR`.
+Render it with `python -m benchmarks.sample_cell DIR`.
 """
 
 import sys
@@ -20,10 +20,11 @@ from evercal.geometry import SE3
 from evercal.recordings import generic
 from evercal.recordings.images import write_jpeg
 from evercal.simulation.box_room import default_camera, look_at
-from evercal.simulation.furnished.panda import Panda
-from evercal.simulation.furnished.renderer import Renderer, RenderOptions, mitsuba
-from evercal.simulation.furnished.rooms import room
+from evercal.simulation.panda_arm import base_from_flange
 from evercal.storage import write_bytes, write_json
+from rooms.panda import panda_meshes
+from rooms.renderer import Renderer, RenderOptions, mitsuba
+from rooms.room import room
 
 ROOM = ("living", 22)
 """Kind and seed of the room."""
@@ -49,20 +50,20 @@ def render_sample_cell(out: Path) -> None:
     Existing files of the same names are replaced.
 
     Raises:
-        InputError: The extra `sim` is not installed.
+        InputError: Mitsuba or the meshes of the arm are missing.
     """
-    camera, panda = default_camera(), Panda()
+    camera = default_camera()
     gripper_from_camera = _mounted_camera()
     tripod = look_at(_TRIPOD_M, _TRIPOD_TARGET_M)
     bumped = tripod @ _bump()
     wrist_joints = _arm_path(WRIST_IMAGES, _WRIST_CENTRE_RAD, _WRIST_SPREAD_RAD, 1)
     work_joints = _arm_path(TRIPOD_IMAGES + 1, _WORK_CENTRE_RAD, _WORK_SPREAD_RAD, 2)
-    grippers = SE3.stack([panda.base_from_flange(joints) for joints in wrist_joints])
+    grippers = SE3.stack([base_from_flange(joints) for joints in wrist_joints])
     options = RenderOptions()
-    renderer = Renderer(room(*ROOM).meshes() + panda.meshes(wrist_joints[0]))
+    renderer = Renderer(room(*ROOM).meshes() + panda_meshes(wrist_joints[0]))
 
     def take(path: Path, joints: np.ndarray, base_from_camera: SE3) -> None:
-        renderer.move({mesh.name: mesh for mesh, _ in panda.meshes(joints)})
+        renderer.move({mesh.name: mesh for mesh, _ in panda_meshes(joints)})
         seed = int.from_bytes(path.relative_to(out).as_posix().encode()) % 2**31
         write_jpeg(path, renderer.render(camera, base_from_camera, options, seed), JPEG_QUALITY)
 

@@ -35,7 +35,7 @@ def test_a_dry_run_prints_the_commands_and_runs_nothing(
 ) -> None:
     assert networks.run(("a", "memory"), tmp_path, tmp_path, dry=True) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == f"evercal simulate sim-mini --sweep-only --out {tmp_path}/sim-mini"
+    assert lines[0] == f"rooms sim-mini --sweep-only --out {tmp_path}/sim-mini"
     assert len(lines) == 11
     assert not list(tmp_path.iterdir())
 

@@ -160,7 +160,7 @@ def test_unusable_arguments_are_an_error_object(run: Any, words: list[str], mess
         (["convert", "R", "FILE"], "FILE: is a file; give a folder"),
         (["demo", "--out", "FILE/x"], "--out FILE/x: cannot be created"),
         (["demo", "--copy-samples", "FILE"], "FILE: is a file; name a new folder"),
-        (["simulate", "sim-mini", "--out", "FILE/x"], "FILE/x"),
+        (["simulate", "cell", "--out", "FILE/x"], "FILE/x"),
         (["bench", "sim-mini", "--out", "FILE/x"], "FILE/x"),
         (["pretrain", "--out", "FILE/x"], "FILE/x"),
     ],

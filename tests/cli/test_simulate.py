@@ -1,4 +1,4 @@
-"""`evercal simulate`: bad input, and a tiny suite from end to end."""
+"""`evercal simulate`: bad input, and a small cell from end to end."""
 
 import json
 from pathlib import Path
@@ -7,23 +7,17 @@ from typing import Any
 import pytest
 
 from evercal.recordings import load_recording
-from evercal.simulation import cell
-from evercal.simulation.cell import Suite
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (("lab", "--out", "x"), "lab"),
-        (("sim",), "--out"),
-        (("sim", "--out", "x", "--size", "640"), "640x480"),
-        (("sim", "--out", "x", "--size", "4x4"), "at least 16x16"),
-        (("sim", "--out", "x", "--frames", "1"), "at least 2"),
-        (("sim", "--out", "x", "--seed", "9000"), "reserved"),
-        (("sim", "--out", "x", "--frames", "1000000000"), "GB are free"),
-        (("cell", "--out", "x", "--samples", "4"), "--samples"),
-        (("cell", "--out", "x", "--seed", "9000"), "reserved"),
+        (("cell",), "--out"),
+        (("cell", "--out", "x", "--size", "640"), "640x480"),
         (("cell", "--out", "x", "--size", "20x20"), "at least 64x64"),
+        (("cell", "--out", "x", "--frames", "0"), "at least 1"),
+        (("cell", "--out", "x", "--seed", "9000"), "reserved"),
     ],
 )
 def test_bad_input_is_refused_and_nothing_is_written(
@@ -40,25 +34,15 @@ def test_bad_input_is_refused_and_nothing_is_written(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_finished_suite_is_not_rendered_again(
-    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("mitsuba", reason="the extra 'sim' is not installed")
-    suite = Suite((("den", "living", 103),), 3, (32, 24), 1)
-    monkeypatch.setitem(cell.SUITES, "sim-mini", suite)
-    monkeypatch.setattr(cell, "CALIBRATION_FRAMES", 1)
-    out = tmp_path / "rooms"
-    first = run("simulate", "sim-mini", "--out", out, "--json")
-    assert first.code == 0, first.err
-    report = json.loads(first.out)
-    assert (report["scenes"], report["frames"]) == ([str(out / "den")], 6)
-    scene = load_recording(out / "den")
-    assert (len(scene.train), len(scene.test)) == (2, 1)
-    assert scene.train[0].read_image().shape == (24, 32, 3)
-    before = {path: path.stat().st_mtime_ns for path in out.rglob("*.jpg")}
-    again = run("simulate", "sim-mini", "--out", out, "--size", "32x24")
-    assert again.code == 0
-    assert {path: path.stat().st_mtime_ns for path in out.rglob("*.jpg")} == before
-    other = run("simulate", "sim-mini", "--out", out, "--seed", "1")
-    assert other.code == 2
-    assert "seed 0, now it is 1" in other.err[-1]
+def test_a_cell_has_the_stated_parts(run: Any, tmp_path: Path) -> None:
+    out = tmp_path / "cell"
+    words = ("--frames", "3", "--size", "64x64", "--seed", "4", "--noise", "0", "--json")
+    ran = run("simulate", "cell", "--out", out, *words)
+    assert ran.code == 0, ran.err
+    report = json.loads(ran.out)
+    assert (report["scenes"], report["frames"]) == ([str(out / "wrist")], 3 + 8)
+    frames = load_recording(out / "wrist").train
+    assert [frame.read_image().shape for frame in frames] == 3 * [(64, 64, 3)]
+    assert len(list(Path(report["tripod"]).iterdir())) == 8
+    truth = json.loads(Path(report["truth.json"]).read_text())
+    assert (truth["seed"], truth["options"]["image_noise"]) == (4, 0)

@@ -6,7 +6,7 @@ import pytest
 
 from evercal.geometry import SE3
 from evercal.live.coverage import Sample, clipped_share, coverage, sharpness
-from evercal.simulation.furnished.textures import dead_leaves
+from evercal.simulation.textures import dead_leaves
 
 
 def samples(tangents: np.ndarray) -> list[Sample]:

@@ -52,15 +52,12 @@ def show_report(
     from evercal.continual.benchmark.comparison import summary
     from evercal.continual.benchmark.latex import paper_tables
     from evercal.continual.benchmark.report_data import read_report, tables_text
-    from evercal.simulation.cell import SUITES
     from evercal.storage import write_bytes
 
     report = read_report(folder, reference, compare_with)
     tables = report.tables()
     write_bytes(folder / TABLES, (tables_text(tables, "markdown") + "\n").encode())
-    suite = SUITES.get(report.suite)
-    rooms = {name: (kind, seed) for name, kind, seed in suite.rooms} if suite else {}
-    views = view_pictures(folder, report.plotted, rooms)
+    views = view_pictures(folder, report.plotted)
     write_bytes(folder / PAGE, bench_page(report, tables, views).encode())
     latex = paper_tables(report.runs, report.suite, tables.get("ablation"))
     write_bytes(folder / LATEX, (latex + "\n").encode())

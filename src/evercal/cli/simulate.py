@@ -1,6 +1,5 @@
 """`evercal simulate`."""
 
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,96 +13,36 @@ from evercal.errors import InputError
 
 @dataclass(frozen=True)
 class Simulate:
-    """Render furnished rooms with an arm (extra `sim`), or record a virtual robot cell.
+    """Record a virtual robot cell: a wrist camera, a fixed camera, and the truth.
 
     Example: evercal simulate cell --out cell/
     """
 
-    suite: Annotated[
-        Positional[
-            Literal[
-                "sim",
-                "sim-7",
-                "sim-12",
-                "sim-mini",
-                "sim-tune",
-                "sim-unseen",
-                "sim-repeat",
-                "cell",
-            ]
-        ],
-        arg(name="SUITE"),
-    ]
-    """Rooms to render: three (sim), seven, twelve, the three packaged ones (sim-mini), three for
-    tuning networks (sim-tune), three for confirming them (sim-unseen), or three with repeated
-    textures and objects (sim-repeat). cell: a wrist recording and images of a fixed camera, in
-    seconds and without the extra."""
+    kind: Annotated[Positional[Literal["cell"]], arg(name="KIND")]
+    """What is simulated: cell. Furnished rooms are rendered by 'python -m rooms' in a checkout."""
     out: Annotated[Path, arg(metavar="DIR")]
-    """Output folder. The same command continues an interrupted run."""
+    """Output folder, which is new or empty."""
     frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Training and test frames of each room, or wrist images of a cell; default: as the suite
-    defines."""
+    """Images of the wrist camera. Default: 25."""
     size: Annotated[str | None, arg(metavar="WxH", help_behavior_hint="")] = None
-    """Image size in pixels, such as 640x480; default: as the suite defines."""
+    """Image size in pixels. Default: 640x480."""
     seed: int = 0
-    """Seed of the camera paths and the noise, and of the whole cell. Rooms do not depend on it."""
-    samples: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Light paths per pixel; more is slower and more exact. Default: as the suite defines."""
-    exposure_ev: float = 0.0
-    """Exposure in stops; positive is brighter."""
+    """Seed of the cell, the motion and the noise."""
     noise: Annotated[float | None, arg(metavar="SHARE", help_behavior_hint="")] = None
-    """Sensor noise as a fraction of full scale; a good camera has 0.01. Default: 0, cell 0.008."""
-    blur_steps: int = 1
-    """Camera poses per exposure; 1 disables motion blur."""
-    sweep_only: bool = False
-    """Render training and test frames only, without calibration recordings and changed frames. The
-    same command without this option adds them."""
+    """Sensor noise as a fraction of full scale. Default: 0.008."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Render the missing frames."""
-        if self.suite == "cell":
-            return self._record_cell()
-        from evercal.simulation.cell import SUITES, SimulateOptions, simulate
-
-        began = time.perf_counter()
-        options = SimulateOptions(
-            frames=self.frames,
-            size=_size(self.size),
-            seed=self.seed,
-            samples=self.samples,
-            exposure_ev=self.exposure_ev,
-            noise=self.noise or 0.0,
-            blur_steps=self.blur_steps,
-            sweep_only=self.sweep_only,
-        )
-        with progress_bar("rendering", 0, "frame") as bar:
-            for progress in simulate(self.suite, self.out, options):
-                if not bar.total:
-                    bar.write(f"rendering with {progress.renderer}", file=sys.stderr)
-                    bar.total = progress.total
-                bar.update(progress.done - bar.n)
-        scenes = [str(self.out / name) for name, _, _ in SUITES[self.suite].rooms]
-        if self.json:
-            seconds = time.perf_counter() - began
-            print_json({"scenes": scenes, "frames": bar.n, "seconds": seconds})
-        else:
-            print_next("evercal", "inspect", scenes[0])
-        return 0
-
-    def _record_cell(self) -> int:
-        if self.samples is not None or self.exposure_ev or self.blur_steps != 1 or self.sweep_only:
-            raise InputError(
-                "cell: takes no --samples, --exposure-ev, --blur-steps and --sweep-only; omit them"
-            )
+        """Record the cell."""
         from evercal.simulation.cell_recording import TRIPOD_IMAGES, WRIST_IMAGES, record_cell
         from evercal.simulation.virtual_cell import CellOptions
 
         began, frames = time.perf_counter(), WRIST_IMAGES if self.frames is None else self.frames
-        options, size = CellOptions(), _size(self.size)
-        if size is not None:
-            options = replace(options, width=size[0], height=size[1])
+        options = CellOptions()
+        if self.size is not None:
+            width, height = _size(self.size)
+            options = replace(options, width=width, height=height)
         if self.noise is not None:
             options = replace(options, image_noise=self.noise)
         with progress_bar("recording", frames + TRIPOD_IMAGES, "image") as bar:
@@ -118,9 +57,7 @@ class Simulate:
         return 0
 
 
-def _size(text: str | None) -> tuple[int, int] | None:
-    if text is None:
-        return None
+def _size(text: str) -> tuple[int, int]:
     width, cross, height = text.partition("x")
     if not (cross and width.isdecimal() and height.isdecimal()):
         raise InputError(f"--size {text}: give WIDTHxHEIGHT in pixels, such as 640x480")

@@ -13,7 +13,7 @@ import numpy as np
 
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
-from evercal.simulation.furnished.textures import dead_leaves, one_over_f
+from evercal.simulation.textures import dead_leaves, one_over_f
 
 NEAR_M = 0.05
 

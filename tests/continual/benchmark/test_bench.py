@@ -292,7 +292,7 @@ def test_suites_load_their_scenes_in_order() -> None:
         (lambda _: load_suite("real2"), "--data"),
         (lambda data: load_suite("i7s", data), "chess is missing; get it from https://www.micro"),
         (lambda data: load_suite("sim-mini", poses=data), "--poses are for i7s and i12s"),
-        (lambda data: load_suite("sim", data), "bedroom is missing; get it from evercal simulate"),
+        (lambda data: load_suite("sim", data), "bedroom is missing; get it from python -m rooms"),
     ],
 )
 def test_unavailable_suites_are_refused(

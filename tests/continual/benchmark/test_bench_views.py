@@ -1,13 +1,12 @@
-"""Scenes at the estimated poses: rendered if possible, else drawn as points."""
+"""Scenes at the estimated poses, drawn as points."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import cv2
 import numpy as np
-import pytest
 
 from evercal.continual.benchmark.bench_views import view_pictures
 from evercal.continual.benchmark.scene_views import keep_views
@@ -16,7 +15,6 @@ from evercal.localization.estimate import PoseEstimate
 from evercal.localization.learned import LearnedLocalizer
 from evercal.recordings import Frame, Recording
 from evercal.reports.page import Picture
-from evercal.simulation import untextured
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 POSE = SE3(np.array([1.0, 0, 0, 0]), np.array([0.0, 0.0, -1.0]))
@@ -63,9 +61,9 @@ def grey(picture: Picture) -> np.ndarray:
     return image.astype(int)
 
 
-def test_points_are_drawn_for_scenes_without_a_model(tmp_path: Path) -> None:
+def test_points_are_drawn_at_the_estimated_poses(tmp_path: Path) -> None:
     save_views(tmp_path, ours="hall", lost=None)
-    pictures = view_pictures(tmp_path, ["ours", "lost", "never run"], {})
+    pictures = view_pictures(tmp_path, ["ours", "lost", "never run"])
     assert list(pictures) == ["attic", "hall"]
     query, ours, lost = pictures["hall"]
     assert query.caption == "hall, seen"
@@ -76,31 +74,5 @@ def test_points_are_drawn_for_scenes_without_a_model(tmp_path: Path) -> None:
     assert grey(lost).min() > 240
 
 
-def test_rooms_are_rendered_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[Any] = []
-
-    def render(model: tuple[str, int], frames: list[Frame], poses: list[SE3]) -> list[np.ndarray]:
-        calls.append((model, len(frames)))
-        return [np.full((48, 64, 3), 200, np.uint8) for _ in frames]
-
-    monkeypatch.setattr(untextured, "untextured_renders", render)
-    save_views(tmp_path, ours="hall", lost=None)
-    for _ in range(2):
-        pictures = view_pictures(tmp_path, ["ours", "lost"], {"hall": ("bedroom", 3)})
-        # Both images were localized in the hall; one renderer serves both.
-        assert calls == [(("bedroom", 3), 2)]
-        assert abs(grey(pictures["hall"][1])[24, 32] - 200) < 5
-
-
-def test_points_are_drawn_without_the_simulator(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(untextured, "untextured_renders", lambda *_: [])
-    save_views(tmp_path, ours="hall")
-    pictures = view_pictures(tmp_path, ["ours"], {"hall": ("bedroom", 3)})
-    assert abs(grey(pictures["hall"][1])[23, 31] - 90) < 25
-    assert not list(tmp_path.rglob("*.png"))
-
-
 def test_no_views_give_no_pictures(tmp_path: Path) -> None:
-    assert view_pictures(tmp_path, ["ours"], {}) == {}
+    assert view_pictures(tmp_path, ["ours"]) == {}

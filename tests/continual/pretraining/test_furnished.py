@@ -1,6 +1,6 @@
 """Furnished rooms for pretraining: correspondences, cached files, reserved seeds.
 
-Rendering needs the extra `sim`.
+Rendering needs Mitsuba.
 """
 
 from pathlib import Path
@@ -32,8 +32,8 @@ from evercal.continual.pretraining.pairs import (
 )
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.simulation.cell import SUITES
-from evercal.simulation.furnished.rooms import RESERVED
+from rooms.room import RESERVED
+from rooms.suites import SUITES
 
 CAMERA = Camera(WIDTH, HEIGHT, 200.0, 200.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 
@@ -111,7 +111,7 @@ def test_batch_contains_furnished_rooms() -> None:
 
 
 def test_rendered_pairs_correspond_and_are_cached(tmp_path: Path) -> None:
-    pytest.importorskip("mitsuba", reason="the extra 'sim' is not installed")
+    pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
     views = furnished_views(1001, anchors=1)
     assert views.images.shape == views.depth_m.shape == (PER_ANCHOR, HEIGHT, WIDTH)
     rng, captured = np.random.default_rng(0), []

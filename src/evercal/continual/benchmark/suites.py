@@ -17,7 +17,6 @@ from evercal.recordings import (
     with_sfm_poses,
 )
 from evercal.recordings.samples import sample_rooms
-from evercal.simulation.cell import SUITES as ROOMS
 
 
 @dataclass(frozen=True)
@@ -44,19 +43,25 @@ def _packaged(data: Path | None, names: Sequence[str]) -> list[Recording]:
     return [rooms[name] for name in names]
 
 
-def _rendered(name: str) -> Suite:
-    rooms = tuple(room for room, _, _ in ROOMS[name].rooms)
-    return Suite(rooms, f"evercal simulate {name} --out DIR", _folders)
+_THREE = ("bedroom", "kitchen", "living")
+
+
+def _rendered(name: str, rooms: tuple[str, ...]) -> Suite:
+    return Suite(rooms, f"python -m rooms {name} --out DIR in a checkout", _folders)
+
+
+def _numbered(count: int) -> tuple[str, ...]:
+    return tuple(f"{_THREE[i % 3]}-{i // 3 + 1}" for i in range(count))
 
 
 SUITES: dict[str, Suite] = {
-    "sim-mini": Suite(("bedroom", "kitchen", "living"), "the package", _packaged),
-    "sim": _rendered("sim"),
-    "sim-7": _rendered("sim-7"),
-    "sim-12": _rendered("sim-12"),
-    "sim-repeat": _rendered("sim-repeat"),
-    "sim-tune": _rendered("sim-tune"),
-    "sim-unseen": _rendered("sim-unseen"),
+    "sim-mini": Suite(_THREE, "the package", _packaged),
+    "sim": _rendered("sim", _THREE),
+    "sim-7": _rendered("sim-7", _numbered(7)),
+    "sim-12": _rendered("sim-12", _numbered(12)),
+    "sim-repeat": _rendered("sim-repeat", ("workshop", "canteen", "hall")),
+    "sim-tune": _rendered("sim-tune", _THREE),
+    "sim-unseen": _rendered("sim-unseen", _THREE),
     "real2": Suite(
         ("redkitchen", "fr1_rpy"),
         "7-Scenes (Shotton et al., CVPR 2013) and TUM RGB-D (Sturm et al., IROS 2012)",

@@ -35,8 +35,8 @@ from evercal.continual.pretraining.pairs import (
 from evercal.errors import InputError
 from evercal.features.encoder import LocalEncoder
 from evercal.features.precision import autocast
-from evercal.simulation.furnished.renderer import mitsuba
 from evercal.storage.atomic import write_bytes
+from rooms.renderer import mitsuba
 
 CHECKPOINT = "encoder.pt"
 CHECKPOINT_STEPS = 250
@@ -52,7 +52,7 @@ class PretrainOptions:
     rooms: int = 160
     """Box rooms, each with 20 views."""
     furnished: int = 120
-    """Furnished rooms (extra `sim`), each with 20 views."""
+    """Furnished rooms (folder `rooms`), each with 20 views."""
     pictures: int = 300
     """Dead-leaves pictures for homography pairs."""
     room_pairs: int = 1
@@ -107,7 +107,7 @@ def make_data(options: PretrainOptions, folder: Path) -> PretrainData:
     Furnished rooms take about ten seconds each and are cached in `folder`.
 
     Raises:
-        InputError: Pairs but no furnished rooms, more rooms than seeds, or no extra `sim`.
+        InputError: Pairs but no furnished rooms, more rooms than seeds, or no Mitsuba.
     """
     if options.furnished_pairs and not options.furnished:
         raise InputError(
@@ -120,7 +120,7 @@ def make_data(options: PretrainOptions, folder: Path) -> PretrainData:
             " later seeds are held out"
         )
     if options.furnished:
-        mitsuba()  # fails early without the extra
+        mitsuba()  # fails early without it
     with get_context("spawn").Pool() as pool:
         seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + options.rooms)
         rooms = pool.map(room_views, seeds, chunksize=4)

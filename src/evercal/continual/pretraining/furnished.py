@@ -1,4 +1,4 @@
-"""Path-traced views of furnished rooms with true depth, for pretraining (extra `sim`)."""
+"""Path-traced views of furnished rooms with true depth, for pretraining (folder `rooms`)."""
 
 import io
 from collections.abc import Iterator
@@ -11,12 +11,13 @@ from evercal.continual.pretraining.pairs import HEIGHT, PER_ANCHOR, WIDTH, pinho
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.simulation.box_room import look_at
-from evercal.simulation.cell_paths import is_clear
-from evercal.simulation.furnished.panda import HOME_RAD, Panda
-from evercal.simulation.furnished.renderer import Renderer, RenderOptions
-from evercal.simulation.furnished.rooms import KINDS, Room, room
+from evercal.simulation.panda_arm import HOME_RAD
 from evercal.storage import write_bytes
 from evercal.storage.settings import lock_settings
+from rooms.panda import panda_meshes
+from rooms.paths import is_clear
+from rooms.renderer import Renderer, RenderOptions
+from rooms.room import KINDS, Room, room
 
 SAMPLES = 8
 OCCLUSION = 0.02
@@ -60,9 +61,9 @@ def furnished_views(seed: int, anchors: int = 5) -> FurnishedViews:
     import cv2
 
     rng = np.random.default_rng([seed, 78])
-    scene, panda = room(sorted(KINDS)[seed % len(KINDS)], seed), Panda()
-    joints = np.array(HOME_RAD) + rng.normal(0, 0.3, 7)
-    renderer = Renderer(scene.meshes() + panda.meshes(joints), rng.uniform(1.2, 2.8))
+    scene = room(sorted(KINDS)[seed % len(KINDS)], seed)
+    joints = HOME_RAD + rng.normal(0, 0.3, 7)
+    renderer = Renderer(scene.meshes() + panda_meshes(joints), rng.uniform(1.2, 2.8))
     poses, cameras, images, depths = [], [], [], []
     for _ in range(anchors):
         camera = pinhole(rng.uniform(0.65, 1.15) * WIDTH)

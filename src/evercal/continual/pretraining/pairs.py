@@ -8,7 +8,7 @@ import numpy as np
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.simulation.box_room import BoxRoom, look_at
-from evercal.simulation.furnished.textures import dead_leaves
+from evercal.simulation.textures import dead_leaves
 
 HEIGHT, WIDTH = 192, 256
 PER_ANCHOR = 4

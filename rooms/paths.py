@@ -13,8 +13,8 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.simulation.box_room import look_at
-from evercal.simulation.furnished.panda import HOME_RAD
-from evercal.simulation.furnished.rooms import Room
+from evercal.simulation.panda_arm import HOME_RAD
+from rooms.room import Room
 
 WORK_AREA_M = np.array([0.45, 0.0, 0.15])
 """Centre of the work area that cameras look at, base frame."""
@@ -131,7 +131,7 @@ def _arm_path(frames: int, seed: list[int], hold: int, cycles: float | None = No
     spread = np.array([0.45, 0.25, 0.3, 0.3, 0.5, 0.35, 0.6])
     phase = rng.uniform(0, 2 * np.pi, (2, 7))
     wave = 0.65 * np.sin(t[:, None] + phase[0]) + 0.35 * np.sin(2.3 * t[:, None] + phase[1])
-    return np.array(HOME_RAD) + spread * wave
+    return HOME_RAD + spread * wave
 
 
 def _free_path(room: Room, frames: int, seed: list[int]) -> SE3:

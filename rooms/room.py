@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evercal.simulation.furnished import materials as m
-from evercal.simulation.furnished.clutter import SmallObjects
-from evercal.simulation.furnished.furniture import FurnitureBuilder, Item
-from evercal.simulation.furnished.shapes import Mesh, about_x, box, cylinder, lathe, sheet
-from evercal.simulation.furnished.wall_objects import WallObjects
+from rooms import materials as m
+from rooms.clutter import SmallObjects
+from rooms.furniture import FurnitureBuilder, Item
+from rooms.shapes import Mesh, about_x, box, cylinder, lathe, sheet
+from rooms.wall_objects import WallObjects
 
 RESERVED = 9000
 """Seeds from this one on are reserved for final evaluation."""

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from evercal.simulation.furnished.furniture import Item
-from evercal.simulation.furnished.materials import Material
-from evercal.simulation.furnished.rooms import Room
+from rooms.furniture import Item
+from rooms.materials import Material
+from rooms.room import Room
 
 SMALL = (
     "ball", "basket", "blocks", "books", "bottle", "bowl", "carton", "jar", "kettle", "lamp",

@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from evercal.simulation.furnished.textures import dead_leaves, one_over_f
+from evercal.simulation.textures import dead_leaves, one_over_f
 
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 2.0])

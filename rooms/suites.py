@@ -21,7 +21,12 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings import Frame, generic
 from evercal.recordings.images import write_jpeg
 from evercal.simulation.box_room import default_camera
-from evercal.simulation.cell_paths import (
+from evercal.simulation.panda_arm import base_from_flange
+from evercal.storage import write_bytes, write_json
+from evercal.storage.settings import lock_settings
+from rooms.changed import changed_room
+from rooms.panda import panda_meshes
+from rooms.paths import (
     Shot,
     changed_shots,
     fixed_shots,
@@ -30,12 +35,8 @@ from evercal.simulation.cell_paths import (
     sees_work_area,
     sweep_shots,
 )
-from evercal.simulation.changed_room import changed_room
-from evercal.simulation.furnished.panda import Panda
-from evercal.simulation.furnished.renderer import Renderer, RenderOptions, choose_variant, mitsuba
-from evercal.simulation.furnished.rooms import RESERVED, Room, room
-from evercal.storage import write_bytes, write_json
-from evercal.storage.settings import lock_settings
+from rooms.renderer import Renderer, RenderOptions, choose_variant, mitsuba
+from rooms.room import RESERVED, Room, room
 
 CALIBRATION_FRAMES = 25
 
@@ -132,7 +133,7 @@ def simulate(
 
     Raises:
         InputError: The suite is unknown, an option is out of range, the disk is too small, `out`
-            was begun with other settings, or the extra `sim` is not installed.
+            was begun with other settings, or Mitsuba or the meshes of the arm are missing.
     """
     options = options or SimulateOptions()
     suite = _checked(name, options)
@@ -160,13 +161,13 @@ def simulate(
     settings["renderer"] = f"mitsuba {mi.__version__} {mi.variant()}"
     lock_settings(out / "render.json", settings)
     renderer = f"Mitsuba {mi.__version__}, {': '.join(choose_variant())}"
-    panda, done = Panda(), 0
+    done = 0
     for scene, kind, room_seed in suite.rooms:
         before = room(kind, room_seed)
         sweep = sweep_shots(before, frames, options.seed)
         recordings = [(out / scene, sweep)]
         if not options.sweep_only:
-            recordings += _calibrations(before, panda, options.seed, out / scene / "calibration")
+            recordings += _calibrations(before, options.seed, out / scene / "calibration")
         plans = [(before, recordings)]
         if suite.changed and not options.sweep_only:
             after = changed_room(before, options.seed)
@@ -175,7 +176,7 @@ def simulate(
             plans.append((after, [(out / scene / "changed", shots)]))
         for state, recordings in plans:
             camera = default_camera(width, height)
-            writer = _Writer(state, panda, camera, suite, options.seed, render, settings)
+            writer = _Writer(state, camera, suite, options.seed, render, settings)
             for root, shots in recordings:
                 for _ in writer.record(root, scene, shots):
                     done += 1
@@ -212,13 +213,11 @@ def _refuse_full_disk(out: Path, needed: int) -> None:
         )
 
 
-def _calibrations(
-    before: Room, panda: Panda, seed: int, folder: Path
-) -> list[tuple[Path, list[Shot]]]:
+def _calibrations(before: Room, seed: int, folder: Path) -> list[tuple[Path, list[Shot]]]:
     """Plan the calibration recordings of a room and write the true calibration."""
     fixed, bumped, bump = fixed_shots(before, CALIBRATION_FRAMES, seed)
     gripper_from_camera = hand_camera(seed)
-    hand = _hand_shots(before, panda, gripper_from_camera, seed)
+    hand = _hand_shots(before, gripper_from_camera, seed)
     folder.mkdir(parents=True, exist_ok=True)
     truth = {"gripper_from_camera": gripper_from_camera, "fixed_camera_from_bumped_camera": bump}
     poses = {name: generic.pose_to_dict(pose) for name, pose in truth.items()}
@@ -230,11 +229,11 @@ def _calibrations(
     ]
 
 
-def _hand_shots(before: Room, panda: Panda, gripper_from_camera: SE3, seed: int) -> list[Shot]:
+def _hand_shots(before: Room, gripper_from_camera: SE3, seed: int) -> list[Shot]:
     """Select free arm poses whose hand camera sees the work area."""
     shots: list[Shot] = []
     for joints in hand_joints(40 * CALIBRATION_FRAMES, seed):
-        camera = panda.base_from_flange(joints) @ gripper_from_camera
+        camera = base_from_flange(joints) @ gripper_from_camera
         eye = camera.translation_m
         if eye[2] > 0.2 and sees_work_area(camera) and before.is_free(eye[None], 0.05).all():
             shots.append(Shot(f"hand-{len(shots):06d}", "test", camera, joints))
@@ -251,7 +250,6 @@ class _Writer:
     """Renders the missing frames of recordings in one room."""
 
     room: Room
-    panda: Panda
     camera: Camera
     suite: Suite
     seed: int
@@ -274,7 +272,7 @@ class _Writer:
                     image,
                     self.camera,
                     shot.base_from_camera,
-                    self.panda.base_from_flange(shot.joints_rad),
+                    base_from_flange(shot.joints_rad),
                     depth if self.suite.depth else None,
                     tuple(float(angle) for angle in shot.joints_rad),
                 )
@@ -292,9 +290,9 @@ class _Writer:
         import cv2
 
         if self._renderer is None:
-            self._renderer = Renderer(self.room.meshes() + self.panda.meshes(shot.joints_rad))
+            self._renderer = Renderer(self.room.meshes() + panda_meshes(shot.joints_rad))
         elif not np.array_equal(self._joints_rad, shot.joints_rad):
-            arm = self.panda.meshes(shot.joints_rad)
+            arm = panda_meshes(shot.joints_rad)
             self._renderer.move({mesh.name: mesh for mesh, _ in arm})
         self._joints_rad = shot.joints_rad
         path = _shutter(shot, following, self.options.blur_steps)

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from evercal.simulation.furnished import materials as m
-from evercal.simulation.furnished.furniture import FurnitureBuilder, Item
-from evercal.simulation.furnished.shapes import Mesh, about_x, ball, box, drape, lathe, sheet, tube
+from rooms import materials as m
+from rooms.furniture import FurnitureBuilder, Item
+from rooms.shapes import Mesh, about_x, ball, box, drape, lathe, sheet, tube
 
 
 class WallObjects:

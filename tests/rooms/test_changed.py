@@ -7,12 +7,12 @@ import pytest
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
-from evercal.simulation.cell import SUITES
-from evercal.simulation.cell_paths import changed_shots, is_clear, sweep_shots
-from evercal.simulation.changed_room import SMALL, changed_room
-from evercal.simulation.furnished.furniture import Item
-from evercal.simulation.furnished.rooms import Room, room
-from evercal.simulation.furnished.shapes import box
+from rooms.changed import SMALL, changed_room
+from rooms.furniture import Item
+from rooms.paths import changed_shots, is_clear, sweep_shots
+from rooms.room import Room, room
+from rooms.shapes import box
+from rooms.suites import SUITES
 
 Items = dict[tuple[str, bytes], Item]
 

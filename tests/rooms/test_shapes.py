@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evercal.simulation.furnished.shapes import Mesh, ball, box, cushion, cylinder, lathe, sheet
+from rooms.shapes import Mesh, ball, box, cushion, cylinder, lathe, sheet
 
 
 def volume(mesh: Mesh) -> float:

@@ -1,4 +1,4 @@
-"""Renderings against geometry: projected balls and the depth of a plane. Needs `sim`."""
+"""Renderings against geometry: projected balls and the depth of a plane."""
 
 from dataclasses import replace
 
@@ -7,11 +7,11 @@ import pytest
 
 from evercal.geometry import SE3, Camera
 from evercal.simulation.box_room import look_at
-from evercal.simulation.furnished.materials import Material, plain
-from evercal.simulation.furnished.renderer import Renderer, RenderOptions
-from evercal.simulation.furnished.shapes import ball, box
+from rooms.materials import Material, plain
+from rooms.renderer import Renderer, RenderOptions
+from rooms.shapes import ball, box
 
-pytest.importorskip("mitsuba", reason="the extra 'sim' is not installed")
+pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
 
 CENTRES = np.array([[0.05, -0.3, 0.0], [0.3, 0.15, 0.2], [-0.4, 0.3, 0.1]])
 RADIUS = 0.02

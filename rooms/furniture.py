@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from evercal.simulation.furnished import materials as m
-from evercal.simulation.furnished.shapes import (
+from rooms import materials as m
+from rooms.shapes import (
     Mesh,
     about_x,
     ball,

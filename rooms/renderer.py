@@ -17,8 +17,8 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.simulation.furnished.materials import Material
-from evercal.simulation.furnished.shapes import Mesh
+from rooms.materials import Material
+from rooms.shapes import Mesh
 
 _PROBE = """
 import drjit as dr, sys
@@ -57,7 +57,7 @@ def mitsuba() -> Any:
     EVERCAL_MITSUBA_VARIANT overrides the variant; EVERCAL_RENDER_THREADS limits the threads.
 
     Raises:
-        InputError: The extra `sim` is not installed.
+        InputError: Mitsuba is not installed.
     """
     try:
         import drjit as dr  # pyright: ignore[reportMissingImports]
@@ -65,7 +65,8 @@ def mitsuba() -> Any:
         import mitsuba_oidn  # noqa: F401  # pyright: ignore
     except ImportError:
         raise InputError(
-            "the simulator needs Mitsuba, which is not installed; run: pip install 'evercal[sim]'"
+            "rendering needs Mitsuba, which is not installed; run:"
+            " python -m pip install -c constraints.txt mitsuba mitsuba-oidn"
         ) from None
     variant, _ = choose_variant()
     if "EVERCAL_RENDER_THREADS" in os.environ:

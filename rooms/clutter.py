@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from evercal.simulation.furnished import materials as m
-from evercal.simulation.furnished.furniture import CLOTHS, PAINTS, FurnitureBuilder, Item, pick
-from evercal.simulation.furnished.shapes import (
+from rooms import materials as m
+from rooms.furniture import CLOTHS, PAINTS, FurnitureBuilder, Item, pick
+from rooms.shapes import (
     Mesh,
     about_x,
     about_y,

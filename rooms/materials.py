@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from evercal.simulation.furnished.textures import dead_leaves, one_over_f
+from evercal.simulation.textures import dead_leaves, one_over_f
 
 SIZE = 512
 """Side of a tiling texture in pixels."""

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from evercal.geometry import pose_distance
-from evercal.simulation.cell import SUITES
-from evercal.simulation.cell_paths import fixed_shots, sweep_shots
-from evercal.simulation.furnished import rooms
-from evercal.simulation.furnished.rooms import Room, room
+from rooms.paths import fixed_shots, sweep_shots
+from rooms.room import RESERVED, Room, room
+from rooms.suites import SUITES
 
 
 @pytest.fixture(scope="module", params=SUITES["sim"].rooms, ids=lambda entry: entry[0])
@@ -73,7 +72,7 @@ def test_the_same_seed_gives_the_same_room() -> None:
 
 def test_reserved_seeds_and_unknown_kinds_are_refused() -> None:
     with pytest.raises(ValueError, match="reserved"):
-        room("living", rooms.RESERVED)
+        room("living", RESERVED)
     with pytest.raises(ValueError, match="bedroom, kitchen, living"):
         room("garage", 1)
     seeds = [
@@ -82,4 +81,4 @@ def test_reserved_seeds_and_unknown_kinds_are_refused() -> None:
         for *_, seed in SUITES[suite].rooms
     ]
     assert len(set(seeds)) == len(seeds) == 31
-    assert max(seeds) < rooms.RESERVED
+    assert max(seeds) < RESERVED

@@ -1,0 +1,1 @@
+"""Furnished rooms with an arm, path traced: the simulator beside the package."""

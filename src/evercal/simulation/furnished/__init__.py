@@ -1,1 +1,0 @@
-"""Furnished rooms with a robot arm, path-traced: furniture, materials, renderer."""
