@@ -33,6 +33,20 @@ def test_rooms_are_complete_and_small(rooms: tuple[SampleRoom, ...]) -> None:
     assert sum(path.stat().st_size for path in FOLDER.rglob("*")) <= 13e6
 
 
+def test_bumped_recordings_are_shifted_and_changed_ones_have_no_training_frames(
+    rooms: tuple[SampleRoom, ...],
+) -> None:
+    for room in rooms:
+        assert room.fixed is not None
+        assert room.bumped is not None
+        metres, radians = pose_distance(poses(room.fixed.test), poses(room.bumped.test))
+        np.testing.assert_allclose(metres, 0.005, atol=1e-9)
+        assert radians.max() < 1e-9
+        assert room.changed is not None
+        assert room.changed.name == f"{room.scene.name}-changed"
+        assert (len(room.changed.train), len(room.changed.test)) == (0, 20)
+
+
 def test_test_frames_differ_from_training_frames(rooms: tuple[SampleRoom, ...]) -> None:
     for room in rooms:
         test, train = poses(room.scene.test), poses(room.scene.train)

@@ -125,6 +125,6 @@ def test_a_missing_renderer_is_named_in_the_error(
 ) -> None:
     renderer.mitsuba.cache_clear()
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    with pytest.raises(InputError, match="pip install -c constraints.txt mitsuba"):
+    with pytest.raises(InputError, match=r"pip install -c constraints\.txt mitsuba"):
         next(simulate("sim", tmp_path / "out", TINY))
     renderer.mitsuba.cache_clear()

@@ -8,7 +8,7 @@ from evercal.errors import InputError
 from evercal.recordings import Recording, load_recording
 
 FOLDER = Path(__file__).parent / "sample_rooms"
-"""One folder for each room, rendered by `evercal simulate sim-mini`."""
+"""One folder for each room, rendered by `python -m rooms sim-mini`."""
 ROOMS = ("bedroom", "kitchen", "living")
 """Names of the rooms, in order of learning."""
 CELL = Path(__file__).parent / "sample_cell"

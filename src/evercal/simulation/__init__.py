@@ -1,1 +1,1 @@
-"""Rendered rooms and robot cells with exact poses."""
+"""Box rooms and a virtual robot cell, with exact poses."""

@@ -1,4 +1,4 @@
-"""Recordings of a virtual cell, for who has no robot.
+"""Simulated recordings of a robot cell.
 
 OUT/wrist/                    a recording of the camera on the gripper, see `live.recorder`
 OUT/tripod/0000.jpg, ...      images of the fixed camera while the arm moves
