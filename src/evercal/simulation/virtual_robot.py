@@ -3,7 +3,6 @@
 import threading
 import time
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -13,18 +12,6 @@ from evercal.simulation.panda_arm import HOME_RAD, base_from_flange, joints_for
 SPEED_RAD_S = 1.0
 """Speed of the fastest joint."""
 _SETTLE_S = 0.1
-
-
-class Clock(Protocol):
-    """What time it is, and how to let it pass."""
-
-    def now(self) -> float:
-        """Seconds."""
-        ...
-
-    def sleep(self, seconds: float) -> None:
-        """Let time pass."""
-        ...
 
 
 class WallClock:
@@ -52,6 +39,9 @@ class SimulatedClock:
     def sleep(self, seconds: float) -> None:
         """Advance the time."""
         self._now += seconds
+
+
+Clock = WallClock | SimulatedClock
 
 
 @dataclass(frozen=True, eq=False)
