@@ -313,7 +313,7 @@ def test_other_versions_and_features_are_refused(tmp_path: Path) -> None:
     for changed, message in (
         ({}, r"no feature holds a pose .*observation.state: shoulder, reach"),
         ({"codebase_version": "v1.6"}, r"version v1\.6; this evercal reads v2 and v3"),
-        ({"codebase_version": "v2.1", "fps": 0}, "no LeRobot dataset"),
+        ({"codebase_version": "v2.1", "fps": 0}, "does not describe the dataset"),
     ):
         change(root, **changed)
         with pytest.raises(InputError, match=message):

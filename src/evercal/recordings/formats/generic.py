@@ -34,11 +34,7 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str]) -> Recording:
-    """Read scene.json and check that its images exist; no image is opened.
-
-    Raises:
-        InputError: scene.json or an image is missing, or scene.json breaks the format.
-    """
+    """Read scene.json and check that its images exist; no image is opened."""
     root = Path(root)
     file = root / FILE
     data = _read(file)
@@ -144,11 +140,7 @@ class SceneWriter:
             self.close()
 
     def add(self, frame: Frame, split: Literal["train", "test"]) -> None:
-        """Write the frame's image and collect its entry of scene.json.
-
-        Raises:
-            InputError: The image cannot be read or written, or the frame name is not unique.
-        """
+        """Write the frame's image and collect its entry of scene.json."""
         if frame.name in self._entries:
             raise InputError(f"frame {frame.name!r}: already written; frame names are unique")
         # The counter keeps names like 'a/b' and 'a_b' apart and the folder in recorded order.
@@ -219,11 +211,7 @@ class SceneWriter:
             raise InputError(f"{target}: cannot be written ({error.strerror})") from None
 
     def close(self) -> None:
-        """Write scene.json.
-
-        Raises:
-            InputError: The file cannot be written.
-        """
+        """Write scene.json."""
         data: dict[str, object] = {
             "format": _FORMAT,
             "version": _VERSION,

@@ -30,6 +30,7 @@ from evercal.recordings.poses.conventions import (
 )
 from evercal.recordings.poses.joint_states import in_radians
 from evercal.recordings.poses.kinematics import RobotModel
+from evercal.recordings.poses.row_files import first_repeated
 from evercal.recordings.read_options import ReadOptions
 
 _STATE = "observation.state"
@@ -38,11 +39,7 @@ _PARTS = {"xyzw": ("x", "y", "z", "qx", "qy", "qz", "qw"), "ur": ("x", "y", "z",
 
 
 def pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> str:
-    """Name of the feature with the gripper poses or joint angles.
-
-    Raises:
-        InputError: No feature holds poses, or several do.
-    """
+    """Name of the only feature with gripper poses or joint angles."""
     features = info["features"]
     if options.urdf is not None:
         return _STATE
@@ -62,11 +59,8 @@ def pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> s
         raise InputError(
             f"{root}: gripper poses are in {' and '.join(keys)}; name one with --gripper-frame"
         )
-    listed = "; ".join(
-        f"{key}: {', '.join(names)}"
-        for key, names in observed.items()
-        if names and "image" not in key
-    )
+    named = {key: names for key, names in observed.items() if names and "image" not in key}
+    listed = "; ".join(f"{key}: {', '.join(names)}" for key, names in named.items())
     raise InputError(
         f"{root}: no feature holds a pose (x, y, z and qx, qy, qz, qw or wx, wy, wz), there are"
         f" {listed or 'no named numbers'}; for joint angles give --urdf, for a pose in another form"
@@ -81,11 +75,7 @@ def feature_poses(
     values: NDArray[np.float64],
     options: ReadOptions,
 ) -> tuple[SE3, list[str]]:
-    """Convert the numbers (n, k) of a feature to (n,) base_from_gripper, with notes.
-
-    Raises:
-        InputError: The numbers are no poses, or several poses are possible.
-    """
+    """Convert the numbers (n, k) of a feature to (n,) base_from_gripper, with notes."""
     names = _names(info, column)
     if options.urdf is not None:
         return _joint_poses(root, names, values, options)
@@ -117,14 +107,13 @@ def feature_poses(
 def _joint_poses(
     root: Path, names: list[str], stated: NDArray[np.float64], options: ReadOptions
 ) -> tuple[SE3, list[str]]:
-    """Forward kinematics of observation.state."""
     assert options.urdf is not None
     if len(names) != stated.shape[1]:
         count = stated.shape[1]
         raise InputError(f"{root}: {_STATE} has {count} numbers and {len(names)} names")
-    repeated = [name for i, name in enumerate(names) if name in names[:i]]
-    if repeated:
-        raise InputError(f"{root}: {_STATE}: {repeated[0]!r} names several numbers; rename them")
+    repeated = first_repeated(names)
+    if repeated is not None:
+        raise InputError(f"{root}: {_STATE}: {repeated!r} names several numbers; rename them")
     model = RobotModel(options.urdf)
     values = in_radians(model, names, stated, [options.pose_convention] * len(names))
     try:

@@ -43,11 +43,7 @@ def detect(root: Path) -> bool:
 
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
-    """Read stamps, intrinsics and poses; only the first image is decoded.
-
-    Raises:
-        InputError: The bag cannot be read, or lacks images, intrinsics or poses.
-    """
+    """Read stamps, intrinsics and poses; only the first image is decoded."""
     root, options = Path(root), options or ReadOptions()
     bag = BagFile(root)
     topic = _image_topic(bag, options.image_topic)
@@ -164,9 +160,6 @@ def _bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
 
     The topic of `/camera/image_raw/compressed` is `/camera/camera_info`. Rectified images
     take P without distortion, others K and D.
-
-    Raises:
-        InputError: There is no camera_info, it is uncalibrated, or its model is not supported.
     """
     topics = bag.topics(CAMERA_INFO)
     image = image_topic.removesuffix("/compressed")

@@ -35,11 +35,7 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str]) -> Recording:
-    """Read split files and poses, and the size of one image; no other image is opened.
-
-    Raises:
-        InputError: The folder, a split, a sequence, a pose or an image is missing or broken.
-    """
+    """Read split files and poses, and the size of one image; no other image is opened."""
     root = Path(root)
     splits = [_sequences(root, name) for name in _SPLITS]
     shared = sorted({folder.name for folder in splits[0]} & {folder.name for folder in splits[1]})

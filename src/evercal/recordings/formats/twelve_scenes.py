@@ -29,11 +29,7 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str]) -> Recording:
-    """Read split, calibration and poses, and the size of one image; no other image is opened.
-
-    Raises:
-        InputError: A file is missing or broken.
-    """
+    """Read split, calibration and poses, and the size of one image; no other image is opened."""
     root = Path(root)
     images = colour_images(root / "data")
     split = _test_count(root, len(images))

@@ -40,11 +40,7 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Recording:
-    """Read poses, intrinsics and the size of one image; no other image is opened.
-
-    Raises:
-        InputError: Poses, images or intrinsics are missing, broken or inconsistent.
-    """
+    """Read poses, intrinsics and the size of one image; no other image is opened."""
     root = Path(root)
     options = options or ReadOptions()
     file = _pose_file(root)

@@ -35,9 +35,6 @@ def read_joint_poses(
 
     `unit` is "rad" or "deg" of angles whose column states no unit; radians if omitted. Links are
     chosen by `RobotModel.chosen_links`.
-
-    Raises:
-        InputError: The file is broken, a link or joint is missing, or angles look like degrees.
     """
     rows = read_joints(path)
     base, gripper = model.chosen_links(base, gripper)
@@ -73,11 +70,7 @@ def in_radians(
     values: NDArray[np.float64],
     units: Sequence[str | None],
 ) -> NDArray[np.float64]:
-    """Convert angles in degrees to radians and leave other values (n, k) as they are.
-
-    Raises:
-        InputError: A unit is not known.
-    """
+    """Convert angles in degrees to radians and leave other values (n, k) as they are."""
     other = next((unit for unit in units if unit not in (None, *_UNITS)), None)
     if other is not None:
         raise InputError(f"--pose-convention {other}: joint angles are rad or deg")
@@ -112,11 +105,7 @@ def interpolate(
 
 
 def read_joints(path: Path) -> Rows:
-    """Read a table of joint values.
-
-    Raises:
-        InputError: The file is missing or broken.
-    """
+    """Read a table of joint values."""
     if path.suffix.lower() == ".csv":
         return read_rows(path, "joint angles")
     data: dict[str, Any] = read_json(path, "file of joint angles", f"give {_JSON}")

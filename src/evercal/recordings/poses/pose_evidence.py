@@ -55,9 +55,6 @@ def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> l
         frames: (n,) frames in recorded order.
         poses: (n,) base_from_camera or base_from_gripper.
         of_camera: Whether the poses are base_from_camera.
-
-    Raises:
-        InputError: An image cannot be read.
     """
     rotations = pair_rotations(frames, poses)
     if rotations is None:

@@ -37,12 +37,7 @@ class ImagePoses:
 def poses_at_images(
     bag: BagFile, stamps_ns: NDArray[np.int64], camera_frame: str, options: ReadOptions
 ) -> ImagePoses:
-    """Interpolate the pose of the gripper at n images, taken at `stamps_ns` (n,) in `camera_frame`.
-
-    Raises:
-        InputError: There is no tf and there are no joint states, frames are missing or ambiguous,
-            or no image is within the recorded poses.
-    """
+    """Interpolate the pose of the gripper at n images, taken at `stamps_ns` (n,) in `camera_frame`."""
     if options.urdf is not None:
         return _from_joints(bag, stamps_ns, options)
     tree, times = _tf(bag, int(stamps_ns[0]), options.pose_topic)

@@ -56,9 +56,6 @@ class TfTree:
             stamp_s: Time in seconds, or None for a static transform.
             parent_from_child: Unit quaternion wxyz, and translation in metres.
             topic: Topic of the message; /tf_static belongs to /tf.
-
-        Raises:
-            InputError: The numbers are no rigid transform.
         """
         parent, child = plain_name(parent), plain_name(child)
         quaternion, translation = parent_from_child
@@ -102,9 +99,6 @@ class TfTree:
         """Interpolate (n,) poses of frame b in frame a, and whether each is valid.
 
         Validity is that of `PoseTrack.at`.
-
-        Raises:
-            InputError: The frames are not connected, or the transforms between them are ambiguous.
         """
         up, down = self._chain(a), self._chain(b)
         for child in (frame for frame in (*up, *down) if frame in self._edges):
