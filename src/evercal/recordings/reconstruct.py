@@ -1,20 +1,17 @@
 """`reconstruct`: camera poses from a plain video or images, by structure from motion (pycolmap).
 
     OUT/images/         chosen frames
-    OUT/frames.json     written when all frames are chosen
     OUT/database.db     features and matches
     OUT/sparse/0/       the model, read as a COLMAP recording
 
-Every finished step is kept, so the same call continues an interrupted one. The unit of length is
-arbitrary until the map is aligned.
+The unit of length is arbitrary until the map is aligned.
 """
 
 import itertools
-import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +21,6 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.recordings.images import write_image
 from evercal.recordings.streams import StreamFrame, stream
-from evercal.storage import write_json
 
 OnStep = Callable[[str, int, int], object]
 """Called with the name of the step, how much of it is done, and its total."""
@@ -32,7 +28,6 @@ OnStep = Callable[[str, int, int], object]
 _SMALL_PX = 320
 """Width of the copy in which motion and sharpness are measured."""
 _LEAST_FRAMES = 12
-_FRAMES, _DATABASE, _MODEL = "frames.json", "database.db", "sparse"
 
 
 @dataclass(frozen=True)
@@ -76,7 +71,7 @@ def reconstruct(
 
     Args:
         source: Video file or folder.
-        out: New folder, or that of an interrupted call with the same source.
+        out: New or empty folder.
         options: How frames are chosen and matched.
         on_step: Called with the current step.
 
@@ -91,9 +86,7 @@ def reconstruct(
     options, root = options or ReconstructOptions(), Path(out)
     names = _chosen(str(source), root, options, on_step)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
-    if not (root / "matched").exists():
-        _detect_and_match(pycolmap, root, names, options, on_step)
-        (root / "matched").touch()
+    _detect_and_match(pycolmap, root, names, options, on_step)
     models = _mapped(pycolmap, root, len(names), on_step)
     if not models:
         raise InputError(
@@ -112,18 +105,8 @@ def reconstruct(
 
 def _chosen(source: str, root: Path, options: ReconstructOptions, on_step: OnStep) -> list[str]:
     """Write the frames to reconstruct, and return their names."""
-    record, settings = root / _FRAMES, {"source": str(Path(source).resolve()), **asdict(options)}
-    if record.exists():
-        before = json.loads(record.read_text())
-        if before["settings"] != settings:
-            raise InputError(
-                f"{root}: holds frames of {before['settings']['source']} with other options; give"
-                f" another folder"
-            )
-        return before["names"]
-    if root.exists() and any(p.name not in ("images", _DATABASE) for p in root.iterdir()):
+    if root.exists() and any(root.iterdir()):
         raise InputError(f"{root}: is not empty; give a new folder")
-    shutil.rmtree(root / "images", ignore_errors=True)  # of an interrupted call
     images = Path(source).is_dir()
     names = []
     for frame in stream(source) if images else _moving(stream(source), options.motion):
@@ -142,7 +125,6 @@ def _chosen(source: str, root: Path, options: ReconstructOptions, on_step: OnSte
             f"{source}: {len(keep)} frames to reconstruct, at least {_LEAST_FRAMES} are required;"
             " record longer, or move more"
         )
-    write_json(record, {"settings": settings, "names": keep})
     return keep
 
 
@@ -198,8 +180,7 @@ def _detect_and_match(
     pycolmap: Any, root: Path, names: list[str], options: ReconstructOptions, on_step: OnStep
 ) -> None:
     """Match all pairs of few frames, else neighbours and, for loops, pairs of spread frames."""
-    database = root / _DATABASE
-    database.unlink(missing_ok=True)
+    database = root / "database.db"
     on_step("detecting features", 0, 1)
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = options.camera_model
@@ -222,27 +203,20 @@ def _detect_and_match(
 
 def _mapped(pycolmap: Any, root: Path, count: int, on_step: OnStep) -> list[Any]:
     """Return the models, largest first; the largest is written as number 0."""
-    model, working = root / _MODEL, root / "mapping"
-    if (model / "0").is_dir():
-        found = [pycolmap.Reconstruction(path) for path in model.iterdir()]
-        return sorted(found, key=lambda m: -m.num_reg_images())
-    shutil.rmtree(working, ignore_errors=True)  # of an interrupted call
-    (working / _MODEL).mkdir(parents=True)
-    done = itertools.count(1)
+    working, done = root / "mapping", itertools.count(1)
+    working.mkdir()
     on_step("mapping", 0, count)
     found = pycolmap.incremental_mapping(
-        root / _DATABASE,
+        root / "database.db",
         root / "images",
         working,
         next_image_callback=lambda: on_step("mapping", min(next(done), count), count),
     )
     on_step("mapping", count, count)
+    shutil.rmtree(working)
     models = sorted(found.values(), key=lambda m: -m.num_reg_images())
     for number, item in enumerate(models):
-        folder = working / _MODEL / str(number)
-        folder.mkdir()
+        folder = root / "sparse" / str(number)
+        folder.mkdir(parents=True)
         item.write(folder)
-    if models:
-        os.replace(working / _MODEL, model)
-    shutil.rmtree(working)
     return models

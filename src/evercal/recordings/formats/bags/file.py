@@ -28,6 +28,10 @@ class Message:
     content: Any
     """Fields as rosbags decodes them."""
 
+    def seconds(self, header: Any, zero_ns: int) -> float:
+        """Time of a header after `zero_ns`; that of recording if it is not set."""
+        return ((stamp_ns(header.stamp) or self.logged_ns) - zero_ns) * 1e-9
+
 
 class BagFile:
     """A bag that stays open until nothing refers to it.
