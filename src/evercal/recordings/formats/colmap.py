@@ -1,12 +1,8 @@
 """COLMAP models (Schönberger and Frahm, CVPR 2016), read by pycolmap (extra `colmap`).
 
-    ROOT/sparse/0/cameras.bin, images.bin, points3D.bin    or .txt, or ROOT itself, or ROOT/0
-    ROOT/images/...
-
 COLMAP states camera_from_world, and its pixel (0.5, 0.5) is the centre of the top-left pixel, which
-is (0, 0) here. The base frame and the unit of length are the model's own. Images without a pose
-count as untracked, including files beside the images of the model. Of several models in one folder,
-the one with the most images is read.
+is (0, 0) here. Images without a pose count as untracked, including files beside the images of the
+model. Of several models in one folder, the one with the most images is read.
 """
 
 import os
@@ -166,7 +162,6 @@ def _base_from_camera(folder: Path, image: Any) -> SE3:
 
 
 def _image_folder(root: Path, folder: Path, names: list[str]) -> Path:
-    """The folder that holds all images."""
     beside = (parent / "images" for parent in folder.resolve().parents[:3])
     for candidate in (root / "images", root, *beside):
         if all((candidate / name).is_file() for name in names):

@@ -191,7 +191,6 @@ def _parquet(path: Path) -> Any:
 
 
 def _columns(file: Path, names: list[str]) -> list[list[Any]]:
-    """Columns of a table."""
     parquet = _parquet(file)
     try:
         table = parquet.read_table(file, columns=names)

@@ -1,15 +1,9 @@
 """Gripper poses of a LeRobot dataset, from the features of its tables.
 
-A pose is one of the following:
-
-- a feature with the names x, y, z and qx, qy, qz, qw, or wx, wy, wz for a rotation vector (`ee.x`
-  and `x` alike), in metres and radians;
-- the first numbers of observation.state or another feature, in a convention that the user gives;
-- with a URDF, the joints of observation.state (`elbow.pos` is the joint elbow), in radians, or in
-  degrees with the convention deg.
-
-`--gripper-frame` selects the feature if several hold poses, or the arm, such as left_ee, if one
-feature holds left_ee.x and right_ee.x.
+A pose is a feature whose names end in x, y, z and qx, qy, qz, qw, or wx, wy, wz for a rotation
+vector; the first numbers of a feature in a convention that the user gives; or, with a URDF, the
+joints of observation.state. `--gripper-frame` selects the feature if several hold poses, or the
+arm, such as left_ee, if one feature holds left_ee.x and right_ee.x.
 """
 
 from collections.abc import Mapping

@@ -1,9 +1,7 @@
-"""A plain folder: images, and the gripper pose at each, see docs/formats.md.
+"""A plain folder: images, and the gripper pose or joint angles at each, see docs/formats.md.
 
-Poses are in base_from_gripper.csv, .json, .npy, .npz, .tum or .txt, or in joints.csv or joints.json
-with a URDF. Rows are paired with images by name, by time or in order. Images with a pose become
-training frames with base_from_gripper; gripper_from_camera is unknown. All images come from one
-camera.
+Images with a pose become training frames with base_from_gripper; gripper_from_camera is unknown.
+All images come from one camera.
 """
 
 import os

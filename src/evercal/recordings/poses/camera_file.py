@@ -1,10 +1,8 @@
 """Camera files: a 3x3 matrix, JSON, YAML, NPZ, ROS camera_info, OpenCV's FileStorage.
 
-The content decides the kind, not the file ending. Fields of JSON, YAML and NPZ have the names of
-OpenCV (`camera_matrix`, `dist_coeffs`), of ROS (`K`, `D`), of RealSense (`fx`, `ppx`, `coeffs`) or
-of evercal's own JSON. Of ROS, both calibration files and printed messages (`ros2 topic echo --once
-.../camera_info`) are read, with the matrix K and D of the raw image. In all kinds, pixel (0, 0) is
-the centre of the top-left pixel, and images are upright.
+The content decides the kind, not the file ending; docs/formats.md lists the names of the fields. Of
+ROS, both calibration files and printed messages are read, with the matrix K and D of the raw image.
+In all kinds, pixel (0, 0) is the centre of the top-left pixel, and images are upright.
 """
 
 import json

@@ -3,7 +3,7 @@
 A convention defines order, units and rotation of the numbers. Its name may be followed by
 modifiers: `kuka:m` (KUKA's angles, but metres), `matrix:inverse` (gripper_from_base),
 `matrix:opengl` (camera axes x right, y up, z back). Units in the name are final, units that a
-convention only implies are checked against the numbers. docs/formats.md has the same tables.
+convention only implies are checked against the numbers.
 
 The conventions were checked against Roboception's documentation of pose formats (ABB, FANUC, KUKA,
 Yaskawa), Universal Robots' script manual, RoboDK's converters (Staubli) and libfranka's reference.

@@ -1,8 +1,7 @@
 """Gripper poses from joint angles and a URDF.
 
 A CSV table has a column for each joint of the URDF; JSON has `joint_names` and `positions`. Values
-are radians, or degrees if a name ends in `_deg`, and metres for prismatic joints. Rows are labelled
-with images or times, or are in the order of the images.
+are radians, or degrees if a name ends in `_deg`, and metres for prismatic joints.
 """
 
 from collections.abc import Sequence
@@ -81,16 +80,10 @@ def in_radians(
 def interpolate(
     times_s: NDArray[np.float64], positions: NDArray[np.float64], stamps_s: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Interpolate the position of one joint at (m,) seconds.
+    """Interpolate (n,) positions of a joint at (m,) seconds; jumps by full rotations are removed.
 
-    Args:
-        times_s: (n,) times of the positions, in any order.
-        positions: (n,) radians or metres; jumps by full rotations are removed.
-        stamps_s: (m,) seconds.
-
-    Returns:
-        (m,) positions and (m,) whether each is valid: between the ends, and not in a gap of more
-        than `MAX_GAP_S` over which the joint moved.
+    The second array tells whether each is valid: between the ends, and not in a gap of more than
+    `MAX_GAP_S` over which the joint moved.
     """
     times, first = np.unique(times_s, return_index=True)
     values = np.unwrap(positions[first])

@@ -145,7 +145,6 @@ class RobotModel:
         return notes
 
     def _ancestors(self, link: str) -> list[Any]:
-        """Joints from a link up to the root."""
         if link not in self.links:
             raise InputError(
                 f"{self.path}: has no link {link!r}; its links are {', '.join(self.links)}"

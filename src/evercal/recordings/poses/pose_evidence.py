@@ -190,7 +190,6 @@ def _sentence(frame: str, error: float, errors: dict[str, float], pairs: int, be
 
 
 def _error_deg(measured: Array, stated: Array) -> float:
-    """Median angle between rotations, degrees."""
     difference = Rotation.from_rotvec(measured).inv() * Rotation.from_rotvec(stated)
     return float(np.rad2deg(np.median(difference.magnitude())))
 

@@ -1,9 +1,7 @@
 """Pose files: a table (CSV, TUM, text), JSON, NPY or NPZ, in a named convention.
 
-JSON is a list of objects with `translation_m` and `quaternion_wxyz`, with `matrix`, or with numbers
-named like the columns of a table. It may also be a list of lists of numbers, as NPY and NPZ. Poses
-and lists of names or times may stand under keys. A convention is required if the file does not
-define the meaning of its numbers. docs/formats.md has examples.
+A convention is required if the file does not define the meaning of its numbers. docs/formats.md
+has examples of all kinds.
 """
 
 import json
@@ -216,7 +214,6 @@ def _flat(entry: Mapping[str, Any]) -> dict[str, object]:
 
 
 def _pose_key(data: Mapping[str, Any]) -> str:
-    """The only key of poses."""
     keys = [key for key in data if key in _KEYS]
     for key in () if keys else data:
         with suppress(ValueError):  # ragged

@@ -9,7 +9,6 @@ any name. In JSON lists beside the poses, names are in the plural: `images`, `st
 import io
 import re
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
@@ -92,14 +91,11 @@ def table_cells(lines: Sequence[str]) -> NDArray[np.str_]:
 
 def cell_numbers(cells: NDArray[np.str_], words: Sequence[str] = ()) -> Array:
     """Convert cells (n, k) to finite numbers; ValueError names the first other cell."""
-    with suppress(ValueError):
-        if np.isfinite(numbers := cells.astype(np.float64)).all():
-            return numbers
     for (row, column), cell in np.ndenumerate(cells):
         if not is_number(cell) or not np.isfinite(float(cell)):
-            break
-    name = repr(words[column]) if words else column + 1
-    raise ValueError(f"row {row + 1}, column {name}: {str(cell)!r} is not a finite number")
+            name = repr(words[column]) if words else column + 1
+            raise ValueError(f"row {row + 1}, column {name}: {str(cell)!r} is not a finite number")
+    return cells.astype(np.float64)
 
 
 def name_and_unit(cell: str) -> tuple[str, str | None]:
@@ -139,7 +135,6 @@ def row_labels(
 
 
 def _image_column(words: Sequence[str], columns: Sequence[Sequence[object]]) -> int | None:
-    """The only column with nothing but names of image files."""
     files = [
         i
         for i, column in enumerate(columns)

@@ -142,7 +142,6 @@ class TfTree:
         return PoseTrack(np.array(stamps), poses).at(stamps_s)
 
     def _chain(self, frame: str) -> list[str]:
-        """A frame and its ancestors up to the root."""
         chain = [frame]
         while chain[-1] in self._edges:
             parent = self._edge(chain[-1]).transforms[0].parent
