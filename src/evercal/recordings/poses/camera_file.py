@@ -88,6 +88,8 @@ def camera_from_fields(data: Mapping[str, Any], size: tuple[int, int] | None = N
     roi = data.get("roi")
     if isinstance(roi, dict) and any(roi.get(key) for key in ("x_offset", "y_offset")):
         raise ValueError(f"the image is a cut-out (roi {roi}); give the whole image's camera_info")
+    if fields.get("fisheyemodel"):
+        raise ValueError("fisheye_model is set; rectify the images or calibrate without it")
     matrix = _matrix(fields, data)
     width, height = _size(fields, data, None if ros else size)
     distortion = _distortion(fields, data, ros)
@@ -111,18 +113,20 @@ def _fields_of(path: Path) -> Mapping[str, Any]:
     if zipped:
         return arrays_as_lists(path)
     text = read_text(path, "camera file")
+    if "<opencv_storage" in text:
+        return _xml_of_opencv(text)
+    words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
+    if all(map(is_number, words)):
+        if len(words) != 9:
+            raise ValueError(f"{len(words)} numbers, a 3x3 matrix has 9; {_EXPECTED}")
+        return {"camera_matrix": [float(word) for word in words]}
     try:
-        if text.startswith("%YAML:") or "opencv-matrix" in text or "<opencv_storage" in text:
-            return _stored_by_opencv(text)
-        words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
-        if all(map(is_number, words)):
-            if len(words) != 9:
-                raise ValueError(f"{len(words)} numbers, a 3x3 matrix has 9; {_EXPECTED}")
-            return {"camera_matrix": [float(word) for word in words]}
         if text.lstrip().startswith("{"):
             return json.loads(text)
+        # OpenCV's %YAML:1.0 is not valid YAML. cv2.FileStorage can end the process on such files.
+        plain = re.sub(r"^%.*$|!!opencv-[a-z-]+", "", text, flags=re.MULTILINE)
         # A printed message ends with '---', which opens a second, empty document.
-        data = next(yaml.safe_load_all(text), None)
+        data = next(yaml.safe_load_all(plain), None)
     except json.JSONDecodeError as error:
         raise ValueError(f"not valid JSON ({error}); {_EXPECTED}") from None
     except yaml.YAMLError as error:
@@ -132,35 +136,8 @@ def _fields_of(path: Path) -> Mapping[str, Any]:
     return data
 
 
-def _stored_by_opencv(text: str) -> dict[str, Any]:
-    """Matrices and numbers of a cv2.FileStorage.
-
-    Read without OpenCV, whose parser of such files can end the whole process on a damaged one.
-    """
-    if text.lstrip().startswith("{"):
-        found = json.loads(text)
-    elif "<opencv_storage" in text:
-        found = _xml_of_opencv(text)
-    else:
-        import yaml
-
-        lines = text.splitlines()  # the first one, %YAML:1.0, is not valid YAML
-        plain = "\n".join(line for line in lines if not line.startswith("%"))
-        found = yaml.safe_load(re.sub(r"!!opencv-[a-z-]+", "", plain))
-    if not isinstance(found, dict):
-        raise ValueError(f"no camera in it; {_EXPECTED}")
-    values = {
-        str(key): float(value) if isinstance(value, str) and is_number(value) else value
-        for key, value in found.items()
-        if isinstance(value, dict | int | float) or is_number(str(value))
-    }
-    if values.get("fisheye_model"):
-        raise ValueError("fisheye_model is set; rectify the images or calibrate without it")
-    return values
-
-
-def _xml_of_opencv(text: str) -> dict[str, object]:
-    """Texts of the elements, and numbers of the matrices."""
+def _xml_of_opencv(text: str) -> dict[str, Any]:
+    """Texts of the elements, and numbers of the matrices, of a cv2.FileStorage."""
     from xml.etree import ElementTree
 
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can expand without bound
@@ -169,11 +146,13 @@ def _xml_of_opencv(text: str) -> dict[str, object]:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise ValueError(f"not valid XML ({error}); {_EXPECTED}") from None
-    found: dict[str, object] = {}
+    found: dict[str, Any] = {}
     for element in root:
-        data = element.find("data")
-        words = "" if data is None else data.text or ""
-        found[element.tag] = element.text if data is None else {"data": words.split()}
+        data, word = element.find("data"), element.text or ""
+        if data is not None:
+            found[element.tag] = {"data": (data.text or "").split()}
+        elif is_number(word):
+            found[element.tag] = float(word)
     return found
 
 
