@@ -20,6 +20,7 @@ from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS
 from evercal.recordings.poses.row_files import natural_key
 from evercal.recordings.read_options import ReadOptions
+from evercal.recordings.text_files import named_errors
 
 USES = ("metres",)
 
@@ -145,20 +146,16 @@ def _camera(folder: Path, camera: Any) -> Camera:
     # Half a pixel: COLMAP counts from the image's corner.
     pinhole = p[fx], p[fy], p[cx] - 0.5, p[cy] - 0.5
     coefficients = tuple(0.0 if i is None else float(p[i]) for i in distortion)
-    try:
+    with named_errors(folder, "COLMAP model"):
         return Camera(int(camera.width), int(camera.height), *pinhole, coefficients)
-    except ValueError as error:
-        raise InputError(f"{folder}: {error}") from None
 
 
 def _base_from_camera(folder: Path, image: Any) -> SE3:
     camera_from_world: Any = image.cam_from_world
     if callable(camera_from_world):  # a method since pycolmap 3.12
         camera_from_world = camera_from_world()
-    try:
+    with named_errors(folder / image.name, "pose"):
         return SE3.from_matrix(np.asarray(camera_from_world.matrix())).inverse()
-    except ValueError as error:
-        raise InputError(f"{folder}: image {image.name}: {error}") from None
 
 
 def _image_folder(root: Path, folder: Path, names: list[str]) -> Path:

@@ -173,11 +173,8 @@ def _video_starts(
 
 
 def _video_path(root: Path, info: Mapping[str, Any], key: str, numbers: dict[str, int]) -> Path:
-    try:
-        path = str(info["video_path"]).format(video_key=key, **numbers)
-        return root / path_inside(path, "'video_path'")
-    except (KeyError, IndexError, AttributeError, ValueError) as error:
-        raise InputError(f"{root / INFO}: unusable 'video_path': {error}") from None
+    path = str(info["video_path"]).format(video_key=key, **numbers)
+    return root / path_inside(path, "'video_path'")
 
 
 def _parquet(path: Path) -> Any:
