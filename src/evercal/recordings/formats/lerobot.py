@@ -124,7 +124,8 @@ def _rows(root: Path, column: str) -> tuple[list[_Row], NDArray[np.float64]]:
     parts = []
     for file in files:
         *cells, poses = _columns(file, ["episode_index", "frame_index", "timestamp", column])
-        rows += [_Row(*row, file, i) for i, row in enumerate(zip(*cells, strict=True))]
+        for i, (episode, number, seconds) in enumerate(zip(*cells, strict=True)):
+            rows.append(_Row(episode, number, seconds, file, i))
         values = np.empty(0)
         with suppress(TypeError, ValueError):
             values = np.array(poses, dtype=np.float64)

@@ -70,7 +70,7 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
             width, height = image_size(_image(root, str(first["file_path"])))
             data |= {"w": width, "h": height}
         frames = [_frame(root, data, i, entry, undo, scale) for i, entry in enumerate(entries)]
-        test = _test_images(root, data, {frame.image for frame in frames})
+        test = _test_images(root, data, {str(frame.image) for frame in frames})
     repeated = first_repeated([frame.name for frame in frames])
     if repeated is not None:
         raise InputError(f"{file}: {repeated!r} comes twice; keep one entry for each image")
@@ -144,8 +144,8 @@ def _camera(data: Mapping[str, object]) -> Camera:
     # Half a pixel: the file counts from the image's corner.
     cx, cy = _number(data, "cx", width / 2) - 0.5, _number(data, "cy", height / 2) - 0.5
     distortion = tuple(_number(data, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
-    numbers: Any = width, height  # whole numbers, checked when constructed
-    return Camera(*numbers, fx, fy, cx, cy, distortion)
+    size: Any = width, height  # whole numbers, checked when constructed
+    return Camera(size[0], size[1], fx, fy, cx, cy, distortion)
 
 
 def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:
@@ -188,14 +188,14 @@ def _scaled(frame: Frame, sizes: Mapping[tuple[int, int], tuple[int, int]]) -> F
     return frame if size == stated else replace(frame, camera=frame.camera.resized(*size))
 
 
-def _test_images(root: Path, data: Mapping[str, object], images: Container[object]) -> set[Path]:
+def _test_images(root: Path, data: Mapping[str, object], images: Container[str]) -> set[Path]:
     test: set[Path] = set()
     for key in ("val_filenames", "test_filenames"):
         names = data.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError(f"{key!r} is a list of file names")
         # A test frame under another name would be learned from.
-        other = [name for name in names if _image(root, name) not in images]
+        other = [name for name in names if str(_image(root, name)) not in images]
         if other:
             raise ValueError(f"{key!r} names {other[0]!r}, which is no frame; correct the name")
         test |= {_image(root, name) for name in names}
