@@ -1,7 +1,7 @@
-"""Text and JSON files that a user names."""
+"""Text and JSON files that a user names, and their errors."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -42,3 +42,13 @@ def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str
     if not isinstance(data, dict):
         raise InputError(f"{path}: holds no JSON object; {remedy}")
     return data
+
+
+def first_repeated(names: Sequence[str]) -> str | None:
+    """The first name that came before."""
+    known: set[str] = set()
+    for name in names:
+        if name in known:
+            return name
+        known.add(name)
+    return None

@@ -17,8 +17,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, write_image
-from evercal.recordings.poses.row_files import first_repeated
-from evercal.recordings.text_files import named_errors, read_json
+from evercal.recordings.text_files import first_repeated, named_errors, read_json
 from evercal.storage import write_json
 
 FILE = "scene.json"

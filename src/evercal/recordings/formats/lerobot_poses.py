@@ -24,8 +24,8 @@ from evercal.recordings.poses.conventions import (
 )
 from evercal.recordings.poses.joint_states import in_radians
 from evercal.recordings.poses.kinematics import RobotModel
-from evercal.recordings.poses.row_files import first_repeated
 from evercal.recordings.read_options import ReadOptions
+from evercal.recordings.text_files import first_repeated
 
 _STATE = "observation.state"
 # Names of the numbers of a pose, by convention.

@@ -21,9 +21,8 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, image_size
-from evercal.recordings.poses.row_files import first_repeated
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import named_errors, read_json
+from evercal.recordings.text_files import first_repeated, named_errors, read_json
 
 FILE = "transforms.json"
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")

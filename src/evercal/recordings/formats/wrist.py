@@ -18,6 +18,7 @@ from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, read_rows
 from evercal.recordings.read_options import ReadOptions, flag
+from evercal.recordings.text_files import first_repeated
 
 USES = ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention")
 _POSES = tuple(
@@ -120,7 +121,7 @@ def _stamps(root: Path) -> dict[str, float] | None:
     if rows.names is None or rows.stamps_s is None:
         raise InputError(f"{file}: needs the columns image and stamp_s")
     names = [PurePath(name).name for name in rows.names]
-    repeated = [name for i, name in enumerate(names) if name in names[:i]]
-    if repeated:
-        raise InputError(f"{file}: {repeated[0]!r} comes twice; give every image one time")
+    repeated = first_repeated(names)
+    if repeated is not None:
+        raise InputError(f"{file}: {repeated!r} comes twice; give every image one time")
     return dict(zip(names, rows.stamps_s.tolist(), strict=True))

@@ -33,11 +33,10 @@ from evercal.recordings.poses.pose_table import (
 from evercal.recordings.poses.row_files import (
     Names,
     arrays_as_lists,
-    first_repeated,
     number_array,
     row_labels,
 )
-from evercal.recordings.text_files import named_errors, read_text
+from evercal.recordings.text_files import first_repeated, named_errors, read_text
 
 _KEYS = ("poses", "base_from_gripper", "camera_from_board", "T", "transforms", "matrices")
 """Keys of poses in JSON and NPZ."""

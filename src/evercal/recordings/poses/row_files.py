@@ -195,16 +195,6 @@ def is_number(cell: object) -> bool:
     return True
 
 
-def first_repeated(names: Sequence[str]) -> str | None:
-    """The first name that came before."""
-    known: set[str] = set()
-    for name in names:
-        if name in known:
-            return name
-        known.add(name)
-    return None
-
-
 def times_in_names(names: Sequence[str]) -> Array | None:
     """(n,) seconds if the image names are times, else None.
 
