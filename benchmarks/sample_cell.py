@@ -16,8 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evercal.geometry import SE3
-from evercal.recordings import generic
+from evercal.geometry import SE3, pose_to_dict
 from evercal.recordings.images import write_jpeg
 from evercal.simulation.box_room import default_camera, look_at
 from evercal.simulation.panda_arm import base_from_flange
@@ -78,9 +77,9 @@ def render_sample_cell(out: Path) -> None:
     write_json(
         out / "truth.json",
         {
-            "gripper_from_camera": generic.pose_to_dict(gripper_from_camera),
-            "base_from_camera": generic.pose_to_dict(tripod),
-            "base_from_bumped_camera": generic.pose_to_dict(bumped),
+            "gripper_from_camera": pose_to_dict(gripper_from_camera),
+            "base_from_camera": pose_to_dict(tripod),
+            "base_from_bumped_camera": pose_to_dict(bumped),
             "gripper_noise_m": NOISE_M,
             "gripper_noise_rad": float(NOISE_RAD),
             "seed": _SEED,

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.recordings import Frame, generic
 from evercal.recordings.images import write_jpeg
 from evercal.simulation.box_room import default_camera
@@ -220,7 +220,7 @@ def _calibrations(before: Room, seed: int, folder: Path) -> list[tuple[Path, lis
     hand = _hand_shots(before, gripper_from_camera, seed)
     folder.mkdir(parents=True, exist_ok=True)
     truth = {"gripper_from_camera": gripper_from_camera, "fixed_camera_from_bumped_camera": bump}
-    poses = {name: generic.pose_to_dict(pose) for name, pose in truth.items()}
+    poses = {name: pose_to_dict(pose) for name, pose in truth.items()}
     write_json(folder / "truth.json", poses)
     return [
         (folder / "fixed", fixed),

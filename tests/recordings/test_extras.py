@@ -16,7 +16,7 @@ from evercal.recordings.poses.kinematics import RobotModel
 @pytest.mark.parametrize(
     ("module", "extra", "read"),
     [
-        ("pycolmap", "colmap", colmap.load),
+        ("pycolmap", "colmap", colmap._model),
         ("rosbags.highlevel", "bags", BagFile),
         ("yourdfpy", "urdf", RobotModel),
         ("pyarrow.parquet", "lerobot", lerobot._parquet),

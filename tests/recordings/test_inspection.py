@@ -5,7 +5,7 @@ import pytest
 
 from evercal.geometry import SE3, Camera
 from evercal.recordings import Frame, Recording
-from evercal.recordings.inspection import inspect_recording, rotation_shares
+from evercal.recordings.inspection import inspect_recording
 from evercal.simulation.box_room import BoxRoom, look_at
 
 LENS = Camera(32, 24, 26, 26, 15.5, 11.5)
@@ -60,26 +60,3 @@ def test_planted_faults_are_reported() -> None:
         ((26, 40, 15.5, 11.5), "square pixels"),
     ):
         assert message in warned(recording_of(TRAIN, TEST, Camera(32, 24, *lens)))
-
-
-def test_other_conventions_are_reported() -> None:
-    for shift in (1, -1):
-        wrong = SE3(np.roll(TRAIN.rotation_wxyz, shift, axis=1), TRAIN.translation_m)
-        assert "w x y z" in warned(recording_of(wrong, TEST))
-    assert "not their inverse" in warned(recording_of(TRAIN.inverse(), TEST))
-    body = np.eye(4)
-    body[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]  # camera_from_body, x forward and z up
-    assert "forward" in warned(recording_of(TRAIN @ SE3.from_matrix(body), TEST))
-
-
-def test_rotation_is_attributed_to_axes() -> None:
-    eye, angles = np.zeros(3), np.linspace(0, 6, 100)
-    pan = [look_at(eye, np.array([np.cos(a), np.sin(a), 0.0])) for a in angles]
-    np.testing.assert_allclose(rotation_shares(SE3.stack(pan)), (0, 1, 0), atol=1e-9)
-    # Looking down by 45 deg, half of a pan is a roll: no reason for a warning.
-    down = [look_at(eye, np.array([np.cos(a), np.sin(a), -1.0])) for a in angles]
-    np.testing.assert_allclose(rotation_shares(SE3.stack(down)), (0, 0.5, 0.5), atol=1e-9)
-    roll = [look_at(eye, np.array([1.0, 0, 0]), a) for a in angles]
-    np.testing.assert_allclose(rotation_shares(SE3.stack(roll)), (0, 0, 1), atol=1e-9)
-    leaps = SE3.stack([pose for i in range(10) for pose in (pan[i], roll[50 + i])])
-    assert rotation_shares(leaps) == (1 / 3, 1 / 3, 1 / 3)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
+from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg, pose_to_dict
 from evercal.live.coverage import sharpness
-from evercal.recordings import generic, load_recording, read_robot_poses
+from evercal.recordings import load_recording, read_robot_poses
 from evercal.simulation.cell_recording import record_cell
 from evercal.simulation.cell_room import TABLE_M, cell_room
 from evercal.simulation.panda_arm import (
@@ -123,7 +123,7 @@ def test_a_recording_is_read_back_and_states_its_truth_apart(tmp_path: Path) -> 
     assert len(read_robot_poses(out / "reachable.csv").poses) == 200
     truth = json.loads((out / "truth.json").read_text())
     cell = VirtualCell(6, SMALL)
-    assert truth["gripper_from_camera"] == generic.pose_to_dict(cell.truth.gripper_from_camera)
+    assert truth["gripper_from_camera"] == pose_to_dict(cell.truth.gripper_from_camera)
     mount = cell.truth.gripper_from_camera
     millimetres, degrees = pose_distance_mm_deg(mount, nominal_mount())
     assert 1 < millimetres < 40

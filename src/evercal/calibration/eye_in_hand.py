@@ -18,7 +18,7 @@ from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance_mm_deg
 from evercal.mapping.build import Adjusted, BuiltMap, OnProgress
 from evercal.recordings.frame import Recording
-from evercal.recordings.held_out import lacks_camera_poses as lacks_camera_poses
+from evercal.recordings.frame import lacks_camera_poses as lacks_camera_poses
 
 MOST_FOCAL_PERCENT, MOST_POSE_SIGMA_MM = 1.0, 5.0
 """Larger corrections indicate systematic errors, which the covariance does not contain."""

@@ -18,8 +18,8 @@ _CONNECTED = 0.8
 class Reconstruct:
     """Estimate camera poses from a plain video or images, to learn a map from.
 
-    The unit of length is arbitrary until 'evercal align'. The same command continues where it was
-    stopped. Exit code 1 if less than 80 % of the frames connect.
+    The unit of length is arbitrary until 'evercal align'. Exit code 1 if less than 80 % of the
+    frames connect.
 
     Example: evercal reconstruct phone.mp4 capture/
     """

@@ -194,6 +194,16 @@ class SE3:
         return Rotation.from_quat(self.rotation_wxyz, scalar_first=True)
 
 
+def pose_to_dict(pose: SE3 | None) -> dict[str, object] | None:
+    """Single transform as plain numbers for JSON, metres and wxyz; None stays None."""
+    if pose is None:
+        return None
+    return {
+        "translation_m": pose.translation_m.tolist(),
+        "quaternion_wxyz": pose.rotation_wxyz.tolist(),
+    }
+
+
 def pose_distance(a: SE3, b: SE3) -> tuple[Array, Array]:
     """Distance between transforms into the same frame.
 

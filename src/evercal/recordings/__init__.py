@@ -19,7 +19,6 @@ from evercal.recordings.images import write_image as write_image
 
 if TYPE_CHECKING:
     from evercal.recordings.formats import generic as generic
-    from evercal.recordings.formats.sfm_poses import with_sfm_poses as with_sfm_poses
     from evercal.recordings.load import FORMATS as FORMATS
     from evercal.recordings.load import Format as Format
     from evercal.recordings.load import load_recording as load_recording
@@ -34,7 +33,6 @@ _LOADED_ON_USE = {
     "RobotPoses": "poses.robot_poses",
     "load_recording": "load",
     "read_robot_poses": "poses.robot_poses",
-    "with_sfm_poses": "formats.sfm_poses",
     "generic": "formats.generic",
 }
 

@@ -34,11 +34,7 @@ def split_held_out(frames: Sequence[Frame]) -> HeldOutSplit:
 
 
 def named_recording(recording: Recording, name: str | None, taken: Iterable[str]) -> Recording:
-    """A recording under the name that its scene will have; its own name by default.
-
-    Raises:
-        InputError: A name that is among the names `taken`, or that is no single word of a path.
-    """
+    """A recording under the name that its scene will have; its own name by default."""
     name = checked_name(recording.name if name is None else name)
     if name in taken:
         raise InputError(f"scene {name!r}: a scene of this name exists; give another with --name")
@@ -46,11 +42,7 @@ def named_recording(recording: Recording, name: str | None, taken: Iterable[str]
 
 
 def checked_name(name: str) -> str:
-    """A name that a scene can have.
-
-    Raises:
-        InputError: A name that is no single word of a path.
-    """
+    """A name that a scene can have."""
     if not name.strip() or name.startswith(".") or re.search(r"[/\\=\x00-\x1f]", name):
         raise InputError(
             f"scene name {name!r}: give one that is not empty, does not begin with a dot and holds"
@@ -60,19 +52,9 @@ def checked_name(name: str) -> str:
 
 
 def require_frames(recording: Recording, least: int = MIN_TRAIN_FRAMES) -> None:
-    """Refuse a recording with too few training frames.
-
-    Raises:
-        InputError: Fewer than `least`.
-    """
+    """Refuse a recording with too few training frames."""
     if len(recording.train) < least:
         raise InputError(
             f"scene {recording.name!r}: {len(recording.train)} training frames are too few; give at"
             f" least {least}"
         )
-
-
-def lacks_camera_poses(recording: Recording) -> bool:
-    """Whether a recording states gripper poses but no camera poses."""
-    stated = any(frame.base_from_camera is not None for frame in recording.train)
-    return not stated and any(frame.base_from_gripper is not None for frame in recording.train)

@@ -10,11 +10,7 @@ from evercal.recordings.poses.row_files import natural_key
 
 
 def image_files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
-    """Image files; a folder stands for its images, image-2 before image-10.
-
-    Raises:
-        InputError: No path, a file that is missing, or a folder without images.
-    """
+    """Image files; a folder stands for its images, image-2 before image-10."""
     if not paths:
         raise InputError("no image given; name one or more image files or a folder")
     files: list[Path] = []

@@ -19,11 +19,7 @@ class StoredImage(ABC):
 
     @abstractmethod
     def read(self) -> NDArray[np.uint8]:
-        """Decode the image to (H, W, 3) uint8 RGB.
-
-        Raises:
-            InputError: The image cannot be read or decoded.
-        """
+        """Decode the image to (H, W, 3) uint8 RGB."""
 
     def file(self) -> tuple[str, bytes] | None:
         """Ending and content of the image file, or None if the image is not stored as a file."""
@@ -139,10 +135,6 @@ def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Width and height in pixels of an image file, turned upright as by `read_image`.
-
-    Raises:
-        InputError: As `read_image`.
-    """
+    """Width and height in pixels of an image file, turned upright as by `read_image`."""
     height, width = read_image(path).shape[:2]
     return width, height

@@ -1,7 +1,7 @@
 """Summary and plausibility checks of a recording."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -18,11 +18,8 @@ SAME_M, SAME_DEG = 0.001, 0.1
 LARGEST_EXTENT_M = 100.0
 LARGEST_STEP_M = 0.5
 SMALLEST_EXTENT_M = 0.05
-LEAST_ROTATION_DEG = 60.0
-LARGEST_ROTATION_STEP_DEG = 30.0
 LARGEST_REACH_M = 5.0
 MOST_CAMERAS_LISTED = 4
-LARGEST_PITCH_SHARE, LARGEST_ROLL_SHARE = 0.6, 0.8
 
 
 @dataclass(frozen=True)
@@ -74,9 +71,12 @@ def inspect_recording(recording: Recording) -> Inspection:
         metres, radians = pose_distance(poses[:-1], poses[1:])
     extent = np.ptp(poses.translation_m, axis=0) if len(train) else np.zeros(3)
     untracked = recording.untracked + len(both) - len(train) - len(test)
-    warnings = [*_warn_frames(len(train), len(test), untracked, owner), *_warn_cameras(cameras)]
+    warnings = _warn_frames(len(train), len(test), untracked, owner)
+    warnings += [warning for camera in cameras for warning in _warn_camera(camera)]
     if metres is not None:
-        warnings += _warn_motion(poses, extent, float(np.median(metres)), owner == "camera")
+        warnings += _warn_motion(
+            poses, float(extent.max()), float(np.median(metres)), owner == "camera"
+        )
         warnings += rotation_warnings(train, poses, owner == "camera")
     if train and test:
         warnings += _warn_copies(train, test, poses, tested)
@@ -122,101 +122,73 @@ def _camera_line(camera: Camera, count: int) -> str:
     )
 
 
-def _warn_frames(train: int, test: int, untracked: int, owner: str) -> list[str]:
-    warnings = []
-    if train < MIN_TRAIN_FRAMES:
-        warnings.append(
-            f"{train} training frames with a pose; learning takes {MIN_TRAIN_FRAMES} or more"
-        )
-    if not test and owner != "gripper":
-        warnings.append("no test frame with a pose; 'evercal evaluate' has nothing to measure on")
-    total = train + test + untracked
-    if untracked > total / 2:
-        warnings.append(f"{untracked} of {total} frames have no pose; check the tracking")
-    return warnings
-
-
-def _warn_cameras(cameras: Counter[Camera]) -> list[str]:
-    warnings = []
-    for camera in cameras:
-        name = f"camera {camera.width}x{camera.height}"
-        middle = (camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height
-        view = np.rad2deg(2 * np.arctan(camera.width / (2 * camera.fx)))
-        if max(abs(share - 0.5) for share in middle) > 0.2:
-            warnings.append(
-                f"{name}: principal point ({camera.cx:.0f}, {camera.cy:.0f}) is far from the"
-                f" middle; are the intrinsics those of this image size?"
-            )
-        if not 20 < view < 150:
-            warnings.append(
-                f"{name}: sees {view:.0f} deg across; are the intrinsics those of this image size?"
-            )
-        if not 0.8 < camera.fx / camera.fy < 1.25:
-            warnings.append(
-                f"{name}: fx {camera.fx:.0f} and fy {camera.fy:.0f} differ; square pixels?"
-            )
-    return warnings
-
-
-def _warn_motion(poses: SE3, extent: np.ndarray, step: float, of_camera: bool) -> list[str]:
-    rotation_deg = np.rad2deg(pose_distance(poses[0], poses)[1].max())
-    reach = float(np.median(np.linalg.norm(poses.translation_m, axis=1)))
-    far = extent.max() > LARGEST_EXTENT_M
-    rotates = of_camera and rotation_deg > LEAST_ROTATION_DEG
-    about_x, _, about_z = rotation_shares(poses)
-    checks = [
-        (
-            reach > LARGEST_REACH_M and not of_camera,
-            f"the gripper is {reach:.1f} m from the robot's base, farther than arms reach; are the"
-            f" poses in millimetres?",
-        ),
-        (
-            extent.max() < SAME_M,
-            f"all training frames stand at one point, rotating by {rotation_deg:.0f} deg; a map"
-            f" takes views from several. Are the translations there, and in metres?",
-        ),
-        (
-            SAME_M <= extent.max() < SMALLEST_EXTENT_M,
-            f"the training camera moves by {100 * extent.max():.1f} cm only; points may get no"
-            f" depth. Are the translations in metres?",
-        ),
-        (
-            rotation_deg < SAME_DEG,
-            "all training frames look the same way; are the rotations missing?",
-        ),
-        (far, f"the camera moves over {extent.max():.0f} m; are the poses in millimetres?"),
-        (
-            step > LARGEST_STEP_M and of_camera and not far,
-            f"consecutive frames are {step:.2f} m apart; are they in recorded order and in metres?",
-        ),
-        (
-            rotates and about_x > LARGEST_PITCH_SHARE,
-            f"{100 * about_x:.0f} % of the rotation is a nod about the image's x axis; are"
-            f" quaternions in the order w x y z, and camera axes right, down, forward?",
-        ),
-        (
-            rotates and about_z > LARGEST_ROLL_SHARE,
-            f"{100 * about_z:.0f} % of the rotation is a roll about the viewing axis; are poses"
-            f" base_from_camera, not their inverse, and camera axes right, down, forward?",
-        ),
-    ]
+def _applying(checks: Iterable[tuple[bool, str]]) -> list[str]:
     return [warning for applies, warning in checks if applies]
 
 
-def rotation_shares(poses: SE3) -> tuple[float, float, float]:
-    """Shares of the camera's x, y and z axis in the rotation from frame to frame; their sum is 1.
+def _warn_frames(train: int, test: int, untracked: int, owner: str) -> list[str]:
+    total = train + test + untracked
+    too_few = f"{train} training frames with a pose; learning takes {MIN_TRAIN_FRAMES} or more"
+    untested = "no test frame with a pose; 'evercal evaluate' has nothing to measure on"
+    lost = f"{untracked} of {total} frames have no pose; check the tracking"
+    return _applying(
+        [
+            (train < MIN_TRAIN_FRAMES, too_few),
+            (not test and owner != "gripper", untested),
+            (untracked > total / 2, lost),
+        ]
+    )
 
-    A camera that is carried about mostly pans about its y axis. Inverted poses appear to roll, and
-    quaternions in another order or body axes (x forward) to nod. Jumps between recordings are
-    ignored. Without rotation, all shares are a third.
-    """
-    rotations = (poses[:-1].inverse() @ poses[1:]).log()[:, 3:]
-    small = np.linalg.norm(rotations, axis=1) < np.deg2rad(LARGEST_ROTATION_STEP_DEG)
-    squares = np.square(rotations[small]).sum(axis=0)
-    if squares.sum() < 1e-12:
-        return 1 / 3, 1 / 3, 1 / 3
-    x, y, z = (squares / squares.sum()).tolist()
-    return x, y, z
+
+def _warn_camera(camera: Camera) -> list[str]:
+    name = f"camera {camera.width}x{camera.height}"
+    middle = (camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height
+    view = np.rad2deg(2 * np.arctan(camera.width / (2 * camera.fx)))
+    size = "are the intrinsics those of this image size?"
+    far = f"principal point ({camera.cx:.0f}, {camera.cy:.0f}) is far from the middle; {size}"
+    uneven = f"fx {camera.fx:.0f} and fy {camera.fy:.0f} differ; square pixels?"
+    return _applying(
+        [
+            (max(abs(share - 0.5) for share in middle) > 0.2, f"{name}: {far}"),
+            (not 20 < view < 150, f"{name}: sees {view:.0f} deg across; {size}"),
+            (not 0.8 < camera.fx / camera.fy < 1.25, f"{name}: {uneven}"),
+        ]
+    )
+
+
+def _warn_motion(poses: SE3, extent: float, step: float, of_camera: bool) -> list[str]:
+    rotation_deg = np.rad2deg(pose_distance(poses[0], poses)[1].max())
+    reach = float(np.median(np.linalg.norm(poses.translation_m, axis=1)))
+    far = extent > LARGEST_EXTENT_M
+    return _applying(
+        [
+            (
+                reach > LARGEST_REACH_M and not of_camera,
+                f"the gripper is {reach:.1f} m from the robot's base, farther than arms reach; are"
+                f" the poses in millimetres?",
+            ),
+            (
+                extent < SAME_M,
+                f"all training frames stand at one point, rotating by {rotation_deg:.0f} deg; a map"
+                f" takes views from several. Are the translations there, and in metres?",
+            ),
+            (
+                SAME_M <= extent < SMALLEST_EXTENT_M,
+                f"the training camera moves by {100 * extent:.1f} cm only; points may get no"
+                f" depth. Are the translations in metres?",
+            ),
+            (
+                rotation_deg < SAME_DEG,
+                "all training frames look the same way; are the rotations missing?",
+            ),
+            (far, f"the camera moves over {extent:.0f} m; are the poses in millimetres?"),
+            (
+                step > LARGEST_STEP_M and of_camera and not far,
+                f"consecutive frames are {step:.2f} m apart; are they in recorded order and in"
+                f" metres?",
+            ),
+        ]
+    )
 
 
 def _warn_copies(

@@ -87,7 +87,6 @@ def load_recording(
 
 
 def _refuse_unused(format: str, options: ReadOptions) -> None:
-    """Raise for options that the format would silently ignore."""
     if options.every < 1:
         raise InputError(f"--every {options.every}: give a number >= 1")
     for name in options.given():

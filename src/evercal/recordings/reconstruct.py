@@ -1,19 +1,17 @@
 """`reconstruct`: camera poses from a plain video or images, by structure from motion (pycolmap).
 
     OUT/images/         chosen frames
-    OUT/frames.json     written when all frames are chosen
     OUT/database.db     features and matches
     OUT/sparse/0/       the model, read as a COLMAP recording
 
-Every finished step is kept, so the same call continues an interrupted one. The unit of length is
-arbitrary until the map is aligned.
+The unit of length is arbitrary until the map is aligned.
 """
 
-import json
+import itertools
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,6 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.recordings.images import write_image
 from evercal.recordings.streams import StreamFrame, stream
-from evercal.storage import write_json
 
 OnStep = Callable[[str, int, int], object]
 """Called with the name of the step, how much of it is done, and its total."""
@@ -31,7 +28,6 @@ OnStep = Callable[[str, int, int], object]
 _SMALL_PX = 320
 """Width of the copy in which motion and sharpness are measured."""
 _LEAST_FRAMES = 12
-_FRAMES, _DATABASE, _MODEL = "frames.json", "database.db", "sparse"
 
 
 @dataclass(frozen=True)
@@ -41,10 +37,10 @@ class ReconstructOptions:
     motion: float = 0.04
     """Median motion of corners from one chosen frame of a video to the next, parts of its width."""
     most_frames: int = 300
-    """Frames, at most; of more, every n-th is used."""
+    """Maximum number of frames; of more, every n-th is used."""
     exhaustive: int = 60
-    """Up to so many frames, every pair is matched. Of more, neighbours are, and for loops every
-    pair among so many frames spread over all."""
+    """Up to this many frames are matched exhaustively. Longer sequences are matched sequentially,
+    plus exhaustively on a subset of this size for loop closure."""
     camera_model: str = "OPENCV"
     """COLMAP's camera model, shared by all frames."""
 
@@ -75,7 +71,7 @@ def reconstruct(
 
     Args:
         source: Video file or folder.
-        out: New folder, or that of an interrupted call with the same source.
+        out: New or empty folder.
         options: How frames are chosen and matched.
         on_step: Called with the current step.
 
@@ -90,21 +86,7 @@ def reconstruct(
     options, root = options or ReconstructOptions(), Path(out)
     names = _chosen(str(source), root, options, on_step)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
-    database = root / _DATABASE
-    if not (root / "matched").exists():
-        database.unlink(missing_ok=True)
-        on_step("detecting features", 0, 1)
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = options.camera_model
-        mode = pycolmap.CameraMode.SINGLE
-        pycolmap.extract_features(
-            database, root / "images", camera_mode=mode, reader_options=reader
-        )
-        on_step("detecting features", 1, 1)
-        on_step("matching", 0, 1)
-        _match(pycolmap, root, names, options)
-        (root / "matched").touch()
-        on_step("matching", 1, 1)
+    _detect_and_match(pycolmap, root, names, options, on_step)
     models = _mapped(pycolmap, root, len(names), on_step)
     if not models:
         raise InputError(
@@ -123,16 +105,8 @@ def reconstruct(
 
 def _chosen(source: str, root: Path, options: ReconstructOptions, on_step: OnStep) -> list[str]:
     """Write the frames to reconstruct, and return their names."""
-    record, settings = root / _FRAMES, {"source": str(Path(source).resolve()), **asdict(options)}
-    if record.exists():
-        known = json.loads(record.read_text())
-        if known["settings"] != settings:
-            raise InputError(f"{root}: holds frames of {known['settings']['source']} with other"
-                             " options; give another folder")  # fmt: skip
-        return known["names"]
-    if root.exists() and any(p.name not in ("images", _DATABASE) for p in root.iterdir()):
+    if root.exists() and any(root.iterdir()):
         raise InputError(f"{root}: is not empty; give a new folder")
-    shutil.rmtree(root / "images", ignore_errors=True)  # of an interrupted call
     images = Path(source).is_dir()
     names = []
     for frame in stream(source) if images else _moving(stream(source), options.motion):
@@ -151,7 +125,6 @@ def _chosen(source: str, root: Path, options: ReconstructOptions, on_step: OnSte
             f"{source}: {len(keep)} frames to reconstruct, at least {_LEAST_FRAMES} are required;"
             " record longer, or move more"
         )
-    write_json(record, {"settings": settings, "names": keep})
     return keep
 
 
@@ -203,45 +176,47 @@ def _sharpness(grey: NDArray[np.uint8]) -> float:
     return float(cv2.Laplacian(grey, cv2.CV_64F).var())
 
 
-def _match(pycolmap: Any, root: Path, names: list[str], options: ReconstructOptions) -> None:
-    """Match frames: all pairs of few, else neighbours and, for loops, pairs of spread frames."""
+def _detect_and_match(
+    pycolmap: Any, root: Path, names: list[str], options: ReconstructOptions, on_step: OnStep
+) -> None:
+    """Match all pairs of few frames, else neighbours and, for loops, pairs of spread frames."""
+    database = root / "database.db"
+    on_step("detecting features", 0, 1)
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = options.camera_model
+    mode = pycolmap.CameraMode.SINGLE
+    pycolmap.extract_features(database, root / "images", camera_mode=mode, reader_options=reader)
+    on_step("detecting features", 1, 1)
+    on_step("matching", 0, 1)
     if len(names) <= options.exhaustive:
-        pycolmap.match_exhaustive(root / _DATABASE)
-        return
-    pycolmap.match_sequential(root / _DATABASE)
-    some = np.linspace(0, len(names) - 1, options.exhaustive).round().astype(int)
-    pairs = root / "pairs.txt"
-    lines = [f"{names[i]} {names[j]}" for a, i in enumerate(some) for j in some[a + 1 :]]
-    pairs.write_text("\n".join(lines) + "\n")
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = pairs
-    pycolmap.match_image_pairs(root / _DATABASE, pairing_options=pairing)
+        pycolmap.match_exhaustive(database)
+    else:
+        pycolmap.match_sequential(database)
+        spread = np.linspace(0, len(names) - 1, options.exhaustive).round().astype(int)
+        pairs = itertools.combinations([names[i] for i in spread], 2)
+        (root / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairs))
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = root / "pairs.txt"
+        pycolmap.match_image_pairs(database, pairing_options=pairing)
+    on_step("matching", 1, 1)
 
 
 def _mapped(pycolmap: Any, root: Path, count: int, on_step: OnStep) -> list[Any]:
     """Return the models, largest first; the largest is written as number 0."""
-    model = root / _MODEL
-    if (model / "0").is_dir():
-        found = [pycolmap.Reconstruction(path) for path in sorted(model.iterdir())]
-        return sorted(found, key=lambda m: -m.num_reg_images())
-    working, done = root / "mapping", iter(range(1, count + 1))
-    shutil.rmtree(working, ignore_errors=True)
+    working, done = root / "mapping", itertools.count(1)
     working.mkdir()
     on_step("mapping", 0, count)
     found = pycolmap.incremental_mapping(
-        root / _DATABASE,
+        root / "database.db",
         root / "images",
         working,
-        next_image_callback=lambda: on_step("mapping", next(done, count), count),
+        next_image_callback=lambda: on_step("mapping", min(next(done), count), count),
     )
     on_step("mapping", count, count)
-    models = sorted(found.values(), key=lambda m: -m.num_reg_images())
     shutil.rmtree(working)
-    shutil.rmtree(root / f".{_MODEL}", ignore_errors=True)  # of an interrupted call
+    models = sorted(found.values(), key=lambda m: -m.num_reg_images())
     for number, item in enumerate(models):
-        folder = root / f".{_MODEL}" / str(number)
-        folder.mkdir(parents=True, exist_ok=True)
+        folder = root / "sparse" / str(number)
+        folder.mkdir(parents=True)
         item.write(folder)
-    if models:
-        os.replace(root / f".{_MODEL}", model)
     return models

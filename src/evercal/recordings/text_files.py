@@ -1,33 +1,40 @@
-"""Text and JSON files that a user names."""
+"""Text and JSON files that a user names, and their errors."""
 
 import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from evercal.errors import InputError
 
 
-def read_text(path: Path, what: str, remedy: str = "check the path") -> str:
-    """Read a text file; `what` names its contents in messages.
+@contextmanager
+def named_errors(path: Path, what: str, remedy: str = "check the path") -> Iterator[None]:
+    """Turn errors while a file is read into an `InputError` that names it.
 
-    Raises:
-        InputError: The file is missing, cannot be read, or is not UTF-8.
+    `what` names the contents of the file. A ValueError is about the contents and already says what
+    is wrong with them.
     """
     try:
-        return path.read_text(encoding="utf-8-sig")
+        yield
     except FileNotFoundError:
         raise InputError(f"{path}: {what} is missing; {remedy}") from None
     except OSError as error:
         raise InputError(f"{path}: {what} cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: {what} is not a text file; {remedy}") from None
+    except (ValueError, TypeError, OverflowError, EOFError) as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def read_text(path: Path, what: str, remedy: str = "check the path") -> str:
+    """Read a UTF-8 text file; `what` names its contents in messages."""
+    with named_errors(path, what, remedy):
+        return path.read_text(encoding="utf-8-sig")
 
 
 def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str, object]:
-    """Read a JSON object.
-
-    Raises:
-        InputError: As `read_text`, or the file holds something else.
-    """
+    """Read a JSON object; `what` names its contents in messages."""
     try:
         data = json.loads(read_text(path, what, remedy))
     except ValueError as error:
@@ -35,3 +42,13 @@ def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str
     if not isinstance(data, dict):
         raise InputError(f"{path}: holds no JSON object; {remedy}")
     return data
+
+
+def first_repeated(names: Sequence[str]) -> str | None:
+    """The first name that came before."""
+    known: set[str] = set()
+    for name in names:
+        if name in known:
+            return name
+        known.add(name)
+    return None

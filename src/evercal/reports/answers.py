@@ -35,7 +35,7 @@ def answer_row(answer: Answer) -> dict[str, object]:
 
     Where the unit of length is unknown, lengths are in that unit and there are no millimetres.
     """
-    from evercal.recordings.formats.generic import pose_to_dict
+    from evercal.geometry import pose_to_dict
 
     estimate = answer.estimate
     pose, uncertain = pose_to_dict(estimate.base_from_camera), finite_pose(estimate)

@@ -28,7 +28,7 @@ ENDINGS = (".jsonl", ".tum", ".txt", ".mcap")
 
 def track_row(frame: TrackedFrame, name: str, unit_known: bool = True) -> dict[str, object]:
     """Return a frame as JSON values: the row of `evercal localize --json`, state and time."""
-    from evercal.recordings.formats.generic import pose_to_dict
+    from evercal.geometry import pose_to_dict
 
     answer = Answer(Path(name), frame.estimate, frame.estimate.milliseconds, unit_known)
     return {

@@ -12,9 +12,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from evercal.errors import InputError
+from evercal.geometry import pose_to_dict
 from evercal.live.recorder import WristRecorder, pose_rows
 from evercal.mapping.selection import spread_poses
-from evercal.recordings import generic
 from evercal.recordings.images import write_jpeg
 from evercal.simulation.virtual_cell import CellOptions, VirtualCell, nominal_mount
 from evercal.storage import write_bytes, write_json
@@ -59,8 +59,8 @@ def record_cell(
     write_json(
         out / "truth.json",
         {
-            "gripper_from_camera": generic.pose_to_dict(cell.truth.gripper_from_camera),
-            "base_from_tripod": generic.pose_to_dict(cell.truth.base_from_tripod),
+            "gripper_from_camera": pose_to_dict(cell.truth.gripper_from_camera),
+            "base_from_tripod": pose_to_dict(cell.truth.base_from_tripod),
             "seed": seed,
             "options": asdict(cell.options),
         },

@@ -79,7 +79,7 @@ def test_projections_agree_with_colmap(model: str, kind: str, tmp_path: Path) ->
 
 @pytest.mark.parametrize("folder", [".", "sparse", "sparse/0", "colmap/sparse/0"])
 def test_model_in_any_usual_folder_is_read(folder: str, tmp_path: Path) -> None:
-    make(tmp_path, folder=folder)
+    make(tmp_path, folder=folder, kind="txt")
     assert len(load_recording(tmp_path).train) == 4
     # Pointing at the model itself, or at the folder of models, does as well.
     assert len(load_recording(tmp_path / folder).train) == 4

@@ -313,7 +313,7 @@ def test_other_versions_and_features_are_refused(tmp_path: Path) -> None:
     for changed, message in (
         ({}, r"no feature holds a pose .*observation.state: shoulder, reach"),
         ({"codebase_version": "v1.6"}, r"version v1\.6; this evercal reads v2 and v3"),
-        ({"codebase_version": "v2.1", "fps": 0}, "no LeRobot dataset"),
+        ({"codebase_version": "v2.1", "fps": 0}, "does not describe the dataset"),
     ):
         change(root, **changed)
         with pytest.raises(InputError, match=message):
@@ -327,7 +327,7 @@ def test_other_versions_and_features_are_refused(tmp_path: Path) -> None:
         ("video_path", "../other/{video_key}.mp4", "'video_path' stays inside the folder"),
         ("video_path", "/tmp/{video_key}.mp4", "'video_path' is a path relative to the folder"),
         ("data_path", "../../data.parquet", "'data_path' stays inside the folder"),
-        ("video_path", "{nothing}.mp4", "unusable 'video_path': 'nothing'"),
+        ("video_path", "{nothing}.mp4", "does not describe the dataset .KeyError: 'nothing'"),
     ],
 )
 def test_paths_outside_the_dataset_are_refused(

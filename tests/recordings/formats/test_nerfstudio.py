@@ -199,7 +199,7 @@ BREAKS: list[tuple[dict[str, Any], str]] = [
         {"frames": [{"file_path": "a.png", "transform_matrix": np.diag([2, 2, 2, 1.0]).tolist()}]},
         "frame 0 .a.png.: .*is a rotation",
     ),
-    ({"frames": entries(ring(1)) * 2}, "'images/frame_00000.png' comes 2 times"),
+    ({"frames": entries(ring(1)) * 2}, "'images/frame_00000.png' comes twice"),
     (
         {"frames": [{"file_path": "no.png", "transform_matrix": np.eye(4).tolist()}]},
         "no.png: named",

@@ -121,27 +121,11 @@ def test_opencv_storage_is_read(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
-def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
-    path = tmp_path / "camera.any"
-    for text in (
-        json.dumps(CAMERA.to_dict()),
-        CALIBRATION,
-        MESSAGE,
-        "525 0 319.5 0 525 239.5 0 0 1",
-    ):
-        path.write_text(text, encoding="utf-8-sig")
-        assert read_camera(path, (640, 480)).width == 640
-
-
 def test_missing_distortion_is_refused(tmp_path: Path) -> None:
     text = CALIBRATION.replace("distortion_coefficients", "lens")
     with pytest.raises(InputError, match="'distortion_coefficients' is missing"):
         read_camera(written(tmp_path, text))
     assert read_camera(written(tmp_path, text + "d: [0, 0, 0, 0]\n")).distortion == ()
-
-
-def test_size_in_the_file_takes_precedence(tmp_path: Path) -> None:
-    assert read_camera(written(tmp_path, CALIBRATION), (320, 240)) == CAMERA
 
 
 def test_ros_1_messages_and_longer_models_are_read(tmp_path: Path) -> None:

@@ -72,16 +72,16 @@ HEADERS = [
 
 
 @pytest.mark.parametrize(("header", "written", "given"), HEADERS)
-@pytest.mark.parametrize("separator", [",", ";", "\t"])
 def test_headers_define_columns(
-    tmp_path: Path, header: str, written: str, given: str | None, separator: str
+    tmp_path: Path, header: str, written: str, given: str | None
 ) -> None:
     numbers = numbers_from_poses(arm(), pose_convention(written))
     file = tmp_path / "poses.csv"
-    file.write_text(table(header, numbers, separator))
-    read = read_robot_poses(file, given)
-    assert same(read.poses, arm())
-    assert (read.names, read.stamps_s) == (None, None)
+    for separator in (",", ";", "\t"):
+        file.write_text(table(header, numbers, separator))
+        read = read_robot_poses(file, given)
+        assert same(read.poses, arm())
+        assert (read.names, read.stamps_s) == (None, None)
 
 
 @given(st.permutations(range(9)), st.integers(0, 1000))

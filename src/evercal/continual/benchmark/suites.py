@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from evercal.continual.benchmark.sfm_poses import with_sfm_poses
 from evercal.errors import InputError
 from evercal.recordings import (
     MIN_TRAIN_FRAMES,
@@ -14,7 +15,6 @@ from evercal.recordings import (
     load_recording,
     posed_frames,
     stated_poses,
-    with_sfm_poses,
 )
 from evercal.recordings.samples import sample_rooms
 

@@ -1,12 +1,8 @@
 """COLMAP models (Schönberger and Frahm, CVPR 2016), read by pycolmap (extra `colmap`).
 
-    ROOT/sparse/0/cameras.bin, images.bin, points3D.bin    or .txt, or ROOT itself, or ROOT/0
-    ROOT/images/...
-
 COLMAP states camera_from_world, and its pixel (0.5, 0.5) is the centre of the top-left pixel, which
-is (0, 0) here. The base frame and the unit of length are the model's own. Images without a pose
-count as untracked, including files beside the images of the model. Of several models in one folder,
-the one with the most images is read.
+is (0, 0) here. Images without a pose count as untracked, including files beside the images of the
+model. Of several models in one folder, the one with the most images is read.
 """
 
 import os
@@ -24,6 +20,7 @@ from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS
 from evercal.recordings.poses.row_files import natural_key
 from evercal.recordings.read_options import ReadOptions
+from evercal.recordings.text_files import named_errors
 
 USES = ("metres",)
 
@@ -37,6 +34,9 @@ _PARAMETERS: dict[str, tuple[int, int, int, int, tuple[int | None, ...]]] = {
     "OPENCV": (0, 1, 2, 3, (4, 5, 6, 7)),
     "FULL_OPENCV": (0, 1, 2, 3, (4, 5, 6, 7, 8, 9, 10, 11)),
 }
+_READ = "import pycolmap, sys; pycolmap.Reconstruction(sys.argv[1])"
+_LEAST_S, _SLOWEST_BYTES_PER_S = 10.0, 5e6
+"""Time for reading a binary model."""
 
 
 def detect(root: Path) -> bool:
@@ -45,18 +45,17 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Recording:
-    """Read the largest model and check that its images exist; no image is opened.
-
-    Raises:
-        InputError: The extra `colmap` is not installed, the model is broken, its camera is not
-            supported, or its images are missing.
-    """
+    """Read the largest model and check that its images exist; no image is opened."""
     root, metric = Path(root), options is not None and options.metres
-    models = _read_models(root)
-    folder, model = max(models, key=lambda pair: pair[1].num_reg_images())
-    notes = [frame_note("COLMAP", metric)]
+    models = {folder: _model(folder) for folder in _models(root)}
+    if not models:
+        raise InputError(
+            f"{root}: no COLMAP model; expected cameras, images and points3D (.bin, .txt)"
+        )
+    folder = max(models, key=lambda folder: models[folder].num_reg_images())
+    model, notes = models[folder], [frame_note("COLMAP", metric)]
     if len(models) > 1:
-        sizes = ", ".join(f"{f.name}: {m.num_reg_images()}" for f, m in models)
+        sizes = ", ".join(f"{f.name}: {m.num_reg_images()}" for f, m in models.items())
         notes.append(f"took model {folder.name}, the one with the most images ({sizes})")
     cameras = {key: _camera(folder, camera) for key, camera in model.cameras.items()}
     posed = [image for image in model.images.values() if image.has_pose]
@@ -64,19 +63,14 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
     if not posed:
         raise InputError(f"{folder}: no image has a pose; reconstruct with more overlap")
     images = _image_folder(root, folder, [image.name for image in posed])
-    frames = tuple(
-        Frame(
-            image.name,
-            images / image.name,
-            cameras[image.camera_id],
-            _base_from_camera(folder, image),
-        )
-        for image in posed
-    )
+    frames = []
+    for image in posed:
+        pose = _base_from_camera(folder, image)
+        frames.append(Frame(image.name, images / image.name, cameras[image.camera_id], pose))
     files = [p for p in images.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS]
     total = max(len(model.images), len(files) if images != root else 0)
     name, lost = root.resolve().name, total - len(frames)
-    return Recording(name, frames, (), lost, notes=tuple(notes), metric=metric)
+    return Recording(name, tuple(frames), (), lost, notes=tuple(notes), metric=metric)
 
 
 def _models(root: Path) -> list[Path]:
@@ -89,49 +83,32 @@ def _models(root: Path) -> list[Path]:
         inner = sorted(parent.iterdir()) if parent.is_dir() else []
         if name == ".":  # may be a folder of models, which COLMAP numbers
             inner = [folder for folder in inner if folder.name.isdigit()]
-        models = [f for f in (parent, *inner) if f.is_dir() and _is_model(f)]
+        models = [
+            folder
+            for folder in (parent, *inner)
+            for kind in ("bin", "txt")
+            if all((folder / f"{file}.{kind}").is_file() for file in ("cameras", "images"))
+        ]
         if models:
-            return models
+            return list(dict.fromkeys(models))
     return []
 
 
-def _is_model(folder: Path) -> bool:
-    return any(
-        all((folder / f"{name}.{kind}").is_file() for name in ("cameras", "images"))
-        for kind in ("bin", "txt")
-    )
-
-
-_READ = "import pycolmap, sys; pycolmap.Reconstruction(sys.argv[1])"
-_LEAST_BYTES = 8
-"""No entry of a binary file is shorter."""
-_LEAST_S, _SLOWEST_BYTES_PER_S = 10.0, 5e6
-"""Time for reading a binary model."""
-
-
-def _read_models(root: Path) -> list[tuple[Path, Any]]:
+def _model(folder: Path) -> Any:
     try:
         import pycolmap  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise InputError(
-            f"{root}: reading a COLMAP model needs pycolmap; run: pip install 'evercal[colmap]'"
+            f"{folder}: reading a COLMAP model needs pycolmap; run: pip install 'evercal[colmap]'"
         ) from None
-    folders = _models(root)
-    if not folders:
-        raise InputError(
-            f"{root}: no COLMAP model; expected cameras, images and points3D (.bin, .txt)"
-        )
-    models = []
-    for folder in folders:
-        _require_ends(folder)
-        try:
-            model = pycolmap.Reconstruction(str(folder))
-            _ = [image.name for image in model.images.values()]  # decodes UTF-8
-            models.append((folder, model))
-        except Exception as error:  # pycolmap passes C++ exceptions on as several types
-            text = " ".join(str(error).split())[:200]
-            raise InputError(f"{folder}: pycolmap cannot read the model: {text}") from None
-    return models
+    _require_ends(folder)
+    try:
+        model = pycolmap.Reconstruction(str(folder))
+        _ = [image.name for image in model.images.values()]  # decodes UTF-8
+        return model
+    except Exception as error:  # pycolmap passes C++ exceptions on as several types
+        text = " ".join(str(error).split())[:200]
+        raise InputError(f"{folder}: pycolmap cannot read the model: {text}") from None
 
 
 def _require_ends(folder: Path) -> None:
@@ -140,17 +117,16 @@ def _require_ends(folder: Path) -> None:
     At the end of an incomplete file it goes on with what is left in memory. So a process of its
     own reads the model first.
     """
-    files = sorted(folder.glob("*.bin"))
-    for file in files:
-        size = file.stat().st_size
+    sizes = {file: file.stat().st_size for file in sorted(folder.glob("*.bin"))}
+    for file, size in sizes.items():
         with file.open("rb") as stream:
             count = int.from_bytes(stream.read(8), "little")
-        if size < 8 or count > (size - 8) / _LEAST_BYTES:
+        if size < 8 or count > (size - 8) / 8:  # no entry is shorter
             raise InputError(f"{file}: {size} bytes, too few for what it lists; copy it again")
-    seconds = _LEAST_S + sum(file.stat().st_size for file in files) / _SLOWEST_BYTES_PER_S
+    seconds = _LEAST_S + sum(sizes.values()) / _SLOWEST_BYTES_PER_S
     command = [sys.executable, "-c", _READ, str(folder)]
     try:
-        if files:
+        if sizes:
             subprocess.run(command, capture_output=True, timeout=seconds, check=False)
     except subprocess.TimeoutExpired:
         raise InputError(
@@ -167,33 +143,22 @@ def _camera(folder: Path, camera: Any) -> Camera:
         )
     fx, fy, cx, cy, distortion = _PARAMETERS[name]
     p = np.asarray(camera.params, dtype=np.float64)
-    try:
-        return Camera(
-            int(camera.width),
-            int(camera.height),
-            fx=p[fx],
-            fy=p[fy],
-            # Half a pixel: COLMAP counts from the image's corner.
-            cx=p[cx] - 0.5,
-            cy=p[cy] - 0.5,
-            distortion=tuple(0.0 if i is None else float(p[i]) for i in distortion),
-        )
-    except ValueError as error:
-        raise InputError(f"{folder}: {error}") from None
+    # Half a pixel: COLMAP counts from the image's corner.
+    pinhole = p[fx], p[fy], p[cx] - 0.5, p[cy] - 0.5
+    coefficients = tuple(0.0 if i is None else float(p[i]) for i in distortion)
+    with named_errors(folder, "COLMAP model"):
+        return Camera(int(camera.width), int(camera.height), *pinhole, coefficients)
 
 
 def _base_from_camera(folder: Path, image: Any) -> SE3:
     camera_from_world: Any = image.cam_from_world
     if callable(camera_from_world):  # a method since pycolmap 3.12
         camera_from_world = camera_from_world()
-    try:
+    with named_errors(folder / image.name, "pose"):
         return SE3.from_matrix(np.asarray(camera_from_world.matrix())).inverse()
-    except ValueError as error:
-        raise InputError(f"{folder}: image {image.name}: {error}") from None
 
 
 def _image_folder(root: Path, folder: Path, names: list[str]) -> Path:
-    """The folder that holds all images."""
     beside = (parent / "images" for parent in folder.resolve().parents[:3])
     for candidate in (root / "images", root, *beside):
         if all((candidate / name).is_file() for name in names):

@@ -19,11 +19,7 @@ _ROTATION_TOLERANCE = 1e-2
 
 
 def colour_images(folder: Path) -> list[Path]:
-    """Colour images of a folder, sorted by name.
-
-    Raises:
-        InputError: There are none, or a frame has two.
-    """
+    """Colour images of a folder, sorted by name."""
     # os.listdir and one sort: globbing a thousand files twice dominates the loading time.
     names = os.listdir(folder) if folder.is_dir() else []
     names = sorted(name for name in names if re.search(r"\.color\.(png|jpe?g)$", name))
@@ -45,9 +41,6 @@ def tracked_frames(
     """Build frames from images and the pose files beside them, and drop poses with inf or nan.
 
     With `folders`, names of frames begin with the name of the folder.
-
-    Raises:
-        InputError: A pose file is missing or broken.
     """
     frames = []
     for image in images:
@@ -65,11 +58,7 @@ def tracked_frames(
 
 
 def read_numbers(file: Path, count: int, what: str) -> NDArray[np.float64]:
-    """Read the `count` numbers of a matrix from a small text file.
-
-    Raises:
-        InputError: The file is missing or holds something else.
-    """
+    """Read the `count` numbers of a matrix from a small text file."""
     # float() on the words: np.loadtxt takes longer per file than reading the file.
     words = read_text(file, f"{what} matrix").split()
     try:

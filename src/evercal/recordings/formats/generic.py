@@ -7,7 +7,6 @@ ignored.
 import contextlib
 import os
 import shutil
-from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path, PureWindowsPath
 from typing import Any, Literal, Self
@@ -15,10 +14,10 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, write_image
-from evercal.recordings.text_files import read_json
+from evercal.recordings.text_files import first_repeated, named_errors, read_json
 from evercal.storage import write_json
 
 FILE = "scene.json"
@@ -34,23 +33,16 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str]) -> Recording:
-    """Read scene.json and check that its images exist; no image is opened.
-
-    Raises:
-        InputError: scene.json or an image is missing, or scene.json breaks the format.
-    """
+    """Read scene.json and check that its images exist; no image is opened."""
     root = Path(root)
     file = root / FILE
     data = _read(file)
-    try:
+    with named_errors(file, "scene file"):
         cameras = _cameras(data.get("cameras"))
         entries = data.get("frames")
         if not isinstance(entries, list) or not entries:
             raise ValueError("'frames' is a list with at least one frame")
-        frames: dict[str, list[Frame]] = {"train": [], "test": []}
-        for i, entry in enumerate(entries):
-            split, frame = _frame(root, i, entry, cameras)
-            frames[split].append(frame)
+        frames = [_frame(root, i, entry, cameras) for i, entry in enumerate(entries)]
         untracked = data.get("untracked", 0)
         if not isinstance(untracked, int):
             raise ValueError(f"'untracked' is a count, got {untracked!r}")
@@ -60,23 +52,22 @@ def load(root: str | os.PathLike[str]) -> Recording:
         notes = data.get("notes", [])
         if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
             raise ValueError(f"'notes' is a list of sentences, got {notes!r}")
-        every = frames["train"] + frames["test"]
-        name, times = Counter(frame.name for frame in every).most_common(1)[0]
-        if times > 1:
-            raise ValueError(f"frame name {name!r} comes twice; names are unique")
-    except (ValueError, OverflowError) as error:  # JSON numbers have no largest
-        raise InputError(f"{file}: {error}") from None
-    missing = [frame.image for frame in every if not Path(frame.image).is_file()]  # pyright: ignore[reportArgumentType]
+        repeated = first_repeated([frame.name for _, frame in frames])
+        if repeated is not None:
+            raise ValueError(f"frame name {repeated!r} comes twice; names are unique")
+    images = [Path(str(frame.image)) for _, frame in frames]
+    missing = [image for image in images if not image.is_file()]
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise InputError(
             f"{missing[0]}{more}: named in {file} but missing; restore or take the frame out"
         )
     name = data.get("name")
+    train, test = (tuple(f for s, f in frames if s == split) for split in ("train", "test"))
     return Recording(
         name if isinstance(name, str) and name else root.resolve().name,
-        tuple(frames["train"]),
-        tuple(frames["test"]),
+        train,
+        test,
         untracked,
         notes=tuple(notes),
         metric=unit == "metres",
@@ -140,15 +131,27 @@ class SceneWriter:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Write scene.json unless an error was raised."""
-        if kind is None:
-            self.close()
+        if kind is not None:
+            return
+        data: dict[str, object] = {
+            "format": _FORMAT,
+            "version": _VERSION,
+            "name": self._name,
+            "cameras": {number: camera.to_dict() for camera, number in self._cameras.items()},
+            "frames": list(self._entries.values()),
+            "untracked": self.untracked,
+        }
+        data |= {} if self.metric else {"unit": "unknown"}
+        data |= {"notes": list(self.notes)} if self.notes else {}
+        data |= {"render": self.render} if self.render is not None else {}
+        try:
+            write_json(self._root / FILE, data)
+            (self._root / _UNFINISHED).unlink(missing_ok=True)
+        except OSError as error:
+            raise InputError(f"{self._root / FILE}: cannot be written ({error.strerror})") from None
 
     def add(self, frame: Frame, split: Literal["train", "test"]) -> None:
-        """Write the frame's image and collect its entry of scene.json.
-
-        Raises:
-            InputError: The image cannot be read or written, or the frame name is not unique.
-        """
+        """Write the frame's image and collect its entry of scene.json."""
         if frame.name in self._entries:
             raise InputError(f"frame {frame.name!r}: already written; frame names are unique")
         # The counter keeps names like 'a/b' and 'a_b' apart and the folder in recorded order.
@@ -177,12 +180,12 @@ class SceneWriter:
             return relative
         stored = frame.image.file() if isinstance(frame.image, StoredImage) else None
         if stored is None:
-            ending, image = ".png", frame.read_image()
-            self._put(stem + ending, lambda path: write_image(path, image))
+            relative, image = f"{stem}.png", frame.read_image()
+            self._put(relative, lambda path: write_image(path, image))
         else:
-            ending, content = stored
-            self._put(stem + ending, lambda path: path.write_bytes(content))
-        return stem + ending
+            relative = stem + stored[0]
+            self._put(relative, lambda path: path.write_bytes(stored[1]))
+        return relative
 
     def _copy(self, source: Path, relative: str) -> None:
         """Copy or link a file into the folder, unless it is that file already."""
@@ -217,42 +220,6 @@ class SceneWriter:
             temporary.replace(target)
         except OSError as error:
             raise InputError(f"{target}: cannot be written ({error.strerror})") from None
-
-    def close(self) -> None:
-        """Write scene.json.
-
-        Raises:
-            InputError: The file cannot be written.
-        """
-        data: dict[str, object] = {
-            "format": _FORMAT,
-            "version": _VERSION,
-            "name": self._name,
-            "cameras": {number: camera.to_dict() for camera, number in self._cameras.items()},
-            "frames": list(self._entries.values()),
-            "untracked": self.untracked,
-        }
-        if not self.metric:
-            data["unit"] = "unknown"
-        if self.notes:
-            data["notes"] = list(self.notes)
-        if self.render is not None:
-            data["render"] = self.render
-        try:
-            write_json(self._root / FILE, data)
-            (self._root / _UNFINISHED).unlink(missing_ok=True)
-        except OSError as error:
-            raise InputError(f"{self._root / FILE}: cannot be written ({error.strerror})") from None
-
-
-def pose_to_dict(pose: SE3 | None) -> dict[str, object] | None:
-    """Single transform as plain numbers, metres and wxyz; None stays None."""
-    if pose is None:
-        return None
-    return {
-        "translation_m": pose.translation_m.tolist(),
-        "quaternion_wxyz": pose.rotation_wxyz.tolist(),
-    }
 
 
 def _pose_from_dict(data: object) -> SE3 | None:

@@ -13,6 +13,7 @@ dataset must stay inside its folder.
 
 import functools
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,19 +37,13 @@ INFO = Path("meta") / "info.json"
 
 def detect(root: Path) -> bool:
     """Whether `root` holds a LeRobot dataset."""
-    try:
+    with suppress(OSError):
         return b"codebase_version" in (root / INFO).read_bytes()
-    except OSError:
-        return False
+    return False
 
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
-    """Read the tables and decode one image; the others stay in their files until needed.
-
-    Raises:
-        InputError: The extra `lerobot` is not installed, a file is missing or broken, the version
-            is not supported, or the dataset has no gripper poses.
-    """
+    """Read the tables and decode one image; the others stay in their files until needed."""
     root = Path(root)
     try:
         return _load(root, options or ReadOptions())
@@ -65,15 +60,15 @@ def _load(root: Path, options: ReadOptions) -> Recording:
         raise InputError(
             f"{root}: LeRobot datasets hold no intrinsics; give them with --camera FILE"
         )
-    width, height = _image_size(root, key, info["features"][key])
+    shape = [int(n) for n in info["features"][key]["shape"]]
+    height, width = shape[1:3] if shape[0] == 3 else shape[:2]  # some state channels first
     camera = read_camera_of_size(options.camera, (width, height), key)
     column = pose_feature(root, info, options)
     rows, values = _rows(root, column)
     poses, notes = feature_poses(root, info, column, values, options)
-    images = _images(root, info, key, rows)
     frames = tuple(
         Frame(f"episode_{row.episode:06d}/{row.number:06d}", image, camera, None, pose)
-        for row, image, pose in zip(rows, images, poses, strict=True)
+        for row, image, pose in zip(rows, _images(root, info, key, rows), poses, strict=True)
     )
     here, total = len({row.episode for row in rows}), int(info.get("total_episodes", 0))
     if here < total:
@@ -83,23 +78,16 @@ def _load(root: Path, options: ReadOptions) -> Recording:
 
 
 def _info(root: Path) -> dict[str, Any]:
-    file = root / INFO
-    info: dict[str, Any] = read_json(file, "LeRobot dataset")
-    try:
-        version = str(info["codebase_version"])
-        if not version.startswith(("v2.", "v3.")):
-            raise InputError(f"{file}: version {version}; this evercal reads v2 and v3")
-        features = info["features"]
-        if not isinstance(features, dict) or not float(info["fps"]) > 0:
-            raise ValueError("'features' is an object and 'fps' a number > 0")
-        if not all(isinstance(feature, dict) for feature in features.values()):
-            raise ValueError("every feature is an object")
-        for name in ("data_path", "video_path"):
-            if info.get(name) is not None:
-                path_inside(info[name], repr(name))
-        return info
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{file}: no LeRobot dataset ({type(error).__name__}: {error})") from None
+    info: dict[str, Any] = read_json(root / INFO, "LeRobot dataset")
+    version, features = str(info["codebase_version"]), info["features"]
+    if not version.startswith(("v2.", "v3.")):
+        raise InputError(f"{root / INFO}: version {version}; this evercal reads v2 and v3")
+    if not all(isinstance(f, dict) for f in features.values()) or not float(info["fps"]) > 0:
+        raise ValueError("'features' is an object of objects and 'fps' a number > 0")
+    for name in ("data_path", "video_path"):
+        if info.get(name) is not None:
+            path_inside(info[name], repr(name))
+    return info
 
 
 def _camera_key(root: Path, info: Mapping[str, Any], wanted: str | None) -> str:
@@ -110,19 +98,6 @@ def _camera_key(root: Path, info: Mapping[str, Any], wanted: str | None) -> str:
         return str(wanted)
     what = f"no camera {wanted!r}" if wanted else f"{len(keys)} cameras"
     raise InputError(f"{root}: {what}; name one with --image-topic: {', '.join(keys) or 'none'}")
-
-
-def _image_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int, int]:
-    """Width and height of the images of a camera."""
-    try:
-        shape = [int(n) for n in feature["shape"]]
-        height, width = shape[1:3] if shape[0] == 3 else shape[:2]  # some state channels first
-    except (KeyError, TypeError, ValueError, IndexError):
-        raise InputError(
-            f"{root / INFO}: {key}: 'shape' is height, width and channels, got"
-            f" {feature.get('shape')!r}"
-        ) from None
-    return width, height
 
 
 class _Row(NamedTuple):
@@ -148,44 +123,18 @@ def _rows(root: Path, column: str) -> tuple[list[_Row], NDArray[np.float64]]:
     rows: list[_Row] = []
     parts = []
     for file in files:
-        table = _read_table(file, ["episode_index", "frame_index", "timestamp", column])
-        *cells, poses = (table[name].to_pylist() for name in table.column_names)
+        *cells, poses = _columns(file, ["episode_index", "frame_index", "timestamp", column])
         for i, (episode, number, seconds) in enumerate(zip(*cells, strict=True)):
             rows.append(_Row(episode, number, seconds, file, i))
-        try:
+        values = np.empty(0)
+        with suppress(TypeError, ValueError):
             values = np.array(poses, dtype=np.float64)
-        except (TypeError, ValueError):
-            values = np.empty(0)
         if values.ndim != 2 or not np.isfinite(values).all():
             raise InputError(f"{file}: {column} holds no rows of finite numbers")
         parts.append(values)
     if not rows:
         raise InputError(f"{root}: the dataset has no frames")
     return rows, np.concatenate(parts)
-
-
-def _parquet(path: Path) -> Any:
-    try:
-        import pyarrow.parquet as parquet  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise InputError(
-            f"{path}: LeRobot datasets need pyarrow and PyAV; run: pip install 'evercal[lerobot]'"
-        ) from None
-    return parquet
-
-
-def _read_table(file: Path, columns: list[str]) -> Any:
-    parquet = _parquet(file)
-    try:
-        return parquet.read_table(file, columns=columns).select(columns)
-    except Exception as error:
-        raise _unreadable(file, error) from None
-
-
-def _unreadable(file: Path, error: Exception) -> InputError:
-    """The error for a damaged file; pyarrow raises many types."""
-    text = " ".join(str(error).split())[:200]
-    return InputError(f"{file}: cannot be read: {text}")
 
 
 def _images(
@@ -218,19 +167,38 @@ def _video_starts(
     parts = ("chunk_index", "file_index", "from_timestamp")
     names = ["episode_index", *(f"videos/{key}/{part}" for part in parts)]
     for file in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
-        for row in _read_table(file, names).to_pylist():
-            episode, chunk, number, start = (row[name] for name in names)
+        for episode, chunk, number, start in zip(*_columns(file, names), strict=True):
             numbers = {"chunk_index": chunk, "file_index": number}
             starts[int(episode)] = _video_path(root, info, key, numbers), float(start)
     return starts
 
 
 def _video_path(root: Path, info: Mapping[str, Any], key: str, numbers: dict[str, int]) -> Path:
+    path = str(info["video_path"]).format(video_key=key, **numbers)
+    return root / path_inside(path, "'video_path'")
+
+
+def _parquet(path: Path) -> Any:
     try:
-        path = str(info["video_path"]).format(video_key=key, **numbers)
-        return root / path_inside(path, "'video_path'")
-    except (KeyError, IndexError, AttributeError, ValueError) as error:
-        raise InputError(f"{root / INFO}: unusable 'video_path': {error}") from None
+        import pyarrow.parquet as parquet  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise InputError(
+            f"{path}: LeRobot datasets need pyarrow and PyAV; run: pip install 'evercal[lerobot]'"
+        ) from None
+    return parquet
+
+
+def _columns(file: Path, names: list[str]) -> list[list[Any]]:
+    parquet = _parquet(file)
+    try:
+        table = parquet.read_table(file, columns=names)
+        return [table[name].to_pylist() for name in names]
+    except Exception as error:  # pyarrow raises many types for damaged files
+        raise _unreadable(file, error) from None
+
+
+def _unreadable(file: Path, error: Exception) -> InputError:
+    return InputError(f"{file}: cannot be read: {' '.join(str(error).split())[:200]}")
 
 
 @functools.lru_cache(maxsize=1)

@@ -1,15 +1,9 @@
 """Gripper poses of a LeRobot dataset, from the features of its tables.
 
-A pose is one of the following:
-
-- a feature with the names x, y, z and qx, qy, qz, qw, or wx, wy, wz for a rotation vector (`ee.x`
-  and `x` alike), in metres and radians;
-- the first numbers of observation.state or another feature, in a convention that the user gives;
-- with a URDF, the joints of observation.state (`elbow.pos` is the joint elbow), in radians, or in
-  degrees with the convention deg.
-
-`--gripper-frame` selects the feature if several hold poses, or the arm, such as left_ee, if one
-feature holds left_ee.x and right_ee.x.
+A pose is a feature whose names end in x, y, z and qx, qy, qz, qw, or wx, wy, wz for a rotation
+vector; the first numbers of a feature in a convention that the user gives; or, with a URDF, the
+joints of observation.state. `--gripper-frame` selects the feature if several hold poses, or the
+arm, such as left_ee, if one feature holds left_ee.x and right_ee.x.
 """
 
 from collections.abc import Mapping
@@ -31,6 +25,7 @@ from evercal.recordings.poses.conventions import (
 from evercal.recordings.poses.joint_states import in_radians
 from evercal.recordings.poses.kinematics import RobotModel
 from evercal.recordings.read_options import ReadOptions
+from evercal.recordings.text_files import first_repeated
 
 _STATE = "observation.state"
 # Names of the numbers of a pose, by convention.
@@ -38,11 +33,7 @@ _PARTS = {"xyzw": ("x", "y", "z", "qx", "qy", "qz", "qw"), "ur": ("x", "y", "z",
 
 
 def pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> str:
-    """Name of the feature with the gripper poses or joint angles.
-
-    Raises:
-        InputError: No feature holds poses, or several do.
-    """
+    """Name of the only feature with gripper poses or joint angles."""
     features = info["features"]
     if options.urdf is not None:
         return _STATE
@@ -62,11 +53,8 @@ def pose_feature(root: Path, info: Mapping[str, Any], options: ReadOptions) -> s
         raise InputError(
             f"{root}: gripper poses are in {' and '.join(keys)}; name one with --gripper-frame"
         )
-    listed = "; ".join(
-        f"{key}: {', '.join(names)}"
-        for key, names in observed.items()
-        if names and "image" not in key
-    )
+    named = {key: names for key, names in observed.items() if names and "image" not in key}
+    listed = "; ".join(f"{key}: {', '.join(names)}" for key, names in named.items())
     raise InputError(
         f"{root}: no feature holds a pose (x, y, z and qx, qy, qz, qw or wx, wy, wz), there are"
         f" {listed or 'no named numbers'}; for joint angles give --urdf, for a pose in another form"
@@ -81,11 +69,7 @@ def feature_poses(
     values: NDArray[np.float64],
     options: ReadOptions,
 ) -> tuple[SE3, list[str]]:
-    """Convert the numbers (n, k) of a feature to (n,) base_from_gripper, with notes.
-
-    Raises:
-        InputError: The numbers are no poses, or several poses are possible.
-    """
+    """Convert the numbers (n, k) of a feature to (n,) base_from_gripper, with notes."""
     names = _names(info, column)
     if options.urdf is not None:
         return _joint_poses(root, names, values, options)
@@ -117,14 +101,13 @@ def feature_poses(
 def _joint_poses(
     root: Path, names: list[str], stated: NDArray[np.float64], options: ReadOptions
 ) -> tuple[SE3, list[str]]:
-    """Forward kinematics of observation.state."""
     assert options.urdf is not None
     if len(names) != stated.shape[1]:
         count = stated.shape[1]
         raise InputError(f"{root}: {_STATE} has {count} numbers and {len(names)} names")
-    repeated = [name for i, name in enumerate(names) if name in names[:i]]
-    if repeated:
-        raise InputError(f"{root}: {_STATE}: {repeated[0]!r} names several numbers; rename them")
+    repeated = first_repeated(names)
+    if repeated is not None:
+        raise InputError(f"{root}: {_STATE}: {repeated!r} names several numbers; rename them")
     model = RobotModel(options.urdf)
     values = in_radians(model, names, stated, [options.pose_convention] * len(names))
     try:

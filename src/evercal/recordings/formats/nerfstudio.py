@@ -9,10 +9,10 @@ test frames. (Tancik et al., Nerfstudio, SIGGRAPH 2023; its documentation, Data 
 
 import math
 import os
-from collections import Counter
 from collections.abc import Container, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, image_size
 from evercal.recordings.read_options import ReadOptions
-from evercal.recordings.text_files import read_json
+from evercal.recordings.text_files import first_repeated, named_errors, read_json
 
 FILE = "transforms.json"
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
@@ -54,15 +54,12 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
     """Read the poses and the size of one image of every camera; no other image is opened.
 
     If the file states no image size, that of the first image is taken.
-
-    Raises:
-        InputError: The file or an image is missing, or the file breaks the format.
     """
     root, metric = Path(root), options is not None and options.metres
     file = root if root.is_file() else root / FILE
     root = file.parent
     data = read_json(file, "nerfstudio file", "export it again")
-    try:
+    with named_errors(file, "nerfstudio file"):
         undo, scale = _applied(data)
         entries = data.get("frames")
         if not isinstance(entries, list) or not entries:
@@ -73,12 +70,10 @@ def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Re
             data |= {"w": width, "h": height}
         frames = [_frame(root, data, i, entry, undo, scale) for i, entry in enumerate(entries)]
         test = _test_images(root, data, {str(frame.image) for frame in frames})
-    except (ValueError, OverflowError) as error:
-        raise InputError(f"{file}: {error}") from None
+    repeated = first_repeated([frame.name for frame in frames])
+    if repeated is not None:
+        raise InputError(f"{file}: {repeated!r} comes twice; keep one entry for each image")
     frames = _resized(file, frames)
-    (name, times), *_ = Counter(frame.name for frame in frames).most_common(1)
-    if times > 1:
-        raise InputError(f"{file}: {name!r} comes {times} times; keep one entry for each image")
     return Recording(
         root.resolve().name,
         tuple(frame for frame in frames if frame.image not in test),
@@ -95,14 +90,12 @@ def _applied(data: Mapping[str, object]) -> tuple[SE3, float]:
         raise ValueError(f"'applied_scale' is > 0, got {scale}")
     if data.get("applied_transform") is None:
         return SE3.identity(), scale
-    matrix = _matrix(data["applied_transform"], "applied_transform")
-    size = abs(np.linalg.det(matrix[:3, :3])) ** (1 / 3)
+    matrix = _matrix(data["applied_transform"], "applied_transform")[:3]
+    size = abs(np.linalg.det(matrix[:, :3])) ** (1 / 3)
     if not size > 0:
         raise ValueError("'applied_transform' cannot be undone: its determinant is 0")
-    rigid = np.eye(4)
-    rigid[:3] = matrix[:3] / size
     try:
-        return SE3.from_matrix(rigid, _TOLERANCE).inverse(), scale * size
+        return SE3.from_matrix(matrix / size, _TOLERANCE).inverse(), scale * size
     except ValueError as error:
         raise ValueError(f"'applied_transform': {error}") from None
 
@@ -140,23 +133,18 @@ def _camera(data: Mapping[str, object]) -> Camera:
         )
     if data.get("is_fisheye"):
         raise ValueError("fisheye images are not supported; undistort them first")
+    if _number(data, "k4", 0.0):
+        raise ValueError("k4 is not 0; only k1, k2, k3, p1 and p2 are supported")
     width, height = _number(data, "w"), _number(data, "h")
     fx, fy = _focal(data, "x", width), _focal(data, "y", height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None:
         raise ValueError("'fl_x' is missing, and so are 'fl_y' and 'camera_angle_x'")
-    if _number(data, "k4", 0.0):
-        raise ValueError("k4 is not 0; only k1, k2, k3, p1 and p2 are supported")
-    return Camera(
-        width,  # pyright: ignore[reportArgumentType]  # checked when constructed
-        height,  # pyright: ignore[reportArgumentType]
-        fx,
-        fy,
-        # Half a pixel: the file counts from the image's corner.
-        cx=_number(data, "cx", width / 2) - 0.5,
-        cy=_number(data, "cy", height / 2) - 0.5,
-        distortion=tuple(_number(data, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")),
-    )
+    # Half a pixel: the file counts from the image's corner.
+    cx, cy = _number(data, "cx", width / 2) - 0.5, _number(data, "cy", height / 2) - 0.5
+    distortion = tuple(_number(data, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
+    size: Any = width, height  # whole numbers, checked when constructed
+    return Camera(size[0], size[1], fx, fy, cx, cy, distortion)
 
 
 def _focal(data: Mapping[str, object], axis: str, size: float) -> float | None:
@@ -177,24 +165,26 @@ def _resized(file: Path, frames: list[Frame]) -> list[Frame]:
     Downscaled copies of the images get scaled cameras. Rotated and cropped images are refused.
     """
     sizes: dict[tuple[int, int], tuple[int, int]] = {}
-    resized = []
     for frame in frames:
         image, stated = frame.image, (frame.camera.width, frame.camera.height)
         if not isinstance(image, Path) or not image.is_file():
             raise InputError(f"{image}: named in {file} but missing; restore or take the frame out")
-        if stated not in sizes:
-            size = sizes[stated] = image_size(image)
-            if abs(size[0] / size[1] / (stated[0] / stated[1]) - 1) > 0.01:
-                rotated = "the image was rotated after the intrinsics were written"
-                raise InputError(
-                    f"{image}: is {size[0]}x{size[1]}, {file.name} says {stated[0]}x{stated[1]}"
-                    f" ({rotated if size == stated[::-1] else 'cropped?'}); give images of that"
-                    f" shape"
-                )
-        if sizes[stated] != stated:
-            frame = replace(frame, camera=frame.camera.resized(*sizes[stated]))
-        resized.append(frame)
-    return resized
+        if stated in sizes:
+            continue
+        size = sizes[stated] = image_size(image)
+        if abs(size[0] / size[1] / (stated[0] / stated[1]) - 1) > 0.01:
+            rotated = "the image was rotated after the intrinsics were written"
+            raise InputError(
+                f"{image}: is {size[0]}x{size[1]}, {file.name} says {stated[0]}x{stated[1]}"
+                f" ({rotated if size == stated[::-1] else 'cropped?'}); give images of that shape"
+            )
+    return [_scaled(frame, sizes) for frame in frames]
+
+
+def _scaled(frame: Frame, sizes: Mapping[tuple[int, int], tuple[int, int]]) -> Frame:
+    stated = frame.camera.width, frame.camera.height
+    size = sizes[stated]
+    return frame if size == stated else replace(frame, camera=frame.camera.resized(*size))
 
 
 def _test_images(root: Path, data: Mapping[str, object], images: Container[str]) -> set[Path]:

@@ -8,9 +8,9 @@ image stamps from /tf and /tf_static, or from /joint_states with a URDF. If the 
 frame of the images themselves, the poses are base_from_camera. Images stay in the bag until needed.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,16 +43,12 @@ def detect(root: Path) -> bool:
 
 
 def load(root: Path, options: ReadOptions | None = None) -> Recording:
-    """Read stamps, intrinsics and poses; only the first image is decoded.
-
-    Raises:
-        InputError: The bag cannot be read, or lacks images, intrinsics or poses.
-    """
+    """Read stamps, intrinsics and poses; only the first image is decoded."""
     root, options = Path(root), options or ReadOptions()
     bag = BagFile(root)
     topic = _image_topic(bag, options.image_topic)
     shots, notes = _shots(bag, topic)
-    height, width = shots[0].image.read().shape[:2]
+    height, width = shots[0].read().shape[:2]
     if options.camera is not None:
         camera = read_camera_of_size(options.camera, (width, height), topic)
     else:
@@ -64,7 +60,7 @@ def load(root: Path, options: ReadOptions | None = None) -> Recording:
     for i in np.flatnonzero(poses.valid).tolist():
         pose = poses.poses[i]
         of_camera, of_gripper = (pose, None) if poses.of_camera else (None, pose)
-        frames.append(Frame(f"{i:06d}", shots[i].image, camera, of_camera, of_gripper))
+        frames.append(Frame(f"{i:06d}", shots[i], camera, of_camera, of_gripper))
     lost = len(shots) - len(frames)
     if lost:
         notes.append(
@@ -84,6 +80,8 @@ class BagImage(StoredImage):
     """Time of recording, nanoseconds."""
     repeat: int
     """Number of earlier messages of the topic with the same time of recording."""
+    stamp_ns: int
+    frame_id: str
 
     def read(self) -> NDArray[np.uint8]:
         """Decode the message, see `StoredImage.read`."""
@@ -101,14 +99,6 @@ class BagImage(StoredImage):
             return None
         message = self.bag.message(self.topic, self.logged_ns, self.repeat)
         return image_file(bytes(message.content.data))
-
-
-class _Shot(NamedTuple):
-    """One image with its time and camera frame."""
-
-    image: BagImage
-    stamp_ns: int
-    frame_id: str
 
 
 def _image_topic(bag: BagFile, wanted: str | None) -> str:
@@ -145,16 +135,16 @@ def _unsupported(bag: BagFile, topic: str) -> str | None:
     return "holds depth" if "compressedDepth" in first.format else None
 
 
-def _shots(bag: BagFile, topic: str) -> tuple[list[_Shot], list[str]]:
+def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
     """All images of a topic in order of time, and notes."""
     shots = []
     for message in bag.messages([topic]):
         header = message.content.header
-        image = BagImage(bag, topic, message.logged_ns, message.repeat)
-        shots.append(_Shot(image, stamp_ns(header.stamp), plain_name(header.frame_id)))
+        stamp, frame_id = stamp_ns(header.stamp), plain_name(header.frame_id)
+        shots.append(BagImage(bag, topic, message.logged_ns, message.repeat, stamp, frame_id))
     notes = []
     if all(shot.stamp_ns == 0 for shot in shots):
-        shots = [shot._replace(stamp_ns=shot.image.logged_ns) for shot in shots]
+        shots = [replace(shot, stamp_ns=shot.logged_ns) for shot in shots]
         notes.append(f"images on {topic} carry no stamps; the times of recording were taken")
     return sorted(shots, key=lambda shot: shot.stamp_ns), notes
 
@@ -164,9 +154,6 @@ def _bag_camera(bag: BagFile, image_topic: str) -> tuple[str, Camera]:
 
     The topic of `/camera/image_raw/compressed` is `/camera/camera_info`. Rectified images
     take P without distortion, others K and D.
-
-    Raises:
-        InputError: There is no camera_info, it is uncalibrated, or its model is not supported.
     """
     topics = bag.topics(CAMERA_INFO)
     image = image_topic.removesuffix("/compressed")

@@ -1,15 +1,8 @@
-"""The folder layout of Microsoft's 7-Scenes.
+"""The folder layout of Microsoft's 7-Scenes, see docs/formats.md.
 
-    ROOT/TrainSplit.txt, TestSplit.txt     one sequence per line: `sequence3` means seq-03
-    ROOT/camera-intrinsics.txt             optional 3x3 matrix in pixels (as in 3DMatch)
-    ROOT/seq-03/frame-000000.color.png     or .jpg
-    ROOT/seq-03/frame-000000.pose.txt      4x4 base_from_camera, metres
-
-Camera axes are OpenCV's. Without an intrinsics file the focal length is 525 pixels at 640x480, as
-is usual, scaled with the image size, and the principal point is the middle of the image. In the
-intrinsics file, pixel (0, 0) is the centre of the top-left pixel. Poses with inf or nan mark
-untracked frames, which are left out and counted. All sequences come from one camera. Depth files
-are not read.
+Without an intrinsics file the focal length is 525 pixels at 640x480, as is usual, scaled with the
+image size, and the principal point is the middle of the image. Poses with inf or nan mark untracked
+frames, which are left out and counted. All sequences come from one camera.
 """
 
 import os
@@ -35,11 +28,7 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str]) -> Recording:
-    """Read split files and poses, and the size of one image; no other image is opened.
-
-    Raises:
-        InputError: The folder, a split, a sequence, a pose or an image is missing or broken.
-    """
+    """Read split files and poses, and the size of one image; no other image is opened."""
     root = Path(root)
     splits = [_sequences(root, name) for name in _SPLITS]
     shared = sorted({folder.name for folder in splits[0]} & {folder.name for folder in splits[1]})
@@ -57,7 +46,6 @@ def load(root: str | os.PathLike[str]) -> Recording:
 
 
 def _sequences(root: Path, split: str) -> list[Path]:
-    """Folders named by a split file, in its order."""
     file = root / split
     text = read_text(file, "split file", "write lines like 'sequence1' for the seq-XX folders")
     folders = []

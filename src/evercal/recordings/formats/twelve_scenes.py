@@ -1,14 +1,9 @@
-"""The folder layout of Stanford's 12-Scenes (Valentin et al., 3DV 2016).
+"""The folder layout of Stanford's 12-Scenes (Valentin et al., 3DV 2016), see docs/formats.md.
 
-    ROOT/split.txt                        first line `sequence0 [frames=357] ...`: the test frames
-    ROOT/info.txt                         `m_calibrationColorIntrinsic = fx 0 cx 0 0 fy cy ...`
-    ROOT/data/frame-000000.color.jpg
-    ROOT/data/frame-000000.pose.txt       4x4 base_from_camera, metres
-
-As is usual, the first sequence is for testing and the others are for training. Camera axes are
-OpenCV's. The intrinsics of info.txt are scaled to the image size. Pixel (0, 0) is taken as a pixel
-centre: the data set states no convention, and its cy of 483.5 is then the middle of 968 rows. Poses
-with inf or nan mark untracked frames, which are left out and counted.
+As is usual, the first sequence is for testing and the others are for training. The intrinsics of
+info.txt are scaled to the image size. Pixel (0, 0) is taken as a pixel centre: the data set states
+no convention, and its cy of 483.5 is then the middle of 968 rows. Poses with inf or nan mark
+untracked frames, which are left out and counted.
 """
 
 import os
@@ -29,11 +24,7 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str]) -> Recording:
-    """Read split, calibration and poses, and the size of one image; no other image is opened.
-
-    Raises:
-        InputError: A file is missing or broken.
-    """
+    """Read split, calibration and poses, and the size of one image; no other image is opened."""
     root = Path(root)
     images = colour_images(root / "data")
     split = _test_count(root, len(images))
@@ -43,7 +34,6 @@ def load(root: str | os.PathLike[str]) -> Recording:
 
 
 def _test_count(root: Path, frames: int) -> int:
-    """Number of test frames, which come first."""
     file = root / "split.txt"
     text = read_text(file, "split file", "its first line is '... [frames=N]'")
     match = re.search(r"\[frames=(\d+)\]", text.split("\n")[0])

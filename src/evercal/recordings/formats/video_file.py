@@ -27,45 +27,34 @@ class VideoFrame(StoredImage):
     """Time since the video's first frame."""
 
     def read(self) -> NDArray[np.uint8]:
-        """Decode the frame, see `Videos.frame`."""
+        """Decode the frame to (H, W, 3) uint8 RGB."""
         return self.videos.frame(self.path, self.seconds)
 
 
 class _Open:
     """A video that is being decoded, with its last frame."""
 
-    def __init__(self, path: Path, container: Any) -> None:
-        self.path, self.container = path, container
-        self.stream = container.streams.video[0]
+    def __init__(self, container: Any) -> None:
+        self.container, self.stream = container, container.streams.video[0]
         self.stream.thread_type = "AUTO"
         self.frames: Any = None
-        self.last: tuple[float, Any] | None = None
+        self.last: Any = None
 
     def at(self, seconds: float, half: float) -> NDArray[np.uint8] | None:
         """Frame within `half` seconds of a time, or None if there is none."""
-        last = None if self.last is None else self.last[0]
-        if last is None or not last - half < seconds < last + _READ_AHEAD_S:
-            self.container.seek(
-                max(0, round(seconds / self.stream.time_base)), stream=self.stream, backward=True
-            )
+        if self.last is None or not -half < seconds - self.last.time < _READ_AHEAD_S:
+            start = max(0, round(seconds / self.stream.time_base))
+            self.container.seek(start, stream=self.stream, backward=True)
             self.frames, self.last = self.container.decode(self.stream), None
-        while self.last is None or self.last[0] < seconds - half:
-            frame = next(self.frames, None)
-            if frame is None:
-                self.last = None
+        while self.last is None or self.last.time < seconds - half:
+            self.last = next(self.frames, None)
+            if self.last is None:
                 return None
-            self.last = (float(frame.time), frame)
-        if self.last[0] > seconds + half:
-            return None
-        return self.last[1].to_ndarray(format="rgb24")
+        return self.last.to_ndarray(format="rgb24") if self.last.time <= seconds + half else None
 
 
 class Videos:
-    """Cache of open videos with `fps` frames per second; threads may share it.
-
-    Raises:
-        InputError: The extra `lerobot` is not installed.
-    """
+    """Cache of open videos with `fps` frames per second; threads may share it."""
 
     def __init__(self, fps: float) -> None:
         try:
@@ -80,11 +69,7 @@ class Videos:
         self._lock = threading.Lock()
 
     def frame(self, path: Path, seconds: float) -> NDArray[np.uint8]:
-        """Decode the frame at a time in seconds since the first frame to (H, W, 3) uint8 RGB.
-
-        Raises:
-            InputError: The video is missing, cannot be decoded, or has no frame at this time.
-        """
+        """Decode the frame at a time in seconds since the first frame to (H, W, 3) uint8 RGB."""
         with self._lock:
             try:
                 image = self._opened(path).at(seconds, self._half)
@@ -102,6 +87,6 @@ class Videos:
         if path not in self._open:
             while len(self._open) >= _MOST_OPEN:
                 self._open.popitem(last=False)[1].container.close()
-            self._open[path] = _Open(path, self._av.open(str(path)))
+            self._open[path] = _Open(self._av.open(str(path)))
         self._open.move_to_end(path)
         return self._open[path]

@@ -1,9 +1,7 @@
-"""A plain folder: images, and the gripper pose at each, see docs/formats.md.
+"""A plain folder: images, and the gripper pose or joint angles at each, see docs/formats.md.
 
-Poses are in base_from_gripper.csv, .json, .npy, .npz, .tum or .txt, or in joints.csv or joints.json
-with a URDF. Rows are paired with images by name, by time or in order. Images with a pose become
-training frames with base_from_gripper; gripper_from_camera is unknown. All images come from one
-camera.
+Images with a pose become training frames with base_from_gripper; gripper_from_camera is unknown.
+All images come from one camera.
 """
 
 import os
@@ -20,6 +18,7 @@ from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.recordings.poses.row_files import natural_key, read_rows
 from evercal.recordings.read_options import ReadOptions, flag
+from evercal.recordings.text_files import first_repeated
 
 USES = ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention")
 _POSES = tuple(
@@ -40,11 +39,7 @@ def detect(root: Path) -> bool:
 
 
 def load(root: str | os.PathLike[str], options: ReadOptions | None = None) -> Recording:
-    """Read poses, intrinsics and the size of one image; no other image is opened.
-
-    Raises:
-        InputError: Poses, images or intrinsics are missing, broken or inconsistent.
-    """
+    """Read poses, intrinsics and the size of one image; no other image is opened."""
     root = Path(root)
     options = options or ReadOptions()
     file = _pose_file(root)
@@ -126,7 +121,7 @@ def _stamps(root: Path) -> dict[str, float] | None:
     if rows.names is None or rows.stamps_s is None:
         raise InputError(f"{file}: needs the columns image and stamp_s")
     names = [PurePath(name).name for name in rows.names]
-    repeated = [name for i, name in enumerate(names) if name in names[:i]]
-    if repeated:
-        raise InputError(f"{file}: {repeated[0]!r} comes twice; give every image one time")
+    repeated = first_repeated(names)
+    if repeated is not None:
+        raise InputError(f"{file}: {repeated!r} comes twice; give every image one time")
     return dict(zip(names, rows.stamps_s.tolist(), strict=True))

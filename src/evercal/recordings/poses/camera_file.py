@@ -1,10 +1,8 @@
 """Camera files: a 3x3 matrix, JSON, YAML, NPZ, ROS camera_info, OpenCV's FileStorage.
 
-The content decides the kind, not the file ending. Fields of JSON, YAML and NPZ have the names of
-OpenCV (`camera_matrix`, `dist_coeffs`), of ROS (`K`, `D`), of RealSense (`fx`, `ppx`, `coeffs`) or
-of evercal's own JSON. Of ROS, both calibration files and printed messages (`ros2 topic echo --once
-.../camera_info`) are read, with the matrix K and D of the raw image. In all kinds, pixel (0, 0) is
-the centre of the top-left pixel, and images are upright.
+The content decides the kind, not the file ending; docs/formats.md lists the names of the fields. Of
+ROS, both calibration files and printed messages are read, with the matrix K and D of the raw image.
+In all kinds, pixel (0, 0) is the centre of the top-left pixel, and images are upright.
 """
 
 import json
@@ -19,13 +17,14 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.recordings.poses.row_files import arrays_as_lists, is_number
-from evercal.recordings.text_files import read_text
+from evercal.recordings.text_files import named_errors, read_text
 
 _MODELS = (
     "plumbbob", "rationalpolynomial", "brownconrady", "radtan", "opencv", "pinhole", "none", "",
 )  # fmt: skip
 _MODEL_KEYS = ("distortionmodel", "model", "cameramodel")
 _LENGTHS = (0, 4, 5, 8)
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 # Names of the fields in lower case without underscores.
 _ALIASES = {
     "camera_matrix": ("cameramatrix", "intrinsicmatrix", "intrinsics", "k", "mtx"),
@@ -58,22 +57,12 @@ def read_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = Non
         InputError: The file is missing, of an unknown kind, or holds no usable camera.
     """
     path = Path(path)
-    try:
+    with named_errors(path, "camera file"):
         return camera_from_fields(_fields_of(path), size)
-    except FileNotFoundError:
-        raise InputError(f"{path}: camera file is missing; check the path") from None
-    except OSError as error:
-        raise InputError(f"{path}: camera file cannot be read ({error.strerror})") from None
-    except (ValueError, OverflowError) as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def read_camera_of_size(path: Path, size: tuple[int, int], images: str) -> Camera:
-    """Read the intrinsics of images of one size.
-
-    Raises:
-        InputError: As `read_camera`, or the camera has another size.
-    """
+    """Read the intrinsics of images of one size; another size is refused."""
     camera = read_camera(path, size)
     check_size(str(path), camera, size, images)
     return camera
@@ -91,21 +80,20 @@ def check_size(source: str, camera: Camera, size: tuple[int, int], images: str) 
 def camera_from_fields(data: Mapping[str, Any], size: tuple[int, int] | None = None) -> Camera:
     """Build a camera from the fields of a file, or of a ROS message.
 
-    `size` is (width, height) in pixels of the images, if the fields may lack it.
-
-    Raises:
-        ValueError: A field is missing or unusable, the distortion model is not supported, or the
-            image is a region of interest.
+    `size` is (width, height) in pixels of the images, if the fields may lack it. ValueError: a
+    field is missing or unusable, the distortion model is not supported, or the image is a region
+    of interest.
     """
-    fields = _fields(data)
-    ros = not {_plain(key) for key in data}.isdisjoint(_ROS)
+    fields, ros = _fields(data), not {_plain(key) for key in data}.isdisjoint(_ROS)
     roi = data.get("roi")
     if isinstance(roi, dict) and any(roi.get(key) for key in ("x_offset", "y_offset")):
         raise ValueError(f"the image is a cut-out (roi {roi}); give the whole image's camera_info")
+    if fields.get("fisheyemodel"):
+        raise ValueError("fisheye_model is set; rectify the images or calibrate without it")
     matrix = _matrix(fields, data)
     width, height = _size(fields, data, None if ros else size)
     distortion = _distortion(fields, data, ros)
-    for model in (str(data[key]) for key in data if _plain(key) in _MODEL_KEYS):
+    for model in (str(fields[key]) for key in _MODEL_KEYS if key in fields):
         # RealSense prints distortion.inverse_brown_conrady, mostly with zeros.
         known = _plain(model.rpartition(".")[2].replace(" ", "")) in _MODELS
         if not known and (any(distortion) or "conrady" not in model.lower()):
@@ -125,18 +113,20 @@ def _fields_of(path: Path) -> Mapping[str, Any]:
     if zipped:
         return arrays_as_lists(path)
     text = read_text(path, "camera file")
+    if "<opencv_storage" in text:
+        return _xml_of_opencv(text)
+    words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
+    if all(map(is_number, words)):
+        if len(words) != 9:
+            raise ValueError(f"{len(words)} numbers, a 3x3 matrix has 9; {_EXPECTED}")
+        return {"camera_matrix": [float(word) for word in words]}
     try:
-        if text.startswith("%YAML:") or "opencv-matrix" in text or "<opencv_storage" in text:
-            return _stored_by_opencv(text)
-        words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
-        if all(map(is_number, words)):
-            if len(words) != 9:
-                raise ValueError(f"{len(words)} numbers, a 3x3 matrix has 9; {_EXPECTED}")
-            return {"camera_matrix": [float(word) for word in words]}
         if text.lstrip().startswith("{"):
             return json.loads(text)
+        # OpenCV's %YAML:1.0 is not valid YAML. cv2.FileStorage can end the process on such files.
+        plain = re.sub(r"^%.*$|!!opencv-[a-z-]+", "", text, flags=re.MULTILINE)
         # A printed message ends with '---', which opens a second, empty document.
-        data = next(yaml.safe_load_all(text), None)
+        data = next(yaml.safe_load_all(plain), None)
     except json.JSONDecodeError as error:
         raise ValueError(f"not valid JSON ({error}); {_EXPECTED}") from None
     except yaml.YAMLError as error:
@@ -146,35 +136,8 @@ def _fields_of(path: Path) -> Mapping[str, Any]:
     return data
 
 
-def _stored_by_opencv(text: str) -> dict[str, Any]:
-    """Matrices and numbers of a cv2.FileStorage.
-
-    Read without OpenCV, whose parser of such files can end the whole process on a damaged one.
-    """
-    if text.lstrip().startswith("{"):
-        found = json.loads(text)
-    elif "<opencv_storage" in text:
-        found = _xml_of_opencv(text)
-    else:
-        import yaml
-
-        lines = text.splitlines()  # the first one, %YAML:1.0, is not valid YAML
-        plain = "\n".join(line for line in lines if not line.startswith("%"))
-        found = yaml.safe_load(re.sub(r"!!opencv-[a-z-]+", "", plain))
-    if not isinstance(found, dict):
-        raise ValueError(f"no camera in it; {_EXPECTED}")
-    values = {
-        str(key): float(value) if isinstance(value, str) and is_number(value) else value
-        for key, value in found.items()
-        if isinstance(value, dict | int | float) or is_number(str(value))
-    }
-    if values.get("fisheye_model"):
-        raise ValueError("fisheye_model is set; rectify the images or calibrate without it")
-    return values
-
-
-def _xml_of_opencv(text: str) -> dict[str, object]:
-    """Texts of the elements, and numbers of the matrices."""
+def _xml_of_opencv(text: str) -> dict[str, Any]:
+    """Texts of the elements, and numbers of the matrices, of a cv2.FileStorage."""
     from xml.etree import ElementTree
 
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can expand without bound
@@ -183,11 +146,13 @@ def _xml_of_opencv(text: str) -> dict[str, object]:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise ValueError(f"not valid XML ({error}); {_EXPECTED}") from None
-    found: dict[str, object] = {}
+    found: dict[str, Any] = {}
     for element in root:
-        data = element.find("data")
-        words = "" if data is None else data.text or ""
-        found[element.tag] = element.text if data is None else {"data": words.split()}
+        data, word = element.find("data"), element.text or ""
+        if data is not None:
+            found[element.tag] = {"data": (data.text or "").split()}
+        elif is_number(word):
+            found[element.tag] = float(word)
     return found
 
 
@@ -196,15 +161,15 @@ def _plain(key: object) -> str:
 
 
 def _fields(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Known fields by key of `_ALIASES`."""
-    fields: dict[str, Any] = {}
-    for name, aliases in _ALIASES.items():
-        keys = [key for key in data if _plain(key) in aliases]
-        if len(keys) > 1:
-            raise ValueError(f"{' and '.join(keys)} are the same; keep one of them")
-        if keys:
-            fields[name] = data[keys[0]]
-    return fields
+    """Values by key of `_ALIASES`, others by their plain key."""
+    keys: dict[str, str] = {}
+    for key in data:
+        plain = _plain(key)
+        name = next((name for name, aliases in _ALIASES.items() if plain in aliases), plain)
+        if name in keys and name in (*_ALIASES, *_COEFFICIENTS):
+            raise ValueError(f"{keys[name]} and {key} are the same; keep one of them")
+        keys[name] = key
+    return {name: data[key] for name, key in keys.items()}
 
 
 def _matrix(fields: Mapping[str, Any], data: Mapping[str, Any]) -> np.ndarray:
@@ -232,11 +197,11 @@ def _matrix(fields: Mapping[str, Any], data: Mapping[str, Any]) -> np.ndarray:
 def _distortion(fields: Mapping[str, Any], data: Mapping[str, Any], ros: bool) -> list[float]:
     """Distortion coefficients, empty if a file has no such field; ROS files must have it."""
     name = "distortion_coefficients"
+    stated = [key for key in _COEFFICIENTS if key in fields]
     if name in fields:
         numbers = _numbers(fields[name], name)
-    elif "k1" in data:
-        names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        numbers = _numbers([data.get(key, 0.0) for key in names], "k1")
+    elif stated:
+        numbers = _numbers([fields.get(key, 0.0) for key in _COEFFICIENTS], stated[0])
         numbers = numbers if any(numbers[5:]) else numbers[:5]
     else:
         other = [key for key in data if "dist" in _plain(key) and _plain(key) not in _MODEL_KEYS]
@@ -256,19 +221,18 @@ def _size(
     fields: Mapping[str, Any], data: Mapping[str, Any], size: tuple[int, int] | None
 ) -> tuple[Any, Any]:
     """Width and height in pixels, checked when the camera is constructed."""
-    names = ("image_width", "image_height")
-    stated: Any = [fields[name] for name in names if name in fields]
-    if len(stated) < 2:
-        given = None if stated else size
-        stated = fields.get("image_size", given)
-        if not isinstance(stated, Mapping | list | tuple):
-            stated = given  # a single number called `size` is that of something else
-    if isinstance(stated, Mapping):
-        return _size(_fields(stated), stated, None)
+    missing = [name for name in ("image_width", "image_height") if name not in fields]
+    stated: Any = size if len(missing) == 2 else None
+    if not missing:
+        stated = [fields["image_width"], fields["image_height"]]
+    elif isinstance(fields.get("image_size"), Mapping):
+        return _size(_fields(fields["image_size"]), fields["image_size"], None)
+    elif isinstance(fields.get("image_size"), list | tuple):  # a number called `size` is not one
+        stated = fields["image_size"]
     if stated is None:
-        missing = next(name for name in names if name not in fields)
         raise ValueError(
-            f"{missing!r} is missing, so it has no image size, there is {', '.join(map(str, data))}"
+            f"{missing[0]!r} is missing, so it has no image size, there is"
+            f" {', '.join(map(str, data))}"
         )
     numbers = _numbers(list(stated), "image size")
     if len(numbers) != 2:

@@ -3,7 +3,7 @@
 A convention defines order, units and rotation of the numbers. Its name may be followed by
 modifiers: `kuka:m` (KUKA's angles, but metres), `matrix:inverse` (gripper_from_base),
 `matrix:opengl` (camera axes x right, y up, z back). Units in the name are final, units that a
-convention only implies are checked against the numbers. docs/formats.md has the same tables.
+convention only implies are checked against the numbers.
 
 The conventions were checked against Roboception's documentation of pose formats (ABB, FANUC, KUKA,
 Yaskawa), Universal Robots' script manual, RoboDK's converters (Staubli) and libfranka's reference.
@@ -108,8 +108,7 @@ UNITS: dict[str, dict[str, Any]] = {
 def pose_convention(name: str) -> PoseConvention:
     """Parse the name of a convention with modifiers, such as `kuka:m:inverse`.
 
-    Raises:
-        ValueError: The name is not known, or a modifier does not belong to it.
+    ValueError: the name is not known, or a modifier does not belong to it.
     """
     base, *modifiers = name.strip().lower().split(":")
     if base not in CONVENTIONS:
@@ -137,9 +136,8 @@ def poses_from_numbers(
     the pose, or the first with `camera_from` (camera_from_board); only `:opengl` depends on it.
 
     Raises:
-        ValueError: The count is wrong, a number is not finite, a quaternion is not of length one,
-            or a matrix is no rigid transform; the message names the first such pose.
         ConventionError: The matrices are transposed.
+        ValueError: Other numbers that are no pose; the message names the first such pose.
     """
     numbers = np.asarray(numbers, dtype=np.float64)
     if not numbers.ndim or numbers.shape[-1] not in convention.counts:
@@ -286,17 +284,17 @@ def _rigid(matrices: Array) -> NDArray[np.bool_]:
 
 def _from_matrices(numbers: Array, convention: PoseConvention) -> SE3:
     matrices = _matrices(numbers, convention.layout)
-    other = CONVENTIONS["franka" if convention.layout == "rows" else "matrix"]
-    stated, written = "row after row", "column after column"
-    stated, written = (stated, written) if other.base == "franka" else (written, stated)
+    orders = {"matrix": "row after row", "franka": "column after column"}
+    stated, other = ("matrix", "franka") if convention.layout == "rows" else ("franka", "matrix")
     broken = ~_rigid(matrices)
-    if broken.any() and _rigid(_matrices(numbers, other.layout)).all():
-        problem = f"the matrices are no rigid transforms {stated}, they are written {written}"
-        raise ConventionError(problem, ":".join([other.name, *convention.name.split(":")[1:]]))
+    if broken.any() and _rigid(_matrices(numbers, CONVENTIONS[other].layout)).all():
+        problem = f"no rigid transforms {orders[stated]}, they are written {orders[other]}"
+        remedy = ":".join([other, *convention.name.split(":")[1:]])
+        raise ConventionError(f"the matrices are {problem}", remedy)
     _refuse(
         broken,
-        f"the matrix {stated} is no rigid transform: its last row is not 0 0 0 1, or its left 3x3"
-        f" block is no rotation but holds a scale or a reflection",
+        f"the matrix {orders[stated]} is no rigid transform: its last row is not 0 0 0 1, or its"
+        f" left 3x3 block is no rotation but holds a scale or a reflection",
     )
     poses = SE3.from_matrix(matrices, _TOLERANCE)
     return SE3(poses.rotation_wxyz, poses.translation_m * convention.metres_per_unit)

@@ -1,8 +1,7 @@
 """Gripper poses from joint angles and a URDF.
 
 A CSV table has a column for each joint of the URDF; JSON has `joint_names` and `positions`. Values
-are radians, or degrees if a name ends in `_deg`, and metres for prismatic joints. Rows are labelled
-with images or times, or are in the order of the images.
+are radians, or degrees if a name ends in `_deg`, and metres for prismatic joints.
 """
 
 from collections.abc import Sequence
@@ -35,9 +34,6 @@ def read_joint_poses(
 
     `unit` is "rad" or "deg" of angles whose column states no unit; radians if omitted. Links are
     chosen by `RobotModel.chosen_links`.
-
-    Raises:
-        InputError: The file is broken, a link or joint is missing, or angles look like degrees.
     """
     rows = read_joints(path)
     base, gripper = model.chosen_links(base, gripper)
@@ -73,11 +69,7 @@ def in_radians(
     values: NDArray[np.float64],
     units: Sequence[str | None],
 ) -> NDArray[np.float64]:
-    """Convert angles in degrees to radians and leave other values (n, k) as they are.
-
-    Raises:
-        InputError: A unit is not known.
-    """
+    """Convert angles in degrees to radians and leave other values (n, k) as they are."""
     other = next((unit for unit in units if unit not in (None, *_UNITS)), None)
     if other is not None:
         raise InputError(f"--pose-convention {other}: joint angles are rad or deg")
@@ -88,16 +80,10 @@ def in_radians(
 def interpolate(
     times_s: NDArray[np.float64], positions: NDArray[np.float64], stamps_s: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Interpolate the position of one joint at (m,) seconds.
+    """Interpolate (n,) positions of a joint at (m,) seconds; jumps by full rotations are removed.
 
-    Args:
-        times_s: (n,) times of the positions, in any order.
-        positions: (n,) radians or metres; jumps by full rotations are removed.
-        stamps_s: (m,) seconds.
-
-    Returns:
-        (m,) positions and (m,) whether each is valid: between the ends, and not in a gap of more
-        than `MAX_GAP_S` over which the joint moved.
+    The second array tells whether each is valid: between the ends, and not in a gap of more than
+    `MAX_GAP_S` over which the joint moved.
     """
     times, first = np.unique(times_s, return_index=True)
     values = np.unwrap(positions[first])
@@ -112,11 +98,7 @@ def interpolate(
 
 
 def read_joints(path: Path) -> Rows:
-    """Read a table of joint values.
-
-    Raises:
-        InputError: The file is missing or broken.
-    """
+    """Read a table of joint values."""
     if path.suffix.lower() == ".csv":
         return read_rows(path, "joint angles")
     data: dict[str, Any] = read_json(path, "file of joint angles", f"give {_JSON}")

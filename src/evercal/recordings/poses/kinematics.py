@@ -17,11 +17,7 @@ _LARGEST_RAD = 4 * np.pi
 
 
 class RobotModel:
-    """Links and joints of a URDF; its meshes are not read.
-
-    Raises:
-        InputError: The extra `urdf` is not installed, or the file is missing or no URDF.
-    """
+    """Links and joints of a URDF; its meshes are not read."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -54,11 +50,7 @@ class RobotModel:
         return name in self._urdf.joint_map
 
     def chosen_links(self, base: str | None, gripper: str | None) -> tuple[str, str]:
-        """Base and gripper link; if omitted, the root and the only end of the arm.
-
-        Raises:
-            InputError: The gripper is omitted and the links have several ends.
-        """
+        """Base and gripper link; if omitted, the root and the only end of the arm."""
         parents = {joint.parent for joint in self._joint_above.values()}
         ends = [link for link in self.links if link not in parents]
         if gripper is None and len(ends) != 1:
@@ -75,11 +67,7 @@ class RobotModel:
         base: str | None,
         gripper: str | None,
     ) -> tuple[SE3, list[str]]:
-        """Compute (n,) poses of the gripper, with notes about their source and joint limits.
-
-        Raises:
-            InputError: As `chosen_links` and `base_from_gripper`.
-        """
+        """Compute (n,) poses of the gripper, with notes about their source and joint limits."""
         base, gripper = self.chosen_links(base, gripper)
         poses = self.base_from_gripper(names, values, base, gripper)
         note = f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
@@ -88,11 +76,7 @@ class RobotModel:
         return poses, [note, *self.beyond_limits(needed, columns)]
 
     def joints_between(self, base: str, gripper: str) -> tuple[str, ...]:
-        """Moving joints between two links, from the base outwards.
-
-        Raises:
-            InputError: A link does not exist, or a joint has several values.
-        """
+        """Moving joints between two links, from the base outwards."""
         up, down = self._ancestors(base), self._ancestors(gripper)
         joints = [j for j in down if j not in up] + [j for j in up if j not in down]
         names = []
@@ -109,9 +93,6 @@ class RobotModel:
         """Compute (n,) poses of the link `gripper` in the link `base`.
 
         Values (n, k) of the k named joints are radians, or metres for prismatic joints.
-
-        Raises:
-            InputError: A joint has no values, or values are not in radians.
         """
         needed = self.joints_between(base, gripper)
         missing = [name for name in needed if name not in names]
@@ -164,7 +145,6 @@ class RobotModel:
         return notes
 
     def _ancestors(self, link: str) -> list[Any]:
-        """Joints from a link up to the root."""
         if link not in self.links:
             raise InputError(
                 f"{self.path}: has no link {link!r}; its links are {', '.join(self.links)}"

@@ -55,14 +55,44 @@ def rotation_warnings(frames: Sequence[Frame], poses: SE3, of_camera: bool) -> l
         frames: (n,) frames in recorded order.
         poses: (n,) base_from_camera or base_from_gripper.
         of_camera: Whether the poses are base_from_camera.
-
-    Raises:
-        InputError: An image cannot be read.
     """
     rotations = pair_rotations(frames, poses)
     if rotations is None:
         return []
-    return _camera_warnings(rotations) if of_camera else _gripper_warnings(rotations)
+    measured, stated, inverse, swapped = rotations
+    owner = "camera" if of_camera else "gripper"
+    readings = {f"{owner}_from_base, the inverse": inverse}
+    if of_camera:
+        readings["with OpenGL's camera axes (right, up, backward)"] = _GL.apply(stated)
+        readings["the inverse with OpenGL's camera axes"] = _GL.apply(inverse)
+    elif np.rad2deg(np.median(np.linalg.norm(measured, axis=1))) < STILL_DEG:
+        return [
+            "the gripper rotates and the images hardly do; does the camera stand still, or are the"
+            " angles in another unit than stated?"
+        ]
+    readings["with quaternions in another order"] = swapped
+    # Between gripper and camera is a fixed rotation that is not known.
+    error_of, better = (_error_deg, BETTER) if of_camera else (_fitted_error_deg, GRIPPER_BETTER)
+    error = error_of(measured, stated)
+    errors = {reading: error_of(measured, vectors) for reading, vectors in readings.items()}
+    improved = min(errors.values()) < error / better
+    if error < (AGREE_DEG if of_camera or not improved else GRIPPER_AGREE_DEG):
+        return []
+    if of_camera and not improved:
+        fitted = _fitted_error_deg(measured, stated)
+        errors["those of another frame, at a fixed angle to the camera"] = fitted
+    problem = (
+        f"the {owner} rotates differently from the images, by {error:.1f} deg in the median of"
+        f" {len(measured)} pairs"
+    )
+    least = min(errors.values())
+    if least < min(AGREE_DEG, error / better):
+        fitting = [reading for reading, e in errors.items() if e < least + CLOSE_DEG]
+        return [f"{problem}; the poses fit ({least:.1f} deg) if they are {', or '.join(fitting)}"]
+    return [
+        f"{problem}; do poses and images belong together, are angles in the stated unit and Euler"
+        f" order, and are the intrinsics right?"
+    ]
 
 
 def pair_rotations(frames: Sequence[Frame], poses: SE3) -> PairRotations | None:
@@ -141,59 +171,7 @@ def _pairs(poses: SE3) -> list[tuple[int, int]]:
     return pairs
 
 
-def _camera_warnings(rotations: PairRotations) -> list[str]:
-    measured, stated, inverse = rotations.measured, rotations.stated, rotations.inverse
-    error = _error_deg(measured, stated)
-    if error < AGREE_DEG:
-        return []
-    errors = {
-        "camera_from_base, the inverse": _error_deg(measured, inverse),
-        "with OpenGL's camera axes (right, up, backward)": _error_deg(measured, _GL.apply(stated)),
-        "the inverse with OpenGL's camera axes": _error_deg(measured, _GL.apply(inverse)),
-        "with quaternions in another order": _error_deg(measured, rotations.swapped),
-    }
-    if min(errors.values()) > error / BETTER:
-        fitted = _fitted_error_deg(measured, stated)
-        errors["those of another frame, at a fixed angle to the camera"] = fitted
-    return [_sentence("camera", error, errors, len(measured), BETTER)]
-
-
-def _gripper_warnings(rotations: PairRotations) -> list[str]:
-    measured = rotations.measured
-    if np.rad2deg(np.median(np.linalg.norm(measured, axis=1))) < STILL_DEG:
-        return [
-            "the gripper rotates and the images hardly do; does the camera stand still, or are the"
-            " angles in another unit than stated?"
-        ]
-    error = _fitted_error_deg(measured, rotations.stated)
-    errors = {
-        "gripper_from_base, the inverse": _fitted_error_deg(measured, rotations.inverse),
-        "with quaternions in another order": _fitted_error_deg(measured, rotations.swapped),
-    }
-    better = min(errors.values()) < error / GRIPPER_BETTER
-    if error < (GRIPPER_AGREE_DEG if better else AGREE_DEG):
-        return []
-    return [_sentence("gripper", error, errors, len(measured), GRIPPER_BETTER)]
-
-
-def _sentence(frame: str, error: float, errors: dict[str, float], pairs: int, better: float) -> str:
-    """Warning that names the readings with the smallest error, if it is small enough."""
-    least = min(errors.values())
-    problem = (
-        f"the {frame} rotates differently from the images, by {error:.1f} deg in the median of"
-        f" {pairs} pairs"
-    )
-    if least < min(AGREE_DEG, error / better):
-        readings = [reading for reading, e in errors.items() if e < least + CLOSE_DEG]
-        return f"{problem}; the poses fit ({least:.1f} deg) if they are {', or '.join(readings)}"
-    return (
-        f"{problem}; do poses and images belong together, are angles in the stated unit and Euler"
-        f" order, and are the intrinsics right?"
-    )
-
-
 def _error_deg(measured: Array, stated: Array) -> float:
-    """Median angle between rotations, degrees."""
     difference = Rotation.from_rotvec(measured).inv() * Rotation.from_rotvec(stated)
     return float(np.rad2deg(np.median(difference.magnitude())))
 

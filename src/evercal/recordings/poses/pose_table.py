@@ -3,8 +3,8 @@
 Lines that start with # are ignored, except that the last of them before the numbers may be the
 header, as in files of numpy and TUM. Rows without a header have the numbers of a convention,
 optionally preceded by a stamp, and a name before or after them. Matrices may be blocks of 3 or 4
-lines. Brackets hold a pose or a row of a matrix each: `[...]` of numpy, `p[...]` of Universal
-Robots, `{X ..., C ...}` of KUKA.
+lines, with numpy's brackets or without. Notations are `p[...]` of Universal Robots and
+`{X ..., C ...}` of KUKA.
 """
 
 import re
@@ -24,6 +24,7 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
 )
 from evercal.recordings.poses.row_files import (
+    Names,
     cell_numbers,
     in_unit,
     is_number,
@@ -33,7 +34,6 @@ from evercal.recordings.poses.row_files import (
 )
 
 Array = NDArray[np.float64]
-Names = tuple[str, ...] | None
 
 
 class PoseTable(NamedTuple):
@@ -58,6 +58,12 @@ class Columns(NamedTuple):
     """Conventions that the columns of a rotation may hold."""
     ask: str = ""
     """Conventions to ask for; empty if the columns define the first one."""
+
+    def names(self, index: int) -> set[str]:
+        """Possible names of one column."""
+        prefixes = self.prefixes.split(",")
+        by_index = {f"{prefix}{index}" for prefix in prefixes if "vec_" in prefix}
+        return {prefix + self.ends[index] for prefix in prefixes} | by_index
 
 
 _GRID = [f"{row}{column}" for row in range(4) for column in range(4)]
@@ -84,9 +90,8 @@ HEADERS = {
 """Columns of a position and of rotations; definite rotations come first."""
 _AXES = {"quaternion": "wxyz", "angles": "xyz", "roll pitch yaw": "xyz"}
 """Columns that conventions order by axis; rx and roll rotate about x."""
-_BRACKETS = re.compile(r'(?:([^\s\[\](){}=,;:"]+)[\s=,;:"]+)?(p?\[|\{)([^\[\]{}]*)[\]}]')
-_NOTATIONS = {"[": "", "p[": "x,y,z,rotvec_x,rotvec_y,rotvec_z", "{": "X,Y,Z,A,B,C"}
-
+_NOTATION = re.compile(r'(?:([^\s\[\](){}=,;:"]+)[\s=,;:"]+)?(p\[|\{)([^\[\]{}]*)[\]}]')
+"""A word, if there is one, the bracket and what it holds."""
 
 _Groups = dict[str, tuple[list[int], str | None]]
 """Columns and their unit, if stated, by key of `HEADERS`."""
@@ -99,17 +104,15 @@ def read_pose_table(text: str, given: PoseConvention | None) -> PoseTable:
         ValueError: The text is no table of numbers, or its convention is not defined.
     """
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    plain = [line for line in lines if not line.startswith("#")]
-    if not plain:
-        raise ValueError("no line of numbers in it")
-    comments = lines[: lines.index(plain[0])]
+    plain = [line for line in lines if line[0] != "#"]
+    comments = lines[: lines.index(plain[0])] if plain else []
     plain, given = _without_brackets(plain, given)
-    cells = table_cells(plain)
-    if not len(cells):  # separators only
-        raise ValueError("no line of numbers in it")
-    words, rows = cells[0].tolist(), cells[1:]
-    if not _is_header(words):
-        words, rows = table_cells([c.lstrip("# ") for c in comments[-1:]]).ravel().tolist(), cells
+    rows = table_cells(plain)
+    words = rows[0].tolist() if len(rows) else []
+    if _is_header(words):
+        rows = rows[1:]
+    else:
+        words = table_cells([line.lstrip("# ") for line in comments[-1:]]).ravel().tolist()
     if not len(rows):
         raise ValueError("no line of numbers in it")
     if len(words) == rows.shape[1] and _is_header(words):
@@ -185,9 +188,9 @@ def plain_numbers(numbers: Array, given: PoseConvention | None, names: Names = N
         )
     count = next((count for count in given.counts if 0 <= width - count <= 1), 0)
     stamps = in_unit(numbers[:, 0]) if count and width > count else None
-    back = np.flatnonzero(np.diff(numbers[:, 0]) < 0)
     # A misplaced number shows in quaternions and matrices, but not in angles.
-    if not count or (stamps is not None and given.has_angles and back.size):
+    misplaced = stamps is not None and given.has_angles and (np.diff(stamps) < 0).any()
+    if not count or misplaced:
         raise ValueError(
             f"rows have {width} numbers; {given.name} takes {' or '.join(map(str, given.counts))}"
             f" ({given.meaning}), optionally after a name and a stamp that increases"
@@ -198,28 +201,31 @@ def plain_numbers(numbers: Array, given: PoseConvention | None, names: Names = N
 def _without_brackets(
     lines: list[str], given: PoseConvention | None
 ) -> tuple[list[str], PoseConvention | None]:
-    """Lines of a table, one for each bracket, and the convention that a notation defines."""
-    found: list[list[str]] = []
-    kinds: set[str] = set()
+    """Lines of a table without brackets, and the convention that a robot's notation defines."""
     text = "\n".join(lines)
-    if "[" not in text and "{" not in text:
+    found = _NOTATION.findall(text)
+    # Units are in brackets, too, and KUKA has braces for other things.
+    found = [each for each in found if re.search(r"\bX\s" if each[1] == "{" else ",", each[2])]
+    if not found:
+        if lines and re.search(r"\[\s*[-+.\d]", lines[0]):  # by numpy, which wraps long rows
+            text = re.sub(r"\[[^\[\]]*\]", lambda row: row[0].replace("\n", " "), text)
+            lines = re.sub(r'[\[\],;="]', " ", text).splitlines()
         return lines, given
-    for word, bracket, inside in _BRACKETS.findall(text):
-        values = dict(re.findall(r"\b([XYZABC])\s+([^\s,]+)", inside))
-        numbers = [values.get(key, "") for key in "XYZABC"]
-        numbers = numbers if bracket == "{" else inside.replace(",", " ").split()
-        if len(numbers) > 3 and all(map(is_number, numbers)):
-            found.append([word, *numbers])
-            kinds.add(bracket)
+    kinds = {bracket for _, bracket, _ in found}
+    kinds |= set(re.findall(r"p?\[", text)) if "p[" in kinds else set()
     if len(kinds) > 1:
         raise ValueError(f"it mixes the brackets {' and '.join(sorted(kinds))}; use one notation")
     words = [word for word, *_ in found]
-    named = all(words) and (len(found) == 1 or len({*words}) > 1)  # else E6POS or nothing
-    rows = [",".join(row if named else row[1:]) for row in found]
-    given = given or (pose_convention("kuka") if "{" in kinds else None)
-    header = _NOTATIONS[kinds.pop()] if found else ""
-    label = "" if not named else "stamp," if is_number(found[0][0]) else "image,"
-    return ([label + header, *rows] if header else rows or lines), given
+    named = all(words) and (len(found) == 1 or len({*words}) > 1)  # else a type, such as E6POS
+    rows = []
+    for word, bracket, inside in found:
+        values = dict(re.findall(r"\b([XYZABC])\s+([^\s,]+)", inside))
+        row = inside if bracket == "p[" else ",".join(values.get(key, "") for key in "XYZABC")
+        rows.append(f"{word},{row}" if named else row)
+    label = "" if not named else "stamp," if is_number(words[0]) else "image,"
+    if "{" in kinds:
+        return [label + "X,Y,Z,A,B,C", *rows], given or pose_convention("kuka")
+    return [label + "x,y,z,rotvec_x,rotvec_y,rotvec_z", *rows], given
 
 
 def _is_header(words: Sequence[str]) -> bool:
@@ -231,17 +237,15 @@ def _is_header(words: Sequence[str]) -> bool:
 def _groups(words: Sequence[str]) -> _Groups:
     """Columns of a header that belong together.
 
-    Raises:
-        ValueError: The columns of a group differ in unit, or a column is ambiguous.
+    ValueError: the columns of a group differ in unit, or a column is ambiguous.
     """
     names, units = zip(*map(name_and_unit, words), strict=True)
     groups: _Groups = {}
-    for key, (prefixes, ends, *_) in HEADERS.items():
-        found: list[list[int]] = []
-        for k, end in enumerate(ends):
-            some = {prefix + end for prefix in prefixes.split(",")}
-            some |= {f"{prefix}{k}" for prefix in prefixes.split(",") if "vec_" in prefix}
-            found.append([column for column, name in enumerate(names) if name in some])
+    for key, group in HEADERS.items():
+        found = [
+            [column for column, name in enumerate(names) if name in group.names(i)]
+            for i in range(len(group.ends))
+        ]
         columns = [candidates[0] for candidates in found if candidates]
         # rotation_x belongs to a quaternion if there is a rotation_w.
         if not all(found) or any({*columns} & {*used} for used, _ in groups.values()):

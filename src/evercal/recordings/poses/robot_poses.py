@@ -1,16 +1,14 @@
 """Pose files: a table (CSV, TUM, text), JSON, NPY or NPZ, in a named convention.
 
-JSON is a list of objects with `translation_m` and `quaternion_wxyz`, with `matrix`, or with numbers
-named like the columns of a table. It may also be a list of lists of numbers, as NPY and NPZ. Poses
-and lists of names or times may stand under keys. A convention is required if the file does not
-define the meaning of its numbers. docs/formats.md has examples.
+A convention is required if the file does not define the meaning of its numbers. docs/formats.md
+has examples of all kinds.
 """
 
 import json
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +30,13 @@ from evercal.recordings.poses.pose_table import (
     plain_numbers,
     read_pose_table,
 )
-from evercal.recordings.poses.row_files import arrays_as_lists, number_array, row_labels
-from evercal.recordings.text_files import read_text
+from evercal.recordings.poses.row_files import (
+    Names,
+    arrays_as_lists,
+    number_array,
+    row_labels,
+)
+from evercal.recordings.text_files import first_repeated, named_errors, read_text
 
 _KEYS = ("poses", "base_from_gripper", "camera_from_board", "T", "transforms", "matrices")
 """Keys of poses in JSON and NPZ."""
@@ -49,7 +52,7 @@ _LISTS = {"translation_m": ("x_m", "y_m", "z_m"), "quaternion_wxyz": ("qw", "qx"
 class RobotPoses:
     """Poses in the order of their file."""
 
-    names: tuple[str, ...] | None
+    names: Names
     """(n,) unique names of images or rows, if the file has any."""
     stamps_s: NDArray[np.float64] | None
     """(n,) seconds, if the file has any."""
@@ -87,34 +90,18 @@ def read_robot_poses(
         InputError: The file is missing or broken, or the numbers do not fit the convention.
     """
     path = Path(path)
-    ending = path.suffix.lower()
-    try:
-        name = "tum" if convention is None and ending == ".tum" else convention
-        given = None if name is None else pose_convention(name)
-        if ending in (".npy", ".npz"):
-            table = _data_table(arrays_as_lists(path), given)
-        elif ending == ".json":
-            table = _data_table(json.loads(read_text(path, what)), given)
-        else:
-            table = read_pose_table(read_text(path, what), given)
-        poses = poses_from_numbers(table.numbers, table.convention, camera_from)
-        check_units(table.numbers, table.convention)
-        names = table.names or ()
-        repeated = [name for i, name in enumerate(names) if name in names[:i]]
-        if repeated:
-            raise ValueError(f"the name {repeated[0]!r} comes twice; names are unique")
-        read = RobotPoses(table.names, table.stamps_s, poses)
-        if table.fixed:
-            return read
-        return replace(read, numbers=table.numbers, convention=table.convention)
-    except FileNotFoundError:
-        raise InputError(f"{path}: {what} is missing; check the path") from None
-    except OSError as error:
-        raise InputError(f"{path}: {what} cannot be read ({error.strerror})") from None
-    except ConventionError as error:
-        raise InputError(f"{path}: {error.naming(option)}") from None
-    except (ValueError, EOFError, TypeError) as error:
-        raise InputError(f"{path}: {error}") from None  # also invalid JSON and arrays of text
+    with named_errors(path, what):
+        try:
+            table = _read(path, _given(path, convention), what)
+            poses = poses_from_numbers(table.numbers, table.convention, camera_from)
+            check_units(table.numbers, table.convention)
+        except ConventionError as error:
+            raise InputError(f"{path}: {error.naming(option)}") from None
+        repeated = first_repeated(table.names or ())
+        if repeated is not None:
+            raise ValueError(f"the name {repeated!r} comes twice; names are unique")
+        stated = (None, None) if table.fixed else (table.numbers, table.convention)
+        return RobotPoses(table.names, table.stamps_s, poses, *stated)
 
 
 def read_last_robot_pose(path: str | os.PathLike[str], convention: str | None = None) -> SE3:
@@ -124,17 +111,15 @@ def read_last_robot_pose(path: str | os.PathLike[str], convention: str | None = 
 
     Args:
         path: `.jsonl` holds one JSON object a line; other endings are read as a table.
-        convention: As `read_robot_poses`.
+        convention: As of `read_robot_poses`.
 
     Raises:
         InputError: The file is missing, has no complete row, or its row is no pose.
     """
     path = Path(path)
-    try:
+    with named_errors(path, "file of robot poses"):
         head, tail = _ends(path)
-        given = None if convention is None else pose_convention(convention)
-        if given is None and path.suffix.lower() == ".tum":
-            given = pose_convention("tum")
+        given = _given(path, convention)
         if path.suffix.lower() == ".jsonl":
             table = _data_table(json.loads(tail[-1]), given) if tail else None
         else:
@@ -147,15 +132,23 @@ def read_last_robot_pose(path: str | os.PathLike[str], convention: str | None = 
             raise ValueError("no complete line of a pose in it yet")
         pose = poses_from_numbers(table.numbers, table.convention)[-1]
         check_units(table.numbers, table.convention)
-    except FileNotFoundError:
-        raise InputError(f"{path}: file of robot poses is missing; check the path") from None
-    except OSError as error:
-        raise InputError(f"{path}: robot poses cannot be read ({error.strerror})") from None
-    except ConventionError as error:
-        raise InputError(f"{path}: {error.naming(None)}") from None
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{path}: {error}") from None
-    return pose
+        return pose
+
+
+def _given(path: Path, convention: str | None) -> PoseConvention | None:
+    if convention is None and path.suffix.lower() == ".tum":
+        convention = "tum"
+    return None if convention is None else pose_convention(convention)
+
+
+def _read(path: Path, given: PoseConvention | None, what: str) -> PoseTable:
+    ending = path.suffix.lower()
+    if ending in (".npy", ".npz"):
+        return _data_table(arrays_as_lists(path), given)
+    text = read_text(path, what)
+    return (
+        _data_table(json.loads(text), given) if ending == ".json" else read_pose_table(text, given)
+    )
 
 
 def _ends(path: Path) -> tuple[list[str], list[str]]:
@@ -176,9 +169,8 @@ def _data_table(data: Any, given: PoseConvention | None) -> PoseTable:
     """Poses in lists and mappings, as in JSON."""
     if isinstance(data, Mapping) and not {"matrix", "translation_m"} & data.keys():
         key = _pose_key(data)
-        table = _data_table(data[key], given)
-        columns = {k: v for k, v in data.items() if k != key and isinstance(v, list)}
-        return _labelled(table, columns, plural=True)
+        lists = {k: v for k, v in data.items() if k != key and isinstance(v, list)}
+        return _labelled(_data_table(data[key], given), lists, plural=True)
     entries = data if isinstance(data, list) else [data]
     if entries and all(isinstance(entry, list) for entry in entries):
         numbers = number_array(entries, "a list of poses")
@@ -193,8 +185,8 @@ def _data_table(data: Any, given: PoseConvention | None) -> PoseTable:
     rows = [_flat(entry) for entry in entries]
     words = [*rows[0]]
     cells = np.array([[str(row.get(word)) for word in words] for row in rows])
-    table = named_numbers(words, cells, given)
-    return _labelled(table, columns)._replace(fixed="quaternion_wxyz" in columns)
+    table = _labelled(named_numbers(words, cells, given), columns)
+    return table._replace(fixed="quaternion_wxyz" in columns)
 
 
 def _labelled(
@@ -210,18 +202,17 @@ def _flat(entry: Mapping[str, Any]) -> dict[str, object]:
     """Values of an object by the name of a column."""
     cells: dict[str, object] = {}
     for key, value in entry.items():
-        if isinstance(value, list):
-            value = dict(zip(_LISTS.get(key, range(len(value))), value, strict=False))
-            cells |= value if key in _LISTS else {f"{key}_{i}": v for i, v in value.items()}
-        elif isinstance(value, Mapping):
-            cells |= _flat({f"{key}_{inner}": v for inner, v in value.items()})
+        if isinstance(value, Mapping):
+            cells |= _flat({f"{key}_{inner}": each for inner, each in value.items()})
+        elif isinstance(value, list):
+            names = _LISTS.get(key, [f"{key}_{i}" for i in range(len(value))])
+            cells |= dict(zip(names, value, strict=False))
         else:
             cells[key] = value
     return cells
 
 
 def _pose_key(data: Mapping[str, Any]) -> str:
-    """The only key of poses."""
     keys = [key for key in data if key in _KEYS]
     for key in () if keys else data:
         with suppress(ValueError):  # ragged

@@ -9,19 +9,17 @@ any name. In JSON lists beside the poses, names are in the plural: `images`, `st
 import io
 import re
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.errors import InputError
 from evercal.recordings.images import IMAGE_ENDINGS
-from evercal.recordings.text_files import read_text
+from evercal.recordings.text_files import named_errors, read_text
 
 Array = NDArray[np.float64]
+Names = tuple[str, ...] | None
 
 _NAMES = (
     "image", "image_name", "image_file", "image_path", "img", "file", "filename", "file_name",
@@ -35,11 +33,10 @@ _EARLIEST_S, _LATEST_S = 1e9, 4e9  # 2001 and 2096 in seconds since 1970
 _DECIMAL_COMMA = r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$"
 
 
-@dataclass(frozen=True, eq=False)
-class Rows:
+class Rows(NamedTuple):
     """A table of numbers with one row for each image or time."""
 
-    names: tuple[str, ...] | None
+    names: Names
     """(n,) image names, if there is such a column."""
     stamps_s: Array | None
     """(n,) seconds, if there is such a column."""
@@ -50,45 +47,39 @@ class Rows:
 
 
 def read_rows(path: Path, contents: str) -> Rows:
-    """Read a table whose first line names the columns; `contents` describes it in messages.
-
-    Raises:
-        InputError: The file is missing, lacks a header or rows, or holds a cell that is not a
-            finite number.
-    """
+    """Read a table whose first line names the columns; `contents` describes it in messages."""
     text = read_text(path, f"file with {contents}")
-    try:
+    with named_errors(path, contents):
         cells = table_cells([line for line in text.splitlines() if line[:1] != "#"])
         if len(cells) < 2 or all(map(is_number, cells[0])):
             raise ValueError(f"needs a line of column names, then rows of {contents}")
         header, rows = cells[0].tolist(), cells[1:]
         names, stamps, others = row_labels(header, rows.T.tolist(), len(rows))
         columns = tuple(header[i] for i in others)
-        values = cell_numbers(rows[:, others], columns)
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
-    return Rows(names, stamps, columns, values)
+        return Rows(names, stamps, columns, cell_numbers(rows[:, others], columns))
 
 
 def table_cells(lines: Sequence[str]) -> NDArray[np.str_]:
     """(n, k) cells of lines of text; missing cells at the end of a line are empty.
 
     Semicolons, commas, tabs or blanks of the first line separate them. If it is semicolons, the
-    comma may be a decimal point.
-
-    Raises:
-        ValueError: A line has more cells than the first.
+    comma may be a decimal point. ValueError: a line has more cells than the first.
     """
     import pandas as pd
 
     first = next((line for line in lines if line.strip()), "")
     separator = next((s for s in (";", ",", "\t") if s in first), " ")
     # Empty cells at the end of a line are missing cells.
-    text = io.StringIO("\n".join(line.lstrip(" ").rstrip(f" \r\n{separator}") for line in lines))
-    sep = r"\s+" if separator == " " else separator
-    options = {"header": None, "keep_default_na": False, "skipinitialspace": True}
+    text = "\n".join(line.lstrip(" ").rstrip(f" \r\n{separator}") for line in lines)
     try:
-        table = pd.read_csv(text, sep=sep, dtype=str, **options)
+        table = pd.read_csv(
+            io.StringIO(text),
+            sep=r"\s+" if separator == " " else separator,
+            dtype=str,
+            header=None,
+            keep_default_na=False,
+            skipinitialspace=True,
+        )
     except pd.errors.EmptyDataError:
         return np.empty((0, 0), dtype=np.str_)
     except pd.errors.ParserError as error:
@@ -100,16 +91,11 @@ def table_cells(lines: Sequence[str]) -> NDArray[np.str_]:
 
 def cell_numbers(cells: NDArray[np.str_], words: Sequence[str] = ()) -> Array:
     """Convert cells (n, k) to finite numbers; ValueError names the first other cell."""
-    with suppress(ValueError):
-        if np.isfinite(numbers := cells.astype(np.float64)).all():
-            return numbers
-    (row, column), cell = next(
-        (at, str(cell))
-        for at, cell in np.ndenumerate(cells)
-        if not is_number(cell) or not np.isfinite(float(cell))
-    )
-    name = repr(words[column]) if words else column + 1
-    raise ValueError(f"row {row + 1}, column {name}: {cell!r} is not a finite number")
+    for (row, column), cell in np.ndenumerate(cells):
+        if not is_number(cell) or not np.isfinite(float(cell)):
+            name = repr(words[column]) if words else column + 1
+            raise ValueError(f"row {row + 1}, column {name}: {str(cell)!r} is not a finite number")
+    return cells.astype(np.float64)
 
 
 def name_and_unit(cell: str) -> tuple[str, str | None]:
@@ -123,26 +109,18 @@ def name_and_unit(cell: str) -> tuple[str, str | None]:
 
 def row_labels(
     words: Sequence[str], columns: Sequence[Sequence[object]], count: int, plural: bool = False
-) -> tuple[tuple[str, ...] | None, Array | None, list[int]]:
+) -> tuple[Names, Array | None, list[int]]:
     """Image names, seconds and indices of the other columns of `count` rows.
 
-    Names and seconds are None if there is no such column.
-
-    Raises:
-        ValueError: A column is incomplete, a time is no number, or the columns are ambiguous.
+    Names and seconds are None if there is no such column. ValueError: a column is incomplete, a
+    time is no number, or the columns are ambiguous.
     """
     plain = [name_and_unit(word)[0] for word in words]
-    plain = [name[:-1] if name.endswith("s") else "" for name in plain] if plural else plain
-    name, stamp = (next((plain.index(w) for w in k if w in plain), None) for k in (_NAMES, _STAMPS))
-    if name is None:
-        ends = [
-            [str(cell).lower().endswith(IMAGE_ENDINGS) for cell in column] for column in columns
-        ]
-        files = [i for i, images in enumerate(ends) if images and all(images)]
-        if len(files) > 1:
-            found = " and ".join(words[i] for i in files)
-            raise ValueError(f"{found} name image files; call the right one 'image'")
-        name = files[0] if files else None
+    if plural:
+        plain = [word.removesuffix("s") if word.endswith("s") else "" for word in plain]
+    stamp = next((plain.index(word) for word in _STAMPS if word in plain), None)
+    name = next((plain.index(word) for word in _NAMES if word in plain), None)
+    name = _image_column(words, columns) if name is None else name
     for i in (i for i in (name, stamp) if i is not None):
         if len(columns[i]) != count:
             raise ValueError(f"{words[i]!r} holds {len(columns[i])} entries for {count} poses")
@@ -154,6 +132,18 @@ def row_labels(
         return names, None, others
     times = number_array(columns[stamp], f"{words[stamp]!r}")
     return names, in_unit(times, name_and_unit(words[stamp])[1]), others
+
+
+def _image_column(words: Sequence[str], columns: Sequence[Sequence[object]]) -> int | None:
+    files = [
+        i
+        for i, column in enumerate(columns)
+        if column and all(str(cell).lower().endswith(IMAGE_ENDINGS) for cell in column)
+    ]
+    if len(files) > 1:
+        found = " and ".join(words[i] for i in files)
+        raise ValueError(f"{found} name image files; call the right one 'image'")
+    return files[0] if files else None
 
 
 def number_array(values: object, what: str) -> Array:
@@ -180,10 +170,8 @@ def in_unit(stamps: Array, unit: str | None = None) -> Array:
     """Convert stamps (n,) to seconds from `s`, `ms`, `us` or `ns`, by their size if omitted.
 
     Times since 1970 are about 1.7e9 s, and a thousand, a million or a billion times as large in
-    milli-, micro- or nanoseconds. Smaller numbers are seconds.
-
-    Raises:
-        ValueError: The numbers are too large for seconds.
+    milli-, micro- or nanoseconds. Smaller numbers are seconds. ValueError: the numbers are too
+    large for seconds.
     """
     middle = float(np.median(stamps)) if stamps.size else 0.0
     sizes = {"ns": 1e17, "us": 1e14, "ms": 1e11}
@@ -195,13 +183,13 @@ def in_unit(stamps: Array, unit: str | None = None) -> Array:
             f"a stamp of {middle:.4g} is not in seconds; call the column stamp_ns, stamp_us or"
             f" stamp_ms"
         )
-    return stamps / _PER_SECOND[unit if unit in _PER_SECOND else likely]
+    return stamps / _PER_SECOND.get(unit or likely, _PER_SECOND[likely])
 
 
-def is_number(cell: str) -> bool:
+def is_number(cell: object) -> bool:
     """Whether Python reads a cell as a number."""
     try:
-        float(cell)
+        float(str(cell))
     except ValueError:
         return False
     return True

@@ -28,6 +28,10 @@ class Message:
     content: Any
     """Fields as rosbags decodes them."""
 
+    def seconds(self, header: Any, zero_ns: int) -> float:
+        """Time of a header after `zero_ns`; that of recording if it is not set."""
+        return ((stamp_ns(header.stamp) or self.logged_ns) - zero_ns) * 1e-9
+
 
 class BagFile:
     """A bag that stays open until nothing refers to it.
@@ -36,9 +40,6 @@ class BagFile:
 
     Args:
         path: A `.bag`, `.mcap` or `.db3` file, or a folder of a ROS 2 bag or of parts of a bag.
-
-    Raises:
-        InputError: The extra `bags` is not installed, or the bag cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -84,11 +85,7 @@ class BagFile:
         return (", ".join(words[:30]) or "nothing") + more
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
-        """Iterate over the messages of some topics in recorded order.
-
-        Raises:
-            InputError: The bag is damaged.
-        """
+        """Iterate over the messages of some topics in recorded order."""
         messages = self._messages(topics)
         while True:
             # The lock is free between two messages, so that the caller may read others.
@@ -99,21 +96,13 @@ class BagFile:
             yield message
 
     def first(self, topic: str) -> Any:
-        """Content of the first message of a topic that holds some.
-
-        Raises:
-            InputError: The bag is damaged.
-        """
+        """Content of the first message of a topic that holds some."""
         for message in self.messages([topic]):
             return message.content
         raise InputError(f"{self.path}: damaged: {topic} has no message, although some are listed")
 
     def message(self, topic: str, logged_ns: int, repeat: int) -> Message:
-        """Read one message.
-
-        Raises:
-            InputError: The bag is damaged or has changed.
-        """
+        """Read one message."""
         with self._lock:
             for message in self._messages([topic], logged_ns, logged_ns + 1):
                 if message.repeat == repeat:

@@ -3,14 +3,15 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.recordings.formats.bags.file import JOINT_STATE, TF, BagFile, stamp_ns
-from evercal.recordings.formats.bags.tf_tree import TfTree, plain_name
+from evercal.recordings.formats.bags.file import JOINT_STATE, TF, BagFile
+from evercal.recordings.formats.bags.tf_tree import TfTree, Transform, plain_name
 from evercal.recordings.poses.joint_states import interpolate
 from evercal.recordings.poses.kinematics import RobotModel
 from evercal.recordings.read_options import ReadOptions
@@ -37,16 +38,12 @@ class ImagePoses:
 def poses_at_images(
     bag: BagFile, stamps_ns: NDArray[np.int64], camera_frame: str, options: ReadOptions
 ) -> ImagePoses:
-    """Interpolate the pose of the gripper at n images, taken at `stamps_ns` (n,) in `camera_frame`.
-
-    Raises:
-        InputError: There is no tf and there are no joint states, frames are missing or ambiguous,
-            or no image is within the recorded poses.
-    """
+    """Interpolate the pose of the gripper at n images in `camera_frame`, at `stamps_ns` (n,)."""
+    zero = int(stamps_ns[0])
+    stamps = (stamps_ns - zero).astype(np.float64) * 1e-9
     if options.urdf is not None:
-        return _from_joints(bag, stamps_ns, options)
-    tree, times = _tf(bag, int(stamps_ns[0]), options.pose_topic)
-    stamps = (stamps_ns - stamps_ns[0]).astype(np.float64) * 1e-9
+        return _from_joints(bag, stamps, zero, RobotModel(options.urdf), options)
+    tree, times = _tf(bag, zero, options.pose_topic)
     base = _frame(bag, tree, options.base_frame, _BASES, "--base-frame")
     gripper = _frame(bag, tree, options.gripper_frame, _GRIPPERS, "--gripper-frame")
     poses, valid = tree.a_from_b(base, gripper, stamps)
@@ -55,7 +52,7 @@ def poses_at_images(
     of_camera = gripper == camera_frame
     owner = "the camera" if of_camera else "the gripper"
     notes = [f"poses of {owner} are those of {gripper} in {base}, from tf"]
-    if not of_camera and camera_frame in tree and tree.connected(base, camera_frame):
+    if not of_camera and camera_frame in tree.frames() and tree.connected(base, camera_frame):
         notes.append(
             f"tf also has the camera ({camera_frame}), which is not used; to use it, give"
             f" --gripper-frame {camera_frame}"
@@ -63,7 +60,7 @@ def poses_at_images(
     return ImagePoses(poses, valid, of_camera, notes)
 
 
-def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[TfTree, NDArray[np.float64]]:
+def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[TfTree, list[float]]:
     """All transforms, and times of the moving ones in seconds after `zero_ns`."""
     topics = bag.topics(*TF)
     if not topics:
@@ -79,17 +76,18 @@ def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[TfTree, NDArray
         for entry in message.content.transforms:
             stamp = None
             if not message.topic.endswith("tf_static"):
-                stamp = ((stamp_ns(entry.header.stamp) or message.logged_ns) - zero_ns) * 1e-9
+                stamp = message.seconds(entry.header, zero_ns)
                 times.append(stamp)
             t, q = entry.transform.translation, entry.transform.rotation
-            tree.add(
+            link = Transform(
                 entry.header.frame_id,
                 entry.child_frame_id,
                 stamp,
-                ((q.w, q.x, q.y, q.z), (t.x, t.y, t.z)),
-                message.topic.removesuffix("_static"),
+                (q.w, q.x, q.y, q.z),
+                (t.x, t.y, t.z),
             )
-    return tree, np.array(times)
+            tree.add(link, message.topic.removesuffix("_static"))
+    return tree, times
 
 
 def _check_topic(bag: BagFile, wanted: str | None, topics: Sequence[str], what: str) -> None:
@@ -121,20 +119,23 @@ def _frame(
 
 
 def _refuse_times(
-    bag: BagFile, stamps: NDArray[np.float64], times: NDArray[np.float64], what: str
-) -> None:
-    """Raise for images that are all outside the recorded times."""
-    covered = f"{times.min():.1f} to {times.max():.1f} s" if times.size else "no time"
+    bag: BagFile, stamps: NDArray[np.float64], times: Sequence[float], what: str
+) -> NoReturn:
+    covered = f"{min(times):.1f} to {max(times):.1f} s" if len(times) else "no time"
     raise InputError(
         f"{bag.path}: no image has a pose: images were taken at {stamps.min():.1f} to"
         f" {stamps.max():.1f} s after the first, {what} covers {covered}; are the clocks the same?"
     )
 
 
-def _from_joints(bag: BagFile, stamps_ns: NDArray[np.int64], options: ReadOptions) -> ImagePoses:
+def _from_joints(
+    bag: BagFile,
+    stamps: NDArray[np.float64],
+    zero_ns: int,
+    model: RobotModel,
+    options: ReadOptions,
+) -> ImagePoses:
     """Forward kinematics of the joint states, interpolated at the images."""
-    assert options.urdf is not None
-    model = RobotModel(options.urdf)
     base, gripper = model.chosen_links(options.base_frame, options.gripper_frame)
     topics = bag.topics(JOINT_STATE)
     if not topics:
@@ -143,8 +144,7 @@ def _from_joints(bag: BagFile, stamps_ns: NDArray[np.int64], options: ReadOption
             f" {bag.contents()}"
         )
     _check_topic(bag, options.pose_topic, topics, "joint states")
-    zero = int(stamps_ns[0])
-    tracks = _joint_tracks(bag, topics, zero)
+    tracks = _joint_tracks(bag, topics, zero_ns)
     joints = model.joints_between(base, gripper)
     missing = [name for name in joints if name not in tracks]
     if missing:
@@ -152,9 +152,8 @@ def _from_joints(bag: BagFile, stamps_ns: NDArray[np.int64], options: ReadOption
             f"{bag.path}: joint states lack {', '.join(missing)}, which {gripper} depends on; they"
             f" have {', '.join(tracks)}"
         )
-    stamps = (stamps_ns - zero).astype(np.float64) * 1e-9
     values, valid = np.empty((len(stamps), len(joints))), np.ones(len(stamps), dtype=bool)
-    times = np.empty(0)
+    times: Sequence[float] = ()
     for column, name in enumerate(joints):
         track = tracks[name]
         if len(track) > 1 and options.pose_topic not in track:
@@ -163,9 +162,9 @@ def _from_joints(bag: BagFile, stamps_ns: NDArray[np.int64], options: ReadOption
                 f" choose one with --pose-topic"
             )
         topic = options.pose_topic if options.pose_topic in track else next(iter(track))
-        times, positions = np.array(track[topic]).T
-        values[:, column], valid_here = interpolate(times, positions, stamps)
-        valid &= valid_here
+        times, positions = zip(*track[topic], strict=True)
+        values[:, column], here = interpolate(np.array(times), np.array(positions), stamps)
+        valid &= here
     if not valid.any():
         _refuse_times(bag, stamps, times, "the joint states")
     poses, notes = model.poses(joints, values, base, gripper)
@@ -178,7 +177,7 @@ def _joint_tracks(
     """By joint and topic: pairs of seconds after `zero_ns` and position."""
     tracks: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
     for message in bag.messages(topics):
-        stamp = ((stamp_ns(message.content.header.stamp) or message.logged_ns) - zero_ns) * 1e-9
+        stamp = message.seconds(message.content.header, zero_ns)
         for name, position in zip(message.content.name, message.content.position, strict=False):
             tracks[name][message.topic].append((stamp, float(position)))
     return tracks

@@ -1,6 +1,7 @@
 """The tree of transforms of ROS's /tf and /tf_static."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,19 +11,34 @@ from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import PoseTrack
 
 
-@dataclass
-class _Edge:
-    """Transforms of one child frame in its parent, from one topic."""
+class Transform(NamedTuple):
+    """One TransformStamped, parent_from_child."""
 
     parent: str
-    static: bool
-    stamps_s: list[float] = field(default_factory=list)
-    quaternions: list[tuple[float, ...]] = field(default_factory=list)
-    translations: list[tuple[float, ...]] = field(default_factory=list)
+    child: str
+    stamp_s: float | None
+    """Seconds, or None for a static transform."""
+    quaternion: tuple[float, ...]
+    """Unit quaternion wxyz."""
+    translation: tuple[float, ...]
+    """Metres."""
 
-    def numbers(self) -> list[float]:
-        """The last transform."""
-        return [*self.translations[-1], *self.quaternions[-1]]
+
+@dataclass
+class _Edge:
+    """Transforms of one child frame from one topic."""
+
+    moving: list[Transform] = field(default_factory=list)
+    static: list[Transform] = field(default_factory=list)
+
+    @property
+    def transforms(self) -> list[Transform]:
+        """The last static transform is valid, and moving ones take precedence."""
+        return self.moving or self.static[-1:]
+
+    @property
+    def parents(self) -> set[str]:
+        return {transform.parent for transform in (*self.moving, *self.static)}
 
 
 class TfTree:
@@ -37,60 +53,25 @@ class TfTree:
         self._source, self._topic = source, topic
         self._edges: dict[str, dict[str, _Edge]] = {}
         """By child and topic."""
-        self._parents: dict[str, set[str]] = {}
-        """Parents of every child that has several on one topic."""
 
-    def add(
-        self,
-        parent: str,
-        child: str,
-        stamp_s: float | None,
-        parent_from_child: tuple[tuple[float, ...], tuple[float, ...]],
-        topic: str,
-    ) -> None:
-        """Add one TransformStamped.
-
-        Args:
-            parent: header.frame_id.
-            child: child_frame_id.
-            stamp_s: Time in seconds, or None for a static transform.
-            parent_from_child: Unit quaternion wxyz, and translation in metres.
-            topic: Topic of the message; /tf_static belongs to /tf.
-
-        Raises:
-            InputError: The numbers are no rigid transform.
-        """
-        parent, child = plain_name(parent), plain_name(child)
-        quaternion, translation = parent_from_child
-        length = float(np.linalg.norm(quaternion))
-        if not (abs(length - 1) < 1e-2 and np.isfinite(translation).all()):
+    def add(self, transform: Transform, topic: str) -> None:
+        """Add a transform of a topic; /tf_static belongs to /tf."""
+        length = float(np.linalg.norm(transform.quaternion))
+        parent, child = plain_name(transform.parent), plain_name(transform.child)
+        if not (abs(length - 1) < 1e-2 and np.isfinite(transform.translation).all()):
             raise InputError(
-                f"{self._source}: tf {parent} -> {child}: quaternion (w x y z) {quaternion},"
-                f" translation {translation}: no rigid transform; repair the program that"
-                f" publishes it"
+                f"{self._source}: tf {parent} -> {child}: quaternion (w x y z)"
+                f" {transform.quaternion}, translation {transform.translation}: no rigid transform;"
+                f" repair the program that publishes it"
             )
-        topics = self._edges.setdefault(child, {})
-        edge = topics.get(topic)
-        if edge is not None and edge.parent != parent:
-            self._parents.setdefault(child, {edge.parent}).add(parent)
-            return
-        # The last static transform is valid, and a moving transform takes precedence.
-        if edge is None or edge.static:
-            edge = topics[topic] = _Edge(parent, stamp_s is None)
-        elif stamp_s is None:
-            return
-        edge.stamps_s.append(0.0 if stamp_s is None else stamp_s)
-        edge.quaternions.append(quaternion)
-        edge.translations.append(translation)
+        edge = self._edges.setdefault(child, {}).setdefault(topic, _Edge())
+        part = edge.static if transform.stamp_s is None else edge.moving
+        part.append(transform._replace(parent=parent, child=child))
 
     def frames(self) -> tuple[str, ...]:
         """All frames, parents before children."""
-        parents = {e.parent for topics in self._edges.values() for e in topics.values()}
+        parents = {p for topics in self._edges.values() for e in topics.values() for p in e.parents}
         return tuple(sorted({*parents, *self._edges}, key=lambda f: (len(self._chain(f)), f)))
-
-    def __contains__(self, frame: str) -> bool:
-        """Whether a transform has this frame."""
-        return frame in self.frames()
 
     def connected(self, a: str, b: str) -> bool:
         """Whether a chain of transforms joins two frames."""
@@ -101,25 +82,12 @@ class TfTree:
     ) -> tuple[SE3, NDArray[np.bool_]]:
         """Interpolate (n,) poses of frame b in frame a, and whether each is valid.
 
-        Validity is that of `PoseTrack.at`.
-
-        Raises:
-            InputError: The frames are not connected, or the transforms between them are ambiguous.
+        Validity is that of `PoseTrack.at`. Frames that are not connected, and ambiguous transforms
+        between them, are refused.
         """
         up, down = self._chain(a), self._chain(b)
         for child in (frame for frame in (*up, *down) if frame in self._edges):
-            if self._conflicting(child):
-                raise InputError(
-                    f"{self._source}: tf {self._edge(child).parent} -> {child} is on several"
-                    f" topics, {', '.join(sorted(self._edges[child]))}; choose one with"
-                    f" --pose-topic"
-                )
-            if child in self._parents:
-                parents = ", ".join(sorted(self._parents[child]))
-                raise InputError(
-                    f"{self._source}: tf frame {child!r} has several parents, {parents}: two"
-                    f" programs publish it; record with one of them"
-                )
+            self._refuse_ambiguous(child)
         if up[-1] != down[-1]:
             raise InputError(
                 f"{self._source}: tf has no chain between {a!r} and {b!r}: their roots are"
@@ -140,32 +108,43 @@ class TfTree:
     def _edge(self, child: str) -> _Edge:
         """The transforms to use for a frame: the chosen topic, else a moving one."""
         topics = self._edges[child]
-        moving = [topic for topic, edge in topics.items() if not edge.static]
+        moving = [topic for topic, edge in topics.items() if edge.moving]
         return topics[self._topic if self._topic in topics else (moving or [*topics])[0]]
 
-    def _conflicting(self, child: str) -> bool:
-        """Whether topics contradict each other about a frame and no topic was chosen."""
-        edges, edge = list(self._edges[child].values()), self._edge(child)
-        if self._topic in self._edges[child]:
-            return False
-        moving = sum(not other.static for other in edges)
+    def _refuse_ambiguous(self, child: str) -> None:
+        topics, edge = self._edges[child], self._edge(child)
+        others = [] if self._topic in topics else [*topics.values()]
+        moving = sum(bool(other.moving) for other in others)
         # Equal static transforms agree, and one moving topic takes precedence over static ones.
-        equal = all(np.allclose(edge.numbers(), e.numbers(), atol=1e-6) for e in edges)
-        agree = moving == 1 or (not moving and equal)
-        return not agree or any(other.parent != edge.parent for other in edges)
+        last = [np.r_[e.transforms[-1].translation, e.transforms[-1].quaternion] for e in others]
+        agree = moving == 1 or (
+            not moving and all(np.allclose(last[0], x, atol=1e-6) for x in last)
+        )
+        parent = edge.transforms[0].parent
+        if not agree or any(other.transforms[0].parent != parent for other in others):
+            raise InputError(
+                f"{self._source}: tf {parent} -> {child} is on several topics,"
+                f" {', '.join(sorted(topics))}; choose one with --pose-topic"
+            )
+        if len(edge.parents) > 1:
+            raise InputError(
+                f"{self._source}: tf frame {child!r} has several parents,"
+                f" {', '.join(sorted(edge.parents))}: two programs publish it; record with one of"
+                f" them"
+            )
 
     def _at(self, child: str, stamps_s: NDArray[np.float64]) -> tuple[SE3, NDArray[np.bool_]]:
         edge = self._edge(child)
-        poses = SE3(np.array(edge.quaternions), np.array(edge.translations))
-        if edge.static:
+        _, _, stamps, quaternions, translations = zip(*edge.transforms, strict=True)
+        poses = SE3(np.array(quaternions), np.array(translations))
+        if not edge.moving:
             return poses[np.zeros(len(stamps_s), int)], np.ones(len(stamps_s), dtype=bool)
-        return PoseTrack(np.array(edge.stamps_s), poses).at(stamps_s)
+        return PoseTrack(np.array(stamps), poses).at(stamps_s)
 
     def _chain(self, frame: str) -> list[str]:
-        """A frame and its ancestors up to the root."""
         chain = [frame]
         while chain[-1] in self._edges:
-            parent = self._edge(chain[-1]).parent
+            parent = self._edge(chain[-1]).transforms[0].parent
             if parent in chain:
                 cycle = " -> ".join([*chain, parent])
                 raise InputError(f"{self._source}: tf has a cycle: {cycle}")

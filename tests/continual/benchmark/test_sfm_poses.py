@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from evercal.continual.benchmark.sfm_poses import with_sfm_poses
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.recordings import Frame, Recording, with_sfm_poses
+from evercal.recordings import Frame, Recording
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
 IMAGE = np.zeros((480, 640, 3), np.uint8)

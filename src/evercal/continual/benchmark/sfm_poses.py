@@ -28,9 +28,6 @@ def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:
     """Replace poses and focal lengths of a recording and keep its split.
 
     Files in `folder` begin with `name`, such as chess or apt1_kitchen.
-
-    Raises:
-        InputError: A file is missing or broken, or holds no frame of the recording.
     """
     splits, lost = [], 0
     for split, frames in (("train", recording.train), ("test", recording.test)):
