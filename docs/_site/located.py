@@ -9,7 +9,7 @@ from pathlib import Path
 import evercal
 from evercal.recordings import write_image
 from evercal.reports.answers import Answer
-from evercal.reports.scene.animation import Animation
+from evercal.reports.video import Animation
 
 OUT = Path(__file__).parents[1] / "located.jpg"
 

@@ -12,7 +12,7 @@ from evercal.cli.point_words import point_dict, point_of, point_text
 from evercal.cli.stores import open_localizer
 
 if TYPE_CHECKING:
-    from evercal.reports.board_views import BoardSeen
+    from evercal.reports.boards_seen import BoardSeen
     from evercal.reports.calibration_images import AnnotatedImages
     from evercal.reports.calibration_page import NamedCalibration
 
@@ -50,7 +50,7 @@ class Report:
         point = point_of(self.at)
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.verdict import expected_error, tier, verdict
-        from evercal.reports.board_views import boards_seen
+        from evercal.reports.boards_seen import boards_seen
         from evercal.reports.calibration_page import NamedCalibration, calibration_page, difference
         from evercal.storage import write_bytes
 
@@ -83,7 +83,7 @@ class Report:
                 "tier": None if best is None else best.name,
                 "expected_error_mm": mm,
                 "expected_error_deg": deg,
-                "pictures": [image.name for image in images.images],
+                "pictures": list(images.images),
                 "against": against,
                 "missing": list(page.missing),
                 **({} if point is None else {"at": point_dict(point, calibration.uncertain_pose)}),

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from statistics import median
 
 from evercal.evaluation import FrameResult, scores
-from evercal.reports.charts import error_histogram
+from evercal.reports.charts import error_curve
 from evercal.reports.page import Picture, Table, Tile, render
 
 
@@ -116,7 +116,7 @@ def demo_page(result: DemoResult, pictures: Sequence[Picture]) -> str:
         level="",
         first=[Tile(*item) for item in others],
         result=result,
-        histogram=Picture(error_histogram(errors), "Position errors of the test images"),
+        curve=Picture(error_curve(errors, 5.0, None), "Share of test images below each error"),
         pictures=pictures,
         scores={"": scores(result.test), "after a change": scores(result.changed)},
         cameras=Table.of_records(result.cameras),

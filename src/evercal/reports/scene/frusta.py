@@ -72,10 +72,10 @@ class Ellipsoid:
         return " / ".join(f"{1000 * axis:.2g}" for axis in self.axes_m[::-1])
 
 
-def readable_scale(ellipsoids: list[Ellipsoid]) -> int:
-    """The round factor that draws the largest ellipsoid with a half axis of about `DRAWN_M`.
+def readable_scale(ellipsoids: list[Ellipsoid], drawn_m: float = DRAWN_M) -> int:
+    """The largest round factor that draws the half axes of ellipsoids no longer than `drawn_m`.
 
     Without ellipsoids, that of a standard deviation of 1 mm.
     """
     longest = max((float(ellipsoid.axes_m[-1]) for ellipsoid in ellipsoids), default=0.001)
-    return max([scale for scale in _SCALES if scale * longest <= DRAWN_M], default=1)
+    return max([scale for scale in _SCALES if scale * longest <= drawn_m], default=1)
