@@ -231,8 +231,8 @@ def _pose(recording: "Recording") -> "SE3":
 
 def _pictures(localizer: "Localizer", scene: "Recording") -> "list[Picture]":
     """Test images with detected landmarks."""
+    from evercal.reports.overlay import draw_landmarks
     from evercal.reports.page import Picture
-    from evercal.reports.pictures import draw_landmarks
 
     pictures = []
     for frame in _spread(scene.test, PICTURES):

@@ -91,7 +91,7 @@ class Localize:
         """The answer for each image; times include decoding."""
         from evercal.localization.parallel import in_parallel
         from evercal.recordings import read_image, write_image
-        from evercal.reports.pictures import draw_landmarks
+        from evercal.reports.overlay import draw_landmarks
 
         def answer(number: int) -> Answer:
             path, began = files[number], time.perf_counter()
@@ -113,7 +113,7 @@ class Localize:
 
     def _animate(self, path: Path, localizer: "LearnedLocalizer", answers: list[Answer]) -> None:
         from evercal.recordings import read_image
-        from evercal.reports.video import Animation, write_video
+        from evercal.reports.video import animate, write_video
 
         with progress_bar("drawing", len(answers), "image") as bar:
 
@@ -121,7 +121,7 @@ class Localize:
                 bar.update()
                 return read_image(file)
 
-            write_video(path, iter(Animation(answers, localizer, read)))
+            write_video(path, animate(answers, localizer, read))
 
     def _next(self, files: list[Path], located: int) -> None:
         if not located:

@@ -1,19 +1,16 @@
 """Charts of a calibration: cameras in space with their uncertainty, and residuals of images."""
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
 from evercal.calibration.calibration import Calibration
-from evercal.reports.boards_seen import BoardSeen, pose_of
 from evercal.reports.charts import COLOURS, new_figure, png_bytes, tidy
 from evercal.reports.page import Picture
 from evercal.reports.scene.frusta import Ellipsoid, Frustum, readable_scale
 from evercal.reports.scene.side_views import (
     ABOVE,
     CHI2_95,
-    Line,
     Surroundings,
     draw_view,
     ellipse,
@@ -21,7 +18,7 @@ from evercal.reports.scene.side_views import (
     frustum_line,
 )
 
-USED, REJECTED, OTHER = COLOURS[0], COLOURS[1], "black"
+USED, REJECTED = COLOURS[0], COLOURS[1]
 
 
 def camera_views(calibration: Calibration, around: Surroundings) -> Picture:
@@ -38,8 +35,10 @@ def camera_views(calibration: Calibration, around: Surroundings) -> Picture:
     half = times * np.sqrt(CHI2_95 * np.diag(pose.covariance)[:3].clip(0))
     points = np.concatenate([ends, [ends[1] - half, ends[1] + half]])
     bounds = around.bounds(np.concatenate([points, *(line.points_m for line in lines)]))
+    width, depth, _ = np.ptp(bounds, axis=0)
+    side = int(depth > width), 2  # the wider one
     figure = new_figure(10.8, 4.8)
-    for panel, plane in zip(figure.subplots(1, 2), (ABOVE, _side(bounds)), strict=True):
+    for panel, plane in zip(figure.subplots(1, 2), (ABOVE, side), strict=True):
         draw_view(panel, plane, lines, around, bounds, (parent, "m"))
         panel.fill(*ellipse(pose, times, plane).T, color=COLOURS[1], alpha=0.3, zorder=2)
     c, b, a = 1000 * np.sqrt(CHI2_95 * variances.clip(0))
@@ -51,43 +50,6 @@ def camera_views(calibration: Calibration, around: Surroundings) -> Picture:
         f" one lies {angle:.0f} deg from the viewing direction."
     )
     return Picture(png_bytes(figure), caption)
-
-
-def board_views(calibration: Calibration, boards: Mapping[str, BoardSeen]) -> Picture | None:
-    """Draw boards and cameras in the base frame; None where they are not known."""
-    camera, board = calibration.camera, calibration.checks.get("base_from_board")
-    carried = calibration.mount == "eye_in_hand"
-    if not boards or camera is None or (carried and board is None):
-        return None
-    used = {image.name: image.used for image in calibration.images}
-    fixed = pose_of(board) if carried else calibration.parent_from_child
-    depth = 0.12 * float(np.median([s.camera_from_board.translation_m[2] for s in boards.values()]))
-    lines = frame_lines(depth)
-    for name, seen in boards.items():
-        colour = USED if used.get(name, True) else REJECTED
-        if carried:
-            eye = fixed @ seen.camera_from_board.inverse()
-            lines.append(frustum_line(Frustum.of(eye, camera), depth, colour))
-        else:
-            lines.append(Line((fixed @ seen.camera_from_board).apply(seen.outline_m), colour))
-    if carried:
-        lines.append(Line(fixed.apply(next(iter(boards.values())).outline_m), OTHER, 1.6))
-    else:
-        lines.append(frustum_line(Frustum.of(fixed, camera), depth, OTHER, 1.6))
-    nothing = Surroundings()
-    bounds = nothing.bounds(np.concatenate([line.points_m for line in lines]))
-    figure = new_figure(10.8, 4.8)
-    for panel, plane in zip(figure.subplots(1, 2), (ABOVE, _side(bounds)), strict=True):
-        draw_view(panel, plane, lines, nothing, bounds)
-    what = "the board (black) and the cameras" if carried else "the camera (black) and boards"
-    caption = f"In the base frame: {what}. Used images are blue, rejected ones orange."
-    return Picture(png_bytes(figure), caption)
-
-
-def _side(bounds: np.ndarray) -> tuple[int, int]:
-    """The plane of the wider of two views from the side."""
-    width, depth, _ = np.ptp(bounds, axis=0)
-    return int(depth > width), 2
 
 
 def residual_chart(calibration: Calibration) -> Picture | None:

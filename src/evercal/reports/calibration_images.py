@@ -8,23 +8,46 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.calibration.boards.board_poses import read_board_poses
+from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.calibration.from_images import map_digest
 from evercal.errors import InputError
-from evercal.geometry import Camera, resize_pixels
+from evercal.geometry import SE3, Camera, resize_pixels
 from evercal.recordings.images import read_image
-from evercal.reports.boards_seen import BoardSeen
-from evercal.reports.frame_axes import draw_axes
-from evercal.reports.overlay import draw_residuals, resized
-from evercal.reports.pictures import PICTURE_PX, LandmarkPicture, draw_landmarks
+from evercal.reports.overlay import (
+    PICTURE_PX,
+    LandmarkPicture,
+    draw_axes,
+    draw_landmarks,
+    draw_residuals,
+    resized,
+)
 from evercal.reports.scene.side_views import Surroundings
 
 if TYPE_CHECKING:
     from evercal.localization.learned import LearnedLocalizer
 
 Image = NDArray[np.uint8]
+Array = NDArray[np.float64]
 
 MAX_IMAGES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class BoardSeen:
+    """A board in one image."""
+
+    view: BoardView
+    """Detected corners."""
+    camera_from_board: SE3
+    """Pose by the robot's pose and the calibration."""
+    scale: float
+    """Estimated length per stated length of the board."""
+
+    def projected(self, camera: Camera) -> Array:
+        """Return the (k, 2) pixels of the corners by the calibration."""
+        return camera.project(self.camera_from_board.apply(self.scale * self.view.points_m))
 
 
 class ImageFile(NamedTuple):
@@ -104,25 +127,18 @@ def annotate_images(
     missing = []
     for file in files:
         try:
-            image = read_image(file.path)
+            image = _fitting(file.path, camera)
         except InputError as error:
             missing.append(f"One picture is missing: {error}.")
-            continue
-        height, width = image.shape[:2]
-        if not camera.fits(width, height):
-            missing.append(
-                f"One picture is missing: {file.path} is {width}x{height}, which does not fit the"
-                f" camera, {camera.width}x{camera.height}."
-            )
             continue
         board = boards.get(file.use.name) if boards and file.use is not None else None
         drawn = _with_evidence(calibration, camera, image, board or localizer)
         picture = drawn.image
         if older is not None:
             pose = older.parent_from_child.inverse()
-            picture = draw_axes(picture, camera, pose, "", pale=True)
+            picture = draw_axes(picture, camera, pose, pale=True)
         pose = calibration.parent_from_child.inverse()
-        picture = draw_axes(picture, camera, pose, calibration.parent_frame)
+        picture = draw_axes(picture, camera, pose)
         summary = "; ".join(filter(None, [_use(file.use), drawn.summary]))
         annotated[str(file.path)] = LandmarkPicture(picture, drawn.landmarks, summary)
         on_image()
@@ -132,6 +148,17 @@ def annotate_images(
         return AnnotatedImages(annotated, tuple(missing))
     other, around = _is_other_map(calibration, localizer), _surroundings(calibration, localizer)
     return AnnotatedImages(annotated, tuple(missing), other, around)
+
+
+def _fitting(path: Path, camera: Camera) -> Image:
+    image = read_image(path)
+    height, width = image.shape[:2]
+    if not camera.fits(width, height):
+        raise InputError(
+            f"{path} is {width}x{height}, which does not fit the camera,"
+            f" {camera.width}x{camera.height}"
+        )
+    return image
 
 
 def _with_evidence(
@@ -192,3 +219,29 @@ def _is_other_map(calibration: Calibration, localizer: "LearnedLocalizer") -> bo
     from evercal.localization.localizer import Localizer
 
     return not isinstance(localizer, Localizer) or map_digest(localizer, str(scene)) != digest
+
+
+def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:
+    """Return the board in each image of a calibration by name; empty without corners.
+
+    Args:
+        calibration: By `evercal solve`.
+        folder: Folder of its file.
+    """
+    poses = calibration.checks.get("camera_from_board")
+    given = Path(str(calibration.source.get("camera_poses", "")))
+    file = next((f for f in (folder / given, given, folder / given.name) if f.is_file()), None)
+    if not isinstance(poses, dict) or file is None:
+        return {}
+    try:
+        board = read_board_poses(file)
+    except InputError:  # poses by other programs have no corners
+        return {}
+    views = {(file.parent / image.name).resolve(): image.view for image in board.images}
+    scale, seen = float(calibration.checks.get("scale", 1.0)), {}
+    for name, pose in poses.items():
+        view = views.get((folder / name).resolve()) or views.get((file.parent / name).resolve())
+        if view is not None:
+            camera_from_board = SE3(pose["quaternion_wxyz"], pose["translation_m"])
+            seen[name] = BoardSeen(view, camera_from_board, scale)
+    return seen

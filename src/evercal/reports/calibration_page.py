@@ -1,7 +1,6 @@
 """The HTML report of `evercal report`: a calibration, its quality and its evidence."""
 
 import os
-from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -11,8 +10,7 @@ from evercal.calibration.located import deviations, length_mm_deg
 from evercal.calibration.verdict import TIERS, expected_error, tier, verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.reports.boards_seen import BoardSeen
-from evercal.reports.calibration_charts import board_views, camera_views, residual_chart
+from evercal.reports.calibration_charts import camera_views, residual_chart
 from evercal.reports.calibration_images import AnnotatedImages
 from evercal.reports.calibration_tables import (
     camera_table,
@@ -22,7 +20,7 @@ from evercal.reports.calibration_tables import (
     source_table,
     use_table,
 )
-from evercal.reports.frame_axes import origin_in_view
+from evercal.reports.overlay import origin_in_view
 from evercal.reports.page import Picture, Tile, render
 
 
@@ -37,7 +35,6 @@ class CalibrationPage(NamedTuple):
     """A report."""
 
     html: str
-    """The HTML document."""
     missing: tuple[str, ...]
     """Sentences about contents that the calibration does not provide."""
 
@@ -75,12 +72,12 @@ def calibration_page(
     store: str | None = None,
     older: NamedCalibration | None = None,
     point_m: tuple[float, float, float] | None = None,
-    boards: Mapping[str, BoardSeen] | None = None,
+    boards: bool = False,
 ) -> CalibrationPage:
     """Write the report of a calibration.
 
-    `boards` are the boards in its images, which are drawn with the cameras in the base frame.
-    `store` is the path of the store whose landmarks are drawn. `point_m` is a point in the camera
+    `store` is the path of the store whose landmarks are drawn; `boards` says whether corners of a
+    board are drawn. `point_m` is a point in the camera
     frame, metres, whose standard deviation is reported.
 
     Raises:
@@ -107,7 +104,6 @@ def calibration_page(
         older=older,
         difference=None if old is None else difference(calibration, old),
         same_map=old is not None and _map(old) is not None and _map(old) == _map(calibration),
-        board_views=board_views(calibration, boards or {}),
         images=images,
         origin=_origin(calibration),
         pictures=[
@@ -115,7 +111,7 @@ def calibration_page(
             for name, drawn in images.images.items()
         ],
         landmarks_drawn=any(drawn.landmarks for drawn in images.images.values()),
-        boards_drawn=bool(boards),
+        boards_drawn=boards,
         store=store,
         camera_views=camera_views(calibration, images.surroundings) if uncertain else None,
         budget=error_budget(calibration),

@@ -1,17 +1,15 @@
-"""Charts as PNG bytes: their common style, and the curve of errors.
+"""The common style of charts, and their PNG bytes.
 
 The Okabe-Ito colours are distinguishable with colour blindness. No pyplot and no global state is
 used.
 """
 
 import io
-import math
 import warnings
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,31 +59,6 @@ def line_style(index: int, name: str) -> dict[str, Any]:
         "linewidth": 1.5,
         "markersize": 3.5,
     }
-
-
-def error_curve(
-    groups: Mapping[str, ArrayLike], limit_mm: float = 200.0, threshold_mm: float | None = 50.0
-) -> bytes:
-    """Plot the share of frames below each translation error.
-
-    Errors (frames,) are in metres, infinite without a pose.
-    """
-    figure = new_figure(5.4, 3.4)
-    panel = figure.subplots()
-    for index, (name, values) in enumerate(groups.items()):
-        errors = np.sort(1000.0 * np.asarray(values, np.float64))
-        shown = errors[errors <= limit_mm]
-        share = 100.0 * np.arange(len(shown) + 1) / len(errors)
-        x = np.concatenate([[0.0], shown, [limit_mm]])
-        style = {**line_style(index, name), "marker": ""}
-        panel.step(x, np.append(share, share[-1]), where="post", **style)
-    if threshold_mm is not None:
-        panel.axvline(threshold_mm, color="0.5", linewidth=1, linestyle=(0, (2, 2)), zorder=0)
-    panel.set(xlim=(0, limit_mm), ylim=(-3, 103))
-    panel.set(xlabel="translation error (mm)", ylabel="share of frames (%)")
-    tidy(panel)
-    panel.legend(loc="lower right", fontsize=9, frameon=False)
-    return png_bytes(figure)
 
 
 def plain(text: str) -> str:

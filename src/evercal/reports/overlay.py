@@ -1,14 +1,29 @@
-"""Points and lines drawn over images; images are (H, W, 3) uint8 RGB."""
+"""Landmarks, residuals and axes drawn over images; images are (H, W, 3) uint8 RGB."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from evercal.geometry import SE3, Camera, resize_pixels
+
+if TYPE_CHECKING:
+    from evercal.localization.estimate import PoseEstimate
+    from evercal.localization.learned import LearnedLocalizer
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
+MAX_RESIDUAL_PX = 2.0
+"""Upper end of the colour scale of residuals, pixels of the working image."""
+PICTURE_PX = 640
+"""Width of pictures in reports and videos."""
+AXES_M, _AXES_STEPS = 0.1, 32
+_AXES = ((214, 39, 40), (44, 160, 44), (31, 95, 220))
+"""x red, y green, z blue."""
+_PALE_AXES = ((237, 158, 158), (160, 212, 160), (154, 183, 239))
 _NAN_COLOUR = (160, 160, 160)
 _FRACTION_BITS = 4  # of a pixel, for OpenCV's drawing functions
 _FONT = 0  # cv2.FONT_HERSHEY_SIMPLEX; OpenCV is imported inside functions only
@@ -18,6 +33,50 @@ _VECTOR_PX = 25.0
 _VECTOR_COLOUR = (255, 140, 40)
 
 
+class LandmarkPicture(NamedTuple):
+    """An image with its landmarks."""
+
+    image: NDArray[np.uint8]
+    """(h, w, 3) RGB."""
+    landmarks: int
+    """Number of landmarks."""
+    summary: str
+    """Their number and median residual; without landmarks, the reason."""
+
+
+def draw_landmarks(
+    image: NDArray[np.uint8],
+    estimate: "PoseEstimate",
+    localizer: "LearnedLocalizer",
+    camera: Camera | None = None,
+    base_from_camera: SE3 | None = None,
+    width: int = PICTURE_PX,
+) -> LandmarkPicture:
+    """Resize an image and draw its landmarks, with lines from detections to projections.
+
+    The camera is by default that of the estimate, else that of the scene; the pose that of the
+    estimate. Residuals are in pixels of the image. Nothing is drawn without a pose or landmarks.
+    """
+    large, pose = resized(image, width), base_from_camera or estimate.base_from_camera
+    pixels, points = estimate.pixels, estimate.points_m
+    if pose is None or pixels is None or points is None or estimate.base_from_camera is None:
+        return LandmarkPicture(large, 0, estimate.reason or estimate.status.replace("_", " "))
+    scene = next(s for s in localizer.contents.scenes if s.name == estimate.scene)
+    whole = camera or estimate.camera or scene.adjusted_camera
+    working = whole.short_side_resized(localizer.contents.short_side)
+    in_camera = scene.frame.camera_among_points(pose).inverse().apply(points)
+    errors = working.project(in_camera) - pixels
+    enlarged, own = large.shape[0] / working.height, image.shape[0] / working.height
+    residuals = own * np.linalg.norm(errors, axis=1)
+    drawn, times = draw_residuals(
+        large, resize_pixels(pixels, enlarged), enlarged * errors, residuals, own * MAX_RESIDUAL_PX
+    )
+    median = float(np.nanmedian(residuals)) if np.isfinite(residuals).any() else np.nan
+    count = len(residuals)
+    words = f"{count} landmarks, median residual {median:.2f} px, lines {times} times as long"
+    return LandmarkPicture(drawn, count, words)
+
+
 def draw_residuals(
     image: Image, pixels: Array, vectors: Array, residuals: Array, largest: float
 ) -> tuple[Image, int]:
@@ -25,7 +84,8 @@ def draw_residuals(
 
     Args:
         image: (H, W, 3).
-        pixels: (n, 2) detections, x and y; 0 is the centre of the first pixel.
+        pixels: (n, 2) detections, x and y; 0 is the centre of the first pixel. Those that are not
+            finite are omitted.
         vectors: (n, 2) from detections to projections, pixels of the image.
         residuals: (n,) of the legend, any unit of pixels; NaN without a projection.
         largest: Upper end of the colour scale.
@@ -33,35 +93,26 @@ def draw_residuals(
     Returns:
         The image, and the factor by which the vectors are exaggerated.
     """
-    drawn = overlay_points(image, pixels, residuals, (0.0, largest), "residual (px)")
-    times = exaggeration(vectors)
-    lines = np.stack([pixels, pixels + times * vectors], 1)
-    return overlay_lines(drawn, list(lines), [_VECTOR_COLOUR] * len(lines), 1), times
-
-
-def overlay_points(
-    image: Image, pixels: Array, values: Array, limits: tuple[float, float], legend: str
-) -> Image:
-    """Draw points (n, 2) over a grey copy of an image, coloured by values (n,).
-
-    Later points cover earlier ones; points that are not finite are omitted.
-    """
     import cv2
 
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     drawn = np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
+    limits, radius = (0.0, largest), max(2.0, image.shape[1] / 180)
     visible = (np.abs(pixels) < 1e5).all(axis=1)
-    centres = np.round(pixels[visible] * (1 << _FRACTION_BITS)).astype(int)
-    size = round(max(2.0, image.shape[1] / 180) * (1 << _FRACTION_BITS))
-    colours = colour_map(values, limits)[visible]
-    for centre, colour in zip(centres.tolist(), colours.tolist(), strict=True):
+    centres = np.round(pixels[visible] * (1 << _FRACTION_BITS)).astype(int).tolist()
+    colours = colour_map(residuals, limits)[visible].tolist()
+    for centre, colour in zip(centres, colours, strict=True):
+        size = round(radius * (1 << _FRACTION_BITS))
         cv2.circle(drawn, centre, size, colour, -1, cv2.LINE_AA, _FRACTION_BITS)
-    _draw_legend(drawn, legend, limits)
-    return drawn
+    times = exaggeration(vectors)
+    lines = np.stack([pixels, pixels + times * vectors], 1)
+    drawn = overlay_lines(drawn, lines, [_VECTOR_COLOUR] * len(lines), 1)
+    _draw_legend(drawn, "residual (px)", limits)
+    return drawn, times
 
 
 def overlay_lines(
-    image: Image, lines: Sequence[Array], colours: Sequence[Colour], width: int = 2
+    image: Image, lines: Sequence[Array] | Array, colours: Sequence[Colour], width: int
 ) -> Image:
     """Draw lines (n, 2) over an image; points that are not finite interrupt them."""
     import cv2
@@ -123,3 +174,49 @@ def _draw_legend(image: Image, text: str, limits: tuple[float, float]) -> None:
     panel[_MARGIN : _MARGIN + line, _MARGIN:-_MARGIN] = ramp
     at = (image.shape[1] - width + _MARGIN, image.shape[0] - _MARGIN)
     cv2.putText(image, words, at, _FONT, scale, (0, 0, 0), 1, cv2.LINE_AA)
+
+
+def origin_in_view(camera: Camera, camera_from_frame: SE3) -> tuple[Array, str]:
+    """Project the origin of a frame: its pixel (2,), and where it lies if outside the image."""
+    pixel = camera.project(camera_from_frame.translation_m)
+    if camera_from_frame.translation_m[2] <= 0:
+        return pixel, "behind the camera"
+    inside = (pixel > -0.5) & (pixel < (camera.width - 0.5, camera.height - 0.5))
+    return pixel, "" if inside.all() else "outside the image"
+
+
+def axes_in_view(camera: Camera, camera_from_frame: SE3, length_m: float = AXES_M) -> Array:
+    """Project the axes of a frame: (3, n, 2) pixels along x, y and z; NaN where not visible."""
+    along = np.linspace(0.0, length_m, _AXES_STEPS + 1)
+    points = np.eye(3)[:, None] * along[:, None]
+    return camera.project(camera_from_frame.apply(points))
+
+
+def draw_axes(image: Image, camera: Camera, camera_from_frame: SE3, pale: bool = False) -> Image:
+    """Draw the axes of a frame into a copy of an image of any size.
+
+    If the origin is not visible, the lower left corner shows the directions of the axes instead,
+    unless they are pale.
+    """
+    import cv2
+
+    height, width = image.shape[:2]
+    camera = camera.resized(width, height)
+    lines = axes_in_view(camera, camera_from_frame)
+    thickness = max(2, round(width / 220))
+    if pale:
+        return overlay_lines(image, lines, _PALE_AXES, thickness)
+    if origin_in_view(camera, camera_from_frame)[1]:
+        length = 0.09 * min(width, height)
+        directions = length * camera_from_frame.rotation_matrix()[:2].T
+        corner = np.array([2 * length, height - 2 * length])
+        lines = corner + np.stack([np.zeros((3, 2)), directions], 1)
+    drawn = overlay_lines(image, lines, [(255, 255, 255)] * 3, thickness + 2)
+    drawn = overlay_lines(drawn, lines, _AXES, thickness)
+    for letter, line, colour in zip("xyz", lines, _AXES, strict=True):
+        end = line[0] + 1.15 * (line[-1] - line[0])
+        if (np.abs(end) < 1e5).all():
+            at = round(float(end[0])) - 5, round(float(end[1])) + 5
+            cv2.putText(drawn, letter, at, 0, 0.6, (255, 255, 255), 5, cv2.LINE_AA)
+            cv2.putText(drawn, letter, at, 0, 0.6, colour, 2, cv2.LINE_AA)
+    return drawn

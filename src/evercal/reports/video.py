@@ -14,7 +14,7 @@ from evercal.errors import InputError
 from evercal.mapping.scene_map import SceneMap
 from evercal.reports.answers import Answer, finite_pose
 from evercal.reports.charts import COLOURS, plain
-from evercal.reports.pictures import draw_landmarks
+from evercal.reports.overlay import draw_landmarks
 from evercal.reports.scene.frusta import Frustum
 from evercal.reports.scene.side_views import (
     ABOVE,
@@ -26,7 +26,6 @@ from evercal.reports.scene.side_views import (
 )
 
 if TYPE_CHECKING:
-    from evercal.geometry import SE3
     from evercal.localization.learned import LearnedLocalizer
 
 Image = NDArray[np.uint8]
@@ -75,75 +74,65 @@ def write_video(path: Path, frames: Iterator[Image]) -> None:
         whole.replace(path)
 
 
-class Animation:
-    """The frames of a video, one for each image.
+def animate(
+    answers: Sequence[Answer], localizer: "LearnedLocalizer", read: Callable[[Path], Image]
+) -> Iterator[Image]:
+    """Draw one frame for each answer; `read` reads an image file."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
-    Args:
-        answers: One for each image.
-        localizer: That located them.
-        read: Reads an image file.
-    """
+    figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    scenes = {scene.name: scene for scene in localizer.contents.scenes}
+    found = [a.estimate.scene for a in answers if a.estimate.scene is not None]
+    maps = {name: _MapView(scenes[name], answers) for name in set(found)}
+    shown = found[0] if found else None
+    for i, answer in enumerate(answers):
+        good = answer.estimate.status == "ok"
+        shown = answer.estimate.scene if good else shown
+        drawn = draw_landmarks(read(answer.path), answer.estimate, localizer)
+        figure.clear()
+        panel: Any = figure.add_axes((0.012, 0.1, 0.49, 0.75))
+        panel.imshow(drawn.image)
+        panel.axis("off")
+        panel.set_title(plain(textwrap.shorten(drawn.summary, 90)), fontsize=9, loc="left")
+        if shown is not None:
+            maps[shown].draw(figure.add_axes((0.57, 0.13, 0.42, 0.72)), i)
+        words, colour = plain(_words(answer)), _GOOD if good else _BAD
+        figure.suptitle(words, color=colour, x=0.015, y=0.97, ha="left", fontsize=13)
+        canvas.draw()
+        yield np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
-    def __init__(
-        self,
-        answers: Sequence[Answer],
-        localizer: "LearnedLocalizer",
-        read: Callable[[Path], Image],
-    ) -> None:
-        self._answers, self._localizer, self._read = answers, localizer, read
-        self._scenes = {scene.name: scene for scene in localizer.contents.scenes}
-        found = [a.estimate.scene for a in answers if a.estimate.scene is not None]
-        self._shown = found[0] if found else None
-        self._around = {name: _surroundings(self._scenes[name]) for name in set(found)}
 
-    def __iter__(self) -> Iterator[Image]:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
+class _MapView:
+    """A map from above, with the path of the camera."""
 
-        figure = Figure(figsize=_SIZE_IN, dpi=_DPI, facecolor="white")
-        canvas, shown = FigureCanvasAgg(figure), self._shown
-        for i, answer in enumerate(self._answers):
-            good = answer.estimate.status == "ok"
-            shown = answer.estimate.scene if good else shown
-            image = self._read(answer.path)
-            drawn = draw_landmarks(image, answer.estimate, self._localizer)
-            figure.clear()
-            panel: Any = figure.add_axes((0.012, 0.1, 0.49, 0.75))
-            panel.imshow(drawn.image)
-            panel.axis("off")
-            panel.set_title(plain(textwrap.shorten(drawn.summary, 90)), fontsize=9, loc="left")
-            if shown is not None:
-                self._draw_map(figure.add_axes((0.57, 0.13, 0.42, 0.72)), shown, i)
-            words, colour = plain(_words(answer)), _GOOD if good else _BAD
-            figure.suptitle(words, color=colour, x=0.015, y=0.97, ha="left", fontsize=13)
-            canvas.draw()
-            yield np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
+    def __init__(self, scene: Any, answers: Sequence[Answer]) -> None:
+        self._name, self._camera = scene.name, scene.adjusted_camera
+        self._around = Surroundings.of(scene) if isinstance(scene, SceneMap) else Surroundings()
+        here = [a.estimate.status == "ok" and a.estimate.scene == scene.name for a in answers]
+        self._poses = [
+            answer.estimate.base_from_camera if own else None
+            for answer, own in zip(answers, here, strict=True)
+        ]
+        self._eyes = np.array(
+            [np.full(3, np.nan) if pose is None else pose.translation_m for pose in self._poses]
+        )
+        known = all(a.unit_known for a, own in zip(answers, here, strict=True) if own)
+        self._names = "base", "m" if known else "unit unknown"
 
-    def _draw_map(self, panel: Any, name: str, number: int) -> None:
-        """Draw a map from above, with the path of the camera up to an image."""
-        around, poses = self._around[name], [_pose(a, name) for a in self._answers]
-        eyes = [np.full(3, np.nan) if pose is None else pose.translation_m for pose in poses]
-        finite = np.reshape([np.zeros(3), *(eye for eye in eyes if eye[0] == eye[0])], (-1, 3))
-        bounds = around.bounds(finite)
-        extent = float(np.ptp(bounds, axis=0).max())
-        lines = [*frame_lines(0.07 * extent), Line(np.array(eyes[: number + 1]), COLOURS[1])]
-        pose = poses[number]
+    def draw(self, panel: Any, number: int) -> None:
+        """Draw the camera of an image and the path up to it."""
+        seen = self._eyes[np.isfinite(self._eyes[:, 0])]
+        bounds = self._around.bounds(np.concatenate([np.zeros((1, 3)), seen]))
+        extent, pose = float(np.ptp(bounds, axis=0).max()), self._poses[number]
+        lines = [*frame_lines(0.07 * extent), Line(self._eyes[: number + 1], COLOURS[1])]
         if pose is not None:
-            view = Frustum.of(pose, self._scenes[name].adjusted_camera)
+            view = Frustum.of(pose, self._camera)
             lines.append(frustum_line(view, 0.08 * extent, COLOURS[1], 1.8))
-        known = all(a.unit_known for a in self._answers if a.estimate.scene == name)
-        draw_view(panel, ABOVE, lines, around, bounds, ("base", "m" if known else "unit unknown"))
-        words = f"{name[:24]} from above: keyframes blue, camera and path orange"
+        draw_view(panel, ABOVE, lines, self._around, bounds, self._names)
+        words = f"{self._name[:24]} from above: keyframes blue, camera and path orange"
         panel.set_title(plain(words), fontsize=9, loc="left")
-
-
-def _surroundings(scene: Any) -> Surroundings:
-    return Surroundings.of(scene) if isinstance(scene, SceneMap) else Surroundings()
-
-
-def _pose(answer: Answer, scene: str) -> "SE3 | None":
-    here = answer.estimate.status == "ok" and answer.estimate.scene == scene
-    return answer.estimate.base_from_camera if here else None
 
 
 def _words(answer: Answer) -> str:
